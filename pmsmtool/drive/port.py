@@ -1,0 +1,122 @@
+"""What a drive can do for the tool: the port every transport and every simulated drive implements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Protocol
+
+from pmsmtool.trace import Trace
+
+
+class Injection(IntEnum):
+    """Injection point of the excitation (object 0x2050:02)."""
+
+    U_D = 0
+    U_Q = 1
+    I_D = 2
+    I_Q = 3
+    SPEED = 4
+
+
+class Shape(IntEnum):
+    """Shape of the excitation (object 0x2050:01)."""
+
+    NONE = 0
+    STEP = 1
+    SINE = 2
+    CHIRP = 3
+    PRBS = 4
+    BUFFER = 5
+    SQUARE = 6
+    DC = 7
+    HYSTERESIS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Identity object 0x1018 and names of a drive."""
+
+    node: int
+    vendor: int
+    product: int
+    revision: int
+    serial: int
+    name: str = ""
+    hardware: str = ""
+    software: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Excitation:
+    """One experiment's signal, as the drive generates it (object 0x2050); SI, electrical rad.
+
+    ``amplitude`` is the wave's amplitude at the injection point (V, A or rad/s); ``bias_d_a`` and ``bias_q_a``
+    are held by the drive's current loop of bandwidth ``bias_bandwidth_rad_s``; ``fixed_angle_rad`` is
+    None to follow the rotor. ``amplitude_q`` and ``i_limit_*`` are for hysteresis pulses.
+    """
+
+    shape: Shape
+    point: Injection
+    amplitude: float
+    bias_d_a: float = 0.0
+    bias_q_a: float = 0.0
+    bias_bandwidth_rad_s: float = 0.0
+    f0_hz: float = 0.0
+    f1_hz: float = 0.0
+    duration_s: float = 0.0
+    hold_periods: int = 1
+    fixed_angle_rad: float | None = None
+    amplitude_q: float = 0.0
+    i_limit_d_a: float = 0.0
+    i_limit_q_a: float = 0.0
+    i_centre_d_a: float = 0.0
+    abort_current_apk: float = 0.0
+    abort_speed_rad_s: float = 0.0
+    buffer: Sequence[float] = field(default=())
+
+
+class Drive(Protocol):
+    """A connected drive. Every method may raise ``BusError``, ``SdoAbort`` or ``DriveFault``."""
+
+    period_s: float
+    identity: Identity
+
+    def read(self, name: str) -> float:
+        """Return one parameter by catalogue name, in SI."""
+
+    def write(self, values: Mapping[str, float]) -> None:
+        """Write parameters (staged and activated where the drive stages); the guard restores them."""
+
+    def enable(self) -> None:
+        """Bring the drive to operation enabled at zero reference."""
+
+    def disable(self) -> None:
+        """Remove the voltage; returns when the statusword confirms it."""
+
+    def quick_stop(self) -> None:
+        """Stop as fast as the drive can and confirm it, else raise ``StopNotConfirmed``."""
+
+    def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
+        """Hold a current vector (A peak), in the rotor frame or at a fixed electrical angle."""
+
+    def command_speed(self, omega_m_rad_s: float) -> None:
+        """Run at a mechanical speed (rad/s)."""
+
+    def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
+        """Return means over a window of control periods, taken inside the drive."""
+
+    def record(
+        self,
+        signals: Sequence[str],
+        samples: int,
+        *,
+        decimation: int = 1,
+        excitation: Excitation | None = None,
+        pretrigger: int = 0,
+    ) -> Trace:
+        """Record signals every ``decimation`` periods, starting with the excitation if there is one."""
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass on the bus clock."""

@@ -1,0 +1,242 @@
+"""Errors and exit codes of pmsmtool.
+
+::
+
+    PmsmtoolError                      70  a bug, unless a subclass says better
+    +-- ConfigError (ValueError)        2  bad file, bad flag, bad value; lists every violation
+    +-- BusError                        3  no bus, no drive, connection lost
+    |   +-- DriveTimeout (TimeoutError) 3  the drive did not answer in time
+    +-- DriveFault                      4  drive in fault, or it refused a value
+    |   +-- SdoAbort                    4  an SDO transfer was aborted, with the abort code
+    +-- LimitExceeded                   5  refused by a safety limit before anything moved
+    +-- IdentificationError             6  the measurement is not trustworthy; no number is given
+    +-- Declined                        7  the person said no, or nobody could be asked
+    +-- StopNotConfirmed                8  the machine may be energised; outranks every other error
+    +-- NotAvailable                    9  this drive cannot give that; what is missing is named
+    +-- CheckFailed                     1  checked and not good (margin, compare, prove)
+        +-- VerifyMismatch              1  read back differs from what was written
+        +-- DesignInfeasible            1  no design satisfies the request
+
+``Interrupted`` (130) is a BaseException-free sibling raised after a confirmed safe stop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """Exit codes of the command line (``interface.md`` section 1)."""
+
+    OK = 0
+    CHECK_FAILED = 1
+    USAGE = 2
+    BUS = 3
+    DRIVE = 4
+    SAFETY = 5
+    NOT_TRUSTWORTHY = 6
+    DECLINED = 7
+    STOP_NOT_CONFIRMED = 8
+    NOT_AVAILABLE = 9
+    INTERNAL = 70
+    INTERRUPTED = 130
+
+
+class PmsmtoolError(Exception):
+    """Base of all errors a user can meet.
+
+    Parameters
+    ----------
+    what : str
+        What happened, one sentence.
+    where : str
+        File and key, or node and object ("node 5, 0x6040:00"); empty when there is no place.
+    likely : str
+        The most likely cause.
+    hint : str
+        The next step to take.
+    """
+
+    exit_code = ExitCode.INTERNAL
+
+    def __init__(self, what: str, *, where: str = "", likely: str = "", hint: str = "") -> None:
+        super().__init__(what)
+        self.what = what
+        self.where = where
+        self.likely = likely
+        self.hint = hint
+
+    def __str__(self) -> str:
+        parts = [f"{self.where}: {self.what}" if self.where else self.what]
+        if self.likely:
+            parts.append(f"likely: {self.likely}")
+        if self.hint:
+            parts.append(f"try: {self.hint}")
+        return "\n".join(parts)
+
+
+class ConfigError(PmsmtoolError, ValueError):
+    """A file, flag or value is not usable; ``violations`` lists all that is wrong, not the first."""
+
+    exit_code = ExitCode.USAGE
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        likely: str = "",
+        hint: str = "",
+        violations: Sequence[str] = (),
+    ) -> None:
+        super().__init__(what, where=where, likely=likely, hint=hint)
+        self.violations = tuple(violations)
+
+    def __str__(self) -> str:
+        lines = [super().__str__()]
+        lines[1:] = [f"  - {violation}" for violation in self.violations]
+        return "\n".join(lines)
+
+
+class BusError(PmsmtoolError):
+    """No bus, no drive on it, or the connection was lost."""
+
+    exit_code = ExitCode.BUS
+
+
+class DriveTimeout(BusError, TimeoutError):
+    """The drive did not answer within its deadline."""
+
+
+class DriveFault(PmsmtoolError):
+    """The drive is in fault, or refuses what was asked."""
+
+    exit_code = ExitCode.DRIVE
+
+
+class SdoAbort(DriveFault):
+    """An SDO transfer ended with an abort.
+
+    Parameters
+    ----------
+    code : int
+        CiA 301 abort code (table 22), e.g. 0x06090030.
+    index, sub : int
+        The object of the transfer.
+    """
+
+    def __init__(
+        self,
+        code: int,
+        index: int,
+        sub: int,
+        what: str,
+        *,
+        where: str = "",
+        likely: str = "",
+        hint: str = "",
+    ) -> None:
+        super().__init__(what, where=where, likely=likely, hint=hint)
+        self.code = code
+        self.index = index
+        self.sub = sub
+
+
+class LimitExceeded(PmsmtoolError):
+    """Refused by a safety limit; nothing was energised."""
+
+    exit_code = ExitCode.SAFETY
+
+    def __init__(
+        self,
+        quantity: str,
+        value: float,
+        limit: float,
+        unit: str,
+        *,
+        where: str = "",
+        likely: str = "",
+        hint: str = "",
+    ) -> None:
+        super().__init__(
+            f"{quantity} {value:.6g} {unit} is outside the limit {limit:.6g} {unit}",
+            where=where,
+            likely=likely,
+            hint=hint,
+        )
+        self.quantity = quantity
+        self.value = value
+        self.limit = limit
+        self.unit = unit
+
+
+class IdentificationError(PmsmtoolError):
+    """A measurement that must not be trusted: no number is given.
+
+    Parameters
+    ----------
+    reason : str
+        Name of the detected trap, e.g. ``E_MODEL_MISMATCH`` (``pmsmtool help refusals``).
+    """
+
+    exit_code = ExitCode.NOT_TRUSTWORTHY
+
+    def __init__(
+        self, reason: str, what: str, *, where: str = "", likely: str = "", hint: str = ""
+    ) -> None:
+        super().__init__(f"{reason}: {what}", where=where, likely=likely, hint=hint)
+        self.reason = reason
+
+
+class Declined(PmsmtoolError):
+    """The person declined, or there was no terminal to ask on."""
+
+    exit_code = ExitCode.DECLINED
+
+
+class StopNotConfirmed(PmsmtoolError):
+    """The drive did not confirm that it stopped: use the hardware stop."""
+
+    exit_code = ExitCode.STOP_NOT_CONFIRMED
+
+
+class NotAvailable(PmsmtoolError):
+    """This drive cannot give what was asked; the message names what is missing."""
+
+    exit_code = ExitCode.NOT_AVAILABLE
+
+
+class CheckFailed(PmsmtoolError):
+    """Checked and not good."""
+
+    exit_code = ExitCode.CHECK_FAILED
+
+
+class VerifyMismatch(CheckFailed):
+    """What the drive holds differs from what it should hold; ``differences`` has one line each."""
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        likely: str = "",
+        hint: str = "",
+        differences: Sequence[str] = (),
+    ) -> None:
+        super().__init__(what, where=where, likely=likely, hint=hint)
+        self.differences = tuple(differences)
+
+    def __str__(self) -> str:
+        return "\n".join([super().__str__(), *(f"  - {line}" for line in self.differences)])
+
+
+class DesignInfeasible(CheckFailed):
+    """No design satisfies what was asked."""
+
+
+class Interrupted(PmsmtoolError):
+    """Interrupted by the person, after a confirmed safe stop."""
+
+    exit_code = ExitCode.INTERRUPTED

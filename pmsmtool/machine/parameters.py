@@ -1,0 +1,119 @@
+"""The machine and its inverter as numbers: what design, simulation and the drive agree on.
+
+Amplitude-invariant (peak) dq quantities, SI, electrical angle; torque = 1.5 p (psi_d i_q - psi_q i_d),
+motoring positive; resistance and inductance per phase (star).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A number that carries its doubt.
+
+    Attributes
+    ----------
+    value : float
+        Estimate in SI.
+    std : float
+        Statistical standard deviation, same unit.
+    systematic : float
+        Half width of the 95 % systematic part (sensor gains, references), same unit.
+    unit : str
+        Unit, as in ``units.UNITS``.
+    n : int
+        Samples (or levels) in the fit.
+    chi2 : float
+        Reduced chi-square of the fit; NaN where the method has none.
+    T_c : float
+        Winding (or magnet) temperature the value was measured at (degC); NaN when unknown.
+    method, source : str
+        How it was found, and by whom: ``pmsmtool``, ``vendor``, ``datasheet``, ``meter``.
+    i_d_apk, i_q_apk : float
+        Bias point (A peak); NaN where the quantity has none.
+    dof : float
+        Degrees of freedom behind ``std`` (Student t); infinity when it is large.
+    fallback : str
+        What the method fell back to; empty when it did not.
+    """
+
+    value: float
+    std: float
+    systematic: float
+    unit: str
+    n: int = 0
+    chi2: float = math.nan
+    T_c: float = math.nan
+    method: str = ""
+    source: str = "pmsmtool"
+    i_d_apk: float = math.nan
+    i_q_apk: float = math.nan
+    dof: float = math.inf
+    fallback: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MachineParameters:
+    """Constant-parameter machine (``[machine]`` of a machine file); see ``interface.md`` section 5."""
+
+    pole_pairs: int
+    R_s_ohm: float
+    L_d_h: float
+    L_q_h: float
+    psi_f_wb: float
+    R_winding_ohm: float | None = None
+    L_d_app_h: float | None = None
+    L_q_app_h: float | None = None
+    T_ref_c: float = 20.0
+    alpha_R_per_k: float = 0.00393
+    alpha_psi_per_k: float = -0.0012
+    I_nom_apk: float | None = None
+    I_max_apk: float | None = None
+    I_max_time_s: float | None = None
+    n_nom_rpm: float | None = None
+    n_max_rpm: float | None = None
+    J_kgm2: float | None = None
+    B_nms: float | None = None
+    tau_c_nm: float | None = None
+    flux_map: str | None = None
+    iron_loss_map: str | None = None
+
+    @property
+    def L_d_decoupling_h(self) -> float:
+        """Apparent d inductance where known, else the incremental one (H)."""
+        return self.L_d_h if self.L_d_app_h is None else self.L_d_app_h
+
+    @property
+    def L_q_decoupling_h(self) -> float:
+        """Apparent q inductance where known, else the incremental one (H)."""
+        return self.L_q_h if self.L_q_app_h is None else self.L_q_app_h
+
+    def torque_nm(self, i_d_a: float, i_q_a: float) -> float:
+        """Torque of the linear machine (N m), 1.5 p (psi_d i_q - psi_q i_d)."""
+        psi_d = self.psi_f_wb + self.L_d_decoupling_h * i_d_a
+        psi_q = self.L_q_decoupling_h * i_q_a
+        return 1.5 * self.pole_pairs * (psi_d * i_q_a - psi_q * i_d_a)
+
+
+@dataclass(frozen=True, slots=True)
+class InverterParameters:
+    """Inverter and timing (``[inverter]`` of a machine file)."""
+
+    U_dc_v: float
+    f_s_hz: float
+    dead_time_s: float = 0.0
+    delay_periods: float = 1.5
+    voltage_utilisation: float = 1.0 / math.sqrt(3.0)
+
+    @property
+    def T_s(self) -> float:
+        """Control period (s)."""
+        return 1.0 / self.f_s_hz
+
+    @property
+    def V_max_v(self) -> float:
+        """Largest phase voltage amplitude in use (V peak)."""
+        return self.voltage_utilisation * self.U_dc_v

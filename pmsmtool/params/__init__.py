@@ -1,0 +1,1 @@
+"""Parameters of the drive: the catalogue, sets of values, differences between sets."""

@@ -1,0 +1,54 @@
+"""Trace: named signals over one time base, with units and the facts needed to read them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """Samples of several signals at common instants.
+
+    Row k of a drive trace holds the currents and the angle *sampled* at ``t_s[k]`` and the voltage
+    command *computed* there, which acts in the stator frame one period later (identification
+    reference, "trace row k").
+
+    Parameters
+    ----------
+    t_s : ndarray, shape (n,)
+        Sampling instants (s), increasing.
+    signals : mapping of str to ndarray, shape (n,)
+        One array per signal; the unit is the name's suffix (``i_d_a``, ``u_q_v``, ``theta_e_rad``).
+    units : mapping of str to str
+        Unit of each signal, as in ``units.UNITS``.
+    meta : mapping
+        JSON-serialisable facts: period, excitation, temperatures, flags' meaning.
+    """
+
+    t_s: NDArray[np.float64]
+    signals: Mapping[str, NDArray[np.float64]]
+    units: Mapping[str, str]
+    meta: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, values in self.signals.items():
+            if values.shape != self.t_s.shape:
+                raise ValueError(f"signal {name} has {values.shape}, the time base {self.t_s.shape}")
+            if name not in self.units:
+                raise ValueError(f"signal {name} has no unit")
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        return self.signals[name]
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+    @property
+    def period_s(self) -> float:
+        """Sampling period (s)."""
+        return float(self.t_s[-1] - self.t_s[0]) / (len(self.t_s) - 1)
