@@ -1,0 +1,113 @@
+/* One PWM period of the drive's control: pmsm_step().
+ *
+ * Order inside a period: transform the sampled currents, (every N_fw) field weakening or look-up,
+ * reference governor, current controller, voltage limit, delay-compensating angle, duty ratios,
+ * integrators. Everything tunable stands in pmsm_params (generated from the catalogue) and in the
+ * look-up words behind it; everything that changes stands in pmsm_state.
+ */
+#ifndef PMSM_CORE_H
+#define PMSM_CORE_H
+
+#include "pmsm_params.h" /* generated: struct pmsm_params, schema version, layout signature */
+#include "pmsm_types.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* What the controller is asked to do in this period. */
+enum pmsm_mode {
+    PMSM_MODE_OFF = 0,     /* gates off, controller reset */
+    PMSM_MODE_VOLTAGE = 1, /* u_d_inject, u_q_inject are the whole voltage */
+    PMSM_MODE_CURRENT = 2, /* i_d_ref, i_q_ref */
+    PMSM_MODE_TORQUE = 3,  /* tau_ref through look-up or field weakening */
+    PMSM_MODE_SPEED = 4    /* omega_M_ref through the speed controller */
+};
+
+/* Bits of pmsm_live.flags. */
+enum pmsm_flag {
+    PMSM_FLAG_VOLTAGE_LIMITED = 1u << 0,  /* the demanded voltage left the circle or hexagon */
+    PMSM_FLAG_DUTY_CLIPPED = 1u << 1,     /* a leg reached 0 or 1 */
+    PMSM_FLAG_CURRENT_LIMITED = 1u << 2,  /* the current reference was cut to its limit */
+    PMSM_FLAG_LUT_EDGE = 1u << 3,         /* the look-up was asked outside its axes */
+    PMSM_FLAG_LUT_NO_POINT = 1u << 4,     /* the look-up cell holds no operating point */
+    PMSM_FLAG_GOVERNOR_ACTIVE = 1u << 5,  /* the governor changed the reference */
+    PMSM_FLAG_GOVERNOR_FALLBACK = 1u << 6,/* the admissible set was empty */
+    PMSM_FLAG_FW_EMPTY = 1u << 7,         /* no current satisfies voltage and current limit */
+    PMSM_FLAG_I2T = 1u << 8,              /* the time-limited current budget is used up */
+    PMSM_FLAG_ADC_CLIPPED = 1u << 9,      /* set by the drive: a current sample was at full scale */
+    PMSM_FLAG_EXCITATION = 1u << 10       /* set by the drive: an excitation is running */
+};
+
+typedef struct {            /* sampled at the start of the period */
+    pmsm_real i_a;          /* A */
+    pmsm_real i_b;          /* A */
+    pmsm_real i_c;          /* A */
+    pmsm_real theta_e;      /* rad, electrical, any multiple of a turn within +-1e3 rad */
+    pmsm_real omega_e;      /* rad/s, electrical */
+    pmsm_real U_dc;         /* V */
+    pmsm_real T_winding;    /* degC */
+} pmsm_measurement;
+
+typedef struct {
+    uint32_t mode;           /* enum pmsm_mode */
+    pmsm_real i_d_ref;       /* A peak */
+    pmsm_real i_q_ref;       /* A peak */
+    pmsm_real tau_ref;       /* N m */
+    pmsm_real omega_M_ref;   /* rad/s, mechanical */
+    pmsm_real u_d_inject;    /* V, added behind the current controller */
+    pmsm_real u_q_inject;    /* V */
+    pmsm_real bias_bandwidth;/* rad/s; > 0 replaces the current gains by a slow integral loop */
+} pmsm_reference;
+
+typedef struct {             /* what a trace or a TPDO can show of this period */
+    pmsm_real i_d, i_q;              /* A, sampled */
+    pmsm_real i_d_req, i_q_req;      /* A, before the governor */
+    pmsm_real i_d_ref, i_q_ref;      /* A, after the governor */
+    pmsm_real u_d, u_q;              /* V, demanded, before the limiter */
+    pmsm_real u_d_lim, u_q_lim;      /* V, after limiter and duty clip, in the sampled frame convention of u */
+    pmsm_real theta_e, omega_e;      /* rad in [-pi, pi), rad/s */
+    pmsm_real tau;                   /* N m, from currents and parameters */
+    pmsm_real kappa;                 /* governor: share of the way to the request, 1 = passed unchanged */
+    uint32_t binding;                /* governor: index of the binding row, 255 none */
+    uint32_t iterations;             /* governor or field weakening: solver iterations of this period */
+    uint32_t flags;                  /* enum pmsm_flag */
+} pmsm_live;
+
+typedef struct {
+    pmsm_real duty_a, duty_b, duty_c; /* 0..1 */
+    pmsm_real u_alpha, u_beta;        /* V, demanded stator-frame voltage after the limiter */
+    uint32_t gates;                   /* 1: switch, 0: all transistors off */
+} pmsm_output;
+
+typedef struct {             /* per-axis controller memory and whatever the modes need */
+    pmsm_dq integrator;      /* V */
+    pmsm_dq voltage_committed; /* V, stator frame: computed in the last period, acting now (delay 1.5) */
+    pmsm_dq reference_held;  /* A, governed reference of the last period */
+    pmsm_dq disturbance;     /* V, observer */
+    pmsm_real speed_integrator;   /* N m */
+    pmsm_real omega_filtered;     /* rad/s mechanical */
+    pmsm_real omega_ref_ramped;   /* rad/s mechanical */
+    pmsm_real notch_1, notch_2;
+    pmsm_real i2t;           /* 0..1 of the budget */
+    pmsm_dq fw_reference;    /* A */
+    uint32_t fw_count;       /* periods since the last optimisation */
+    uint32_t speed_count;
+    pmsm_real polar[12];     /* memory of the polar-coordinate laws */
+    pmsm_real tau_speed;     /* N m, last output of the speed controller */
+    pmsm_live live;
+} pmsm_state;
+
+/* Clear the memory (all zero, kappa 1, binding 255); call at enable and after a parameter change. */
+PMSM_EXPORT void pmsm_init(pmsm_state *state);
+
+/* One PWM period. lut points to the words behind pmsm_params in the image, may be NULL if lut_format is 0. */
+PMSM_EXPORT void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut,
+                           const pmsm_measurement *measurement, const pmsm_reference *reference,
+                           pmsm_output *output);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif
