@@ -1,0 +1,220 @@
+"""The run directory ``runs/<utc>-<serial>/``: the record of what was done to one drive.
+
+``run.json`` carries the date, the operator, the drive, the versions, both consents and one entry per stage; the
+files beside it (``traces/``, ``machine.toml``, ``design.toml``, ``params.toml``, ``lut.npz``, ``report.html``)
+are what the stages left. Every later command takes the directory, and a stage that is recorded as passed is not
+run again. The record is replaced as a whole after every stage, never half written.
+"""
+
+from __future__ import annotations
+
+import datetime
+import getpass
+import hashlib
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from pmsmtool.errors import ConfigError
+
+SCHEMA = "pmsmtool.run/1"
+RECORD = "run.json"
+
+Status = Literal["pass", "fail", "refused", "interrupted"]
+
+
+@dataclass(frozen=True, slots=True)
+class Acceptance:
+    """One criterion of a stage: what was asked, what was measured, whether it holds."""
+
+    what: str
+    measured: str
+    limit: str
+    ok: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """What one stage did.
+
+    Attributes
+    ----------
+    name : str
+        ``identify``, ``tune``, ``lut``, ``margins``, ``flash``, ``verify`` ...
+    status : Status
+        ``pass`` only when every acceptance holds.
+    seconds : float
+        Time the stage took on the bus clock (s).
+    values : sequence of mapping
+        Estimates or results: ``name value std systematic unit`` and whatever else the stage knows, SI.
+    acceptance : sequence of Acceptance
+        The criteria the status follows from.
+    fallbacks : sequence of str
+        Every fallback that was taken, one line each.
+    files : mapping of str to str
+        File name in the run directory -> SHA-256 of its bytes.
+    note : str
+        The error text of a stage that did not pass.
+    """
+
+    name: str
+    status: Status
+    seconds: float
+    values: Sequence[Mapping[str, Any]] = ()
+    acceptance: Sequence[Acceptance] = ()
+    fallbacks: Sequence[str] = ()
+    files: Mapping[str, str] = field(default_factory=dict)
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """Content of ``run.json``; it is signed off by a person, so it carries date and operator."""
+
+    started_utc: str
+    operator: str
+    command: Sequence[str]
+    versions: Mapping[str, str]
+    drive: Mapping[str, Any]
+    bus: Mapping[str, Any]
+    envelope: Mapping[str, Any] = field(default_factory=dict)
+    consents: Sequence[Mapping[str, Any]] = ()
+    instruments: Sequence[str] = ()
+    stages: Sequence[Stage] = ()
+    schema: str = SCHEMA
+
+    def stage(self, name: str) -> Stage | None:
+        """Return the latest entry of a stage, or None when it has not been run."""
+        return next((stage for stage in reversed(self.stages) if stage.name == name), None)
+
+    def passed(self, name: str) -> bool:
+        """Return whether the latest entry of a stage is a pass."""
+        stage = self.stage(name)
+        return stage is not None and stage.status == "pass"
+
+
+@dataclass(frozen=True, slots=True)
+class RunDirectory:
+    """One run directory on disk."""
+
+    path: Path
+
+    @classmethod
+    def create(cls, parent: Path, serial: int, record: RunRecord) -> RunDirectory:
+        """Make ``parent/<utc>-<serial>`` with its record; a second run in the same second gets a suffix.
+
+        Raises
+        ------
+        ConfigError
+            If the directory cannot be made or written.
+        """
+        stem = f"{record.started_utc.replace(':', '').replace('-', '')}-{serial:08x}"
+        for attempt in range(100):
+            path = parent / (stem if attempt == 0 else f"{stem}-{attempt}")
+            try:
+                (path / "traces").mkdir(parents=True, exist_ok=False)
+            except FileExistsError:
+                continue
+            except OSError as error:
+                raise _unwritable(path, error) from error
+            run = cls(path)
+            run.write(record)
+            return run
+        raise ConfigError(f"a hundred runs started in the same second under {parent}", where=str(parent))
+
+    def read(self) -> RunRecord:
+        """Return the record.
+
+        Raises
+        ------
+        ConfigError
+            If there is no record, or it is not one of ours.
+        """
+        path = self.path / RECORD
+        try:
+            raw = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise ConfigError(
+                "no run.json here", where=str(self.path), hint="give a directory that identify or commission made"
+            ) from None
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"the record cannot be read: {error}", where=str(path)) from error
+        if not isinstance(raw, dict) or raw.get("schema") != SCHEMA:
+            raise ConfigError(f"the record is not of schema {SCHEMA}", where=str(path))
+        try:
+            raw["stages"] = tuple(_stage(entry) for entry in raw.get("stages", ()))
+            return RunRecord(**raw)
+        except (TypeError, KeyError, AttributeError) as error:
+            raise ConfigError(f"the record is damaged: {error}", where=str(path)) from error
+
+    def write(self, record: RunRecord) -> None:
+        """Replace the record in one step (write beside it, sync, rename)."""
+        text = json.dumps(asdict(record), indent=1, allow_nan=True) + "\n"
+        try:
+            handle, name = tempfile.mkstemp(dir=self.path, prefix=".run-", suffix=".json")
+            with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(name, self.path / RECORD)
+        except OSError as error:
+            raise _unwritable(self.path, error) from error
+
+    def add(self, stage: Stage) -> None:
+        """Append a stage to the record, with the hashes of the files it names."""
+        record = self.read()
+        hashed = {name: self.sha256(name) for name in stage.files}
+        self.write(replace(record, stages=(*record.stages, replace(stage, files=hashed))))
+
+    def sha256(self, name: str) -> str:
+        """Return the SHA-256 of a file of this run (hex)."""
+        return hashlib.sha256((self.path / name).read_bytes()).hexdigest()
+
+
+def new_record(
+    command: Sequence[str],
+    *,
+    drive: Mapping[str, Any],
+    bus: Mapping[str, Any],
+    versions: Mapping[str, str],
+    operator: str | None = None,
+    instruments: Sequence[str] = (),
+) -> RunRecord:
+    """Return a record that starts now, signed with the login name unless an operator is given."""
+    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    return RunRecord(
+        started_utc=now.isoformat().replace("+00:00", "Z"),
+        operator=operator if operator is not None else _login_name(),
+        command=tuple(command),
+        versions={"python": platform.python_version(), **versions},
+        drive=dict(drive),
+        bus=dict(bus),
+        instruments=tuple(instruments),
+    )
+
+
+def _login_name() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):
+        return "unknown"
+
+
+def _stage(entry: Mapping[str, Any]) -> Stage:
+    values = dict(entry)
+    values["acceptance"] = tuple(Acceptance(**line) for line in values.get("acceptance", ()))
+    return Stage(**values)
+
+
+def _unwritable(path: Path, error: OSError) -> ConfigError:
+    return ConfigError(
+        f"cannot write: {error.strerror or error}",
+        where=str(path),
+        likely="a read-only or full disk",
+        hint="choose another folder with --runs DIR",
+    )
