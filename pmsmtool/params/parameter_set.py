@@ -1,0 +1,251 @@
+"""ParameterSet: catalogue names with SI values, where each came from, and the text form ``params.toml``.
+
+The text is canonical: groups and keys in catalogue order, shortest decimals, one content hash over
+values and tables. Two equal sets are equal byte for byte, whoever wrote them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import itertools
+import math
+import re
+import struct
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, LUT_CAPACITY_WORDS
+
+SCHEMA = "pmsmtool.params/1"
+
+TABLE_NAMES = ("lut.axis_x", "lut.axis_y", "lut.axis_z", "lut.i_d_a", "lut.i_q_a")
+"""Axes (torque in N m; rpm or Wb; V) and tables (A peak, row-major x, y, z) of the reference look-up."""
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+\Z")
+_NUMBERS_PER_LINE = 8
+_INTEGER_LIMIT = 2**53
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterSet:
+    """Values of drive parameters, all or some of the catalogue.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Catalogue name -> value in SI.
+    tables : mapping of str to sequence of float
+        Look-up axes and tables, names as in ``TABLE_NAMES``.
+    provenance : mapping of str to str
+        Catalogue name, or any fact's name -> where it came from (hashes, methods; no dates).
+    name : str
+        What the set is for.
+    """
+
+    values: Mapping[str, float]
+    tables: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        unknown = [_unknown(key, BY_NAME) for key in self.values if key not in BY_NAME]
+        unknown += [_unknown(key, TABLE_NAMES) for key in self.tables if key not in TABLE_NAMES]
+        if unknown:
+            raise ConfigError("not in the parameter catalogue", violations=unknown)
+        object.__setattr__(self, "values", {r.name: float(self.values[r.name]) for r in CATALOGUE if r.name in self.values})
+        object.__setattr__(self, "tables", {n: tuple(map(float, self.tables[n])) for n in TABLE_NAMES if n in self.tables})
+        object.__setattr__(self, "provenance", dict(self.provenance))
+
+    def violations(self) -> tuple[str, ...]:
+        """List every value out of bounds and every table that does not fit its descriptor."""
+        found = [line for name, value in self.values.items() for line in _bound_violations(name, value)]
+        return tuple(found + _table_violations(self.values, self.tables))
+
+    def content_hash(self) -> str:
+        """Return ``sha256:<hex>`` over values and tables in canonical form (provenance not included)."""
+        return "sha256:" + hashlib.sha256(self._body().encode("ascii")).hexdigest()
+
+    def to_toml(self) -> str:
+        """Return the canonical text of ``params.toml``."""
+        lines = [f'schema = "{SCHEMA}"', f"name = {toml_string(self.name)}", f'content = "{self.content_hash()}"', ""]
+        text = "\n".join(lines) + "\n" + self._body()
+        if self.provenance:
+            text += "\n[provenance]\n"
+            text += "".join(f"{_toml_key(k)} = {toml_string(v)}\n" for k, v in sorted(self.provenance.items()))
+        return text
+
+    def merged(self, other: ParameterSet) -> ParameterSet:
+        """Return this set with every entry of ``other`` laid over it."""
+        return ParameterSet(
+            values={**self.values, **other.values},
+            tables={**self.tables, **other.tables},
+            provenance={**self.provenance, **other.provenance},
+            name=other.name or self.name,
+        )
+
+    def _body(self) -> str:
+        groups: dict[str, list[str]] = {}
+        for name, value in self.values.items():
+            group, key = name.split(".", 1)
+            groups.setdefault(group, []).append(f"{key} = {_number(name, value)}\n")
+        for name, table in self.tables.items():
+            group, key = name.split(".", 1)
+            groups.setdefault(group, []).append(f"{key} = {_array(table)}\n")
+        return "\n".join(f"[{group}]\n" + "".join(lines) for group, lines in groups.items())
+
+
+def parse_parameter_set(text: str, where: str = "params.toml") -> ParameterSet:
+    """Read the text of a parameter set.
+
+    Raises
+    ------
+    ConfigError
+        Not TOML, wrong schema, unknown names, values that are no numbers, or a content hash that
+        does not fit the content; all violations at once.
+    """
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"not a TOML file: {error}", where=where) from error
+    schema = document.pop("schema", None)
+    if schema != SCHEMA:
+        raise ConfigError(f"schema is {schema!r}, expected {SCHEMA!r}", where=where, hint="give a params.toml as `tune` writes it")
+    name, content = document.pop("name", ""), document.pop("content", None)
+    provenance = document.pop("provenance", {})
+    values, tables, wrong = _read_groups(document)
+    if not isinstance(name, str):
+        wrong.append("name: not a string")
+    if not isinstance(provenance, dict) or not all(isinstance(v, str) for v in provenance.values()):
+        wrong.append("[provenance]: not a table of strings")
+    if wrong:
+        raise ConfigError("the parameter set cannot be used", where=where, violations=wrong)
+    found = ParameterSet(values=values, tables=tables, provenance=provenance, name=name)
+    if content is not None and content != found.content_hash():
+        raise ConfigError(
+            f"the content is {found.content_hash()}, the file says {content}",
+            where=f"{where}:content",
+            likely="the file was edited or cut",
+            hint="delete the line `content` to accept the file as it is",
+        )
+    return found
+
+
+def read_parameter_set(path: Path) -> ParameterSet:
+    """Read ``params.toml`` from a file; raises ``ConfigError`` naming the file."""
+    try:
+        return parse_parameter_set(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read: {error}", where=str(path)) from error
+
+
+def default_set() -> ParameterSet:
+    """Return the factory values of the reference drive."""
+    return ParameterSet({row.name: row.default for row in CATALOGUE}, name="factory defaults")
+
+
+def toml_string(text: str) -> str:
+    """Return a TOML basic string."""
+    escaped = "".join(
+        {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t"}.get(c, c if c.isprintable() else f"\\U{ord(c):08x}")
+        for c in text
+    )
+    return f'"{escaped}"'
+
+
+def _toml_key(key: str) -> str:
+    return key if _BARE_KEY.match(key) else toml_string(key)
+
+
+def _number(name: str, value: float) -> str:
+    if BY_NAME[name].is_integer and value == int(value):
+        return str(int(value))
+    return repr(value)
+
+
+def _array(numbers: Sequence[float]) -> str:
+    if len(numbers) <= _NUMBERS_PER_LINE:
+        return "[" + ", ".join(map(repr, numbers)) + "]"
+    rows = [numbers[k : k + _NUMBERS_PER_LINE] for k in range(0, len(numbers), _NUMBERS_PER_LINE)]
+    return "[\n" + "".join("    " + ", ".join(map(repr, row)) + ",\n" for row in rows) + "]"
+
+
+def _unknown(name: str, known: Sequence[str] | Mapping[str, object]) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"{name}: unknown" + (f", did you mean {close[0]}?" if close else "")
+
+
+def _read_groups(document: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, list[float]], list[str]]:
+    values: dict[str, float] = {}
+    tables: dict[str, list[float]] = {}
+    wrong: list[str] = []
+    for group, entries in document.items():
+        if not isinstance(entries, dict):
+            wrong.append(_unknown(group, {row.name.split(".")[0]: None for row in CATALOGUE}))
+            continue
+        for key, value in entries.items():
+            name = f"{group}.{key}"
+            if name in TABLE_NAMES and isinstance(value, list) and all(map(_is_number, value)):
+                tables[name] = value
+            elif name in BY_NAME and _is_number(value):
+                values[name] = value
+            elif name in BY_NAME or name in TABLE_NAMES:
+                wrong.append(f"{name}: {value!r} is not {'a number' if name in BY_NAME else 'a list of numbers'}")
+            else:
+                wrong.append(_unknown(name, [*BY_NAME, *TABLE_NAMES]))
+    return values, tables, wrong
+
+
+def _is_number(value: object) -> bool:
+    # TOML knows integers of any length, binary64 does not.
+    return isinstance(value, float) or (type(value) is int and abs(value) < _INTEGER_LIMIT)
+
+
+def _binary32(value: float) -> float:
+    try:
+        return float(struct.unpack("<f", struct.pack("<f", value))[0])
+    except OverflowError:
+        return math.copysign(math.inf, value)
+
+
+def _bound_violations(name: str, value: float) -> list[str]:
+    row = BY_NAME[name]
+    if not math.isfinite(value):
+        return [f"{name} = {value!r} is not finite"]
+    # The drive judges the binary32 value, so a bound that is not one must not refuse its own image.
+    low, x, high = (value_ if row.is_integer else _binary32(value_) for value_ in (row.minimum, value, row.maximum))
+    found = []
+    if not low <= x <= high:
+        found.append(f"{name} = {value:.9g} {row.unit} is outside [{row.minimum:.9g}, {row.maximum:.9g}]")
+    if row.is_integer and value != int(value):
+        found.append(f"{name} = {value:.9g} is not an integer")
+    return found
+
+
+def _table_violations(values: Mapping[str, float], tables: Mapping[str, Sequence[float]]) -> list[str]:
+    """Compare the tables with the descriptor, as far as the set holds it; NaN marks a cell without a point."""
+    found = []
+    for name, table in tables.items():
+        axis = name.startswith("lut.axis_")
+        found += [f"{name}[{k}] is {x!r}" for k, x in enumerate(table) if math.isinf(x) or (axis and math.isnan(x))]
+        if axis and any(b <= a for a, b in itertools.pairwise(table)):
+            found.append(f"{name} does not rise strictly")
+    descriptor = [values.get(name, math.nan) for name in ("lut.format", "lut.n_x", "lut.n_y", "lut.n_z")]
+    if not all(map(math.isfinite, descriptor)):
+        return [*found, "tables without their descriptor lut.format, lut.n_x, lut.n_y, lut.n_z"] if tables else found
+    kind, n_x, n_y, n_z = map(int, descriptor)
+    present = kind != 0
+    expected = {"lut.axis_x": n_x, "lut.axis_y": n_y, "lut.axis_z": n_z}
+    expected |= dict.fromkeys(("lut.i_d_a", "lut.i_q_a"), n_x * n_y * n_z)
+    for name, count in expected.items():
+        given = len(tables.get(name, ()))
+        if given != (count if present else 0):
+            found.append(f"{name} has {given} numbers, the descriptor says {count if present else 'no table'}")
+    words = n_x + n_y + n_z + 2 * (n_x * n_y * n_z if kind == 1 else (n_x * n_y * n_z + 1) // 2)
+    if present and words > LUT_CAPACITY_WORDS:
+        found.append(f"axes and tables need {words} words, the drive has {LUT_CAPACITY_WORDS}")
+    return found
