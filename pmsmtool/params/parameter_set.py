@@ -28,7 +28,7 @@ TABLE_NAMES = ("lut.axis_x", "lut.axis_y", "lut.axis_z", "lut.i_d_a", "lut.i_q_a
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+\Z")
 _NUMBERS_PER_LINE = 8
-_INTEGER_LIMIT = 2**53
+_INTEGER_LIMIT = 2**64
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ def _toml_key(key: str) -> str:
 
 
 def _number(name: str, value: float) -> str:
-    if BY_NAME[name].is_integer and value == int(value):
+    if BY_NAME[name].is_integer and abs(value) < _INTEGER_LIMIT and value == int(value):
         return str(int(value))
     return repr(value)
 
