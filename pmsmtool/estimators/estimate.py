@@ -1,0 +1,172 @@
+"""From a fit to an :class:`~pmsmtool.machine.parameters.Estimate`: gates, verdicts and intervals.
+
+The statistical part comes from the fit, the systematic part from the declared tolerances of the sensors. They are kept
+apart everywhere; only :func:`total_half_width` joins them, in the manner of the GUM (JCGM 100:2008, 5.1.2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.machine.parameters import Estimate
+
+CHI2_WARN = 1.25
+"""Reduced chi-square above which a result is widened and marked (identification reference, section 4)."""
+CHI2_REFUSE = 3.0
+"""Reduced chi-square above which no number is given."""
+CONDITION_LIMIT = 1e6
+"""Largest condition number of a column-scaled Jacobian (identification reference, section 7)."""
+COVERAGE_FACTOR = 1.959963984540054
+"""Two-sided 95 % quantile of the normal distribution."""
+SENSOR_GAIN_TOLERANCE = 0.01
+"""Default tolerance of the current and the voltage scale (95 % half width, relative)."""
+
+
+class Verdict(StrEnum):
+    """What the gates say about one result."""
+
+    PASS = "pass"
+    WARN = "warn"
+
+
+@dataclass(frozen=True, slots=True)
+class SensorTolerance:
+    """Declared tolerances that no experiment on the machine itself can see (95 % half widths).
+
+    Attributes
+    ----------
+    current_gain, voltage_gain : float
+        Relative scale errors of the current measurement and of the DC-link measurement.
+    temperature_k : float
+        Error of the temperature sensor (K).
+    device_share_max : float
+        Largest part of the loop resistance that devices and shunts may have when the split is unknown (1).
+    """
+
+    current_gain: float = SENSOR_GAIN_TOLERANCE
+    voltage_gain: float = SENSOR_GAIN_TOLERANCE
+    temperature_k: float = 2.0
+    device_share_max: float = 0.3
+
+    @property
+    def impedance(self) -> float:
+        """Relative systematic half width of R and L, which scale as (1 + g)/(1 + e)."""
+        return math.hypot(self.current_gain, self.voltage_gain)
+
+    @property
+    def flux(self) -> float:
+        """Relative systematic half width of a flux linkage measured as voltage over speed, (1 + g)."""
+        return self.voltage_gain
+
+    @property
+    def inertia(self) -> float:
+        """Relative systematic half width of J, B and tau_c, (1 + g)(1 + e)."""
+        return math.hypot(self.current_gain, self.voltage_gain)
+
+
+def chi2_gate(chi2: float, stage: str) -> tuple[Verdict, float]:
+    """Return the verdict of a reduced chi-square and the factor on the standard deviation.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_MODEL_MISMATCH`` above :data:`CHI2_REFUSE`.
+    """
+    if not math.isfinite(chi2):
+        raise refuse("E_NOT_CONVERGED", f"reduced chi-square is {chi2}", stage=stage)
+    if chi2 > CHI2_REFUSE:
+        raise refuse("E_MODEL_MISMATCH", f"reduced chi-square {chi2:.3g} > {CHI2_REFUSE:g}", stage=stage)
+    verdict = Verdict.WARN if chi2 > CHI2_WARN else Verdict.PASS
+    return verdict, math.sqrt(max(1.0, chi2))
+
+
+def coverage_factor(dof: float) -> float:
+    """Two-sided 95 % quantile of Student's t with ``dof`` degrees of freedom (normal when infinite)."""
+    if math.isinf(dof) or dof > 1e4:
+        return COVERAGE_FACTOR
+    if dof < 1:
+        raise ValueError(f"no interval with {dof} degrees of freedom")
+    from scipy.special import stdtrit
+
+    return float(stdtrit(dof, 0.975))
+
+
+def statistical_half_width(estimate: Estimate) -> float:
+    """95 % half width of the statistical part (same unit as the estimate)."""
+    return coverage_factor(estimate.dof) * estimate.std
+
+
+def total_half_width(estimate: Estimate) -> float:
+    """95 % half width of statistical and systematic part together (root sum of squares, GUM 5.1.2)."""
+    return math.hypot(statistical_half_width(estimate), estimate.systematic)
+
+
+def information_bound(jacobian: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Standard deviations of the Cramer-Rao bound and the condition number of the scaled Jacobian.
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (n, k)
+        Derivative of the whitened residual with respect to the parameters.
+
+    Returns
+    -------
+    std : ndarray, shape (k,)
+        Square roots of the diagonal of the inverse Fisher information, nuisance parameters included.
+    condition : float
+        Ratio of the largest to the smallest singular value after scaling every column to unit length.
+    """
+    covariance, condition = scaled_covariance(jacobian)
+    return np.sqrt(np.diag(covariance)), condition
+
+
+def scaled_covariance(jacobian: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Inverse of J'J through the scaled singular value decomposition, and the scaled condition number."""
+    scale = np.sqrt(np.sum(jacobian**2, axis=0))
+    if not np.all(scale > 0.0):
+        size = jacobian.shape[1]
+        return np.full((size, size), np.inf), math.inf
+    _, singular, right = np.linalg.svd(jacobian / scale, full_matrices=False)
+    condition = math.inf if singular[-1] == 0.0 else float(singular[0] / singular[-1])
+    if math.isinf(condition):
+        return np.full((len(scale), len(scale)), np.inf), condition
+    root = right.T / singular
+    return (root @ root.T) / np.outer(scale, scale), condition
+
+
+def condition_gate(condition: float, pair: str, stage: str) -> None:
+    """Refuse a fit whose parameters cannot be told apart; ``pair`` names them."""
+    if condition > CONDITION_LIMIT:
+        raise refuse(
+            "E_NOT_IDENTIFIABLE",
+            f"{pair} cannot be told apart, scaled condition number {condition:.2g} > {CONDITION_LIMIT:g}",
+            stage=stage,
+        )
+
+
+def ljung_box(residual: NDArray[np.float64], lags: int = 10) -> float:
+    """p-value of the Ljung-Box test for whiteness (Biometrika 65, 297, 1978, DOI 10.1093/biomet/65.2.297)."""
+    from scipy.special import gammaincc
+
+    centred = residual - np.mean(residual)
+    n = len(centred)
+    power = float(centred @ centred)
+    if power == 0.0 or n <= lags + 1:
+        return 1.0
+    rho = [float(centred[k:] @ centred[:-k]) / power for k in range(1, lags + 1)]
+    statistic = n * (n + 2.0) * sum(r * r / (n - k) for k, r in enumerate(rho, start=1))
+    return float(gammaincc(lags / 2.0, statistic / 2.0))
+
+
+def information_weights(criteria: Sequence[float]) -> NDArray[np.float64]:
+    """Weights of models with information criteria B (chi2 + k ln n): exp(-(B - min B)/2), normalised."""
+    b = np.asarray(criteria, dtype=np.float64)
+    w = np.exp(-0.5 * (b - np.min(b)))
+    return np.asarray(w / np.sum(w))

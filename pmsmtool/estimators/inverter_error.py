@@ -1,0 +1,91 @@
+"""The voltage error of one inverter phase as data: what the drive loses between command and terminal."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.least_squares import levenberg_marquardt
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class InverterCurve:
+    """Voltage error of one phase, odd in its current.
+
+    Attributes
+    ----------
+    i_phase_a : ndarray, shape (n,)
+        Phase current, increasing and positive (A).
+    u_error_v : ndarray, shape (n,)
+        Command minus terminal voltage beyond R i, mean of both signs (V).
+    asymmetry_v : float
+        Largest difference between the signs (V).
+    """
+
+    i_phase_a: Vector
+    u_error_v: Vector
+    asymmetry_v: float
+
+    def error_v(self, i_phase_a: Vector) -> Vector:
+        """Error at any phase current: linear between the points and through zero, constant beyond the last (V)."""
+        magnitude = np.abs(i_phase_a)
+        x = np.concatenate([[0.0], self.i_phase_a])
+        y = np.concatenate([[0.0], self.u_error_v])
+        return np.asarray(np.sign(i_phase_a) * np.interp(magnitude, x, y), dtype=np.float64)
+
+    def error_dq_v(self, i_d_a: Vector, i_q_a: Vector, theta_e_rad: Vector) -> tuple[Vector, Vector]:
+        """Error of the three phases in a frame at ``theta_e_rad`` (V, amplitude-invariant)."""
+        c, s = np.cos(theta_e_rad), np.sin(theta_e_rad)
+        i_alpha, i_beta = c * i_d_a - s * i_q_a, s * i_d_a + c * i_q_a
+        root = math.sqrt(3.0)
+        e_a = self.error_v(i_alpha)
+        e_b = self.error_v(-0.5 * i_alpha + 0.5 * root * i_beta)
+        e_c = self.error_v(-0.5 * i_alpha - 0.5 * root * i_beta)
+        e_alpha, e_beta = (2.0 * e_a - e_b - e_c) / 3.0, (e_b - e_c) / root
+        return c * e_alpha + s * e_beta, c * e_beta - s * e_alpha
+
+    def knee_a(self, V_plateau_v: float) -> float:
+        """Current at which a ramp to the plateau fits the curve best (A): the drive's compensation has that shape."""
+        x, y = self.i_phase_a, self.u_error_v
+        if V_plateau_v == 0.0:
+            return float(x[0])
+
+        def residual(log_knee: Vector) -> Vector:
+            return np.asarray(y / V_plateau_v - np.minimum(1.0, x / math.exp(float(log_knee[0]))), dtype=np.float64)
+
+        # the cost has kinks at the points: start from the best of a coarse scan
+        starts = np.log(np.geomspace(0.2 * x[0], x[-1], 40))
+        best = min(starts, key=lambda s: float(np.sum(residual(np.array([s])) ** 2)))
+        fit = levenberg_marquardt(residual, np.array([best]), np.array([1.0]))
+        return math.exp(float(fit.x[0]))
+
+
+def curve_from_levels(i_vector_a: Vector, u_vector_v: Vector, phase_factor: float) -> InverterCurve:
+    """Curve of one phase from the remainder of DC levels along a vector with one phase idle.
+
+    Parameters
+    ----------
+    i_vector_a, u_vector_v : ndarray, shape (n,)
+        Vector current and v - R i - v0 of each level, both signs.
+    phase_factor : float
+        Phase current over vector current, sqrt(3)/2 at 30 + k 60 degrees; the phase error is the vector error times
+        the same factor, because v_beta = (e_b - e_c)/sqrt 3 with e_b = -e_c.
+    """
+    magnitude = np.abs(i_vector_a)
+    odd = np.sign(i_vector_a) * u_vector_v
+    order = np.argsort(magnitude, kind="stable")
+    magnitude, odd, positive = magnitude[order], odd[order], (i_vector_a > 0.0)[order]
+    step = 0.01 * float(magnitude[-1])
+    edges = np.flatnonzero(np.diff(magnitude) > step) + 1
+    x, y, differences = [], [], [0.0]
+    for group in np.split(np.arange(len(magnitude)), edges):
+        x.append(float(np.mean(magnitude[group])))
+        y.append(float(np.mean(odd[group])))
+        if np.any(positive[group]) and not np.all(positive[group]):
+            differences.append(abs(float(np.mean(odd[group][positive[group]]) - np.mean(odd[group][~positive[group]]))))
+    return InverterCurve(phase_factor * np.array(x), phase_factor * np.array(y), phase_factor * max(differences))

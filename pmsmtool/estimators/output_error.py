@@ -1,0 +1,148 @@
+"""Exact discrete model of one axis at standstill, with a delay that is a real number and a first-order sensor.
+
+    L di/dt = u - v0 - R i,    tau dy/dt = i - y,    u(t) = v[k] on [t_k + D T_s, t_k+1 + D T_s)
+
+sampled at t_k. Computation delay and sampling instant enter only through D, so one number covers both; with D = 1 and
+tau = 0 this is i[k+1] = a i[k] + (1 - a)/R (v[k-1] - v0), a = exp(-R T_s/L) (identification reference, 3.2 and its
+addendum). The model runs free: no measured current enters it.
+
+A slightly saturated machine bends the response: the measured current is y + c_2 (y - y_b)^2 + c_3 (y - y_b)^3 about its
+mean y_b, so that L stays the incremental inductance *at* the bias whatever the ripple.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+BLOCK = 64
+"""Samples per block of the recursion (matrix inside a block, carry between blocks)."""
+SMALLEST_RATE = 1e-9
+"""R T_s/L below which the limit of a pure inductance is used."""
+
+
+@dataclass(frozen=True, slots=True)
+class AxisModel:
+    """Physical parameters of the response.
+
+    Attributes
+    ----------
+    L_h, R_ohm : float
+        Incremental inductance (H) and resistance of the axis at the injection, inverter slope included (ohm).
+    delay : float
+        Delay D from sample to acting voltage (T_s), 0 <= D.
+    lag_s : float
+        Time constant of the current sensor (s), 0 for none.
+    """
+
+    L_h: float
+    R_ohm: float
+    delay: float
+    lag_s: float
+
+
+def recursion(pole: float, drive: Vector, start: float) -> Vector:
+    """Return x with x[0] = start and x[k+1] = pole x[k] + drive[k]; shape (n + 1,) for drive of shape (n,)."""
+    n = len(drive)
+    out = np.empty(n + 1)
+    out[0] = start
+    lags = np.arange(BLOCK)
+    power = pole ** np.arange(BLOCK + 1, dtype=np.float64)
+    difference = lags[:, None] - lags[None, :]
+    toeplitz = np.where(difference >= 0, power[np.clip(difference, 0, BLOCK)], 0.0)
+    blocks = -(-n // BLOCK)
+    padded = np.zeros(blocks * BLOCK)
+    padded[:n] = drive
+    forced = padded.reshape(blocks, BLOCK) @ toeplitz.T
+    carry = start
+    for block in range(blocks):
+        response = forced[block] + carry * power[1:]
+        first = block * BLOCK
+        count = min(BLOCK, n - first)
+        out[first + 1 : first + 1 + count] = response[:count]
+        carry = float(response[-1])
+    return out
+
+
+def acting_voltages(command: Vector, delay: float) -> tuple[Vector, Vector, float]:
+    """Split the voltage acting between two samples into its two constant parts.
+
+    Parameters
+    ----------
+    command : ndarray, shape (n,)
+        Voltage computed at each sample (V).
+    delay : float
+        Delay D >= 0 (T_s).
+
+    Returns
+    -------
+    early, late : ndarray, shape (n - first,)
+        Commands acting in the first and the second part of the interval from sample k, k = first ... n - 1, with
+        first = ceil(D).
+    fraction : float
+        Length of the first part (T_s).
+    """
+    whole = math.floor(delay)
+    fraction = delay - whole
+    first = whole + 1
+    n = len(command)
+    early = command[first - whole - 1 : n - whole - 1]
+    late = command[first - whole : n - whole]
+    return early, late, fraction
+
+
+def _advance(model: AxisModel, h: float) -> tuple[float, float, float, float, float]:
+    """Coefficients of one step of length h: i' = a i + b u, y' = e y + c i + d u."""
+    rate = model.R_ohm / model.L_h
+    if abs(rate * h) < SMALLEST_RATE:
+        a, b = 1.0, h / model.L_h
+        conductance_ratio = 0.0
+    else:
+        a = math.exp(-rate * h)
+        b = -math.expm1(-rate * h) / model.R_ohm
+        conductance_ratio = 1.0 / model.R_ohm
+    if model.lag_s <= 0.0:
+        return a, b, 0.0, a, b
+    mu = 1.0 / model.lag_s
+    e = math.exp(-mu * h)
+    if conductance_ratio == 0.0:
+        c = -math.expm1(-mu * h)
+        return a, b, e, c, (h + math.expm1(-mu * h) / mu) / model.L_h
+    c = mu * (a - e) / (mu - rate)
+    return a, b, e, c, (1.0 - e - c) * conductance_ratio
+
+
+def respond(model: AxisModel, command: Vector, period_s: float, start_a: float) -> Vector:
+    """Measured current from sample ceil(D) on, shape (n - first + 1,), started in equilibrium at ``start_a``.
+
+    Parameters
+    ----------
+    model : AxisModel
+        Parameters.
+    command : ndarray, shape (n,)
+        Voltage computed at each sample minus its constant part (V).
+    period_s : float
+        Control period (s).
+    start_a : float
+        Current and sensor output at the first modelled sample (A).
+    """
+    early, late, fraction = acting_voltages(command, model.delay)
+    a_1, b_1, e_1, c_1, d_1 = _advance(model, fraction * period_s)
+    a_2, b_2, e_2, c_2, d_2 = _advance(model, (1.0 - fraction) * period_s)
+    # i after both parts, then y after both parts with the current in between eliminated
+    current = recursion(a_1 * a_2, a_2 * b_1 * early + b_2 * late, start_a)
+    if model.lag_s <= 0.0:
+        return current
+    inside = a_1 * current[:-1] + b_1 * early
+    forced = e_2 * (c_1 * current[:-1] + d_1 * early) + c_2 * inside + d_2 * late
+    return recursion(e_1 * e_2, forced, start_a)
+
+
+def bend(y: Vector, centre_a: float, c_2: float, c_3: float) -> Vector:
+    """Saturation about the bias: y + c_2 (y - centre)^2 + c_3 (y - centre)^3 (A)."""
+    x = y - centre_a
+    return np.asarray(y + x * x * (c_2 + c_3 * x), dtype=np.float64)

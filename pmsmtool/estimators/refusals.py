@@ -1,0 +1,143 @@
+"""The named refusals of identification: what was detected, what usually causes it, what to do next.
+
+One table; ``pmsmtool help refusals`` prints it, and every estimator raises through :func:`refuse`, so that a message
+always carries the stage, what was measured, the limit, the likely cause and the next step (identification
+reference, section 7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pmsmtool.errors import IdentificationError
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """One named reason to give no number."""
+
+    name: str
+    meaning: str
+    likely: str
+    next_step: str
+
+
+_ROWS: tuple[tuple[str, str, str, str], ...] = (
+    (
+        "E_NOT_CONNECTED",
+        "no current flows in any of the three test vectors",
+        "motor cable not connected, gates blocked, or a contactor is open",
+        "check the motor cable and the enable chain, then repeat",
+    ),
+    (
+        "E_PHASE_OPEN",
+        "one phase carries no current",
+        "a broken lead, a loose terminal or a dead half bridge",
+        "measure the three line-line resistances with a meter",
+    ),
+    (
+        "E_UNBALANCED",
+        "the three phases differ by more than 10 %",
+        "a bad joint, a shorted turn, or one current sensor with a wrong gain",
+        "measure the three line-line resistances with a meter, then the sensor gains",
+    ),
+    (
+        "E_ROTOR_MOVED",
+        "the rotor moved during a measurement at standstill",
+        "free shaft and too slow an injection, or a load that pulls",
+        "lock the shaft, or let the injection be faster and smaller",
+    ),
+    (
+        "E_CLIPPED",
+        "samples in the fit window were limited or at full scale",
+        "the amplitude exceeds the voltage limit, the current limit or the converter's range",
+        "lower the amplitude, or raise the DC-link voltage",
+    ),
+    (
+        "E_NOT_SETTLED",
+        "the quantity still drifts at the end of its settling time",
+        "a rotor that swings, a slow current loop, or heating",
+        "lengthen the settling time",
+    ),
+    (
+        "E_SNR",
+        "the predicted standard deviation is above the limit",
+        "too small an amplitude for the noise of this current measurement",
+        "raise the amplitude (--i-max) or the number of samples",
+    ),
+    (
+        "E_MODEL_MISMATCH",
+        "the residual is larger than the noise explains",
+        "an effect that is not in the model: saturation, eddy currents, a moving rotor, a lagging sensor",
+        "look at the residual in the report; change the bias or the amplitude",
+    ),
+    (
+        "E_NOT_IDENTIFIABLE",
+        "two quantities cannot be told apart with these data",
+        "too narrow a range of current or speed",
+        "widen the range: a higher peak current, or speeds further apart and in both directions",
+    ),
+    (
+        "E_THERMAL_DRIFT",
+        "the first and the last repetition differ: the winding changed its temperature",
+        "too much energy in the sweep",
+        "wait until it has cooled down, lower --i-max or connect the temperature sensor",
+    ),
+    (
+        "E_CURRENT_SENSOR",
+        "the voltage has a line at once or twice the electrical frequency",
+        "offset or gain of the phase current sensors differ",
+        "calibrate the current sensors",
+    ),
+    (
+        "E_NOT_CONVERGED",
+        "the fit did not converge",
+        "data that do not look like the model at all",
+        "look at the trace in the report",
+    ),
+    (
+        "E_FREQUENCY_DEPENDENT",
+        "two injection frequencies give different inductances",
+        "eddy currents in the core or the magnets",
+        "use the value of the frequency that the current loop will see; both are in the record",
+    ),
+    (
+        "E_POLE_PAIRS",
+        "the number of pole pairs does not come out as an integer",
+        "the rotor slips or is loaded, or the encoder resolution is set wrongly",
+        "free the shaft, raise the current, check the increments per turn",
+    ),
+    (
+        "E_EXCITATION",
+        "the recorded signal does not contain the excitation the method needs",
+        "the drive aborted the excitation, or recorded something else",
+        "look at the trace in the report and at the abort limits",
+    ),
+    (
+        "E_TRACK_LOST",
+        "the filter's innovations are not consistent with its model",
+        "wrong inductances or inverter table, or no excitation",
+        "repeat the identification of L and of the inverter",
+    ),
+)
+
+REFUSALS: dict[str, Refusal] = {row[0]: Refusal(*row) for row in _ROWS}
+"""All named refusals."""
+
+
+def refuse(name: str, what: str, *, stage: str, likely: str = "", hint: str = "") -> IdentificationError:
+    """Return the error of a named refusal; ``what`` states the measured value and the limit.
+
+    Parameters
+    ----------
+    name : str
+        Key of :data:`REFUSALS`.
+    what : str
+        One sentence with the measured value and the limit it hit.
+    stage : str
+        The measurement, e.g. ``resistance`` or ``inductance, q axis``.
+    likely, hint : str
+        Replace the table's cause and next step where more is known.
+    """
+    row = REFUSALS[name]
+    return IdentificationError(name, what, where=stage, likely=likely or row.likely, hint=hint or row.next_step)

@@ -1,0 +1,363 @@
+"""R_s and the inverter's voltage error from many DC levels of alternating sign.
+
+A current vector at 30 + k 60 degrees electrical leaves one phase idle; the other two carry +-0.866 i. The voltage is
+
+    v = R i + V sgn(i) + v0 + sum_p c_p sgn(i) / |i|^p
+
+on the levels above 0.28 of the largest. R is *defined* as the asymptotic slope: the shape of the inverter error near
+zero is not assumed, its tail is a series in 1/|i| of at most two terms out of p = 1, 2, 3, 4, 6, and all sixteen fits
+are averaged with their information weights (identification reference, section 3.1).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.estimate import (
+    COVERAGE_FACTOR,
+    SensorTolerance,
+    Verdict,
+    chi2_gate,
+    condition_gate,
+    information_weights,
+)
+from pmsmtool.estimators.inverter_error import InverterCurve, curve_from_levels
+from pmsmtool.estimators.least_squares import linear_solve
+from pmsmtool.estimators.noise import Noise
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.trace import Trace
+
+STAGE = "resistance"
+Vector = NDArray[np.float64]
+
+TAIL_POWERS = (1, 2, 3, 4, 6)
+TAIL_TERMS = 2
+FIT_FROM = 0.28
+"""Fraction of the largest level from which on levels enter the fit; the lower ones serve the inverter curve."""
+MODEL_FLOOR = 2e-4
+"""Deliberate model error of every level, of R I_r (identification reference, 3.1)."""
+MEAN_NOISE_FACTOR = 1.05
+"""Noise of the mean current seen through R and the slope of the tail."""
+TEMPERATURE_PASSES = 3
+DRIFT_LIMIT = 0.06
+"""Largest change of R over the sweep (relative), 15 K of copper; beyond it E_THERMAL_DRIFT."""
+DRIFT_SECOND_ORDER = 0.02
+"""Part of a drift that the linear drift term may leave in R: 12 K in one sweep left 0.6 % of 4.7 % without any term."""
+SETTLE_SIGMA = 6.0
+SETTLE_FLOOR = 2e-3
+"""Change of v - R i between the halves of one window, of R I_r, that still counts as settled."""
+HALF_WIDTH_LIMIT = 0.03
+"""Relative 95 % half width above which R and V_dead count as not told apart."""
+HARD_RATIO = 3.0
+"""V_dead/(R I) above which the reference method covered 79 % only."""
+HARD_FACTOR = 2.0
+"""Widening of the standard deviation there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Copper:
+    """What is known of the winding's temperature coefficient.
+
+    Attributes
+    ----------
+    T_ref_c : float
+        Temperature R_s is normalised to (degC).
+    alpha_per_k : float
+        Temperature coefficient of the copper part (1/K).
+    R_winding_ohm : float or None
+        The copper part of the loop at ``T_ref_c``, where a meter gave it (ohm).
+    """
+
+    T_ref_c: float = 20.0
+    alpha_per_k: float = 0.00393
+    R_winding_ohm: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ResistanceResult:
+    """Loop resistance and inverter error.
+
+    Attributes
+    ----------
+    R_s : Estimate
+        Loop resistance at the reference temperature (ohm); ``T_c`` is the temperature it was measured at.
+    R_measured : Estimate
+        Loop resistance at the temperature of the measurement (ohm).
+    curve : InverterCurve
+        Voltage error of one phase against its current.
+    V_dead_v : float
+        Plateau of that error, without the device slope that R contains (V).
+    drift : float
+        Relative change of R over the sweep that the temperature reading does not explain.
+    hardness : float
+        V_dead/(R I): above 3 the class that is hard to separate.
+    weights : mapping of tuple to float
+        Information weight of each tail model.
+    verdict : Verdict
+        ``warn`` when the fit is above its chi-square limit.
+    """
+
+    R_s: Estimate
+    R_measured: Estimate
+    curve: InverterCurve
+    V_dead_v: float
+    drift: float
+    hardness: float
+    weights: dict[tuple[int, ...], float]
+    verdict: Verdict
+
+
+@dataclass(frozen=True, slots=True)
+class _TailFit:
+    powers: tuple[int, ...]
+    x: Vector
+    covariance: NDArray[np.float64]
+    chi2: float
+    dof: int
+    condition: float
+
+
+def tail_models() -> tuple[tuple[int, ...], ...]:
+    """All subsets of the tail powers with at most two elements."""
+    return tuple(subset for size in range(TAIL_TERMS + 1) for subset in itertools.combinations(TAIL_POWERS, size))
+
+
+def estimate_resistance(
+    levels: Trace,
+    noise: Noise,
+    *,
+    tolerance: SensorTolerance | None = None,
+    copper: Copper | None = None,
+    half_width_limit: float = HALF_WIDTH_LIMIT,
+) -> ResistanceResult:
+    """Loop resistance from DC levels.
+
+    Parameters
+    ----------
+    levels : Trace
+        One row per level: ``i_d_a`` and ``u_d_v`` along the vector (means of a window), ``u_d_first_v``,
+        ``u_d_second_v``, ``i_d_first_a``, ``i_d_second_a`` (its halves), ``T_winding_c`` (NaN without a sensor);
+        ``meta["samples"]`` is the window in samples.
+    noise : Noise
+        From the zero-current trace.
+    tolerance : SensorTolerance
+        Declared sensor tolerances.
+    copper : Copper
+        Temperature coefficient and reference.
+    half_width_limit : float
+        Relative 95 % half width above which the result is refused.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``, ``E_THERMAL_DRIFT``, ``E_NOT_IDENTIFIABLE``,
+        ``E_MODEL_MISMATCH``.
+    """
+    tolerance = tolerance or SensorTolerance()
+    copper = copper or Copper()
+    i, v = levels["i_d_a"], levels["u_d_v"]
+    samples = int(levels.meta["samples"])
+    peak = float(np.max(np.abs(i)))
+    R_0 = _two_point_slope(i, v)
+    _check_levels(levels, i, peak, R_0, noise, samples)
+    sigma_v = math.hypot(MEAN_NOISE_FACTOR * R_0 * noise.sigma_a / math.sqrt(samples), MODEL_FLOOR * R_0 * peak)
+
+    T = levels["T_winding_c"]
+    known_T = bool(np.all(np.isfinite(T)))
+    T_w = float(np.sum(T * i**2) / np.sum(i**2)) if known_T else math.nan
+    share = _copper_share(copper, R_0)
+    R_w, v_w = R_0, v
+    fits: list[_TailFit] = []
+    weights = np.array([])
+    for _ in range(TEMPERATURE_PASSES if known_T else 1):
+        # R at T_w: what the copper part adds at each level's own temperature moves to the left side
+        slope = R_w * share * copper.alpha_per_k / (1.0 + copper.alpha_per_k * (T_w - copper.T_ref_c))
+        v_w = v - slope * (T - T_w) * i if known_T else v
+        fits = [_fit_tail(levels.t_s, i, v_w, peak, sigma_v, powers) for powers in tail_models()]
+        weights = information_weights([_criterion(fit, len(i)) for fit in fits])
+        R_w = float(sum(w * fit.x[0] for w, fit in zip(weights, fits, strict=True)))
+    best = min(fits, key=lambda fit: fit.chi2 / fit.dof)
+    chi2 = best.chi2 / best.dof
+    verdict, widen = chi2_gate(chi2, STAGE)
+    condition_gate(best.condition, "R_s and the inverter error", STAGE)
+    variance = sum(
+        w * (fit.covariance[0, 0] * widen**2 + (fit.x[0] - R_w) ** 2) for w, fit in zip(weights, fits, strict=True)
+    )
+    V_vector, v_0, drift = (
+        float(sum(w * fit.x[k] for w, fit in zip(weights, fits, strict=True))) for k in (1, 2, 3)
+    )
+    drift /= R_w
+    V_dead = V_vector * math.sqrt(3.0) / 2.0
+    hardness = abs(V_dead) / (R_w * peak)
+    std = math.sqrt(float(variance)) * (HARD_FACTOR if hardness > HARD_RATIO else 1.0)
+    std = math.hypot(std, DRIFT_SECOND_ORDER * abs(drift) * R_w)
+    _check_result(R_w, std, drift, half_width_limit)
+    R_measured = Estimate(
+        value=R_w,
+        std=std,
+        systematic=tolerance.impedance * R_w,
+        unit="ohm",
+        n=int(np.sum(np.abs(i) >= FIT_FROM * peak)),
+        chi2=chi2,
+        T_c=T_w,
+        method="multi-level DC, asymptotic slope",
+        i_d_apk=peak,
+        dof=math.inf,
+    )
+    return ResistanceResult(
+        R_s=_normalise(R_measured, copper, tolerance),
+        R_measured=R_measured,
+        curve=curve_from_levels(i, v_w - R_w * i - v_0, math.sqrt(3.0) / 2.0),
+        V_dead_v=V_dead,
+        drift=drift,
+        hardness=hardness,
+        weights=dict(zip(tail_models(), (float(w) for w in weights), strict=True)),
+        verdict=verdict,
+    )
+
+
+def _two_point_slope(i: Vector, v: Vector) -> float:
+    """Slope between the largest level and the one nearest to 60 % of it, mean of both signs (ohm)."""
+    peak = float(np.max(np.abs(i)))
+    high = np.abs(i) > 0.97 * peak
+    middle = np.abs(np.abs(i) - 0.6 * peak) < 0.06 * peak
+    if not np.any(middle):
+        middle = np.abs(i) < 0.7 * peak
+    if not np.any(middle):
+        raise refuse("E_EXCITATION", "all levels have the same magnitude", stage=STAGE)
+
+    def mean(mask: NDArray[np.bool_]) -> tuple[float, float]:
+        sign = np.sign(i[mask])
+        return float(np.mean(sign * i[mask])), float(np.mean(sign * v[mask]))
+
+    (i_1, v_1), (i_2, v_2) = mean(middle), mean(high)
+    R_0 = (v_2 - v_1) / (i_2 - i_1)
+    if not R_0 > 0.0:
+        raise refuse("E_EXCITATION", f"the voltage does not rise with the current ({R_0:.3g} ohm)", stage=STAGE)
+    return R_0
+
+
+def _check_levels(levels: Trace, i: Vector, peak: float, R_0: float, noise: Noise, samples: int) -> None:
+    used = np.abs(i) >= FIT_FROM * peak
+    for sign in (1.0, -1.0):
+        count = len(set(np.round(i[used & (np.sign(i) == sign)] / (0.02 * peak))))
+        if count < TAIL_TERMS + 3:
+            raise refuse(
+                "E_EXCITATION",
+                f"{count} different levels of one sign above {FIT_FROM:g} of the largest, {TAIL_TERMS + 3} needed",
+                stage=STAGE,
+            )
+    if "flagged" in levels.signals and float(np.max(levels["flagged"])) > 0.0:
+        raise refuse("E_CLIPPED", f"{int(np.sum(levels['flagged'] > 0))} levels with limited samples", stage=STAGE)
+    change = (levels["u_d_second_v"] - levels["u_d_first_v"]) - R_0 * (levels["i_d_second_a"] - levels["i_d_first_a"])
+    sigma = 2.0 * R_0 * noise.sigma_a / math.sqrt(samples)  # difference of two halves
+    limit = max(SETTLE_SIGMA * sigma, SETTLE_FLOOR * R_0 * peak)
+    worst = int(np.argmax(np.abs(change)))
+    if abs(change[worst]) > limit:
+        raise refuse(
+            "E_NOT_SETTLED",
+            f"at {i[worst]:.3g} A the voltage still moves by {change[worst]:.3g} V in one window, limit {limit:.3g} V",
+            stage=STAGE,
+        )
+
+
+def _copper_share(copper: Copper, R_loop: float) -> float:
+    if copper.R_winding_ohm is None:
+        return 1.0
+    return min(1.0, copper.R_winding_ohm / R_loop)
+
+
+def _fit_tail(t: Vector, i: Vector, v: Vector, peak: float, sigma_v: float, powers: tuple[int, ...]) -> _TailFit:
+    used = np.abs(i) >= FIT_FROM * peak
+    i, v, t = i[used], v[used], t[used]
+    sign, u = np.sign(i), np.abs(i) / peak
+    centre = float(np.sum(t * i**2) / np.sum(i**2))
+    drift = i * (t - centre) / max(float(np.ptp(t)), 1e-12)  # zero at the mean heating: R belongs to T_w
+    columns = np.stack([i, sign, np.ones_like(i), drift, *(sign / u**p for p in powers)], axis=1)
+    x, covariance, residual, condition = linear_solve(columns, v, np.full_like(v, 1.0 / sigma_v))
+    return _TailFit(powers, x, covariance, float(residual @ residual), len(v) - len(x), condition)
+
+
+def _criterion(fit: _TailFit, levels: int) -> float:
+    return fit.chi2 + len(fit.x) * math.log(levels)
+
+
+def _check_result(R: float, std: float, drift: float, half_width_limit: float) -> None:
+    if abs(drift) > DRIFT_LIMIT:
+        raise refuse(
+            "E_THERMAL_DRIFT",
+            f"R changed by {100 * drift:+.2g} % over the sweep, limit {100 * DRIFT_LIMIT:g} %",
+            stage=STAGE,
+        )
+    if not R > 0.0 or COVERAGE_FACTOR * std > half_width_limit * R:
+        raise refuse(
+            "E_NOT_IDENTIFIABLE",
+            f"R_s and V_dead cannot be told apart: R = {R:.4g} +- {COVERAGE_FACTOR * std:.2g} ohm (95 %), "
+            f"limit {100 * half_width_limit:g} %",
+            stage=STAGE,
+            hint="allow a higher peak current (--i-max)",
+        )
+
+
+def _normalise(measured: Estimate, copper: Copper, tolerance: SensorTolerance) -> Estimate:
+    """Move the copper part of R from its measured temperature to the reference temperature."""
+    if not math.isfinite(measured.T_c):
+        return Estimate(
+            value=measured.value,
+            std=measured.std,
+            systematic=measured.systematic,
+            unit="ohm",
+            n=measured.n,
+            chi2=measured.chi2,
+            T_c=math.nan,
+            method=measured.method,
+            i_d_apk=measured.i_d_apk,
+            fallback="winding temperature unknown: R_s is not normalised",
+        )
+    rise = copper.alpha_per_k * (measured.T_c - copper.T_ref_c)
+    if copper.R_winding_ohm is None:
+        value, unknown = measured.value / (1.0 + rise), tolerance.device_share_max
+    else:
+        value, unknown = measured.value - copper.R_winding_ohm * rise, 0.0
+    scale = value / measured.value
+    systematic = math.hypot(measured.systematic * scale, unknown * abs(rise) * value)
+    systematic = math.hypot(systematic, copper.alpha_per_k * tolerance.temperature_k * value)
+    return Estimate(
+        value=value,
+        std=measured.std * scale,
+        systematic=systematic,
+        unit="ohm",
+        n=measured.n,
+        chi2=measured.chi2,
+        T_c=measured.T_c,
+        method=measured.method,
+        i_d_apk=measured.i_d_apk,
+    )
+
+
+def two_point_resistance(levels: Trace) -> float:
+    """The two-point slope that simpler tools use (ohm); for comparison only, never a fallback."""
+    return _two_point_slope(levels["i_d_a"], levels["u_d_v"])
+
+
+def single_point_resistance(levels: Trace) -> float:
+    """V/I at the largest level (ohm); for comparison only, never a fallback."""
+    index = int(np.argmax(np.abs(levels["i_d_a"])))
+    return float(levels["u_d_v"][index] / levels["i_d_a"][index])
+
+
+def level_sequence(magnitudes: Sequence[float]) -> tuple[float, ...]:
+    """Order of the levels: + and - alternating, magnitudes up and then down (A).
+
+    The alternation makes the slope equal to R at the current-weighted mean temperature; up and down makes a drift
+    orthogonal to the slope.
+    """
+    up = sorted(magnitudes)
+    return tuple(sign * value for run in (up, up[::-1]) for value in run for sign in (1.0, -1.0))
