@@ -1,0 +1,1 @@
+"""The simulated drive's communication half: object dictionary, SDO server, state machines, memory."""

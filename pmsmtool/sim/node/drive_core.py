@@ -1,0 +1,213 @@
+"""What the CANopen node needs from the simulated drive's application (``pmsmtool/sim/drive.h``).
+
+The node decides when something may happen and speaks CANopen; everything that happens every control period (control
+core, excitation, recorder, window averages, trips, plant) lies behind this protocol. Between two calls of
+:meth:`DriveCore.run` nothing moves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Protocol
+
+from pmsmtool.drive.port import Excitation
+
+TRACE_BYTES = 65536
+"""Capacity of the recorder (bytes)."""
+TRACE_CHANNELS = 8
+"""Channels of the recorder, and of the window averages."""
+BUFFER_SAMPLES = 4096
+"""Capacity of the excitation buffer (binary32 samples)."""
+
+
+class Signal(IntEnum):
+    """A quantity that can be read, recorded, averaged or triggered on (``enum pmsm_signal``)."""
+
+    NONE = 0
+    I_D = 1
+    I_Q = 2
+    I_D_REQ = 3
+    I_Q_REQ = 4
+    I_D_REF = 5
+    I_Q_REF = 6
+    U_D = 7
+    U_Q = 8
+    U_D_LIM = 9
+    U_Q_LIM = 10
+    THETA_E = 11
+    OMEGA_E = 12
+    TAU = 13
+    KAPPA = 14
+    BINDING = 15
+    ITERATIONS = 16
+    FLAGS = 17
+    I_A = 18
+    I_B = 19
+    I_C = 20
+    U_DC = 21
+    T_WINDING = 22
+    T_MAGNET = 23
+    THETA_M = 24
+
+
+class ControlMode(IntEnum):
+    """What the controller does (``enum pmsm_mode``)."""
+
+    OFF = 0
+    VOLTAGE = 1
+    CURRENT = 2
+    TORQUE = 3
+    SPEED = 4
+
+
+class Trigger(IntEnum):
+    """Trigger of the recorder (object 0x2060:04)."""
+
+    NOW = 0
+    RISING = 1
+    FALLING = 2
+    WINDOW = 3
+    EXCITATION_START = 4
+    FAULT = 5
+
+
+class ExcitationState(IntEnum):
+    """Object 0x2050:0E."""
+
+    IDLE = 0
+    ARMED = 1
+    RUNNING = 2
+    DONE = 3
+    ABORTED = 4
+
+
+class RecorderState(IntEnum):
+    """Object 0x2060:08."""
+
+    IDLE = 0
+    ARMED = 1
+    TRIGGERED = 2
+    COMPLETE = 3
+
+
+class AverageState(IntEnum):
+    """Object 0x2063:03."""
+
+    IDLE = 0
+    RUNNING = 1
+    COMPLETE = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """References of the running mode; SI, peak, mechanical speed, electrical frame angle.
+
+    ``fixed_angle_rad`` is NaN when the frame follows the rotor. With ``quick_stop`` the core ramps the current to
+    zero (and brakes in speed mode) and ignores the references.
+    """
+
+    mode: ControlMode = ControlMode.OFF
+    i_d_a: float = 0.0
+    i_q_a: float = 0.0
+    torque_nm: float = 0.0
+    omega_m_rad_s: float = 0.0
+    fixed_angle_rad: float = math.nan
+    quick_stop: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderSetup:
+    """How to record (objects 0x2060, 0x2061); samples are taken every ``decimation`` periods."""
+
+    channels: Sequence[Signal]
+    depth: int
+    decimation: int = 1
+    pretrigger: int = 0
+    trigger: Trigger = Trigger.NOW
+    source: Signal = Signal.NONE
+    level: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatus:
+    """State of the recorder; ``trigger_position`` is the row of the trigger in the recording."""
+
+    state: RecorderState
+    stored: int = 0
+    trigger_position: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Averages:
+    """Means and standard deviations over the last window, in the order of the signals asked for."""
+
+    state: AverageState
+    mean: Sequence[float] = field(default=())
+    std: Sequence[float] = field(default=())
+
+
+class DriveCore(Protocol):
+    """The drive's application at control-period rate, with the machine behind it."""
+
+    @property
+    def period_ns(self) -> int:
+        """Control period of the loaded parameters (ns)."""
+
+    @property
+    def encoder_counts(self) -> int:
+        """Encoder counts per mechanical turn."""
+
+    def load(self, image: bytes) -> None:
+        """Take a parameter image (``firmware/image.py``); controller memory is kept (live gains)."""
+
+    def restart(self) -> None:
+        """Firmware reset: gates off, controller memory, excitation, recorder and trip cleared; the rotor keeps moving."""
+
+    def run(self, periods: int) -> int:
+        """Run at most ``periods`` control periods and return how many ran (at least 1 for ``periods`` >= 1).
+
+        Returns early after the period in which a trip was latched or the state of the excitation, the recorder or the
+        averages changed, so that the node can report it at the right time.
+        """
+
+    def command(self, command: Command) -> None:
+        """Set mode and references from the next period on; mode OFF removes the gate signals at once."""
+
+    def signal(self, signal: Signal) -> float:
+        """Return a signal as it would be recorded now."""
+
+    def trip(self) -> int:
+        """Return the latched trip as CiA 402 error code (0x2310 over-current, ...), 0 when there is none."""
+
+    def reset_fault(self) -> None:
+        """Clear the trip latch; a cause that persists latches again in the next period."""
+
+    def excite(self, excitation: Excitation | None) -> None:
+        """Start an excitation in the running mode, change the running one, or end it with None.
+
+        When an abort limit is exceeded the state becomes ABORTED and the injection ends.
+        """
+
+    def excitation_state(self) -> ExcitationState:
+        """Return IDLE, RUNNING, DONE or ABORTED."""
+
+    def record(self, setup: RecorderSetup | None) -> None:
+        """Arm the recorder, or stop it with None (what was stored stays)."""
+
+    def force_trigger(self) -> None:
+        """Trigger an armed recorder now."""
+
+    def recorder(self) -> RecorderStatus:
+        """Return the state of the recorder."""
+
+    def recording(self) -> bytes:
+        """Return the stored rows, oldest first: one little-endian binary32 per channel."""
+
+    def average(self, signals: Sequence[Signal], periods: int) -> None:
+        """Start a window average over the next ``periods`` periods."""
+
+    def averages(self) -> Averages:
+        """Return the state and, when complete, the result of the window average."""
