@@ -1,0 +1,108 @@
+"""Deterministic TOML text: the one writer behind every generated TOML file.
+
+Same tables, same bytes: keys in the order given, floats as the shortest text that reads back to the same
+number, no dates, no trailing blanks, LF line ends.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+_LINE_LENGTH = 110
+"""Arrays longer than this are broken over lines."""
+
+_ESCAPES = {'"': '\\"', "\\": "\\\\", "\b": "\\b", "\t": "\\t", "\n": "\\n", "\f": "\\f", "\r": "\\r"}
+
+
+def toml_text(tables: Mapping[str, Any], *, comment: str = "") -> str:
+    """Return the TOML document of nested tables.
+
+    Parameters
+    ----------
+    tables : mapping
+        Values are bool, int, float, str, a sequence of such, a mapping (a table) or a sequence of mappings
+        (an array of tables). A table's own values are written before its sub-tables.
+    comment : str
+        Written first, each line after ``# ``.
+
+    Raises
+    ------
+    TypeError
+        A value TOML has no form for (``None`` among them: leave the key out).
+    """
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    if lines:
+        lines.append("")
+    _write_table(lines, (), tables)
+    return "\n".join(lines).strip("\n") + "\n"
+
+
+def toml_value(value: Any) -> str:
+    """Return one value as TOML text."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
+        return str(int(value))
+    if isinstance(value, float):
+        return repr(float(value))
+    if isinstance(value, str):
+        return _string(value)
+    if isinstance(value, Sequence):
+        return _array(value)
+    raise TypeError(f"TOML has no form for {value!r}")
+
+
+def _string(text: str) -> str:
+    escaped = "".join(
+        _ESCAPES.get(c, f"\\u{ord(c):04X}" if ord(c) < 0x20 or ord(c) == 0x7F else c) for c in text
+    )
+    return f'"{escaped}"'
+
+
+def _array(values: Sequence[Any]) -> str:
+    items = [toml_value(item) for item in values]
+    flat = "[" + ", ".join(items) + "]"
+    if len(flat) <= _LINE_LENGTH and "\n" not in flat:
+        return flat
+    lines, line = [], ""
+    for item in items:
+        if line and len(line) + len(item) + 6 > _LINE_LENGTH:
+            lines.append(line)
+            line = ""
+        line += f"{item}, "
+    lines.append(line)
+    return "[\n" + "\n".join(f"    {text.rstrip()}" for text in lines) + "\n]"
+
+
+def _key(name: str) -> str:
+    return name if _BARE_KEY.fullmatch(name) else _string(name)
+
+
+def _is_tables(value: Any) -> bool:
+    return (
+        isinstance(value, Sequence)
+        and not isinstance(value, str)
+        and len(value) > 0
+        and all(isinstance(item, Mapping) for item in value)
+    )
+
+
+def _write_table(lines: list[str], path: tuple[str, ...], table: Mapping[str, Any]) -> None:
+    for name, value in table.items():
+        if not isinstance(value, Mapping) and not _is_tables(value):
+            lines.append(f"{_key(name)} = {toml_value(value)}")
+    for name, value in table.items():
+        below = (*path, name)
+        header = ".".join(_key(part) for part in below)
+        if isinstance(value, Mapping):
+            # a table that only holds tables needs no header of its own
+            if not value or any(not isinstance(v, Mapping) and not _is_tables(v) for v in value.values()):
+                lines.extend(["", f"[{header}]"])
+            _write_table(lines, below, value)
+        elif _is_tables(value):
+            for item in value:
+                lines.extend(["", f"[[{header}]]"])
+                _write_table(lines, below, item)
