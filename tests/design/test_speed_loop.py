@@ -1,0 +1,129 @@
+"""Speed loops: textbook gains, and the lifted multirate loop against a plain simulation of its parts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pmsmtool.design.current_loop import AxisPlant, axis_loop, imc
+from pmsmtool.design.sampled_loop import margins
+from pmsmtool.design.speed_loop import (
+    PLL_DAMPING,
+    Notch,
+    SpeedGains,
+    SpeedPath,
+    notch_coefficients,
+    pole_placement,
+    small_time_constants,
+    speed_loop,
+    symmetric_optimum,
+    symmetric_ratio,
+)
+from pmsmtool.errors import DesignInfeasible
+
+R, L_Q, T_S, J, B = 0.137, 2.1e-3, 1.0 / 12e3, 0.05, 0.01
+ALPHA = 4000.0
+DECIMATION, PLL, FILTER_HZ = 10, 1200.0, 200.0
+
+PULSE_TOLERANCE = 1e-9
+"""Lifted loop against the simulated pulse response, relative to its largest sample (measured 2e-11)."""
+
+
+def path(notch: Notch = Notch()) -> SpeedPath:
+    return SpeedPath(J, B, axis_loop(imc(R, L_Q, ALPHA), AxisPlant(R, L_Q, T_S, 1.5)), DECIMATION, PLL, FILTER_HZ, notch)
+
+
+def pulse_response(gains: SpeedGains, samples: int) -> list[float]:
+    """Response of the controller's output to one unit torque sample with the loop cut, every part stepped by hand."""
+    T_speed = DECIMATION * T_S
+    i_q = voltage = voltage_next = x = omega = theta = theta_hat = omega_hat = filtered = integral = 0.0
+    decay, found = math.exp(-R * T_S / L_Q), []
+    K_p, K_i = ALPHA * L_Q, ALPHA * R
+    friction = math.exp(-B * T_S / J)
+    smoothing = 1.0 - math.exp(-2.0 * math.pi * FILTER_HZ * T_speed)
+    for k in range(samples * DECIMATION):
+        if k % DECIMATION == 0:
+            filtered += smoothing * (omega_hat - filtered)
+            found.append(gains.K_p * filtered + integral)
+            integral += gains.K_i * T_speed * filtered
+        torque_wanted = 1.0 if k < DECIMATION else 0.0
+        voltage, voltage_next = voltage_next, K_p * (torque_wanted - i_q) + x
+        x += K_i * T_S * (torque_wanted - i_q)
+        i_before, i_q = i_q, i_q * decay + voltage * (1.0 - decay) / R
+        error = theta - theta_hat
+        theta_hat += T_S * (omega_hat + 2.0 * PLL_DAMPING * PLL * error)
+        omega_hat += T_S * PLL**2 * error
+        omega_before = omega
+        omega = omega * friction + 0.5 * (i_before + i_q) * (1.0 - friction) / B
+        theta += 0.5 * T_S * (omega_before + omega)
+    return found
+
+
+def test_the_lifted_loop_is_the_simulated_one() -> None:
+    gains = SpeedGains(2.0, 30.0, 1.0, pole_placement(J, B, 50.0, 1.0).method)
+    loop = speed_loop(gains, path())
+    expected = np.array(pulse_response(gains, 40))
+    den = np.asarray(loop.den)
+    num = np.concatenate((np.zeros(den.size - len(loop.num)), loop.num))
+    response = np.zeros(40)
+    for k in range(40):
+        past = sum(den[m] * response[k - m] for m in range(1, den.size) if k >= m)
+        response[k] = (num[k] if k < num.size else 0.0) - past
+    assert np.abs(response - expected).max() <= PULSE_TOLERANCE * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("wanted_deg", [40.0, 50.0, 60.0])
+def test_symmetric_optimum_meets_its_phase_margin(wanted_deg: float) -> None:
+    T_sum = small_time_constants(path(), ALPHA)
+    gains = symmetric_optimum(J, T_sum, symmetric_ratio(math.radians(wanted_deg)))
+    found = margins(speed_loop(gains, path()))
+    # One lag T_sum stands for six small ones: the true margin is a little larger.
+    assert wanted_deg <= found.phase_margin_deg <= wanted_deg + 3.0
+    assert found.crossover_rad_s == pytest.approx(gains.omega_c, rel=0.06)
+    limit = speed_loop(gains, path()).scaled(found.gain_margin)
+    assert np.abs(limit.closed_loop_poles()).max() == pytest.approx(1.0, abs=1e-7)
+
+
+def test_symmetric_ratio_is_the_textbook_one() -> None:
+    a = symmetric_ratio(math.radians(36.8698976458440))
+    assert a == pytest.approx(2.0)
+    assert symmetric_optimum(0.02, 1e-3, 2.0) == pytest.approx(symmetric_optimum(0.02, 1e-3, 2.0))
+    gains = symmetric_optimum(0.02, 1e-3, 2.0)
+    assert (gains.K_p, gains.K_i) == pytest.approx((10.0, 2500.0))
+
+
+def test_a_crossover_beyond_the_small_time_constants_is_refused() -> None:
+    with pytest.raises(DesignInfeasible, match="crossover"):
+        symmetric_optimum(J, 3e-3, 0.9)
+
+
+def test_pole_placement_on_the_stiff_machine() -> None:
+    gains = pole_placement(J, B, 60.0, 0.9)
+    poles = np.roots([J, B + gains.K_p, gains.K_i])
+    assert np.abs(poles) == pytest.approx(60.0)
+    with pytest.raises(DesignInfeasible, match="friction"):
+        pole_placement(1e-4, 1.0, 10.0, 1.0)
+
+
+def test_notch_is_unity_outside_and_deep_at_its_frequency() -> None:
+    T = DECIMATION * T_S
+    num, den = notch_coefficients(Notch(120.0, 0.05, 0.5), T)
+
+    def gain(hz: float) -> float:
+        z = np.exp(2j * math.pi * hz * T)
+        return float(abs(np.polyval(num, z) / np.polyval(den, z)))
+
+    assert gain(0.0) == pytest.approx(1.0)
+    assert gain(0.5 / T) == pytest.approx(1.0)
+    assert gain(120.0) == pytest.approx(0.1)
+    assert notch_coefficients(Notch(), T) == ((1.0,), (1.0,))
+    with pytest.raises(DesignInfeasible, match="notch"):
+        notch_coefficients(Notch(700.0), T)
+
+
+def test_a_notch_costs_phase_below_it() -> None:
+    gains = symmetric_optimum(J, small_time_constants(path(), ALPHA), 4.0)
+    plain, notched = (margins(speed_loop(gains, path(n))) for n in (Notch(), Notch(150.0, 0.05, 0.5)))
+    assert notched.phase_margin_deg < plain.phase_margin_deg
