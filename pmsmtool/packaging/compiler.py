@@ -1,0 +1,178 @@
+"""Find a C compiler that really works, or the pinned zig, and compile a kernel with it."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from pmsmtool.native import library_name
+from pmsmtool.packaging.kernels import COMMON_DEFINES, COMPILE_FLAGS, INCLUDE_FOLDERS, WARNING_FLAGS, Kernel
+from pmsmtool.packaging.targets import Target, here
+
+CANDIDATES: tuple[str, ...] = ("cc", "gcc", "clang")
+ZIG = "zig"
+"""Value of the environment variable ``CC`` that asks for the pinned ziglang although a compiler is installed."""
+
+_PROBE_C = """\
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+#ifdef _WIN32
+__declspec(dllexport)
+#else
+__attribute__((visibility("default")))
+#endif
+int32_t pmsm_probe(double x) { uint64_t bits; memcpy(&bits, &x, sizeof bits); return (int32_t)(sqrt(x) + (double)(bits >> 63)); }
+"""
+_PROBE_PY = "import ctypes, sys; sys.exit(ctypes.CDLL(sys.argv[1]).pmsm_probe(ctypes.c_double(1764.0)) != 42)"
+
+
+class CompilerError(RuntimeError):
+    """No usable compiler, or a source that does not compile; the text is what the person who installs reads."""
+
+
+@dataclass(frozen=True, slots=True)
+class Compiler:
+    """A command that compiles and links a shared library, and how to name it to a person."""
+
+    command: tuple[str, ...]
+    name: str
+
+
+def zig_compiler(target: Target | None) -> Compiler:
+    """Return the installed ziglang as a compiler for a platform (None: the one it runs on), baseline CPU.
+
+    Raises
+    ------
+    CompilerError
+        ziglang is not importable.
+    """
+    spec = importlib.util.find_spec("ziglang")
+    if spec is None or not spec.submodule_search_locations:
+        raise CompilerError("ziglang is not installed in this environment: pip install '.[cross]'")
+    folder = Path(next(iter(spec.submodule_search_locations)))
+    program = folder / ("zig.exe" if sys.platform == "win32" else "zig")
+    # Without -mcpu=baseline zig emits the instructions of the machine that builds; its sanitizer needs a run time.
+    arguments = (str(program), "cc", "-mcpu=baseline", "-fno-sanitize=undefined")
+    return Compiler(
+        arguments + (("-target", target.zig) if target else ()), f"ziglang for {target.name if target else 'here'}"
+    )
+
+
+def system_compiler() -> tuple[Compiler | None, list[str]]:
+    """Return the first compiler of this machine that builds a library this Python can load, and why others do not.
+
+    ``CC`` is obeyed: when it is set nothing else is tried, and a ``CC`` that does not work is an error.
+
+    Raises
+    ------
+    CompilerError
+        ``CC`` is set and does not work.
+    """
+    chosen = os.environ.get("CC", "").strip()
+    if chosen == ZIG:
+        return None, ["CC=zig asks for ziglang"]
+    reasons: list[str] = []
+    for text in (chosen,) if chosen else CANDIDATES:
+        command = tuple(shlex.split(text))
+        program = shutil.which(command[0])
+        reason = "not found" if program is None else _probe(Compiler((program, *command[1:]), text))
+        if program is not None and not reason:
+            return Compiler((program, *command[1:]), text), reasons
+        reasons.append(f"{text}: {reason}")
+    if chosen:
+        raise CompilerError(f"CC is set to a compiler that does not work here: {reasons[0]}")
+    return None, reasons
+
+
+def build_compiler() -> Compiler:
+    """Return the compiler for a build on and for this machine: the system's own, else ziglang."""
+    compiler, reasons = system_compiler()
+    if compiler is not None:
+        return compiler
+    try:
+        return zig_compiler(here())
+    except CompilerError as error:
+        raise CompilerError("no C compiler works here ({}) and {}".format("; ".join(reasons), error)) from None
+
+
+def compile_library(
+    compiler: Compiler,
+    kernel: Kernel,
+    package: Path,
+    library: Path,
+    *,
+    platform: str = sys.platform,
+    strict: bool = False,
+) -> None:
+    """Compile one kernel.
+
+    Parameters
+    ----------
+    compiler : Compiler
+        From :func:`build_compiler` or :func:`zig_compiler`.
+    kernel : Kernel
+        Must have sources.
+    package : Path
+        The folder ``pmsmtool`` that holds the sources.
+    library : Path
+        The file to write; replaced as a whole, so that a process that has the old one loaded keeps it.
+    platform : str
+        Platform of the target, as ``sys.platform``.
+    strict : bool
+        Treat warnings as errors.
+
+    Raises
+    ------
+    CompilerError
+        The compiler refused; carries its messages.
+    """
+    with tempfile.TemporaryDirectory(dir=library.parent, prefix=".build-") as scratch:
+        # A scratch folder of its own: linkers for Windows leave import libraries and debug files beside the output.
+        output = Path(scratch) / library.name
+        _run(
+            compiler, _arguments(kernel, package, output, platform, strict), package, f"{compiler.name}: {kernel.name}"
+        )
+        os.replace(output, library)
+
+
+def _arguments(kernel: Kernel, package: Path, output: Path, platform: str, strict: bool) -> list[str]:
+    """Arguments with paths relative to the package, so that no path of the building machine gets into a library."""
+    arguments = ["-shared", *COMPILE_FLAGS, *([] if platform == "win32" else ["-fPIC"])]
+    if platform == "darwin":
+        arguments += ["-mmacosx-version-min=11.0"]
+    arguments += WARNING_FLAGS if strict else []
+    arguments += [f"-D{define}" for define in (*COMMON_DEFINES, *kernel.defines)]
+    arguments += [part for folder in INCLUDE_FOLDERS for part in ("-iquote", folder)]
+    return [*arguments, *(path.as_posix() for path in kernel.source_files(package)), "-lm", "-o", str(output)]
+
+
+def _run(compiler: Compiler, arguments: list[str], folder: Path, what: str) -> None:
+    done = subprocess.run([*compiler.command, *arguments], cwd=folder, capture_output=True, text=True, errors="replace")
+    if done.returncode != 0:
+        raise CompilerError(f"{what}: exit {done.returncode}\n{done.stderr.strip() or done.stdout.strip()}")
+
+
+def _probe(compiler: Compiler) -> str:
+    """Return why a compiler is of no use here, empty when it is: compile a library, load and call it."""
+    with tempfile.TemporaryDirectory(prefix="pmsm-probe-", ignore_cleanup_errors=True) as scratch:
+        folder = Path(scratch)
+        (folder / "probe.c").write_text(_PROBE_C, encoding="ascii")
+        output = folder / library_name("probe")
+        arguments = ["-shared", *COMPILE_FLAGS, *([] if sys.platform == "win32" else ["-fPIC"])]
+        try:
+            _run(compiler, [*arguments, "probe.c", "-lm", "-o", str(output)], folder, "does not build a library")
+        except (CompilerError, OSError) as error:
+            return str(error)
+        # In a process of its own: a library that crashes must not take the installation with it.
+        loaded = subprocess.run([sys.executable, "-I", "-c", _PROBE_PY, str(output)], capture_output=True, text=True)
+        return (
+            "" if loaded.returncode == 0 else f"its library does not run in this Python: {loaded.stderr.strip()[-300:]}"
+        )

@@ -1,0 +1,68 @@
+"""The list of compiled kernels: what is built from which sources. To add a kernel, add a row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """One shared library.
+
+    Attributes
+    ----------
+    name : str
+        Library name without prefix and suffix; what ``native.load`` takes.
+    sources : tuple of str
+        Globs relative to the package folder. A glob that matches nothing adds nothing.
+    defines : tuple of str
+        Preprocessor symbols besides :data:`COMMON_DEFINES`.
+    """
+
+    name: str
+    sources: tuple[str, ...]
+    defines: tuple[str, ...] = ()
+
+    def source_files(self, package: Path) -> list[Path]:
+        """Return the sources relative to ``package``, each once, in a fixed order."""
+        found = {path.relative_to(package) for pattern in self.sources for path in package.glob(pattern)}
+        return sorted(found)
+
+
+_CORE = "firmware/core/*.c"
+
+KERNELS: tuple[Kernel, ...] = (
+    Kernel("pmsm_core", (_CORE,)),
+    Kernel("pmsm_core_f64", (_CORE,), ("PMSM_REAL_DOUBLE",)),
+    Kernel("pmsm_sim", ("sim/*.c", "machine/*.c", _CORE)),
+    Kernel("pmsm_design", ("design/*.c", "machine/*.c")),
+)
+
+INCLUDE_FOLDERS: tuple[str, ...] = ("firmware/core", "machine", "sim", "design")
+"""Searched for quoted includes only, so that no header here can hide one of the C library."""
+
+HEADERS: tuple[str, ...] = tuple(f"{folder}/*.h" for folder in INCLUDE_FOLDERS)
+
+COMMON_DEFINES: tuple[str, ...] = ("PMSM_SHARED",)
+"""``PMSM_EXPORT`` becomes visibility or ``__declspec(dllexport)`` (``firmware/core/pmsm_types.h``)."""
+
+COMPILE_FLAGS: tuple[str, ...] = (
+    "-std=c99",
+    "-O3",
+    # The same bits on every platform: no fused multiply-add, no reassociation (-O3 without -ffast-math keeps order).
+    "-ffp-contract=off",
+    # Lets sqrt be one instruction; changes no value.
+    "-fno-math-errno",
+    "-fvisibility=hidden",
+)
+
+WARNING_FLAGS: tuple[str, ...] = (
+    "-Wall",
+    "-Wextra",
+    "-Wshadow",
+    "-Wdouble-promotion",
+    "-Wfloat-conversion",
+    "-Werror",
+)
+"""For development and release builds; ``pip install`` must not fail on a warning a later compiler invents."""
