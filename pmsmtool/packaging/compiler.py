@@ -29,7 +29,11 @@ __declspec(dllexport)
 #else
 __attribute__((visibility("default")))
 #endif
-int32_t pmsm_probe(double x) { uint64_t bits; memcpy(&bits, &x, sizeof bits); return (int32_t)(sqrt(x) + (double)(bits >> 63)); }
+int32_t pmsm_probe(double x) {
+    uint64_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    return (int32_t)(sqrt(x) + (double)(bits >> 63));
+}
 """
 _PROBE_PY = "import ctypes, sys; sys.exit(ctypes.CDLL(sys.argv[1]).pmsm_probe(ctypes.c_double(1764.0)) != 42)"
 
@@ -155,7 +159,9 @@ def _arguments(kernel: Kernel, package: Path, output: Path, platform: str, stric
 
 
 def _run(compiler: Compiler, arguments: list[str], folder: Path, what: str) -> None:
-    done = subprocess.run([*compiler.command, *arguments], cwd=folder, capture_output=True, text=True, errors="replace")
+    done = subprocess.run(
+        [*compiler.command, *arguments], cwd=folder, capture_output=True, text=True, errors="replace", check=False
+    )
     if done.returncode != 0:
         raise CompilerError(f"{what}: exit {done.returncode}\n{done.stderr.strip() or done.stdout.strip()}")
 
@@ -172,7 +178,9 @@ def _probe(compiler: Compiler) -> str:
         except (CompilerError, OSError) as error:
             return str(error)
         # In a process of its own: a library that crashes must not take the installation with it.
-        loaded = subprocess.run([sys.executable, "-I", "-c", _PROBE_PY, str(output)], capture_output=True, text=True)
+        loaded = subprocess.run(
+            [sys.executable, "-I", "-c", _PROBE_PY, str(output)], capture_output=True, text=True, check=False
+        )
         return (
             "" if loaded.returncode == 0 else f"its library does not run in this Python: {loaded.stderr.strip()[-300:]}"
         )
