@@ -1,0 +1,154 @@
+"""The commissioning report: one self-contained HTML page, verdict first.
+
+The page is made from the record of a run and from figures drawn elsewhere; nothing is measured or decided here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+from pmsmtool.units import format_estimate, format_quantity
+
+COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify")
+"""Stages of a full commissioning; one that is missing keeps the verdict open."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One plot: inline SVG text and its caption."""
+
+    svg: str
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One parameter of the download, as text with the digits that matter."""
+
+    name: str
+    old: str
+    asked: str
+    held: str
+    unit: str
+
+
+def render(
+    record: Mapping[str, Any],
+    *,
+    figures: Sequence[Figure] = (),
+    changes: Sequence[Change] = (),
+    not_checked: Sequence[str] = (),
+    complete: Sequence[str] = COMPLETE,
+) -> str:
+    """Return the report as HTML.
+
+    Parameters
+    ----------
+    record : mapping
+        Content of ``run.json`` (schema ``pmsmtool.run/1``).
+    figures : sequence of Figure
+        Plots in reading order.
+    changes : sequence of Change
+        What the download wrote.
+    not_checked : sequence of str
+        What a reader must not assume; printed as it is.
+    complete : sequence of str
+        Stages that a green verdict needs.
+    """
+    import jinja2
+
+    source = resources.files("pmsmtool.report").joinpath("templates/report.html.j2").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    latest = _latest(record.get("stages", ()))
+    drive = record.get("drive", {})
+    name = str(drive.get("name") or "drive")
+    return environment.from_string(source).render(
+        title=f"Commissioning of {name}, serial {int(drive.get('serial', 0)):#010x}",
+        subtitle=f"started {record['started_utc']} by {record['operator']}",
+        verdict=_verdict(latest, complete),
+        stages=latest,
+        estimates=[_estimate_row(value) for stage in latest for value in stage.get("values", ()) if "std" in value],
+        fallbacks=[f"{stage['name']}: {line}" for stage in latest for line in stage.get("fallbacks", ())],
+        figures=[{"svg": _trusted_svg(figure.svg), "caption": figure.caption} for figure in figures],
+        changes=changes,
+        not_checked=list(not_checked),
+        conditions=list(_conditions(record)),
+        files=[pair for stage in latest for pair in sorted(stage.get("files", {}).items())],
+    )
+
+
+def _latest(stages: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the last entry of every stage, in the order the stages were first run."""
+    return list({stage["name"]: stage for stage in stages}.values())
+
+
+def _verdict(stages: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> dict[str, Any]:
+    failed = [stage for stage in stages if stage["status"] != "pass"]
+    done = {stage["name"] for stage in stages}
+    missing = [name for name in complete if name not in done]
+    if failed:
+        lines = [f"{stage['name']}: {_failure(stage)}" for stage in failed]
+        return {"kind": "fail", "word": "FAIL", "lines": lines}
+    if missing:
+        return {"kind": "open", "word": "NOT COMPLETE", "lines": [f"not run yet: {', '.join(missing)}"]}
+    criteria = sum(len(stage.get("acceptance", ())) for stage in stages)
+    return {"kind": "pass", "word": "PASS", "lines": [f"{len(stages)} stages, {criteria} criteria, all met"]}
+
+
+def _failure(stage: Mapping[str, Any]) -> str:
+    broken = [line for line in stage.get("acceptance", ()) if not line["ok"]]
+    if broken:
+        return "; ".join(f"{line['what']}: {line['measured']}, limit {line['limit']}" for line in broken)
+    return str(stage.get("note") or stage["status"])
+
+
+def _estimate_row(value: Mapping[str, Any]) -> dict[str, str]:
+    unit = str(value["unit"])
+    total = total_interval(float(value["std"]), float(value["systematic"]), float(value.get("coverage_factor", 1.96)))
+    conditions = []
+    if _finite(value.get("T_c")):
+        conditions.append(f"{value['T_c']:.1f} °C")
+    if _finite(value.get("i_d_apk")) or _finite(value.get("i_q_apk")):
+        bias = (float(value[key]) if _finite(value.get(key)) else 0.0 for key in ("i_d_apk", "i_q_apk"))
+        conditions.append("i_d {:.3g}, i_q {:.3g} A pk".format(*bias))
+    return {
+        "name": str(value["name"]),
+        "value": format_estimate(float(value["value"]), total, unit),
+        "std": format_quantity(float(value["std"]), unit, 2),
+        "systematic": format_quantity(float(value["systematic"]), unit, 2),
+        "conditions": ", ".join(conditions),
+        "method": ", ".join(str(value[key]) for key in ("method", "source") if value.get(key)),
+    }
+
+
+def total_interval(std: float, systematic: float, coverage_factor: float = 1.96) -> float:
+    """Return the half width of the total 95 % interval: statistical and systematic part in quadrature.
+
+    GUM (JCGM 100:2008) section 5.1.2 for independent parts; ``systematic`` is itself a 95 % half width.
+    """
+    return math.hypot(coverage_factor * std, systematic)
+
+
+def _conditions(record: Mapping[str, Any]) -> list[tuple[str, str]]:
+    rows = [("command", " ".join(map(str, record.get("command", ()))))]
+    for group in ("drive", "bus", "envelope", "versions"):
+        rows += [(f"{group}: {key}", str(value)) for key, value in record.get(group, {}).items()]
+    rows += [("instrument", str(line)) for line in record.get("instruments", ())]
+    for consent in record.get("consents", ()):
+        rows.append(("consent", ", ".join(f"{key}: {value}" for key, value in consent.items())))
+    return rows
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _trusted_svg(svg: str) -> Any:
+    """Mark our own SVG as safe, without the XML prologue a page must not carry in its body."""
+    import markupsafe
+
+    return markupsafe.Markup(svg[svg.index("<svg") :])

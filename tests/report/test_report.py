@@ -1,0 +1,93 @@
+"""The report says PASS only when everything passed, and shows every number with its interval."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+
+from pmsmtool.report.report import COMPLETE, Change, Figure, render, total_interval
+
+
+def _record() -> dict:
+    stages = [
+        {
+            "name": name,
+            "status": "pass",
+            "seconds": 1.0,
+            "values": [],
+            "acceptance": [{"what": f"{name} criterion", "measured": "0.1 %", "limit": "1 %", "ok": True}],
+            "fallbacks": [],
+            "files": {},
+            "note": "",
+        }
+        for name in COMPLETE
+    ]
+    stages[0]["values"] = [
+        {"name": "R_s_ohm", "value": 0.13712, "std": 0.0002, "systematic": 0.0014, "unit": "ohm", "T_c": 24.5,
+         "method": "multi-level DC", "source": "pmsmtool", "i_d_apk": math.nan, "i_q_apk": math.nan}
+    ]
+    return {
+        "schema": "pmsmtool.run/1",
+        "started_utc": "2026-01-01T00:00:00Z",
+        "operator": "A. <b>Engineer</b>",
+        "command": ["commission"],
+        "versions": {"pmsmtool": "0.1.0"},
+        "drive": {"name": "pmsmsim", "serial": 17},
+        "bus": {"interface": "pmsmsim"},
+        "envelope": {"i_max": "28 A pk"},
+        "consents": [{"what": "motion", "answer": "yes"}],
+        "stages": stages,
+    }
+
+
+def test_all_passed_is_pass_and_names_the_value_with_its_interval() -> None:
+    page = render(_record(), not_checked=["thermal behaviour under load"])
+    assert ">PASS</strong>" in page
+    assert "0.1371" in page and "multi-level DC" in page
+    assert "thermal behaviour under load" in page
+    assert page.index(">PASS</strong>") < page.index("Stages"), "the verdict comes first"
+
+
+@pytest.mark.parametrize("missing", COMPLETE)
+def test_a_missing_stage_keeps_the_verdict_open(missing: str) -> None:
+    record = _record()
+    record["stages"] = [stage for stage in record["stages"] if stage["name"] != missing]
+    page = render(record)
+    assert "NOT COMPLETE" in page and f"not run yet: {missing}" in page
+    assert ">PASS</strong>" not in page
+
+
+def test_a_failed_criterion_is_named_with_number_and_limit() -> None:
+    record = _record()
+    stage = record["stages"][2]
+    stage["status"] = "fail"
+    stage["acceptance"][0] = {"what": "phase margin", "measured": "31 deg", "limit": "40 deg", "ok": False}
+    page = render(record)
+    assert ">FAIL</strong>" in page and "phase margin: 31 deg, limit 40 deg" in page
+
+
+def test_a_stage_that_was_repeated_counts_with_its_last_entry() -> None:
+    record = _record()
+    failed = copy.deepcopy(record["stages"][0])
+    failed["status"] = "fail"
+    record["stages"].insert(0, failed)
+    assert ">PASS</strong>" in render(record)
+
+
+def test_text_from_outside_is_escaped_and_figures_are_inline() -> None:
+    page = render(
+        _record(),
+        figures=[Figure('<?xml version="1.0"?>\n<svg xmlns="http://www.w3.org/2000/svg"></svg>', "a & b")],
+        changes=[Change("motor.R_s_ohm", "0.2", "0.13712", "0.13712", "ohm")],
+    )
+    assert "<b>Engineer</b>" not in page and "&lt;b&gt;Engineer&lt;/b&gt;" in page
+    assert "<svg xmlns" in page and "<?xml" not in page and "a &amp; b" in page
+    assert "motor.R_s_ohm" in page
+    assert "<script" not in page and " src=" not in page
+
+
+def test_total_interval_adds_in_quadrature() -> None:
+    assert total_interval(1.0, 0.0) == pytest.approx(1.96)
+    assert total_interval(1.0, 1.96) == pytest.approx(1.96 * math.sqrt(2.0))
