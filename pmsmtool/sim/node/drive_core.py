@@ -164,7 +164,7 @@ class DriveCore(Protocol):
         """Take a parameter image (``firmware/image.py``); controller memory is kept (live gains)."""
 
     def restart(self) -> None:
-        """Firmware reset: gates off, controller memory, excitation, recorder and trip cleared; the rotor keeps moving."""
+        """Firmware reset: gates off; controller memory, excitation, recorder and trip cleared; the rotor moves on."""
 
     def run(self, periods: int) -> int:
         """Run at most ``periods`` control periods and return how many ran (at least 1 for ``periods`` >= 1).
