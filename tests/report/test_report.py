@@ -25,8 +25,18 @@ def _record() -> dict:
         for name in COMPLETE
     ]
     stages[0]["values"] = [
-        {"name": "R_s_ohm", "value": 0.13712, "std": 0.0002, "systematic": 0.0014, "unit": "ohm", "T_c": 24.5,
-         "method": "multi-level DC", "source": "pmsmtool", "i_d_apk": math.nan, "i_q_apk": math.nan}
+        {
+            "name": "R_s_ohm",
+            "value": 0.13712,
+            "std": 0.0002,
+            "systematic": 0.0014,
+            "unit": "ohm",
+            "T_c": 24.5,
+            "method": "multi-level DC",
+            "source": "pmsmtool",
+            "i_d_apk": math.nan,
+            "i_q_apk": math.nan,
+        }
     ]
     return {
         "schema": "pmsmtool.run/1",
