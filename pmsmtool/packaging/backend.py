@@ -8,6 +8,7 @@ but the kernels of an editable installation.
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 import tomllib
@@ -67,6 +68,7 @@ def build_wheel(wheel_directory: str, config_settings: Settings = None, metadata
     """Build the wheel for this machine and return its file name."""
     compiler = build_compiler()
     with tempfile.TemporaryDirectory() as scratch:
+        _keep_zig_cache_in(scratch)
         metadata = _metadata(Path(scratch))
         return wheel_for(Path(wheel_directory), Path.cwd(), metadata, compiler, sys.platform, local_wheel_tag()).name
 
@@ -76,8 +78,9 @@ def build_editable(
 ) -> str:
     """Compile the kernels into the checkout and return a wheel that only points to it."""
     root = Path.cwd()
-    build_all(root / "pmsmtool", root / "pmsmtool" / "_native", build_compiler(), force=True)
     with tempfile.TemporaryDirectory() as scratch:
+        _keep_zig_cache_in(scratch)
+        build_all(root / "pmsmtool", root / "pmsmtool" / "_native", build_compiler(), force=True)
         metadata = _metadata(Path(scratch))
         pointer = {"__editable__.pmsmtool.pth": f"{root}\n".encode()}
         return wheel.write_wheel(Path(wheel_directory), metadata, "py3-none-any", pointer).name
@@ -108,6 +111,12 @@ def wheel_for(
         files: dict[str, Path | bytes] = {**contents.package_files(root)}
         files |= {f"pmsmtool/_native/{library.name}": library for library in built}
         return wheel.write_wheel(folder, metadata, f"py3-none-{platform_tag}", files)
+
+
+def _keep_zig_cache_in(scratch: str) -> None:
+    """Leave nothing in the home of the person who installs (it may even be read-only); this process ends soon."""
+    for name in ("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR"):
+        os.environ.setdefault(name, os.path.join(scratch, "zig"))
 
 
 def _metadata(scratch: Path) -> Path:

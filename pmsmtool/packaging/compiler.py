@@ -63,8 +63,9 @@ def zig_compiler(target: Target | None) -> Compiler:
         raise CompilerError("ziglang is not installed in this environment: pip install '.[cross]'")
     folder = Path(next(iter(spec.submodule_search_locations)))
     program = folder / ("zig.exe" if sys.platform == "win32" else "zig")
-    # Without -mcpu=baseline zig emits the instructions of the machine that builds; its sanitizer needs a run time.
-    arguments = (str(program), "cc", "-mcpu=baseline", "-fno-sanitize=undefined")
+    # Without -mcpu=baseline zig emits the instructions of the machine that builds; its sanitizer needs a run time;
+    # its debug information names folders of this machine.
+    arguments = (str(program), "cc", "-mcpu=baseline", "-fno-sanitize=undefined", "-g0", "-s")
     return Compiler(
         arguments + (("-target", target.zig) if target else ()), f"ziglang for {target.name if target else 'here'}"
     )
@@ -152,6 +153,8 @@ def _arguments(kernel: Kernel, package: Path, output: Path, platform: str, stric
     arguments = ["-shared", *COMPILE_FLAGS, *([] if platform == "win32" else ["-fPIC"])]
     if platform == "darwin":
         arguments += ["-mmacosx-version-min=11.0"]
+    if platform == "linux":
+        arguments += ["-Wl,-z,defs"]  # a missing function is an error here, as it is on the other platforms
     arguments += WARNING_FLAGS if strict else []
     arguments += [f"-D{define}" for define in (*COMMON_DEFINES, *kernel.defines)]
     arguments += [part for folder in INCLUDE_FOLDERS for part in ("-iquote", folder)]
