@@ -119,7 +119,7 @@ _ROWS: tuple[tuple[str, int, int, WireType, str, float, float, float, bool, str]
     ("current.K_i_d_v_per_as", 0x2020, 0x02, _F32, "V/(A s)", 411, 0, 1e8, True, "integral gain, d axis"),
     ("current.K_p_q_v_per_a", 0x2020, 0x03, _F32, "V/A", 6.3, 0, 1e5, True, "proportional gain, q axis"),
     ("current.K_i_q_v_per_as", 0x2020, 0x04, _F32, "V/(A s)", 411, 0, 1e8, True, "integral gain, q axis"),
-    ("current.options", 0x2020, 0x05, _U8, "1", 7, 0, 63, False, "bit0 decoupling, bit1 emf feed-forward, bit2 back-calculation, bit3 hexagon limit, bit4 one-step predictor"),
+    ("current.options", 0x2020, 0x05, _U8, "1", 7, 0, 63, False, "bit0 decoupling, bit1 emf feed-forward, bit2 back-calculation, bit3 hexagon limit, bit4 one-step predictor, bit5 record the dead-time compensation in u_d_lim, u_q_lim"),
     # 0x2021 speed controller
     ("speed.K_p_nms_per_rad", 0x2021, 0x01, _F32, "N m s/rad", 0, 0, 1e6, True, "proportional gain"),
     ("speed.K_i_nm_per_rad", 0x2021, 0x02, _F32, "N m/rad", 0, 0, 1e8, True, "integral gain"),

@@ -10,7 +10,6 @@ import difflib
 import hashlib
 import itertools
 import math
-import re
 import struct
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -20,14 +19,13 @@ from typing import Any
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, LUT_CAPACITY_WORDS
+from pmsmtool.toml_text import toml_text
 
 SCHEMA = "pmsmtool.params/1"
 
 TABLE_NAMES = ("lut.axis_x", "lut.axis_y", "lut.axis_z", "lut.i_d_a", "lut.i_q_a")
 """Axes (torque in N m; rpm or Wb; V) and tables (A peak, row-major x, y, z) of the reference look-up."""
 
-_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+\Z")
-_NUMBERS_PER_LINE = 8
 _INTEGER_LIMIT = 2**64
 
 
@@ -57,8 +55,12 @@ class ParameterSet:
         unknown += [_unknown(key, TABLE_NAMES) for key in self.tables if key not in TABLE_NAMES]
         if unknown:
             raise ConfigError("not in the parameter catalogue", violations=unknown)
-        object.__setattr__(self, "values", {r.name: float(self.values[r.name]) for r in CATALOGUE if r.name in self.values})
-        object.__setattr__(self, "tables", {n: tuple(map(float, self.tables[n])) for n in TABLE_NAMES if n in self.tables})
+        object.__setattr__(
+            self, "values", {r.name: float(self.values[r.name]) for r in CATALOGUE if r.name in self.values}
+        )
+        object.__setattr__(
+            self, "tables", {n: tuple(map(float, self.tables[n])) for n in TABLE_NAMES if n in self.tables}
+        )
         object.__setattr__(self, "provenance", dict(self.provenance))
 
     def violations(self) -> tuple[str, ...]:
@@ -68,16 +70,13 @@ class ParameterSet:
 
     def content_hash(self) -> str:
         """Return ``sha256:<hex>`` over values and tables in canonical form (provenance not included)."""
-        return "sha256:" + hashlib.sha256(self._body().encode("ascii")).hexdigest()
+        return "sha256:" + hashlib.sha256(toml_text(self._groups()).encode("ascii")).hexdigest()
 
     def to_toml(self) -> str:
         """Return the canonical text of ``params.toml``."""
-        lines = [f'schema = "{SCHEMA}"', f"name = {toml_string(self.name)}", f'content = "{self.content_hash()}"', ""]
-        text = "\n".join(lines) + "\n" + self._body()
-        if self.provenance:
-            text += "\n[provenance]\n"
-            text += "".join(f"{_toml_key(k)} = {toml_string(v)}\n" for k, v in sorted(self.provenance.items()))
-        return text
+        head = {"schema": SCHEMA, "name": self.name, "content": self.content_hash()}
+        tail = {"provenance": dict(sorted(self.provenance.items()))} if self.provenance else {}
+        return toml_text({**head, **self._groups(), **tail})
 
     def merged(self, other: ParameterSet) -> ParameterSet:
         """Return this set with every entry of ``other`` laid over it."""
@@ -88,15 +87,12 @@ class ParameterSet:
             name=other.name or self.name,
         )
 
-    def _body(self) -> str:
-        groups: dict[str, list[str]] = {}
-        for name, value in self.values.items():
+    def _groups(self) -> dict[str, dict[str, Any]]:
+        groups: dict[str, dict[str, Any]] = {}
+        for name, entry in [*((n, _plain(n, v)) for n, v in self.values.items()), *self.tables.items()]:
             group, key = name.split(".", 1)
-            groups.setdefault(group, []).append(f"{key} = {_number(name, value)}\n")
-        for name, table in self.tables.items():
-            group, key = name.split(".", 1)
-            groups.setdefault(group, []).append(f"{key} = {_array(table)}\n")
-        return "\n".join(f"[{group}]\n" + "".join(lines) for group, lines in groups.items())
+            groups.setdefault(group, {})[key] = entry
+        return groups
 
 
 def parse_parameter_set(text: str, where: str = "params.toml") -> ParameterSet:
@@ -114,7 +110,9 @@ def parse_parameter_set(text: str, where: str = "params.toml") -> ParameterSet:
         raise ConfigError(f"not a TOML file: {error}", where=where) from error
     schema = document.pop("schema", None)
     if schema != SCHEMA:
-        raise ConfigError(f"schema is {schema!r}, expected {SCHEMA!r}", where=where, hint="give a params.toml as `tune` writes it")
+        raise ConfigError(
+            f"schema is {schema!r}, expected {SCHEMA!r}", where=where, hint="give a params.toml as `tune` writes it"
+        )
     name, content = document.pop("name", ""), document.pop("content", None)
     provenance = document.pop("provenance", {})
     values, tables, wrong = _read_groups(document)
@@ -148,30 +146,10 @@ def default_set() -> ParameterSet:
     return ParameterSet({row.name: row.default for row in CATALOGUE}, name="factory defaults")
 
 
-def toml_string(text: str) -> str:
-    """Return a TOML basic string."""
-    escaped = "".join(
-        {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t"}.get(c, c if c.isprintable() else f"\\U{ord(c):08x}")
-        for c in text
-    )
-    return f'"{escaped}"'
-
-
-def _toml_key(key: str) -> str:
-    return key if _BARE_KEY.match(key) else toml_string(key)
-
-
-def _number(name: str, value: float) -> str:
-    if BY_NAME[name].is_integer and abs(value) < _INTEGER_LIMIT and value == int(value):
-        return str(int(value))
-    return repr(value)
-
-
-def _array(numbers: Sequence[float]) -> str:
-    if len(numbers) <= _NUMBERS_PER_LINE:
-        return "[" + ", ".join(map(repr, numbers)) + "]"
-    rows = [numbers[k : k + _NUMBERS_PER_LINE] for k in range(0, len(numbers), _NUMBERS_PER_LINE)]
-    return "[\n" + "".join("    " + ", ".join(map(repr, row)) + ",\n" for row in rows) + "]"
+def _plain(name: str, value: float) -> float | int:
+    """Return an integer parameter as an integer; violations of that stay visible as floats."""
+    whole = BY_NAME[name].is_integer and abs(value) < _INTEGER_LIMIT and value == int(value)
+    return int(value) if whole else value
 
 
 def _unknown(name: str, known: Sequence[str] | Mapping[str, object]) -> str:

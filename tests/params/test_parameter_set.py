@@ -34,7 +34,9 @@ def test_text_is_canonical_whatever_the_order_of_entry() -> None:
 
 
 def test_round_trip_with_tables_and_provenance() -> None:
-    first = ParameterSet({**default_set().values, **DESCRIPTOR}, LUT, {"motor.R_s_ohm": 'dc_levels "a"\\b', "x": "y"}, "née")
+    first = ParameterSet(
+        {**default_set().values, **DESCRIPTOR}, LUT, {"motor.R_s_ohm": 'dc_levels "a"\\b', "x": "y"}, "née"
+    )
     again = parse_parameter_set(first.to_toml())
     assert again.to_toml() == first.to_toml()
     assert again.content_hash() == first.content_hash()
@@ -103,7 +105,9 @@ def test_tables_must_fit_their_descriptor() -> None:
 
 def test_difference_lists_scalars_and_counts_table_cells() -> None:
     old = ParameterSet({"motor.R_s_ohm": 0.1, "motor.L_d_h": 0.002}, LUT)
-    new = ParameterSet({"motor.R_s_ohm": 0.2, "motor.L_q_h": 0.002}, {**LUT, "lut.i_d_a": (9.0, -1.0, -2.0, -3.0, 9.0, math.nan)})
+    new = ParameterSet(
+        {"motor.R_s_ohm": 0.2, "motor.L_q_h": 0.002}, {**LUT, "lut.i_d_a": (9.0, -1.0, -2.0, -3.0, 9.0, math.nan)}
+    )
     found = {d.name: d for d in compare(old, new)}
     assert found["motor.R_s_ohm"].relative == pytest.approx(1.0)
     assert found["motor.L_d_h"].new is None and found["motor.L_q_h"].old is None
