@@ -56,9 +56,7 @@ def toml_value(value: Any) -> str:
 
 
 def _string(text: str) -> str:
-    escaped = "".join(
-        _ESCAPES.get(c, f"\\u{ord(c):04X}" if ord(c) < 0x20 or ord(c) == 0x7F else c) for c in text
-    )
+    escaped = "".join(_ESCAPES.get(c, f"\\u{ord(c):04X}" if ord(c) < 0x20 or ord(c) == 0x7F else c) for c in text)
     return f'"{escaped}"'
 
 
