@@ -100,7 +100,21 @@ typedef struct pmsm_drive {
     double average_sum[PMSM_TRACE_CHANNELS], average_square[PMSM_TRACE_CHANNELS];
     float trigger_last;
     uint32_t trigger_primed;
+    double theta_M_base;                /* rad, whole turns taken off PMSM_SIGNAL_THETA_M so that binary32 resolves it */
+    double pll_alpha, pll_beta;         /* gains of the speed estimate, from the active parameters */
+    uint32_t quick_stop_state;          /* 0 inactive, 1 stopping, 2 stopped */
+    float quick_stop_share;             /* 1 -> 0 */
+    pmsm_reference quick_stop_start;    /* reference when the quick stop came */
+    pmsm_reference applied;             /* reference of the last period, excitation included */
+    float applied_angle;                /* rad, fixed frame angle of the last period, NaN when it followed the rotor */
+    uint32_t excitation_active;         /* 1 in a period with a wave */
+    uint32_t excitation_started;        /* 1 in the period in which an excitation started */
+    uint32_t trip_last;
+    double average_first[PMSM_TRACE_CHANNELS];
 } pmsm_drive;
+
+/* A command that has been carried out; 0 stop, 1 arm (or start an average), 2 start (or force) are new ones. */
+#define PMSM_COMMAND_TAKEN 0xFFFFFFFFu
 
 /* Bytes of a pmsm_drive (for the caller who allocates it). */
 PMSM_EXPORT uint32_t pmsm_drive_size(void);

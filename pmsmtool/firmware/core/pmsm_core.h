@@ -65,7 +65,7 @@ typedef struct {             /* what a trace or a TPDO can show of this period *
     pmsm_real i_d_req, i_q_req;      /* A, before the governor */
     pmsm_real i_d_ref, i_q_ref;      /* A, after the governor */
     pmsm_real u_d, u_q;              /* V, demanded, before the limiter */
-    pmsm_real u_d_lim, u_q_lim;      /* V, after limiter and duty clip, in the sampled frame convention of u */
+    pmsm_real u_d_lim, u_q_lim;      /* V, after limiter and duty clip, in the frame of u; dead-time compensation excluded unless current.options bit 5 */
     pmsm_real theta_e, omega_e;      /* rad in [-pi, pi), rad/s */
     pmsm_real tau;                   /* N m, from currents and parameters */
     pmsm_real kappa;                 /* governor: share of the way to the request, 1 = passed unchanged */
@@ -79,6 +79,16 @@ typedef struct {
     pmsm_real u_alpha, u_beta;        /* V, demanded stator-frame voltage after the limiter */
     uint32_t gates;                   /* 1: switch, 0: all transistors off */
 } pmsm_output;
+
+typedef struct {             /* constants of the active set, computed in the first period after pmsm_init() */
+    pmsm_real T_s;           /* s */
+    pmsm_real pole_pairs;
+    pmsm_real torque_per_flux;    /* 1.5 p */
+    pmsm_real i2t_rate;      /* budget per period and A^2 above I_cont^2 */
+    pmsm_real speed_period;  /* s */
+    pmsm_real speed_filter;  /* weight of a new sample */
+    pmsm_real notch_b0, notch_b1, notch_b2, notch_a2; /* a1 = b1; b0 = 0: no notch */
+} pmsm_derived;
 
 typedef struct {             /* per-axis controller memory and whatever the modes need */
     pmsm_dq integrator;      /* V */
@@ -96,10 +106,21 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_real polar[12];     /* memory of the polar-coordinate laws */
     pmsm_real tau_speed;     /* N m, last output of the speed controller */
     pmsm_live live;
+    /* private to the core */
+    pmsm_dq voltage_before;  /* V, stator frame: computed one period before voltage_committed */
+    pmsm_dq current_before;  /* A, sampled in the last period */
+    pmsm_real tau_granted;   /* N m, torque of the reference that the limits left */
+    pmsm_real i2t_carry;     /* rounding remainder of i2t */
+    uint32_t i2t_exhausted;  /* 1 from a used-up budget until a tenth of it has recovered */
+    uint32_t prepared;       /* 0 fresh from pmsm_init(), 1 derived is valid, 2 derived is stale */
+    pmsm_derived derived;
 } pmsm_state;
 
-/* Clear the memory (all zero, kappa 1, binding 255); call at enable and after a parameter change. */
+/* Clear the memory (all zero, kappa 1, binding 255); call at start-up and after another parameter set. */
 PMSM_EXPORT void pmsm_init(pmsm_state *state);
+
+/* Parameters changed while the controller runs (live gains): keep its memory, renew what was derived from them. */
+PMSM_EXPORT void pmsm_parameters_changed(pmsm_state *state);
 
 /* One PWM period. lut points to the words behind pmsm_params in the image, may be NULL if lut_format is 0. */
 PMSM_EXPORT void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut,

@@ -7,7 +7,8 @@ enum pmsm_current_option {
     PMSM_CURRENT_EMF = 1u << 1,              /* omega_e psi */
     PMSM_CURRENT_BACK_CALCULATION = 1u << 2, /* realizable-reference anti-windup; off: plain clip */
     PMSM_CURRENT_HEXAGON = 1u << 3,          /* limit to the inverter's hexagon instead of the circle */
-    PMSM_CURRENT_PREDICTOR = 1u << 4         /* proportional part and decoupling act on the predicted current */
+    PMSM_CURRENT_PREDICTOR = 1u << 4,        /* proportional part and decoupling act on the predicted current */
+    PMSM_CURRENT_RECORD_COMPENSATION = 1u << 5 /* u_d_lim, u_q_lim include the dead-time compensation */
 };
 
 enum pmsm_governor_mode {

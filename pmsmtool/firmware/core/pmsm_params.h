@@ -54,7 +54,7 @@ typedef struct pmsm_params {
     float    current_K_i_d_v_per_as;         /* [V/(A s)] integral gain, d axis */
     float    current_K_p_q_v_per_a;          /* [V/A] proportional gain, q axis */
     float    current_K_i_q_v_per_as;         /* [V/(A s)] integral gain, q axis */
-    uint32_t current_options;                /* bit0 decoupling, bit1 emf feed-forward, bit2 back-calculation, bit3 hexagon limit, bit4 one-step predictor */
+    uint32_t current_options;                /* bit0 decoupling, bit1 emf feed-forward, bit2 back-calculation, bit3 hexagon limit, bit4 one-step predictor, bit5 record the dead-time compensation in u_d_lim, u_q_lim */
     float    speed_K_p_nms_per_rad;          /* [N m s/rad] proportional gain */
     float    speed_K_i_nm_per_rad;           /* [N m/rad] integral gain */
     float    speed_filter_hz;                /* [Hz] feedback filter cut-off */

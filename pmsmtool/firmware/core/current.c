@@ -1,0 +1,115 @@
+/* Current controller: PI with decoupling, emf feed-forward and realizable-reference anti-windup.
+ *
+ *   u_d = K_p e_d + x_d - omega_e L_q i_q          e = reference - i
+ *   u_q = K_p e_q + x_q + omega_e (L_d i_d + psi)  x += T_s K_i (e + (u_realised - u)/K_p)
+ *
+ * The correction is the reference that the limited voltage would have realised (Hanus, Kinnaert, Henrotte,
+ * Automatica 23 (1987) 729-739). With the one-step predictor the proportional part and the decoupling see the
+ * predicted current, the integrators the sampled one, so that a model error leaves no offset.
+ */
+#include "pmsm_period.h"
+
+typedef struct {
+    pmsm_dq K_p;
+    pmsm_dq K_i;
+} current_gains;
+
+/* A bias loop is the PI of the machine's own time constant at the bandwidth asked for: its gain at the frequency of
+ * an injection is bias_bandwidth/omega of the winding's impedance, so it does not fight it. */
+static current_gains select_gains(const pmsm_period *period)
+{
+    const pmsm_params *params = period->params;
+    const pmsm_real bandwidth = period->request->bias_bandwidth;
+    current_gains gains;
+    if (bandwidth > PMSM_C(0.0)) {
+        gains.K_p.d = bandwidth * (pmsm_real)params->motor_L_d_h;
+        gains.K_p.q = bandwidth * (pmsm_real)params->motor_L_q_h;
+        gains.K_i.d = bandwidth * (pmsm_real)params->motor_R_s_ohm;
+        gains.K_i.q = gains.K_i.d;
+        return gains;
+    }
+    gains.K_p.d = (pmsm_real)params->current_K_p_d_v_per_a;
+    gains.K_p.q = (pmsm_real)params->current_K_p_q_v_per_a;
+    gains.K_i.d = (pmsm_real)params->current_K_i_d_v_per_as;
+    gains.K_i.q = (pmsm_real)params->current_K_i_q_v_per_as;
+    return gains;
+}
+
+/* Rotation voltages of a current, as far as the options ask for them. */
+static pmsm_dq feed_forward(const pmsm_period *period, pmsm_dq i)
+{
+    const pmsm_params *params = period->params;
+    pmsm_dq u = {PMSM_C(0.0), PMSM_C(0.0)};
+    pmsm_real psi_d = PMSM_C(0.0);
+    if ((params->current_options & PMSM_CURRENT_DECOUPLING) != 0u) {
+        u.d = -(period->omega_e * (pmsm_real)params->motor_L_q_app_h) * i.q;
+        psi_d = (pmsm_real)params->motor_L_d_app_h * i.d;
+    }
+    if ((params->current_options & PMSM_CURRENT_EMF) != 0u) {
+        psi_d += (pmsm_real)params->motor_psi_f_wb;
+    }
+    u.q = period->omega_e * psi_d;
+    return u;
+}
+
+void pmsm_current_demand(pmsm_period *period)
+{
+    const pmsm_state *state = period->state;
+    const current_gains gains = select_gains(period);
+    const pmsm_dq i = period->i_model;
+    const pmsm_dq rotation = feed_forward(period, i);
+    const pmsm_dq reference = period->reference;
+    period->u.d = gains.K_p.d * (reference.d - i.d) + state->integrator.d + rotation.d + period->request->u_d_inject;
+    period->u.q = gains.K_p.q * (reference.q - i.q) + state->integrator.q + rotation.q + period->request->u_q_inject;
+}
+
+static pmsm_real integrate(pmsm_real x, pmsm_real T_s, pmsm_real K_p, pmsm_real K_i, pmsm_real error, pmsm_real cut)
+{
+    if (cut == PMSM_C(0.0)) {
+        return x + T_s * K_i * error;
+    }
+    if (K_p > PMSM_C(0.0)) {
+        return x + T_s * K_i * (error + cut / K_p);
+    }
+    return x; /* a pure integrator at the limit holds */
+}
+
+void pmsm_current_integrate(pmsm_period *period)
+{
+    pmsm_state *state = period->state;
+    const current_gains gains = select_gains(period);
+    const pmsm_real T_s = state->derived.T_s;
+    pmsm_dq cut = {PMSM_C(0.0), PMSM_C(0.0)};
+    if ((period->params->current_options & PMSM_CURRENT_BACK_CALCULATION) != 0u) {
+        cut.d = period->u_realised.d - period->u.d;
+        cut.q = period->u_realised.q - period->u.q;
+    }
+    pmsm_dq *x = &state->integrator;
+    x->d = integrate(x->d, T_s, gains.K_p.d, gains.K_i.d, period->reference.d - period->i.d, cut.d);
+    x->q = integrate(x->q, T_s, gains.K_p.q, gains.K_i.q, period->reference.q - period->i.q, cut.q);
+}
+
+/* Current at the start of the next period under the voltage that acts in this one. Flux in the stator frame is
+ * integrated with the resistance drop at the mean current, then seen from the rotor turned by omega_e T_s. */
+pmsm_dq pmsm_predict_current(const pmsm_period *period)
+{
+    const pmsm_params *params = period->params;
+    const pmsm_real T_s = period->state->derived.T_s;
+    const pmsm_ab committed = {period->state->voltage_committed.d, period->state->voltage_committed.q};
+    const pmsm_dq u = pmsm_park(committed, period->sine, period->cosine);
+    const pmsm_dq psi = {(pmsm_real)params->motor_L_d_app_h * period->i.d + (pmsm_real)params->motor_psi_f_wb,
+                         (pmsm_real)params->motor_L_q_app_h * period->i.q};
+    const pmsm_real drop = PMSM_C(0.5) * T_s * period->R_s;
+    pmsm_real sine;
+    pmsm_real cosine;
+    pmsm_sincos(period->omega_e * T_s, &sine, &cosine);
+    const pmsm_ab fixed = {psi.d + T_s * u.d - drop * period->i.d, psi.q + T_s * u.q - drop * period->i.q};
+    const pmsm_dq turned = pmsm_park(fixed, sine, cosine);
+    /* half of the drop belongs to the new current itself: i = i_k + L^-1 (turned - drop i - psi) solved for i */
+    const pmsm_real L_d = (pmsm_real)params->motor_L_d_h;
+    const pmsm_real L_q = (pmsm_real)params->motor_L_q_h;
+    pmsm_dq next;
+    next.d = (L_d * period->i.d + (turned.d - psi.d)) / (L_d + drop);
+    next.q = (L_q * period->i.q + (turned.q - psi.q)) / (L_q + drop);
+    return next;
+}

@@ -1,0 +1,95 @@
+/* From a voltage demand to duty ratios: limit, delay-compensating angle, zero sequence, legs, and what came of it. */
+#include "pmsm_period.h"
+
+#define LIMIT_FLAG_MARGIN PMSM_C(1.00002) /* on the square: float rounding of a demand at the limit is no event */
+
+/* Circle of radius V_max, keeping the direction. */
+static pmsm_dq limit_to_circle(pmsm_period *period, pmsm_dq u)
+{
+    const pmsm_real square = pmsm_square(u);
+    const pmsm_real limit = period->V_max * period->V_max;
+    if (square <= limit) {
+        return u;
+    }
+    period->flags |= (square > LIMIT_FLAG_MARGIN * limit) ? (uint32_t)PMSM_FLAG_VOLTAGE_LIMITED : 0u;
+    const pmsm_real scale = period->V_max / PMSM_SQRT(square);
+    u.d *= scale;
+    u.q *= scale;
+    return u;
+}
+
+static pmsm_real error_shape(pmsm_real i, pmsm_real i_knee)
+{
+    return pmsm_clamp(i / i_knee, PMSM_C(-1.0), PMSM_C(1.0));
+}
+
+/* Leg voltages that cancel the inverter's error, from the current as it will flow when they act. */
+static pmsm_abc dead_time_voltage(const pmsm_period *period)
+{
+    const pmsm_params *params = period->params;
+    pmsm_abc error = {PMSM_C(0.0), PMSM_C(0.0), PMSM_C(0.0)};
+    if (params->inverter_deadtime_compensation == 0u) {
+        return error;
+    }
+    const pmsm_abc i = pmsm_clarke_inverse(pmsm_park_inverse(period->i, period->sine_out, period->cosine_out));
+    const pmsm_real V_dead = (pmsm_real)params->inverter_V_dead_v;
+    const pmsm_real i_knee = (pmsm_real)params->inverter_i_knee_apk;
+    error.a = V_dead * error_shape(i.a, i_knee);
+    error.b = V_dead * error_shape(i.b, i_knee);
+    error.c = V_dead * error_shape(i.c, i_knee);
+    return error;
+}
+
+static pmsm_real duty(pmsm_real u, pmsm_real inverse_U_dc, uint32_t *clipped)
+{
+    const pmsm_real d = PMSM_C(0.5) + u * inverse_U_dc;
+    if (d > PMSM_C(1.0)) {
+        *clipped = 1u;
+        return PMSM_C(1.0);
+    }
+    if (d < PMSM_C(0.0)) {
+        *clipped = 1u;
+        return PMSM_C(0.0);
+    }
+    return d;
+}
+
+/* Min-max zero sequence: the extreme legs stand symmetrically, V_max reaches U_dc/sqrt(3). */
+static uint32_t set_duties(pmsm_abc u, pmsm_real U_dc, pmsm_output *output)
+{
+    const pmsm_real high = (u.a > u.b) ? ((u.a > u.c) ? u.a : u.c) : ((u.b > u.c) ? u.b : u.c);
+    const pmsm_real low = (u.a < u.b) ? ((u.a < u.c) ? u.a : u.c) : ((u.b < u.c) ? u.b : u.c);
+    const pmsm_real middle = PMSM_C(0.5) * (high + low);
+    const pmsm_real inverse = (U_dc > PMSM_C(0.0)) ? PMSM_C(1.0) / U_dc : PMSM_C(0.0);
+    uint32_t clipped = 0u;
+    output->duty_a = duty(u.a - middle, inverse, &clipped);
+    output->duty_b = duty(u.b - middle, inverse, &clipped);
+    output->duty_c = duty(u.c - middle, inverse, &clipped);
+    return clipped;
+}
+
+void pmsm_modulate(pmsm_period *period, pmsm_output *output)
+{
+    const uint32_t options = period->params->current_options;
+    const pmsm_dq limited =
+        ((options & PMSM_CURRENT_HEXAGON) != 0u) ? period->u : limit_to_circle(period, period->u);
+    pmsm_ab stator = pmsm_park_inverse(limited, period->sine_out, period->cosine_out);
+    const pmsm_abc wanted = pmsm_clarke_inverse(stator);
+    const pmsm_abc error = dead_time_voltage(period);
+    const pmsm_abc legs = {wanted.a + error.a, wanted.b + error.b, wanted.c + error.c};
+    period->u_realised = limited;
+    if ((options & PMSM_CURRENT_RECORD_COMPENSATION) != 0u) {
+        period->u_compensation = pmsm_park(pmsm_clarke(error), period->sine_out, period->cosine_out);
+    }
+    if (set_duties(legs, period->U_dc, output) != 0u) {
+        const pmsm_abc applied = {period->U_dc * output->duty_a - error.a, period->U_dc * output->duty_b - error.b,
+                                  period->U_dc * output->duty_c - error.c};
+        stator = pmsm_clarke(applied);
+        period->u_realised = pmsm_park(stator, period->sine_out, period->cosine_out);
+        period->flags |= (uint32_t)PMSM_FLAG_DUTY_CLIPPED;
+        period->flags |= ((options & PMSM_CURRENT_HEXAGON) != 0u) ? (uint32_t)PMSM_FLAG_VOLTAGE_LIMITED : 0u;
+    }
+    output->u_alpha = stator.alpha;
+    output->u_beta = stator.beta;
+    output->gates = 1u;
+}

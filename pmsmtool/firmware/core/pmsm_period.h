@@ -1,0 +1,56 @@
+/* What the parts of one period hand to each other. Internal to the core.
+ *
+ * step.c fills it, reference.c and governor.c turn a request into a reference, current.c (or polar.c) into a voltage,
+ * modulation.c into duty ratios.
+ */
+#ifndef PMSM_PERIOD_H
+#define PMSM_PERIOD_H
+
+#include "pmsm_core.h"
+#include "pmsm_math.h"
+#include "pmsm_modes.h"
+
+typedef struct {
+    const pmsm_params *params;
+    const uint32_t *lut;
+    const pmsm_reference *request;
+    pmsm_state *state;
+    pmsm_real omega_e;         /* rad/s */
+    pmsm_real omega_M;         /* rad/s */
+    pmsm_real U_dc;            /* V */
+    pmsm_real V_max;           /* V, radius of the voltage circle */
+    pmsm_real R_s;             /* ohm, at the winding temperature */
+    pmsm_real sine, cosine;    /* of the sampled angle */
+    pmsm_real sine_out, cosine_out; /* of the angle at the middle of the applied voltage */
+    pmsm_dq i;                 /* A, sampled */
+    pmsm_dq i_model;           /* A, the current the proportional part sees: sampled, or predicted */
+    pmsm_dq reference;         /* A, what the current controller shall reach */
+    pmsm_dq u;                 /* V, demanded */
+    pmsm_dq u_realised;        /* V, after the limits, without dead-time compensation */
+    pmsm_dq u_compensation;    /* V, dead-time compensation, when it is to be recorded */
+    uint32_t flags;
+} pmsm_period;
+
+/* derived.c */
+void pmsm_prepare(pmsm_state *state, const pmsm_params *params);
+
+/* reference.c: protection, torque and speed to a current request */
+void pmsm_update_i2t(pmsm_period *period);
+pmsm_real pmsm_current_limit(const pmsm_period *period);
+pmsm_real pmsm_speed_control(pmsm_period *period);
+pmsm_dq pmsm_torque_to_current(pmsm_period *period, pmsm_real tau);
+pmsm_dq pmsm_limit_current(pmsm_period *period, pmsm_dq i);
+pmsm_real pmsm_torque(const pmsm_params *params, pmsm_dq i);
+
+/* lookup.c: currents of a torque from the tables; sets the look-up flags */
+pmsm_dq pmsm_lookup(pmsm_period *period, pmsm_real tau);
+
+/* current.c */
+void pmsm_current_demand(pmsm_period *period);
+void pmsm_current_integrate(pmsm_period *period);
+pmsm_dq pmsm_predict_current(const pmsm_period *period);
+
+/* modulation.c */
+void pmsm_modulate(pmsm_period *period, pmsm_output *output);
+
+#endif

@@ -1,0 +1,186 @@
+/* One PWM period. */
+#include "pmsm_period.h"
+
+void pmsm_init(pmsm_state *state)
+{
+    const pmsm_state zero = {0};
+    *state = zero;
+    state->live.kappa = PMSM_C(1.0);
+    state->live.binding = 255u;
+}
+
+void pmsm_parameters_changed(pmsm_state *state)
+{
+    if (state->prepared == 1u) {
+        state->prepared = 2u;
+    }
+}
+
+/* Forget everything but the thermal budget: what is energised next starts from rest. */
+static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
+{
+    const pmsm_dq zero = {PMSM_C(0.0), PMSM_C(0.0)};
+    state->integrator = zero;
+    state->voltage_committed = zero;
+    state->voltage_before = zero;
+    state->reference_held = zero;
+    state->disturbance = zero;
+    state->fw_reference = zero;
+    state->speed_integrator = PMSM_C(0.0);
+    state->notch_1 = PMSM_C(0.0);
+    state->notch_2 = PMSM_C(0.0);
+    state->tau_speed = PMSM_C(0.0);
+    state->tau_granted = PMSM_C(0.0);
+    state->omega_filtered = omega_M;
+    state->omega_ref_ramped = omega_M;
+    state->fw_count = 0u;
+    state->speed_count = 0u;
+    for (uint32_t k = 0u; k < 12u; k++) {
+        state->polar[k] = PMSM_C(0.0);
+    }
+}
+
+/* x - x is zero for every number, and NaN for infinity and NaN. */
+static uint32_t is_usable(const pmsm_measurement *m, pmsm_real advance)
+{
+    const pmsm_real sum = ((m->i_a + m->i_b) + m->i_c) + m->U_dc;
+    return (sum - sum == PMSM_C(0.0) && pmsm_abs(m->theta_e) + pmsm_abs(advance) <= PMSM_ANGLE_MAX) ? 1u : 0u;
+}
+
+static pmsm_real winding_resistance(const pmsm_params *params, pmsm_real T_winding)
+{
+    const pmsm_real rise = T_winding - (pmsm_real)params->motor_T_ref_c;
+    const pmsm_real R_s = (pmsm_real)params->motor_R_s_ohm;
+    /* no sensor shows as NaN: the value at the reference temperature stays */
+    return (rise == rise) ? R_s * (PMSM_C(1.0) + (pmsm_real)params->motor_alpha_R_per_k * rise) : R_s;
+}
+
+static void transform(pmsm_period *period, const pmsm_measurement *m, pmsm_real advance)
+{
+    const pmsm_abc phases = {m->i_a, m->i_b, m->i_c};
+    pmsm_sincos(m->theta_e, &period->sine, &period->cosine);
+    pmsm_sincos(m->theta_e + advance, &period->sine_out, &period->cosine_out);
+    period->i = pmsm_park(pmsm_clarke(phases), period->sine, period->cosine);
+    period->i_model = period->i;
+    period->omega_e = m->omega_e;
+    period->omega_M = m->omega_e / period->state->derived.pole_pairs;
+    period->U_dc = m->U_dc;
+    period->V_max = (pmsm_real)period->params->inverter_voltage_utilisation * m->U_dc;
+    period->R_s = winding_resistance(period->params, m->T_winding);
+}
+
+static uint32_t uses_predictor(const pmsm_params *params)
+{
+    const uint32_t asked = params->current_options & (uint32_t)PMSM_CURRENT_PREDICTOR;
+    return (asked != 0u && params->inverter_delay_periods >= 1.0F) ? 1u : 0u;
+}
+
+/* The current the mode asks for. */
+static pmsm_dq current_request(pmsm_period *period)
+{
+    const pmsm_reference *request = period->request;
+    if (request->mode == PMSM_MODE_CURRENT) {
+        const pmsm_dq asked = {request->i_d_ref, request->i_q_ref};
+        return pmsm_limit_current(period, asked);
+    }
+    const pmsm_real tau = (request->mode == PMSM_MODE_SPEED) ? pmsm_speed_control(period) : request->tau_ref;
+    return pmsm_torque_to_current(period, tau);
+}
+
+static void control(pmsm_period *period, pmsm_output *output)
+{
+    pmsm_live *live = &period->state->live;
+    const pmsm_dq request = current_request(period);
+    live->i_d_req = request.d;
+    live->i_q_req = request.q;
+    period->reference = request;
+    if (uses_predictor(period->params) != 0u) {
+        period->i_model = pmsm_predict_current(period);
+    }
+    pmsm_current_demand(period);
+    pmsm_modulate(period, output);
+    pmsm_current_integrate(period);
+    period->state->reference_held = period->reference;
+}
+
+static void inject_only(pmsm_period *period, pmsm_output *output)
+{
+    period->u.d = period->request->u_d_inject;
+    period->u.q = period->request->u_q_inject;
+    pmsm_modulate(period, output);
+    period->state->integrator.d = PMSM_C(0.0);
+    period->state->integrator.q = PMSM_C(0.0);
+    period->state->live.i_d_req = PMSM_C(0.0);
+    period->state->live.i_q_req = PMSM_C(0.0);
+}
+
+static void gates_off(pmsm_state *state, pmsm_output *output, pmsm_real omega_M)
+{
+    reset_controllers(state, omega_M);
+    output->duty_a = PMSM_C(0.5);
+    output->duty_b = PMSM_C(0.5);
+    output->duty_c = PMSM_C(0.5);
+    output->u_alpha = PMSM_C(0.0);
+    output->u_beta = PMSM_C(0.0);
+    output->gates = 0u;
+    state->live.i_d_req = PMSM_C(0.0);
+    state->live.i_q_req = PMSM_C(0.0);
+}
+
+static void publish(pmsm_period *period, const pmsm_measurement *m)
+{
+    pmsm_live *live = &period->state->live;
+    live->i_d = period->i.d;
+    live->i_q = period->i.q;
+    live->i_d_ref = period->reference.d;
+    live->i_q_ref = period->reference.q;
+    live->u_d = period->u.d;
+    live->u_q = period->u.q;
+    live->u_d_lim = period->u_realised.d + period->u_compensation.d;
+    live->u_q_lim = period->u_realised.q + period->u_compensation.q;
+    live->theta_e = pmsm_wrap(m->theta_e);
+    live->omega_e = m->omega_e;
+    live->tau = pmsm_torque(period->params, period->i);
+    live->flags = period->flags;
+}
+
+void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut, const pmsm_measurement *measurement,
+               const pmsm_reference *reference, pmsm_output *output)
+{
+    pmsm_period period = {0};
+    if (state->prepared != 1u) {
+        const uint32_t fresh = (state->prepared == 0u) ? 1u : 0u;
+        pmsm_prepare(state, params);
+        if (fresh != 0u) {
+            state->omega_filtered = measurement->omega_e / state->derived.pole_pairs;
+            state->omega_ref_ramped = state->omega_filtered;
+        }
+    }
+    const pmsm_real advance =
+        (pmsm_real)params->inverter_delay_periods * state->derived.T_s * measurement->omega_e;
+    if (is_usable(measurement, advance) == 0u) {
+        gates_off(state, output, PMSM_C(0.0));
+        return;
+    }
+    period.params = params;
+    period.lut = lut;
+    period.request = reference;
+    period.state = state;
+    transform(&period, measurement, advance);
+    pmsm_update_i2t(&period);
+    state->omega_filtered += state->derived.speed_filter * (period.omega_M - state->omega_filtered);
+    if (reference->mode == PMSM_MODE_OFF) {
+        gates_off(state, output, period.omega_M);
+    } else {
+        if (reference->mode == PMSM_MODE_VOLTAGE) {
+            inject_only(&period, output);
+        } else {
+            control(&period, output);
+        }
+        state->voltage_before = state->voltage_committed;
+        state->voltage_committed.d = output->u_alpha;
+        state->voltage_committed.q = output->u_beta;
+    }
+    state->current_before = period.i;
+    publish(&period, measurement);
+}
