@@ -1,0 +1,302 @@
+"""Read electronic data sheets as they are: any encoding, loose spelling, vendor keys (CiA 306-1).
+
+What is unambiguous is accepted with a warning that names file and line; what cannot be understood is left out of the
+object list with a warning, or refused when nothing usable remains. Nothing raises anything but ``ConfigError``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from pmsmtool.errors import ConfigError
+
+BOOLEAN, INTEGER8, INTEGER16, INTEGER32 = 0x01, 0x02, 0x03, 0x04
+UNSIGNED8, UNSIGNED16, UNSIGNED32, REAL32 = 0x05, 0x06, 0x07, 0x08
+VISIBLE_STRING, OCTET_STRING, UNICODE_STRING, DOMAIN = 0x09, 0x0A, 0x0B, 0x0F
+REAL64, INTEGER64, UNSIGNED64 = 0x11, 0x15, 0x1B
+"""Data type codes (CiA 301, table 44)."""
+
+INTEGER_BITS = {
+    BOOLEAN: 8, INTEGER8: 8, INTEGER16: 16, INTEGER32: 32, INTEGER64: 64,
+    UNSIGNED8: 8, UNSIGNED16: 16, UNSIGNED32: 32, UNSIGNED64: 64,
+}  # fmt: skip
+SIGNED = frozenset({INTEGER8, INTEGER16, INTEGER32, INTEGER64})
+_VAR, _DOMAIN_OBJECT = 0x07, 0x02
+_HAVE_SUBS = frozenset({0x06, 0x08, 0x09})  # DEFSTRUCT, ARRAY, RECORD
+
+_SECTION = re.compile(r"\s*\[([^\]]*)\]?\s*(?:;.*)?$")
+_OBJECT = re.compile(r"([0-9A-Fa-f]{1,4})(?:sub([0-9A-Fa-f]{1,2}))?\Z", re.IGNORECASE)
+_NODE_ID = re.compile(r"\$NODEID", re.IGNORECASE)
+_ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
+COMMISSIONING = ("devicecomissioning", "devicecommissioning")
+"""The standard's own spelling and the right one."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdsObject:
+    """One entry of the dictionary as the file describes it; numbers are None where the file has none."""
+
+    index: int
+    sub: int
+    name: str
+    data_type: int
+    access: str
+    low: int | float | None
+    high: int | float | None
+    default: str
+    value: str
+    line: int
+
+
+@dataclass(frozen=True, slots=True)
+class Eds:
+    """A data sheet: objects by (index, sub), the device's identity as far as stated, and what was odd."""
+
+    objects: dict[tuple[int, int], EdsObject]
+    vendor: int | None
+    product: int | None
+    revision: int | None
+    product_name: str
+    node_id: int | None
+    encoding: str
+    warnings: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class Section:
+    """One section of the text: its name, where it stands, and its keys (lower case) with value and line."""
+
+    name: str
+    line: int
+    entries: dict[str, tuple[str, int]] = field(default_factory=dict)
+
+    def get(self, key: str) -> str:
+        """Return the value of a key, empty when there is none."""
+        return self.entries.get(key, ("", 0))[0]
+
+
+def decode(data: bytes) -> tuple[str, str]:
+    """Return text and the name of the encoding that fits: UTF-8 (with or without mark), cp1252, Latin-1."""
+    for encoding in ("utf-8-sig", "cp1252"):
+        try:
+            return data.decode(encoding), encoding
+        except UnicodeDecodeError:
+            continue
+    return data.decode("latin-1"), "latin-1"
+
+
+def parse_integer(text: str, node_id: int | None = None) -> int:
+    """Return an integer as data sheets write it: decimal, hex, with leading zeros, ``$NODEID+0x600``.
+
+    Raises
+    ------
+    ValueError
+        If it is none of these.
+    """
+    total = 0
+    for part in text.replace(" ", "").replace("\t", "").split("+"):
+        if _NODE_ID.fullmatch(part):
+            if node_id is None:
+                raise ValueError("depends on the node id")
+            total += node_id
+        elif part.lower().startswith(("0x", "-0x")):
+            total += int(part, 16)
+        else:
+            total += int(part.lstrip("0") or "0") if not part.startswith("-") else int(part)
+    return total
+
+
+def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Eds:
+    """Return the data sheet.
+
+    Parameters
+    ----------
+    data : bytes
+        The file's bytes, EDS or DCF.
+    where : str
+        Name for messages.
+    node_id : int, optional
+        Value of ``$NODEID`` where the file does not state one.
+
+    Raises
+    ------
+    ConfigError
+        If the file has no object at all.
+    """
+    text, encoding = decode(data)
+    warnings: list[str] = []
+    sections = _sections(text, where, warnings)
+    info = sections.get("deviceinfo", Section("", 0))
+    stated = next((sections[name].get("nodeid") for name in COMMISSIONING if name in sections), "")
+    node = _number(stated, None, f"{where}: NodeID", warnings)
+    node = node if isinstance(node, int) else node_id
+    objects: dict[tuple[int, int], EdsObject] = {}
+    for section in sections.values():
+        for entry in _objects_of(section, sections, node, where, warnings):
+            objects.setdefault((entry.index, entry.sub), entry)
+    if not objects:
+        raise ConfigError(
+            "no object dictionary entries",
+            where=where,
+            likely="this is not an EDS or DCF file",
+            hint="give the file that the drive's vendor calls EDS or DCF",
+            violations=warnings[:20],
+        )
+
+    def identity(key: str) -> int | None:
+        number = _number(info.get(key), None, f"{where}: [DeviceInfo] {key}", warnings)
+        return number if isinstance(number, int) else None
+
+    return Eds(
+        dict(sorted(objects.items())),
+        identity("vendornumber"),
+        identity("productnumber"),
+        identity("revisionnumber"),
+        info.get("productname"),
+        node,
+        encoding,
+        tuple(warnings),
+    )
+
+
+def sections_of(lines: list[str]) -> Iterator[tuple[int, str]]:
+    """Yield (line index, lower-case section name) of every section header."""
+    for number, line in enumerate(lines):
+        found = _SECTION.match(line) if "[" in line else None
+        if found:
+            yield number, found.group(1).strip().lower()
+
+
+def object_of(section: str) -> tuple[int, int | None] | None:
+    """Return (index, sub) of an object section's name, sub None for the object itself, or None for others."""
+    found = _OBJECT.match(section)
+    if not found:
+        return None
+    return int(found.group(1), 16), None if found.group(2) is None else int(found.group(2), 16)
+
+
+def _sections(text: str, where: str, warnings: list[str]) -> dict[str, Section]:
+    lines = text.splitlines()
+    starts = dict(sections_of(lines))
+    sections: dict[str, Section] = {}
+    current: Section | None = None
+    for number, line in enumerate(lines):
+        if number in starts:
+            name = starts[number]
+            if name in sections:
+                warnings.append(f"{where}:{number + 1}: section [{name}] stands twice, merged")
+            current = sections.setdefault(name, Section(name, number + 1))
+            continue
+        stripped = line.strip()
+        if not stripped or stripped[0] in ";#":
+            continue
+        key, equals, value = stripped.partition("=")
+        if not equals or current is None:
+            warnings.append(f"{where}:{number + 1}: not understood: {stripped[:60]!r}")
+            continue
+        key = key.strip().lower()
+        if key in current.entries and current.entries[key][0] != value.strip():
+            warnings.append(f"{where}:{number + 1}: {key} stands twice in [{current.name}], the last one counts")
+        current.entries[key] = (value.strip(), number + 1)
+    return sections
+
+
+def _objects_of(
+    section: Section, sections: dict[str, Section], node: int | None, where: str, warnings: list[str]
+) -> Iterator[EdsObject]:
+    address = object_of(section.name)
+    if address is None:
+        return
+    index, sub = address
+    place = f"{where}:{section.line}: {index:04X}"
+    kind = _number(section.get("objecttype"), None, f"{place} ObjectType", warnings)
+    if sub is None and kind in _HAVE_SUBS:
+        compact = _number(section.get("compactsubobj"), None, f"{place} CompactSubObj", warnings)
+        if isinstance(compact, int) and compact > 0:
+            yield from _compact(section, index, min(compact, 254), sections, node, place, warnings)
+        return
+    if sub is not None and f"{index:04x}" not in sections and f"{index:x}" not in sections:
+        warnings.append(f"{place}sub{sub:X}: its object has no section, accepted")
+    yield _entry(section, index, sub or 0, section.get("parametername"), kind, node, place, warnings)
+
+
+def _compact(
+    section: Section,
+    index: int,
+    count: int,
+    sections: dict[str, Section],
+    node: int | None,
+    place: str,
+    warnings: list[str],
+) -> Iterator[EdsObject]:
+    """Expand CompactSubObj: sub 0 is the count, subs 1..n share the object's description."""
+    names = sections.get(f"{index:04x}name", Section("", 0))
+    values = sections.get(f"{index:04x}value", Section("", 0))
+    yield EdsObject(index, 0, "number of entries", UNSIGNED8, "ro", None, None, str(count), "", section.line)
+    for sub in range(1, count + 1):
+        name = names.get(str(sub)) or f"{section.get('parametername')}{sub}"
+        entry = _entry(section, index, sub, name, _VAR, node, place, warnings if sub == 1 else [])
+        value = values.get(str(sub))
+        yield EdsObject(
+            index, sub, name, entry.data_type, entry.access, entry.low, entry.high, entry.default, value, section.line
+        )
+
+
+def _entry(
+    section: Section,
+    index: int,
+    sub: int,
+    name: str,
+    kind: int | float | None,
+    node: int | None,
+    place: str,
+    warnings: list[str],
+) -> EdsObject:
+    data_type = _number(section.get("datatype"), None, f"{place} DataType", warnings)
+    if not isinstance(data_type, int):
+        data_type = DOMAIN if kind == _DOMAIN_OBJECT else 0
+        if data_type == 0:
+            warnings.append(f"{place}sub{sub:X}: no DataType")
+    access = section.get("accesstype").lower()
+    if access not in _ACCESS:
+        warnings.append(f"{place}sub{sub:X}: AccessType {access or 'missing'}, taken as ro")
+        access = "ro"
+    limits = []
+    for key in ("lowlimit", "highlimit"):
+        limit = _number(section.get(key), data_type, f"{place}sub{sub:X} {key}", warnings, node)
+        limits.append(limit)
+    return EdsObject(
+        index,
+        sub,
+        name,
+        data_type,
+        access,
+        limits[0],
+        limits[1],
+        section.get("defaultvalue"),
+        section.get("parametervalue"),
+        section.line,
+    )
+
+
+def _number(
+    text: str, data_type: int | None, place: str, warnings: list[str], node: int | None = None
+) -> int | float | None:
+    """Return a number, or None with a warning when it is none; empty is None without one."""
+    if not text:
+        return None
+    try:
+        if data_type in (REAL32, REAL64):
+            return float(text)
+        value = parse_integer(text, node)
+    except ValueError as error:
+        if "node id" not in str(error):
+            warnings.append(f"{place}: {text[:40]!r} is not a number, left out")
+        return None
+    if data_type in SIGNED:
+        bits = INTEGER_BITS[data_type]
+        if value >= 1 << (bits - 1) and value < 1 << bits:  # a negative limit written in hex
+            value -= 1 << bits
+    return value
