@@ -152,7 +152,8 @@ def _arguments(kernel: Kernel, package: Path, output: Path, platform: str, stric
     """Arguments with paths relative to the package, so that no path of the building machine gets into a library."""
     arguments = ["-shared", *COMPILE_FLAGS, *([] if platform == "win32" else ["-fPIC"])]
     if platform == "darwin":
-        arguments += ["-mmacosx-version-min=11.0"]
+        # The library's own name, else the linker writes the path of the scratch folder into it.
+        arguments += ["-mmacosx-version-min=11.0", f"-Wl,-install_name,@rpath/{output.name}"]
     if platform == "linux":
         arguments += ["-Wl,-z,defs"]  # a missing function is an error here, as it is on the other platforms
     arguments += WARNING_FLAGS if strict else []
