@@ -1,0 +1,182 @@
+"""The object dictionary at run time: typed entries with range checks, and hooks of the application behind them."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.sim.node.objects import ObjectRow, object_rows
+
+Sink = Callable[[bytes], bool | None]
+"""Takes the bytes of a write; returns True when the write is confirmed later (slow store)."""
+Source = Callable[[], bytes]
+
+
+class Refused(Exception):
+    """An access the node refuses, with the SDO abort code it answers."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"0x{code:08X}")
+        self.code = code
+
+
+class Entry:
+    """One sub-object of the running node.
+
+    Attributes
+    ----------
+    value : bytes
+        Stored value, little endian, when no ``source`` computes it.
+    source, sink : callables or None
+        The application's hooks for reading and writing.
+    """
+
+    __slots__ = ("code", "high", "low", "nan_allowed", "readable", "row", "sink", "size", "source", "value", "writable")
+
+    def __init__(self, row: ObjectRow, node: int) -> None:
+        self.row = row
+        kind = row.data_type
+        self.size = kind.size
+        self.code = struct.Struct("<" + kind.letter) if kind.letter else None
+        self.low = _as_binary32(row.low) if kind.is_float else row.low
+        self.high = _as_binary32(row.high) if kind.is_float else row.high
+        self.nan_allowed = row.default == "nan"
+        self.readable = row.access != "wo"
+        self.writable = row.access in ("rw", "wo")
+        self.source: Source | None = None
+        self.sink: Sink | None = None
+        self.value = row.default_bytes(node)
+
+    def read(self) -> bytes:
+        """Return the bytes of the value."""
+        return self.value if self.source is None else self.source()
+
+    def number(self) -> float:
+        """Return the value as a number."""
+        if self.code is None:
+            raise TypeError(f"{self.row.key} is not a number")
+        value: float = self.code.unpack(self.read())[0]
+        return value
+
+    def integer(self) -> int:
+        """Return the value of an integer type."""
+        return int(self.number())
+
+    def encode(self, number: float) -> bytes:
+        """Return a number as bytes of this type, cut to the range of the type."""
+        code = self.code
+        if code is None:
+            raise TypeError(f"{self.row.key} is not a number")
+        if code.format == "<f":
+            return code.pack(number)
+        bits = 8 * self.size
+        signed = self.row.type.startswith("I")
+        lowest, highest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+        return code.pack(min(max(round(number), lowest), highest))
+
+    def put(self, number: float) -> None:
+        """Set the stored value."""
+        self.value = self.encode(number)
+
+    def check(self, data: bytes) -> None:
+        """Refuse bytes of a wrong length or outside the bounds.
+
+        Raises
+        ------
+        Refused
+            0x06070012/13 for the length, 0x06090030/31/32 for the value.
+        """
+        size = self.size
+        if size and len(data) != size:
+            raise Refused(AbortCode.TOO_LONG if len(data) > size else AbortCode.TOO_SHORT)
+        code = self.code
+        if code is None:
+            return
+        value = code.unpack(data)[0]
+        if code.format == "<f" and not math.isfinite(value):
+            if not (self.nan_allowed and math.isnan(value)):
+                raise Refused(AbortCode.VALUE)
+            return
+        if self.high is not None and value > self.high:
+            raise Refused(AbortCode.VALUE_HIGH)
+        if self.low is not None and value < self.low:
+            raise Refused(AbortCode.VALUE_LOW)
+
+
+def _as_binary32(bound: float | None) -> float | None:
+    if bound is None:
+        return None
+    rounded: float = struct.unpack("<f", struct.pack("<f", bound))[0]
+    return rounded
+
+
+class Dictionary:
+    """All entries of one node, by object and by key.
+
+    Attributes
+    ----------
+    on_change : callable
+        Called with the entry after a value that can be stored was changed from outside.
+    """
+
+    def __init__(self, node: int) -> None:
+        self._entries = {row.index << 8 | row.sub: Entry(row, node) for row in object_rows()}
+        self._indices = {row.index for row in object_rows()}
+        self.by_key = {entry.row.key: entry for entry in self._entries.values() if entry.row.key}
+        self.on_change: Callable[[Entry], None] = lambda entry: None
+
+    def __iter__(self) -> Iterator[Entry]:
+        return iter(self._entries.values())
+
+    def __getitem__(self, key: str) -> Entry:
+        return self.by_key[key]
+
+    def find(self, index: int, sub: int) -> Entry:
+        """Return an entry.
+
+        Raises
+        ------
+        Refused
+            0x06020000 or 0x06090011.
+        """
+        entry = self._entries.get(index << 8 | sub)
+        if entry is None:
+            raise Refused(AbortCode.NO_SUBINDEX if index in self._indices else AbortCode.NO_OBJECT)
+        return entry
+
+    def readable(self, index: int, sub: int) -> Entry:
+        """Return an entry that can be read, else refuse."""
+        entry = self.find(index, sub)
+        if not entry.readable:
+            raise Refused(AbortCode.WRITE_ONLY)
+        return entry
+
+    def writable(self, index: int, sub: int) -> Entry:
+        """Return an entry that can be written, else refuse."""
+        entry = self.find(index, sub)
+        if not entry.writable:
+            raise Refused(AbortCode.READ_ONLY)
+        return entry
+
+    def write(self, entry: Entry, data: bytes) -> bool:
+        """Write an entry; returns True when the application confirms it later.
+
+        Raises
+        ------
+        Refused
+            Wrong length, out of range, or the application's own reason.
+        """
+        entry.check(data)
+        if entry.sink is not None:
+            before = entry.value
+            pending = bool(entry.sink(data))
+            changed = before != entry.value
+        else:
+            changed = entry.value != data
+            entry.value = bytes(data)
+            pending = False
+        if changed and entry.row.stored:
+            self.on_change(entry)
+        return pending

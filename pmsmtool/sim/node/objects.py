@@ -1,0 +1,180 @@
+"""The rows of the simulated drive's object dictionary: its own table plus the parameter catalogue.
+
+``firmware-params/pmsmsim/objects.csv`` holds everything that is not a parameter; every row of ``params/catalogue.py``
+becomes an object too. Both the running node and its EDS are built from :func:`object_rows`.
+"""
+
+from __future__ import annotations
+
+import csv
+import struct
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, Parameter, layout_signature
+from pmsmtool.resources import data_folder
+
+
+@dataclass(frozen=True, slots=True)
+class DataType:
+    """A CiA 301 data type: index in the dictionary (7.4.7), bytes on the wire (0: any), struct letter."""
+
+    code: int
+    size: int
+    letter: str
+
+    @property
+    def is_float(self) -> bool:
+        """Whether the type is REAL32."""
+        return self.letter == "f"
+
+
+TYPES: Final[dict[str, DataType]] = {
+    "I8": DataType(0x0002, 1, "b"),
+    "I16": DataType(0x0003, 2, "h"),
+    "I32": DataType(0x0004, 4, "i"),
+    "U8": DataType(0x0005, 1, "B"),
+    "U16": DataType(0x0006, 2, "H"),
+    "U32": DataType(0x0007, 4, "I"),
+    "REAL32": DataType(0x0008, 4, "f"),
+    "VSTR": DataType(0x0009, 0, ""),
+    "DOMAIN": DataType(0x000F, 0, ""),
+    "U64": DataType(0x001B, 8, "Q"),
+}
+_WIRE_NAMES = {"UNSIGNED8": "U8", "UNSIGNED16": "U16", "UNSIGNED32": "U32", "REAL32": "REAL32"}
+_COUNTED = {"ARRAY8": "ARRAY", "RECORD8": "RECORD"}
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectRow:
+    """One sub-object, or the heading of a record or array (``container`` set, sub 0).
+
+    ``default`` is text as in an EDS; ``low`` and ``high`` are None where only the type bounds the value. ``stored``
+    says that the value survives a reset when it was saved (the parameter set is stored as one image).
+    """
+
+    index: int
+    sub: int
+    key: str
+    name: str
+    type: str
+    access: str
+    pdo: str
+    unit: str
+    default: str
+    low: float | None
+    high: float | None
+    stored: bool
+    container: str = ""
+    parameter: Parameter | None = None
+
+    @property
+    def data_type(self) -> DataType:
+        """Type of the value."""
+        return TYPES[self.type]
+
+    def default_number(self, node: int) -> float:
+        """Return the default as a number, ``$NODEID`` replaced."""
+        text = self.default.removeprefix("$NODEID+")
+        number = float(text) if self.data_type.is_float else float(int(text or "0", 0))
+        return number + (node if text != self.default else 0)
+
+    def default_bytes(self, node: int) -> bytes:
+        """Return the default as it travels, little endian."""
+        kind = self.data_type
+        if not kind.letter:
+            return self.default.encode("ascii")
+        number = self.default_number(node)
+        return struct.pack("<" + kind.letter, number if kind.is_float else int(number))
+
+
+def _bound(text: str) -> float | None:
+    return float(int(text, 16)) if text.startswith("0x") else float(text) if text else None
+
+
+def _csv_row(fields: dict[str, str]) -> ObjectRow:
+    kind = fields["type"]
+    container = _COUNTED.get(kind, kind if kind in ("ARRAY", "RECORD") else "")
+    default = fields["default"].replace("$SCHEMA", str(SCHEMA_VERSION))
+    return ObjectRow(
+        index=int(fields["index"], 16),
+        sub=int(fields["sub"], 16),
+        key=fields["key"],
+        name=fields["name"],
+        type="U8" if container else kind,
+        access=fields["access"] or "const",
+        pdo=fields["pdo"] or "0",
+        unit=fields["unit"],
+        default=default.replace("$SIGNATURE", f"0x{layout_signature():08X}"),
+        low=_bound(fields["low"]),
+        high=_bound(fields["high"]),
+        stored=fields["store"] == "y",
+        container=container,
+    )
+
+
+def _parameter_row(parameter: Parameter) -> ObjectRow:
+    default = f"{int(parameter.default)}" if parameter.is_integer else f"{parameter.default:.9g}"
+    return ObjectRow(
+        index=parameter.index,
+        sub=parameter.sub,
+        key=parameter.name,
+        name=parameter.meaning[0].upper() + parameter.meaning[1:],
+        type=_WIRE_NAMES[parameter.wire],
+        access="rw",
+        pdo="R" if parameter.live else "0",
+        unit=parameter.unit,
+        default=default,
+        low=parameter.minimum,
+        high=parameter.maximum,
+        stored=False,
+        parameter=parameter,
+    )
+
+
+def _counts(rows: list[ObjectRow]) -> dict[int, int]:
+    highest: dict[int, int] = {}
+    for row in rows:
+        highest[row.index] = max(highest.get(row.index, 0), row.sub)
+    return highest
+
+
+@cache
+def object_rows() -> tuple[ObjectRow, ...]:
+    """Return all rows sorted by index and sub-index; constant sub 0 of containers filled with the highest sub."""
+    path = data_folder("firmware-params") / "pmsmsim" / "objects.csv"
+    return build_rows(path)
+
+
+def build_rows(path: Path) -> tuple[ObjectRow, ...]:
+    """Return the rows of a table file and of the catalogue.
+
+    Raises
+    ------
+    ValueError
+        Two rows name the same object, or one misses its container.
+    """
+    with path.open(encoding="ascii", newline="") as file:
+        rows = [_csv_row(fields) for fields in csv.DictReader(file)]
+    rows += [_parameter_row(parameter) for parameter in CATALOGUE]
+    highest = _counts(rows)
+    filled: dict[tuple[int, int], ObjectRow] = {}
+    for row in rows:
+        if (row.index, row.sub) in filled:
+            raise ValueError(f"{path}: object 0x{row.index:04X}:{row.sub:02X} appears twice")
+        if row.container and row.access == "const":
+            row = _with_default(row, highest[row.index])
+        filled[row.index, row.sub] = row
+    for index, sub in filled:
+        if (index, 0) not in filled:
+            raise ValueError(f"{path}: object 0x{index:04X}:{sub:02X} has no sub-index 0")
+    return tuple(filled[key] for key in sorted(filled))
+
+
+def _with_default(row: ObjectRow, highest: int) -> ObjectRow:
+    return ObjectRow(
+        row.index, row.sub, row.key, row.name, row.type, row.access, row.pdo, row.unit,
+        str(highest), row.low, row.high, row.stored, row.container,
+    )  # fmt: skip
