@@ -141,8 +141,10 @@ def axis_loop(gains: CurrentGains, plant: AxisPlant, model: AxisPlant | None = N
     if model is None:
         control_num, control_den = np.array([K_p, K_i_T - K_p]), np.array([1.0, -1.0])
     else:
-        # u = K_p (v - i^) + x with i^ = a i + b u(k-1), Euler as in the core; the integrator keeps the measured error.
-        a, b = 1.0 - plant.T_s * model.R / model.L, plant.T_s / model.L
+        # u = K_p (v - i^) + x with i^ = a i + b u(k-1), the drop at the mean current as in the core; the
+        # integrator keeps the measured error.
+        drop = 0.5 * plant.T_s * model.R
+        a, b = (model.L - drop) / (model.L + drop), plant.T_s / (model.L + drop)
         control_num = np.polymul([K_p * a, K_i_T - K_p * a], [1.0, 0.0])
         control_den = np.polymul([1.0, -1.0], [1.0, K_p * b])
     return SampledLoop(

@@ -1,6 +1,6 @@
 """Speed controller: PI gains from the inertia and the sum of the small time constants, and the exact sampled loop.
 
-The path runs at the control period (current loop, speed estimate), the controller every ``decimation`` periods with
+The path runs at the control period (current loop, speed estimate, filter), the controller every ``decimation`` periods with
 its torque held between: the loop is lifted to the controller's period exactly, so the margins contain the multirate
 hold, the current loop's own delay, the speed estimate and the feedback filter.
 
@@ -25,7 +25,7 @@ System = tuple[Array, Array, Array, float]
 """A, b, c, d of a single-input single-output system, x(k+1) = A x + b u, y = c x + d u."""
 
 PLL_DAMPING = 1.0
-"""Damping of the drive's speed estimate, whose natural frequency is ``encoder.pll_bandwidth_rad_s``."""
+"""Damping of the drive's speed estimate, a double pole at ``encoder.pll_bandwidth_rad_s``."""
 
 
 class SpeedMethod(StrEnum):
@@ -81,7 +81,7 @@ class SpeedPath:
     pll_rad_s : float
         Natural frequency of the speed estimate (rad/s).
     filter_hz : float
-        Cut-off of the first-order feedback filter (Hz), updated at the controller's period.
+        Cut-off of the first-order feedback filter (Hz).
     notch : Notch
         Notch on the torque.
     """
@@ -150,11 +150,10 @@ def pole_placement(J: float, B: float, omega_n: float, zeta: float) -> SpeedGain
 def speed_loop(gains: SpeedGains, path: SpeedPath) -> SampledLoop:
     """Return the loop at the controller's period, broken at the torque."""
     T = path.T_speed
-    lifted = _lift(_series(_torque_path(path.current), _mechanics(path), _speed_estimate(path)), path.decimation)
-    num, den = _rational(lifted)
+    parts = (_torque_path(path.current), _mechanics(path), _speed_estimate(path), _feedback_filter(path))
+    num, den = _rational(_lift(_series(*parts), path.decimation))
     for factor_num, factor_den in (
         ((gains.K_p, gains.K_i * T - gains.K_p), (1.0, -1.0)),
-        _feedback_filter(path.filter_hz, T),
         notch_coefficients(path.notch, T),
     ):
         num, den = _product(num, factor_num), _product(den, factor_den)
@@ -178,11 +177,6 @@ def notch_coefficients(notch: Notch, T: float) -> tuple[tuple[float, ...], tuple
     return num, den
 
 
-def _feedback_filter(cutoff_hz: float, T: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    a = -math.expm1(-2.0 * math.pi * cutoff_hz * T)
-    return (a, 0.0), (1.0, a - 1.0)
-
-
 def _torque_path(current: SampledLoop) -> System:
     """Closed current loop, reference to current, from the loop transfer function: L / (1 + L)."""
     return _companion(np.asarray(current.num), np.asarray(np.polyadd(current.den, current.num), dtype=np.float64))
@@ -198,15 +192,23 @@ def _mechanics(path: SpeedPath) -> System:
 
 
 def _speed_estimate(path: SpeedPath) -> System:
-    """Phase-locked loop on the position: e = th - th^, th^ += T (w^ + 2 zeta w_n e), w^ += T w_n^2 e; output w^.
+    """Tracking filter on the sampled position with a double pole at z0 = exp(-w_n T); output w^ after its update.
 
-    The position rises by the mean speed of the period; with e' = e - T w / 2 as state that needs no speed ahead.
+    e = th - (th^ + T w^), th^ += T w^ + (1 - z0^2) e, w^ += (1 - z0)^2 / T e. The position rises over a period by the
+    mean of the speeds at its ends; the part of the later one is moved from the state (th - th^, w^) to the output.
     """
-    T, w_n = path.current.T_s, path.pll_rad_s
-    k_p, k_i = 2.0 * PLL_DAMPING * w_n, w_n * w_n
-    A = np.array([[1.0 - k_p * T, -T], [k_i * T, 1.0]])
-    b = np.array([0.5 * T * (2.0 - k_p * T), 0.5 * k_i * T * T])
-    return A, b, np.array([0.0, 1.0]), 0.0
+    T = path.current.T_s
+    z0 = math.exp(-path.pll_rad_s * T)
+    keep, gain = z0 * z0, (1.0 - z0) ** 2 / T
+    A = np.array([[keep, -T * keep], [gain, 1.0 - T * gain]])
+    half_step = 0.5 * T * np.array([keep, gain])
+    return A, A @ half_step + half_step, np.array([0.0, 1.0]), float(half_step[1])
+
+
+def _feedback_filter(path: SpeedPath) -> System:
+    x = 2.0 * math.pi * path.filter_hz * path.current.T_s
+    share = x / (1.0 + x)
+    return _companion(np.array([share, 0.0]), np.array([1.0, share - 1.0]))
 
 
 def _companion(num: Array, den: Array) -> System:
