@@ -104,3 +104,31 @@ def _write_table(lines: list[str], path: tuple[str, ...], table: Mapping[str, An
             for item in value:
                 lines.extend(["", f"[[{header}]]"])
                 _write_table(lines, below, item)
+
+
+_HEADER = re.compile(r"\s*\[{1,2}\s*([^\[\]#]+?)\s*\]{1,2}\s*(?:#.*)?")
+_ASSIGNMENT = re.compile(
+    r"""\s*((?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*'))*)\s*="""
+)
+_PART = re.compile(r"""[A-Za-z0-9_-]+|"[^"]*"|'[^']*'""")
+
+
+def toml_lines(text: str) -> dict[tuple[str, ...], int]:
+    """Return the line of each table header and key of a TOML text, for messages about them.
+
+    Keys are paths (``("machine", "R_s_ohm")``). A line-by-line reading that ``tomllib`` does not offer: a line inside a
+    multi-line text that looks like a key may be listed too.
+    """
+    lines: dict[tuple[str, ...], int] = {}
+    table: tuple[str, ...] = ()
+    for number, line in enumerate(text.splitlines(), start=1):
+        if header := _HEADER.fullmatch(line):
+            table = _path(header[1])
+            lines.setdefault(table, number)
+        elif assignment := _ASSIGNMENT.match(line):
+            lines.setdefault((*table, *_path(assignment[1])), number)
+    return lines
+
+
+def _path(dotted: str) -> tuple[str, ...]:
+    return tuple(part.strip("\"'") for part in _PART.findall(dotted))

@@ -100,13 +100,22 @@ class MachineParameters:
 
 @dataclass(frozen=True, slots=True)
 class InverterParameters:
-    """Inverter and timing (``[inverter]`` of a machine file)."""
+    """Inverter and timing (``[inverter]`` of a machine file).
+
+    ``voltage_error_i_apk`` and ``voltage_error_v`` are the identified voltage error of one phase over its current
+    (increasing currents, odd in the current where only positive ones are given); ``V_dead_v`` and ``i_knee_apk``
+    are its plateau and knee, what the drive's own compensation takes.
+    """
 
     U_dc_v: float
     f_s_hz: float
     dead_time_s: float = 0.0
     delay_periods: float = 1.5
     voltage_utilisation: float = 1.0 / math.sqrt(3.0)
+    V_dead_v: float | None = None
+    i_knee_apk: float | None = None
+    voltage_error_i_apk: tuple[float, ...] = ()
+    voltage_error_v: tuple[float, ...] = ()
 
     @property
     def T_s(self) -> float:
@@ -117,3 +126,27 @@ class InverterParameters:
     def V_max_v(self) -> float:
         """Largest phase voltage amplitude in use (V peak)."""
         return self.voltage_utilisation * self.U_dc_v
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderParameters:
+    """Encoder (``[encoder]`` of a machine file): theta_e = direction p theta_M - offset."""
+
+    offset_rad: float = 0.0
+    direction: int = 1
+    bits: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MachineLimits:
+    """What must not be exceeded (``[limits]`` of a machine file); None: no limit is known."""
+
+    i_d_min_apk: float | None = None
+    i_trip_apk: float | None = None
+    I_cont_apk: float | None = None
+    U_dc_min_v: float | None = None
+    U_dc_max_v: float | None = None
+    n_trip_rpm: float | None = None
+    tau_max_nm: float | None = None
+    T_winding_max_c: float | None = None
+    T_magnet_max_c: float | None = None

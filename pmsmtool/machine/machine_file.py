@@ -1,0 +1,246 @@
+"""The machine file: one TOML text that holds what is known of a machine, its inverter and their doubt.
+
+``parse_machine`` lists everything that is wrong at once; ``dump_machine_file`` writes the same file, same bytes. A
+design file embeds the same tables (``machine_tables``, ``machine_from_tables``).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.machine.flux_map import FluxMap
+from pmsmtool.machine.flux_map_table import flux_map_table
+from pmsmtool.machine.key import Value
+from pmsmtool.machine.machine_keys import MEASURABLE
+from pmsmtool.machine.machine_reader import MachineReader
+from pmsmtool.machine.parameters import (
+    EncoderParameters,
+    Estimate,
+    InverterParameters,
+    MachineLimits,
+    MachineParameters,
+)
+from pmsmtool.machine.simulation_keys import SIMULATION_KEYS, resolved_simulation
+from pmsmtool.toml_text import toml_lines, toml_text
+
+SCHEMA = "pmsmtool.machine/1"
+
+_HASHED: tuple[str, ...] = ("machine", "inverter", "std", "systematic", "encoder", "limits")
+
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class MachineFile:
+    """What a machine file says.
+
+    Attributes
+    ----------
+    name : str
+        Name of machine and drive together.
+    machine, inverter, encoder, limits
+        The parameters, as numbers.
+    std, systematic : mapping of str to float
+        Standard deviation and 95 % systematic part of keys of machine, inverter and encoder, in their unit.
+    estimates : mapping of str to Estimate
+        What ``identify`` left, by key; a key may carry a bias label after an underscore (``L_q_h_at_rated``).
+    conditions, provenance : mapping
+        Records: free keys, plain values.
+    simulation : mapping of str to float, int, bool or str
+        ``[simulation]`` as given; :meth:`simulation_settings` fills in the defaults.
+    flux_map : FluxMap or None
+        The saturated machine; ``machine.flux_map`` is its file, None when it is embedded.
+    """
+
+    name: str
+    machine: MachineParameters
+    inverter: InverterParameters
+    std: Mapping[str, float] = field(default_factory=dict)
+    systematic: Mapping[str, float] = field(default_factory=dict)
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    encoder: EncoderParameters = field(default_factory=EncoderParameters)
+    limits: MachineLimits = field(default_factory=MachineLimits)
+    conditions: Record = field(default_factory=dict)
+    provenance: Record = field(default_factory=dict)
+    simulation: Mapping[str, Value] = field(default_factory=dict)
+    flux_map: FluxMap | None = None
+
+    def simulation_settings(self) -> dict[str, Value]:
+        """Return every ``[simulation]`` key with the value that holds, defaults and fall-backs filled in."""
+        tables = {name: _plain(getattr(self, name)) for name in ("machine", "inverter", "encoder")}
+        return resolved_simulation(dict(self.simulation), tables)
+
+    def content_hash(self) -> str:
+        """Return the SHA-256 of what decides a design: parameters, deviations, encoder, limits and flux map.
+
+        Name, estimates, conditions, provenance and ``[simulation]`` do not enter, nor where the map lies.
+        """
+        tables = machine_tables(self)
+        kept = {name: tables[name] for name in _HASHED if name in tables}
+        kept["machine"] = {key: value for key, value in kept["machine"].items() if key != "flux_map"}
+        text = toml_text(kept) + (self.flux_map.content_hash() if self.flux_map else "")
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def load_machine_file(path: Path) -> MachineFile:
+    """Read a machine file and the flux map it names.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or everything that is wrong in it.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError("no such file", where=str(path), hint="`pmsmtool sim list` names the profiles") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read as text: {error}", where=str(path)) from None
+    return parse_machine(text, where=str(path), folder=Path(path).parent)
+
+
+def parse_machine(text: str, *, where: str = "machine file", folder: Path | None = None) -> MachineFile:
+    """Parse the text of a machine file.
+
+    Parameters
+    ----------
+    text : str
+        TOML.
+    where : str
+        Named in errors.
+    folder : Path or None
+        Where relative file names start; None refuses files beside the text.
+
+    Raises
+    ------
+    ConfigError
+        Not TOML, another schema, or a list of all violations.
+    """
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"is not TOML: {error}", where=where, likely="a missing quote or bracket") from None
+    schema = tables.pop("schema", None)
+    if schema != SCHEMA:
+        found = "has no schema" if schema is None else f"has the schema {schema!r}"
+        raise ConfigError(found, where=where, hint=f'a machine file starts with schema = "{SCHEMA}"')
+    return machine_from_tables(tables, where=where, folder=folder, lines=toml_lines(text))
+
+
+def machine_from_tables(
+    tables: Record,
+    *,
+    where: str = "machine",
+    folder: Path | None = None,
+    lines: Mapping[tuple[str, ...], int] | None = None,
+    path: tuple[str, ...] = (),
+) -> MachineFile:
+    """Build a machine from tables as in a machine file, without its schema.
+
+    Parameters
+    ----------
+    tables : mapping
+        ``name`` and the tables.
+    where, folder
+        As in :func:`parse_machine`.
+    lines : mapping, optional
+        Line of each key (``toml_text.toml_lines``).
+    path : tuple of str
+        Tables these tables stand in, for a file that embeds a machine.
+
+    Raises
+    ------
+    ConfigError
+        With all violations.
+    """
+    reader = MachineReader(tables, where, dict(lines or {}), path)
+    parts = reader.read(folder)
+    if reader.violations:
+        count = len(reader.violations)
+        what = "1 thing is wrong in this machine" if count == 1 else f"{count} things are wrong in this machine"
+        raise ConfigError(what, where=where, violations=reader.violations)
+    return MachineFile(
+        name=parts["name"],
+        machine=MachineParameters(**parts["machine"]),
+        inverter=InverterParameters(**parts["inverter"]),
+        std=parts["std"],
+        systematic=parts["systematic"],
+        estimates=parts["estimate"],
+        encoder=EncoderParameters(**parts["encoder"]),
+        limits=MachineLimits(**parts["limits"]),
+        conditions=parts["conditions"],
+        provenance=parts["provenance"],
+        simulation=parts["simulation"],
+        flux_map=parts["flux_map"],
+    )
+
+
+def _plain(values: Any) -> dict[str, Any]:
+    """Fields of a dataclass that hold a value, in their order."""
+    pairs = ((item.name, getattr(values, item.name)) for item in fields(values))
+    return {name: value for name, value in pairs if value is not None and value != ()}
+
+
+def _estimate_table(estimate: Estimate) -> dict[str, Any]:
+    pairs = _plain(estimate).items()
+    return {
+        name: value
+        for name, value in pairs
+        if value != "" and not (isinstance(value, float) and not math.isfinite(value))
+    }
+
+
+def machine_tables(machine_file: MachineFile, *, embed_flux_map: bool = False) -> dict[str, Any]:
+    """Return the tables of a machine file, without its schema.
+
+    Parameters
+    ----------
+    machine_file : MachineFile
+        The machine.
+    embed_flux_map : bool
+        Put the flux map itself in instead of the name of its file, so that the tables are complete alone.
+    """
+    machine = _plain(machine_file.machine)
+    embed = machine_file.flux_map is not None and (embed_flux_map or "flux_map" not in machine)
+    if embed:
+        machine.pop("flux_map", None)
+    tables: dict[str, Any] = {
+        "name": machine_file.name,
+        "machine": machine,
+        "inverter": _plain(machine_file.inverter),
+        "std": _in_order(machine_file.std),
+        "systematic": _in_order(machine_file.systematic),
+        "encoder": _plain(machine_file.encoder),
+        "limits": _plain(machine_file.limits),
+        "estimate": {name: _estimate_table(e) for name, e in sorted(machine_file.estimates.items())},
+        "conditions": dict(sorted(machine_file.conditions.items())),
+        "provenance": dict(sorted(machine_file.provenance.items())),
+        "simulation": {
+            key.name: machine_file.simulation[key.name]
+            for key in SIMULATION_KEYS
+            if key.name in machine_file.simulation
+        },
+    }
+    if embed and machine_file.flux_map is not None:
+        tables["flux_map"] = flux_map_table(machine_file.flux_map)
+    return {name: value for name, value in tables.items() if value != {}}
+
+
+def _in_order(values: Mapping[str, float]) -> dict[str, float]:
+    return {name: float(values[name]) for name in MEASURABLE if name in values}
+
+
+def dump_machine_file(machine_file: MachineFile, *, embed_flux_map: bool = False, comment: str = "") -> str:
+    """Return the machine file's text: same machine, same bytes, and ``parse_machine`` gives it back.
+
+    A map that has no file of its own is always embedded.
+    """
+    tables = {"schema": SCHEMA, **machine_tables(machine_file, embed_flux_map=embed_flux_map)}
+    return toml_text(tables, comment=comment)

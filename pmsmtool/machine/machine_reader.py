@@ -1,0 +1,179 @@
+"""Reading the tables of a machine file: everything that is wrong is found in one pass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.machine.flux_map import FluxMap
+from pmsmtool.machine.flux_map_import import load_flux_map
+from pmsmtool.machine.flux_map_table import flux_map_from_table
+from pmsmtool.machine.key import Key, check_table, did_you_mean
+from pmsmtool.machine.machine_keys import (
+    ENCODER_KEYS,
+    ESTIMATE_KEYS,
+    INVERTER_KEYS,
+    LIMIT_KEYS,
+    MACHINE_KEYS,
+    MEASURABLE,
+    deviation_keys,
+)
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
+from pmsmtool.units import UNITS
+
+Record = Mapping[str, Any]
+
+TABLES: dict[str, tuple[Key, ...]] = {
+    "machine": MACHINE_KEYS,
+    "inverter": INVERTER_KEYS,
+    "std": deviation_keys("std"),
+    "systematic": deviation_keys("systematic"),
+    "encoder": ENCODER_KEYS,
+    "limits": LIMIT_KEYS,
+    "simulation": SIMULATION_KEYS,
+}
+OTHER_TABLES = ("estimate", "conditions", "provenance", "flux_map")
+ELSEWHERE = {key.name: table for table in ("limits", "encoder", "inverter", "machine") for key in TABLES[table]}
+
+
+class MachineReader:
+    """One reading of tables: collects values and, in ``violations``, everything that is wrong."""
+
+    def __init__(self, tables: Record, where: str, lines: dict[tuple[str, ...], int], path: tuple[str, ...]) -> None:
+        self.tables, self.where, self.lines, self.path = tables, where, lines, path
+        self.violations: list[str] = []
+
+    def place(self, *names: str) -> str:
+        """``file:line: [table] key``."""
+        full = (*self.path, *names)
+        line = next((self.lines[full[:n]] for n in range(len(full), 0, -1) if full[:n] in self.lines), None)
+        start = self.where if line is None else f"{self.where}:{line}"
+        table = f"[{'.'.join(full[:-1])}] " if len(full) > 1 else ""
+        return f"{start}: {table}{full[-1]}" if full else start
+
+    def places(self, table: Record, *names: str) -> dict[str, str]:
+        """Place of each key of a table, and of the table itself."""
+        header = self.place(*names)
+        return {"": header, **{name: self.place(*names, name) for name in table}}
+
+    def table(self, name: str, keys: tuple[Key, ...]) -> dict[str, Any]:
+        """Checked values of one table."""
+        raw = self.tables.get(name, {})
+        if not isinstance(raw, Mapping):
+            self.violations.append(f"{self.place(name)} is not a table")
+            return {}
+        elsewhere = {key: table for key, table in ELSEWHERE.items() if table != name}
+        return dict(check_table(raw, keys, self.places(raw, name), self.violations, elsewhere))
+
+    def read(self, folder: Path | None) -> dict[str, Any]:
+        """Return the checked parts; they make a machine only if ``violations`` is empty."""
+        self.names()
+        parts: dict[str, Any] = {"name": self.tables.get("name", "")}
+        parts.update({name: self.table(name, keys) for name, keys in TABLES.items()})
+        parts["estimate"] = self.estimates()
+        parts["conditions"], parts["provenance"] = self.record("conditions"), self.record("provenance")
+        parts["flux_map"] = self.flux_map(parts["machine"].get("flux_map"), folder)
+        self.iron_loss_map(parts["machine"].get("iron_loss_map"), folder)
+        self.consistency(parts)
+        return parts
+
+    def names(self) -> None:
+        """Title and tables at the top."""
+        known = ["name", *TABLES, *OTHER_TABLES]
+        for name in self.tables:
+            if name not in known:
+                advice = did_you_mean(name, known)
+                if name in ELSEWHERE:
+                    advice = f"; it belongs to [{ELSEWHERE[name]}]"
+                self.violations.append(f"{self.place(name)}: unknown key or table{advice}")
+        title = self.tables.get("name", "")
+        if not isinstance(title, str) or not title:
+            self.violations.append(f"{self.place('name')} is missing or not text")
+
+    def record(self, name: str) -> dict[str, Any]:
+        """A table of free keys with plain values."""
+        raw = self.tables.get(name, {})
+        if not isinstance(raw, Mapping):
+            self.violations.append(f"{self.place(name)} is not a table")
+            return {}
+        for key, value in raw.items():
+            items = value if isinstance(value, list | tuple) else [value]
+            if any(not isinstance(item, str | bool | int | float) for item in items):
+                self.violations.append(f"{self.place(name, key)} is neither text nor number nor an array of them")
+        return dict(raw)
+
+    def estimates(self) -> dict[str, Estimate]:
+        """``[estimate.<key>]``."""
+        raw = self.tables.get("estimate", {})
+        found: dict[str, Estimate] = {}
+        if not isinstance(raw, Mapping):
+            self.violations.append(f"{self.place('estimate')} is not a table")
+            return found
+        for name, table in raw.items():
+            key = next((MEASURABLE[k] for k in MEASURABLE if name == k or name.startswith(f"{k}_")), None)
+            if key is None or not isinstance(table, Mapping):
+                advice = did_you_mean(name, list(MEASURABLE)) if key is None else ", or not a table"
+                self.violations.append(f"{self.place('estimate', name)}: no key of the machine{advice}")
+                continue
+            before = len(self.violations)
+            places = self.places(table, "estimate", name)
+            values: dict[str, Any] = dict(check_table(table, ESTIMATE_KEYS, places, self.violations, {}))
+            unit = values.setdefault("unit", key.unit)
+            if unit not in UNITS or UNITS[unit].dimension != UNITS[key.unit].dimension:
+                self.violations.append(f"{self.place('estimate', name, 'unit')} = {unit!r} is not {key.unit!r}")
+            if len(self.violations) == before:
+                found[name] = Estimate(**{"std": math.nan, "systematic": 0.0, **values})
+        return found
+
+    def flux_map(self, file: str | None, folder: Path | None) -> FluxMap | None:
+        """The map of ``machine.flux_map`` or of the table ``[flux_map]``."""
+        table = self.tables.get("flux_map")
+        try:
+            if table is not None and file is not None:
+                raise ConfigError("is embedded and also named as a file in [machine]; keep one")
+            if table is not None:
+                return flux_map_from_table(table)
+            if file is None:
+                return None
+            if folder is None:
+                raise ConfigError("names a file, but these tables have no folder; embed the map")
+            return load_flux_map(folder / file)
+        except ConfigError as error:
+            place = self.place("flux_map") if table is not None else self.place("machine", "flux_map")
+            reason = f"{place}: {f'{error.where}: ' if error.where else ''}{error.what}"
+            self.violations.append("; ".join([reason, *error.violations]))
+            return None
+
+    def iron_loss_map(self, file: str | None, folder: Path | None) -> None:
+        """``machine.iron_loss_map``: only that the file is there."""
+        if file is not None and folder is not None and not (folder / file).is_file():
+            self.violations.append(f"{self.place('machine', 'iron_loss_map')}: no such file: {folder / file}")
+
+    def consistency(self, values: Mapping[str, dict[str, Any]]) -> None:
+        """Relations between keys."""
+
+        def ordered(table: str, low: str, high: str) -> None:
+            small, large = values[table].get(low), values[table].get(high)
+            if small is not None and large is not None and small > large:
+                self.violations.append(f"{self.place(table, low)} = {small:g} is above {high} = {large:g}")
+
+        ordered("machine", "I_nom_apk", "I_max_apk")
+        ordered("machine", "n_nom_rpm", "n_max_rpm")
+        ordered("machine", "R_winding_ohm", "R_s_ohm")
+        ordered("limits", "U_dc_min_v", "U_dc_max_v")
+        if values["encoder"].get("direction") == 0:
+            self.violations.append(f"{self.place('encoder', 'direction')} = 0, allowed are 1 and -1")
+        currents = values["inverter"].get("voltage_error_i_apk", ())
+        errors = values["inverter"].get("voltage_error_v", ())
+        if len(currents) != len(errors) or len(currents) == 1:
+            self.violations.append(
+                f"{self.place('inverter', 'voltage_error_v')} has {len(errors)} values for {len(currents)} currents "
+                "(two or more of each, or none)"
+            )
+        elif any(b <= a for a, b in pairwise(currents)):
+            self.violations.append(f"{self.place('inverter', 'voltage_error_i_apk')} does not increase")

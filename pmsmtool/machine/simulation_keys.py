@@ -1,0 +1,137 @@
+"""Keys of ``[simulation]``: what only the simulated drive may know. Design commands validate them and look away.
+
+The truth the drive is simulated with: sensor errors, inverter details, temperatures, load, faults. A key
+whose default is another key (``[machine] R_s_ohm``) lets the truth differ from what the file tells the design.
+"""
+
+from __future__ import annotations
+
+import math
+
+from pmsmtool.machine.key import Key, Value
+
+_TABLE = "simulation"
+_PI2 = 2.0 * math.pi
+
+
+def _number(
+    name: str, unit: str, low: float, high: float, default: float | None, meaning: str, falls_back: str = ""
+) -> Key:
+    return Key(_TABLE, name, "float", unit, low, high, default, meaning, falls_back=falls_back)
+
+
+def _whole(name: str, low: float, high: float, default: int | None, meaning: str, falls_back: str = "") -> Key:
+    return Key(_TABLE, name, "int", "1", low, high, default, meaning, falls_back=falls_back)
+
+
+def _choice(name: str, choices: tuple[str, ...], default: str, meaning: str) -> Key:
+    return Key(_TABLE, name, "text", "", -math.inf, math.inf, default, meaning, choices=choices)
+
+
+def _flag(name: str, meaning: str) -> Key:
+    return Key(_TABLE, name, "bool", "", 0, 1, False, meaning)
+
+
+SIMULATION_KEYS: tuple[Key, ...] = (
+    # the inverter
+    _choice("inverter_model", ("averaged", "switched"), "averaged", "one voltage per period, or every edge"),
+    _choice(
+        "deadtime_shape",
+        ("none", "sign", "atan", "tanh", "capacitive"),
+        "tanh",
+        "voltage error over current of the averaged model",
+    ),
+    _number("dead_time_s", "s", 0, 2e-5, None, "dead time per edge", "[inverter] dead_time_s"),
+    _number("i_knee_apk", "A", 1e-4, 1e4, 0.5, "current at which the averaged error reaches its plateau"),
+    _number("device_drop_v", "V", 0, 10, 0.0, "threshold of a switch"),
+    _number("device_slope_ohm", "ohm", 0, 10, 0.0, "slope resistance of a switch"),
+    _number("diode_drop_v", "V", 0, 10, 0.0, "threshold of a diode"),
+    _number("diode_slope_ohm", "ohm", 0, 10, 0.0, "slope resistance of a diode"),
+    _number("output_capacitance_f", "F", 0, 1e-6, 0.0, "capacitance of a leg's output node"),
+    _number("minimum_pulse_s", "s", 0, 1e-4, 0.0, "pulses shorter than this are not made"),
+    _number("leg_mismatch_s", "s", -1e-5, 1e-5, 0.0, "dead time of leg a more, of leg b less than nominal"),
+    _choice("compensation", ("off", "right", "wrong"), "off", "the drive's own dead-time compensation"),
+    _choice("recorded_voltage", ("before", "after"), "before", "recorded voltage: before or after compensation"),
+    _number("U_dc_v", "V", 0, 2000, None, "actual DC-link voltage", "[inverter] U_dc_v"),
+    _number("U_dc_ripple_v", "V", 0, 500, 0.0, "amplitude of the DC-link ripple"),
+    _number("U_dc_ripple_hz", "Hz", 0, 1e5, 300.0, "frequency of the DC-link ripple"),
+    # the sensors
+    _number("sensor_gain_a", "1", 0.5, 2, 1.0, "gain of the current sensor of phase a"),
+    _number("sensor_gain_b", "1", 0.5, 2, 1.0, "gain of the current sensor of phase b"),
+    _number("sensor_gain_c", "1", 0.5, 2, 1.0, "gain of the current sensor of phase c"),
+    _number("sensor_offset_a_apk", "A", -1e3, 1e3, 0.0, "offset of the current sensor of phase a"),
+    _number("sensor_offset_b_apk", "A", -1e3, 1e3, 0.0, "offset of the current sensor of phase b"),
+    _number("sensor_offset_c_apk", "A", -1e3, 1e3, 0.0, "offset of the current sensor of phase c"),
+    _number("sensor_lag_s", "s", 0, 1e-3, 0.0, "time constant of the current sensors"),
+    _number("sensor_noise_apk", "A", 0, 100, 0.0, "standard deviation of a phase current sample"),
+    _whole("adc_bits", 0, 24, 12, "resolution of the current ADC, 0 none"),
+    _number("adc_full_scale_apk", "A", 1e-3, 1e5, None, "current at full scale of the ADC; default 1.5 I_max"),
+    _number("sampling_shift_s", "s", -1e-4, 1e-4, 0.0, "sampling instant after the PWM centre"),
+    _number("U_dc_gain", "1", 0.5, 2, 1.0, "gain of the DC-link measurement"),
+    _whole("encoder_bits", 0, 32, 17, "resolution of the encoder per turn, 0 none"),
+    _number("encoder_offset_rad", "rad", -_PI2, _PI2, None, "true electrical offset", "[encoder] offset_rad"),
+    _flag("encoder_reversed", "the encoder counts against the phase order"),
+    # temperatures
+    _number("T_winding_c", "degC", -60, 300, 20.0, "winding temperature at the start"),
+    _number("T_magnet_c", "degC", -60, 300, 20.0, "magnet temperature"),
+    _number("T_ambient_c", "degC", -60, 150, 20.0, "temperature the machine cools to"),
+    _flag("thermal_on", "the winding heats by its copper loss"),
+    _number("thermal_capacity_j_per_k", "J/K", 1e-3, 1e7, 1000.0, "heat capacity of the winding"),
+    _number("thermal_resistance_k_per_w", "K/W", 1e-4, 1e4, 0.5, "winding to ambient"),
+    _number("T_sensor_lag_s", "s", 0, 1e4, 0.0, "time constant of the temperature sensor"),
+    # the shaft
+    _number("J_kgm2", "kg m2", 1e-9, 1e4, None, "inertia of rotor and what is rigid with it", "[machine] J_kgm2"),
+    _number("B_nms", "N m s", 0, 1e4, None, "viscous friction", "[machine] B_nms"),
+    _number("tau_c_nm", "N m", 0, 1e5, None, "Coulomb friction torque", "[machine] tau_c_nm"),
+    _number("load_nm", "N m", -1e6, 1e6, 0.0, "load torque, positive against positive rotation"),
+    _number("load_viscous_nms", "N m s", 0, 1e4, 0.0, "load torque per speed"),
+    _number("J_load_kgm2", "kg m2", 0, 1e4, 0.0, "second mass behind an elastic shaft, 0 none"),
+    _number("coupling_stiffness_nm_per_rad", "N m/rad", 0, 1e9, 0.0, "stiffness of the elastic shaft"),
+    _number("coupling_damping_nms_per_rad", "N m s/rad", 0, 1e6, 0.0, "damping of the elastic shaft"),
+    _choice("rotor", ("free", "locked", "driven"), "free", "free, held, or turned by a load machine"),
+    _number("theta_M_start_rad", "rad", -_PI2, _PI2, 0.0, "mechanical angle at the start"),
+    _number("cogging_nm", "N m", 0, 1e4, 0.0, "amplitude of the cogging torque"),
+    _whole("cogging_periods", 0, 10000, 0, "cogging periods per mechanical turn"),
+    # the machine, where the truth differs from the file
+    _number("R_s_ohm", "ohm", 1e-5, 1e3, None, "true loop resistance at T_ref", "[machine] R_s_ohm"),
+    _number("L_d_h", "H", 1e-7, 10, None, "true d inductance", "[machine] L_d_h"),
+    _number("L_q_h", "H", 1e-7, 10, None, "true q inductance", "[machine] L_q_h"),
+    _number("psi_f_wb", "Wb", 0, 100, None, "true PM flux linkage at T_ref", "[machine] psi_f_wb"),
+    _whole("pole_pairs", 1, 64, None, "true pole pairs", "[machine] pole_pairs"),
+    _number("iron_loss_ohm", "ohm", 0, 1e6, 0.0, "iron-loss resistance in parallel with the flux voltage, 0 none"),
+    _number("psi_6_wb", "Wb", 0, 10, 0.0, "flux harmonic of order 6 in dq"),
+    _number("psi_12_wb", "Wb", 0, 10, 0.0, "flux harmonic of order 12 in dq"),
+    # faults and identity
+    _choice("phase_open", ("none", "a", "b", "c"), "none", "a phase that is not connected"),
+    Key(_TABLE, "drive_fault", "text", "", -math.inf, math.inf, "none", "misbehaviour of the simulated drive by name"),
+    _whole("serial", 0, 2**32 - 1, 1, "serial number of the simulated drive"),
+    _whole("seed", 0, 2**63 - 1, 0, "seed of its noise"),
+)
+
+
+def resolved_simulation(given: dict[str, Value], tables: dict[str, dict[str, Value]]) -> dict[str, Value]:
+    """Return every simulation key with its value.
+
+    Parameters
+    ----------
+    given : dict
+        The valid ``[simulation]`` table.
+    tables : dict
+        Values of the other tables (``machine``, ``inverter``, ``encoder``), for keys that fall back to them.
+
+    Returns
+    -------
+    dict
+        A key without value anywhere (an inertia that nobody gave) is left out.
+    """
+    resolved: dict[str, Value] = {}
+    for key in SIMULATION_KEYS:
+        value = given.get(key.name, key.default)
+        if value is None and key.falls_back:
+            table, name = key.falls_back[1:].split("] ")
+            value = tables.get(table, {}).get(name)
+        if value is None and key.name == "adc_full_scale_apk" and "I_max_apk" in tables.get("machine", {}):
+            value = 1.5 * float(tables["machine"]["I_max_apk"])  # type: ignore[arg-type]
+        if value is not None:
+            resolved[key.name] = value
+    return resolved
