@@ -119,7 +119,7 @@ def _check_lut(values: Mapping[str, float], lut: bytes) -> None:
         raise ImageRefused(
             ImageStatus.LUT_SIZE, f"look-up data of {len(lut)} bytes, the descriptor announces {4 * words}"
         )
-    if words == 0:
+    if int(values["lut.format"]) == LUT_FORMAT_NONE:
         return
     counts = [int(values[f"lut.n_{axis}"]) for axis in "xyz"]
     if words > LUT_CAPACITY_WORDS or min(counts) < 1 or min(counts[:2]) < 2:

@@ -123,7 +123,7 @@ PMSM_EXPORT void pmsm_drive_init(pmsm_drive *drive);
 PMSM_EXPORT uint32_t pmsm_drive_load(pmsm_drive *drive, const uint8_t *image, uint32_t size);
 PMSM_EXPORT void pmsm_drive_reset_fault(pmsm_drive *drive);
 /* One PWM period of the application: sensors in, duty ratios out. */
-void pmsm_drive_period(pmsm_drive *drive, const pmsm_sensors *sensors, pmsm_output *output);
+PMSM_EXPORT void pmsm_drive_period(pmsm_drive *drive, const pmsm_sensors *sensors, pmsm_output *output);
 /* Value of a signal as it would be recorded now. */
 PMSM_EXPORT float pmsm_drive_signal(const pmsm_drive *drive, uint32_t signal);
 

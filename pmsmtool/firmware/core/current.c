@@ -5,7 +5,8 @@
  *
  * The correction is the reference that the limited voltage would have realised (Hanus, Kinnaert, Henrotte,
  * Automatica 23 (1987) 729-739). With the one-step predictor the proportional part and the decoupling see the
- * predicted current, the integrators the sampled one, so that a model error leaves no offset.
+ * predicted current, the integrators the sampled one against the reference of the last period, so that neither a model
+ * error nor the delay itself charges them.
  */
 #include "pmsm_period.h"
 
@@ -63,15 +64,20 @@ void pmsm_current_demand(pmsm_period *period)
     period->u.q = gains.K_p.q * (reference.q - i.q) + state->integrator.q + rotation.q + period->request->u_q_inject;
 }
 
-static pmsm_real integrate(pmsm_real x, pmsm_real T_s, pmsm_real K_p, pmsm_real K_i, pmsm_real error, pmsm_real cut)
+uint32_t pmsm_uses_predictor(const pmsm_params *params)
+{
+    const uint32_t asked = params->current_options & (uint32_t)PMSM_CURRENT_PREDICTOR;
+    return (asked != 0u && params->inverter_delay_periods >= 1.0F) ? 1u : 0u;
+}
+
+/* What the limiter took, as a change of the reference. A controller without a proportional part has none: at the limit
+ * it follows the current, that is, it holds. */
+static pmsm_real realised(pmsm_real reference, pmsm_real i, pmsm_real cut, pmsm_real K_p)
 {
     if (cut == PMSM_C(0.0)) {
-        return x + T_s * K_i * error;
+        return reference;
     }
-    if (K_p > PMSM_C(0.0)) {
-        return x + T_s * K_i * (error + cut / K_p);
-    }
-    return x; /* a pure integrator at the limit holds */
+    return (K_p > PMSM_C(0.0)) ? reference + cut / K_p : i;
 }
 
 void pmsm_current_integrate(pmsm_period *period)
@@ -79,14 +85,21 @@ void pmsm_current_integrate(pmsm_period *period)
     pmsm_state *state = period->state;
     const current_gains gains = select_gains(period);
     const pmsm_real T_s = state->derived.T_s;
+    const pmsm_dq i = period->i;
     pmsm_dq cut = {PMSM_C(0.0), PMSM_C(0.0)};
     if ((period->params->current_options & PMSM_CURRENT_BACK_CALCULATION) != 0u) {
         cut.d = period->u_realised.d - period->u.d;
         cut.q = period->u_realised.q - period->u.q;
     }
-    pmsm_dq *x = &state->integrator;
-    x->d = integrate(x->d, T_s, gains.K_p.d, gains.K_i.d, period->reference.d - period->i.d, cut.d);
-    x->q = integrate(x->q, T_s, gains.K_p.q, gains.K_i.q, period->reference.q - period->i.q, cut.q);
+    pmsm_dq target = {realised(period->reference.d, i.d, cut.d, gains.K_p.d),
+                      realised(period->reference.q, i.q, cut.q, gains.K_p.q)};
+    const pmsm_dq now = target;
+    if (pmsm_uses_predictor(period->params) != 0u) {
+        target = state->reference_realised; /* the sampled current answers to the reference of the last period */
+    }
+    state->integrator.d += T_s * gains.K_i.d * (target.d - i.d);
+    state->integrator.q += T_s * gains.K_i.q * (target.q - i.q);
+    state->reference_realised = now;
 }
 
 /* Current at the start of the next period under the voltage that acts in this one. Flux in the stator frame is

@@ -95,7 +95,7 @@ static uint32_t check_lut(const uint8_t *image, uint32_t size, const pmsm_params
     if (size != 4u * (PMSM_PARAMS_WORDS + words)) {
         return PMSM_IMAGE_LUT_SIZE;
     }
-    if (words == 0u) {
+    if (params->lut_format == PMSM_LUT_NONE) {
         return PMSM_IMAGE_OK;
     }
     if (words > PMSM_PARAMS_LUT_WORDS_MAX || params->lut_n_x < 2u || params->lut_n_y < 2u || params->lut_n_z < 1u) {

@@ -109,6 +109,7 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     /* private to the core */
     pmsm_dq voltage_before;  /* V, stator frame: computed one period before voltage_committed */
     pmsm_dq current_before;  /* A, sampled in the last period */
+    pmsm_dq reference_realised; /* A, reference of the last period that its limited voltage stood for */
     pmsm_real tau_granted;   /* N m, torque of the reference that the limits left */
     pmsm_real i2t_carry;     /* rounding remainder of i2t */
     uint32_t i2t_exhausted;  /* 1 from a used-up budget until a tenth of it has recovered */

@@ -46,6 +46,7 @@ pmsm_real pmsm_torque(const pmsm_params *params, pmsm_dq i);
 pmsm_dq pmsm_lookup(pmsm_period *period, pmsm_real tau);
 
 /* current.c */
+uint32_t pmsm_uses_predictor(const pmsm_params *params);
 void pmsm_current_demand(pmsm_period *period);
 void pmsm_current_integrate(pmsm_period *period);
 pmsm_dq pmsm_predict_current(const pmsm_period *period);

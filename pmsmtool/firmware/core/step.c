@@ -24,6 +24,7 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->voltage_committed = zero;
     state->voltage_before = zero;
     state->reference_held = zero;
+    state->reference_realised = zero;
     state->disturbance = zero;
     state->fw_reference = zero;
     state->speed_integrator = PMSM_C(0.0);
@@ -69,12 +70,6 @@ static void transform(pmsm_period *period, const pmsm_measurement *m, pmsm_real 
     period->R_s = winding_resistance(period->params, m->T_winding);
 }
 
-static uint32_t uses_predictor(const pmsm_params *params)
-{
-    const uint32_t asked = params->current_options & (uint32_t)PMSM_CURRENT_PREDICTOR;
-    return (asked != 0u && params->inverter_delay_periods >= 1.0F) ? 1u : 0u;
-}
-
 /* The current the mode asks for. */
 static pmsm_dq current_request(pmsm_period *period)
 {
@@ -94,7 +89,7 @@ static void control(pmsm_period *period, pmsm_output *output)
     live->i_d_req = request.d;
     live->i_q_req = request.q;
     period->reference = request;
-    if (uses_predictor(period->params) != 0u) {
+    if (pmsm_uses_predictor(period->params) != 0u) {
         period->i_model = pmsm_predict_current(period);
     }
     pmsm_current_demand(period);
