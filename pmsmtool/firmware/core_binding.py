@@ -119,6 +119,9 @@ def params_values(params: Any) -> dict[str, float]:
     return values
 
 
+_STEP_ARGUMENTS = ("pmsm_measurement", "pmsm_reference", "pmsm_output")
+
+
 def _declare(library: ctypes.CDLL, types: Mapping[str, CType]) -> None:
     pointer = ctypes.POINTER
     u32, words, octets = ctypes.c_uint32, pointer(ctypes.c_uint32), ctypes.c_char_p
@@ -128,7 +131,7 @@ def _declare(library: ctypes.CDLL, types: Mapping[str, CType]) -> None:
         "pmsm_parameters_changed": (None, [state]),
         "pmsm_step": (
             None,
-            [state, params, words, *(pointer(types[f"pmsm_{name}"]) for name in ("measurement", "reference", "output"))],
+            [state, params, words, *(pointer(types[name]) for name in _STEP_ARGUMENTS)],
         ),
         "pmsm_image_crc32": (u32, [octets, u32]),
         "pmsm_params_check": (u32, [params]),

@@ -8,6 +8,7 @@ point is NaN (format 1) or -32768 (format 2). ``pmsm_image.c`` does the same in 
 
 from __future__ import annotations
 
+import itertools
 import math
 import struct
 import zlib
@@ -133,7 +134,7 @@ def _check_lut(values: Mapping[str, float], lut: bytes) -> None:
     for axis, count in zip("xyz", counts, strict=True):
         nodes = struct.unpack_from(f"<{count}f", lut, 4 * start)
         start += count
-        if not all(map(math.isfinite, nodes)) or any(b <= a for a, b in zip(nodes, nodes[1:], strict=False)):
+        if not all(map(math.isfinite, nodes)) or any(b <= a for a, b in itertools.pairwise(nodes)):
             raise ImageRefused(ImageStatus.LUT_AXIS, f"axis {axis} of the look-up table does not increase")
 
 

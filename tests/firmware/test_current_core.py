@@ -62,7 +62,7 @@ class Loop:
         return self.state.live
 
 
-def bits(*values: float) -> bytes:
+def bits(*values: float | np.float32) -> bytes:
     return np.array(values, dtype=np.float32).tobytes()
 
 
@@ -83,14 +83,14 @@ def test_sine_and_cosine(double: bool, limit: float) -> None:
     assert worst > 0
 
 
-CASES = {
-    "rated": (dict(), 620.0, 540.0),
-    "field weakening": (dict(), 1860.0, 540.0),
-    "hexagon, low voltage": (dict(current__options=15), 620.0, 180.0),
-    "plain clip": (dict(current__options=3), 620.0, 180.0),
-    "no feed-forward": (dict(current__options=4), -620.0, 210.0),
-    "over-modulation": (dict(inverter__voltage_utilisation=0.6366), 700.0, 200.0),
-    "short delay": (dict(inverter__delay_periods=0.5), 620.0, 210.0),
+CASES: dict[str, tuple[dict[str, float], float, float]] = {
+    "rated": ({}, 620.0, 540.0),
+    "field weakening": ({}, 1860.0, 540.0),
+    "hexagon, low voltage": ({"current__options": 15}, 620.0, 180.0),
+    "plain clip": ({"current__options": 3}, 620.0, 180.0),
+    "no feed-forward": ({"current__options": 4}, -620.0, 210.0),
+    "over-modulation": ({"inverter__voltage_utilisation": 0.6366}, 700.0, 200.0),
+    "short delay": ({"inverter__delay_periods": 0.5}, 620.0, 210.0),
 }
 
 
@@ -121,7 +121,7 @@ def table(kind: int, n_z: int, holes: bool) -> tuple[tuple[np.ndarray, ...], tup
     """Axes, tables as the drive sees them, and the look-up bytes."""
     rng = np.random.default_rng(11)
     torque = np.cumsum(rng.uniform(3, 9, 9)).astype(f) - f(30)
-    second = np.cumsum(rng.uniform(80, 200, 7)).astype(f) if kind == 0 else np.cumsum(rng.uniform(0.05, 0.1, 7)).astype(f)
+    second = np.cumsum(rng.uniform(0.8, 2.0, 7)).astype(f) * f(100 if kind == 0 else 0.05)
     volts = np.array([180, 210, 260], dtype=f)[:n_z]
     shape = (len(torque), len(second), n_z)
     lsb = 0.002
@@ -336,7 +336,7 @@ def test_speed_control_runs_up_and_holds() -> None:
     ramp = 3000 * math.pi / 30 * 800 * loop.plant.T_s
     assert 0.8 * ramp < history[800] < ramp  # the loop's own lag behind the ramp
     assert peak < 44.5  # measured 43.6: the end of the ramp
-    assert min(history[4000:]) > 30.0
+    assert min(history[4000:]) > 40.0 - 10.0 / (J * 60)  # the load over K_p is the most it can sag
     assert history[-1] == pytest.approx(40.0, abs=0.05)
 
 

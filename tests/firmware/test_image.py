@@ -136,7 +136,8 @@ def test_every_member_out_of_its_bounds_is_refused_alike(row: Parameter) -> None
         bad = [int(row.maximum) + 1, 0xFFFFFFFF] + ([int(row.minimum) - 1] if row.minimum > 0 else [])
         words = [struct.pack("<I", value) for value in bad]
     else:
-        up, down = (np.nextafter(np.float32(v), np.float32(s)) for v, s in ((row.maximum, np.inf), (row.minimum, -np.inf)))
+        up = np.nextafter(np.float32(row.maximum), np.float32(np.inf))
+        down = np.nextafter(np.float32(row.minimum), np.float32(-np.inf))
         words = [struct.pack("<f", value) for value in (up, down, math.nan, math.inf, -math.inf)]
     for word in words:
         image[position : position + 4] = word
