@@ -325,7 +325,7 @@ def test_speed_control_runs_up_and_holds() -> None:
                    speed__tau_max_nm=40.0)
     loop = Loop(core(), values, omega=0.0)
     omega_M, peak, history = 0.0, 0.0, []
-    for k in range(6000):
+    for k in range(9500):
         live = loop.step(mode=MODE_SPEED, omega_M_ref=40.0)
         load = 10.0 if k > 4000 else 0.0
         omega_M += loop.plant.T_s / J * (live.tau - load)
