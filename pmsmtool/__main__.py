@@ -1,0 +1,5 @@
+"""``python -m pmsmtool``."""
+
+from pmsmtool.cli.main import main
+
+main()

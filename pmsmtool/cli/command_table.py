@@ -1,0 +1,47 @@
+"""The table of commands. To add one: write ``pmsmtool/cli/<command>.py`` and add a row here.
+
+The row is all that ``pmsmtool --help`` and completion read; the module is imported when its command runs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Section(Enum):
+    """Sections of ``pmsmtool --help``: what a command does to the machine."""
+
+    LOOK = "Look"
+    MOVE = "Move the machine"
+    COMPUTE = "Compute"
+    WRITE = "Write to the drive"
+    TOOL = "The tool itself"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One command.
+
+    Attributes
+    ----------
+    name : str
+        What is typed; kebab-case.
+    target : str
+        ``module:attribute`` of the click command.
+    section : Section
+        Where the help lists it.
+    help : str
+        One sentence; the short help everywhere.
+    """
+
+    name: str
+    target: str
+    section: Section
+    help: str
+
+
+COMMANDS: tuple[Row, ...] = (
+    Row("help", "pmsmtool.cli.help_topics:help_command", Section.TOOL, "Explain a topic or a command."),
+    Row("completion", "pmsmtool.cli.completion:completion_command", Section.TOOL, "Print a shell's completion script."),
+)

@@ -1,0 +1,129 @@
+"""The two consents: the motion envelope before anything moves, the list of differences before anything is written.
+
+Each is asked on its own. ``--yes`` answers them on a simulated bus; on a real one only together with ``--i-max``,
+``--speed-max``, ``--shaft`` and the serial number of the very drive that answered, so that a line from a script's
+history cannot move another machine. Where nobody can be asked, nothing is done (exit code 7).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import click
+
+from pmsmtool.cli.options import MotionOptions
+from pmsmtool.cli.output import Output
+from pmsmtool.errors import Declined
+
+Subject = Literal["motion", "writing"]
+
+
+@dataclass(frozen=True, slots=True)
+class Consent:
+    """A consent that was given, as the run record keeps it.
+
+    Attributes
+    ----------
+    subject : str
+        ``motion`` or ``writing``.
+    answer : str
+        ``prompt`` when a person typed it, ``--yes`` otherwise.
+    text : tuple of str
+        The lines the consent is about.
+    """
+
+    subject: Subject
+    answer: Literal["prompt", "--yes"]
+    text: tuple[str, ...]
+
+
+def person_present() -> bool:
+    """Whether a question can be seen and answered: stdin and stderr are terminals."""
+    return sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()
+
+
+def missing_for_yes(options: MotionOptions) -> list[str]:
+    """Return the options ``--yes`` still needs on a real bus."""
+    needed = {
+        "--i-max": options.i_max_apk,
+        "--speed-max": options.speed_max_rad_s,
+        "--shaft": options.shaft,
+        "--serial": options.serial,
+    }
+    return [name for name, value in needed.items() if value is None]
+
+
+def ask_motion(
+    envelope: Iterable[str], options: MotionOptions, *, simulated: bool, serial: int, out: Output
+) -> Consent:
+    """Show the motion envelope and return the consent to move.
+
+    Parameters
+    ----------
+    envelope : lines
+        Largest current, energy, speed, travel, duration, what the shaft may do.
+    options : MotionOptions
+        From the command line.
+    simulated : bool
+        The bus is the simulated drive (``BusOptions.simulated``).
+    serial : int
+        Serial number the drive reports.
+    out : Output
+        Where the lines go.
+
+    Raises
+    ------
+    Declined
+        The person said no, nobody can be asked, or another drive answered than ``--serial`` names.
+    """
+    return _ask("motion", "Move the machine within these limits?", tuple(envelope), options, simulated, serial, out)
+
+
+def ask_writing(
+    differences: Iterable[str], options: MotionOptions, *, simulated: bool, serial: int, out: Output
+) -> Consent:
+    """Show what a download would change and return the consent to write; parameters as :func:`ask_motion`."""
+    return _ask("writing", "Write these values to the drive?", tuple(differences), options, simulated, serial, out)
+
+
+def _ask(
+    subject: Subject,
+    question: str,
+    text: tuple[str, ...],
+    options: MotionOptions,
+    simulated: bool,
+    serial: int,
+    out: Output,
+) -> Consent:
+    for line in text:
+        click.echo(line, err=True)  # shown even when quiet: nobody consents to what he has not seen
+    if options.serial is not None and options.serial != serial:
+        raise Declined(
+            f"the drive's serial number is {serial}, --serial says {options.serial}: nothing was done",
+            likely="another drive answers on this node",
+            hint="check channel and node; `pmsmtool info` shows the drive",
+        )
+    missing = missing_for_yes(options)
+    if options.yes and (simulated or not missing):
+        return Consent(subject, "--yes", text)
+    if options.yes:
+        out.warn(f"--yes alone moves and writes only a simulated drive; missing here: {', '.join(missing)}")
+    if not person_present():
+        raise Declined(
+            f"nobody can be asked for consent to {_NAMES[subject]}: nothing was done",
+            likely="standard input or standard error is not a terminal",
+            hint=f"--yes {' '.join(f'{name} ...' for name in missing)}".rstrip() if missing else "--yes",
+        )
+    try:
+        agreed = click.confirm(question, default=False, err=True)
+    except click.Abort:
+        agreed = False
+    if not agreed:
+        raise Declined(f"consent to {_NAMES[subject]} was not given: nothing was done")
+    return Consent(subject, "prompt", text)
+
+
+_NAMES: dict[Subject, str] = {"motion": "move the machine", "writing": "write to the drive"}

@@ -1,0 +1,148 @@
+"""From an exception to what a person reads and to the exit code a script reads."""
+
+from __future__ import annotations
+
+import errno
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from pmsmtool.errors import ConfigError, ExitCode, PmsmtoolError, StopNotConfirmed, VerifyMismatch
+
+READER_GONE = 141
+"""Exit code when whoever read standard output went away, as of a filter that SIGPIPE ends (128 + 13)."""
+
+_DISK = (errno.ENOSPC, errno.EROFS, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC))
+"""Errors of writing that name no file, such as those of standard output."""
+
+
+def related(error: BaseException) -> Iterator[BaseException]:
+    """Yield an error, what it was raised from or during, and the members of groups, each once."""
+    seen: set[int] = set()
+    waiting: list[BaseException | None] = [error]
+    while waiting:
+        current = waiting.pop(0)
+        if current is None or id(current) in seen:
+            continue
+        seen.add(id(current))
+        yield current
+        if isinstance(current, BaseExceptionGroup):
+            waiting.extend(current.exceptions)
+        waiting.extend((current.__cause__, current.__context__))
+
+
+def decisive(error: BaseException) -> BaseException:
+    """Return the error that decides the exit code.
+
+    A stop that was not confirmed outranks whatever was raised before, after or because of it. Of a group, the
+    first error of our own decides.
+    """
+    for candidate in related(error):
+        if isinstance(candidate, StopNotConfirmed):
+            return candidate
+    if isinstance(error, BaseExceptionGroup):
+        members = (member for member in related(error) if isinstance(member, (PmsmtoolError, KeyboardInterrupt)))
+        return next(members, error)
+    return error
+
+
+def report(error: BaseException, verbosity: int = 0) -> int:
+    """Tell the error on stderr and return the exit code.
+
+    Parameters
+    ----------
+    error : BaseException
+        Whatever left the command.
+    verbosity : int
+        From 2 on (``-vv``) the traceback is printed too.
+    """
+    chosen = decisive(error)
+    if verbosity >= 2 and not isinstance(chosen, (click.exceptions.Exit, click.Abort)):
+        _echo(_traceback(error))
+    if isinstance(chosen, click.exceptions.Exit):
+        return chosen.exit_code
+    if isinstance(chosen, PmsmtoolError):
+        _tell(chosen)
+        return int(chosen.exit_code)
+    if isinstance(chosen, click.ClickException):
+        return _tell_usage(chosen)
+    if isinstance(chosen, (KeyboardInterrupt, click.Abort)):
+        _echo("interrupted")
+        return int(ExitCode.INTERRUPTED)
+    if isinstance(chosen, OSError) and (chosen.filename is not None or chosen.errno in _DISK):
+        place = str(chosen.filename) if chosen.filename is not None else "while writing"
+        _tell(ConfigError(chosen.strerror or str(chosen), where=place))
+        return int(ExitCode.USAGE)
+    return _tell_bug(error)
+
+
+def _tell(error: PmsmtoolError) -> None:
+    label = "STOP NOT CONFIRMED" if isinstance(error, StopNotConfirmed) else "error"
+    _echo(f"{click.style(label, fg='red', bold=True)}: {error.what}")
+    details = error.violations if isinstance(error, ConfigError) else ()
+    details = error.differences if isinstance(error, VerifyMismatch) else details
+    for detail in details:
+        _echo(f"  - {detail}")
+    for name, text in (("where", error.where), ("likely", error.likely), ("try", error.hint)):
+        if text:
+            _echo(f"  {name + ':':<8}{text}")
+
+
+def _tell_usage(error: click.ClickException) -> int:
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        _echo(error.format_message())
+        return int(ExitCode.USAGE)
+    place = f"{error.ctx.command_path} --help" if isinstance(error, click.UsageError) and error.ctx else ""
+    message = error.format_message().strip()
+    _tell(ConfigError(message[:1].lower() + message[1:].rstrip("."), hint=place))
+    return int(ExitCode.USAGE)
+
+
+def _tell_bug(error: BaseException) -> int:
+    text = _traceback(error)
+    path = _keep(text)
+    summary = f"{type(error).__name__}: {error}".splitlines()[0]
+    if path is None:
+        _echo(text)
+    _tell(
+        PmsmtoolError(
+            f"internal error, this is a bug in pmsmtool: {summary}",
+            where=f"traceback in {path}" if path else "traceback above (no folder can be written to keep it)",
+            hint="report it with that file; -vv shows the traceback here",
+        )
+    )
+    return int(ExitCode.INTERNAL)
+
+
+def _traceback(error: BaseException) -> str:
+    import traceback
+
+    return "".join(traceback.format_exception(error))
+
+
+def _keep(text: str) -> Path | None:
+    """Write a traceback to the user's folder, or to the temporary one; None when neither can be written."""
+    import datetime
+    import platform
+    import tempfile
+
+    from pmsmtool import __version__
+    from pmsmtool.resources import user_folder
+
+    head = f"pmsmtool {__version__}, Python {platform.python_version()}, {platform.platform()}\n{' '.join(sys.argv)}\n"
+    stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S%fZ")
+    for folder in (user_folder() / "crashes", Path(tempfile.gettempdir())):
+        path = folder / f"pmsmtool-crash-{stamp}.txt"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            path.write_text(head + text, encoding="utf-8", errors="backslashreplace")
+        except OSError:
+            continue
+        return path
+    return None
+
+
+def _echo(text: str) -> None:
+    click.echo(text.rstrip("\n"), err=True)

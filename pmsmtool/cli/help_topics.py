@@ -1,0 +1,144 @@
+"""``pmsmtool help``: topics that belong to no single command."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import click
+
+from pmsmtool.cli.command_table import COMMANDS
+from pmsmtool.cli.failure import READER_GONE
+from pmsmtool.cli.options import examples
+from pmsmtool.cli.output import table
+from pmsmtool.errors import ExitCode
+
+EXIT_CODES: dict[ExitCode, str] = {
+    ExitCode.OK: "done, and good",
+    ExitCode.CHECK_FAILED: "checked and not good: a margin, a comparison, a prediction; also an infeasible design",
+    ExitCode.USAGE: "wrong command line, or a file or folder that cannot be used",
+    ExitCode.BUS: "no bus, no drive on it, or the connection was lost",
+    ExitCode.DRIVE: "the drive is in fault, or refused a value (SDO abort)",
+    ExitCode.SAFETY: "refused by a safety limit before anything moved",
+    ExitCode.NOT_TRUSTWORTHY: "the measurement is not trustworthy, so no number is given (help refusals)",
+    ExitCode.DECLINED: "declined at a prompt, or nobody could be asked; nothing was done",
+    ExitCode.STOP_NOT_CONFIRMED: "STOP NOT CONFIRMED: the machine may be energised, use the hardware stop",
+    ExitCode.NOT_AVAILABLE: "this drive cannot give that; what is missing is named",
+    ExitCode.INTERNAL: "a bug in pmsmtool; the traceback is kept in the file that is named",
+    ExitCode.INTERRUPTED: "interrupted; a machine that moved was stopped, and the stop confirmed",
+}
+
+SAFETY = """\
+Nothing moves and nothing is written without a consent, and there are two of them, never one:
+  motion   before the first current the envelope is printed: largest current, energy, speed, travel, duration, and
+           what the shaft may do (--shaft, --load, --brake).
+  writing  before the first write the list of differences is printed: name, old, new, unit.
+--yes answers them on a simulated drive. On a real bus it needs --i-max, --speed-max, --shaft and --serial as well, and
+the serial number must be that of the drive that answers. It cannot be set by an environment variable. Where nobody can
+be asked (no terminal) and --yes does not hold, nothing is done: exit 7.
+
+Every way out of a command that moved the machine is the same: quick stop, zero current, parameters restored, and the
+stop confirmed from the statusword. If the drive does not confirm it, the exit code is 8 whatever else went wrong: use
+the hardware stop. Ctrl-C, SIGTERM and a closed terminal take that way too; a second Ctrl-C removes the voltage at once.
+
+A software stop is no safety function. Keep a hardware stop within reach."""
+
+FILES = """\
+machine file     profiles/*.toml, machine.toml  the machine and its inverter, SI with the unit in the key (R_s_ohm)
+flux map         .npz .mat .csv                 grids of i_d, i_q (A peak) and psi_d, psi_q (Wb)
+design file      design.toml                    gains and limits with their margins; the machine is embedded
+parameter set    params.toml                    catalogue name and SI value; what is written to a drive
+look-up table    .npz .csv                      i_d, i_q over torque and speed; which limit binds, and by how much
+trace            .npz .csv                      named signals over t_s; the second CSV row holds the units
+run directory    runs/<utc>-<serial>/           run.json, traces/, and the files above, as a commissioning leaves them
+drive memory     .pmsmsim/<profile>.nv          non-volatile memory of a simulated drive
+
+What is generated (designs, sets, tables, C, DCF) holds no dates, paths or names: same input, same bytes."""
+
+ENVIRONMENT = """\
+PMSMTOOL_INTERFACE PMSMTOOL_CHANNEL PMSMTOOL_BITRATE PMSMTOOL_NODE PMSMTOOL_SIM PMSMTOOL_TRACE_CAN
+                       as -i -c -b -n --sim --trace-can; an option that is typed wins
+PMSMTOOL_JSON_OUTPUT PMSMTOOL_VERBOSE PMSMTOOL_QUIET
+                       as --json -v -q
+PMSMTOOL_HOME          folder for what must outlive a run (journals, crash reports); now {home}
+CAN_INTERFACE CAN_CHANNEL CAN_BITRATE CAN_CONFIG
+                       python-can's own, with ~/.canrc, ~/.can, /etc/can.conf and can.ini; decide what is not given
+NO_COLOR               no colours
+CC                     when installing from source: the C compiler; CC=zig takes the pinned ziglang
+
+Order: after the command, before the command, PMSMTOOL_*, python-can's configuration."""
+
+
+def _units() -> str:
+    from pmsmtool.units import UNITS
+
+    rows = [(unit.symbol, unit.dimension, ", ".join(unit.spellings)) for unit in UNITS.values()]
+    return "\n".join(
+        [
+            "A value carries its unit: 800Hz, 1.2mH, 1200rpm; prefixes p n u m k M G where the unit takes one.",
+            "A current carries its kind too: 12Apk (amplitude) or 8.5Arms. A bare number where a unit is due: refused.",
+            "An option or key that ends in a unit (--bandwidth-hz, R_s_ohm) takes the bare number in that unit.",
+            "",
+            "dq quantities are amplitudes (peak phase values), torque = 1.5 p (psi_d i_q - psi_q i_d), motoring",
+            "positive, angles electrical, resistance and inductance per phase (star).",
+            "",
+            *table(("unit", "measures", "also written"), rows),
+        ]
+    )
+
+
+def _exit_codes() -> str:
+    rows = [(int(code), meaning) for code, meaning in EXIT_CODES.items()]
+    rows.append((READER_GONE, "whoever read the output went away (| head), as with any filter"))
+    return "\n".join(table(("code", "meaning"), sorted(rows)))
+
+
+def _refusals() -> str:
+    from pmsmtool.estimators.refusals import REFUSALS
+
+    parts = ["Identification gives no number it does not trust; it ends with exit code 6 and one of these names."]
+    for row in REFUSALS.values():
+        parts.append(f"\n{row.name}\n  {row.meaning}\n  likely: {row.likely}\n  try:    {row.next_step}")
+    return "\n".join(parts)
+
+
+def _environment() -> str:
+    from pmsmtool.resources import user_folder
+
+    return ENVIRONMENT.format(home=user_folder())
+
+
+TOPICS: dict[str, tuple[str, Callable[[], str]]] = {
+    "units": ("units, prefixes and conventions of every number", _units),
+    "exit-codes": ("what a script can rely on", _exit_codes),
+    "safety": ("consents, stops, and what --yes may answer", lambda: SAFETY),
+    "files": ("the files that are read and written", lambda: FILES),
+    "environment": ("environment variables and their order", _environment),
+    "refusals": ("named reasons to give no number", _refusals),
+}
+"""Topic -> one line, text."""
+
+
+@click.command("help", epilog=examples("pmsmtool help units", "pmsmtool help completion"))
+@click.argument("topic", nargs=-1)
+@click.pass_context
+def help_command(ctx: click.Context, topic: tuple[str, ...]) -> None:
+    """Explain a TOPIC, or a command; without one, list the topics."""
+    if not topic:
+        lines = [f"{name:<12}  {line}" for name, (line, _) in TOPICS.items()]
+        click.echo("\n".join([*lines, "", "or a command: " + " ".join(row.name for row in COMMANDS)]))
+        return
+    if len(topic) == 1 and topic[0] in TOPICS:
+        click.echo(TOPICS[topic[0]][1]())
+        return
+    click.echo(_command_help(ctx, topic))
+
+
+def _command_help(ctx: click.Context, names: tuple[str, ...]) -> str:
+    context = ctx.find_root()
+    for name in names:
+        group = context.command
+        command = group.get_command(context, name) if isinstance(group, click.Group) else None
+        if command is None:
+            raise click.UsageError(f"no topic and no command: {' '.join(names)}; topics: {', '.join(TOPICS)}", ctx)
+        context = click.Context(command, parent=context, info_name=name)
+    return context.get_help()

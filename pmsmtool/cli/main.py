@@ -1,0 +1,91 @@
+"""The command ``pmsmtool``: global options, lazy commands, errors to exit codes."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import click
+
+from pmsmtool import __version__
+from pmsmtool.cli.failure import READER_GONE, decisive, report
+from pmsmtool.cli.lazy_group import COMPLETE_VARIABLE, LazyGroup
+from pmsmtool.cli.options import VERBOSITY, examples, global_options
+
+PROGRAM = "pmsmtool"
+
+
+@click.group(
+    PROGRAM,
+    cls=LazyGroup,
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "max_content_width": 120,
+        "auto_envvar_prefix": "PMSMTOOL",
+        "show_default": True,
+    },
+    epilog=examples("pmsmtool help units", "pmsmtool help exit-codes"),
+)
+@global_options
+@click.version_option(__version__, prog_name=PROGRAM, message="%(prog)s %(version)s")
+def cli(**_: Any) -> None:
+    """Commission permanent-magnet synchronous motor drives over CANopen.
+
+    Identify the machine, design its control, check it in simulation, flash it, prove it. The sections below say what
+    a command does to the machine. Options before a command hold for it as if they stood after it.
+    """
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run a command line and return its exit code; errors are told on stderr."""
+    context: click.Context | None = None
+    try:
+        with cli.make_context(PROGRAM, list(arguments)) as context:
+            cli.invoke(context)
+        sys.stdout.flush()
+    except BaseException as error:
+        if isinstance(decisive(error), BrokenPipeError) and _reader_gone():
+            return READER_GONE
+        code = report(error, _verbosity(context))
+        return READER_GONE if code == 0 and _reader_gone() else code
+    return 0
+
+
+def _verbosity(context: click.Context | None) -> int:
+    if context is None:
+        return 0
+    # A command that was reached knows the options after it too.
+    return int(context.meta.get(VERBOSITY, context.params.get("verbose", 0)))
+
+
+def _reader_gone() -> bool:
+    """Whether nobody reads standard output any more; it is then closed so that Python's own exit stays silent."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Entry point of the program."""
+    if COMPLETE_VARIABLE in os.environ:
+        from click.shell_completion import shell_complete
+
+        sys.exit(shell_complete(cli, {}, PROGRAM, COMPLETE_VARIABLE, os.environ[COMPLETE_VARIABLE]))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a console without the letter must not end a command
+    # Being ended by the system must stop the machine like Ctrl-C does: through every finally on the way out.
+    for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), _interrupt)
+    sys.exit(run(sys.argv[1:]))

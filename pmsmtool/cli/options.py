@@ -1,0 +1,321 @@
+"""Options that many commands share: the bus, the output, the motion envelope; and quantities with units.
+
+The same options stand before the command and after it (``pmsmtool -n 5 scan`` and ``pmsmtool scan -n 5``). What
+is typed after the command wins over what is typed before it, and both win over ``PMSMTOOL_INTERFACE`` and the like;
+what is given nowhere is left to python-can's own configuration.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+from click.core import ParameterSource
+
+from pmsmtool.cli.output import Output, set_up_logging
+from pmsmtool.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pmsmtool.bus.connect import Connection
+
+Function = Callable[..., Any]
+Option = Callable[[Function], Function]
+
+SIMULATED_INTERFACE = "pmsmsim"
+VERBOSITY = "pmsmtool.verbosity"
+"""Key of the context's shared ``meta``: how much is said, for whoever reports an error."""
+
+
+class WholeNumber(click.ParamType[int]):
+    """A decimal or hexadecimal (``0x``) number within bounds."""
+
+    def __init__(self, name: str, lowest: int, highest: int) -> None:
+        self.name = name
+        self.lowest = lowest
+        self.highest = highest
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the number, or fail as a usage error."""
+        try:
+            number = value if isinstance(value, int) else int(str(value), 0)
+        except ValueError:
+            self.fail(f"{value!r} is no whole number (decimal or 0x...)", param, ctx)
+        if not self.lowest <= number <= self.highest:
+            self.fail(f"{number} is outside {self.lowest}..{self.highest}", param, ctx)
+        return number
+
+
+class Quantity(click.ParamType[float]):
+    """A value with its unit (``800Hz``, ``1200rpm``, ``12Apk``), converted to the dimension's SI unit."""
+
+    def __init__(self, dimension: str) -> None:
+        self.name = dimension
+        self.dimension = dimension
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the SI value (A peak for a current), or fail as a usage error."""
+        from pmsmtool.units import parse_quantity
+
+        if isinstance(value, float):
+            return value
+        try:
+            return parse_quantity(str(value), self.dimension)
+        except ConfigError as error:
+            self.fail("; ".join(part for part in (error.what, error.likely, error.hint) if part), param, ctx)
+
+
+NODE = WholeNumber("node", 1, 127)
+BITRATE = WholeNumber("bit rate", 1, 10**7)
+FILE = click.Path(dir_okay=False, path_type=Path)
+SERIAL = WholeNumber("serial", 0, 0xFFFFFFFF)
+CURRENT = Quantity("current")
+SPEED = Quantity("angular speed")
+FREQUENCY = Quantity("frequency")
+TIME = Quantity("time")
+
+
+def examples(*lines: str) -> str:
+    """Return the epilog of a command's help: lines that can be pasted."""
+    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
+
+
+# ---- the options themselves; auto: whether the environment may give them ----------------------------------
+
+
+def _bus_parameters(auto: bool) -> list[Option]:
+    def option(*names: str, **attributes: Any) -> Option:
+        return click.option(*names, show_envvar=auto, allow_from_autoenv=auto, **attributes)
+
+    return [
+        option("-i", "--interface", metavar="NAME", help="python-can interface, e.g. socketcan, pcan."),
+        option("-c", "--channel", metavar="NAME", help="Channel of the interface, e.g. can0."),
+        option("-b", "--bitrate", type=BITRATE, metavar="BIT/S", help="Bit rate, e.g. 500000."),
+        option("-n", "--node", type=NODE, metavar="ID", help="Node of the drive, 1..127."),
+        option("--sim", metavar="PROFILE", help="Short for -i pmsmsim -c PROFILE: a simulated drive."),
+        option("--trace-can", type=FILE, metavar="FILE", help="Record the bus (.asc .blf .log .trc)."),
+    ]
+
+
+def _output_parameters(auto: bool) -> list[Option]:
+    return [
+        click.option("--json", "json_output", is_flag=True, allow_from_autoenv=auto, help="Print one JSON object."),
+        *_verbosity_parameters(auto),
+    ]
+
+
+def _verbosity_parameters(auto: bool) -> list[Option]:
+    return [
+        click.option(
+            "-v",
+            "--verbose",
+            count=True,
+            allow_from_autoenv=auto,
+            show_default=False,
+            help="Say more; -vv with tracebacks.",
+        ),
+        click.option("-q", "--quiet", is_flag=True, allow_from_autoenv=auto, help="Say only what is wrong."),
+    ]
+
+
+def _yes_parameter(auto: bool) -> Option:
+    return click.option(
+        "--yes",
+        is_flag=True,
+        allow_from_autoenv=False,  # consent is typed, never inherited from a shell's environment
+        help="Answer the prompts; on a real bus only with --i-max, --speed-max, --shaft and --serial.",
+    )
+
+
+_ENVELOPE_PARAMETERS: tuple[Option, ...] = (
+    click.option("--i-max", type=CURRENT, metavar="CURRENT", help="Largest current, e.g. 12Apk or 8.5Arms."),
+    click.option("--speed-max", type=SPEED, metavar="SPEED", help="Largest speed of the shaft, e.g. 1200rpm."),
+    click.option("--shaft", type=click.Choice(["free", "locked", "coupled"]), help="What the shaft may do."),
+    click.option("--serial", type=SERIAL, metavar="NUMBER", help="Serial number the drive must have."),
+)
+_SURROUNDINGS_PARAMETERS: tuple[Option, ...] = (
+    click.option("--load", type=click.Choice(["none", "gravity"]), default="none", help="What pulls on the shaft."),
+    click.option("--brake", type=click.Choice(["open", "drive", "none"]), default="none", help="Holding brake."),
+)
+
+
+def _apply(function: Function, options: list[Option] | tuple[Option, ...]) -> Function:
+    for option in reversed(options):
+        function = option(function)
+    return function
+
+
+def global_options(function: Function) -> Function:
+    """Add the global options to the top-level group."""
+    return _apply(function, [*_bus_parameters(True), *_output_parameters(True), _yes_parameter(True)])
+
+
+# ---- what commands receive --------------------------------------------------------------------------------
+
+_TYPED = (ParameterSource.COMMANDLINE, ParameterSource.PROMPT)
+
+
+def _strength(ctx: click.Context, name: str) -> int:
+    """0 not given, 1 from the environment, 2 typed."""
+    source = ctx.get_parameter_source(name)
+    if ctx.params.get(name) is None or source in (None, ParameterSource.DEFAULT, ParameterSource.DEFAULT_MAP):
+        return 0
+    return 2 if source in _TYPED else 1
+
+
+def given(ctx: click.Context, name: str) -> tuple[Any, int]:
+    """Return a shared option and its strength: 3 typed after the command, 2 before it, 1 environment, 0 nowhere."""
+    if _strength(ctx, name) == 2:
+        return ctx.params[name], 3
+    root = ctx.find_root()
+    strength = _strength(root, name)
+    return (root.params[name], strength) if strength else (None, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class BusOptions:
+    """The bus options of a command; None is left to python-can's configuration."""
+
+    interface: str | None = None
+    channel: str | None = None
+    bitrate: int | None = None
+    node: int | None = None
+    trace_can: Path | None = None
+
+    def simulated(self) -> bool:
+        """Whether the bus is the simulated drive in this process; only then nothing real can move."""
+        if self.interface is not None:
+            return self.interface == SIMULATED_INTERFACE
+        import can
+
+        try:
+            return bool(can.util.load_config().get("interface") == SIMULATED_INTERFACE)
+        except can.CanInterfaceNotImplementedError:
+            return False
+
+    def connect(self) -> Connection:
+        """Open the bus; raises ``BusError`` or ``ConfigError``."""
+        from pmsmtool.bus.connect import connect
+
+        return connect(self.interface, self.channel, self.bitrate, trace=self.trace_can)
+
+
+def merged_bus_options(ctx: click.Context) -> BusOptions:
+    """Return the bus options of a command, from after it, before it and the environment."""
+    values = {name: given(ctx, name) for name in ("interface", "channel", "bitrate", "node", "sim", "trace_can")}
+    profile, strength = values.pop("sim")
+    rivals = [
+        name for name in ("interface", "channel") if values[name][1] and min(values[name][1], 2) == min(strength, 2)
+    ]
+    if strength and rivals:
+        raise click.UsageError(f"--sim and --{rivals[0]} name two buses: give one of them", ctx)
+    if strength and strength >= max(values["interface"][1], values["channel"][1]):
+        values |= {"interface": (SIMULATED_INTERFACE, strength), "channel": (profile, strength)}
+    return BusOptions(**{name: value for name, (value, _) in values.items()})
+
+
+@dataclass(frozen=True, slots=True)
+class MotionOptions:
+    """What a person allows before the machine moves or the drive is written.
+
+    Attributes
+    ----------
+    yes : bool
+        ``--yes`` was typed; what it answers is decided in ``consent``.
+    i_max_apk : float, optional
+        Largest current (A peak).
+    speed_max_rad_s : float, optional
+        Largest mechanical speed (rad/s).
+    shaft : str, optional
+        ``free``, ``locked`` or ``coupled``.
+    serial : int, optional
+        Serial number the drive must have.
+    load, brake : str
+        What pulls on the shaft (``none``, ``gravity``); the holding brake (``open``, ``drive``, ``none``).
+    """
+
+    yes: bool = False
+    i_max_apk: float | None = None
+    speed_max_rad_s: float | None = None
+    shaft: Literal["free", "locked", "coupled"] | None = None
+    serial: int | None = None
+    load: Literal["none", "gravity"] = "none"
+    brake: Literal["open", "drive", "none"] = "none"
+
+
+def bus_options(function: Function) -> Function:
+    """Add the bus options to a command, which receives them as ``bus: BusOptions``."""
+
+    @functools.wraps(function)
+    def command(*args: Any, **kwargs: Any) -> Any:
+        bus = merged_bus_options(click.get_current_context())
+        for name in ("interface", "channel", "bitrate", "node", "sim", "trace_can"):
+            del kwargs[name]
+        return function(*args, bus=bus, **kwargs)
+
+    return _apply(command, _bus_parameters(False))
+
+
+def _output(ctx: click.Context, verbose: int, quiet: bool, json_output: bool) -> Output:
+    root = ctx.find_root().params
+    verbosity = -1 if quiet or root.get("quiet") else verbose + root.get("verbose", 0)
+    ctx.meta[VERBOSITY] = verbosity
+    set_up_logging(verbosity)
+    return Output(json_output or bool(root.get("json_output")), verbosity)
+
+
+def output_options(function: Function) -> Function:
+    """Add ``--json -v -q`` to a command that reads; it receives ``out: Output``."""
+
+    @functools.wraps(function)
+    def command(*args: Any, verbose: int, quiet: bool, json_output: bool, **kwargs: Any) -> Any:
+        return function(*args, out=_output(click.get_current_context(), verbose, quiet, json_output), **kwargs)
+
+    return _apply(command, _output_parameters(False))
+
+
+def text_options(function: Function) -> Function:
+    """Add ``-v -q`` to a command whose output is a file or text only; it receives ``out: Output``."""
+
+    @functools.wraps(function)
+    def command(*args: Any, verbose: int, quiet: bool, **kwargs: Any) -> Any:
+        return function(*args, out=_output(click.get_current_context(), verbose, quiet, False), **kwargs)
+
+    return _apply(command, _verbosity_parameters(False))
+
+
+def _allowed(ctx: click.Context, kwargs: dict[str, Any]) -> MotionOptions:
+    return MotionOptions(
+        yes=bool(kwargs.pop("yes") or ctx.find_root().params.get("yes")),
+        i_max_apk=kwargs.pop("i_max"),
+        speed_max_rad_s=kwargs.pop("speed_max"),
+        shaft=kwargs.pop("shaft"),
+        serial=kwargs.pop("serial"),
+        load=kwargs.pop("load", "none"),
+        brake=kwargs.pop("brake", "none"),
+    )
+
+
+def motion_options(function: Function) -> Function:
+    """Add the envelope and ``--yes`` to a command that moves the machine; it receives ``motion: MotionOptions``."""
+
+    @functools.wraps(function)
+    def command(*args: Any, **kwargs: Any) -> Any:
+        motion = _allowed(click.get_current_context(), kwargs)
+        return function(*args, motion=motion, **kwargs)
+
+    return _apply(command, (*_ENVELOPE_PARAMETERS, *_SURROUNDINGS_PARAMETERS, _yes_parameter(False)))
+
+
+def write_options(function: Function) -> Function:
+    """Add ``--yes`` and what it needs to a command that writes the drive; it receives ``motion: MotionOptions``."""
+
+    @functools.wraps(function)
+    def command(*args: Any, **kwargs: Any) -> Any:
+        motion = _allowed(click.get_current_context(), kwargs)
+        return function(*args, motion=motion, **kwargs)
+
+    return _apply(command, (*_ENVELOPE_PARAMETERS, _yes_parameter(False)))

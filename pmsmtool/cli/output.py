@@ -1,0 +1,154 @@
+"""What a command prints: data on stdout (text or one JSON object), everything else on stderr."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import json
+import math
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+
+def jsonable(value: Any) -> Any:
+    """Return a value as plain JSON types.
+
+    Dataclasses become objects, arrays lists, numbers stay SI numbers without formatting; what is not a finite
+    number becomes null, because JSON has no other word for it.
+
+    Raises
+    ------
+    TypeError
+        A type that has no obvious JSON form.
+    """
+    if isinstance(value, enum.Flag):
+        return jsonable(value.value)
+    if isinstance(value, enum.Enum):
+        return value.name.lower().replace("_", "-")
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: jsonable(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(jsonable(key)): jsonable(entry) for key, entry in value.items()}
+    if isinstance(value, (set, frozenset)):
+        return [jsonable(entry) for entry in sorted(value)]
+    if hasattr(value, "tolist"):  # a numpy array or scalar, without importing numpy here
+        return jsonable(value.tolist())
+    if isinstance(value, Iterable) and not isinstance(value, (bytes, bytearray)):
+        return [jsonable(entry) for entry in value]
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+    """Return aligned lines: text to the left, numbers to the right, two blanks between columns."""
+    body = [[str(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(heads, *body, strict=True)]
+    numeric = [bool(body) and all(_is_number(row[k]) for row in body) for k in range(len(heads))]
+    lines = []
+    for row in ([*heads], *body):
+        cells = (
+            cell.rjust(width) if right else cell.ljust(width)
+            for cell, width, right in zip(row, widths, numeric, strict=True)
+        )
+        lines.append("  ".join(cells).rstrip())
+    return lines
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return text in ("", "-")
+    return True
+
+
+@dataclasses.dataclass(slots=True)
+class Output:
+    """The only way a command prints.
+
+    Parameters
+    ----------
+    json : bool
+        Print one JSON object instead of text.
+    verbosity : int
+        -1 quiet, 0 normal, 1 (``-v``) details, 2 (``-vv``) logs and tracebacks.
+    """
+
+    json: bool = False
+    verbosity: int = 0
+    _status_width: int = 0
+
+    def result(self, command: str, data: Mapping[str, Any], text: Iterable[str] | Callable[[], Iterable[str]]) -> None:
+        """Print the result of a command on stdout.
+
+        Parameters
+        ----------
+        command : str
+            Name in the schema, ``pmsmtool.<command>/1``.
+        data : mapping
+            What ``--json`` prints: SI numbers, see :func:`jsonable`.
+        text : lines, or a function that makes them
+            What a person reads.
+        """
+        self._clear_status()
+        if self.json:
+            self.json_line(command, data)
+            return
+        for line in text() if callable(text) else text:
+            click.echo(line)
+
+    def json_line(self, command: str, data: Mapping[str, Any]) -> None:
+        """Print one JSON object on a line of its own (``monitor`` prints many)."""
+        content = {"schema": f"pmsmtool.{command}/1", **data}
+        click.echo(json.dumps(jsonable(content), allow_nan=False))
+
+    def note(self, text: str) -> None:
+        """Say a step of the work on stderr, unless quiet."""
+        if self.verbosity >= 0:
+            self._say(text)
+
+    def detail(self, text: str) -> None:
+        """Say on stderr what only ``-v`` wants to know."""
+        if self.verbosity >= 1:
+            self._say(text)
+
+    def warn(self, text: str) -> None:
+        """Say on stderr what must be read even when quiet."""
+        self._say(f"{click.style('warning', fg='yellow', bold=True)}: {text}")
+
+    def status(self, text: str) -> None:
+        """Show progress in one line that is overwritten; nothing where stderr is no terminal."""
+        if self.verbosity >= 0 and sys.stderr.isatty():
+            text = text[:119]
+            click.echo(f"\r{text.ljust(self._status_width)}", nl=False, err=True)
+            self._status_width = len(text)
+
+    def _say(self, text: str) -> None:
+        self._clear_status()
+        click.echo(text, err=True)
+
+    def _clear_status(self) -> None:
+        if self._status_width:
+            click.echo(f"\r{' ' * self._status_width}\r", nl=False, err=True)
+            self._status_width = 0
+
+
+def set_up_logging(verbosity: int) -> None:
+    """Send the logs of python-can and canopen to stderr: warnings, from ``-v`` on more, with ``-q`` errors only."""
+    if verbosity == 0:
+        return  # Python's own default: warnings to stderr
+    import logging
+
+    levels = {-1: logging.ERROR, 1: logging.INFO}
+    logging.basicConfig(
+        level=levels.get(verbosity, logging.DEBUG), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
+    )
