@@ -1,8 +1,8 @@
 """Speed controller: PI gains from the inertia and the sum of the small time constants, and the exact sampled loop.
 
-The path runs at the control period (current loop, speed estimate, filter), the controller every ``decimation`` periods with
-its torque held between: the loop is lifted to the controller's period exactly, so the margins contain the multirate
-hold, the current loop's own delay, the speed estimate and the feedback filter.
+The path runs at the control period (current loop, speed estimate, filter), the controller every ``decimation``
+periods with its torque held between. The loop is lifted to the controller's period exactly, so the margins contain
+the multirate hold, the current loop's own delay, the speed estimate and the feedback filter.
 
 Source: symmetric optimum after Kessler (1958), C. Kessler, Regelungstechnik 6; textbook form K_p = J / (a T_sum),
 K_i = K_p / (a^2 T_sum), phase margin atan(a) - atan(1/a).

@@ -30,8 +30,12 @@ PULSE_TOLERANCE = 1e-9
 """Lifted loop against the simulated pulse response, relative to its largest sample (measured 2e-11)."""
 
 
-def path(notch: Notch = Notch()) -> SpeedPath:
-    return SpeedPath(J, B, axis_loop(imc(R, L_Q, ALPHA), AxisPlant(R, L_Q, T_S, 1.5)), DECIMATION, PLL, FILTER_HZ, notch)
+OFF = Notch()
+
+
+def path(notch: Notch = OFF) -> SpeedPath:
+    current = axis_loop(imc(R, L_Q, ALPHA), AxisPlant(R, L_Q, T_S, 1.5))
+    return SpeedPath(J, B, current, DECIMATION, PLL, FILTER_HZ, notch)
 
 
 def pulse_response(gains: SpeedGains, samples: int) -> list[float]:

@@ -1,0 +1,198 @@
+/* Least and largest torque of the domain under a voltage limit.
+ *
+ * Torque has no extreme inside the plane, so the limits lie on the border of the admissible set: on an arc of the
+ * domain's border where the voltage suffices (MTPA end, MTPVA corner, demagnetisation, edge of the map) or on the
+ * voltage limit inside the domain (MTPV). The set may be a lens that touches the border, or lie wholly inside.
+ */
+#include "current_plane.h"
+
+#include <math.h>
+
+#define TRACE_STEP 0.04   /* of I_max, along the voltage limit */
+#define TRACE_STEPS 2000
+#define SHORT_CIRCUIT_STEPS 60
+#define SHORT_CIRCUIT 1e-20 /* squared voltage taken as zero, relative to the limit */
+
+typedef struct {
+    const pmsm_plane *plane;
+    const pmsm_border *border;
+    double omega, V2;
+    pmsm_curve limit;      /* |v|^2 = V2 */
+    pmsm_point *extreme;   /* least, largest torque */
+    int32_t found;
+    int32_t crossings;       /* of border and voltage limit */
+    int32_t outside;         /* border nodes above the limit */
+} search;
+
+static void consider(search *run, const pmsm_point *at)
+{
+    if (!run->found || at->t < run->extreme[0].t)
+        run->extreme[0] = *at;
+    if (!run->found || at->t > run->extreme[1].t)
+        run->extreme[1] = *at;
+    run->found = 1;
+}
+
+/* Follow the voltage limit from a point, while the torque rises (side 1) or falls (side 0). */
+static void follow(search *run, const pmsm_point *start, double length, int32_t side)
+{
+    pmsm_point from = *start, to, top;
+    const double wanted = side ? 1.0 : -1.0;
+    const double along = length > 0.0 ? wanted : -wanted;
+    if (!(along * pmsm_curve_indicator(&run->limit, PMSM_AT_TORQUE_EXTREME, &from) > 0.0))
+        return;
+    for (int32_t k = 0; k < TRACE_STEPS; k++) {
+        int32_t leaving;
+        if (!pmsm_curve_step(&run->limit, &from, length, &to))
+            return;
+        leaving = pmsm_plane_outside(run->plane, &run->border->rectangle, &to) > 0.0;
+        if (leaving && !pmsm_curve_root(&run->limit, PMSM_AT_EDGE, &from, &to, &to))
+            return;
+        if (!(along * pmsm_curve_indicator(&run->limit, PMSM_AT_TORQUE_EXTREME, &to) > 0.0)) {
+            if (pmsm_curve_root(&run->limit, PMSM_AT_TORQUE_EXTREME, &from, &to, &top))
+                consider(run, &top);
+            return;
+        }
+        if (leaving)
+            return; /* the border crossing is a candidate of its own */
+        from = to;
+    }
+}
+
+/* A crossing of border and voltage limit: a candidate, and where the limit enters the domain. */
+static void cross(search *run, const pmsm_point *at)
+{
+    const double length = TRACE_STEP * run->plane->I_max, nudge = 1e-7 * run->plane->I_max;
+    double tangent[2];
+    run->crossings++;
+    consider(run, at);
+    pmsm_curve_tangent(&run->limit, at, tangent);
+    for (int32_t k = 0; k < 2; k++) {
+        const double sign = k ? 1.0 : -1.0;
+        pmsm_point inside;
+        pmsm_plane_at(run->plane, at->d + sign * nudge * tangent[0], at->q + sign * nudge * tangent[1], &inside);
+        if (pmsm_plane_outside(run->plane, &run->border->rectangle, &inside) > 0.0)
+            continue;
+        follow(run, at, sign * length, 0);
+        follow(run, at, sign * length, 1);
+    }
+}
+
+static void root_on_piece(search *run, const pmsm_curve *curve, double s_a, double s_b)
+{
+    double s;
+    pmsm_point at;
+    if (pmsm_curve_root_between(curve, PMSM_AT_VOLTAGE, s_a, s_b, &s, &at))
+        cross(run, &at);
+}
+
+/* Three nodes with the voltage least in the middle, all above the limit: an admissible arc may hide between. */
+static void hidden_arc(search *run, const pmsm_curve *curve, double s_a, double s_c)
+{
+    double s;
+    pmsm_point at;
+    if (!pmsm_curve_root_between(curve, PMSM_AT_VOLTAGE_EXTREME, s_a, s_c, &s, &at))
+        return;
+    if (pmsm_curve_indicator(curve, PMSM_AT_VOLTAGE, &at) > 0.0)
+        return;
+    consider(run, &at);
+    root_on_piece(run, curve, s_a, s);
+    root_on_piece(run, curve, s, s_c);
+}
+
+static void scan_piece(search *run, const pmsm_piece *piece)
+{
+    pmsm_curve curve = piece->curve;
+    const double *s = run->border->s + piece->first;
+    const pmsm_point *node = run->border->node + piece->first;
+    double f[3] = {INFINITY, INFINITY, INFINITY};
+    curve.omega = run->omega;
+    curve.V2 = run->V2;
+    for (int32_t k = 0; k < piece->count; k++) {
+        f[0] = f[1];
+        f[1] = f[2];
+        f[2] = pmsm_curve_indicator(&curve, PMSM_AT_VOLTAGE, &node[k]);
+        if (f[2] <= 0.0)
+            consider(run, &node[k]);
+        else
+            run->outside++;
+        if (k > 0 && (f[1] <= 0.0) != (f[2] <= 0.0))
+            root_on_piece(run, &curve, s[k - 1], s[k]);
+        if (k > 1 && f[1] > 0.0 && f[1] < f[0] && f[1] <= f[2] && f[2] > 0.0)
+            hidden_arc(run, &curve, s[k - 2], s[k]);
+    }
+}
+
+/* The short-circuit current, where the steady-state voltage is zero, by damped Newton from the border point of
+ * least voltage; 1 when it is found inside the domain. */
+static int32_t short_circuit(const search *run, pmsm_point *at)
+{
+    const double R = run->plane->R, w = run->omega;
+    double least = INFINITY;
+    for (int32_t k = 0; k < run->border->n_nodes; k++) {
+        const double v2 = pmsm_voltage_squared(run->plane, &run->border->node[k], w);
+        if (v2 < least) {
+            least = v2;
+            *at = run->border->node[k];
+        }
+    }
+    for (int32_t k = 0; k < SHORT_CIRCUIT_STEPS && least > SHORT_CIRCUIT * run->V2; k++) {
+        double psi[2], jac[4], step_d, step_q, det, v2 = INFINITY;
+        pmsm_point trial = *at;
+        pmsm_plane_flux(run->plane, at->d, at->q, psi, jac);
+        { /* v_d = R i_d - w psi_q, v_q = R i_q + w psi_d */
+            const double v_d = R * at->d - w * psi[1], v_q = R * at->q + w * psi[0];
+            const double a = R - w * jac[2], b = -w * jac[3], c = w * jac[0], d = R + w * jac[1];
+            det = a * d - b * c;
+            step_d = (d * v_d - b * v_q) / det;
+            step_q = (a * v_q - c * v_d) / det;
+        }
+        if (!(det > 0.0))
+            return 0;
+        for (double share = 1.0; share > 1e-6 && !(v2 < least); share *= 0.5) {
+            pmsm_plane_at(run->plane, at->d - share * step_d, at->q - share * step_q, &trial);
+            v2 = pmsm_voltage_squared(run->plane, &trial, w);
+        }
+        if (!(v2 < least))
+            break;
+        least = v2;
+        *at = trial;
+    }
+    return least < run->V2 && pmsm_plane_outside(run->plane, &run->border->rectangle, at) < 0.0;
+}
+
+/* The voltage limit closed inside the domain: start above the short-circuit current and follow it both ways. */
+static void closed_limit(search *run)
+{
+    const double length = TRACE_STEP * run->plane->I_max;
+    const double I2 = run->plane->I_max * run->plane->I_max;
+    pmsm_curve up = run->limit;
+    pmsm_point centre, start;
+    double s, top;
+    if (!short_circuit(run, &centre))
+        return;
+    up.kind = PMSM_CURVE_VERTICAL;
+    up.level = centre.d;
+    top = sqrt(I2 - centre.d * centre.d);
+    if (top > run->border->rectangle.q_high)
+        top = run->border->rectangle.q_high;
+    if (!pmsm_curve_root_between(&up, PMSM_AT_VOLTAGE, centre.q, top, &s, &start))
+        return;
+    consider(run, &start);
+    for (int32_t side = 0; side < 2; side++) {
+        follow(run, &start, length, side);
+        follow(run, &start, -length, side);
+    }
+}
+
+int32_t pmsm_torque_limits(const pmsm_plane *plane, const pmsm_border *border, double omega, double V,
+                           pmsm_point extreme[2])
+{
+    search run = {plane, border, omega, V * V, {plane, &border->rectangle, PMSM_CURVE_VOLTAGE, V * V, omega, V * V, 0.0},
+                  extreme, 0, 0, 0};
+    for (int32_t k = 0; k < border->n_pieces; k++)
+        scan_piece(&run, &border->piece[k]);
+    if (run.crossings == 0 && run.outside > 0)
+        closed_limit(&run); /* border all above the limit, or touched by it in a point */
+    return run.found;
+}
