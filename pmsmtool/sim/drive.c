@@ -9,7 +9,7 @@
 
 #define QUICK_STOP_RAMP_S 0.01F      /* a current or torque reference goes to zero in this time */
 #define QUICK_STOP_TIMEOUT_S 0.1F    /* after the ramp: gates off, whatever the current does */
-#define BRAKE_KNEE_SHARE 0.1         /* of n_max: below it the brake torque falls with the speed */
+#define BRAKE_KNEE_SHARE 0.25        /* of n_max: below it the brake torque falls with the speed */
 #define BRAKE_DAMPING 6.0            /* mechanical brake pole stays this far below the speed estimate's */
 #define STANDSTILL_SHARE 0.01        /* of n_max */
 #define RPM 9.54929658551372         /* rpm per rad/s */
@@ -64,6 +64,9 @@ static void estimate_speed(pmsm_drive *drive)
 {
     const double T_s = 1e-9 * (double)drive->params.inverter_T_s_ns;
     const double theta = (drive->params.encoder_reversed != 0u) ? -drive->sensors.theta_M : drive->sensors.theta_M;
+    if (!isfinite(theta)) {
+        return; /* trips; the estimate must survive it */
+    }
     if (drive->period_count == 0u) {
         drive->pll_theta = theta - drive->pll_omega * T_s;
     }
@@ -98,20 +101,22 @@ static uint32_t find_trip(const pmsm_drive *drive)
     return (s->T_winding > p->protection_T_winding_max_c) ? PMSM_TRIP_OVERTEMPERATURE : PMSM_TRIP_NONE;
 }
 
-/* Torque against the rotation: rated current, falling with the speed near standstill, so slowly that the brake loop
- * stays below the speed estimate's bandwidth. */
+/* Torque against the rotation: rated current, near standstill a viscous brake. Its gain is the speed controller's
+ * where that is tuned, else from the inertia so that its pole stays below the speed estimate's, else a share of what
+ * the full speed range allows. */
 static float brake_torque(const pmsm_drive *drive)
 {
     const pmsm_params *p = &drive->params;
     const double rated =
         1.5 * (double)p->motor_pole_pairs * (double)p->motor_psi_f_wb * (double)p->motor_I_nom_apk;
     const double tau = fmin(rated, (double)p->speed_tau_max_nm);
-    double knee = BRAKE_KNEE_SHARE * (double)p->motor_n_max_rpm / RPM;
-    if (p->motor_J_kgm2 > 0.0F) {
-        knee = fmax(0.1 * knee,
-                    BRAKE_DAMPING * tau / ((double)p->motor_J_kgm2 * (double)p->encoder_pll_bandwidth_rad_s));
+    double gain = (double)p->speed_K_p_nms_per_rad;
+    if (gain <= 0.0 && p->motor_J_kgm2 > 0.0F) {
+        gain = (double)p->motor_J_kgm2 * (double)p->encoder_pll_bandwidth_rad_s / BRAKE_DAMPING;
+    } else if (gain <= 0.0) {
+        gain = tau / (BRAKE_KNEE_SHARE * (double)p->motor_n_max_rpm / RPM);
     }
-    return (float)(-tau * fmax(-1.0, fmin(1.0, drive->pll_omega / knee)));
+    return (float)(-fmax(-tau, fmin(tau, gain * drive->pll_omega)));
 }
 
 static uint32_t at_standstill(const pmsm_drive *drive)
