@@ -83,7 +83,7 @@ class BridgeSaturation:
         raise ArithmeticError(f"no flux found for {int(np.sum(error > _NEWTON_TOLERANCE_A))} currents")
 
     def _newton_step(self, psi: Array, residual: Array) -> Array:
-        """J^-1 residual with J = d i/d psi by central differences (|psi| has no slope at zero, its powers here have)."""
+        """J^-1 residual with J = d i/d psi by central differences."""
         h = 1e-6
         by_d = (np.array(self.current(psi[0] + h, psi[1])) - np.array(self.current(psi[0] - h, psi[1]))) / (2 * h)
         by_q = (np.array(self.current(psi[0], psi[1] + h)) - np.array(self.current(psi[0], psi[1] - h))) / (2 * h)

@@ -1,0 +1,111 @@
+"""``pmsmtool machine``: machine files from what is printed on paper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pmsmtool.cli.options import CURRENT, FILE, FREQUENCY, TIME, Quantity, examples, output_options
+from pmsmtool.cli.output import Output, table
+
+_BETWEEN = click.Choice(["line-line", "phase"])
+_SOURCE = click.Choice(["datasheet", "meter", "guess"])
+
+
+@click.group("machine")
+def machine_command() -> None:
+    """Make machine files."""
+
+
+@machine_command.command(
+    "new",
+    epilog=examples(
+        "pmsmtool machine new --name m1 --pole-pairs 4 --r 0.274ohm --l 4.4mH --ke 60.7Vrms/krpm -o m1.toml \\",
+        "    --ke-between line-line --u-dc 540V --pwm 12kHz --i-nom 19.8Arms",
+        "pmsmtool machine new --name m2 --pole-pairs 3 --connection delta --r 3.2ohm --r-between phase --l-d 30mH \\",
+        "    --l-q 42mH --l-between phase --kt 0.9Nm/Arms --u-dc 325V --pwm 10kHz --source meter -o m2.toml",
+    ),
+)
+@click.option("--name", required=True, help="Name of the machine.")
+@click.option("--pole-pairs", required=True, type=click.IntRange(1, 64), help="Pole pairs.")
+@click.option("--connection", type=click.Choice(["star", "delta"]), default="star", help="Winding connection.")
+@click.option("--r", "R_ohm", required=True, type=Quantity("resistance"), help="Resistance, e.g. 0.274ohm.")
+@click.option("--r-between", "R_between", type=_BETWEEN, default="line-line", help="Where it is measured.")
+@click.option("--r-temperature", "T_c", type=Quantity("temperature"), default="25degC", help="When it is measured.")
+@click.option("--l", "L_h", type=Quantity("inductance"), help="Inductance of both axes, e.g. 4.4mH.")
+@click.option("--l-d", "L_d_h", type=Quantity("inductance"), help="d inductance (the smaller line-line reading).")
+@click.option("--l-q", "L_q_h", type=Quantity("inductance"), help="q inductance (the larger line-line reading).")
+@click.option("--l-between", "L_between", type=_BETWEEN, default="line-line", help="Where they are measured.")
+@click.option("--ke", help="Back-EMF constant: 58Vrms/krpm, 0.39Vpks/rad, 190rpm/Vpk, or a flux 0.41Wb.")
+@click.option("--ke-between", type=_BETWEEN, help="Where the back-EMF is measured.")
+@click.option("--kt", help="Torque constant: 1.74Nm/Arms, 85mNm/Apk, 12oz-in/Arms.")
+@click.option("--i-nom", "I_nom_apk", type=CURRENT, help="Rated line current, e.g. 19.8Arms.")
+@click.option("--i-peak", "I_max_apk", type=CURRENT, help="Short-time line current, e.g. 40Arms.")
+@click.option("--n-nom", "n_nom_rpm", type=Quantity("rpm"), help="Rated speed, e.g. 3000rpm.")
+@click.option("--n-max", "n_max_rpm", type=Quantity("rpm"), help="Largest speed.")
+@click.option("--inertia", "J_kgm2", type=Quantity("inertia"), help="Inertia, e.g. 12kgcm2.")
+@click.option("--u-dc", "U_dc_v", required=True, type=Quantity("voltage"), help="DC-link voltage, e.g. 540V.")
+@click.option("--pwm", "f_s_hz", required=True, type=FREQUENCY, help="Control frequency, e.g. 12kHz.")
+@click.option("--dead-time", "dead_time_s", type=TIME, default="0s", help="Dead time, e.g. 2us.")
+@click.option("--source", type=_SOURCE, default="datasheet", help="Where the numbers come from; sets the deviations.")
+@click.option("--r-source", type=_SOURCE, help="As --source, for the resistance.", show_default=False)
+@click.option("--l-source", type=_SOURCE, help="As --source, for the inductances.", show_default=False)
+@click.option("--psi-source", type=_SOURCE, help="As --source, for the flux.", show_default=False)
+@click.option("-o", "--output", "path", type=FILE, required=True, help="Machine file to write.")
+@click.option("--force", is_flag=True, help="Replace the file.")
+@output_options
+def new_command(path: Path, force: bool, out: Output, **given: Any) -> None:
+    """Write a machine file from a datasheet or meter readings.
+
+    Line-line or phase, star or delta, rms or peak: every conversion is printed. A torque constant that contradicts the
+    back-EMF constant is flagged (exit code 0; the file says which one was used).
+    """
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.machine.datasheet import machine_from_datasheet
+    from pmsmtool.machine.machine_file import dump_machine_file, parse_machine
+
+    if path.exists() and not force:
+        raise ConfigError("the file exists", where=str(path), hint="choose another name, or --force")
+    result = machine_from_datasheet(_sheet(given))
+    text = dump_machine_file(result.machine_file)
+    parse_machine(text, where=str(path))  # what the reader would refuse is not written
+    try:
+        path.write_text(text, encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be written: {error.strerror}", where=str(path), hint="choose another folder"
+        ) from None
+    rows = [(step.key, step.given, step.rule, step.result) for step in result.conversions]
+    data = {
+        "file": path,
+        "machine": result.machine_file.machine,
+        "std": result.machine_file.std,
+        "conversions": result.conversions,
+        "warnings": result.warnings,
+    }
+    out.result("machine-new", data, table(("key", "given", "rule", "result"), rows))
+    for warning in result.warnings:
+        out.warn(warning)
+    out.note(f"wrote {path}")
+
+
+def _sheet(given: dict[str, Any]) -> Any:
+    """The datasheet of the command's options."""
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.machine.datasheet import Datasheet, parse_emf_constant, parse_torque_constant
+
+    both = given.pop("L_h")
+    for name in ("L_d_h", "L_q_h"):
+        given[name] = both if given[name] is None else given[name]
+        if given[name] is None:
+            raise ConfigError("no inductance is given", hint="give --l, or --l-d and --l-q")
+    common = given.pop("source")
+    given["sources"] = {
+        quantity: given.pop(f"{quantity.lower()}_source", None) or common for quantity in ("R", "L", "psi", "J")
+    }
+    ke, between, kt = given.pop("ke"), given.pop("ke_between"), given.pop("kt")
+    given["K_e"] = None if ke is None else parse_emf_constant(ke, between)
+    given["K_t"] = None if kt is None else parse_torque_constant(kt)
+    return Datasheet(**given)
