@@ -1,0 +1,105 @@
+"""SDO abort codes (CiA 301, section 7.2.4.3.17, table 22) and what they mean to a person."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class AbortCode(IntEnum):
+    """Abort codes an SDO server or client may send."""
+
+    TOGGLE = 0x05030000
+    TIMED_OUT = 0x05040000
+    COMMAND = 0x05040001
+    BLOCK_SIZE = 0x05040002
+    SEQUENCE = 0x05040003
+    CRC = 0x05040004
+    MEMORY = 0x05040005
+    ACCESS = 0x06010000
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    NOT_MAPPABLE = 0x06040041
+    PDO_LENGTH = 0x06040042
+    INCOMPATIBLE = 0x06040043
+    INTERNAL = 0x06040047
+    HARDWARE = 0x06060000
+    LENGTH = 0x06070010
+    TOO_LONG = 0x06070012
+    TOO_SHORT = 0x06070013
+    NO_SUBINDEX = 0x06090011
+    VALUE = 0x06090030
+    VALUE_HIGH = 0x06090031
+    VALUE_LOW = 0x06090032
+    RANGE_INVERTED = 0x06090036
+    RESOURCE = 0x060A0023
+    GENERAL = 0x08000000
+    NOT_STORED = 0x08000020
+    LOCAL_CONTROL = 0x08000021
+    DEVICE_STATE = 0x08000022
+    NO_DICTIONARY = 0x08000023
+    NO_DATA = 0x08000024
+
+
+ABORT_TEXT: dict[int, str] = {
+    AbortCode.TOGGLE: "toggle bit not alternated",
+    AbortCode.TIMED_OUT: "SDO protocol timed out",
+    AbortCode.COMMAND: "command specifier not valid or unknown",
+    AbortCode.BLOCK_SIZE: "invalid block size",
+    AbortCode.SEQUENCE: "invalid sequence number",
+    AbortCode.CRC: "CRC error",
+    AbortCode.MEMORY: "out of memory",
+    AbortCode.ACCESS: "unsupported access to an object",
+    AbortCode.WRITE_ONLY: "attempt to read a write-only object",
+    AbortCode.READ_ONLY: "attempt to write a read-only object",
+    AbortCode.NO_OBJECT: "object does not exist in the object dictionary",
+    AbortCode.NOT_MAPPABLE: "object cannot be mapped to a PDO",
+    AbortCode.PDO_LENGTH: "mapped objects exceed the PDO length",
+    AbortCode.INCOMPATIBLE: "general parameter incompatibility",
+    AbortCode.INTERNAL: "general internal incompatibility in the device",
+    AbortCode.HARDWARE: "access failed due to a hardware error",
+    AbortCode.LENGTH: "data type does not match, length of service parameter does not match",
+    AbortCode.TOO_LONG: "data type does not match, length of service parameter too high",
+    AbortCode.TOO_SHORT: "data type does not match, length of service parameter too low",
+    AbortCode.NO_SUBINDEX: "sub-index does not exist",
+    AbortCode.VALUE: "invalid value for the parameter",
+    AbortCode.VALUE_HIGH: "value of the parameter too high",
+    AbortCode.VALUE_LOW: "value of the parameter too low",
+    AbortCode.RANGE_INVERTED: "maximum value is less than minimum value",
+    AbortCode.RESOURCE: "resource not available",
+    AbortCode.GENERAL: "general error",
+    AbortCode.NOT_STORED: "data cannot be transferred or stored to the application",
+    AbortCode.LOCAL_CONTROL: "data cannot be transferred or stored because of local control",
+    AbortCode.DEVICE_STATE: "data cannot be transferred or stored because of the present device state",
+    AbortCode.NO_DICTIONARY: "object dictionary not present",
+    AbortCode.NO_DATA: "no data available",
+}
+
+TRANSPORT_CODES = frozenset(
+    {AbortCode.TOGGLE, AbortCode.TIMED_OUT, AbortCode.COMMAND, AbortCode.BLOCK_SIZE, AbortCode.SEQUENCE, AbortCode.CRC}
+)
+"""Codes that speak of the transfer, not of the value: the whole object may be tried again."""
+
+BLOCK_REFUSED_CODES = frozenset({AbortCode.COMMAND, AbortCode.ACCESS})
+"""What servers without block transfer answer to its initiate; other codes are about the object."""
+
+_LIKELY: dict[int, tuple[str, str]] = {
+    AbortCode.NO_OBJECT: ("the drive's firmware does not have this object", "compare `pmsmtool info` with the map"),
+    AbortCode.NO_SUBINDEX: ("the drive's firmware does not have this object", "compare `pmsmtool info` with the map"),
+    AbortCode.VALUE_HIGH: ("the value is above the drive's limit", "`pmsmtool param help NAME` shows the limits"),
+    AbortCode.VALUE_LOW: ("the value is below the drive's limit", "`pmsmtool param help NAME` shows the limits"),
+    AbortCode.VALUE: ("the value is outside what the drive accepts", "`pmsmtool param help NAME` shows the limits"),
+    AbortCode.DEVICE_STATE: ("the drive is enabled or in fault", "`pmsmtool stop`, then `pmsmtool fault show`"),
+    AbortCode.LOCAL_CONTROL: ("the drive is under local control", "release the panel or the vendor's software"),
+    AbortCode.READ_ONLY: ("the object only reports", ""),
+}
+
+
+def abort_text(code: int) -> str:
+    """Return the meaning of an abort code; codes outside the table are named as such."""
+    return ABORT_TEXT.get(code, "abort code not in CiA 301")
+
+
+def abort_advice(code: int) -> tuple[str, str]:
+    """Return the likely cause and the next step for an abort code; empty where there is none."""
+    return _LIKELY.get(code, ("", ""))

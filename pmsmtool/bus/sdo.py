@@ -1,0 +1,403 @@
+"""The SDO channel: one client for one node that cannot report a refused write as success.
+
+What the stock clients get wrong and this one does not (numbers of the CANopen reference, section
+2.2): every answer is matched by index and sub-index (B1); lost answers are retried by a policy per
+transfer kind (B2, B3); aborts carry the multiplexor of the transfer (B4); block transfers survive
+gaps and losses at their ends (B5 to B8, ``sdo_block``); a block upload may be answered by a normal
+one (B9); announced and expected sizes are compared (B10); one lock per channel (B11); calls from
+a bus callback are refused instead of waiting for themselves (B12).
+
+Protocol: CiA 301, section 7.2.4.3.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from pmsmtool.bus import sdo_block
+from pmsmtool.bus.abort_codes import TRANSPORT_CODES, AbortCode, abort_advice, abort_text
+from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.sdo_transfer import MULTIPLEXOR, Attempt, BlockRefused, Mode, Retry, Transfer, TransferLost
+from pmsmtool.errors import BusError, DriveTimeout, PmsmtoolError, SdoAbort
+
+__all__ = ["Mode", "Retry", "SdoChannel", "Transfer"]
+
+RESPONSE_TIMEOUT_S = 0.3
+"""Time an answer may take unless the object says otherwise; drives answer within a few ms."""
+QUIET_S = 0.05
+"""Silence on the answer's COB-ID after which nothing late is expected soon."""
+DRAIN_LIMIT_S = 1.0
+"""A node that never falls silent does not keep the channel longer than this."""
+TRIES = 3
+"""Attempts per object, the first included (CANopen reference, section 6)."""
+CHECK_INTERVAL_S = 0.2
+"""While an answer is awaited, the node's supervision is asked this often."""
+BLOCK_THRESHOLD = 28
+"""Bytes from which a block transfer has fewer frames than a segmented one."""
+
+
+class SdoChannel:
+    """Client side of one SDO channel.
+
+    Parameters
+    ----------
+    connection : Connection
+        The bus.
+    node : int
+        Node id; the default channel 0x600 + id, 0x580 + id is used.
+    check : callable, optional
+        Raises when waiting on has become pointless (node reset, heartbeat lost, second master).
+
+    Attributes
+    ----------
+    slow_objects : dict of (int, int) to float
+        Time-outs (s) of objects that need longer than ``timeout_s``.
+    block_supported : bool or None
+        None until a block transfer was tried.
+    retries, discarded : int
+        Sums over the life of the channel.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        node: int,
+        *,
+        timeout_s: float = RESPONSE_TIMEOUT_S,
+        check: Callable[[], None] | None = None,
+    ) -> None:
+        self.connection = connection
+        self.node = node
+        self.timeout_s = timeout_s
+        self.slow_objects: dict[tuple[int, int], float] = {}
+        self.block_supported: bool | None = None
+        self.retries = 0
+        self.discarded = 0
+        self._check = check
+        self._cancelled: BaseException | None = None
+        self._request_id = 0x600 + node
+        self._mailbox = connection.mailbox(0x580 + node)
+        self._lock = threading.Lock()
+
+    # ---- for callers ---------------------------------------------------------------------------
+
+    def read(self, index: int, sub: int, *, size: int | None = None) -> bytes:
+        """Return the bytes of an object; see :meth:`upload`."""
+        return self.upload(index, sub, size=size).data
+
+    def upload(
+        self, index: int, sub: int, *, size: int | None = None, mode: Mode = Mode.AUTO, tries: int = TRIES
+    ) -> Transfer:
+        """Read an object.
+
+        Parameters
+        ----------
+        size : int, optional
+            Expected length; anything else is an error, also when the node announces it so.
+        mode : Mode
+            ``AUTO`` reads by block when ``size`` says that pays, falling back to segments.
+
+        Raises
+        ------
+        SdoAbort
+            The node refused, or what it sent is not what it announced.
+        DriveTimeout
+            No answer in ``tries`` attempts.
+        BusError
+            The bus or the node went away.
+        """
+        if mode is Mode.AUTO:
+            mode = Mode.BLOCK if (size or 0) > BLOCK_THRESHOLD else Mode.SEGMENTED
+        with self._transfer(index, sub, mode, size) as attempt:
+            data, count = self._persist(attempt, tries, lambda: self._upload_once(attempt))
+            return self._result(attempt, data, count)
+
+    def download(
+        self,
+        index: int,
+        sub: int,
+        data: bytes,
+        *,
+        mode: Mode = Mode.AUTO,
+        retry: Retry = Retry.READ_BACK,
+        tries: int = TRIES,
+    ) -> Transfer:
+        """Write an object; returns when the node confirmed it.
+
+        Raises
+        ------
+        SdoAbort
+            The node refused; nothing is retried then.
+        DriveTimeout
+            No answer. With ``Retry.NEVER`` the node may have taken the value.
+        BusError
+            The bus or the node went away.
+        """
+        if 0 < len(data) <= 4 and mode is not Mode.BLOCK:
+            mode = Mode.SEGMENTED if mode is Mode.SEGMENTED else Mode.EXPEDITED
+        elif mode is Mode.AUTO:
+            mode = Mode.BLOCK if len(data) > BLOCK_THRESHOLD else Mode.SEGMENTED
+        with self._transfer(index, sub, mode, len(data)) as attempt:
+            recover = (lambda: self._already_holds(attempt, data)) if retry is Retry.READ_BACK else None
+            limit = 1 if retry is Retry.NEVER else tries
+            _, used = self._persist(attempt, limit, lambda: self._download_once(attempt, data), recover)
+            return self._result(attempt, data, used)
+
+    def post(self, index: int, sub: int, data: bytes) -> None:
+        """Send an expedited write without waiting for the answer or for the lock: emergencies only."""
+        self.connection.send(self._request_id, _expedited(index, sub, data))
+
+    def cancel(self, reason: BaseException | None) -> None:
+        """Make the transfer under way, and all later ones, raise ``reason``; None lifts that."""
+        self._cancelled = reason
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._mailbox.close()
+
+    # ---- for the transfer modules ---------------------------------------------------------------
+
+    def send(self, frame: bytes) -> None:
+        """Send one request of eight bytes."""
+        self.connection.send(self._request_id, frame)
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """Return the next frame of the node, or None after ``timeout_s`` on the bus clock."""
+        while True:
+            frame = self._mailbox.get(min(timeout_s, CHECK_INTERVAL_S))
+            if frame is not None:
+                return frame if len(frame) == 8 else frame.ljust(8, b"\0")
+            self._raise_if_pointless()
+            timeout_s -= CHECK_INTERVAL_S
+            if timeout_s <= 0.0:
+                return None
+
+    def await_answer(self, attempt: Attempt, accept: Callable[[bytes], bool], what: str) -> bytes:
+        """Return the first frame that ``accept`` takes; discard others, raise on an abort or silence."""
+        deadline = self.connection.clock.now() + attempt.timeout_s
+        while True:
+            frame = self.receive(deadline - self.connection.clock.now())
+            if frame is None:
+                raise TransferLost(f"no answer to {what} within {attempt.timeout_s:g} s")
+            if frame[0] == 0x80:
+                self.raise_if_abort_of(attempt, frame)
+            elif accept(frame):
+                return frame
+            attempt.discarded += 1
+
+    def raise_if_abort_of(self, attempt: Attempt, frame: bytes) -> None:
+        """Raise when an abort frame belongs to this transfer; a node that names no object means us."""
+        if not attempt.owns(frame) and MULTIPLEXOR.unpack_from(frame)[1:] != (0, 0):
+            return
+        code = int.from_bytes(frame[4:8], "little")
+        if code in TRANSPORT_CODES:
+            raise TransferLost(f"node aborted: {abort_text(code)} ({code:#010x})", code, abort_owed=False)
+        likely, hint = abort_advice(code)
+        raise SdoAbort(
+            code, attempt.index, attempt.sub, f"node refused: {abort_text(code)} ({code:#010x})",
+            where=self._where(attempt), likely=likely, hint=hint,
+        )  # fmt: skip
+
+    def check_announced(self, attempt: Attempt, announced: int | None) -> None:
+        """Compare the announced with the expected length before anything is transferred."""
+        if announced is not None and attempt.size is not None and announced != attempt.size:
+            raise TransferLost(f"node announces {announced} bytes, expected {attempt.size}", AbortCode.LENGTH)
+
+    def check_size(self, attempt: Attempt, data: bytes, announced: int | None) -> bytes:
+        """Compare what came with what was announced and what was expected."""
+        for length, source in ((announced, "announced"), (attempt.size, "expected")):
+            if length is not None and len(data) != length:
+                # After a normal upload the node is done, inside a block transfer it awaits our verdict.
+                owed = attempt.mode is Mode.BLOCK
+                raise TransferLost(
+                    f"node sent {len(data)} of {length} bytes {source}", AbortCode.LENGTH, abort_owed=owed
+                )
+        return data
+
+    # ---- attempts -------------------------------------------------------------------------------
+
+    def _persist(
+        self, attempt: Attempt, tries: int, once: Callable[[], bytes], recover: Callable[[], bool] | None = None
+    ) -> tuple[bytes, int]:
+        """Try until it works; where no block transfer ever did, segments get one more try."""
+        count = 0
+        while True:
+            count += 1
+            try:
+                return once(), count
+            except TransferLost as lost:
+                attempt.notes.append(f"try {count}: {lost.what}")
+                self._leave(attempt, lost)
+                if recover is not None and attempt.mode is Mode.EXPEDITED and recover():
+                    return b"", count
+                if count < tries:
+                    continue
+                if attempt.mode is not Mode.BLOCK or (self.block_supported and lost.code != AbortCode.LENGTH):
+                    raise self._failure(attempt, lost, count) from None
+                attempt.mode = Mode.SEGMENTED
+                attempt.notes.append("by segments now")
+
+    def _upload_once(self, attempt: Attempt) -> bytes:
+        if attempt.mode is Mode.BLOCK and self.block_supported is not False:
+            try:
+                # The node may answer a block initiate with a normal upload (CiA 301: pst, B9).
+                data, normal = sdo_block.upload(self, attempt)
+            except BlockRefused:
+                self._fall_back(attempt)
+            else:
+                self.block_supported = self.block_supported or normal is None or None
+                return data if normal is None else self._finish_upload(attempt, normal)
+        self.send(attempt.head(0x40) + b"\0\0\0\0")
+        first = self.await_answer(attempt, lambda f: f[0] & 0xE0 == 0x40 and attempt.owns(f), "the upload request")
+        return self._finish_upload(attempt, first)
+
+    def _finish_upload(self, attempt: Attempt, first: bytes) -> bytes:
+        """Return the object whose normal upload the node began with the frame ``first``."""
+        if first[0] & 0x02:
+            attempt.mode = Mode.EXPEDITED
+            length = 4 - (first[0] >> 2 & 3) if first[0] & 0x01 else min(4, attempt.size or 4)
+            return self.check_size(attempt, first[4 : 4 + length], None)
+        attempt.mode = Mode.SEGMENTED
+        announced = int.from_bytes(first[4:8], "little") if first[0] & 0x01 else None
+        self.check_announced(attempt, announced)
+        limit = sdo_block.UNBOUNDED_LIMIT if announced is None else announced
+        data, toggle, more = bytearray(), 0, True
+        while more:
+            self.send(bytes((0x60 | toggle, 0, 0, 0, 0, 0, 0, 0)))
+            frame = self._await_toggled(attempt, toggle, len(data))
+            data += frame[1 : 8 - (frame[0] >> 1 & 7)]
+            if len(data) > limit:
+                raise TransferLost(f"node sent more than the {limit} bytes announced", AbortCode.TOO_LONG)
+            more = not frame[0] & 0x01
+            toggle ^= 0x10
+        return self.check_size(attempt, bytes(data), announced)
+
+    def _download_once(self, attempt: Attempt, data: bytes) -> bytes:
+        if attempt.mode is Mode.EXPEDITED:
+            self.send(_expedited(attempt.index, attempt.sub, data))
+            self.await_answer(attempt, lambda f: f[0] == 0x60 and attempt.owns(f), "the write")
+            return data
+        if attempt.mode is Mode.BLOCK and self.block_supported is not False:
+            try:
+                sdo_block.download(self, attempt, data)
+            except BlockRefused:
+                self._fall_back(attempt)
+            else:
+                self.block_supported = True
+                return data
+        attempt.mode = Mode.SEGMENTED
+        self._download_segmented(attempt, data)
+        return data
+
+    def _download_segmented(self, attempt: Attempt, data: bytes) -> None:
+        self.send(attempt.head(0x21) + len(data).to_bytes(4, "little"))
+        self.await_answer(attempt, lambda f: f[0] == 0x60 and attempt.owns(f), "the write request")
+        toggle = 0
+        for start in range(0, max(len(data), 1), 7):
+            piece = data[start : start + 7]
+            last = start + 7 >= len(data)
+            self.send(bytes((toggle | (7 - len(piece)) << 1 | last,)) + piece.ljust(7, b"\0"))
+            self._await_toggled(attempt, 0x20 | toggle, start)
+            toggle ^= 0x10
+
+    def _await_toggled(self, attempt: Attempt, command: int, position: int) -> bytes:
+        """Return the answer to one segment; one with the other toggle is a duplicate of the last."""
+        return self.await_answer(attempt, lambda f: f[0] & 0xF0 == command, f"the segment at byte {position}")
+
+    def _already_holds(self, attempt: Attempt, data: bytes) -> bool:
+        """After a lost answer: read the object before it is written again."""
+        probe = Attempt(attempt.index, attempt.sub, attempt.timeout_s, Mode.SEGMENTED)
+        try:
+            held = self._upload_once(probe) == data
+        except (TransferLost, SdoAbort) as error:
+            attempt.notes.append(f"read-back after a lost answer failed: {error}")
+            if isinstance(error, TransferLost):
+                self._leave(attempt, error)
+            return False
+        finally:
+            attempt.discarded += probe.discarded
+        attempt.notes.append(
+            "read back: " + ("the node had taken the value" if held else "the node holds another value")
+        )
+        return held
+
+    # ---- ends -----------------------------------------------------------------------------------
+
+    def _abort(self, attempt: Attempt, code: int) -> None:
+        """Tell the node that this transfer is over (with its multiplexor, B4)."""
+        self.send(attempt.head(0x80) + code.to_bytes(4, "little"))
+
+    def _leave(self, attempt: Attempt, lost: TransferLost) -> None:
+        """Abort what is left of a transfer and wait until nothing late arrives any more."""
+        if lost.abort_owed:
+            self._abort(attempt, lost.code)
+        deadline = self.connection.clock.now() + DRAIN_LIMIT_S
+        while self.receive(QUIET_S) is not None and self.connection.clock.now() < deadline:
+            attempt.discarded += 1
+
+    def _fall_back(self, attempt: Attempt) -> None:
+        if not attempt.notes:
+            self.block_supported = False  # refused on a quiet channel, not amid the debris of a lost transfer
+        attempt.mode = Mode.SEGMENTED
+        attempt.notes.append("node has no block transfer: by segments")
+
+    @contextmanager
+    def _transfer(self, index: int, sub: int, mode: Mode, size: int | None) -> Iterator[Attempt]:
+        attempt = Attempt(index, sub, self.slow_objects.get((index, sub), self.timeout_s), mode, size)
+        if self.connection.in_callback():
+            raise PmsmtoolError(
+                "SDO transfer asked for from a bus callback, where it would wait for itself",
+                where=self._where(attempt),
+                hint="let the callback only take notes; this is a bug worth reporting",
+            )
+        with self._lock:
+            attempt.discarded += self._mailbox.clear()
+            self._raise_if_pointless()
+            try:
+                yield attempt
+            except (SdoAbort, DriveTimeout):
+                raise
+            except BaseException:
+                # Interrupted, cancelled or supervised away: the node must not stay inside a transfer.
+                self._abort_quietly(attempt)
+                raise
+            finally:
+                self.discarded += attempt.discarded
+
+    def _abort_quietly(self, attempt: Attempt) -> None:
+        try:
+            self._abort(attempt, AbortCode.GENERAL)
+        except BusError:
+            pass  # the error under way says more than this one
+
+    def _raise_if_pointless(self) -> None:
+        if self._cancelled is not None:
+            raise self._cancelled
+        if self._check is not None:
+            self._check()
+
+    def _result(self, attempt: Attempt, data: bytes, tries: int) -> Transfer:
+        self.retries += tries - 1
+        return Transfer(
+            attempt.index, attempt.sub, data, attempt.mode, tries,
+            attempt.retransmitted, attempt.discarded, tuple(attempt.notes),
+        )  # fmt: skip
+
+    def _where(self, attempt: Attempt) -> str:
+        return f"node {self.node}, 0x{attempt.index:04X}:{attempt.sub:02X}"
+
+    def _failure(self, attempt: Attempt, lost: TransferLost, tries: int) -> PmsmtoolError:
+        self.retries += tries - 1
+        where = self._where(attempt)
+        what = lost.what if tries == 1 else f"{lost.what} ({tries} tries: {'; '.join(attempt.notes)})"
+        if lost.code == AbortCode.TIMED_OUT:
+            likely, hint = self.connection.explain_silence(self.node)
+            return DriveTimeout(what, where=where, likely=likely, hint=hint)
+        likely, hint = abort_advice(lost.code)
+        return SdoAbort(lost.code, attempt.index, attempt.sub, what, where=where, likely=likely, hint=hint)
+
+
+def _expedited(index: int, sub: int, data: bytes) -> bytes:
+    return MULTIPLEXOR.pack(0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0")
