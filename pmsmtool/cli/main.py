@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import select
 import signal
 import sys
 from collections.abc import Sequence
@@ -66,10 +67,24 @@ def _reader_gone() -> bool:
     """Whether nobody reads standard output any more; it is then closed so that Python's own exit stays silent."""
     try:
         sys.stdout.flush()
+        descriptor = sys.stdout.fileno()
+        gone = _pipe_is_broken(descriptor)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return True
-    return False
+        descriptor, gone = sys.stdout.fileno(), True
+    except (OSError, ValueError):
+        return False  # no file of the system behind it
+    if gone:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
+    return gone
+
+
+def _pipe_is_broken(descriptor: int) -> bool:
+    """Ask the system, for a write that failed leaves nothing to flush."""
+    if not hasattr(select, "poll"):
+        return False  # Windows: only a failing flush tells
+    question = select.poll()
+    question.register(descriptor, select.POLLOUT)
+    return any(event & select.POLLERR for _, event in question.poll(0))
 
 
 def _interrupt(number: int, frame: object) -> None:

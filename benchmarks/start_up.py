@@ -1,0 +1,67 @@
+"""Time from the prompt to the output, in fresh processes: ``python benchmarks/start_up.py [-n RUNS]``.
+
+Times of a machine are only comparable within one run, so each is printed as a ratio to ``python -c pass`` too. The
+commands are run in turn, round after round, so that a busy moment hits all of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+BARE = "python -c pass"
+TARGETS_MS: Mapping[str, float] = {"pmsmtool --help": 100.0}
+"""Upper limits of the median, from the start-up budget."""
+
+
+def commands() -> dict[str, list[str]]:
+    """Return name -> arguments after the interpreter."""
+    return {
+        BARE: ["-c", "pass"],
+        "import click": ["-c", "import click"],
+        "pmsmtool --help": ["-m", "pmsmtool", "--help"],
+    }
+
+
+def measure(runs: int, folder: str) -> dict[str, float]:
+    """Return name -> median wall time (ms); the first round, with cold caches, is not counted."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}  # this checkout, installed or not
+    times: dict[str, list[float]] = {name: [] for name in commands()}
+    for round_number in range(runs + 1):
+        for name, arguments in commands().items():
+            start = time.perf_counter()
+            subprocess.run(
+                [sys.executable, *arguments], cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL
+            )
+            if round_number:
+                times[name].append(1e3 * (time.perf_counter() - start))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the table; exit 1 when a median is above its target."""
+    parser = argparse.ArgumentParser(description="Start-up times in fresh processes.")
+    parser.add_argument("-n", "--runs", type=int, default=15, help="rounds, of which the median is taken")
+    options = parser.parse_args(argv)
+    with tempfile.TemporaryDirectory() as folder:
+        medians = measure(options.runs, folder)
+    print(f"{'command':<18} {'ms':>7} {'x bare':>7} {'target ms':>10}")
+    late = []
+    for name, median in medians.items():
+        target = TARGETS_MS.get(name)
+        print(f"{name:<18} {median:7.1f} {median / medians[BARE]:7.1f} {target or '':>10}")
+        if target is not None and median > target:
+            late.append(name)
+    return 1 if late else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

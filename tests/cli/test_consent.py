@@ -1,0 +1,118 @@
+"""The two consents: who may answer them, and what happens where nobody can."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from pmsmtool.cli import consent
+from pmsmtool.cli.options import MotionOptions
+from pmsmtool.cli.output import Output
+from pmsmtool.errors import (
+    Declined,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+ENOUGH = MotionOptions(yes=True, i_max_apk=5.0, speed_max_rad_s=10.0, shaft="free", serial=77)
+
+
+def answer(
+    given: MotionOptions, monkeypatch: pytest.MonkeyPatch, *, simulated: bool = False, typed: str | None = None
+) -> consent.Consent:
+    """Ask for motion; ``typed`` None is no terminal, an empty text is Ctrl-D."""
+    monkeypatch.setattr(consent, "person_present", lambda: typed is not None)
+    results: list[consent.Consent] = []
+
+    @click.command()
+    def command() -> None:
+        results.append(consent.ask_motion(["i_max 5 A"], given, simulated=simulated, serial=77, out=Output()))
+
+    CliRunner().invoke(command, input=typed or "", catch_exceptions=False, standalone_mode=False)
+    return results[0]
+
+
+@pytest.mark.parametrize(
+    ("given", "simulated", "typed", "how"),
+    [
+        (MotionOptions(), False, "y\n", "prompt"),
+        (MotionOptions(yes=True), True, None, "--yes"),
+        (ENOUGH, False, None, "--yes"),
+        (MotionOptions(yes=True), False, "y\n", "prompt"),
+    ],
+)
+def test_consent_given(
+    given: MotionOptions, simulated: bool, typed: str | None, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = answer(given, monkeypatch, simulated=simulated, typed=typed)
+    assert found == consent.Consent("motion", how, ("i_max 5 A",))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("given", "simulated", "typed"),
+    [
+        (MotionOptions(), False, None),
+        (MotionOptions(), True, None),
+        (MotionOptions(), False, "n\n"),
+        (MotionOptions(), False, "\n"),
+        (MotionOptions(), False, ""),
+        (MotionOptions(yes=True), False, None),
+        (MotionOptions(yes=True, i_max_apk=5.0, speed_max_rad_s=10.0, shaft="free"), False, None),
+        (MotionOptions(yes=True, speed_max_rad_s=10.0, shaft="free", serial=77), False, None),
+        (MotionOptions(yes=True, i_max_apk=5.0, speed_max_rad_s=10.0, shaft="free", serial=78), False, "y\n"),
+        (MotionOptions(serial=78), False, "y\n"),
+    ],
+)
+def test_consent_declined(
+    given: MotionOptions, simulated: bool, typed: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(Declined) as caught:
+        answer(given, monkeypatch, simulated=simulated, typed=typed)
+    assert caught.value.exit_code == 7
+
+
+def test_declined_message_names_what_yes_still_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Declined) as caught:
+        answer(MotionOptions(yes=True, shaft="free"), monkeypatch)
+    assert caught.value.hint == "--yes --i-max ... --speed-max ... --serial ..."
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminal")
+@pytest.mark.parametrize(("key", "code"), [(b"y\n", 0), (b"n\n", 7), (b"\x03", 7), (b"\x04", 7)])
+def test_prompt_on_a_real_terminal(key: bytes, code: int) -> None:
+    import pty
+
+    program = """
+import sys
+from pmsmtool.cli import consent, failure
+from pmsmtool.cli.options import MotionOptions
+from pmsmtool.cli.output import Output
+try:
+    consent.ask_writing(["R_s 1 2"], MotionOptions(), simulated=False, serial=1, out=Output())
+except BaseException as error:
+    sys.exit(failure.report(error))
+"""
+    child, terminal = pty.fork()
+    if child == 0:
+        os.chdir(ROOT)
+        os.execv(sys.executable, [sys.executable, "-c", program])
+    seen = b""
+    while b"[y/N]" not in seen:
+        seen += os.read(terminal, 1024)
+    time.sleep(0.1)  # the prompt is out; reading starts right behind it
+    os.write(terminal, key)
+    try:
+        while chunk := os.read(terminal, 1024):
+            seen += chunk
+    except OSError:  # Linux: the other end closed
+        pass
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == code
+    assert b"R_s 1 2" in seen

@@ -1,0 +1,107 @@
+"""Shared options: before a command, after it, from the environment."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from pmsmtool.cli import options
+from pmsmtool.cli.options import BusOptions, MotionOptions
+from pmsmtool.cli.output import Output
+
+
+def probe(arguments: list[str], **environment: str) -> tuple[BusOptions, Output, MotionOptions]:
+    """Run a command that takes all shared options below the real group."""
+    seen: list[tuple[BusOptions, Output, MotionOptions]] = []
+
+    @click.command("probe")
+    @options.bus_options
+    @options.output_options
+    @options.motion_options
+    def command(bus: BusOptions, out: Output, motion: MotionOptions) -> None:
+        seen.append((bus, out, motion))
+
+    @click.group("pmsmtool", context_settings={"auto_envvar_prefix": "PMSMTOOL"})
+    @options.global_options
+    def group(**_: object) -> None: ...
+
+    group.add_command(command)
+    env: dict[str, str | None] = {name: None for name in os.environ if name.startswith("PMSMTOOL_")}
+    result = CliRunner(env={**env, **environment}).invoke(
+        group, arguments, catch_exceptions=False, standalone_mode=False
+    )
+    assert result.exit_code == 0, result.output
+    return seen[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environment", "expected"),
+    [
+        (["probe"], {}, BusOptions()),
+        (["-n", "5", "probe"], {}, BusOptions(node=5)),
+        (["probe", "-n", "0x10"], {}, BusOptions(node=16)),
+        (["-n", "5", "probe", "-n", "6"], {}, BusOptions(node=6)),
+        (["probe"], {"PMSMTOOL_NODE": "7"}, BusOptions(node=7)),
+        (["-n", "5", "probe"], {"PMSMTOOL_NODE": "7"}, BusOptions(node=5)),
+        (["probe", "-n", "6"], {"PMSMTOOL_NODE": "7"}, BusOptions(node=6)),
+        (["probe"], {"PMSMTOOL_PROBE_NODE": "7"}, BusOptions()),
+        (["-i", "pcan", "probe", "-c", "x"], {}, BusOptions("pcan", "x")),
+        (["probe", "--sim", "demo"], {}, BusOptions("pmsmsim", "demo")),
+        (["--sim", "demo", "probe", "-b", "250000"], {}, BusOptions("pmsmsim", "demo", 250000)),
+        (["probe", "--sim", "demo"], {"PMSMTOOL_INTERFACE": "pcan"}, BusOptions("pmsmsim", "demo")),
+        (["probe", "-i", "pcan"], {"PMSMTOOL_SIM": "demo"}, BusOptions("pcan")),
+        (["probe"], {"PMSMTOOL_SIM": "demo"}, BusOptions("pmsmsim", "demo")),
+        (["probe", "--trace-can", "x.asc"], {}, BusOptions(trace_can=Path("x.asc"))),
+    ],
+)
+def test_bus_options(arguments: list[str], environment: dict[str, str], expected: BusOptions) -> None:
+    assert probe(arguments, **environment)[0] == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environment"),
+    [
+        (["probe", "--sim", "demo", "-i", "pcan"], {}),
+        (["-c", "can0", "probe", "--sim", "demo"], {}),
+        (["probe"], {"PMSMTOOL_SIM": "demo", "PMSMTOOL_INTERFACE": "pcan"}),
+        (["probe", "-n", "128"], {}),
+        (["probe", "-n", "0"], {}),
+        (["probe", "-n", "five"], {}),
+        (["probe", "-b", "500k"], {}),
+        (["probe", "--i-max", "12"], {}),
+        (["probe", "--i-max", "12A"], {}),
+        (["probe", "--speed-max", "1200"], {}),
+        (["probe", "--shaft", "loose"], {}),
+    ],
+)
+def test_bus_options_refused(arguments: list[str], environment: dict[str, str]) -> None:
+    with pytest.raises(click.UsageError):
+        probe(arguments, **environment)
+
+
+def test_output_and_motion_options() -> None:
+    _, out, motion = probe(["--json", "-v", "probe", "-v", "--i-max", "8.5Arms", "--speed-max", "60rpm", "--yes"])
+    assert (out.json, out.verbosity) == (True, 2)
+    assert motion.i_max_apk == pytest.approx(8.5 * math.sqrt(2.0), rel=1e-12)
+    assert motion.speed_max_rad_s == pytest.approx(2.0 * math.pi, rel=1e-12)
+    assert (motion.yes, motion.load, motion.brake, motion.shaft) == (True, "none", "none", None)
+    _, out, motion = probe(["probe", "-q", "-v"])
+    assert (out.json, out.verbosity, motion.yes) == (False, -1, False)
+
+
+def test_consent_is_not_taken_from_the_environment() -> None:
+    assert probe(["probe"], PMSMTOOL_YES="1", PMSMTOOL_PROBE_YES="1")[2].yes is False
+
+
+def test_simulated_only_when_the_interface_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("CAN_INTERFACE", raising=False)
+    assert BusOptions("pmsmsim").simulated()
+    assert not BusOptions("socketcand").simulated()
+    assert not BusOptions().simulated()

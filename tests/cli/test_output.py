@@ -1,0 +1,92 @@
+"""What commands print: JSON forms, tables, streams."""
+
+from __future__ import annotations
+
+import enum
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pmsmtool.cli.output import Output, jsonable, table
+
+
+class Mode(enum.IntEnum):
+    """A mode with a number, printed by name."""
+
+    LINE_SEARCH = 2
+
+
+class Bits(enum.IntFlag):
+    """Bits, printed as their number."""
+
+    A = 1
+    B = 2
+
+
+@dataclass(frozen=True)
+class Triple:
+    """A number with its doubt."""
+
+    value: float
+    std: float
+    systematic: float
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (Triple(0.1, math.nan, math.inf), {"value": 0.1, "std": None, "systematic": None}),
+        (np.array([[1.0, math.nan]]), [[1.0, None]]),
+        (np.array(3), 3),
+        (np.float32(0.5), 0.5),
+        (np.int64(5), 5),
+        (np.bool_(True), True),
+        (Mode.LINE_SEARCH, "line-search"),
+        (Bits.A | Bits.B, 3),
+        ({1: (True, None)}, {"1": [True, None]}),
+        ({"b", "a"}, ["a", "b"]),
+        (Path("a") / "b", str(Path("a/b"))),
+    ],
+)
+def test_jsonable(value: object, expected: object) -> None:
+    found = jsonable(value)
+    assert found == expected
+    assert json.loads(json.dumps(found, allow_nan=False)) == expected
+
+
+@pytest.mark.parametrize("value", [b"x", object(), Triple])
+def test_jsonable_refuses(value: object) -> None:
+    with pytest.raises(TypeError):
+        jsonable(value)
+
+
+def test_result_is_text_or_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:
+    Output().result("scan", {"nodes": [5]}, ["node 5"])
+    assert capsys.readouterr().out == "node 5\n"
+    Output(json=True).result("scan", {"nodes": [5]}, lambda: pytest.fail("text is not made for JSON"))
+    assert json.loads(capsys.readouterr().out) == {"schema": "pmsmtool.scan/1", "nodes": [5]}
+
+
+@pytest.mark.parametrize(
+    ("verbosity", "expected"), [(-1, "warning: w\n"), (0, "n\nwarning: w\n"), (1, "n\nd\nwarning: w\n")]
+)
+def test_notes_go_to_stderr(verbosity: int, expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out = Output(verbosity=verbosity)
+    out.note("n")
+    out.detail("d")
+    out.status("not on a terminal")
+    out.warn("w")
+    assert capsys.readouterr() == ("", expected)
+
+
+def test_table_aligns() -> None:
+    assert table(("name", "ohm"), [("R_s", 0.1), ("R_winding", "12.25")]) == [
+        "name         ohm",
+        "R_s          0.1",
+        "R_winding  12.25",
+    ]
+    assert table(("a", "b"), []) == ["a  b"]

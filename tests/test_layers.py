@@ -1,0 +1,249 @@
+"""The plan of the house, enforced: who may import whom, what the pure rooms never touch, how long a file may get.
+
+The rules work on source text, so each is also shown a line it must refuse.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "pmsmtool"
+
+FLOORS: dict[str, int] = {
+    "errors": 1,
+    "cia402": 1,
+    "bus": 2,
+    "units": 2,
+    "native": 2,
+    "resources": 2,
+    "npz_file": 2,
+    "toml_text": 2,
+    "machine": 3,
+    "params": 3,
+    "trace": 3,
+    "packaging": 3,
+    "estimators": 4,
+    "design": 4,
+    "firmware": 4,
+    "drive": 5,
+    "sim": 5,
+    "report": 5,
+    "experiments": 6,
+    "flash": 6,
+    "workflow": 7,
+    "cli": 8,
+}
+SAME_ROOM = {"trace_file": "trace", "__main__": "cli"}
+PURE = frozenset({"machine", "params", "estimators", "design", "firmware", "report", "trace", "units"})
+IMPURE_ROOMS = frozenset({"bus", "drive", "experiments", "flash", "sim", "workflow", "cli", "packaging"})
+IMPURE_LIBRARIES = frozenset({"click", "rich", "can", "canopen", "time", "random"})
+MAY_IMPORT_SIM = frozenset({"sim", "workflow", "cli"})
+TYPES_ONLY = "pmsmtool.drive.port"
+"""Types alone; every room that stands as high as drive may name them."""
+
+SLOW_LIBRARIES = frozenset({"scipy", "matplotlib", "filterpy"})
+"""0.2 to 0.6 s each: imported inside the function that needs them (start-up budget)."""
+SLOW_FOR_CLI = SLOW_LIBRARIES | {"numpy", "can", "canopen", "rich", "jinja2", "tomlkit"}
+
+MAY_PRINT = frozenset({"cli", "packaging"})
+RANDOM_TYPES = frozenset({"Generator", "BitGenerator", "SeedSequence", "PCG64", "Philox", "default_rng"})
+EMPTY_WORDS = frozenset({"manager", "handler", "util", "utils", "helper", "helpers", "engine", "service"})
+LINES_MAX = 600
+
+
+@dataclass(frozen=True)
+class Import:
+    """One imported module, and where the import stands."""
+
+    module: str
+    line: int
+    top_level: bool
+    typing_only: bool
+
+
+def room(module: str) -> str:
+    """Return the room of a module of the package."""
+    name = module.split(".")[1] if "." in module else ""
+    return SAME_ROOM.get(name, name)
+
+
+def _is_type_checking(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+
+
+def imports(tree: ast.Module) -> Iterator[Import]:
+    """Yield every import of a module with its place."""
+
+    def visit(node: ast.AST, top_level: bool, typing_only: bool) -> Iterator[Import]:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.Import):
+                for alias in child.names:
+                    yield Import(alias.name, child.lineno, top_level, typing_only)
+            elif isinstance(child, ast.ImportFrom):
+                source = child.module or ""
+                submodules = source == "pmsmtool"  # `from pmsmtool import trace` names rooms
+                for name in [f"{source}.{alias.name}" for alias in child.names] if submodules else [source]:
+                    yield Import(name, child.lineno, top_level, typing_only)
+            inside = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+            yield from visit(child, top_level and not inside, typing_only or _is_type_checking(child))
+
+    yield from visit(tree, True, False)
+
+
+def arrow_faults(module: str, tree: ast.Module) -> Iterator[str]:
+    """Imports that go up, sideways, or out of a pure room."""
+    here = room(module)
+    if not here:
+        return  # pmsmtool/__init__.py names its public modules without importing them
+    for found in imports(tree):
+        top = found.module.split(".")[0]
+        if here in PURE and top in IMPURE_LIBRARIES:
+            yield f"{found.line}: the pure room {here} imports {top}"
+        there = room(found.module) if top == "pmsmtool" else ""
+        if there in ("", here, "__version__"):
+            continue
+        if there not in FLOORS:
+            yield f"{found.line}: no floor is known for {found.module}"
+        elif here in PURE and there in IMPURE_ROOMS:
+            yield f"{found.line}: the pure room {here} imports {there}"
+        elif there == "sim" and here not in MAY_IMPORT_SIM:
+            yield f"{found.line}: {here} imports sim"
+        elif there == "packaging":
+            yield f"{found.line}: {here} imports the build tools"
+        elif FLOORS[there] >= FLOORS[here] and not (found.module == TYPES_ONLY and FLOORS[here] >= FLOORS["drive"]):
+            yield f"{found.line}: {here} (floor {FLOORS[here]}) imports {there} (floor {FLOORS[there]})"
+
+
+def start_up_faults(module: str, tree: ast.Module) -> Iterator[str]:
+    """Slow libraries imported where merely importing the module pays for them."""
+    slow = SLOW_FOR_CLI if room(module) == "cli" else SLOW_LIBRARIES
+    for found in imports(tree):
+        if found.module.split(".")[0] in slow and found.top_level and not found.typing_only:
+            yield f"{found.line}: imports {found.module} at top level"
+
+
+def call_faults(module: str, tree: ast.Module) -> Iterator[str]:
+    """Printing outside the command line, and random numbers nobody passed in."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
+            if room(module) not in MAY_PRINT:
+                yield f"{node.lineno}: print outside cli"
+        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("np.random", "numpy.random"):
+            if node.attr not in RANDOM_TYPES:
+                yield f"{node.lineno}: global random state np.random.{node.attr}"
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("random.default_rng") and not node.args:
+            yield f"{node.lineno}: a random generator without a seed"
+
+
+def _words(name: str) -> set[str]:
+    return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name)}
+
+
+def name_faults(module: str, tree: ast.Module) -> Iterator[str]:
+    """Words that say nothing about what a thing is."""
+    if EMPTY_WORDS & _words(module):
+        yield f"the name {module} says nothing"
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) and EMPTY_WORDS & _words(node.name):
+            yield f"{node.lineno}: the name {node.name} says nothing"
+
+
+RULES = (arrow_faults, start_up_faults, call_faults, name_faults)
+
+
+def faults(module: str, source: str) -> list[str]:
+    """Return all violations of one module."""
+    tree = ast.parse(source)
+    return [fault for rule in RULES for fault in rule(module, tree)]
+
+
+def module_name(path: Path) -> str:
+    """Return the dotted name of a file of the package."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
+def test_module_keeps_the_rules(path: Path) -> None:
+    assert faults(module_name(path), path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize("folder", ["pmsmtool", "tests", "benchmarks"])
+def test_no_file_is_too_long(folder: str) -> None:
+    files = [path for suffix in ("py", "c", "h") for path in (ROOT / folder).rglob(f"*.{suffix}")]
+    lengths = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8").count("\n") for path in files}
+    assert lengths
+    assert {name: lines for name, lines in lengths.items() if lines > LINES_MAX} == {}
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "complaint"),
+    [
+        ("pmsmtool.machine.x", "import pmsmtool.bus.connect", "pure room machine imports bus"),
+        ("pmsmtool.design.x", "def f():\n    from pmsmtool.sim import plant", "pure room design imports sim"),
+        ("pmsmtool.report.x", "from pmsmtool import sim", "pure room report imports sim"),
+        ("pmsmtool.estimators.x", "import time", "imports time"),
+        ("pmsmtool.trace_file", "from random import random", "pure room trace imports random"),
+        ("pmsmtool.machine.x", "from pmsmtool.design.tune import tune", "machine (floor 3) imports design (floor 4)"),
+        ("pmsmtool.design.x", "from pmsmtool.estimators import noise", "design (floor 4) imports estimators"),
+        ("pmsmtool.machine.x", "if TYPE_CHECKING:\n    from pmsmtool.firmware import image", "(floor 4)"),
+        ("pmsmtool.estimators.x", "from pmsmtool.drive.port import Drive", "pure room estimators imports drive"),
+        ("pmsmtool.bus.x", "from pmsmtool.drive.port import Drive", "bus (floor 2) imports drive"),
+        ("pmsmtool.flash.x", "from pmsmtool.sim.bus import PmsmSimBus", "flash imports sim"),
+        ("pmsmtool.cli.x", "from pmsmtool.packaging import kernels", "build tools"),
+        ("pmsmtool.cli.x", "from pmsmtool.attic import y", "no floor is known"),
+        ("pmsmtool.design.x", "from scipy import linalg", "imports scipy at top level"),
+        ("pmsmtool.design.x", "class A:\n    import matplotlib.figure", "imports matplotlib.figure at top level"),
+        ("pmsmtool.cli.x", "import numpy as np", "imports numpy at top level"),
+        ("pmsmtool.cli.x", "if True:\n    import can", "imports can at top level"),
+        ("pmsmtool.workflow.x", "print('x')", "print outside cli"),
+        ("pmsmtool.sim.x", "np.random.normal(0, 1)", "global random state"),
+        ("pmsmtool.sim.x", "rng = np.random.default_rng()", "without a seed"),
+        ("pmsmtool.sim.x", "class BusManager: ...", "BusManager says nothing"),
+        ("pmsmtool.sim.util", "", "says nothing"),
+    ],
+)
+def test_rules_refuse(module: str, source: str, complaint: str) -> None:
+    found = faults(module, source)
+    assert len(found) == 1
+    assert complaint in found[0]
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("pmsmtool.sim.x", "from pmsmtool.drive.port import Excitation"),
+        ("pmsmtool.workflow.x", "from pmsmtool.sim.bus import PmsmSimBus"),
+        ("pmsmtool.design.x", "import numpy as np\ndef f(rng: np.random.Generator):\n    from scipy import linalg"),
+        ("pmsmtool.cli.x", "if TYPE_CHECKING:\n    import numpy\ndef f():\n    import can\n    print(1)"),
+        ("pmsmtool.sim.x", "rng = np.random.default_rng(7)\nUTILISATION = 1\ndef utilisation(): ..."),
+        ("pmsmtool.cli.x", "from pmsmtool import __version__"),
+    ],
+)
+def test_rules_allow(module: str, source: str) -> None:
+    assert faults(module, source) == []
+
+
+def test_every_third_party_import_is_declared() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    requirements = [*project["dependencies"], *itertools.chain(*project["optional-dependencies"].values())]
+    names = {re.match(r"[A-Za-z0-9-]+", text)[0].lower() for text in requirements}  # type: ignore[index]
+    imported_as = {"python-can": "can"}
+    declared = {imported_as.get(name, name) for name in names}
+    for path in MODULES:
+        for found in imports(ast.parse(path.read_text(encoding="utf-8"))):
+            top = found.module.split(".")[0]
+            if top not in sys.stdlib_module_names and top != "pmsmtool":
+                assert top in declared, f"{path.name}:{found.line} imports {top}"
