@@ -46,9 +46,10 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         Missing, truncated, not an archive, or holding Python objects (which are never executed).
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ConfigError("is a single array, not an .npz archive", where=str(path))
+        loaded = np.load(path, allow_pickle=False)
+        if not isinstance(loaded, np.lib.npyio.NpzFile):
+            raise ConfigError("is a single array, not an .npz archive", where=str(path))
+        with loaded as archive:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError:
         raise ConfigError("no such file", where=str(path), hint="check the path") from None

@@ -16,14 +16,14 @@ _SOURCE = click.Choice(["datasheet", "meter", "guess"])
 
 @click.group("machine")
 def machine_command() -> None:
-    """Make machine files."""
+    """Make machine files; check and repair flux maps."""
 
 
 @machine_command.command(
     "new",
     epilog=examples(
-        "pmsmtool machine new --name m1 --pole-pairs 4 --r 0.274ohm --l 4.4mH --ke 60.7Vrms/krpm -o m1.toml \\",
-        "    --ke-between line-line --u-dc 540V --pwm 12kHz --i-nom 19.8Arms",
+        "pmsmtool machine new --name m1 --pole-pairs 4 --r 0.274ohm --l 4.4mH --ke 60.7Vrms/krpm \\",
+        "    --ke-between line-line --i-nom 19.8Arms --u-dc 540V --pwm 12kHz -o m1.toml",
         "pmsmtool machine new --name m2 --pole-pairs 3 --connection delta --r 3.2ohm --r-between phase --l-d 30mH \\",
         "    --l-q 42mH --l-between phase --kt 0.9Nm/Arms --u-dc 325V --pwm 10kHz --source meter -o m2.toml",
     ),
@@ -71,12 +71,7 @@ def new_command(path: Path, force: bool, out: Output, **given: Any) -> None:
     result = machine_from_datasheet(_sheet(given))
     text = dump_machine_file(result.machine_file)
     parse_machine(text, where=str(path))  # what the reader would refuse is not written
-    try:
-        path.write_text(text, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be written: {error.strerror}", where=str(path), hint="choose another folder"
-        ) from None
+    _write(path, text.encode())
     rows = [(step.key, step.given, step.rule, step.result) for step in result.conversions]
     data = {
         "file": path,
@@ -109,3 +104,66 @@ def _sheet(given: dict[str, Any]) -> Any:
     given["K_e"] = None if ke is None else parse_emf_constant(ke, between)
     given["K_t"] = None if kt is None else parse_torque_constant(kt)
     return Datasheet(**given)
+
+
+@machine_command.command(
+    "map",
+    epilog=examples(
+        "pmsmtool machine map measured.mat",
+        "pmsmtool machine map measured.npz --fill-holes --rotate --symmetrise -o repaired.npz",
+    ),
+)
+@click.argument("source", type=FILE)
+@click.option("--fill-holes", "fill", is_flag=True, help="Fill nodes without a flux by the smoothest surface.")
+@click.option("--rotate", "turn", is_flag=True, help="Turn the frame so that the no-load flux lies on the d axis.")
+@click.option("--symmetrise", is_flag=True, help="Make psi_d even and psi_q odd in i_q.")
+@click.option("--make-reciprocal", "reciprocal", is_flag=True, help="Move the fluxes least to a map with a co-energy.")
+@click.option("-o", "--output", "path", type=FILE, help="Write the map as read and repaired (.npz or .csv).")
+@output_options
+def map_command(
+    source: Path, fill: bool, turn: bool, symmetrise: bool, reciprocal: bool, path: Path | None, out: Output
+) -> None:
+    """Check a flux map: reciprocity, monotonicity, holes, rotation, asymmetry, each with its number.
+
+    Repairs happen only on request, in the order fill, rotate, symmetrise, reciprocal, and each says what it changed.
+    Exit code 1 when a number is outside its limit.
+    """
+    from pmsmtool.errors import CheckFailed, ConfigError
+    from pmsmtool.machine import flux_map_repair
+    from pmsmtool.machine.flux_map_check import check_flux_map
+    from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz, load_flux_map
+
+    if path is not None and path.suffix.lower() not in (".npz", ".csv"):
+        raise ConfigError(f"{path.name} is neither .npz nor .csv", hint="choose one of them")
+    flux_map = load_flux_map(source, fill=fill)
+    if turn:
+        flux_map = flux_map_repair.rotate(flux_map, check_flux_map(flux_map).no_load_angle_rad)
+    if symmetrise:
+        flux_map = flux_map_repair.symmetrise(flux_map)
+    if reciprocal:
+        flux_map = flux_map_repair.make_reciprocal(flux_map)
+    report = check_flux_map(flux_map)
+    error = None if report.not_monotonic else flux_map.tables.inverse_error_a
+    data = {"map": flux_map.meta, "interpolation": flux_map.interpolation(), "inverse_error_a": error, "report": report}
+    lines = [f"{'ok  ' if finding.ok else 'BAD '} {finding.name}: {finding.text}" for finding in report.findings]
+    lines += [f"done {text}" for text in (*flux_map.meta.get("notes", ()), *flux_map.meta.get("repairs", ()))]
+    lines.append(f"     {flux_map.interpolation()}" + (f", at most {error:.3g} A off" if error is not None else ""))
+    out.result("machine-map", data, lines)
+    if path is not None:
+        content = flux_map_npz(flux_map) if path.suffix.lower() == ".npz" else flux_map_csv(flux_map).encode()
+        _write(path, content)
+        out.note(f"wrote {path}")
+    if not report.ok:
+        bad = [finding.name for finding in report.findings if not finding.ok]
+        raise CheckFailed(f"not good: {', '.join(bad)}", where=str(source), hint="see the options that repair")
+
+
+def _write(path: Path, content: bytes) -> None:
+    from pmsmtool.errors import ConfigError
+
+    try:
+        path.write_bytes(content)
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be written: {error.strerror}", where=str(path), hint="choose another folder"
+        ) from None

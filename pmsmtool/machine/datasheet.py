@@ -321,7 +321,8 @@ _UNIT = {"R_s_ohm": "ohm", "L_d_h": "H", "L_q_h": "H", "psi_f_wb": "Wb", "J_kgm2
 def _estimate(sheet: Datasheet, key: str, value: float) -> Estimate:
     source = sheet.source(_QUANTITY[key])
     std = value * TOLERANCE[source][_QUANTITY[key]] / math.sqrt(3.0)
-    return Estimate(value, std, 0.0, _UNIT[key], T_c=T_REF_C, method="conversion", source=source)
+    T_c = T_REF_C if key in ("R_s_ohm", "psi_f_wb") else math.nan
+    return Estimate(value, std, 0.0, _UNIT[key], T_c=T_c, method="conversion", source=source)
 
 
 def _resistance(sheet: Datasheet, steps: list[Conversion]) -> float:

@@ -141,6 +141,8 @@ def rotate(flux_map: FluxMap, angle_rad: float) -> FluxMap:
     psi'(i') = R(-angle) psi(R(angle) i') on the largest rectangle of the same node counts, centred as the old one,
     whose corners lie on the old map. With the angle of the no-load flux the new d axis is the magnets'.
     """
+    if not math.isfinite(angle_rad):
+        raise ConfigError("the map cannot be turned: it has no magnet flux to turn to", hint="give a map with magnets")
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     scale = _inscribed(flux_map, cos, sin)
     axis_d, axis_q = flux_map.i_d_a * scale, flux_map.i_q_a * scale

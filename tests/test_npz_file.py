@@ -1,0 +1,78 @@
+"""NumPy archives: deterministic bytes, and one clear error per kind of damage."""
+
+import numpy as np
+import pytest
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.npz_file import npz_bytes, read_npz
+
+ARRAYS = {"x": np.arange(5.0), "grid": np.arange(6).reshape(2, 3), "text": np.array('{"a": 1}')}
+
+
+def test_reads_back(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz_bytes(ARRAYS))
+    back = read_npz(path)
+    assert list(back) == list(ARRAYS)
+    for name, array in ARRAYS.items():
+        assert back[name].dtype == array.dtype
+        assert back[name].shape == array.shape
+        assert np.array_equal(back[name], array)
+
+
+def test_same_arrays_same_bytes():
+    assert npz_bytes(ARRAYS) == npz_bytes({name: np.array(array, order="F") for name, array in ARRAYS.items()})
+
+
+def test_numpy_reads_it(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz_bytes(ARRAYS))
+    with np.load(path) as archive:
+        assert np.array_equal(archive["grid"], ARRAYS["grid"])
+
+
+def test_objects_are_not_written():
+    with pytest.raises(ValueError, match="Object arrays"):
+        npz_bytes({"x": np.array([object()])})
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        read_npz(tmp_path / "none.npz")
+
+
+def test_a_folder_is_no_archive(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_npz(tmp_path)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 10, 100, 300])
+def test_truncated_file(tmp_path, keep):
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz_bytes(ARRAYS)[:keep])
+    with pytest.raises(ConfigError, match="not a complete .npz archive"):
+        read_npz(path)
+
+
+def test_damaged_member(tmp_path):
+    path = tmp_path / "a.npz"
+    data = bytearray(npz_bytes(ARRAYS))
+    data[data.index(b"NUMPY") + 130] ^= 0xFF
+    path.write_bytes(bytes(data))
+    with pytest.raises(ConfigError):
+        read_npz(path)
+
+
+def test_pickles_are_never_loaded(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, x=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(ConfigError):
+        read_npz(path)
+
+
+def test_a_single_array_is_no_archive(tmp_path):
+    path = tmp_path / "a.npz"
+    with path.open("wb") as file:
+        np.save(file, np.arange(3))
+    with pytest.raises(ConfigError, match="single array"):
+        read_npz(path)
