@@ -75,6 +75,15 @@ pmsm_rectangle pmsm_plane_rectangle(const pmsm_plane *plane)
     return r;
 }
 
+int32_t pmsm_on_branch(const pmsm_plane *plane, const pmsm_point *at)
+{
+    pmsm_point axis;
+    if (!(at->t_q > 0.0))
+        return 0;
+    pmsm_plane_at(plane, at->d, 0.0, &axis);
+    return axis.t_q > 0.0;
+}
+
 double pmsm_plane_outside(const pmsm_plane *plane, const pmsm_rectangle *r, const pmsm_point *at)
 {
     const double I = plane->I_max;

@@ -53,6 +53,11 @@ void pmsm_plane_flux(const pmsm_plane *plane, double d, double q, double psi[2],
 void pmsm_plane_at(const pmsm_plane *plane, double d, double q, pmsm_point *at);
 pmsm_rectangle pmsm_plane_rectangle(const pmsm_plane *plane);
 
+/* Whether torque rises with i_q there and at i_q = 0 of the same i_d. The other branch (reluctance torque against the
+ * magnet) needs more current and, without a demagnetisation limit, never reaches more; a table that changed over to
+ * it could not be interpolated. */
+int32_t pmsm_on_branch(const pmsm_plane *plane, const pmsm_point *at);
+
 /* How far a point lies outside the domain, relative to I_max; negative inside. */
 double pmsm_plane_outside(const pmsm_plane *plane, const pmsm_rectangle *rectangle, const pmsm_point *at);
 

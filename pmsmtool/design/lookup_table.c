@@ -49,15 +49,20 @@ typedef struct {
 
 /* ---- least current ------------------------------------------------------------------------------- */
 
-static void extremes_on(const pmsm_border *border, pmsm_point extreme[2])
+static int32_t extremes_on(const pmsm_plane *plane, const pmsm_border *border, pmsm_point extreme[2])
 {
-    extreme[0] = extreme[1] = border->node[0];
-    for (int32_t k = 1; k < border->n_nodes; k++) {
-        if (border->node[k].t < extreme[0].t)
-            extreme[0] = border->node[k];
-        if (border->node[k].t > extreme[1].t)
-            extreme[1] = border->node[k];
+    int32_t found = 0;
+    for (int32_t k = 0; k < border->n_nodes; k++) {
+        const pmsm_point *at = &border->node[k];
+        if (!pmsm_on_branch(plane, at))
+            continue;
+        if (!found || at->t < extreme[0].t)
+            extreme[0] = *at;
+        if (!found || at->t > extreme[1].t)
+            extreme[1] = *at;
+        found = 1;
     }
+    return found;
 }
 
 static void build_locus(tables *all)
@@ -73,9 +78,8 @@ static void build_locus(tables *all)
     }
     for (int32_t k = 1; k <= RADII; k++) {
         pmsm_border_build(all->plane, r, reach * k / RADII, 0, LOCUS_NODES, &ring);
-        if (ring.n_nodes == 0)
+        if (!extremes_on(all->plane, &ring, extreme))
             break;
-        extremes_on(&ring, extreme);
         for (int32_t side = 0; side < 2; side++) {
             locus *to = &all->least[side];
             const double sign = side ? 1.0 : -1.0;
@@ -461,7 +465,9 @@ int32_t pmsm_lookup_table(const pmsm_plane *plane, int32_t n_T, const double *to
     const pmsm_rectangle rectangle = pmsm_plane_rectangle(plane);
     all.plane = plane;
     pmsm_border_build(plane, &rectangle, plane->I_max, 1, BORDER_NODES, &all.border);
-    extremes_on(&all.border, all.bound);
+    if (!extremes_on(plane, &all.border, all.bound)) /* no torque anywhere: a constant machine without magnet or saliency */
+        for (int32_t side = 0; side < 2; side++)
+            pmsm_plane_at(plane, 0.0, 0.0, &all.bound[side]);
     build_locus(&all);
     limits_of_speeds(&all, n_w, omega, n_V, V, extreme);
     for (int32_t k = 0; k < n_T; k++)

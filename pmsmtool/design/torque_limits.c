@@ -7,9 +7,12 @@
 #include "current_plane.h"
 
 #include <math.h>
+#include <stddef.h>
 
 #define TRACE_STEP 0.04   /* of I_max, along the voltage limit */
 #define TRACE_STEPS 2000
+#define FULL_TURN 6.2831853071795865
+#define ON_BORDER 1e-12   /* of I_max: a point on the domain's border */
 #define SHORT_CIRCUIT_STEPS 60
 #define SHORT_CIRCUIT 1e-20 /* squared voltage taken as zero, relative to the limit */
 
@@ -26,56 +29,64 @@ typedef struct {
 
 static void consider(search *run, const pmsm_point *at)
 {
-    if (!run->found || at->t < run->extreme[0].t)
+    const int32_t less = !run->found || at->t < run->extreme[0].t;
+    const int32_t more = !run->found || at->t > run->extreme[1].t;
+    if (!(less || more) || !pmsm_on_branch(run->plane, at))
+        return;
+    if (less)
         run->extreme[0] = *at;
-    if (!run->found || at->t > run->extreme[1].t)
+    if (more)
         run->extreme[1] = *at;
     run->found = 1;
 }
 
-/* Follow the voltage limit from a point, while the torque rises (side 1) or falls (side 0). */
-static void follow(search *run, const pmsm_point *start, double length, int32_t side)
+/* Follow the voltage limit along its tangent until it leaves the domain or has gone round `centre`; every extreme of
+ * the torque on the way is a candidate (a machine with strong saliency has more than one of a kind). */
+static void follow(search *run, const pmsm_point *start, const pmsm_point *centre)
 {
+    const double length = TRACE_STEP * run->plane->I_max;
     pmsm_point from = *start, to, top;
-    const double wanted = side ? 1.0 : -1.0;
-    const double along = length > 0.0 ? wanted : -wanted;
-    if (!(along * pmsm_curve_indicator(&run->limit, PMSM_AT_TORQUE_EXTREME, &from) > 0.0))
-        return;
-    for (int32_t k = 0; k < TRACE_STEPS; k++) {
+    double turned = 0.0;
+    for (int32_t k = 0; k < TRACE_STEPS && fabs(turned) < FULL_TURN; k++) {
         int32_t leaving;
         if (!pmsm_curve_step(&run->limit, &from, length, &to))
             return;
-        leaving = pmsm_plane_outside(run->plane, &run->border->rectangle, &to) > 0.0;
+        leaving = k > 0 && pmsm_plane_outside(run->plane, &run->border->rectangle, &to) > 0.0;
         if (leaving && !pmsm_curve_root(&run->limit, PMSM_AT_EDGE, &from, &to, &to))
             return;
-        if (!(along * pmsm_curve_indicator(&run->limit, PMSM_AT_TORQUE_EXTREME, &to) > 0.0)) {
-            if (pmsm_curve_root(&run->limit, PMSM_AT_TORQUE_EXTREME, &from, &to, &top))
-                consider(run, &top);
-            return;
-        }
+        if (pmsm_curve_root(&run->limit, PMSM_AT_TORQUE_EXTREME, &from, &to, &top)
+            && pmsm_plane_outside(run->plane, &run->border->rectangle, &top) <= ON_BORDER)
+            consider(run, &top);
         if (leaving)
             return; /* the border crossing is a candidate of its own */
+        if (centre) {
+            const double a = from.d - centre->d, b = from.q - centre->q, c = to.d - centre->d, d = to.q - centre->q;
+            turned += atan2(a * d - b * c, a * c + b * d);
+        }
         from = to;
     }
+}
+
+/* Whether the voltage limit runs into the domain from a border point; the limits may touch, hence three lengths. */
+static int32_t enters(const search *run, const pmsm_point *at)
+{
+    static const double nudge[3] = {1e-6, 1e-4, 1e-2}; /* of I_max */
+    for (int32_t k = 0; k < 3; k++) {
+        pmsm_point near;
+        if (pmsm_curve_step(&run->limit, at, nudge[k] * run->plane->I_max, &near)
+            && pmsm_plane_outside(run->plane, &run->border->rectangle, &near) < 0.0)
+            return 1;
+    }
+    return 0;
 }
 
 /* A crossing of border and voltage limit: a candidate, and where the limit enters the domain. */
 static void cross(search *run, const pmsm_point *at)
 {
-    const double length = TRACE_STEP * run->plane->I_max, nudge = 1e-7 * run->plane->I_max;
-    double tangent[2];
     run->crossings++;
     consider(run, at);
-    pmsm_curve_tangent(&run->limit, at, tangent);
-    for (int32_t k = 0; k < 2; k++) {
-        const double sign = k ? 1.0 : -1.0;
-        pmsm_point inside;
-        pmsm_plane_at(run->plane, at->d + sign * nudge * tangent[0], at->q + sign * nudge * tangent[1], &inside);
-        if (pmsm_plane_outside(run->plane, &run->border->rectangle, &inside) > 0.0)
-            continue;
-        follow(run, at, sign * length, 0);
-        follow(run, at, sign * length, 1);
-    }
+    if (enters(run, at)) /* along the tangent; the arc's other end is entered against it */
+        follow(run, at, NULL);
 }
 
 static void root_on_piece(search *run, const pmsm_curve *curve, double s_a, double s_b)
@@ -161,10 +172,9 @@ static int32_t short_circuit(const search *run, pmsm_point *at)
     return least < run->V2 && pmsm_plane_outside(run->plane, &run->border->rectangle, at) < 0.0;
 }
 
-/* The voltage limit closed inside the domain: start above the short-circuit current and follow it both ways. */
+/* The voltage limit closed inside the domain: start above the short-circuit current and follow it once round. */
 static void closed_limit(search *run)
 {
-    const double length = TRACE_STEP * run->plane->I_max;
     const double I2 = run->plane->I_max * run->plane->I_max;
     pmsm_curve up = run->limit;
     pmsm_point centre, start;
@@ -179,10 +189,7 @@ static void closed_limit(search *run)
     if (!pmsm_curve_root_between(&up, PMSM_AT_VOLTAGE, centre.q, top, &s, &start))
         return;
     consider(run, &start);
-    for (int32_t side = 0; side < 2; side++) {
-        follow(run, &start, length, side);
-        follow(run, &start, -length, side);
-    }
+    follow(run, &start, &centre);
 }
 
 int32_t pmsm_torque_limits(const pmsm_plane *plane, const pmsm_border *border, double omega, double V,
