@@ -49,6 +49,14 @@ class InverterCurve:
         e_alpha, e_beta = (2.0 * e_a - e_b - e_c) / 3.0, (e_b - e_c) / root
         return c * e_alpha + s * e_beta, c * e_beta - s * e_alpha
 
+    def along_axis(self, frame_rad: float, axis: str, i_a: Vector, other_a: float) -> Vector:
+        """Error along one axis of a frozen frame while the other axis carries a constant current (V)."""
+        angle = np.full_like(i_a, frame_rad)
+        other = np.full_like(i_a, other_a)
+        if axis == "d":
+            return self.error_dq_v(i_a, other, angle)[0]
+        return self.error_dq_v(other, i_a, angle)[1]
+
     def knee_a(self, V_plateau_v: float) -> float:
         """Current at which a ramp to the plateau fits the curve best (A): the drive's compensation has that shape."""
         x, y = self.i_phase_a, self.u_error_v

@@ -78,7 +78,13 @@ def central_jacobian(residual: Residual, x: Vector, step: Vector) -> NDArray[np.
 
 
 def levenberg_marquardt(
-    residual: Residual, x0: Vector, scale: Vector, *, iterations: int = 60, tolerance: float = 1e-9
+    residual: Residual,
+    x0: Vector,
+    scale: Vector,
+    *,
+    iterations: int = 60,
+    tolerance: float = 1e-9,
+    cost_tolerance: float = 0.0,
 ) -> Fit:
     """Minimise the sum of squares of ``residual(x)``.
 
@@ -94,6 +100,9 @@ def levenberg_marquardt(
         Largest number of steps.
     tolerance : float
         Stop when a step is below this, relative to ``scale``.
+    cost_tolerance : float
+        Stop when a step lowers the cost by less than this; 1e-4 of a whitened cost is a hundredth of a standard
+        deviation.
 
     References
     ----------
@@ -119,10 +128,11 @@ def levenberg_marquardt(
             cost_trial = float(r_trial @ r_trial)
             small = bool(np.all(np.abs(delta) <= tolerance * scale))
             if np.isfinite(cost_trial) and cost_trial <= cost:
+                gain = cost - cost_trial
                 x, r, cost = trial, r_trial, cost_trial
                 damping = max(damping / 10.0, 1e-12)
                 jacobian = central_jacobian(residual, x, step)
-                converged = small
+                converged = small or gain < cost_tolerance
                 break
             if small or damping > DAMPING_LIMIT:
                 converged = small

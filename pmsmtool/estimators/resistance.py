@@ -190,9 +190,7 @@ def estimate_resistance(
     variance = sum(
         w * (fit.covariance[0, 0] * widen**2 + (fit.x[0] - R_w) ** 2) for w, fit in zip(weights, fits, strict=True)
     )
-    V_vector, v_0, drift = (
-        float(sum(w * fit.x[k] for w, fit in zip(weights, fits, strict=True))) for k in (1, 2, 3)
-    )
+    V_vector, v_0, drift = (float(sum(w * fit.x[k] for w, fit in zip(weights, fits, strict=True))) for k in (1, 2, 3))
     drift /= R_w
     V_dead = V_vector * math.sqrt(3.0) / 2.0
     hardness = abs(V_dead) / (R_w * peak)

@@ -1,0 +1,134 @@
+"""Pole pairs, direction and coarse offset of the encoder from a slowly rotated vector (identification reference, 3.6).
+
+The stator vector is turned forward and back through at least one mechanical turn and the rotor follows. The imposed
+electrical angle over the measured mechanical angle is the number of pole pairs, its sign the direction; the mean of
+direction p theta_M - theta_imposed over both runs is the offset, because the lag of friction has opposite signs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.trace import Trace
+
+STAGE = "encoder"
+Vector = NDArray[np.float64]
+
+INTEGER_LIMIT = 0.1
+"""Largest distance of the count from an integer (identification reference, 3.6)."""
+LINEARITY_LIMIT_RAD = math.radians(30.0)
+"""Largest deviation of p theta_M from the imposed angle (electrical): beyond it the rotor slips or sticks."""
+MINIMUM_TURNS = 0.98
+"""Mechanical turns the vector must have gone through in each direction."""
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderResult:
+    """Pole pairs, direction and coarse offset.
+
+    Attributes
+    ----------
+    pole_pairs : Estimate
+        Integer value; ``std`` is the distance of the two runs from it.
+    direction : int
+        +1 when the encoder counts with the electrical angle, -1 against it.
+    offset : Estimate
+        Offset in theta_e = direction p theta_M - offset (rad electrical), within (-pi, pi].
+    lag_rad : float
+        Half the difference between forward and backward run: what friction holds back (rad electrical).
+    """
+
+    pole_pairs: Estimate
+    direction: int
+    offset: Estimate
+    lag_rad: float
+
+
+def estimate_encoder(forward: Trace, backward: Trace) -> EncoderResult:
+    """Pole pairs, direction and offset.
+
+    Parameters
+    ----------
+    forward, backward : Trace
+        ``theta_imposed_rad`` (electrical, unwrapped) and ``theta_M_rad`` (mechanical, unwrapped).
+
+    Raises
+    ------
+    IdentificationError
+        ``E_POLE_PAIRS`` when the count is not an integer, ``E_ROTOR_MOVED`` when the rotor slips, ``E_EXCITATION``.
+    """
+    slopes = [_slope(trace) for trace in (forward, backward)]
+    mean = 0.5 * (slopes[0] + slopes[1])
+    count = round(abs(mean))
+    distance = max(abs(abs(slope) - count) for slope in slopes)
+    if count < 1 or distance > INTEGER_LIMIT or slopes[0] * slopes[1] <= 0.0:
+        raise refuse(
+            "E_POLE_PAIRS",
+            f"electrical over mechanical angle is {slopes[0]:.3f} forward and {slopes[1]:.3f} backward, "
+            f"limit {INTEGER_LIMIT:g} from an integer",
+            stage=STAGE,
+        )
+    direction = 1 if mean > 0.0 else -1
+    offsets = []
+    for trace in (forward, backward):
+        turns = abs(float(np.ptp(trace["theta_M_rad"]))) / (2.0 * math.pi)
+        if turns < MINIMUM_TURNS:
+            raise refuse("E_EXCITATION", f"the rotor turned {turns:.2f} times, {MINIMUM_TURNS:g} needed", stage=STAGE)
+        deviation = direction * count * trace["theta_M_rad"] - trace["theta_imposed_rad"]
+        centre = _circular_mean(deviation)
+        worst = float(np.max(np.abs(_wrap(deviation - centre))))
+        if worst > LINEARITY_LIMIT_RAD:
+            raise refuse(
+                "E_ROTOR_MOVED",
+                f"the rotor leaves the imposed angle by {math.degrees(worst):.3g} deg (electrical), "
+                f"limit {math.degrees(LINEARITY_LIMIT_RAD):g} deg",
+                stage=STAGE,
+                likely="cogging or a load stronger than the holding torque",
+                hint="raise the holding current or free the shaft",
+            )
+        offsets.append((centre, float(np.std(_wrap(deviation - centre)))))
+    lag = 0.5 * float(_wrap(np.array([offsets[0][0] - offsets[1][0]]))[0])
+    offset = float(_wrap(np.array([offsets[1][0] + lag]))[0])
+    scatter = math.hypot(offsets[0][1], offsets[1][1]) / 2.0
+    return EncoderResult(
+        pole_pairs=Estimate(float(count), distance, 0.0, "1", n=len(forward) + len(backward), method="slow rotation"),
+        direction=direction,
+        offset=Estimate(
+            offset,
+            math.hypot(scatter, 0.25 * abs(lag)),
+            0.0,
+            "rad",
+            n=len(forward) + len(backward),
+            method="slow rotation, mean of both directions (coarse)",
+        ),
+        lag_rad=lag,
+    )
+
+
+def _slope(trace: Trace) -> float:
+    """Imposed electrical angle per measured mechanical angle."""
+    imposed, measured = trace["theta_imposed_rad"], trace["theta_M_rad"]
+    centred = measured - np.mean(measured)
+    power = float(centred @ centred)
+    if power < (0.01) ** 2 * len(centred):
+        raise refuse(
+            "E_POLE_PAIRS",
+            "the rotor did not follow the rotating vector",
+            stage=STAGE,
+            likely="locked shaft, too small a current, or an encoder that does not count",
+        )
+    return float(centred @ (imposed - np.mean(imposed))) / power
+
+
+def _wrap(angle: Vector) -> Vector:
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def _circular_mean(angle: Vector) -> float:
+    return math.atan2(float(np.mean(np.sin(angle))), float(np.mean(np.cos(angle))))

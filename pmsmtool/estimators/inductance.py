@@ -1,0 +1,276 @@
+"""Incremental L_d and L_q at a bias from square-wave shots in a frozen frame (identification reference, 3.2).
+
+Two half periods per axis separate the delay, the sensor lag and the motion of the rotor from L; the frame's offset from
+the d axis, known from the flux run, mixes the axes and is undone with the measured inverse inductances
+
+    1/L_d' = cos^2 eps / L_d + sin^2 eps / L_q.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.axis_fit import SKIP_SAMPLES, AxisFit, Shot, VoltageError, fit_axis
+from pmsmtool.estimators.estimate import SensorTolerance, Verdict, chi2_gate, condition_gate, ljung_box
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.noise import Noise
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.trace import Trace
+
+Vector = NDArray[np.float64]
+
+MODEL_FLOOR = 3e-4
+"""Relative standard deviation added for what the model leaves out (identification reference, section 4)."""
+FREQUENCY_LIMIT = 0.01
+"""Relative difference between two injection frequencies above which both values are reported."""
+ROTOR_LIMIT_RAD = math.radians(2.0)
+"""Rotor motion in one shot (electrical, beyond one encoder step): mixes the axes by sin^2(2 deg) = 0.12 %."""
+MINIMUM_PERIODS = 20
+"""Full periods of the square wave below which a shot is not an excitation."""
+CURVE_POINTS = 256
+ANISOTROPY_LIMIT = 0.03
+"""(1/L_d - 1/L_q) over the mean below which the axis angle cannot be told from the inductances."""
+
+
+@dataclass(frozen=True, slots=True)
+class InductanceResult:
+    """Incremental inductances and what came with them.
+
+    Attributes
+    ----------
+    L_d, L_q : Estimate
+        Incremental inductances at the bias stated in the estimate (H).
+    axes : mapping of str to AxisFit
+        Fits of the frame's own axes, before the offset is undone.
+    delay : float
+        Sample to acting voltage, mean of both axes (T_s).
+    lag_s : float
+        Time constant of the current sensor (s).
+    by_frequency : mapping of str to tuple of (float, float)
+        Per axis: injection frequency (Hz) and inductance (H) of every shot.
+    frequency_dependent : tuple of str
+        Axes whose inductances differ by more than 1 % between the injection frequencies.
+    axis_angle_rad, axis_angle_std_rad : float
+        Angle of the frame ahead of the axis of largest 1/L, from the cross responses; NaN for a round machine.
+    whiteness : mapping of str to float
+        Ljung-Box p-value of the residual of each axis.
+    verdict : Verdict
+        ``warn`` above the chi-square limit or when frequency dependent.
+    """
+
+    L_d: Estimate
+    L_q: Estimate
+    axes: Mapping[str, AxisFit]
+    delay: float
+    lag_s: float
+    by_frequency: Mapping[str, tuple[tuple[float, float], ...]]
+    frequency_dependent: tuple[str, ...]
+    axis_angle_rad: float
+    axis_angle_std_rad: float
+    whiteness: Mapping[str, float]
+    verdict: Verdict
+
+
+def estimate_inductances(
+    d_shots: Sequence[Trace],
+    q_shots: Sequence[Trace],
+    noise: Noise,
+    R_ohm: float,
+    *,
+    frame_offset: tuple[float, float] | None = None,
+    inverter: InverterCurve | None = None,
+    tolerance: SensorTolerance | None = None,
+) -> InductanceResult:
+    """Incremental inductances from square-wave shots.
+
+    Parameters
+    ----------
+    d_shots, q_shots : sequence of Trace
+        ``u_d_v u_q_v i_d_a i_q_a theta_e_rad`` (and ``flagged``) in a frozen frame;
+        ``meta["half_period"]`` in samples, ``meta["fixed_angle_rad"]``.
+    noise : Noise
+        From the zero-current trace.
+    R_ohm : float
+        Loop resistance (ohm).
+    frame_offset : (float, float) or None
+        Angle of the frame ahead of the d axis and its standard deviation (rad), from the flux run. None: taken from the
+        cross responses where the machine is salient enough, and said so in ``fallback``.
+    inverter : InverterCurve or None
+        Voltage error from the DC levels.
+    tolerance : SensorTolerance
+        Declared sensor tolerances.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``, ``E_CLIPPED``, ``E_ROTOR_MOVED``, ``E_MODEL_MISMATCH``, ``E_NOT_IDENTIFIABLE``.
+    """
+    tolerance = tolerance or SensorTolerance()
+    fits: dict[str, AxisFit] = {}
+    cross: dict[str, tuple[float, float]] = {}
+    shots: dict[str, list[Shot]] = {}
+    traces = {"d": d_shots, "q": q_shots}
+    for axis, records in traces.items():
+        stage = f"inductance, {axis} axis"
+        shots[axis] = sorted((_shot(record, axis, inverter, stage) for record in records), key=lambda s: s.half_period)
+        fits[axis] = fit_axis(shots[axis], noise.sigma_a, R_ohm, allow_motion=axis == "q")
+        condition_gate(fits[axis].condition, f"L_{axis} and the delay", stage)
+        cross[axis] = _cross_response(shots[axis][0], fits[axis], noise.sigma_a)
+    widen = {axis: chi2_gate(fit.chi2, f"inductance, {axis} axis") for axis, fit in fits.items()}
+    angle, angle_std = _axis_angle(fits, cross)
+    fallback = ""
+    if frame_offset is None:
+        if math.isfinite(angle):
+            frame_offset, fallback = (angle, angle_std), "frame offset from the cross responses"
+        else:
+            frame_offset, fallback = (0.0, 0.0), "frame offset unknown, machine nearly round: axes taken as they are"
+    values, stds = _unmix(fits, {axis: factor for axis, (_, factor) in widen.items()}, frame_offset)
+    bias = (
+        float(np.mean([np.mean(trace["i_d_a"]) for trace in (*d_shots, *q_shots)])),
+        float(np.mean([np.mean(trace["i_q_a"]) for trace in (*d_shots, *q_shots)])),
+    )
+    by_frequency = {
+        axis: tuple(
+            (1.0 / (2 * shot.half_period * shot.period_s), L)
+            for shot, L in zip(shots[axis], fits[axis].L_by_shot_h, strict=True)
+        )
+        for axis in fits
+    }
+    dependent = tuple(
+        axis
+        for axis, fit in fits.items()
+        if max(fit.L_by_shot_h) - min(fit.L_by_shot_h) > FREQUENCY_LIMIT * fit.L_by_shot_h[0]
+    )
+    estimates = {
+        axis: Estimate(
+            value=values[axis],
+            std=math.hypot(stds[axis], MODEL_FLOOR * values[axis]),
+            systematic=tolerance.impedance * values[axis],
+            unit="H",
+            n=fits[axis].n,
+            chi2=fits[axis].chi2,
+            T_c=_temperature(traces[axis]),
+            method="square wave on d bias, output error, incremental",
+            i_d_apk=bias[0],
+            i_q_apk=bias[1],
+            fallback=fallback,
+        )
+        for axis in fits
+    }
+    warned = bool(dependent) or any(verdict is Verdict.WARN for verdict, _ in widen.values())
+    return InductanceResult(
+        L_d=estimates["d"],
+        L_q=estimates["q"],
+        axes=fits,
+        delay=0.5 * (fits["d"].delay + fits["q"].delay),
+        lag_s=0.5 * (fits["d"].lag_s + fits["q"].lag_s),
+        by_frequency=by_frequency,
+        frequency_dependent=dependent,
+        axis_angle_rad=angle,
+        axis_angle_std_rad=angle_std,
+        whiteness={axis: min(ljung_box(residual) for residual in fit.residuals) for axis, fit in fits.items()},
+        verdict=Verdict.WARN if warned else Verdict.PASS,
+    )
+
+
+def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, stage: str) -> Shot:
+    half_period = int(trace.meta["half_period"])
+    if len(trace) < SKIP_SAMPLES + 2 * half_period * MINIMUM_PERIODS:
+        raise refuse(
+            "E_EXCITATION",
+            f"{len(trace)} samples hold fewer than {MINIMUM_PERIODS} periods of {2 * half_period}",
+            stage=stage,
+        )
+    if "flagged" in trace.signals and np.any(trace["flagged"] > 0.0):
+        raise refuse("E_CLIPPED", f"{int(np.sum(trace['flagged'] > 0.0))} samples limited or clipped", stage=stage)
+    _check_rotor(trace["theta_e_rad"], stage)
+    other = "q" if axis == "d" else "d"
+    i, cross = trace[f"i_{axis}_a"], trace[f"i_{other}_a"]
+    error = None
+    if inverter is not None:
+        margin = 0.2 * float(np.ptp(i))
+        grid = np.linspace(float(np.min(i)) - margin, float(np.max(i)) + margin, CURVE_POINTS)
+        frame = float(trace.meta["fixed_angle_rad"])
+        error = VoltageError(grid, inverter.along_axis(frame, axis, grid, float(np.mean(cross))))
+    return Shot(trace[f"u_{axis}_v"], i, cross, half_period, trace.period_s, error)
+
+
+def _check_rotor(theta: Vector, stage: str) -> None:
+    unwrapped = np.unwrap(theta)
+    moves = np.abs(np.diff(unwrapped))
+    moves = moves[moves > 1e-9]
+    step = float(np.min(moves)) if len(moves) else 0.0
+    span = float(np.ptp(unwrapped)) - step
+    if span > ROTOR_LIMIT_RAD:
+        raise refuse(
+            "E_ROTOR_MOVED",
+            f"the rotor moved by {math.degrees(span):.2g} deg (electrical), "
+            f"limit {math.degrees(ROTOR_LIMIT_RAD):g} deg",
+            stage=stage,
+        )
+
+
+def _cross_response(shot: Shot, fit: AxisFit, sigma_a: float) -> tuple[float, float]:
+    """Current of the other axis per current of the injected one, and its standard deviation."""
+    slow = shot.slow_basis()
+    main = shot.i_a[SKIP_SAMPLES:] + fit.residuals[0] * sigma_a  # the modelled current carries no noise
+    main = main - slow @ (slow.T @ main)
+    other = shot.cross_a[SKIP_SAMPLES:]
+    other = other - slow @ (slow.T @ other)
+    power = float(main @ main)
+    return float(main @ other) / power, sigma_a / math.sqrt(power)
+
+
+def _axis_angle(fits: Mapping[str, AxisFit], cross: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
+    """Angle of the frame ahead of the axis of largest inverse inductance, from all four responses (rad)."""
+    g_d, g_q = 1.0 / fits["d"].L_h, 1.0 / fits["q"].L_h
+    weights = [1.0 / (g_d * cross["d"][1]) ** 2, 1.0 / (g_q * cross["q"][1]) ** 2]
+    g_dq = (weights[0] * g_d * cross["d"][0] + weights[1] * g_q * cross["q"][0]) / sum(weights)
+    std = 1.0 / math.sqrt(sum(weights))
+    difference = math.hypot(g_d - g_q, 2.0 * g_dq)
+    if difference < ANISOTROPY_LIMIT * (g_d + g_q):
+        return math.nan, math.nan
+    # frame ahead by eps: G' = R(-eps) G R(eps), so 2 g_dq = -(g_d - g_q)_true sin(2 eps)
+    return 0.5 * math.atan2(-2.0 * g_dq, g_d - g_q), std / difference
+
+
+def _unmix(
+    fits: Mapping[str, AxisFit], widen: Mapping[str, float], frame_offset: tuple[float, float]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Undo the frame offset; standard deviations by first-order propagation."""
+
+    def unmixed(L_d: float, L_q: float, eps: float) -> tuple[float, float]:
+        mean = 0.5 * (1.0 / L_d + 1.0 / L_q)
+        half = 0.5 * (1.0 / L_d - 1.0 / L_q) / math.cos(2.0 * eps)
+        return 1.0 / (mean + half), 1.0 / (mean - half)
+
+    eps, eps_std = frame_offset
+    if abs(eps) > math.radians(30.0):
+        raise refuse(
+            "E_NOT_IDENTIFIABLE",
+            f"the frame is {math.degrees(eps):.3g} deg off the d axis: L_d and L_q cannot be told apart",
+            stage="inductance",
+            likely="wrong encoder offset",
+            hint="store the coarse offset of the rotation test first",
+        )
+    L = {axis: fit.L_h for axis, fit in fits.items()}
+    std = {axis: fit.std_h * widen[axis] for axis, fit in fits.items()}
+    values = unmixed(L["d"], L["q"], eps)
+    shifted = [
+        unmixed(L["d"] + std["d"], L["q"], eps),
+        unmixed(L["d"], L["q"] + std["q"], eps),
+        unmixed(L["d"], L["q"], eps + eps_std),
+    ]
+    spread = [math.sqrt(sum((row[k] - values[k]) ** 2 for row in shifted)) for k in (0, 1)]
+    return {"d": values[0], "q": values[1]}, {"d": spread[0], "q": spread[1]}
+
+
+def _temperature(traces: Sequence[Trace]) -> float:
+    values = [float(np.mean(trace["T_winding_c"])) for trace in traces if "T_winding_c" in trace.signals]
+    return float(np.mean(values)) if values else math.nan

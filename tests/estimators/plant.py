@@ -1,0 +1,263 @@
+"""A drive for judging estimators, written apart from them: many machines at once, small steps, ugly on purpose.
+
+Three phases with an inverter error of a drawn shape per phase current, a current sensor with lag, noise and quantisation
+per phase, a sampling instant that may be late, a saturating d axis, a rotor that is held, free or driven. Integrated in
+the stator frame with explicit midpoint steps; nothing here knows the estimators' closed forms.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.trace import Trace
+
+Vector = NDArray[np.float64]
+ROOT_3 = math.sqrt(3.0)
+
+
+def inverter_shape(kind: Vector, x: Vector) -> Vector:
+    """Odd shapes with limits +-1, none of which is a finite sum of the estimator's tail terms except by accident."""
+    shapes = [
+        2.0 / np.pi * np.arctan(x),
+        np.tanh(x),
+        np.where(np.abs(x) < 1.0, 0.5 * x, np.sign(x) * (1.0 - 0.5 / np.maximum(np.abs(x), 1.0))),
+        np.sign(x) * -np.expm1(-np.abs(x)),
+        x / np.sqrt(1.0 + x * x),
+        np.clip(x, -1.0, 1.0),
+    ]
+    return np.asarray(np.choose(kind.astype(int), shapes), dtype=np.float64)
+
+
+SHAPES = 6
+
+
+@dataclass
+class Drives:
+    """Arrays of shape (n,), one entry per drive."""
+
+    U_dc: Vector
+    I_r: Vector
+    T_s: Vector
+    R: Vector
+    L_d: Vector
+    L_q: Vector
+    psi: Vector
+    p: Vector
+    J: Vector
+    B: Vector
+    tau_c: Vector
+    dV: Vector
+    drop: Vector
+    knee: Vector
+    shape: Vector
+    lsb: Vector
+    adc_noise: Vector
+    offset: Vector  # encoder offset error: frame angle minus true d axis (rad electrical)
+    encoder_steps: Vector
+    lag: Vector
+    late: Vector  # sampling instant, fraction of T_s
+    bend: Vector  # relative change of L_d per ampere
+    w_base: Vector
+
+    @property
+    def n(self) -> int:
+        return len(self.R)
+
+    @property
+    def sigma_dq(self) -> Vector:
+        return np.sqrt(2.0 / 3.0 * (self.lsb**2 / 12.0 + self.adc_noise**2))
+
+
+def draw(n: int, rng: np.random.Generator, *, lag_max: float = 0.0, late_max: float = 0.0) -> Drives:
+    """Draw n drives from the population of the identification reference, section 1."""
+    small = rng.random(n) < 0.55
+
+    def pick(a: Vector, b: Vector) -> Vector:
+        return np.where(small, a, b)
+
+    def log_uniform(low: float, high: float) -> Vector:
+        return np.exp(rng.uniform(math.log(low), math.log(high), n))
+
+    U_dc = pick(rng.choice([24.0, 48.0], n), rng.choice([325.0, 560.0], n))
+    I_r = pick(log_uniform(5, 60), log_uniform(3, 25))
+    T_s = 1.0 / pick(rng.uniform(16e3, 40e3, n), rng.uniform(8e3, 24e3, n))
+    dead_time = pick(rng.uniform(0.1e-6, 0.8e-6, n), rng.uniform(0.5e-6, 3e-6, n))
+    w_base = rng.uniform(400, 1600, n)
+    emf = rng.uniform(0.6, 0.75, n) * U_dc / ROOT_3
+    R = rng.uniform(0.02, 0.12, n) * emf / I_r
+    # reactance 20-60 % of the emf at rated current and base speed
+    L_d = rng.uniform(0.2, 0.6, n) * emf / (w_base * I_r)
+    lsb = 2.0 * rng.uniform(1.8, 3.2, n) * I_r / 4096.0
+    p = rng.integers(2, 11, n).astype(float)
+    psi = emf / w_base
+    return Drives(
+        U_dc=U_dc,
+        I_r=I_r,
+        T_s=T_s,
+        R=R,
+        L_d=L_d,
+        L_q=L_d * rng.uniform(1.0, 2.2, n),
+        psi=psi,
+        p=p,
+        J=1.5 * p * psi * I_r / (w_base / p) * rng.uniform(0.02, 0.1, n),
+        B=np.full(n, 0.0),
+        tau_c=1.5 * p * psi * I_r * rng.uniform(0.002, 0.02, n),
+        dV=U_dc * dead_time / T_s,
+        drop=pick(np.zeros(n), rng.uniform(0.3, 1.2, n)),
+        knee=rng.uniform(0.005, 0.06, n) * I_r,
+        shape=rng.integers(0, SHAPES, n).astype(float),
+        lsb=lsb,
+        adc_noise=rng.uniform(0.5, 2.0, n) * lsb,
+        offset=rng.uniform(-0.1, 0.1, n),
+        encoder_steps=2.0 ** rng.integers(12, 20, n),
+        lag=rng.uniform(0.0, lag_max, n) if lag_max else np.zeros(n),
+        late=rng.uniform(0.0, late_max, n) if late_max else np.zeros(n),
+        bend=np.zeros(n),
+        w_base=w_base,
+    )
+
+
+def abc(alpha: Vector, beta: Vector) -> Vector:
+    return np.stack([alpha, -0.5 * alpha + 0.5 * ROOT_3 * beta, -0.5 * alpha - 0.5 * ROOT_3 * beta])
+
+
+def alpha_beta(x: Vector) -> tuple[Vector, Vector]:
+    return (2.0 * x[0] - x[1] - x[2]) / 3.0, (x[1] - x[2]) / ROOT_3
+
+
+@dataclass
+class Run:
+    """What a drive records; arrays of shape (samples, n)."""
+
+    i_d: Vector
+    i_q: Vector
+    u_d: Vector
+    u_q: Vector
+    theta: Vector
+    omega: Vector
+
+    def trace(self, d: Drives, k: int, skip: int = 0) -> Trace:
+        """Trace of one drive."""
+        names = {
+            "i_d_a": self.i_d,
+            "i_q_a": self.i_q,
+            "u_d_v": self.u_d,
+            "u_q_v": self.u_q,
+            "theta_e_rad": self.theta,
+            "omega_e_rad_s": self.omega,
+        }
+        signals = {name: np.ascontiguousarray(values[skip:, k]) for name, values in names.items()}
+        t = np.arange(len(self.i_d) - skip) * d.T_s[k]
+        return Trace(t, signals, {name: name.split("_", 2)[-1] for name in signals}, {})
+
+
+def run(
+    d: Drives,
+    rng: np.random.Generator,
+    samples: int,
+    *,
+    frame: Vector | None = None,
+    bias_d: Vector | None = None,
+    bias_q: Vector | None = None,
+    square_d: Vector | None = None,
+    square_q: Vector | None = None,
+    half_period: int = 6,
+    bandwidth: float = 2.0 * math.pi * 15.0,
+    imposed_speed: Vector | None = None,
+    free: bool = False,
+    substeps: int = 20,
+    square_from: int = 0,
+) -> Run:
+    """Run all drives for ``samples`` periods under current control plus a square wave on the voltage.
+
+    ``frame`` freezes the frame at these true electrical angles (rotor at angle 0 unless free or driven); otherwise the
+    frame follows the encoder, which is off by ``d.offset``.
+    """
+    n = d.n
+    zero = np.zeros(n)
+    ref_d, ref_q = (zero if b is None else b for b in (bias_d, bias_q))
+    sq_d, sq_q = (zero if b is None else b for b in (square_d, square_q))
+    theta, omega = np.zeros(n), zero.copy() if imposed_speed is None else imposed_speed.copy()
+    psi_a, psi_b = d.psi.copy(), zero.copy()
+    lagged = np.zeros((3, n))
+    x_d, x_q = d.R * ref_d, d.R * ref_q
+    pending_a, pending_b = zero.copy(), zero.copy()
+    h = d.T_s / substeps
+    keep = -np.expm1(-h / np.maximum(d.lag, 1e-12))
+    late_step = np.round(d.late * substeps).astype(int)
+    sample = np.zeros((3, n))
+    angle_at_sample, speed = np.zeros(n), omega.copy()
+    out = [np.empty((samples, n)) for _ in range(6)]
+    lead = 1 + int(np.max(late_step) > 0)
+
+    def currents(pa: Vector, pb: Vector, th: Vector) -> tuple[Vector, Vector]:
+        c, s = np.cos(th), np.sin(th)
+        pd, pq = c * pa + s * pb - d.psi, c * pb - s * pa
+        i_d = pd / d.L_d * (1.0 + 0.5 * d.bend * pd / d.L_d)
+        i_q = pq / d.L_q
+        return c * i_d - s * i_q, s * i_d + c * i_q
+
+    def derivative(pa: Vector, pb: Vector, th: Vector, va: Vector, vb: Vector) -> tuple[Vector, Vector, Vector, Vector]:
+        ia, ib = currents(pa, pb, th)
+        phases = abc(ia, ib)
+        error = d.dV * inverter_shape(np.broadcast_to(d.shape, phases.shape), phases / d.knee)
+        error = error + d.drop * np.tanh(phases / (0.3 * d.knee))
+        ea, eb = alpha_beta(error)
+        return va - ea - d.R * ia, vb - eb - d.R * ib, ia, ib
+
+    del lead
+    for k in range(-1, samples):
+        # samples of this period are taken late by up to a fraction of it; the command they give acts one period later
+        va, vb = pending_a, pending_b
+        for step in range(substeps + 1):
+            take = late_step == step
+            if step < substeps or k < 0:
+                ia, ib = currents(psi_a, psi_b, theta)
+                phases = abc(ia, ib)
+                lagged = np.where(d.lag > 0.0, lagged, phases)
+                if np.any(take) or k < 0:
+                    noisy = lagged + d.adc_noise * rng.standard_normal((3, n))
+                    quantised = d.lsb * np.round(noisy / d.lsb)
+                    sample = np.where(take, quantised, sample)
+                    angle_at_sample = np.where(take, theta, angle_at_sample)
+                    speed = np.where(take, omega, speed)
+            if step == substeps:
+                break
+            da, db, ia, ib = derivative(psi_a, psi_b, theta, va, vb)
+            th_mid = theta + 0.5 * h * omega
+            da, db, ia_m, ib_m = derivative(psi_a + 0.5 * h * da, psi_b + 0.5 * h * db, th_mid, va, vb)
+            torque = 1.5 * d.p * (psi_a * ib_m - psi_b * ia_m)
+            psi_a, psi_b = psi_a + h * da, psi_b + h * db
+            lagged = np.where(d.lag > 0.0, lagged + keep * (abc(ia_m, ib_m) - lagged), lagged)
+            if imposed_speed is not None:
+                theta = theta + h * omega
+            elif free:
+                friction = d.tau_c * np.tanh(omega / (1e-3 * d.w_base)) + d.B * omega / d.p
+                omega = omega + h * d.p * (torque - friction) / d.J
+                theta = theta + h * omega
+        if k < 0:
+            continue
+        step_angle = 2.0 * np.pi * d.p / d.encoder_steps
+        measured = np.floor(angle_at_sample / step_angle) * step_angle
+        f = measured + d.offset if frame is None else frame
+        sa, sb = alpha_beta(sample)
+        c, s = np.cos(f), np.sin(f)
+        i_d, i_q = c * sa + s * sb, c * sb - s * sa
+        K_d, K_q = bandwidth * d.L_d, bandwidth * d.L_q
+        e_d, e_q = ref_d - i_d, ref_q - i_q
+        x_d, x_q = x_d + bandwidth * d.R * d.T_s * 4.0 * e_d, x_q + bandwidth * d.R * d.T_s * 4.0 * e_q
+        w_frame = speed if frame is None else zero
+        t = k - square_from
+        sign = 0.0 if t < 0 else (1.0 if ((t + half_period // 2) // half_period) % 2 == 0 else -1.0)
+        u_d = x_d + K_d * e_d + sign * sq_d - w_frame * d.L_q * i_q
+        u_q = x_q + K_q * e_q + sign * sq_q + w_frame * (d.L_d * i_d + d.psi)
+        for store, value in zip(out, (i_d, i_q, u_d, u_q, measured + 0.0, speed), strict=True):
+            store[k] = value
+        g = f + 1.5 * w_frame * d.T_s
+        c, s = np.cos(g), np.sin(g)
+        pending_a, pending_b = c * u_d - s * u_q, s * u_d + c * u_q
+    return Run(*out)
