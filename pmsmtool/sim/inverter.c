@@ -1,0 +1,584 @@
+/* Averaged and switch-level inverter; see inverter.h. */
+#include "inverter.h"
+
+#include <stddef.h>
+
+#include "elementary.h"
+
+#define NEVER 1.0e300           /* s; also the window of an open leg, in V */
+#define EVENTS_MAX 24           /* zero crossings resolved inside one interval */
+#define CROSSING_STEPS 3        /* secant steps to a zero crossing */
+#define CROSSING_TOLERANCE 1.0e-6 /* what is left of the starting current is taken out of the flux */
+#define I_ZERO 1.0e-9           /* A: below this a sign is rounding */
+#define V_SAME 1.0e-12          /* V: thresholds closer than this make no dead band */
+#define BRIEF 1.0e-3            /* R h / L of an interval whose midpoint rule is as good as RK4: 2e-10 of the current */
+#define STIFFNESS 1.0           /* largest h g / L of an averaged substep (RK4 is stable to 2.78) */
+#define SUBSTEPS_MAX 64u
+#define SIGN_SUBSTEPS 4u        /* substeps that resolve the sign shape */
+#define LAG_SUBSTEPS 4u         /* with a sensor lag, so that the current is straight over a substep */
+#define DIODE_SUBSTEPS 4u       /* with gates off */
+#define COMMUTATION_STEP 0.4    /* substep of a floating node, in sqrt(L C) */
+#define COMMUTATION_STEPS_MAX 32
+#define FIRM_CURRENT 4.0        /* a current this many times what a dead time can change keeps its sign */
+
+/* ---- averaged error --------------------------------------------------------------------------------- */
+
+static double shape_value(uint32_t shape, double x)
+{
+    const double a = pmsm_real64_abs(x);
+    switch (shape) {
+    case PMSM_DEADTIME_ATAN:
+        return (2.0 / PMSM_REAL64_PI) * pmsm_real64_atan(x);
+    case PMSM_DEADTIME_SIGN: /* i_knee is set to what a substep resolves */
+    case PMSM_DEADTIME_TANH:
+        return pmsm_real64_tanh(x);
+    case PMSM_DEADTIME_CAPACITIVE:
+        if (a < 1.0)
+            return 0.5 * x;
+        return x > 0.0 ? 1.0 - 0.5 / a : 0.5 / a - 1.0;
+    default:
+        return 0.0;
+    }
+}
+
+/* Largest slope of a shape, at x = 0. */
+static double shape_slope(uint32_t shape)
+{
+    switch (shape) {
+    case PMSM_DEADTIME_ATAN:
+        return 2.0 / PMSM_REAL64_PI;
+    case PMSM_DEADTIME_SIGN:
+    case PMSM_DEADTIME_TANH:
+        return 1.0;
+    case PMSM_DEADTIME_CAPACITIVE:
+        return 0.5;
+    default:
+        return 0.0;
+    }
+}
+
+double pmsm_leg_error_voltage(const pmsm_leg_error *error, int leg, double i)
+{
+    double v = error->V_dead[leg] * shape_value(error->shape, i * error->i_knee_inverse);
+    if (error->V_device > 0.0)
+        v += error->V_device * pmsm_real64_tanh(i * error->V_device_knee_inverse);
+    return v;
+}
+
+static double largest_dead_time(const pmsm_inverter_setup *setup)
+{
+    double t = setup->dead_time[0];
+    for (int x = 1; x < 3; x++)
+        if (setup->dead_time[x] > t)
+            t = setup->dead_time[x];
+    return t;
+}
+
+static uint32_t at_least(double n, uint32_t floor_value)
+{
+    uint32_t steps = n > (double)SUBSTEPS_MAX ? SUBSTEPS_MAX : (uint32_t)n;
+    if ((double)steps < n && steps < SUBSTEPS_MAX)
+        steps++;
+    return steps > floor_value ? steps : floor_value;
+}
+
+/* Error curve and substeps of this period. */
+static void begin_averaged(pmsm_inverter *inverter, const double duty[3])
+{
+    const pmsm_inverter_setup *setup = &inverter->setup;
+    pmsm_leg_error *error = &inverter->error;
+    for (int x = 0; x < 3; x++)
+        inverter->averaged.v[x] = duty[x] * inverter->U_dc;
+    pmsm_leg_vector(inverter->averaged.v, &inverter->averaged.alpha, &inverter->averaged.beta);
+    if (inverter->exact)
+        return;
+    const double V_max = inverter->U_dc * largest_dead_time(setup) / inverter->T_s;
+    const double reach = inverter->T_s / inverter->L_min; /* A per V that one period can move */
+    double knee = setup->i_knee, slope = setup->r_switch;
+    uint32_t substeps = 1;
+    if (setup->shape == PMSM_DEADTIME_SIGN) {
+        knee = (V_max + setup->V_switch) * reach / (STIFFNESS * (double)SIGN_SUBSTEPS);
+        substeps = SIGN_SUBSTEPS;
+    }
+    if (!(knee > 0.0))
+        knee = I_ZERO;
+    error->shape = V_max > 0.0 ? setup->shape : (uint32_t)PMSM_DEADTIME_NONE;
+    error->i_knee_inverse = error->V_device_knee_inverse = 1.0 / knee;
+    error->V_device = setup->V_switch;
+    for (int x = 0; x < 3; x++) {
+        error->V_dead[x] = inverter->U_dc * setup->dead_time[x] / inverter->T_s;
+        inverter->averaged.r[x] = setup->r_switch;
+    }
+    slope += (V_max * shape_slope(error->shape) + error->V_device) / knee;
+    inverter->averaged.error = error->shape != PMSM_DEADTIME_NONE || error->V_device > 0.0 ? error : NULL;
+    inverter->averaged.general = inverter->averaged.error || setup->r_switch > 0.0;
+    if (inverter->averaged.error)
+        substeps = at_least(slope * reach / STIFFNESS, substeps);
+    inverter->substeps = substeps;
+}
+
+/* ---- one interval of constant leg sources ------------------------------------------------------------- */
+
+/* What a leg offers: its voltage and slope for a current out of it, and into it. */
+typedef struct {
+    double v_out[3], v_in[3], r_out[3], r_in[3];
+    uint32_t open[3];
+} leg_sources;
+
+static int is_dependent(const leg_sources *sources, int x)
+{
+    return sources->open[x] || sources->v_in[x] - sources->v_out[x] > V_SAME;
+}
+
+static void follow_lag(pmsm_current_lag *lag, const double i_start[3], const pmsm_plant *plant, double h)
+{
+    if (lag->decay_h != h) {
+        lag->decay = pmsm_real64_exp(-h / lag->tau);
+        lag->decay_h = h;
+    }
+    for (int x = 0; x < 3; x++) { /* exact for a current that is straight over the interval */
+        const double i_end = pmsm_plant_leg_current(plant, x), behind = (i_end - i_start[x]) / h * lag->tau;
+        lag->value[x] = i_end - behind + (lag->value[x] - i_start[x] + behind) * lag->decay;
+    }
+}
+
+/* Advance the plant, the sensor lag and the volt-seconds. */
+static void advance(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, const pmsm_supply *supply,
+                    double h)
+{
+    if (lag) {
+        const double i[3] = {pmsm_plant_leg_current(plant, 0), pmsm_plant_leg_current(plant, 1),
+                             pmsm_plant_leg_current(plant, 2)};
+        pmsm_plant_advance(plant, supply, h);
+        follow_lag(lag, i, plant, h);
+    } else {
+        pmsm_plant_advance(plant, supply, h);
+    }
+    inverter->volt_seconds_alpha += plant->u_alpha * h;
+    inverter->volt_seconds_beta += plant->u_beta * h;
+}
+
+static void set_supply(pmsm_supply *supply, const pmsm_inverter *inverter, const leg_sources *sources)
+{
+    int32_t blocked = -1;
+    int blocked_count = 0, slopes = 0;
+    for (int x = 0; x < 3; x++) {
+        const int32_t sign = inverter->leg[x].sign;
+        if (sign == 0 && is_dependent(sources, x)) {
+            blocked = x;
+            blocked_count++;
+        }
+        supply->v[x] = sign < 0 ? sources->v_in[x] : sources->v_out[x];
+        supply->r[x] = sign < 0 ? sources->r_in[x] : sources->r_out[x];
+        if (sources->open[x])
+            supply->v[x] = supply->r[x] = 0.0;
+        slopes |= supply->r[x] > 0.0;
+    }
+    supply->blocked = blocked_count > 1 ? 3 : blocked;
+    supply->general = slopes || supply->error || supply->blocked >= 0;
+    pmsm_leg_vector(supply->v, &supply->alpha, &supply->beta);
+}
+
+/* All currents zero: do the thresholds hold them there? If not, the pair with the largest excess conducts. */
+static int release_pair(pmsm_inverter *inverter, const pmsm_plant *plant, const leg_sources *sources)
+{
+    double emf[3], low = -NEVER, high = NEVER;
+    int out = 0, in = 0;
+    pmsm_plant_emf(plant, emf);
+    for (int x = 0; x < 3; x++) {
+        if (sources->open[x])
+            continue;
+        if (sources->v_out[x] - emf[x] > low) {
+            low = sources->v_out[x] - emf[x];
+            out = x;
+        }
+        if (sources->v_in[x] - emf[x] < high) {
+            high = sources->v_in[x] - emf[x];
+            in = x;
+        }
+    }
+    for (int x = 0; x < 3; x++)
+        inverter->leg[x].sign = 0;
+    if (low - high <= V_SAME || out == in)
+        return 0;
+    inverter->leg[out].sign = 1;
+    inverter->leg[in].sign = -1;
+    return 1;
+}
+
+/* A leg without current stays so if the voltage it needs lies between its thresholds. */
+static void release_leg(pmsm_inverter *inverter, const pmsm_plant *plant, const leg_sources *sources,
+                        pmsm_supply *supply, int x)
+{
+    if (sources->open[x])
+        return;
+    set_supply(supply, inverter, sources);
+    const double needed = pmsm_plant_hold_voltage(plant, supply, x, NULL);
+    if (needed < sources->v_out[x])
+        inverter->leg[x].sign = 1;
+    else if (needed > sources->v_in[x])
+        inverter->leg[x].sign = -1;
+}
+
+/* Signs of all legs at the start of an interval; a leg of the mask `held` is not released again. */
+static void settle_signs(pmsm_inverter *inverter, const pmsm_plant *plant, const leg_sources *sources,
+                         pmsm_supply *supply, uint32_t held)
+{
+    int without = 0;
+    for (int x = 0; x < 3; x++) {
+        pmsm_leg *leg = &inverter->leg[x];
+        const double i = pmsm_plant_leg_current(plant, x);
+        if (pmsm_real64_abs(i) > I_ZERO && !sources->open[x])
+            leg->sign = i > 0.0 ? 1 : -1;
+        else if (sources->open[x])
+            leg->sign = 0;
+        without += leg->sign == 0;
+    }
+    if (without >= 2 && !release_pair(inverter, plant, sources))
+        return;
+    for (int x = 0; x < 3; x++)
+        if (inverter->leg[x].sign == 0 && !(held >> x & 1u) && is_dependent(sources, x))
+            release_leg(inverter, plant, sources, supply, x);
+}
+
+/* The dependent leg whose current changed its sign first in the step of length h; -1 none. */
+static int find_crossing(const pmsm_inverter *inverter, const pmsm_plant *plant, const leg_sources *sources,
+                         const double i_start[3], double *share)
+{
+    int crossed = -1;
+    *share = 1.0;
+    for (int x = 0; x < 3; x++) {
+        const double i = pmsm_plant_leg_current(plant, x), s = (double)inverter->leg[x].sign;
+        if (s == 0.0 || !is_dependent(sources, x) || i * s >= -I_ZERO)
+            continue;
+        const double start = i_start[x] * s > 0.0 ? i_start[x] : 0.0;
+        const double at = start / (start - i);
+        if (at < *share || crossed < 0) {
+            *share = at;
+            crossed = x;
+        }
+    }
+    return crossed;
+}
+
+/* Interval of constant sources with all zero crossings resolved. */
+static void run_interval(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, const leg_sources *sources,
+                         double h)
+{
+    const int averaged = inverter->gates && inverter->setup.model == PMSM_INVERTER_AVERAGED;
+    pmsm_supply supply = {{0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, averaged ? inverter->averaged.error : NULL, -1, 0, 0, 0.0, 0.0};
+    supply.brief = !averaged && h * inverter->brief_rate < 1.0;
+    const int dependent = is_dependent(sources, 0) || is_dependent(sources, 1) || is_dependent(sources, 2);
+    if (!dependent) {
+        for (int x = 0; x < 3; x++)
+            inverter->leg[x].sign = pmsm_plant_leg_current(plant, x) < 0.0 ? -1 : 1;
+        set_supply(&supply, inverter, sources);
+        advance(inverter, plant, lag, &supply, h);
+        return;
+    }
+    uint32_t held = 0;
+    for (int event = 0; h > 0.0; event++) {
+        double i_start[3], share;
+        settle_signs(inverter, plant, sources, &supply, held);
+        set_supply(&supply, inverter, sources);
+        for (int x = 0; x < 3; x++)
+            i_start[x] = pmsm_plant_leg_current(plant, x);
+        const pmsm_plant_state before = plant->state;
+        const double volt_seconds[2] = {inverter->volt_seconds_alpha, inverter->volt_seconds_beta};
+        const pmsm_current_lag lag_before = lag ? *lag : (pmsm_current_lag){0};
+        advance(inverter, plant, lag, &supply, h);
+        int x = find_crossing(inverter, plant, sources, i_start, &share);
+        if (x < 0)
+            return;
+        if (event >= EVENTS_MAX) {
+            inverter->event_overruns++;
+            return;
+        }
+        double tau = h;
+        const double near_zero = I_ZERO + CROSSING_TOLERANCE * pmsm_real64_abs(i_start[x]);
+        for (int trial = 0; trial < CROSSING_STEPS; trial++) {
+            const double i_end = pmsm_plant_leg_current(plant, x);
+            if (pmsm_real64_abs(i_end) <= near_zero)
+                break;
+            tau *= i_start[x] / (i_start[x] - i_end);
+            plant->state = before;
+            inverter->volt_seconds_alpha = volt_seconds[0];
+            inverter->volt_seconds_beta = volt_seconds[1];
+            if (lag)
+                *lag = lag_before;
+            if (!(tau > 0.0)) {
+                tau = 0.0;
+                held |= 1u << x; /* released on the edge of its threshold, and back within the interval */
+                break;
+            }
+            advance(inverter, plant, lag, &supply, tau);
+        }
+        inverter->leg[x].sign = 0;
+        pmsm_plant_clear_current(plant, x);
+        h -= tau;
+    }
+}
+
+/* ---- circuits ------------------------------------------------------------------------------------------ */
+
+static void conducting_source(const pmsm_inverter_setup *setup, leg_sources *sources, int x, double rail, int top)
+{
+    const int channel = setup->V_switch == 0.0;
+    const double V_reverse = channel ? 0.0 : setup->V_diode, r_reverse = channel ? setup->r_switch : setup->r_diode;
+    /* out of the leg: the top transistor, or the diode below; into it: the diode above, or the bottom transistor */
+    sources->v_out[x] = rail - (top ? setup->V_switch : V_reverse);
+    sources->r_out[x] = top ? setup->r_switch : r_reverse;
+    sources->v_in[x] = rail + (top ? V_reverse : setup->V_switch);
+    sources->r_in[x] = top ? r_reverse : setup->r_switch;
+}
+
+static void diode_source(const pmsm_inverter *inverter, leg_sources *sources, int x)
+{
+    sources->v_out[x] = -inverter->setup.V_diode;
+    sources->v_in[x] = inverter->U_dc + inverter->setup.V_diode;
+    sources->r_out[x] = sources->r_in[x] = inverter->setup.r_diode;
+}
+
+static void find_source(const pmsm_inverter *inverter, leg_sources *sources, int x)
+{
+    sources->open[x] = inverter->setup.open[x];
+    if (inverter->gates && inverter->setup.model == PMSM_INVERTER_AVERAGED) {
+        sources->v_out[x] = sources->v_in[x] = inverter->averaged.v[x];
+        sources->r_out[x] = sources->r_in[x] = inverter->averaged.r[x];
+        return;
+    }
+    switch (inverter->leg[x].gate) {
+    case PMSM_GATE_TOP:
+        conducting_source(&inverter->setup, sources, x, inverter->U_dc, 1);
+        return;
+    case PMSM_GATE_BOTTOM:
+        conducting_source(&inverter->setup, sources, x, 0.0, 0);
+        return;
+    default:
+        diode_source(inverter, sources, x);
+    }
+}
+
+static int floats(const pmsm_inverter *inverter, int x)
+{
+    return inverter->gates && inverter->setup.capacitance > 0.0 && inverter->leg[x].gate == PMSM_GATE_NONE
+           && !inverter->setup.open[x];
+}
+
+/* The node moves by -i/C between the rails and its diodes; its mean over h is what the machine sees. */
+static double float_node(const pmsm_inverter *inverter, pmsm_leg *leg, double i, double h, double *v_end)
+{
+    const double low = -inverter->setup.V_diode, high = inverter->U_dc + inverter->setup.V_diode;
+    const double step = -i * h / inverter->setup.capacitance;
+    double target = leg->v_node + step;
+    const double rail = target < low ? low : (target > high ? high : target);
+    if (rail == target) {
+        *v_end = target;
+        return 0.5 * (leg->v_node + target);
+    }
+    const double share = step != 0.0 ? (rail - leg->v_node) / step : 0.0; /* of h, until the diode takes over */
+    *v_end = rail;
+    return share * 0.5 * (leg->v_node + rail) + (1.0 - share) * rail;
+}
+
+/* Interval in which at least one node floats: substeps, the node voltage leap-frogging with the current. */
+static void run_commutation(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double h)
+{
+    const double firm = FIRM_CURRENT * inverter->U_dc * h / inverter->L_min;
+    const double resolved = COMMUTATION_STEP * sqrt(inverter->L_min * inverter->setup.capacitance);
+    int steps = 1;
+    for (int x = 0; x < 3; x++)
+        if (floats(inverter, x) && pmsm_real64_abs(pmsm_plant_leg_current(plant, x)) < firm)
+            steps = h < resolved * (double)COMMUTATION_STEPS_MAX ? (int)(h / resolved) + 1 : COMMUTATION_STEPS_MAX;
+    const double dt = h / (double)steps;
+    for (int n = 0; n < steps; n++) {
+        leg_sources sources;
+        double v_half[3] = {0.0, 0.0, 0.0}, v_end[3] = {0.0, 0.0, 0.0};
+        for (int x = 0; x < 3; x++) {
+            pmsm_leg *leg = &inverter->leg[x];
+            find_source(inverter, &sources, x);
+            if (!floats(inverter, x))
+                continue;
+            const double i = pmsm_plant_leg_current(plant, x);
+            v_half[x] = float_node(inverter, leg, i, dt, &v_end[x]);
+            sources.v_out[x] = sources.v_in[x] = v_half[x];
+            if (v_end[x] > -inverter->setup.V_diode && v_end[x] < inverter->U_dc + inverter->setup.V_diode)
+                sources.r_out[x] = sources.r_in[x] = 0.0; /* no diode conducts yet */
+        }
+        run_interval(inverter, plant, lag, &sources, dt);
+        for (int x = 0; x < 3; x++) {
+            if (!floats(inverter, x))
+                continue;
+            pmsm_leg *leg = &inverter->leg[x];
+            double v = v_end[x];
+            if (v > -inverter->setup.V_diode && v < inverter->U_dc + inverter->setup.V_diode) {
+                /* free: second half of the leap with the new current */
+                v = v_half[x] - 0.5 * dt * pmsm_plant_leg_current(plant, x) / inverter->setup.capacitance;
+                if (v < -inverter->setup.V_diode)
+                    v = -inverter->setup.V_diode;
+                if (v > inverter->U_dc + inverter->setup.V_diode)
+                    v = inverter->U_dc + inverter->setup.V_diode;
+            }
+            leg->v_node = v;
+        }
+    }
+}
+
+static void run_circuit(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double h)
+{
+    if (floats(inverter, 0) || floats(inverter, 1) || floats(inverter, 2)) {
+        run_commutation(inverter, plant, lag, h);
+        return;
+    }
+    leg_sources sources;
+    for (int x = 0; x < 3; x++)
+        find_source(inverter, &sources, x);
+    run_interval(inverter, plant, lag, &sources, h);
+}
+
+/* ---- gates ----------------------------------------------------------------------------------------------- */
+
+/* Edges of a centre-aligned pulse of ratio d, and the level the last period left. */
+static void set_edges(const pmsm_inverter *inverter, pmsm_leg *leg, double d)
+{
+    const double T_s = inverter->T_s, on = d * T_s;
+    uint32_t level = leg->target;
+    const int low = on <= 0.0 || on < inverter->setup.minimum_pulse;
+    const int high = T_s - on <= 0.0 || T_s - on < inverter->setup.minimum_pulse;
+    leg->edges = leg->next_edge = 0;
+    if (low || high) {
+        if (level != (uint32_t)(low ? 0 : 1))
+            leg->edge[leg->edges++] = 0.0;
+        return;
+    }
+    if (level)
+        leg->edge[leg->edges++] = 0.0;
+    leg->edge[leg->edges++] = 0.5 * (T_s - on);
+    leg->edge[leg->edges++] = 0.5 * (T_s + on);
+}
+
+static void begin_switched(pmsm_inverter *inverter, const double duty[3], uint32_t gates_before)
+{
+    for (int x = 0; x < 3; x++) {
+        pmsm_leg *leg = &inverter->leg[x];
+        if (!gates_before) { /* released: the bottom transistor closes after a dead time */
+            leg->target = 0;
+            leg->close_at = inverter->setup.dead_time[x];
+            leg->v_node = 0.0;
+        } else if (leg->close_at < NEVER) {
+            leg->close_at -= inverter->T_s;
+        }
+        set_edges(inverter, leg, duty[x]);
+    }
+}
+
+/* Apply what is due at time t; returns the time of the next change. */
+static double gate_events(pmsm_inverter *inverter, double t)
+{
+    double next = NEVER;
+    for (int x = 0; x < 3; x++) {
+        pmsm_leg *leg = &inverter->leg[x];
+        while (leg->next_edge < leg->edges && leg->edge[leg->next_edge] <= t) {
+            if (leg->gate != PMSM_GATE_NONE)
+                leg->v_node = leg->gate == PMSM_GATE_TOP ? inverter->U_dc : 0.0;
+            leg->gate = PMSM_GATE_NONE;
+            leg->target ^= 1u;
+            leg->close_at = leg->edge[leg->next_edge] + inverter->setup.dead_time[x];
+            leg->next_edge++;
+        }
+        if (leg->close_at <= t) {
+            leg->gate = leg->target ? PMSM_GATE_TOP : PMSM_GATE_BOTTOM;
+            leg->close_at = NEVER;
+        }
+        if (leg->close_at < next)
+            next = leg->close_at;
+        if (leg->next_edge < leg->edges && leg->edge[leg->next_edge] < next)
+            next = leg->edge[leg->next_edge];
+    }
+    return next;
+}
+
+/* ---- the period --------------------------------------------------------------------------------------------- */
+
+void pmsm_inverter_start(pmsm_inverter *inverter, const pmsm_plant *plant)
+{
+    const pmsm_leg idle = {PMSM_GATE_NONE, 0, NEVER, {0.0, 0.0, 0.0}, 0, 0, 0.0, 0};
+    for (int x = 0; x < 3; x++)
+        inverter->leg[x] = idle;
+    const pmsm_inverter_setup *setup = &inverter->setup;
+    const double r = setup->r_switch > setup->r_diode ? setup->r_switch : setup->r_diode;
+    inverter->brief_rate = (plant->R + r) / (BRIEF * pmsm_plant_smallest_inductance(plant));
+    const int dead = setup->shape != PMSM_DEADTIME_NONE && largest_dead_time(setup) > 0.0;
+    inverter->exact = !dead && setup->V_switch == 0.0 && setup->r_switch == 0.0;
+    inverter->averaged = (pmsm_supply){{0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, NULL, -1, 0, 0, 0.0, 0.0};
+    inverter->gates = 0;
+    inverter->circuit = 1;
+    inverter->substeps = DIODE_SUBSTEPS;
+    inverter->L_min = pmsm_plant_smallest_inductance(plant);
+    inverter->volt_seconds_alpha = inverter->volt_seconds_beta = 0.0;
+    inverter->elapsed = 0.0;
+    inverter->event_overruns = 0;
+}
+
+void pmsm_inverter_begin(pmsm_inverter *inverter, const double duty[3], uint32_t gates, double U_dc, double T_s)
+{
+    const uint32_t *open = inverter->setup.open, before = inverter->gates;
+    inverter->gates = gates;
+    inverter->U_dc = U_dc;
+    inverter->T_s = T_s;
+    inverter->volt_seconds_alpha = inverter->volt_seconds_beta = 0.0;
+    inverter->elapsed = 0.0;
+    inverter->circuit = inverter->setup.model == PMSM_INVERTER_SWITCHED || !gates || open[0] || open[1] || open[2];
+    if (!gates) {
+        inverter->substeps = DIODE_SUBSTEPS;
+        for (int x = 0; x < 3; x++) {
+            inverter->leg[x].gate = PMSM_GATE_NONE;
+            inverter->leg[x].close_at = NEVER;
+            inverter->leg[x].edges = inverter->leg[x].next_edge = 0;
+        }
+    } else if (inverter->setup.model == PMSM_INVERTER_SWITCHED) {
+        begin_switched(inverter, duty, before);
+    } else {
+        inverter->substeps = 1;
+        begin_averaged(inverter, duty);
+    }
+}
+
+/* Equal substeps of the averaged model and of gates off. */
+static void run_substeps(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double h)
+{
+    uint32_t n = inverter->substeps;
+    if (lag && n < LAG_SUBSTEPS)
+        n = LAG_SUBSTEPS;
+    const double dt = h / (double)n;
+    for (uint32_t k = 0; k < n; k++) {
+        if (inverter->circuit)
+            run_circuit(inverter, plant, lag, dt);
+        else
+            advance(inverter, plant, lag, &inverter->averaged, dt);
+    }
+}
+
+void pmsm_inverter_run(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double t_from, double t_to)
+{
+    pmsm_current_lag *active = lag && lag->tau > 0.0 ? lag : NULL;
+    if (!inverter->gates || inverter->setup.model == PMSM_INVERTER_AVERAGED) {
+        if (t_to > t_from)
+            run_substeps(inverter, plant, active, t_to - t_from);
+    } else {
+        double t = t_from;
+        while (t < t_to) {
+            const double next = gate_events(inverter, t);
+            const double until = next < t_to ? next : t_to;
+            run_circuit(inverter, plant, active, until - t);
+            t = until;
+        }
+    }
+    inverter->elapsed = t_to;
+}
+
+double pmsm_inverter_smallest_capacitance(double dead_time, double L_min)
+{
+    const double root = dead_time / (COMMUTATION_STEP * (double)COMMUTATION_STEPS_MAX);
+    return root * root / L_min;
+}
