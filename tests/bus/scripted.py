@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 from binascii import crc_hqx
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import can
@@ -17,6 +17,8 @@ import can
 from pmsmtool.bus.clock import VirtualClock
 
 NODE = 5
+Serving = Generator[list[bytes], bytes, "list[bytes] | None"]
+"""One transfer: receives requests, yields answers, returns the last one."""
 Fate = Iterable[float]
 """Delays (s) at which copies of a frame arrive: () drops it, (0, 0) doubles it."""
 
@@ -38,7 +40,7 @@ class ScriptedBus(can.BusABC):
         self.alive = True
         self.echo = False
         self.channel_info = "scripted"
-        super().__init__(channel=None)
+        super().__init__(channel="scripted")
         slave.attach(self)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
@@ -106,7 +108,8 @@ class ScriptedSlave:
 
     def attach(self, bus: ScriptedBus) -> None:
         self.bus = bus
-        self.generator: Iterator[object] | None = None
+        self.generator: Serving | None = None
+        self.raw = False
 
     def nmt(self, data: bytes) -> None:
         self.generator = None
@@ -129,20 +132,24 @@ class ScriptedSlave:
         if command == 0x80:
             self.generator = None
             return []
-        fresh = command >> 5 in (1, 2) or (command >> 5 == 5 and command & 3 == 0) or (command >> 5 == 6 and not command & 1)
-        in_block = self.generator is not None and getattr(self, "raw", False)
+        fresh = (
+            command >> 5 in (1, 2)
+            or (command >> 5 == 5 and command & 3 == 0)
+            or (command >> 5 == 6 and not command & 1)
+        )
+        in_block = self.generator is not None and self.raw
         if fresh and not in_block:
             self.generator = self._serve(data)
-            return next(self.generator)  # type: ignore[return-value]
+            return next(self.generator)
         if self.generator is None:
             return [_abort(data[1] | data[2] << 8, data[3], 0x05040001)]
         try:
-            return self.generator.send(data)  # type: ignore[attr-defined,no-any-return]
+            return self.generator.send(data)
         except StopIteration as end:
             self.generator = None
             return end.value or []
 
-    def _serve(self, data: bytes) -> Iterator[list[bytes]]:
+    def _serve(self, data: bytes) -> Serving:
         self.raw = False
         index, sub = data[1] | data[2] << 8, data[3]
         kind = data[0] >> 5
@@ -167,7 +174,7 @@ class ScriptedSlave:
         self.objects[index, sub] = body
         self.writes.append((index, sub, body))
 
-    def _download(self, data: bytes, head: bytes, index: int, sub: int) -> Iterator[list[bytes]]:
+    def _download(self, data: bytes, head: bytes, index: int, sub: int) -> Serving:
         if data[0] & 2:
             self._store(index, sub, data[4 : 8 - (data[0] >> 2 & 3)])
             yield [b"\x60" + head + bytes(4)]
@@ -188,7 +195,7 @@ class ScriptedSlave:
                 return reply
             request = yield reply
 
-    def _upload(self, head: bytes, index: int, sub: int) -> Iterator[list[bytes]]:
+    def _upload(self, head: bytes, index: int, sub: int) -> Serving:
         body = self.objects[index, sub]
         if 0 < len(body) <= 4 and self.lie_size is None:
             yield [bytes((0x43 | 4 - len(body) << 2,)) + head + body.ljust(4, b"\0")]
@@ -209,7 +216,7 @@ class ScriptedSlave:
                 return reply
             request = yield reply
 
-    def _block_upload(self, data: bytes, head: bytes, index: int, sub: int) -> Iterator[list[bytes]]:
+    def _block_upload(self, data: bytes, head: bytes, index: int, sub: int) -> Serving:
         body = self.objects[index, sub]
         block_size, threshold = data[4], data[5]
         if threshold and len(body) <= threshold:
@@ -223,7 +230,8 @@ class ScriptedSlave:
         end = len(body) if self.end_early is None else self.end_early
         position = 0
         while True:
-            frames, at = [], position
+            frames: list[bytes] = []
+            at = position
             while len(frames) < block_size and (at < end or not end):
                 piece = body[at : min(at + 7, end)]
                 at += 7
@@ -243,7 +251,7 @@ class ScriptedSlave:
             return [_abort(index, sub, 0x05040001)]
         return []
 
-    def _block_download(self, data: bytes, head: bytes, index: int, sub: int) -> Iterator[list[bytes]]:
+    def _block_download(self, data: bytes, head: bytes, index: int, sub: int) -> Serving:
         size = int.from_bytes(data[4:8], "little")
         with_crc = self.crc and data[0] & 4
         body = b""
@@ -258,7 +266,12 @@ class ScriptedSlave:
                     taken += 1
                     body += request[1:]
                     done = bool(request[0] & 0x80)
-                if done or number == self.block_size or request[0] & 0x80 or (self.gap_acknowledged_at_once and number > taken):
+                if (
+                    done
+                    or number == self.block_size
+                    or request[0] & 0x80
+                    or (self.gap_acknowledged_at_once and number > taken)
+                ):
                     break
                 request = yield []
             request = yield [bytes((0xA2, taken, self.block_size, 0, 0, 0, 0, 0))]

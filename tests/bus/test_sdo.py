@@ -41,7 +41,9 @@ def body(size: int, seed: int = 1) -> bytes:
 
 @pytest.mark.parametrize("mode", [Mode.AUTO, Mode.SEGMENTED, Mode.BLOCK])
 @pytest.mark.parametrize("size", SIZES)
-def test_every_size_arrives_in_both_directions(channel: SdoChannel, slave: ScriptedSlave, mode: Mode, size: int) -> None:
+def test_every_size_arrives_in_both_directions(
+    channel: SdoChannel, slave: ScriptedSlave, mode: Mode, size: int
+) -> None:
     data = body(size)
     if size:
         written = channel.download(*TABLE, data, mode=mode)
@@ -63,7 +65,9 @@ def test_node_chooses_its_block_size(channel: SdoChannel, slave: ScriptedSlave, 
     assert slave.objects[TABLE] == data
 
 
-def test_b1_late_answer_of_another_object_is_never_counted(channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave) -> None:
+def test_b1_late_answer_of_another_object_is_never_counted(
+    channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave
+) -> None:
     slave.delay = lambda data: 0.45 if data[:4] == b"\x23\x10\x20\x02" else 0.0
     slave.refuse[B] = 0x06090030
     with pytest.raises(DriveTimeout):
@@ -74,14 +78,18 @@ def test_b1_late_answer_of_another_object_is_never_counted(channel: SdoChannel, 
     assert (B[0], B[1], b"\x07") not in slave.writes
 
 
-def test_b1_stale_answer_already_queued_is_thrown_away(channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave) -> None:
+def test_b1_stale_answer_already_queued_is_thrown_away(
+    channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave
+) -> None:
     bus.deliver(0x580 + NODE, b"\x60\x10\x20\x03" + bytes(4))
     slave.refuse[B] = 0x06090031
     with pytest.raises(SdoAbort):
         channel.download(*B, b"\x07")
 
 
-def test_b2_lost_answer_to_a_write_reads_before_it_writes_again(channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave) -> None:
+def test_b2_lost_answer_to_a_write_reads_before_it_writes_again(
+    channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave
+) -> None:
     bus.to_master = lambda number, data: () if number == 1 else (0.0,)
     result = channel.download(*A, b"\xaa\0\0\0")
     assert slave.writes == [(*A, b"\xaa\0\0\0")], "written once although the answer was lost"
@@ -104,7 +112,9 @@ def test_command_is_never_sent_twice(channel: SdoChannel, bus: ScriptedBus, slav
 
 @pytest.mark.parametrize("lost", range(1, 9))
 @pytest.mark.parametrize("side", ["to_slave", "to_master"])
-def test_b3_segmented_transfer_starts_over_from_initiate(bus: ScriptedBus, channel: SdoChannel, slave: ScriptedSlave, side: str, lost: int) -> None:
+def test_b3_segmented_transfer_starts_over_from_initiate(
+    bus: ScriptedBus, channel: SdoChannel, slave: ScriptedSlave, side: str, lost: int
+) -> None:
     setattr(bus, side, lambda number, data, seen=[0]: () if _count(seen) == lost else (0.0,))
     data = body(50)
     channel.download(*TABLE, data, mode=Mode.SEGMENTED)
@@ -144,7 +154,9 @@ def test_b5_to_b8_any_one_lost_frame_of_a_block_transfer(with_crc: bool, lost: i
         assert slave.objects[TABLE] == body(2000)
 
 
-def test_b7_gap_is_acknowledged_after_the_sub_block(channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave) -> None:
+def test_b7_gap_is_acknowledged_after_the_sub_block(
+    channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave
+) -> None:
     bus.to_master = lambda number, data: () if number == 11 else (0.0,)  # the tenth segment
     result = channel.upload(*TABLE, size=2048)
     acknowledgements = [data for _, data in bus.sent if data[0] == 0xA2]
@@ -152,7 +164,9 @@ def test_b7_gap_is_acknowledged_after_the_sub_block(channel: SdoChannel, bus: Sc
     assert result.tries == 1 and result.retransmitted == 127 - 10
 
 
-def test_b9_normal_upload_in_answer_to_a_block_request(channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave) -> None:
+def test_b9_normal_upload_in_answer_to_a_block_request(
+    channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave
+) -> None:
     normal = ScriptedSlave(slave.objects)
     normal.attach(bus)
 
@@ -166,7 +180,9 @@ def test_b9_normal_upload_in_answer_to_a_block_request(channel: SdoChannel, bus:
 
 @pytest.mark.parametrize("mode", [Mode.SEGMENTED, Mode.BLOCK])
 @pytest.mark.parametrize("size", [16384, None])
-def test_b10_node_that_ends_early_is_caught(channel: SdoChannel, slave: ScriptedSlave, mode: Mode, size: int | None) -> None:
+def test_b10_node_that_ends_early_is_caught(
+    channel: SdoChannel, slave: ScriptedSlave, mode: Mode, size: int | None
+) -> None:
     slave.objects[TABLE] = body(16384)
     slave.end_early = 1000
     with pytest.raises(SdoAbort, match="1000 of 16384 bytes"):
@@ -231,7 +247,9 @@ def test_node_silent_to_block_requests_gets_segments_in_the_end(channel: SdoChan
     assert result.mode is Mode.SEGMENTED and result.tries == 4
 
 
-def test_refusal_is_not_retried_and_says_what_to_do(channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave) -> None:
+def test_refusal_is_not_retried_and_says_what_to_do(
+    channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave
+) -> None:
     slave.refuse[A] = 0x08000022
     with pytest.raises(SdoAbort) as refused:
         channel.download(*A, bytes(4))
@@ -275,7 +293,9 @@ def test_adapter_gone_is_a_bus_error(channel: SdoChannel, bus: ScriptedBus) -> N
         channel.read(*A)
 
 
-def test_cancelled_transfer_aborts_and_raises_the_reason(channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave) -> None:
+def test_cancelled_transfer_aborts_and_raises_the_reason(
+    channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave
+) -> None:
     slave.hung = True
     bus.clock.after(0.05, lambda: channel.cancel(KeyboardInterrupt()))
     with pytest.raises(KeyboardInterrupt):

@@ -1,0 +1,214 @@
+"""Supervision of one node: heartbeat, boot-ups, emergencies, and other masters on the bus.
+
+Callbacks only take notes; :meth:`Supervision.check` raises. The SDO channel calls it whenever it
+waits, so a node that went away ends a download within a second instead of after hundreds of time-outs.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.nmt import HEARTBEAT_ID, NMT_ID, NmtState
+from pmsmtool.cia402 import error_text
+from pmsmtool.errors import BusError, DriveFault
+
+HEARTBEAT_TOLERANCE = 1.5
+"""Periods after which a heartbeat counts as lost (CANopen reference, section 6)."""
+SENT_MEMORY = 256
+"""Requests remembered to tell our own echo from a second master; a sub-block has 127."""
+STOPPING_CLASSES = frozenset({0x2, 0x3, 0x4, 0x7})
+"""Emergency classes current, voltage, temperature, additional modules: work on this node ends."""
+_GRACE_S = 0.05
+# A reader thread that a busy main thread starved gets this long before a heartbeat counts as lost.
+
+
+class NodeReset(BusError):
+    """The node booted although nobody asked it to: what was written so far is lost."""
+
+
+class HeartbeatLost(BusError):
+    """The node's heartbeat stayed away."""
+
+
+class SecondMaster(BusError):
+    """Somebody else speaks to the node."""
+
+
+@dataclass(frozen=True, slots=True)
+class Emergency:
+    """One emergency message (CiA 301, section 7.2.7).
+
+    Attributes
+    ----------
+    code : int
+        Error code, 0 for "error reset".
+    register : int
+        Error register 0x1001.
+    detail : bytes
+        Manufacturer's five bytes, fewer when the message was short.
+    time_s : float
+        On the bus clock.
+    """
+
+    code: int
+    register: int
+    detail: bytes
+    time_s: float
+
+    def __str__(self) -> str:
+        text = f"emergency {self.code:#06x} ({error_text(self.code)}), register {self.register:#04x}"
+        return text + (f", detail {self.detail.hex(' ')}" if any(self.detail) else "")
+
+
+class Supervision:
+    """What is known about one node from the frames it and others send.
+
+    Parameters
+    ----------
+    connection : Connection
+        The bus.
+    node : int
+        Node id.
+
+    Attributes
+    ----------
+    heartbeat_period_s : float or None
+        Producer heartbeat time 0x1017; None where the node has none or it was not read yet.
+    nmt_state : NmtState or None
+        As last reported.
+    boot_ups : int
+        Boot-up messages heard.
+    emergencies : list of Emergency
+        In order of arrival.
+    foreign_requests : int
+        SDO requests to the node and NMT commands that this program did not send.
+    """
+
+    def __init__(self, connection: Connection, node: int) -> None:
+        self.node = node
+        self.heartbeat_period_s: float | None = None
+        self.nmt_state: NmtState | None = None
+        self.boot_ups = 0
+        self.emergencies: list[Emergency] = []
+        self.foreign_requests = 0
+        self.stop_at_emergency = True
+        self._connection = connection
+        self._last_heard_s: float | None = None
+        self._boots_seen = 0
+        self._emergencies_seen = 0
+        self._foreign_seen = 0
+        self._paused = False
+        self._subscriptions = (
+            (HEARTBEAT_ID + node, self._on_heartbeat),
+            (0x080 + node, self._on_emergency),
+            (0x600 + node, self._on_request),
+            (NMT_ID, self._on_request),
+            (0x580 + node, self._on_answer),
+        )
+        for cob_id in (0x600 + node, NMT_ID):
+            connection.sent.setdefault(cob_id, deque(maxlen=SENT_MEMORY))
+        for cob_id, callback in self._subscriptions:
+            connection.subscribe(cob_id, callback)
+
+    def close(self) -> None:
+        """Stop listening."""
+        for cob_id, callback in self._subscriptions:
+            self._connection.unsubscribe(cob_id, callback)
+
+    @contextmanager
+    def expected_reset(self) -> Iterator[None]:
+        """While the node is reset on purpose: its boot-up and its silence are no errors."""
+        self._paused = True
+        try:
+            yield
+        finally:
+            self._paused = False
+            self._boots_seen = self.boot_ups
+            self._last_heard_s = None
+
+    def check(self) -> None:
+        """Raise what makes further work on the node pointless.
+
+        Raises
+        ------
+        NodeReset, HeartbeatLost, SecondMaster, DriveFault
+            Each once per occurrence.
+        """
+        if self._paused:
+            return
+        if self.boot_ups > self._boots_seen:
+            self._boots_seen = self.boot_ups
+            raise NodeReset(
+                "the node was reset in the middle of the work: values not stored are lost",
+                where=f"node {self.node}",
+                likely="its supply dipped, its watchdog fired, or another master reset it",
+                hint="check the supply, then run the command again",
+            )
+        if self.foreign_requests > self._foreign_seen:
+            self._foreign_seen = self.foreign_requests
+            raise SecondMaster(
+                "another master sends requests to this node",
+                where=f"node {self.node}",
+                likely="a PLC, the vendor's software or a second pmsmtool is connected",
+                hint="disconnect it: two masters on one SDO channel corrupt each other's transfers",
+            )
+        self._check_emergencies()
+        self._check_heartbeat()
+
+    def _check_emergencies(self) -> None:
+        fresh = self.emergencies[self._emergencies_seen :]
+        self._emergencies_seen = len(self.emergencies)
+        for emergency in fresh:
+            if self.stop_at_emergency and emergency.code >> 12 in STOPPING_CLASSES:
+                raise DriveFault(
+                    str(emergency), where=f"node {self.node}", hint=f"`pmsmtool fault show -n {self.node}`"
+                )
+
+    def _check_heartbeat(self) -> None:
+        if self._overdue() and not self._connection.in_callback():
+            self._connection.wait(_GRACE_S)
+            if self._overdue():
+                self._last_heard_s = None
+                raise HeartbeatLost(
+                    f"no heartbeat for {HEARTBEAT_TOLERANCE:g} periods of {self.heartbeat_period_s:g} s",
+                    where=f"node {self.node}",
+                    likely="the node lost its supply, or the cable is open",
+                    hint="check supply and cable, then run the command again",
+                )
+
+    def _overdue(self) -> bool:
+        if self.heartbeat_period_s is None or self._last_heard_s is None:
+            return False
+        return self._connection.clock.now() - self._last_heard_s > HEARTBEAT_TOLERANCE * self.heartbeat_period_s
+
+    # ---- notes taken ----------------------------------------------------------------------------
+
+    def _on_heartbeat(self, cob_id: int, data: bytes, timestamp: float) -> None:
+        self._last_heard_s = self._connection.clock.now()
+        state = data[0] & 0x7F if data else 0x7F
+        self.nmt_state = NmtState(state) if state in set(NmtState) else None
+        if state == NmtState.BOOT_UP:
+            self.boot_ups += 1
+
+    def _on_emergency(self, cob_id: int, data: bytes, timestamp: float) -> None:
+        if len(data) >= 2:
+            code = int.from_bytes(data[:2], "little")
+            register = data[2] if len(data) > 2 else 0
+            self.emergencies.append(Emergency(code, register, data[3:8], self._connection.clock.now()))
+
+    def _on_request(self, cob_id: int, data: bytes, timestamp: float) -> None:
+        if cob_id == NMT_ID and data[1:2] not in (b"\0", bytes((self.node,))):
+            return
+        sent = self._connection.sent[cob_id]
+        if data in sent:
+            sent.remove(data)  # the adapter echoes what we send
+        else:
+            self.foreign_requests += 1
+
+    def _on_answer(self, cob_id: int, data: bytes, timestamp: float) -> None:
+        # An echo arrives before the answer it causes; what is older has no echo to come.
+        self._connection.sent[0x600 + self.node].clear()

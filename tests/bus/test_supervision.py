@@ -1,0 +1,140 @@
+"""Supervision of a node: reset, silence, emergencies, a second master and our own echo."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.nmt import NmtCommand, NmtState, reset_node, send_nmt
+from pmsmtool.bus.sdo import SdoChannel
+from pmsmtool.bus.supervision import HeartbeatLost, NodeReset, SecondMaster, Supervision
+from pmsmtool.errors import DriveFault, DriveTimeout
+from tests.bus.scripted import NODE, ScriptedBus, ScriptedSlave
+
+BIG = (0x2042, 0)
+
+
+@pytest.fixture
+def bus() -> ScriptedBus:
+    return ScriptedBus(ScriptedSlave({BIG: bytes(4000), (0x1000, 0): bytes(4)}))
+
+
+@pytest.fixture
+def connection(bus: ScriptedBus) -> Iterator[Connection]:
+    with Connection(bus) as opened:
+        yield opened
+
+
+@pytest.fixture
+def supervision(connection: Connection) -> Supervision:
+    return Supervision(connection, NODE)
+
+
+def test_node_reset_stops_the_transfer_at_once(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision
+) -> None:
+    channel = SdoChannel(connection, NODE, check=supervision.check)
+    bus.clock.after(0.004, lambda: bus.deliver(0x700 + NODE, b"\0"))
+    bus.clock.after(0.004, lambda: setattr(bus.slave, "hung", True))
+    with pytest.raises(NodeReset, match="values not stored are lost"):
+        channel.upload(*BIG)
+    assert bus.clock.now() < 0.3
+
+
+def test_wanted_reset_is_no_error(bus: ScriptedBus, connection: Connection, supervision: Supervision) -> None:
+    with supervision.expected_reset():
+        reset_node(connection, NODE)
+    supervision.check()
+    assert supervision.boot_ups == 1 and supervision.nmt_state is NmtState.BOOT_UP
+
+
+def test_reset_without_boot_up_is_reported(bus: ScriptedBus, connection: Connection) -> None:
+    bus.slave.nmt = lambda data: None  # type: ignore[method-assign]
+    with pytest.raises(DriveTimeout, match="no boot-up within 5 s"):
+        reset_node(connection, NODE)
+
+
+def test_lost_heartbeat_ends_a_download_within_a_second(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision
+) -> None:
+    supervision.heartbeat_period_s = 0.2
+    channel = SdoChannel(connection, NODE, check=supervision.check)
+    beat = bus.clock.every(0.2, lambda: bus.deliver(0x700 + NODE, b"\x05"))
+    connection.wait(1.0)
+    supervision.check()
+    beat.stop()
+    bus.slave.hung = True
+    gone = bus.clock.now()
+    with pytest.raises(HeartbeatLost):
+        write_often(channel)
+    assert bus.clock.now() - gone < 1.0
+
+
+def write_often(channel: SdoChannel) -> None:
+    for _ in range(300):
+        channel.download(0x2010, 2, bytes(4))
+
+
+def test_heartbeats_in_time_raise_nothing(bus: ScriptedBus, connection: Connection, supervision: Supervision) -> None:
+    supervision.heartbeat_period_s = 0.2
+    bus.clock.every(0.2, lambda: bus.deliver(0x700 + NODE, b"\x05"))
+    for _ in range(50):
+        connection.wait(0.13)
+        supervision.check()
+    assert supervision.nmt_state is NmtState.OPERATIONAL
+
+
+@pytest.mark.parametrize("code", [0x2310, 0x3210, 0x4310, 0x7305])
+def test_emergency_of_a_stopping_class(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision, code: int
+) -> None:
+    bus.deliver(0x080 + NODE, code.to_bytes(2, "little") + b"\x03\x01\x02\x03\x04\x05")
+    connection.collect()
+    with pytest.raises(DriveFault, match=f"{code:#06x}"):
+        supervision.check()
+    supervision.check()  # told once
+
+
+def test_other_emergencies_are_kept_and_short_ones_understood(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision
+) -> None:
+    bus.deliver(0x080 + NODE, b"\x30\x81\x11")
+    bus.deliver(0x080 + NODE, b"\x00")
+    connection.collect()
+    supervision.check()
+    assert [(e.code, e.register, e.detail) for e in supervision.emergencies] == [(0x8130, 0x11, b"")]
+
+
+def test_second_master_is_noticed(bus: ScriptedBus, connection: Connection, supervision: Supervision) -> None:
+    channel = SdoChannel(connection, NODE, check=supervision.check)
+    channel.read(0x1000, 0)
+    bus.deliver(0x600 + NODE, b"\x40\x41\x60\x00" + bytes(4))
+    connection.collect()
+    with pytest.raises(SecondMaster):
+        channel.read(0x1000, 0)
+
+
+def test_foreign_nmt_command_is_noticed_only_when_it_means_this_node(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision
+) -> None:
+    bus.deliver(0, bytes((1, NODE + 1)))
+    connection.collect()
+    supervision.check()
+    bus.deliver(0, bytes((2, 0)))
+    connection.collect()
+    with pytest.raises(SecondMaster):
+        supervision.check()
+
+
+def test_own_echo_is_no_second_master(bus: ScriptedBus, connection: Connection, supervision: Supervision) -> None:
+    """As udp_multicast does: own frames come back, marked as received."""
+    bus.echo = True
+    channel = SdoChannel(connection, NODE, check=supervision.check)
+    channel.upload(*BIG, size=4000)
+    channel.download(*BIG, bytes(2000))
+    send_nmt(connection, NmtCommand.START, NODE)
+    connection.wait(0.01)
+    supervision.check()
+    assert supervision.foreign_requests == 0
