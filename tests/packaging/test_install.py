@@ -1,0 +1,117 @@
+"""The real installations: pip, a fresh environment, a copy of the sources; with the system's compiler and with ziglang.
+
+Dependencies are left out (``--no-deps``): what is asked here is what this package does itself.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import venv
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.packaging import contents
+from pmsmtool.packaging.compiler import CANDIDATES
+from pmsmtool.packaging.kernels import KERNELS
+
+ROOT = Path(__file__).resolve().parents[2]
+NO_INDEX = ("No matching distribution found for", "Could not find a version that satisfies", "ConnectionError")
+
+pytestmark = [
+    pytest.mark.slow_install,
+    pytest.mark.skipif(sys.platform == "win32", reason="paths of a POSIX environment"),
+]
+
+PROBE = """
+import sys
+from pmsmtool.native import LIBRARY_FOLDER, load
+from pmsmtool.resources import data_folder
+for name in sys.argv[1:]:
+    load(name)
+print(LIBRARY_FOLDER)
+for name in ("profiles", "firmware-params"):
+    folder = data_folder(name)
+    print(folder, *sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
+"""
+
+
+@dataclass(frozen=True)
+class Installation:
+    """Where pmsmtool was installed, and what the build said."""
+
+    python: Path
+    sources: Path
+    log: str
+
+    def probe(self, folder: Path) -> list[str]:
+        """Load every kernel and find the data, from a folder that is not the checkout."""
+        command = [str(self.python), "-c", PROBE, *(kernel.name for kernel in KERNELS)]
+        env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.splitlines()
+
+
+def install(folder: Path, *, editable: bool, compilers: bool) -> Installation:
+    """Install a copy of this checkout in a fresh environment, with or without the system's compilers."""
+    sources = folder / "checkout"
+    for name, path in contents.source_files(ROOT).items():
+        (sources / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, sources / name)
+    for name in contents.DATA_FOLDERS:
+        (sources / name).mkdir(exist_ok=True)
+    venv.create(folder / "environment", with_pip=False)
+    python = folder / "environment" / "bin" / "python"
+    env = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "CC")}
+    if not compilers:
+        env["PATH"] = str(folder / "environment" / "bin")
+        assert not any(shutil.which(name, path=env["PATH"]) for name in CANDIDATES)
+    what = ["-e", str(sources)] if editable else [str(sources)]
+    command = [sys.executable, "-m", "pip", "--python", str(python), "install", "-v", "--no-deps", *what]
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
+    log = done.stdout + done.stderr
+    if done.returncode != 0 and any(text in log for text in NO_INDEX):
+        pytest.skip("no package index can be reached")
+    assert done.returncode == 0, log
+    return Installation(python, sources, log)
+
+
+def data_lines(root: Path) -> list[str]:
+    """What the probe prints for the data folders that stand in ``root``."""
+    files = {
+        name: [p for p in contents.source_files(ROOT) if p.startswith(f"{name}/")] for name in contents.DATA_FOLDERS
+    }
+    return [
+        " ".join([str(root / name), *(p.removeprefix(f"{name}/") for p in sorted(found))])
+        for name, found in files.items()
+    ]
+
+
+def test_installed_wheel_has_kernels_and_data_and_leaves_the_sources_clean(tmp_path: Path) -> None:
+    found = install(tmp_path, editable=False, compilers=True)
+    package = next((tmp_path / "environment").rglob("site-packages")) / "pmsmtool"
+    assert found.probe(tmp_path) == [str(package / "_native"), *data_lines(package / "_data")]
+    left = {path.name for path in found.sources.iterdir()} - {
+        name.split("/")[0] for name in contents.source_files(ROOT)
+    }
+    assert left <= set(contents.DATA_FOLDERS)
+    assert not (found.sources / "pmsmtool" / "_native").exists()
+    help_text = subprocess.run([tmp_path / "environment/bin/pmsmtool", "--version"], capture_output=True, text=True)
+    assert "No module named 'click'" in help_text.stderr  # the entry point is there; its dependencies were left out
+
+
+def test_editable_installation_points_to_the_checkout(tmp_path: Path) -> None:
+    found = install(tmp_path, editable=True, compilers=True)
+    assert found.probe(tmp_path) == [str(found.sources / "pmsmtool" / "_native"), *data_lines(found.sources)]
+
+
+def test_without_a_compiler_ziglang_builds_the_same_installation(tmp_path: Path) -> None:
+    found = install(tmp_path, editable=False, compilers=False)
+    assert "compiled by ziglang" in found.log
+    package = next((tmp_path / "environment").rglob("site-packages")) / "pmsmtool"
+    assert found.probe(tmp_path)[0] == str(package / "_native")

@@ -1,0 +1,133 @@
+"""The compiled kernels: what they export, what they need, and that a warning stops a development build."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from pmsmtool import native
+from pmsmtool.errors import PmsmtoolError
+from pmsmtool.packaging import build_kernels, compiler, cross_wheels, kernels
+from pmsmtool.packaging.kernels import KERNELS, Kernel
+from pmsmtool.packaging.symbols import read_binary
+from pmsmtool.packaging.targets import here
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "pmsmtool"
+
+NEEDED_OF_LIBC = frozenset({"memcpy", "memmove", "memset", "memcmp", "sqrt", "sqrtf"})
+"""What a compiler may call on its own account; a target's own library has them too."""
+
+
+@pytest.fixture(scope="module")
+def working_compiler() -> compiler.Compiler:
+    try:
+        return compiler.build_compiler()
+    except compiler.CompilerError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=lambda kernel: kernel.name)
+def test_every_glob_finds_sources(kernel: Kernel) -> None:
+    for pattern in kernel.sources:
+        assert list(PACKAGE.glob(pattern)), f"{kernel.name}: {pattern} finds nothing"
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=lambda kernel: kernel.name)
+def test_kernel_compiles_without_a_warning_and_exports_only_its_prefix(
+    kernel: Kernel, working_compiler: compiler.Compiler, tmp_path: Path
+) -> None:
+    library = tmp_path / native.library_name(kernel.name)
+    compiler.compile_library(working_compiler, kernel, PACKAGE, library, strict=True)
+    binary = read_binary(library.read_bytes())
+    target = here()
+    if target is not None:
+        assert cross_wheels.library_faults(library.name, binary, target) == []
+    assert [path.name for path in tmp_path.iterdir()] == [library.name]
+
+
+@pytest.mark.parametrize("source", sorted({s for kernel in KERNELS for s in kernel.source_files(PACKAGE)}), ids=str)
+def test_external_symbols_have_the_prefix_and_the_core_needs_no_libc(
+    source: Path, working_compiler: compiler.Compiler, tmp_path: Path
+) -> None:
+    """Linked statically into a firmware, hidden symbols meet those of others as well: every one has the prefix."""
+    target = tmp_path / "unit.o"
+    includes = [part for folder in kernels.INCLUDE_FOLDERS for part in ("-iquote", folder)]
+    command = [*working_compiler.command, *kernels.COMPILE_FLAGS, *includes, "-c", source.as_posix(), "-o", str(target)]
+    subprocess.run(command, cwd=PACKAGE, check=True)
+    data = target.read_bytes()
+    if data[:4] != b"\x7fELF":
+        pytest.skip("object files are read on ELF systems only")
+    binary = read_binary(data)
+    assert binary.external
+    assert {name for name in binary.external if not name.startswith("pmsm_")} == set()
+    if source.parts[0] == "firmware":
+        outside = {name for name in binary.undefined if not name.startswith("pmsm_")}
+        assert outside <= NEEDED_OF_LIBC
+
+
+def test_a_warning_is_an_error_only_in_strict_builds(working_compiler: compiler.Compiler, tmp_path: Path) -> None:
+    (tmp_path / "x.c").write_text("float pmsm_x(double a);\nfloat pmsm_x(double a) { return a; }\n")
+    kernel = Kernel("x", ("x.c",))
+    library = tmp_path / native.library_name("x")
+    compiler.compile_library(working_compiler, kernel, tmp_path, library)
+    assert library.is_file()
+    with pytest.raises(compiler.CompilerError, match=r"x\.c"):
+        compiler.compile_library(working_compiler, kernel, tmp_path, library, strict=True)
+
+
+def test_a_missing_function_is_found_when_linking(working_compiler: compiler.Compiler, tmp_path: Path) -> None:
+    (tmp_path / "x.c").write_text("int pmsm_elsewhere(void);\nint pmsm_x(void) { return pmsm_elsewhere(); }\n")
+    with pytest.raises(compiler.CompilerError, match="pmsm_elsewhere"):
+        compiler.compile_library(working_compiler, Kernel("x", ("x.c",)), tmp_path, tmp_path / native.library_name("x"))
+
+
+def test_same_source_same_bytes(working_compiler: compiler.Compiler, tmp_path: Path) -> None:
+    """Also from another folder: no path of the building machine gets into a library."""
+    libraries = []
+    for name in ("one", "another-place"):
+        package = tmp_path / name / "pmsmtool"
+        for source in [*PACKAGE.glob("firmware/core/*.[ch]")]:
+            target = package / source.relative_to(PACKAGE)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(source, target)
+        library = tmp_path / name / native.library_name("pmsm_core")
+        compiler.compile_library(working_compiler, KERNELS[0], package, library)
+        libraries.append(library.read_bytes())
+    assert libraries[0] == libraries[1]
+
+
+def test_build_keeps_what_is_current_and_skips_kernels_without_sources(
+    working_compiler: compiler.Compiler, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x.c").write_text("int pmsm_x(void);\nint pmsm_x(void) { return 1; }\n")
+    rows = (Kernel("x", ("x.c",)), Kernel("y", ("none/*.c",)))
+    folder = tmp_path / "built"
+    first = build_kernels.build_all(tmp_path, folder, working_compiler, kernels=rows)
+    assert [path.name for path in first] == [native.library_name("x")]
+    printed = capsys.readouterr().err
+    assert "compiled by" in printed
+    assert "y: no sources match none/*.c, not built" in printed
+    build_kernels.build_all(tmp_path, folder, working_compiler, kernels=rows[:1])
+    assert capsys.readouterr().err == ""
+    build_kernels.build_all(tmp_path, folder, working_compiler, kernels=rows[:1], force=True)
+    assert "compiled by" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=lambda kernel: kernel.name)
+def test_built_kernel_loads(kernel: Kernel) -> None:
+    library = native.load(kernel.name)
+    assert library is native.load(kernel.name)
+
+
+def test_missing_or_damaged_kernel_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(native, "LIBRARY_FOLDER", tmp_path)
+    with pytest.raises(PmsmtoolError, match="build_kernels") as missing:
+        native.load("pmsm_absent")
+    assert str(tmp_path) in missing.value.where
+    (tmp_path / native.library_name("pmsm_damaged")).write_bytes(b"not a library")
+    with pytest.raises(PmsmtoolError, match="another machine"):
+        native.load("pmsm_damaged")
