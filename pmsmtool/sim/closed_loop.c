@@ -459,7 +459,7 @@ uint64_t pmsm_sim_overrun_count(const pmsm_sim *sim)
 
 void pmsm_sim_drive_plant(pmsm_sim *sim, uint64_t n, double h, const double *u, double *i)
 {
-    pmsm_supply supply = {{0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, NULL, -1, 0, 0, 0.0, 0.0};
+    pmsm_supply supply = {{0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, NULL, -1, 0, 0, 0.0, 0.0, 0.0};
     for (uint64_t k = 0; k < n; k++) {
         supply.alpha = u[2u * k];
         supply.beta = u[2u * k + 1u];

@@ -1,16 +1,13 @@
-/* Averaged and switch-level inverter; see inverter.h. */
+/* Averaged and switch-level inverter: what the legs are at each instant; see inverter.h. */
 #include "inverter.h"
 
 #include <stddef.h>
 
 #include "elementary.h"
+#include "leg_circuit.h"
 
-#define NEVER 1.0e300           /* s; also the window of an open leg, in V */
-#define EVENTS_MAX 24           /* zero crossings resolved inside one interval */
-#define CROSSING_STEPS 3        /* secant steps to a zero crossing */
-#define CROSSING_TOLERANCE 1.0e-6 /* what is left of the starting current is taken out of the flux */
-#define I_ZERO 1.0e-9           /* A: below this a sign is rounding */
-#define V_SAME 1.0e-12          /* V: thresholds closer than this make no dead band */
+#define NEVER 1.0e300           /* s */
+#define I_LEAST 1.0e-9          /* A, knee of a shape that was given none */
 #define BRIEF 1.0e-3            /* R h / L of an interval whose midpoint rule is as good as RK4: 2e-10 of the current */
 #define STIFFNESS 1.0           /* largest h g / L of an averaged substep (RK4 is stable to 2.78) */
 #define SUBSTEPS_MAX 64u
@@ -101,7 +98,7 @@ static void begin_averaged(pmsm_inverter *inverter, const double duty[3])
         substeps = SIGN_SUBSTEPS;
     }
     if (!(knee > 0.0))
-        knee = I_ZERO;
+        knee = I_LEAST;
     error->shape = V_max > 0.0 ? setup->shape : (uint32_t)PMSM_DEADTIME_NONE;
     error->i_knee_inverse = error->V_device_knee_inverse = 1.0 / knee;
     error->V_device = setup->V_switch;
@@ -111,217 +108,16 @@ static void begin_averaged(pmsm_inverter *inverter, const double duty[3])
     }
     slope += (V_max * shape_slope(error->shape) + error->V_device) / knee;
     inverter->averaged.error = error->shape != PMSM_DEADTIME_NONE || error->V_device > 0.0 ? error : NULL;
-    inverter->averaged.general = inverter->averaged.error || setup->r_switch > 0.0;
+    inverter->averaged.general = inverter->averaged.error != NULL;
+    inverter->averaged.series = inverter->averaged.general ? 0.0 : setup->r_switch;
     if (inverter->averaged.error)
         substeps = at_least(slope * reach / STIFFNESS, substeps);
     inverter->substeps = substeps;
 }
 
-/* ---- one interval of constant leg sources ------------------------------------------------------------- */
-
-/* What a leg offers: its voltage and slope for a current out of it, and into it. */
-typedef struct {
-    double v_out[3], v_in[3], r_out[3], r_in[3];
-    uint32_t open[3];
-} leg_sources;
-
-static int is_dependent(const leg_sources *sources, int x)
-{
-    return sources->open[x] || sources->v_in[x] - sources->v_out[x] > V_SAME;
-}
-
-static void follow_lag(pmsm_current_lag *lag, const double i_start[3], const pmsm_plant *plant, double h)
-{
-    if (lag->decay_h != h) {
-        lag->decay = pmsm_real64_exp(-h / lag->tau);
-        lag->decay_h = h;
-    }
-    for (int x = 0; x < 3; x++) { /* exact for a current that is straight over the interval */
-        const double i_end = pmsm_plant_leg_current(plant, x), behind = (i_end - i_start[x]) / h * lag->tau;
-        lag->value[x] = i_end - behind + (lag->value[x] - i_start[x] + behind) * lag->decay;
-    }
-}
-
-/* Advance the plant, the sensor lag and the volt-seconds. */
-static void advance(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, const pmsm_supply *supply,
-                    double h)
-{
-    if (lag) {
-        const double i[3] = {pmsm_plant_leg_current(plant, 0), pmsm_plant_leg_current(plant, 1),
-                             pmsm_plant_leg_current(plant, 2)};
-        pmsm_plant_advance(plant, supply, h);
-        follow_lag(lag, i, plant, h);
-    } else {
-        pmsm_plant_advance(plant, supply, h);
-    }
-    inverter->volt_seconds_alpha += plant->u_alpha * h;
-    inverter->volt_seconds_beta += plant->u_beta * h;
-}
-
-static void set_supply(pmsm_supply *supply, const pmsm_inverter *inverter, const leg_sources *sources)
-{
-    int32_t blocked = -1;
-    int blocked_count = 0, slopes = 0;
-    for (int x = 0; x < 3; x++) {
-        const int32_t sign = inverter->leg[x].sign;
-        if (sign == 0 && is_dependent(sources, x)) {
-            blocked = x;
-            blocked_count++;
-        }
-        supply->v[x] = sign < 0 ? sources->v_in[x] : sources->v_out[x];
-        supply->r[x] = sign < 0 ? sources->r_in[x] : sources->r_out[x];
-        if (sources->open[x])
-            supply->v[x] = supply->r[x] = 0.0;
-        slopes |= supply->r[x] > 0.0;
-    }
-    supply->blocked = blocked_count > 1 ? 3 : blocked;
-    supply->general = slopes || supply->error || supply->blocked >= 0;
-    pmsm_leg_vector(supply->v, &supply->alpha, &supply->beta);
-}
-
-/* All currents zero: do the thresholds hold them there? If not, the pair with the largest excess conducts. */
-static int release_pair(pmsm_inverter *inverter, const pmsm_plant *plant, const leg_sources *sources)
-{
-    double emf[3], low = -NEVER, high = NEVER;
-    int out = 0, in = 0;
-    pmsm_plant_emf(plant, emf);
-    for (int x = 0; x < 3; x++) {
-        if (sources->open[x])
-            continue;
-        if (sources->v_out[x] - emf[x] > low) {
-            low = sources->v_out[x] - emf[x];
-            out = x;
-        }
-        if (sources->v_in[x] - emf[x] < high) {
-            high = sources->v_in[x] - emf[x];
-            in = x;
-        }
-    }
-    for (int x = 0; x < 3; x++)
-        inverter->leg[x].sign = 0;
-    if (low - high <= V_SAME || out == in)
-        return 0;
-    inverter->leg[out].sign = 1;
-    inverter->leg[in].sign = -1;
-    return 1;
-}
-
-/* A leg without current stays so if the voltage it needs lies between its thresholds. */
-static void release_leg(pmsm_inverter *inverter, const pmsm_plant *plant, const leg_sources *sources,
-                        pmsm_supply *supply, int x)
-{
-    if (sources->open[x])
-        return;
-    set_supply(supply, inverter, sources);
-    const double needed = pmsm_plant_hold_voltage(plant, supply, x, NULL);
-    if (needed < sources->v_out[x])
-        inverter->leg[x].sign = 1;
-    else if (needed > sources->v_in[x])
-        inverter->leg[x].sign = -1;
-}
-
-/* Signs of all legs at the start of an interval; a leg of the mask `held` is not released again. */
-static void settle_signs(pmsm_inverter *inverter, const pmsm_plant *plant, const leg_sources *sources,
-                         pmsm_supply *supply, uint32_t held)
-{
-    int without = 0;
-    for (int x = 0; x < 3; x++) {
-        pmsm_leg *leg = &inverter->leg[x];
-        const double i = pmsm_plant_leg_current(plant, x);
-        if (pmsm_real64_abs(i) > I_ZERO && !sources->open[x])
-            leg->sign = i > 0.0 ? 1 : -1;
-        else if (sources->open[x])
-            leg->sign = 0;
-        without += leg->sign == 0;
-    }
-    if (without >= 2 && !release_pair(inverter, plant, sources))
-        return;
-    for (int x = 0; x < 3; x++)
-        if (inverter->leg[x].sign == 0 && !(held >> x & 1u) && is_dependent(sources, x))
-            release_leg(inverter, plant, sources, supply, x);
-}
-
-/* The dependent leg whose current changed its sign first in the step of length h; -1 none. */
-static int find_crossing(const pmsm_inverter *inverter, const pmsm_plant *plant, const leg_sources *sources,
-                         const double i_start[3], double *share)
-{
-    int crossed = -1;
-    *share = 1.0;
-    for (int x = 0; x < 3; x++) {
-        const double i = pmsm_plant_leg_current(plant, x), s = (double)inverter->leg[x].sign;
-        if (s == 0.0 || !is_dependent(sources, x) || i * s >= -I_ZERO)
-            continue;
-        const double start = i_start[x] * s > 0.0 ? i_start[x] : 0.0;
-        const double at = start / (start - i);
-        if (at < *share || crossed < 0) {
-            *share = at;
-            crossed = x;
-        }
-    }
-    return crossed;
-}
-
-/* Interval of constant sources with all zero crossings resolved. */
-static void run_interval(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, const leg_sources *sources,
-                         double h)
-{
-    const int averaged = inverter->gates && inverter->setup.model == PMSM_INVERTER_AVERAGED;
-    pmsm_supply supply = {{0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, averaged ? inverter->averaged.error : NULL, -1, 0, 0, 0.0, 0.0};
-    supply.brief = !averaged && h * inverter->brief_rate < 1.0;
-    const int dependent = is_dependent(sources, 0) || is_dependent(sources, 1) || is_dependent(sources, 2);
-    if (!dependent) {
-        for (int x = 0; x < 3; x++)
-            inverter->leg[x].sign = pmsm_plant_leg_current(plant, x) < 0.0 ? -1 : 1;
-        set_supply(&supply, inverter, sources);
-        advance(inverter, plant, lag, &supply, h);
-        return;
-    }
-    uint32_t held = 0;
-    for (int event = 0; h > 0.0; event++) {
-        double i_start[3], share;
-        settle_signs(inverter, plant, sources, &supply, held);
-        set_supply(&supply, inverter, sources);
-        for (int x = 0; x < 3; x++)
-            i_start[x] = pmsm_plant_leg_current(plant, x);
-        const pmsm_plant_state before = plant->state;
-        const double volt_seconds[2] = {inverter->volt_seconds_alpha, inverter->volt_seconds_beta};
-        const pmsm_current_lag lag_before = lag ? *lag : (pmsm_current_lag){0};
-        advance(inverter, plant, lag, &supply, h);
-        int x = find_crossing(inverter, plant, sources, i_start, &share);
-        if (x < 0)
-            return;
-        if (event >= EVENTS_MAX) {
-            inverter->event_overruns++;
-            return;
-        }
-        double tau = h;
-        const double near_zero = I_ZERO + CROSSING_TOLERANCE * pmsm_real64_abs(i_start[x]);
-        for (int trial = 0; trial < CROSSING_STEPS; trial++) {
-            const double i_end = pmsm_plant_leg_current(plant, x);
-            if (pmsm_real64_abs(i_end) <= near_zero)
-                break;
-            tau *= i_start[x] / (i_start[x] - i_end);
-            plant->state = before;
-            inverter->volt_seconds_alpha = volt_seconds[0];
-            inverter->volt_seconds_beta = volt_seconds[1];
-            if (lag)
-                *lag = lag_before;
-            if (!(tau > 0.0)) {
-                tau = 0.0;
-                held |= 1u << x; /* released on the edge of its threshold, and back within the interval */
-                break;
-            }
-            advance(inverter, plant, lag, &supply, tau);
-        }
-        inverter->leg[x].sign = 0;
-        pmsm_plant_clear_current(plant, x);
-        h -= tau;
-    }
-}
-
 /* ---- circuits ------------------------------------------------------------------------------------------ */
 
-static void conducting_source(const pmsm_inverter_setup *setup, leg_sources *sources, int x, double rail, int top)
+static void conducting_source(const pmsm_inverter_setup *setup, pmsm_leg_sources *sources, int x, double rail, int top)
 {
     const int channel = setup->V_switch == 0.0;
     const double V_reverse = channel ? 0.0 : setup->V_diode, r_reverse = channel ? setup->r_switch : setup->r_diode;
@@ -332,14 +128,14 @@ static void conducting_source(const pmsm_inverter_setup *setup, leg_sources *sou
     sources->r_in[x] = top ? r_reverse : setup->r_switch;
 }
 
-static void diode_source(const pmsm_inverter *inverter, leg_sources *sources, int x)
+static void diode_source(const pmsm_inverter *inverter, pmsm_leg_sources *sources, int x)
 {
     sources->v_out[x] = -inverter->setup.V_diode;
     sources->v_in[x] = inverter->U_dc + inverter->setup.V_diode;
     sources->r_out[x] = sources->r_in[x] = inverter->setup.r_diode;
 }
 
-static void find_source(const pmsm_inverter *inverter, leg_sources *sources, int x)
+static void find_source(const pmsm_inverter *inverter, pmsm_leg_sources *sources, int x)
 {
     sources->open[x] = inverter->setup.open[x];
     if (inverter->gates && inverter->setup.model == PMSM_INVERTER_AVERAGED) {
@@ -392,7 +188,7 @@ static void run_commutation(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_cur
             steps = h < resolved * (double)COMMUTATION_STEPS_MAX ? (int)(h / resolved) + 1 : COMMUTATION_STEPS_MAX;
     const double dt = h / (double)steps;
     for (int n = 0; n < steps; n++) {
-        leg_sources sources;
+        pmsm_leg_sources sources;
         double v_half[3] = {0.0, 0.0, 0.0}, v_end[3] = {0.0, 0.0, 0.0};
         for (int x = 0; x < 3; x++) {
             pmsm_leg *leg = &inverter->leg[x];
@@ -405,7 +201,7 @@ static void run_commutation(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_cur
             if (v_end[x] > -inverter->setup.V_diode && v_end[x] < inverter->U_dc + inverter->setup.V_diode)
                 sources.r_out[x] = sources.r_in[x] = 0.0; /* no diode conducts yet */
         }
-        run_interval(inverter, plant, lag, &sources, dt);
+        pmsm_leg_interval(inverter, plant, lag, &sources, dt);
         for (int x = 0; x < 3; x++) {
             if (!floats(inverter, x))
                 continue;
@@ -430,10 +226,10 @@ static void run_circuit(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current
         run_commutation(inverter, plant, lag, h);
         return;
     }
-    leg_sources sources;
+    pmsm_leg_sources sources;
     for (int x = 0; x < 3; x++)
         find_source(inverter, &sources, x);
-    run_interval(inverter, plant, lag, &sources, h);
+    pmsm_leg_interval(inverter, plant, lag, &sources, h);
 }
 
 /* ---- gates ----------------------------------------------------------------------------------------------- */
@@ -510,7 +306,7 @@ void pmsm_inverter_start(pmsm_inverter *inverter, const pmsm_plant *plant)
     inverter->brief_rate = (plant->R + r) / (BRIEF * pmsm_plant_smallest_inductance(plant));
     const int dead = setup->shape != PMSM_DEADTIME_NONE && largest_dead_time(setup) > 0.0;
     inverter->exact = !dead && setup->V_switch == 0.0 && setup->r_switch == 0.0;
-    inverter->averaged = (pmsm_supply){{0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, NULL, -1, 0, 0, 0.0, 0.0};
+    inverter->averaged = (pmsm_supply){{0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, NULL, -1, 0, 0, 0.0, 0.0, 0.0};
     inverter->gates = 0;
     inverter->circuit = 1;
     inverter->substeps = DIODE_SUBSTEPS;
@@ -555,7 +351,7 @@ static void run_substeps(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_curren
         if (inverter->circuit)
             run_circuit(inverter, plant, lag, dt);
         else
-            advance(inverter, plant, lag, &inverter->averaged, dt);
+            pmsm_leg_advance(inverter, plant, lag, &inverter->averaged, dt);
     }
 }
 

@@ -62,6 +62,7 @@ typedef struct {
     int32_t general;               /* 0: v alone counts and alpha, beta hold its vector */
     int32_t brief;                 /* 1: so short that the midpoint rule does (R h / L below 1e-3) */
     double alpha, beta;            /* V */
+    double series;                 /* ohm, in every leg; what r holds when general is 0 */
 } pmsm_supply;
 
 typedef struct {

@@ -1,0 +1,96 @@
+/* One point of the machine's trajectory: fluxes, angle and the currents they give. Internal to sim/. */
+#ifndef PMSM_PLANT_POINT_H
+#define PMSM_PLANT_POINT_H
+
+#include "elementary.h"
+#include "plant.h"
+
+/* A point of the trajectory inside an interval. */
+typedef struct {
+    double psi_alpha, psi_beta, c, s; /* Wb; cosine and sine of theta_e */
+    double i_d, i_q, i_alpha, i_beta;
+} pmsm_point;
+
+/* Harmonics of the magnet flux at angle (c, s): value and derivative with respect to theta_e. */
+static inline void pmsm_magnet_harmonics(const pmsm_machine *machine, double c, double s, double h[2], double dh[2])
+{
+    const double c2 = c * c - s * s, s2 = 2.0 * c * s;
+    const double c3 = c2 * c - s2 * s, s3 = s2 * c + c2 * s;
+    const double c6 = c3 * c3 - s3 * s3, s6 = 2.0 * c3 * s3;
+    const double c12 = c6 * c6 - s6 * s6, s12 = 2.0 * c6 * s6;
+    h[0] = machine->psi_6 * c6 + machine->psi_12 * c12;
+    h[1] = -machine->psi_6 * s6 - machine->psi_12 * s12;
+    dh[0] = -6.0 * machine->psi_6 * s6 - 12.0 * machine->psi_12 * s12;
+    dh[1] = -6.0 * machine->psi_6 * c6 - 12.0 * machine->psi_12 * c12;
+}
+
+static inline int pmsm_has_harmonics(const pmsm_machine *machine)
+{
+    return machine->psi_6 != 0.0 || machine->psi_12 != 0.0;
+}
+
+/* Currents of a point from its flux and angle. */
+static inline void pmsm_find_currents(pmsm_plant *m, pmsm_point *at)
+{
+    const double c = at->c, s = at->s;
+    double psi_d = c * at->psi_alpha + s * at->psi_beta;
+    double psi_q = c * at->psi_beta - s * at->psi_alpha;
+    if (pmsm_has_harmonics(&m->machine)) {
+        double h[2], dh[2];
+        pmsm_magnet_harmonics(&m->machine, c, s, h, dh);
+        psi_d -= h[0];
+        psi_q -= h[1];
+    }
+    if (m->machine.map) {
+        if (pmsm_flux_map_current(m->machine.map, psi_d - m->psi_shift, psi_q, &at->i_d, &at->i_q))
+            m->outside_count++;
+    } else {
+        at->i_d = (psi_d - m->psi_m) * m->L_d_inverse;
+        at->i_q = psi_q * m->L_q_inverse;
+    }
+    at->i_alpha = c * at->i_d - s * at->i_q;
+    at->i_beta = s * at->i_d + c * at->i_q;
+}
+
+static inline double pmsm_air_gap_torque(const pmsm_plant *m, const pmsm_point *at)
+{
+    double flux_current = at->psi_alpha * at->i_beta - at->psi_beta * at->i_alpha;
+    if (pmsm_has_harmonics(&m->machine)) { /* from the co-energy: i . d psi_pm / d theta_e */
+        double h[2], dh[2];
+        pmsm_magnet_harmonics(&m->machine, at->c, at->s, h, dh);
+        flux_current += at->i_d * dh[0] + at->i_q * dh[1];
+    }
+    return 1.5 * m->machine.pole_pairs * flux_current;
+}
+
+/* Make a point the state. */
+static inline void pmsm_keep_point(pmsm_plant *m, const pmsm_point *at)
+{
+    pmsm_plant_state *state = &m->state;
+    state->psi_alpha = at->psi_alpha;
+    state->psi_beta = at->psi_beta;
+    state->i_d = at->i_d;
+    state->i_q = at->i_q;
+    state->i_alpha = at->i_alpha;
+    state->i_beta = at->i_beta;
+    state->torque = pmsm_air_gap_torque(m, at);
+}
+
+static inline pmsm_point pmsm_point_here(const pmsm_plant_state *state)
+{
+    const pmsm_point at = {state->psi_alpha, state->psi_beta, state->cos_e,   state->sin_e,
+                      state->i_d,       state->i_q,      state->i_alpha, state->i_beta};
+    return at;
+}
+
+/* Leg voltages behind slope and error at the point's currents. */
+void pmsm_point_leg_voltages(const pmsm_supply *supply, const pmsm_point *at, double v[3]);
+
+/* Voltage of leg x that keeps its current, the others at v: solves d i_x/dt = 0, which is linear in v_x.
+ * slope_per_volt may be null. */
+double pmsm_point_hold_voltage(const pmsm_plant *m, const pmsm_point *at, double omega_e, int x,
+                               const double v_legs[3], double *slope_per_volt);
+
+#define PMSM_ALL_LEGS 3 /* pmsm_supply.blocked, pmsm_plant_clear_current() */
+
+#endif
