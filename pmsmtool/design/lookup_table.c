@@ -20,6 +20,7 @@
 #define FULL_VOLTAGE 1e-12   /* a node at the limit counts as inside, relative; the stored point is exact to 1e-13 */
 #define NEWTON_STEPS 12
 #define NEWTON_DONE 4e-15    /* residual of torque and voltage, relative */
+#define SAME_TORQUE 1e-10    /* torques that are one, relative to the range of a speed */
 #define UNSOLVED 255
 
 typedef struct {             /* least current per torque, one sign of torque */
@@ -409,6 +410,16 @@ static void store_nothing(output *out, ptrdiff_t cell, uint8_t why)
     out->unsolved += why == UNSOLVED;
 }
 
+/* Within rounding of the largest torque the contour is a point: that of the limit. */
+static int32_t at_the_limit(const tables *all, double torque, const double *e, pmsm_point *at)
+{
+    const double *nearest = torque - e[0] < e[3] - torque ? e : e + 3;
+    if (fabs(torque - nearest[0]) > SAME_TORQUE * (e[3] - e[0]))
+        return 0;
+    pmsm_plane_at(all->plane, nearest[1], nearest[2], at);
+    return 1;
+}
+
 static void solve_row(const tables *all, double torque, ptrdiff_t row, contour *c, output *out)
 {
     const double scale = 1.5 * all->plane->pole_pairs, T = torque / scale;
@@ -429,6 +440,8 @@ static void solve_row(const tables *all, double torque, ptrdiff_t row, contour *
                 if (!started)
                     started = start_contour(all, T, c) ? 1 : -1;
                 if (started > 0 && solve_cell(c, all->plane, out->omega[w], out->V[v], &at))
+                    store(all, out, cell, &at, out->omega[w], out->V[v], 0);
+                else if (at_the_limit(all, torque, e, &at))
                     store(all, out, cell, &at, out->omega[w], out->V[v], 0);
                 else
                     store_nothing(out, cell, UNSOLVED);
