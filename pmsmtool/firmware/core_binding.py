@@ -19,7 +19,7 @@ from pmsmtool.firmware.image import pack_image, unpack_image
 from pmsmtool.native import load
 
 HEADER_FOLDER = Path(__file__).parent / "core"
-CORE_HEADERS = ("pmsm_types.h", "pmsm_params.h", "pmsm_core.h")
+CORE_HEADERS = ("pmsm_types.h", "pmsm_params.h", "pmsm_core.h", "pmsm_projection.h")
 
 CType = Any
 """A ctypes type: a simple type, or a Structure subclass."""
@@ -140,6 +140,14 @@ def _declare(library: ctypes.CDLL, types: Mapping[str, CType]) -> None:
         "pmsm_image_check_content": (u32, [octets, u32]),
         "pmsm_image_load": (u32, [octets, u32, params, words, u32]),
         "pmsm_image_store": (u32, [params, words, pointer(ctypes.c_uint8)]),
+    }
+    row, dq, steps = pointer(types["pmsm_row"]), types["pmsm_dq"], words
+    signatures |= {
+        "pmsm_row_voltage": (dq, [row, dq]),
+        "pmsm_project_row": (dq, [row, dq, steps]),
+        "pmsm_project_rows": (u32, [row, u32, dq, pointer(dq), words, steps]),
+        "pmsm_smallest_voltage": (dq, [row, row, steps]),
+        "pmsm_project_half_planes": (u32, [pointer(dq), pointer(types["pmsm_real"]), u32, dq, pointer(dq), words, steps]),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)

@@ -1,0 +1,45 @@
+/* Nearest point of a plane to the intersection of ellipses |M v + c| <= V: what the reference governor and the field
+ * weakening solve. Every loop is bounded; nothing is allocated.
+ */
+#ifndef PMSM_PROJECTION_H
+#define PMSM_PROJECTION_H
+
+#include "pmsm_types.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef struct {                  /* the row |M v + c| <= V */
+    pmsm_real m_dd, m_dq, m_qd, m_qq; /* V/A */
+    pmsm_real c_d, c_q;           /* V */
+    pmsm_real V;                  /* V, > 0 */
+} pmsm_row;
+
+#define PMSM_PROJECTION_EMPTY 255u /* the rows have no common point */
+#define PMSM_PROJECTION_ROUNDS 16u /* bound of the outer loop, and of every Newton iteration inside */
+
+/* M v + c. */
+PMSM_EXPORT pmsm_dq pmsm_row_voltage(const pmsm_row *row, pmsm_dq v);
+
+/* Nearest point to r on one row; r itself when it satisfies the row. steps counts Newton steps. */
+PMSM_EXPORT pmsm_dq pmsm_project_row(const pmsm_row *row, pmsm_dq r, uint32_t *steps);
+
+/* Nearest point to r that satisfies all rows, by an active set of at most two rows.
+ * Returns the number of active rows (0: r itself), or PMSM_PROJECTION_EMPTY; then *v is not written.
+ * active receives the index of the row that was added last, 255 when none is active. */
+PMSM_EXPORT uint32_t pmsm_project_rows(const pmsm_row *rows, uint32_t count, pmsm_dq r, pmsm_dq *v, uint32_t *active,
+                                       uint32_t *steps);
+
+/* The point with the smallest |M v + c| of the goal among those that satisfy the limit row. */
+PMSM_EXPORT pmsm_dq pmsm_smallest_voltage(const pmsm_row *goal, const pmsm_row *limit, uint32_t *steps);
+
+/* Nearest point to r under the half planes a_k v <= b_k (normals need not be of unit length), by the same method. */
+PMSM_EXPORT uint32_t pmsm_project_half_planes(const pmsm_dq *a, const pmsm_real *b, uint32_t count, pmsm_dq r,
+                                              pmsm_dq *v, uint32_t *active, uint32_t *steps);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif
