@@ -1,0 +1,201 @@
+"""Channel strings of the simulated bus: ``NAME[?key=value&...]``, and the line they describe.
+
+NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
+
+========== =============================================================================================
+``seed``   seed of noise and faults; default: ``[simulation] seed`` of the machine file
+``nv``     file of the non-volatile memory, or ``:memory:``; default ``./.pmsmsim/<profile>.nv``
+``faults`` file of faults on purpose (``sim/faults.py``)
+``bitrate`` bit rate (bit/s) for bit-exact frame times; default: nominal times at 1 Mbit/s
+``node``   node id of the first drive, outranks one stored by LSS; default 1; 255: unconfigured
+``nodes``  number of drives on the line, with consecutive node ids and serial numbers; default 1
+``speed``  how fast idle time passes at most, as a multiple of the wall clock; default: at once
+========== =============================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qsl
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.resources import data_folder
+from pmsmtool.sim.faults import load_faults
+from pmsmtool.sim.line import Line
+from pmsmtool.sim.node.factory import drive_settings
+from pmsmtool.sim.node.memory import FileStorage, Memory, RamStorage, Storage
+from pmsmtool.sim.node.node import Node
+
+if TYPE_CHECKING:
+    from pmsmtool.machine.machine_file import MachineFile
+    from pmsmtool.sim.node.drive_core import DriveCore
+
+DEFAULT_PROFILE = "interior-2k2"
+"""Profile of a channel without a name."""
+DEFAULT_NODE_ID = 1
+MEMORY_FOLDER = Path(".pmsmsim")
+VOLATILE = ":memory:"
+_RATES = range(10_000, 1_000_001)
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A parsed channel string; ``name`` is a profile or a path."""
+
+    name: str = DEFAULT_PROFILE
+    seed: int | None = None
+    nv: str | None = None
+    faults: Path | None = None
+    bitrate: int | None = None
+    node: int | None = None
+    nodes: int = 1
+    speed: float | None = None
+
+
+def _whole(low: int, high: int) -> Callable[[str], int]:
+    def convert(text: str) -> int:
+        value = int(text, 0)
+        if not low <= value <= high:
+            raise ValueError(f"must be within {low} .. {high}")
+        return value
+
+    return convert
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < 1e6:
+        raise ValueError("must be a positive number")
+    return value
+
+
+_KEYS: dict[str, Callable[[str], Any]] = {
+    "seed": _whole(0, 2**63 - 1),
+    "nv": str,
+    "faults": Path,
+    "bitrate": _whole(_RATES.start, _RATES.stop - 1),
+    "node": _whole(1, 255),
+    "nodes": _whole(1, 127),
+    "speed": _positive,
+}
+
+
+def parse_channel(text: str | None) -> Channel:
+    """Return the channel a string describes; None is the default profile.
+
+    Raises
+    ------
+    ConfigError
+        Everything that is wrong with the string.
+    """
+    name, _, query = (text or "").partition("?")
+    values: dict[str, Any] = {}
+    violations = []
+    for key, value in parse_qsl(query, keep_blank_values=True):
+        if key not in _KEYS:
+            near = get_close_matches(key, _KEYS, 1)
+            violations.append(f"{key}: unknown key" + (f", did you mean {near[0]}?" if near else ""))
+            continue
+        try:
+            values[key] = _KEYS[key](value)
+        except ValueError as error:
+            violations.append(f"{key} = {value!r}: {error}")
+    first, count = values.get("node", DEFAULT_NODE_ID), values.get("nodes", 1)
+    if first != 255 and first + count - 1 > 127:
+        violations.append(f"node ids {first} .. {first + count - 1} exceed 127")
+    if violations:
+        raise ConfigError(
+            "the channel of the simulated bus cannot be used",
+            where=f"channel {text!r}",
+            hint=f"NAME[?key=value&...] with {', '.join(_KEYS)}",
+            violations=violations,
+        )
+    return Channel(name=name or DEFAULT_PROFILE, **values)
+
+
+def profile_names() -> list[str]:
+    """Return the names of the profiles that ship with the package."""
+    return sorted(path.stem for path in data_folder("profiles").glob("*.toml"))
+
+
+def machine_path(name: str) -> Path:
+    """Return the machine file of a profile name or path.
+
+    Raises
+    ------
+    ConfigError
+        There is neither such a profile nor such a file.
+    """
+    path = Path(name)
+    if path.suffix == ".toml" or path.is_file():
+        return path
+    profile = data_folder("profiles") / f"{name}.toml"
+    if profile.is_file():
+        return profile
+    near = get_close_matches(name, profile_names(), 3)
+    raise ConfigError(
+        f"no profile and no file is named {name!r}",
+        where="channel",
+        likely=f"did you mean {' or '.join(near)}?" if near else "",
+        hint="`pmsmtool sim list` names the profiles",
+    )
+
+
+def _storage(channel: Channel, stem: str, position: int) -> Storage:
+    if channel.nv == VOLATILE:
+        return RamStorage()
+    path = MEMORY_FOLDER / f"{stem}.nv" if channel.nv is None else Path(channel.nv)
+    return FileStorage(path if position == 0 else path.with_name(f"{path.stem}-{position + 1}{path.suffix}"))
+
+
+CoreMaker = Callable[["MachineFile", int], "DriveCore"]
+
+
+def _kernel(machine_file: MachineFile, seed: int) -> DriveCore:
+    from pmsmtool.sim import drive_kernel
+
+    return drive_kernel.create(machine_file, seed)
+
+
+def build_line(
+    channel: Channel, *, bitrate: int | None = None, instant: bool = False, make_core: CoreMaker = _kernel
+) -> Line:
+    """Return a line with the drives of a channel.
+
+    Parameters
+    ----------
+    channel : Channel
+        What is wanted.
+    bitrate : int, optional
+        Bit rate where the channel names none.
+    instant : bool
+        Frames take no time while there is no bit rate.
+    make_core : callable
+        Makes the application with its machine: ``(machine file, seed)``.
+
+    Raises
+    ------
+    ConfigError
+        The machine file, the faults file or the memory cannot be used.
+    """
+    from pmsmtool.machine.machine_file import load_machine_file
+
+    path = machine_path(channel.name)
+    machine_file = load_machine_file(path)
+    plan = None if channel.faults is None else load_faults(channel.faults)
+    seed = int(machine_file.simulation.get("seed", 0)) if channel.seed is None else channel.seed  # type: ignore[arg-type]
+    line = Line(channel.bitrate or bitrate, plan, seed=seed, instant=instant)
+    first = DEFAULT_NODE_ID if channel.node is None else channel.node
+    for position in range(channel.nodes):
+        node_id = first if first == 255 else first + position
+        settings = drive_settings(
+            machine_file, path.stem, node_id, position, fixed_node_id=channel.node not in (None, 255)
+        )
+        memory = Memory(_storage(channel, path.stem, position))
+        line.add_node(Node(line, make_core(machine_file, seed + position), memory, settings))
+    line.arm_faults()
+    return line

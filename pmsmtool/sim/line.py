@@ -1,0 +1,210 @@
+"""The simulated CAN line: one wire with arbitration and frame times, the drives on it, the programs attached to it.
+
+Frames queue for the wire, the lowest identifier goes first when it becomes free, and a frame arrives everywhere at the
+end of its time on the wire. Everything runs on the line's own virtual clock.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from pmsmtool.bus.clock import NS, VirtualClock
+from pmsmtool.bus.frame_time import frame_bits, unstuffed_bits
+from pmsmtool.sim.fault_injection import Injector
+from pmsmtool.sim.faults import FaultPlan
+from pmsmtool.sim.node.node import Node
+
+NOMINAL_BITRATE = 1_000_000
+"""Rate (bit/s) whose unstuffed frame lengths pass when no bit rate is given."""
+EXTENDED = 1
+REMOTE = 2
+_NOMINAL_NS = tuple(unstuffed_bits(length) * NS // NOMINAL_BITRATE for length in range(9))
+
+
+class Frame(NamedTuple):
+    """A frame: identifier, data, flags (``EXTENDED``, ``REMOTE``), length code of a remote frame."""
+
+    can_id: int
+    data: bytes
+    flags: int = 0
+    dlc: int = 0
+
+
+class Endpoint(Protocol):
+    """A program attached to the line."""
+
+    echo: bool
+    """Whether it hears its own frames."""
+
+    def hear(self, frame: Frame, own: bool) -> None:
+        """Take a frame that has arrived."""
+
+    def transmitted(self, acknowledged: bool) -> None:
+        """One of the endpoint's frames has left."""
+
+    def pull(self, recv_raises: bool) -> None:
+        """Fault injection: the adapter is pulled."""
+
+
+def _priority(frame: Frame) -> int:
+    """Return the arbitration field as a number; the smaller wins (ISO 11898-1, 10.8)."""
+    remote = frame.flags & REMOTE
+    if frame.flags & EXTENDED:
+        base, low = frame.can_id >> 18, frame.can_id & 0x3FFFF
+        return base << 21 | 1 << 20 | 1 << 19 | low << 1 | remote >> 1
+    return frame.can_id << 21 | (remote >> 1) << 20
+
+
+class Line:
+    """One simulated line.
+
+    Parameters
+    ----------
+    bitrate : int or None
+        Bit rate (bit/s) for bit-exact frame times. None: nominal times.
+    faults : FaultPlan or None
+        Faults on purpose.
+    instant : bool
+        Frames take no time (a served line without a bit rate, where the network takes longer anyway).
+
+    Attributes
+    ----------
+    clock : VirtualClock
+        The time of everything on the line.
+    nodes : list of Node
+        The drives.
+    frames : int
+        Frames that have passed.
+    wire_ns : int
+        Time (ns) the wire has been busy.
+    """
+
+    def __init__(
+        self, bitrate: int | None = None, faults: FaultPlan | None = None, *, seed: int = 0, instant: bool = False
+    ) -> None:
+        self.clock = VirtualClock()
+        self.bitrate = bitrate
+        self.nodes: list[Node] = []
+        self.endpoints: list[Endpoint] = []
+        self.frames = 0
+        self.wire_ns = 0
+        self.on_traffic: Callable[[], None] = lambda: None
+        self._instant = instant
+        self._pending: list[tuple[int, int, Node | Endpoint, Frame]] = []
+        self._count = 0
+        self._on_wire: tuple[Node | Endpoint, Frame] | None = None
+        self._injector = None if faults is None else Injector(faults, self, seed)
+
+    # ---- the wire ------------------------------------------------------------------------------
+
+    def transmit(self, sender: Node, can_id: int, data: bytes) -> None:
+        """Queue a data frame of a node."""
+        self.queue(sender, Frame(can_id, data))
+
+    def queue(self, sender: Node | Endpoint, frame: Frame) -> None:
+        """Queue a frame for the wire."""
+        self._count += 1
+        heapq.heappush(self._pending, (_priority(frame), self._count, sender, frame))
+        if self._on_wire is None:
+            self._start()
+
+    def withdraw(self, sender: Node, can_id: int | None) -> None:
+        """Take back queued frames of a node, of one identifier or all."""
+        kept = [
+            item
+            for item in self._pending
+            if item[2] is not sender or (can_id is not None and item[3].can_id != can_id)
+        ]
+        if len(kept) != len(self._pending):
+            self._pending = kept
+            heapq.heapify(kept)
+
+    def _duration_ns(self, frame: Frame) -> int:
+        if self._instant and self.bitrate is None:
+            return 0
+        if self.bitrate is None and not frame.flags:
+            return _NOMINAL_NS[len(frame.data)]
+        bits = frame_bits(
+            frame.can_id,
+            frame.data,
+            extended=bool(frame.flags & EXTENDED),
+            remote=bool(frame.flags & REMOTE),
+            dlc=frame.dlc if frame.flags & REMOTE else None,
+        )
+        return bits * NS // (self.bitrate or NOMINAL_BITRATE)
+
+    def _start(self) -> None:
+        _, _, sender, frame = heapq.heappop(self._pending)
+        self._on_wire = sender, frame
+        duration_ns = self._duration_ns(frame)
+        self.wire_ns += duration_ns
+        self.clock.at(self.clock.now_ns + duration_ns, self._arrive)
+
+    def _arrive(self) -> None:
+        if self._on_wire is None:
+            raise RuntimeError("nothing is on the wire")
+        sender, frame = self._on_wire
+        self.frames += 1
+        if isinstance(sender, Node):
+            self._carry(sender, frame, from_drive=True)
+        else:
+            acknowledged = self.is_acknowledged(sender)
+            if acknowledged:
+                self._carry(sender, frame, from_drive=False)
+            sender.transmitted(acknowledged)
+        self._on_wire = None
+        if self._pending:
+            self._start()
+
+    def _carry(self, sender: Node | Endpoint, frame: Frame, *, from_drive: bool) -> None:
+        if self._injector is None:
+            self.deliver(sender, frame)
+        else:
+            self._injector.carry(sender, frame, from_drive)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a frame is on the wire."""
+        return self._on_wire is not None
+
+    def is_acknowledged(self, sender: Endpoint) -> bool:
+        """Whether any other controller is there to acknowledge a program's frame."""
+        return len(self.endpoints) > 1 or any(node.listens for node in self.nodes)
+
+    def deliver(self, sender: Node | Endpoint | None, frame: Frame) -> None:
+        """Hand a frame to everybody but its sender."""
+        for endpoint in self.endpoints:
+            own = endpoint is sender
+            if not own or endpoint.echo:
+                endpoint.hear(frame, own)
+        for node in self.nodes:
+            if node is not sender:
+                node.receive(frame.can_id, frame.data, frame.flags)
+
+    # ---- who is there --------------------------------------------------------------------------
+
+    def attach(self, endpoint: Endpoint) -> None:
+        """Attach a program."""
+        self.endpoints.append(endpoint)
+
+    def detach(self, endpoint: Endpoint) -> None:
+        """Detach a program; its frames still queued are lost."""
+        if endpoint in self.endpoints:
+            self.endpoints.remove(endpoint)
+            self._pending = [item for item in self._pending if item[2] is not endpoint]
+            heapq.heapify(self._pending)
+
+    def add_node(self, node: Node) -> None:
+        """Connect a drive."""
+        self.nodes.append(node)
+
+    def arm_faults(self) -> None:
+        """Begin with the faults on purpose, now that the drives are there."""
+        if self._injector is not None:
+            self._injector.arm()
+
+    def node_by_id(self, node_id: int) -> Node | None:
+        """Return the node that uses a node id now."""
+        return next((node for node in self.nodes if node.node_id == node_id), None)
