@@ -1,0 +1,208 @@
+"""Drives drawn at random, to judge identification and design by numbers instead of examples.
+
+Two draws. :func:`draw_drive` takes a whole drive from the population below; :func:`draw_around` varies a given
+machine file. The ranges are fixed here, before any run, and every drive follows from its seed alone. What is drawn
+goes into ``[simulation]`` (the truth) and into the nameplate; the tool sees the nameplate only.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from pmsmtool.machine.key import Value
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import (
+    EncoderParameters,
+    InverterParameters,
+    MachineLimits,
+    MachineParameters,
+)
+
+Block = Literal["ideal", "timing", "gains"]
+"""Sensors: ideal gains and timing; unknown lag and sampling shift; gains off within their tolerance."""
+
+SENSOR_TOLERANCE = 0.01
+"""Declared 95 % tolerance of current and DC-link gains, as ``identify`` assumes by default."""
+GAIN_STD = SENSOR_TOLERANCE / 1.96
+
+
+@dataclass(frozen=True, slots=True)
+class VoltageClass:
+    """Ranges of one class of drives: currents (A peak), switching frequency (Hz), dead time and device drops."""
+
+    U_dc_v: tuple[float, ...]
+    I_nom_apk: tuple[float, float]
+    f_s_hz: tuple[float, float]
+    dead_time_s: tuple[float, float]
+    drop_v: tuple[float, float]
+    slope_drop_v: tuple[float, float]
+    capacitance_f: tuple[float, float]
+
+
+LOW_VOLTAGE = VoltageClass(
+    (24.0, 48.0), (5.0, 60.0), (16e3, 40e3), (0.1e-6, 0.8e-6), (0.0, 0.0), (0.01, 0.10), (0.3e-9, 3e-9)
+)
+"""MOSFET bridges: no threshold, the diode never conducts but in the dead time; the slope is their on-resistance."""
+HIGH_VOLTAGE = VoltageClass(
+    (325.0, 560.0), (3.0, 25.0), (8e3, 24e3), (0.5e-6, 3e-6), (0.3, 1.2), (0.1, 0.8), (0.05e-9, 1e-9)
+)
+"""IGBT bridges: thresholds of switch and diode drawn apart. ``slope_drop_v`` is the drop on the slope at I_nom."""
+
+BASE_SPEED_RAD_S = (400.0, 1600.0)
+EMF_SHARE = (0.60, 0.75)
+RESISTIVE_SHARE = (0.02, 0.12)
+INDUCTIVE_SHARE = (0.12, 0.45)
+SALIENCY = (1.0, 2.2)
+POLE_PAIRS = (2, 10)
+ADC_NOISE_LSB = (0.5, 2.0)
+ADC_SPAN = (1.8, 3.2)
+ENCODER_BITS = (12, 19)
+ENCODER_OFFSET_RAD = math.radians(180.0)
+LEG_MISMATCH_SHARE = 0.05
+ACCELERATION_TIME_S = (0.05, 0.4)
+SENSOR_LAG_S = (0.0, 20e-6)
+SAMPLING_SHIFT_SHARE = (0.0, 0.10)
+
+
+def draw_drive(seed: int, block: Block = "ideal") -> MachineFile:
+    """Return drive number ``seed`` of the population (identification reference, section 1, with a switched inverter).
+
+    Emf at base speed is 0.60 to 0.75 of U_dc/sqrt(3), the resistive drop at rated current 2 to 12 % and the inductive
+    one 12 to 45 % of the emf, L_q/L_d 1 to 2.2; currents are log-uniform.
+    """
+    rng = np.random.default_rng([20260101, seed])
+    kind = LOW_VOLTAGE if rng.random() < 0.5 else HIGH_VOLTAGE
+    U_dc = float(rng.choice(kind.U_dc_v))
+    I_nom = _log_uniform(rng, kind.I_nom_apk)
+    f_s = _log_uniform(rng, kind.f_s_hz)
+    omega_base = float(rng.uniform(*BASE_SPEED_RAD_S))
+    emf = float(rng.uniform(*EMF_SHARE)) * U_dc / math.sqrt(3.0)
+    L_q = float(rng.uniform(*INDUCTIVE_SHARE)) * emf / (omega_base * I_nom)
+    pole_pairs = int(rng.integers(POLE_PAIRS[0], POLE_PAIRS[1] + 1))
+    psi_f = emf / omega_base
+    tau_nom = 1.5 * pole_pairs * psi_f * I_nom
+    omega_M = omega_base / pole_pairs
+    J = tau_nom * _log_uniform(rng, ACCELERATION_TIME_S) / omega_M
+    n_nom = omega_M * 30.0 / math.pi
+    machine = MachineParameters(
+        pole_pairs=pole_pairs,
+        R_s_ohm=float(rng.uniform(*RESISTIVE_SHARE)) * emf / I_nom,
+        L_d_h=L_q / float(rng.uniform(*SALIENCY)),
+        L_q_h=L_q,
+        psi_f_wb=psi_f,
+        I_nom_apk=I_nom,
+        I_max_apk=1.5 * I_nom,
+        I_max_time_s=10.0,
+        n_nom_rpm=n_nom,
+        n_max_rpm=1.5 * n_nom,
+        J_kgm2=J,
+        B_nms=0.01 * tau_nom / omega_M,
+        tau_c_nm=0.01 * tau_nom,
+    )
+    inverter = InverterParameters(U_dc_v=U_dc, f_s_hz=f_s, dead_time_s=_log_uniform(rng, kind.dead_time_s))
+    drive = MachineFile(
+        name=f"random-{seed}",
+        machine=machine,
+        inverter=inverter,
+        encoder=EncoderParameters(
+            offset_rad=0.0, direction=1, bits=int(rng.integers(ENCODER_BITS[0], ENCODER_BITS[1] + 1))
+        ),
+        limits=MachineLimits(i_trip_apk=1.35 * 1.5 * I_nom, I_cont_apk=I_nom),
+    )
+    return _with_truth(drive, kind, rng, seed, block)
+
+
+def draw_around(base: MachineFile, seed: int, block: Block = "ideal", *, spread: float = 0.15) -> MachineFile:
+    """Return a drive around a machine file: its parameters times log-normal factors of ``spread``.
+
+    Resistance, inductances, flux linkage (or the flux map's machine, left as it is), temperature, offset, sensors,
+    dead time and devices vary; the nameplate stays, so the tool meets a machine it was not told about.
+    """
+    rng = np.random.default_rng([20260102, seed])
+    kind = LOW_VOLTAGE if base.inverter.U_dc_v < 100.0 else HIGH_VOLTAGE
+    truth: dict[str, Value] = {}
+    names = ("R_s_ohm",) if base.flux_map is not None else ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
+    for name in names:
+        truth[name] = float(getattr(base.machine, name)) * math.exp(spread * float(rng.standard_normal()))
+    dead_time = base.inverter.dead_time_s * math.exp(0.3 * float(rng.standard_normal()))
+    drive = replace(
+        base,
+        name=f"{base.name}-{seed}",
+        inverter=replace(base.inverter, dead_time_s=dead_time),
+        simulation={**base.simulation, **truth},
+    )
+    return _with_truth(drive, kind, rng, seed, block)
+
+
+def _with_truth(
+    drive: MachineFile, kind: VoltageClass, rng: np.random.Generator, seed: int, block: Block
+) -> MachineFile:
+    """Add what only the simulated drive may know: inverter devices, sensors, offset, temperature."""
+    machine, inverter = drive.machine, drive.inverter
+    I_nom = machine.I_nom_apk or 1.0
+    T_s = inverter.T_s
+    full_scale = max(float(rng.uniform(*ADC_SPAN)) * I_nom, 1.4 * (machine.I_max_apk or I_nom))
+    step = 2.0 * full_scale / 2**12
+    slope = float(rng.uniform(*kind.slope_drop_v)) / I_nom
+    temperature = float(rng.uniform(15.0, 60.0))
+    truth: dict[str, Value] = {
+        "inverter_model": "switched",
+        "device_drop_v": float(rng.uniform(*kind.drop_v)),
+        "diode_drop_v": float(rng.uniform(*kind.drop_v)) if kind is HIGH_VOLTAGE else 0.7,
+        "device_slope_ohm": slope,
+        "diode_slope_ohm": slope * (float(rng.uniform(0.7, 1.3)) if kind is HIGH_VOLTAGE else 1.0),
+        "output_capacitance_f": _log_uniform(rng, kind.capacitance_f),
+        "leg_mismatch_s": LEG_MISMATCH_SHARE * inverter.dead_time_s * float(rng.uniform(-1.0, 1.0)),
+        "sensor_offset_a_apk": step * float(rng.uniform(-2.0, 2.0)),
+        "sensor_offset_b_apk": step * float(rng.uniform(-2.0, 2.0)),
+        "sensor_offset_c_apk": step * float(rng.uniform(-2.0, 2.0)),
+        "sensor_noise_apk": step * float(rng.uniform(*ADC_NOISE_LSB)),
+        "adc_bits": 12,
+        "adc_full_scale_apk": full_scale,
+        "sensor_lag_s": 0.0,
+        "sampling_shift_s": 0.0,
+        "encoder_bits": drive.encoder.bits or 17,
+        "encoder_offset_rad": ENCODER_OFFSET_RAD * float(rng.uniform(-1.0, 1.0)),
+        "T_winding_c": temperature,
+        "T_magnet_c": temperature,
+        "T_ambient_c": temperature,
+        "thermal_on": False,
+        "theta_M_start_rad": float(rng.uniform(-math.pi, math.pi)),
+        "serial": 1 + seed,
+        "seed": seed,
+    }
+    if block == "timing":
+        truth["sensor_lag_s"] = float(rng.uniform(*SENSOR_LAG_S))
+        truth["sampling_shift_s"] = float(rng.uniform(*SAMPLING_SHIFT_SHARE)) * T_s
+    if block == "gains":
+        common = 1.0 + GAIN_STD * float(rng.standard_normal())
+        for phase in "abc":
+            truth[f"sensor_gain_{phase}"] = common
+        truth["U_dc_gain"] = 1.0 + GAIN_STD * float(rng.standard_normal())
+    return replace(drive, simulation={**drive.simulation, **truth})
+
+
+def true_loop_resistance(drive: MachineFile) -> float:
+    """Return R_s at T_ref as the drive can see it: winding plus the mean slope of switch and diode (ohm).
+
+    Near standstill every leg conducts half the period through the switch and half through the diode, so their slopes
+    count half each. A MOSFET's channel carries both halves.
+    """
+    truth = drive.simulation_settings()
+    slope = 0.5 * (_number(truth, "device_slope_ohm") + _number(truth, "diode_slope_ohm"))
+    return _number(truth, "R_s_ohm") + slope
+
+
+def _number(values: dict[str, Value], key: str) -> float:
+    value = values[key]
+    if not isinstance(value, int | float):
+        raise TypeError(f"{key} is no number")
+    return float(value)
+
+
+def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    return float(math.exp(rng.uniform(math.log(bounds[0]), math.log(bounds[1]))))

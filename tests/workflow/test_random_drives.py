@@ -1,0 +1,46 @@
+"""Random drives follow from their seed, are valid machine files, and stay inside the declared ranges."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
+from pmsmtool.resources import data_folder
+from pmsmtool.workflow.random_drives import draw_around, draw_drive, true_loop_resistance
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_drawn_drive_is_a_valid_machine_file(seed: int) -> None:
+    drive = draw_drive(seed, ("ideal", "timing", "gains")[seed % 3])
+    text = dump_machine_file(drive)
+    assert parse_machine(text) == drive
+    assert dump_machine_file(draw_drive(seed, ("ideal", "timing", "gains")[seed % 3])) == text
+
+
+def test_the_population_spans_its_ranges() -> None:
+    drives = [draw_drive(seed) for seed in range(200)]
+    resistive = [d.machine.R_s_ohm * (d.machine.I_nom_apk or 0) for d in drives]
+    emf = [d.machine.psi_f_wb * (d.machine.n_nom_rpm or 0) * math.pi / 30 * d.machine.pole_pairs for d in drives]
+    shares = [r / e for r, e in zip(resistive, emf, strict=True)]
+    assert min(shares) >= 0.02 and max(shares) <= 0.12 and max(shares) - min(shares) > 0.09
+    saliency = [d.machine.L_q_h / d.machine.L_d_h for d in drives]
+    assert min(saliency) >= 1.0 and max(saliency) <= 2.2
+    assert {d.inverter.U_dc_v for d in drives} == {24.0, 48.0, 325.0, 560.0}
+    hard = [d for d in drives if _dead_voltage(d) > 3 * d.machine.R_s_ohm * (d.machine.I_nom_apk or 0)]
+    assert hard, "some drives must have a dead-time voltage above three times R I"
+
+
+def _dead_voltage(drive) -> float:  # type: ignore[no-untyped-def]
+    return drive.inverter.U_dc_v * drive.inverter.dead_time_s / drive.inverter.T_s
+
+
+def test_only_the_truth_changes_around_a_machine() -> None:
+    base = load_machine_file(data_folder("profiles") / "jercic-2017.toml")
+    drive = draw_around(base, 3)
+    assert drive.machine == base.machine
+    truth = drive.simulation_settings()
+    assert truth["R_s_ohm"] != base.machine.R_s_ohm
+    slope = 0.5 * (truth["device_slope_ohm"] + truth["diode_slope_ohm"])  # type: ignore[operator]
+    assert true_loop_resistance(drive) == pytest.approx(truth["R_s_ohm"] + slope)
