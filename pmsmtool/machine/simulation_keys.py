@@ -71,6 +71,10 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _whole("encoder_bits", 0, 32, 17, "resolution of the encoder per turn, 0 none"),
     _number("encoder_offset_rad", "rad", -_PI2, _PI2, None, "true electrical offset", "[encoder] offset_rad"),
     _flag("encoder_reversed", "the encoder counts against the phase order"),
+    _number("encoder_once_rad", "rad", -0.1, 0.1, 0.0, "encoder error once per turn, amplitude (mechanical)"),
+    _number("encoder_twice_rad", "rad", -0.1, 0.1, 0.0, "encoder error twice per turn, amplitude (mechanical)"),
+    _number("encoder_latency_s", "s", 0, 1e-3, 0.0, "age of an encoder sample"),
+    _number("shunt_blind_s", "s", 0, 1e-4, 0.0, "low-side pulses shorter than this cannot be read, 0 in-phase sensors"),
     # temperatures
     _number("T_winding_c", "degC", -60, 300, 20.0, "winding temperature at the start"),
     _number("T_magnet_c", "degC", -60, 300, 20.0, "magnet temperature"),
@@ -89,6 +93,7 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number("coupling_stiffness_nm_per_rad", "N m/rad", 0, 1e9, 0.0, "stiffness of the elastic shaft"),
     _number("coupling_damping_nms_per_rad", "N m s/rad", 0, 1e6, 0.0, "damping of the elastic shaft"),
     _choice("rotor", ("free", "locked", "driven"), "free", "free, held, or turned by a load machine"),
+    _number("driven_rpm", "rpm", -1e6, 1e6, 0.0, "speed of a driven rotor"),
     _number("theta_M_start_rad", "rad", -_PI2, _PI2, 0.0, "mechanical angle at the start"),
     _number("cogging_nm", "N m", 0, 1e4, 0.0, "amplitude of the cogging torque"),
     _whole("cogging_periods", 0, 10000, 0, "cogging periods per mechanical turn"),
@@ -99,6 +104,8 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number("psi_f_wb", "Wb", 0, 100, None, "true PM flux linkage at T_ref", "[machine] psi_f_wb"),
     _whole("pole_pairs", 1, 64, None, "true pole pairs", "[machine] pole_pairs"),
     _number("iron_loss_ohm", "ohm", 0, 1e6, 0.0, "iron-loss resistance in parallel with the flux voltage, 0 none"),
+    _number("eddy_share", "1", 0, 0.9, 0.0, "share of the inductances that fast changes do not see"),
+    _number("eddy_time_s", "s", 1e-6, 1, 1e-3, "time constant of that share"),
     _number("psi_6_wb", "Wb", 0, 10, 0.0, "flux harmonic of order 6 in dq"),
     _number("psi_12_wb", "Wb", 0, 10, 0.0, "flux harmonic of order 12 in dq"),
     # faults and identity

@@ -81,6 +81,20 @@ static inline void set_angle(pmsm_plant_state *state, double theta_M)
 
 /* ---- one step ------------------------------------------------------------------------------------- */
 
+/* The point h along the given slopes, at another angle; its currents are still those of `from`. */
+static inline pmsm_point moved(const pmsm_point *from, double h, double d_alpha, double d_beta, double d_chi_d,
+                               double d_chi_q, double c, double s)
+{
+    pmsm_point at = *from;
+    at.psi_alpha += h * d_alpha;
+    at.psi_beta += h * d_beta;
+    at.chi_d += h * d_chi_d;
+    at.chi_q += h * d_chi_q;
+    at.c = c;
+    at.s = s;
+    return at;
+}
+
 /* Flux with the angle given: locked, driven, or held by friction. */
 static inline void step_imposed(pmsm_plant *m, const pmsm_supply *supply, double h, double omega, double acceleration,
                                 const int general)
@@ -104,39 +118,37 @@ static inline void step_imposed(pmsm_plant *m, const pmsm_supply *supply, double
         }
         m->rotation_omega = omega;
     }
-    mid.c = first.c * m->half_cos - first.s * m->half_sin;
-    mid.s = first.s * m->half_cos + first.c * m->half_sin;
-    last.c = first.c * m->full_cos - first.s * m->full_sin;
-    last.s = first.s * m->full_cos + first.c * m->full_sin;
+    const double mid_c = first.c * m->half_cos - first.s * m->half_sin;
+    const double mid_s = first.s * m->half_cos + first.c * m->half_sin;
+    const double last_c = first.c * m->full_cos - first.s * m->full_sin;
+    const double last_s = first.s * m->full_cos + first.c * m->full_sin;
 
     terminal_voltage(m, supply, &first, p * omega, general, &u_alpha, &u_beta);
     k1a = (u_alpha - R * first.i_alpha) * f;
     k1b = (u_beta - R * first.i_beta) * f;
-    mid.psi_alpha = first.psi_alpha + half_h * k1a;
-    mid.psi_beta = first.psi_beta + half_h * k1b;
+    mid = moved(&first, half_h, k1a, k1b, first.d_chi_d, first.d_chi_q, mid_c, mid_s);
     pmsm_find_currents(m, &mid);
     terminal_voltage(m, supply, &mid, p * omega_half, general, &u_alpha, &u_beta);
     k2a = (u_alpha - R * mid.i_alpha) * f;
     k2b = (u_beta - R * mid.i_beta) * f;
     if (supply->brief) {
-        last.psi_alpha = first.psi_alpha + h * k2a;
-        last.psi_beta = first.psi_beta + h * k2b;
+        last = moved(&first, h, k2a, k2b, mid.d_chi_d, mid.d_chi_q, last_c, last_s);
     } else {
         double k3a, k3b, k4a, k4b;
-        mid.psi_alpha = first.psi_alpha + half_h * k2a;
-        mid.psi_beta = first.psi_beta + half_h * k2b;
+        const pmsm_point second = mid;
+        mid = moved(&first, half_h, k2a, k2b, second.d_chi_d, second.d_chi_q, mid_c, mid_s);
         pmsm_find_currents(m, &mid);
         terminal_voltage(m, supply, &mid, p * omega_half, general, &u_alpha, &u_beta);
         k3a = (u_alpha - R * mid.i_alpha) * f;
         k3b = (u_beta - R * mid.i_beta) * f;
-        last.psi_alpha = first.psi_alpha + h * k3a;
-        last.psi_beta = first.psi_beta + h * k3b;
+        last = moved(&first, h, k3a, k3b, mid.d_chi_d, mid.d_chi_q, last_c, last_s);
         pmsm_find_currents(m, &last);
         terminal_voltage(m, supply, &last, p * omega_full, general, &u_alpha, &u_beta);
         k4a = (u_alpha - R * last.i_alpha) * f;
         k4b = (u_beta - R * last.i_beta) * f;
-        last.psi_alpha = first.psi_alpha + h * (1.0 / 6.0) * (k1a + 2.0 * (k2a + k3a) + k4a);
-        last.psi_beta = first.psi_beta + h * (1.0 / 6.0) * (k1b + 2.0 * (k2b + k3b) + k4b);
+        last = moved(&first, h * (1.0 / 6.0), k1a + 2.0 * (k2a + k3a) + k4a, k1b + 2.0 * (k2b + k3b) + k4b,
+                     first.d_chi_d + 2.0 * (second.d_chi_d + mid.d_chi_d) + last.d_chi_d,
+                     first.d_chi_q + 2.0 * (second.d_chi_q + mid.d_chi_q) + last.d_chi_q, last_c, last_s);
     }
 
     m->u_alpha = u_alpha;
@@ -169,7 +181,7 @@ static inline void step_free(pmsm_plant *m, const pmsm_supply *supply, double h,
     pmsm_point at = first;
     double ka = 0.0, kb = 0.0, kw = 0.0, kl = 0.0, omega = state->omega_M, omega_load = state->omega_load;
     double d_theta = 0.0, twist = state->twist, torque = state->torque, u_alpha = 0.0, u_beta = 0.0;
-    double sum_a = 0.0, sum_b = 0.0, sum_w = 0.0, sum_l = 0.0, sum_theta = 0.0, sum_twist = 0.0;
+    double sum_a = 0.0, sum_b = 0.0, sum_d = 0.0, sum_q = 0.0, sum_w = 0.0, sum_l = 0.0, sum_theta = 0.0, sum_twist = 0.0;
     for (int j = 0; j < stages; j++) {
         if (j > 0) { /* omega, omega_load still belong to the previous stage: they move the angles */
             const double hj = h * place[j];
@@ -177,9 +189,9 @@ static inline void step_free(pmsm_plant *m, const pmsm_supply *supply, double h,
             twist = state->twist + hj * (omega - omega_load);
             omega = state->omega_M + hj * kw;
             omega_load = state->omega_load + hj * kl;
-            at.psi_alpha = first.psi_alpha + hj * ka;
-            at.psi_beta = first.psi_beta + hj * kb;
-            rotate(first.c, first.s, p * d_theta, &at.c, &at.s);
+            double c, s;
+            rotate(first.c, first.s, p * d_theta, &c, &s);
+            at = moved(&first, hj, ka, kb, at.d_chi_d, at.d_chi_q, c, s);
             pmsm_find_currents(m, &at);
             torque = pmsm_air_gap_torque(m, &at);
         }
@@ -189,13 +201,13 @@ static inline void step_free(pmsm_plant *m, const pmsm_supply *supply, double h,
         accelerations(m, torque, state->theta_M + d_theta, omega, twist, omega_load, &kw, &kl);
         sum_a += weight[j] * ka;
         sum_b += weight[j] * kb;
+        sum_d += weight[j] * at.d_chi_d;
+        sum_q += weight[j] * at.d_chi_q;
         sum_w += weight[j] * kw;
         sum_l += weight[j] * kl;
         sum_theta += weight[j] * omega;
         sum_twist += weight[j] * (omega - omega_load);
     }
-    at.psi_alpha = first.psi_alpha + h * sum_a;
-    at.psi_beta = first.psi_beta + h * sum_b;
     m->u_alpha = u_alpha;
     m->u_beta = u_beta;
     state->omega_M += h * sum_w;
@@ -204,8 +216,7 @@ static inline void step_free(pmsm_plant *m, const pmsm_supply *supply, double h,
     set_angle(state, state->theta_M + h * sum_theta);
     pmsm_real64_sincos(p * state->theta_M, &state->sin_e, &state->cos_e);
     state->turned = 0;
-    at.c = state->cos_e;
-    at.s = state->sin_e;
+    at = moved(&first, h, sum_a, sum_b, sum_d, sum_q, state->cos_e, state->sin_e);
     pmsm_find_currents(m, &at);
     pmsm_keep_point(m, &at);
 }

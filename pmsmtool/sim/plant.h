@@ -26,6 +26,7 @@ typedef struct {
     double T_ref, alpha_R, alpha_psi;
     const pmsm_flux_map *map;      /* null: constant inductances; else the inverse table is the machine */
     double R_iron;                 /* ohm, parallel to the flux voltage; 0 off */
+    double eddy_d, eddy_q, eddy_rate; /* 1/H, 1/H, 1/s: i += eddy (psi - chi), chi' = eddy_rate (psi - chi); 0 off */
     double psi_6, psi_12;          /* Wb: psi_dq += psi_6 exp(-6 j theta_e) + psi_12 exp(-12 j theta_e); 0 off */
     double J, B, tau_c;            /* kg m2, N m s, N m */
     double load_viscous;           /* N m s, of the load */
@@ -37,13 +38,15 @@ typedef struct {
 
 typedef struct {
     double psi_alpha, psi_beta;    /* Wb */
+    double chi_d, chi_q;           /* Wb, rotor frame: flux behind the eddy currents */
     double theta_M;                /* rad in [-pi, pi) */
     double omega_M;                /* rad/s */
     int64_t turns;
     double twist, omega_load;      /* rad (rotor ahead of the second mass), rad/s */
     /* functions of the above, kept current */
     double cos_e, sin_e;
-    double i_d, i_q, i_alpha, i_beta; /* A, magnetising (= terminal but for the iron current) */
+    double d_chi_d, d_chi_q;       /* V */
+    double i_d, i_q, i_alpha, i_beta; /* A, at the terminals but for the iron current */
     double torque;                 /* N m, of the air gap */
     uint32_t sticking;             /* 1: held by Coulomb friction */
     uint32_t turned;               /* steps since cos_e, sin_e were computed from theta_M */

@@ -21,6 +21,10 @@ static void find_reluctance(const pmsm_plant *m, const pmsm_point *at, double g[
         g[2] = 0.0;
         g[3] = m->L_q_inverse;
     }
+    if (m->machine.eddy_rate > 0.0) {
+        g[0] += m->machine.eddy_d;
+        g[3] += m->machine.eddy_q;
+    }
 }
 
 void pmsm_point_leg_voltages(const pmsm_supply *supply, const pmsm_point *at, double v[3])
@@ -53,8 +57,12 @@ double pmsm_point_hold_voltage(const pmsm_plant *m, const pmsm_point *at, double
     }
     find_reluctance(m, at, g);
     const double n_d = c * pmsm_leg_alpha[x] + s * pmsm_leg_beta[x], n_q = c * pmsm_leg_beta[x] - s * pmsm_leg_alpha[x];
-    const double di_d = g[0] * d_psi_d + g[1] * d_psi_q - omega_e * at->i_q;
-    const double di_q = g[2] * d_psi_d + g[3] * d_psi_q + omega_e * at->i_d;
+    double di_d = g[0] * d_psi_d + g[1] * d_psi_q - omega_e * at->i_q;
+    double di_q = g[2] * d_psi_d + g[3] * d_psi_q + omega_e * at->i_d;
+    if (m->machine.eddy_rate > 0.0) {
+        di_d -= m->machine.eddy_d * at->d_chi_d;
+        di_q -= m->machine.eddy_q * at->d_chi_q;
+    }
     const double per_volt = (2.0 / 3.0) * m->iron_factor
                             * (n_d * (g[0] * n_d + g[1] * n_q) + n_q * (g[2] * n_d + g[3] * n_q));
     if (slope_per_volt)
@@ -161,6 +169,9 @@ void pmsm_plant_clear_current(pmsm_plant *m, int x)
         at.psi_alpha = at.c * psi_d - at.s * psi_q;
         at.psi_beta = at.s * psi_d + at.c * psi_q;
         at.i_d = at.i_q = at.i_alpha = at.i_beta = 0.0;
+        at.chi_d = psi_d; /* eddy currents are gone when the terminals open */
+        at.chi_q = psi_q;
+        at.d_chi_d = at.d_chi_q = 0.0;
     } else {
         for (int n = 0; n < 2; n++) { /* one step is exact for constant inductances */
             double g[4];

@@ -8,6 +8,8 @@
 /* A point of the trajectory inside an interval. */
 typedef struct {
     double psi_alpha, psi_beta, c, s; /* Wb; cosine and sine of theta_e */
+    double chi_d, chi_q;              /* Wb */
+    double d_chi_d, d_chi_q;          /* V */
     double i_d, i_q, i_alpha, i_beta;
 } pmsm_point;
 
@@ -48,6 +50,13 @@ static inline void pmsm_find_currents(pmsm_plant *m, pmsm_point *at)
         at->i_d = (psi_d - m->psi_m) * m->L_d_inverse;
         at->i_q = psi_q * m->L_q_inverse;
     }
+    if (m->machine.eddy_rate > 0.0) {
+        const double slip_d = psi_d - at->chi_d, slip_q = psi_q - at->chi_q;
+        at->i_d += m->machine.eddy_d * slip_d;
+        at->i_q += m->machine.eddy_q * slip_q;
+        at->d_chi_d = m->machine.eddy_rate * slip_d;
+        at->d_chi_q = m->machine.eddy_rate * slip_q;
+    }
     at->i_alpha = c * at->i_d - s * at->i_q;
     at->i_beta = s * at->i_d + c * at->i_q;
 }
@@ -69,6 +78,10 @@ static inline void pmsm_keep_point(pmsm_plant *m, const pmsm_point *at)
     pmsm_plant_state *state = &m->state;
     state->psi_alpha = at->psi_alpha;
     state->psi_beta = at->psi_beta;
+    state->chi_d = at->chi_d;
+    state->chi_q = at->chi_q;
+    state->d_chi_d = at->d_chi_d;
+    state->d_chi_q = at->d_chi_q;
     state->i_d = at->i_d;
     state->i_q = at->i_q;
     state->i_alpha = at->i_alpha;
@@ -78,8 +91,18 @@ static inline void pmsm_keep_point(pmsm_plant *m, const pmsm_point *at)
 
 static inline pmsm_point pmsm_point_here(const pmsm_plant_state *state)
 {
-    const pmsm_point at = {state->psi_alpha, state->psi_beta, state->cos_e,   state->sin_e,
-                      state->i_d,       state->i_q,      state->i_alpha, state->i_beta};
+    const pmsm_point at = {.psi_alpha = state->psi_alpha,
+                           .psi_beta = state->psi_beta,
+                           .c = state->cos_e,
+                           .s = state->sin_e,
+                           .chi_d = state->chi_d,
+                           .chi_q = state->chi_q,
+                           .d_chi_d = state->d_chi_d,
+                           .d_chi_q = state->d_chi_q,
+                           .i_d = state->i_d,
+                           .i_q = state->i_q,
+                           .i_alpha = state->i_alpha,
+                           .i_beta = state->i_beta};
     return at;
 }
 
