@@ -8,7 +8,8 @@
     |   +-- DriveTimeout (TimeoutError) 3  the drive did not answer in time
     +-- DriveFault                      4  drive in fault, or it refused a value
     |   +-- SdoAbort                    4  an SDO transfer was aborted, with the abort code
-    +-- LimitExceeded                   5  refused by a safety limit before anything moved
+    +-- SafetyRefusal                   5  refused for safety before anything moved or was written
+    |   +-- LimitExceeded               5  a quantity is outside its limit
     +-- IdentificationError             6  the measurement is not trustworthy; no number is given
     +-- Declined                        7  the person said no, or nobody could be asked
     +-- StopNotConfirmed                8  the machine may be energised; outranks every other error
@@ -143,10 +144,14 @@ class SdoAbort(DriveFault):
         self.sub = sub
 
 
-class LimitExceeded(PmsmtoolError):
-    """Refused by a safety limit; nothing was energised."""
+class SafetyRefusal(PmsmtoolError):
+    """Refused for safety: nothing was energised, nothing was written."""
 
     exit_code = ExitCode.SAFETY
+
+
+class LimitExceeded(SafetyRefusal):
+    """A quantity is outside its safety limit."""
 
     def __init__(
         self,
