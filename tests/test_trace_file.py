@@ -47,7 +47,7 @@ def test_round_trip(tmp_path, suffix, meta):
     st.sampled_from(["npz", "csv"]),
 )
 def test_any_number_survives(tmp_path_factory, values, suffix):
-    trace = Trace(np.arange(len(values)) * 1e-4, {"i_d_a": values}, {"i_d_a": "A"})
+    trace = Trace(np.linspace(0.0, 1.0, len(values)), {"i_d_a": values}, {"i_d_a": "A"})
     path = tmp_path_factory.mktemp("trace") / f"t.{suffix}"
     write_trace(trace, path)
     assert_same(read_trace(path), trace)

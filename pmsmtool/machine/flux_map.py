@@ -125,14 +125,18 @@ class FluxMap:
     def apparent_inductance(self, i_d_a: ArrayLike, i_q_a: ArrayLike) -> tuple[Array, Array]:
         """Return L_d_app = (psi_d - psi_f)/i_d and L_q_app = psi_q/i_q (H), what torque and decoupling see.
 
-        psi_f is the flux at zero current; at zero current of an axis the limit, the incremental one, is given.
+        psi_f is psi_d at zero current, so that psi_f + L_d_app i_d and L_q_app i_q are the fluxes of the map at that
+        very point (cross-saturation makes L_d_app meaningless near i_d = 0). At zero current of an axis the
+        incremental one is given.
         """
         i_d, i_q = np.broadcast_arrays(np.asarray(i_d_a, float), np.asarray(i_q_a, float))
-        now, jac = self.forward.evaluate(i_d, i_q).value, self.incremental_inductance(i_d, i_q)
-        chord_d = now[0] - self.flux(np.zeros_like(i_d), i_q)[0]
-        chord_q = now[1] - self.flux(i_d, np.zeros_like(i_q))[1]
+        psi_f = self.flux(0.0, 0.0)[0]
+        psi, jac = self.forward.evaluate(i_d, i_q).value, self.incremental_inductance(i_d, i_q)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(i_d == 0, jac[0, 0], chord_d / i_d), np.where(i_q == 0, jac[1, 1], chord_q / i_q)
+            return (
+                np.where(i_d == 0, jac[0, 0], (psi[0] - psi_f) / i_d),
+                np.where(i_q == 0, jac[1, 1], psi[1] / i_q),
+            )
 
     def current(self, psi_d_wb: ArrayLike, psi_q_wb: ArrayLike) -> tuple[Array, Array]:
         """Return i_d, i_q (A peak) of the inverse table, the simulated machine, at fluxes of any shape."""

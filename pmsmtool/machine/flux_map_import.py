@@ -226,10 +226,10 @@ def _rising(
 def _read_mat(path: Path) -> dict[str, NDArray[Any]]:
     from scipy.io import loadmat  # 0.3 s: only when a .mat file is read
 
+    if not path.is_file():
+        raise ConfigError("no such file", where=str(path), hint="check the path")
     try:
         content = loadmat(path, squeeze_me=True, struct_as_record=True)
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=str(path), hint="check the path") from None
     except NotImplementedError:
         raise ConfigError("is a MATLAB 7.3 file", where=str(path), hint="save it with -v7, or export .csv") from None
     except Exception as error:  # scipy raises many kinds on damaged files

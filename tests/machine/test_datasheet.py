@@ -1,0 +1,277 @@
+"""Datasheets: one machine, printed in every usual way, always gives the same file; contradictions are named."""
+
+import itertools
+import json
+import math
+
+import pytest
+from click.testing import CliRunner
+
+from pmsmtool.cli.machine import machine_command
+from pmsmtool.errors import ConfigError
+from pmsmtool.machine.analytic_saturation import saturated_pmsyrm_map
+from pmsmtool.machine.datasheet import (
+    TOLERANCE,
+    Datasheet,
+    disagreement,
+    machine_from_datasheet,
+    parse_emf_constant,
+    parse_torque_constant,
+    star_phase,
+)
+from pmsmtool.machine.flux_map_import import flux_map_csv, load_flux_map
+from pmsmtool.machine.machine_file import load_machine_file
+
+P, R, L, PSI = 4, 0.137, 2.2e-3, 0.41
+"""Star phase of the machine behind all sheets: ohm at 20 degC, H, Wb peak."""
+
+KRPM = 1000 * 2 * math.pi / 60
+
+
+def sheet(**changes):
+    values = {
+        "name": "m",
+        "pole_pairs": P,
+        "U_dc_v": 300.0,
+        "f_s_hz": 12e3,
+        "R_ohm": 2 * R,
+        "L_d_h": 2 * L,
+        "L_q_h": 2 * L,
+        "K_e": parse_emf_constant(f"{PSI!r}Wb", None),
+        "T_c": 20.0,
+    }
+    return Datasheet(**{**values, **changes})
+
+
+def emf_texts():
+    """K_e of the machine in every unit, with where it is measured: (text, between, connection)."""
+    for kind, between, connection in itertools.product(("rms", "pk"), ("line-line", "phase"), ("star", "delta")):
+        volts = PSI * P  # peak of the star phase per mechanical rad/s
+        if between == "line-line" or connection == "delta":
+            volts *= math.sqrt(3)
+        if kind == "rms":
+            volts /= math.sqrt(2)
+        yield f"{volts * KRPM!r}V{kind}/krpm", between, connection
+        yield f"{volts * KRPM!r} V{kind}/1000 min-1", between, connection
+        yield f"{volts * KRPM!r}mV{kind}/rpm", between, connection
+        yield f"{volts!r}V{kind}/(rad/s)", between, connection
+        yield f"{volts * 1e3!r}mV{kind}s/rad", between, connection
+        yield f"{1 / (volts * KRPM / 1000)!r}rpm/V{kind}", between, connection
+
+
+@pytest.mark.parametrize(("text", "between", "connection"), list(emf_texts()))
+def test_every_way_to_print_the_back_emf(text, between, connection):
+    resistance = {"R_ohm": 3 * R, "R_between": "phase"} if connection == "delta" else {}
+    result = machine_from_datasheet(sheet(K_e=parse_emf_constant(text, between), connection=connection, **resistance))
+    assert result.machine_file.machine.psi_f_wb == pytest.approx(PSI, rel=1e-12)
+    assert result.machine_file.machine.R_s_ohm == pytest.approx(R, rel=1e-12)
+    assert not result.warnings
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{1.5 * P * PSI!r}Nm/Apk",
+        f"{1.5 * P * PSI * math.sqrt(2)!r} N m/Arms",
+        f"{1.5 * P * PSI * 1e3!r}mNm/Apk",
+        f"{1.5 * P * PSI / 0.0070615518!r}oz-in/Apk",
+        f"{1.5 * P * PSI / 0.1129848290!r}lb-in/Apk",
+    ],
+)
+def test_every_way_to_print_the_torque_constant(text):
+    alone = machine_from_datasheet(sheet(K_e=None, K_t=parse_torque_constant(text)))
+    assert alone.machine_file.machine.psi_f_wb == pytest.approx(PSI, rel=1e-9)
+    both = machine_from_datasheet(sheet(K_t=parse_torque_constant(text)))
+    assert not both.warnings
+    assert [step.key for step in both.conversions].count("(check)") == 1
+
+
+@pytest.mark.parametrize(
+    ("between", "connection", "factor"),
+    [("line-line", "star", 2.0), ("line-line", "delta", 2.0), ("phase", "star", 1.0), ("phase", "delta", 3.0)],
+)
+def test_impedances_become_the_star_phase(between, connection, factor):
+    assert star_phase(factor * 7.0, between, connection)[0] == pytest.approx(7.0)
+
+
+def test_resistance_is_brought_to_20_degrees():
+    hot = R * (1 + 0.00393 * 60.0)
+    assert machine_from_datasheet(sheet(R_ohm=2 * hot, T_c=80.0)).machine_file.machine.R_s_ohm == pytest.approx(R)
+
+
+@pytest.mark.parametrize(
+    ("factor", "says"),
+    [
+        (math.sqrt(2), "rms where peak"),
+        (1 / math.sqrt(2), "rms where peak"),
+        (math.sqrt(3), "line-line where phase"),
+        (1 / math.sqrt(6), "line-line peak and phase rms"),
+        (4.0, "pole pairs"),
+        (9.5493, "rpm and rad/s"),
+        (1.12, "differ by +12.0 %"),
+    ],
+)
+def test_a_torque_constant_that_contradicts_is_named(factor, says):
+    K_t = parse_torque_constant(f"{1.5 * P * PSI * factor!r}Nm/Apk")
+    result = machine_from_datasheet(sheet(K_t=K_t))
+    assert says in result.warnings[0]
+    assert result.machine_file.machine.psi_f_wb == pytest.approx(PSI)  # K_e decides
+
+
+def test_small_disagreement_is_production_spread():
+    assert disagreement(0.41, 0.41 * 1.04, 4) == ""
+    assert disagreement(0.41, 0.41 * 1.06, 4) != ""
+
+
+@pytest.mark.parametrize("source", ["datasheet", "meter", "guess"])
+def test_deviations_follow_the_source(source):
+    result = machine_from_datasheet(sheet(sources={"R": source}, J_kgm2=1e-3))
+    machine_file = result.machine_file
+    assert machine_file.std["R_s_ohm"] == pytest.approx(R * TOLERANCE[source]["R"] / math.sqrt(3))
+    assert machine_file.std["L_d_h"] == pytest.approx(L * TOLERANCE["datasheet"]["L"] / math.sqrt(3))
+    assert machine_file.estimates["R_s_ohm"].source == source
+    assert machine_file.estimates["J_kgm2"].value == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("text", "between", "kind", "says"),
+    [
+        ("60V/krpm", "line-line", None, "does not say whether it is rms or peak"),
+        ("60Vrms/krpm", None, None, "where the voltage is measured"),
+        ("60Vrms/krpm", "phase", "peak", "says rms, but peak"),
+        ("60Vrms/furlong", "phase", None, "no back-EMF constant"),
+        ("0Vrms/krpm", "phase", None, "no back-EMF constant"),
+        ("fast", "phase", None, "no back-EMF constant"),
+    ],
+)
+def test_a_bad_back_emf_constant_says_why(text, between, kind, says):
+    with pytest.raises(ConfigError) as caught:
+        parse_emf_constant(text, between, kind)
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["1.7Nm/A", "1.7", "-1Nm/Apk", "1.7V/Apk"])
+def test_a_bad_torque_constant_is_refused(text):
+    with pytest.raises(ConfigError):
+        parse_torque_constant(text)
+
+
+def test_neither_constant():
+    with pytest.raises(ConfigError, match="neither"):
+        machine_from_datasheet(sheet(K_e=None))
+
+
+def test_implausible_numbers_are_flagged():
+    texts = " ".join(machine_from_datasheet(sheet(L_d_h=4.4, L_q_h=0.0044, n_nom_rpm=6000.0)).warnings)
+    assert "L_q/L_d = 0.001" in texts
+    assert "back-EMF at rated speed is 1030 V" in texts
+    assert "L/R" in " ".join(machine_from_datasheet(sheet(R_ohm=2e3 * R)).warnings)
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+NEW = [
+    "new",
+    "--name",
+    "m1",
+    "--pole-pairs",
+    "4",
+    "--r",
+    "0.274ohm",
+    "--l",
+    "4.4mH",
+    "--u-dc",
+    "540V",
+    "--pwm",
+    "12kHz",
+]
+EMF = ["--ke", "60.7Vrms/krpm", "--ke-between", "line-line"]
+
+
+def run(*arguments):
+    return CliRunner().invoke(machine_command, arguments)
+
+
+def test_new_writes_a_file_that_loads(tmp_path):
+    path = tmp_path / "m1.toml"
+    result = run(*NEW, *EMF, "--i-nom", "20Arms", "--n-nom", "3000rpm", "--inertia", "12kgcm2", "-o", str(path))
+    assert result.exit_code == 0, result.output
+    machine_file = load_machine_file(path)
+    assert machine_file.machine.psi_f_wb == pytest.approx(60.7 * math.sqrt(2 / 3) / KRPM / 4)
+    assert machine_file.machine.R_s_ohm == pytest.approx(0.137 / (1 + 5 * 0.00393))
+    assert machine_file.machine.I_nom_apk == pytest.approx(20 * math.sqrt(2))
+    assert machine_file.machine.n_nom_rpm == 3000.0
+    assert machine_file.machine.J_kgm2 == 1.2e-3
+    assert "line-line / 2" in result.stdout
+    assert "sqrt 2 / sqrt 3 / 4 pole pairs" in result.stdout
+
+
+def test_new_is_reproducible(tmp_path):
+    paths = [tmp_path / "a.toml", tmp_path / "b.toml"]
+    for path in paths:
+        assert run(*NEW, *EMF, "-o", str(path)).exit_code == 0
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_new_flags_a_contradiction(tmp_path):
+    result = run(*NEW, *EMF, "--kt", "1Nm/Apk", "-o", str(tmp_path / "m.toml"), "--json")
+    assert result.exit_code == 0
+    data = json.loads(result.stdout)
+    assert data["schema"] == "pmsmtool.machine-new/1"
+    assert "rms where peak" in data["warnings"][0]
+    assert data["machine"]["pole_pairs"] == 4
+    assert "warning" in result.stderr
+
+
+def test_new_does_not_replace_a_file(tmp_path):
+    path = tmp_path / "m.toml"
+    path.write_text("precious")
+    result = run(*NEW, *EMF, "-o", str(path))
+    assert isinstance(result.exception, ConfigError)
+    assert path.read_text() == "precious"
+    assert run(*NEW, *EMF, "-o", str(path), "--force").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (["--r", "0.274"], "has no unit"),
+        (["--i-nom", "20A"], "peak or an rms"),
+        (["--r", "0.274mH"], "is a unit of inductance"),
+    ],
+)
+def test_new_teaches_units(tmp_path, change, says):
+    result = run(*NEW, *EMF, *change, "-o", str(tmp_path / "m.toml"))
+    assert result.exit_code == 2
+    assert says in result.output
+
+
+def test_new_refuses_what_a_file_may_not_hold(tmp_path):
+    result = run(*NEW, *EMF, "--r", "5kohm", "-o", str(tmp_path / "m.toml"))
+    assert isinstance(result.exception, ConfigError)
+    assert "above 1000 ohm" in str(result.exception)
+    assert not (tmp_path / "m.toml").exists()
+
+
+def test_map_checks_and_repairs(tmp_path):
+    lines = flux_map_csv(saturated_pmsyrm_map()).splitlines()
+    source, repaired = tmp_path / "map.csv", tmp_path / "map.npz"
+    source.write_text("\n".join(lines[:100] + lines[101:]))
+    assert isinstance(run("map", str(source)).exception, ConfigError)
+    result = run("map", str(source), "--fill-holes", "--symmetrise", "-o", str(repaired))
+    assert result.exit_code == 0, result.output
+    assert "holes filled by the smoothest surface; 1 of 2809" in result.stdout
+    assert "ok   reciprocal" in result.stdout
+    assert len(load_flux_map(repaired).meta["repairs"]) == 2
+
+
+def test_map_that_is_not_good(tmp_path):
+    lines = flux_map_csv(saturated_pmsyrm_map()).splitlines()
+    i_d, i_q, psi_d, _ = lines[1500].split(",")
+    lines[1500] = f"{i_d},{i_q},{psi_d},3.0"
+    path = tmp_path / "map.csv"
+    path.write_text("\n".join(lines))
+    result = run("map", str(path), "--json")
+    assert "not good" in str(result.exception)
+    assert json.loads(result.stdout)["report"]["not_monotonic"] > 0
