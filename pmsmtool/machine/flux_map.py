@@ -242,7 +242,17 @@ def jacobian_samples(flux_map: FluxMap) -> tuple[Array, Array, Array]:
         inner = (axis[:-1, None] + np.diff(axis)[:, None] * share).ravel()
         axes.append(np.append(inner, axis[-1]))
     i_d, i_q = (grid.ravel() for grid in np.meshgrid(axes[0], axes[1], indexing="ij"))
-    return i_d, i_q, flux_map.incremental_inductance(i_d, i_q)
+    return i_d, i_q, _forward_in_c(_forward_struct(flux_map), i_d, i_q)[1]
+
+
+def _forward_in_c(struct: FluxMapStruct, i_d: Array, i_q: Array) -> tuple[Array, Array]:
+    """Fluxes (2, n) and Jacobian (2, 2, n) of many points: the bits of ``Table.evaluate``, without its temporaries."""
+    psi, jac = np.empty((2, i_d.size)), np.empty((i_d.size, 2, 2))
+    library().pmsm_flux_map_flux_many(
+        ctypes.byref(struct), i_d.size, i_d.ctypes.data, i_q.ctypes.data, psi[0].ctypes.data, psi[1].ctypes.data,
+        jac.ctypes.data, None,
+    )  # fmt: skip
+    return psi, np.moveaxis(jac, 0, 2)
 
 
 def _require_invertible(flux_map: FluxMap) -> None:
@@ -285,21 +295,22 @@ def _build(flux_map: FluxMap) -> FluxTables:
     inverse = Table.fit(flux_map.kind, psi_d, psi_q, (i_d, i_q))
     struct.inverse_cells = pointer(inverse.cells)
     struct.arrays = (*struct.arrays, inverse.cells)
-    error = _round_trip(flux_map, inverse)
+    error = _round_trip(flux_map, struct)
     return FluxTables(flux_map.forward, inverse, struct, float(error.max()), float(np.sqrt(np.mean(error**2))))
 
 
-def _round_trip(flux_map: FluxMap, inverse: Table) -> Array:
+def _round_trip(flux_map: FluxMap, struct: FluxMapStruct) -> Array:
     """|i(psi(i)) - i| (A) at the nodes and the cell centres."""
-    errors = []
-    for axis_d, axis_q in (
-        (flux_map.i_d_a, flux_map.i_q_a),
-        (flux_map.i_d_a[:-1] + np.diff(flux_map.i_d_a) / 2, flux_map.i_q_a[:-1] + np.diff(flux_map.i_q_a) / 2),
-    ):
-        i_d, i_q = np.meshgrid(axis_d, axis_q, indexing="ij")
-        back = inverse.evaluate(*flux_map.flux(i_d, i_q)).value
-        errors.append(np.hypot(back[0] - i_d, back[1] - i_q).ravel())
-    return np.concatenate(errors)
+    centres = [axis[:-1] + np.diff(axis) / 2 for axis in (flux_map.i_d_a, flux_map.i_q_a)]
+    grids = [np.meshgrid(*axes, indexing="ij") for axes in ((flux_map.i_d_a, flux_map.i_q_a), centres)]
+    i_d, i_q = (np.concatenate([grid[k].ravel() for grid in grids]) for k in range(2))
+    psi, _ = _forward_in_c(struct, i_d, i_q)
+    back = np.empty_like(psi)
+    library().pmsm_flux_map_current_many(
+        ctypes.byref(struct), i_d.size, psi[0].ctypes.data, psi[1].ctypes.data, back[0].ctypes.data,
+        back[1].ctypes.data, None,
+    )  # fmt: skip
+    return np.asarray(np.hypot(back[0] - i_d, back[1] - i_q))
 
 
 def meta_json(flux_map: FluxMap) -> str:
