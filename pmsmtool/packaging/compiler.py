@@ -44,10 +44,21 @@ class CompilerError(RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Compiler:
-    """A command that compiles and links a shared library, and how to name it to a person."""
+    """A command that compiles and links a shared library.
+
+    Attributes
+    ----------
+    command : tuple of str
+        Program and leading arguments.
+    name : str
+        How to name it to a person.
+    tolerated : tuple of str
+        Flags that take back warnings this compiler gives without need.
+    """
 
     command: tuple[str, ...]
     name: str
+    tolerated: tuple[str, ...] = ()
 
 
 def zig_compiler(target: Target | None) -> Compiler:
@@ -65,10 +76,11 @@ def zig_compiler(target: Target | None) -> Compiler:
     program = folder / ("zig.exe" if sys.platform == "win32" else "zig")
     # Without -mcpu=baseline zig emits the instructions of the machine that builds; its sanitizer needs a run time;
     # its debug information names folders of this machine.
-    arguments = (str(program), "cc", "-mcpu=baseline", "-fno-sanitize=undefined", "-g0", "-s")
-    return Compiler(
-        arguments + (("-target", target.zig) if target else ()), f"ziglang for {target.name if target else 'here'}"
-    )
+    arguments: tuple[str, ...] = (str(program), "cc", "-mcpu=baseline", "-fno-sanitize=undefined", "-g0", "-s")
+    if target:
+        arguments += ("-target", target.zig)
+    # clang warns of the constant INFINITY, a float by the standard; gcc, in development, of real promotions only.
+    return Compiler(arguments, f"ziglang for {target.name if target else 'this machine'}", ("-Wno-double-promotion",))
 
 
 def system_compiler() -> tuple[Compiler | None, list[str]]:
@@ -143,12 +155,17 @@ def compile_library(
         # A scratch folder of its own: linkers for Windows leave import libraries and debug files beside the output.
         output = Path(scratch) / library.name
         _run(
-            compiler, _arguments(kernel, package, output, platform, strict), package, f"{compiler.name}: {kernel.name}"
+            compiler,
+            _arguments(kernel, package, output, platform, strict, compiler.tolerated),
+            package,
+            f"{compiler.name}: {kernel.name}",
         )
         os.replace(output, library)
 
 
-def _arguments(kernel: Kernel, package: Path, output: Path, platform: str, strict: bool) -> list[str]:
+def _arguments(
+    kernel: Kernel, package: Path, output: Path, platform: str, strict: bool, tolerated: tuple[str, ...]
+) -> list[str]:
     """Arguments with paths relative to the package, so that no path of the building machine gets into a library."""
     arguments = ["-shared", *COMPILE_FLAGS, *([] if platform == "win32" else ["-fPIC"])]
     if platform == "darwin":
@@ -156,7 +173,7 @@ def _arguments(kernel: Kernel, package: Path, output: Path, platform: str, stric
         arguments += ["-mmacosx-version-min=11.0", f"-Wl,-install_name,@rpath/{output.name}"]
     if platform == "linux":
         arguments += ["-Wl,-z,defs"]  # a missing function is an error here, as it is on the other platforms
-    arguments += WARNING_FLAGS if strict else []
+    arguments += [*WARNING_FLAGS, *tolerated] if strict else []
     arguments += [f"-D{define}" for define in (*COMMON_DEFINES, *kernel.defines)]
     arguments += [part for folder in INCLUDE_FOLDERS for part in ("-iquote", folder)]
     return [*arguments, *(path.as_posix() for path in kernel.source_files(package)), "-lm", "-o", str(output)]
