@@ -62,13 +62,10 @@ double pmsm_leg_error_voltage(const pmsm_leg_error *error, int leg, double i)
     return v;
 }
 
-static double largest_dead_time(const pmsm_inverter_setup *setup)
+static double largest(const double value[3])
 {
-    double t = setup->dead_time[0];
-    for (int x = 1; x < 3; x++)
-        if (setup->dead_time[x] > t)
-            t = setup->dead_time[x];
-    return t;
+    const double ab = value[0] > value[1] ? value[0] : value[1];
+    return ab > value[2] ? ab : value[2];
 }
 
 static uint32_t at_least(double n, uint32_t floor_value)
@@ -89,9 +86,9 @@ static void begin_averaged(pmsm_inverter *inverter, const double duty[3])
     pmsm_leg_vector(inverter->averaged.v, &inverter->averaged.alpha, &inverter->averaged.beta);
     if (inverter->exact)
         return;
-    const double V_max = inverter->U_dc * largest_dead_time(setup) / inverter->T_s;
+    const double V_max = inverter->U_dc * largest(setup->dead_time) / inverter->T_s;
     const double reach = inverter->T_s / inverter->L_min; /* A per V that one period can move */
-    double knee = setup->i_knee, slope = setup->r_switch;
+    double knee = setup->i_knee, slope = setup->r_switch + largest(setup->r_leg);
     uint32_t substeps = 1;
     if (setup->shape == PMSM_DEADTIME_SIGN) {
         knee = (V_max + setup->V_switch) * reach / (STIFFNESS * (double)SIGN_SUBSTEPS);
@@ -104,12 +101,13 @@ static void begin_averaged(pmsm_inverter *inverter, const double duty[3])
     error->V_device = setup->V_switch;
     for (int x = 0; x < 3; x++) {
         error->V_dead[x] = inverter->U_dc * setup->dead_time[x] / inverter->T_s;
-        inverter->averaged.r[x] = setup->r_switch;
+        inverter->averaged.r[x] = setup->r_switch + setup->r_leg[x];
     }
     slope += (V_max * shape_slope(error->shape) + error->V_device) / knee;
     inverter->averaged.error = error->shape != PMSM_DEADTIME_NONE || error->V_device > 0.0 ? error : NULL;
-    inverter->averaged.general = inverter->averaged.error != NULL;
-    inverter->averaged.series = inverter->averaged.general ? 0.0 : setup->r_switch;
+    const double *r = inverter->averaged.r;
+    inverter->averaged.general = inverter->averaged.error || r[0] != r[1] || r[1] != r[2];
+    inverter->averaged.series = inverter->averaged.general ? 0.0 : r[0];
     if (inverter->averaged.error)
         substeps = at_least(slope * reach / STIFFNESS, substeps);
     inverter->substeps = substeps;
@@ -146,13 +144,15 @@ static void find_source(const pmsm_inverter *inverter, pmsm_leg_sources *sources
     switch (inverter->leg[x].gate) {
     case PMSM_GATE_TOP:
         conducting_source(&inverter->setup, sources, x, inverter->U_dc, 1);
-        return;
+        break;
     case PMSM_GATE_BOTTOM:
         conducting_source(&inverter->setup, sources, x, 0.0, 0);
-        return;
+        break;
     default:
         diode_source(inverter, sources, x);
     }
+    sources->r_out[x] += inverter->setup.r_leg[x];
+    sources->r_in[x] += inverter->setup.r_leg[x];
 }
 
 static int floats(const pmsm_inverter *inverter, int x)
@@ -199,7 +199,7 @@ static void run_commutation(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_cur
             v_half[x] = float_node(inverter, leg, i, dt, &v_end[x]);
             sources.v_out[x] = sources.v_in[x] = v_half[x];
             if (v_end[x] > -inverter->setup.V_diode && v_end[x] < inverter->U_dc + inverter->setup.V_diode)
-                sources.r_out[x] = sources.r_in[x] = 0.0; /* no diode conducts yet */
+                sources.r_out[x] = sources.r_in[x] = inverter->setup.r_leg[x]; /* no diode conducts yet */
         }
         pmsm_leg_interval(inverter, plant, lag, &sources, dt);
         for (int x = 0; x < 3; x++) {
@@ -303,9 +303,10 @@ void pmsm_inverter_start(pmsm_inverter *inverter, const pmsm_plant *plant)
         inverter->leg[x] = idle;
     const pmsm_inverter_setup *setup = &inverter->setup;
     const double r = setup->r_switch > setup->r_diode ? setup->r_switch : setup->r_diode;
-    inverter->brief_rate = (plant->R + r) / (BRIEF * pmsm_plant_smallest_inductance(plant));
-    const int dead = setup->shape != PMSM_DEADTIME_NONE && largest_dead_time(setup) > 0.0;
-    inverter->exact = !dead && setup->V_switch == 0.0 && setup->r_switch == 0.0;
+    inverter->brief_rate = (plant->R + r + largest(setup->r_leg)) / (BRIEF * pmsm_plant_smallest_inductance(plant));
+    const int dead = setup->shape != PMSM_DEADTIME_NONE && largest(setup->dead_time) > 0.0;
+    inverter->exact = !dead && setup->V_switch == 0.0 && setup->r_switch == 0.0 && setup->r_leg[0] == 0.0
+                      && setup->r_leg[1] == 0.0 && setup->r_leg[2] == 0.0;
     inverter->averaged = (pmsm_supply){{0.0, 0.0, 0.0}, {0.0, 0.0, 0.0}, NULL, -1, 0, 0, 0.0, 0.0, 0.0};
     inverter->gates = 0;
     inverter->circuit = 1;

@@ -45,6 +45,7 @@ typedef struct {
     double i_knee;           /* A, averaged shapes */
     double V_switch, r_switch; /* V, ohm; V_switch 0: a channel that conducts both ways */
     double V_diode, r_diode; /* V, ohm */
+    double r_leg[3];         /* ohm, further resistance of each leg: a bad joint */
     double capacitance;      /* F, of a leg's output node; 0: the node follows at once */
     double minimum_pulse;    /* s, shorter pulses of either polarity are not made */
     uint32_t open[3];        /* 1: no connection to the machine */
@@ -95,6 +96,6 @@ void pmsm_inverter_begin(pmsm_inverter *inverter, const double duty[3], uint32_t
 void pmsm_inverter_run(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double t_from, double t_to);
 
 /* Smallest output capacitance (F) whose commutation is resolved; 0 needs none. */
-double pmsm_inverter_smallest_capacitance(double dead_time, double L_min);
+PMSM_EXPORT double pmsm_inverter_smallest_capacitance(double dead_time, double L_min);
 
 #endif
