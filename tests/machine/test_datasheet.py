@@ -275,3 +275,25 @@ def test_map_that_is_not_good(tmp_path):
     result = run("map", str(path), "--json")
     assert "not good" in str(result.exception)
     assert json.loads(result.stdout)["report"]["not_monotonic"] > 0
+
+
+def test_the_examples_of_the_help_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    new = machine_command.commands["new"]
+    lines = [line.strip() for line in (new.epilog or "").splitlines() if "Examples" not in line and line != "\b"]
+    examples = " ".join(lines).replace("\\ ", "").split("pmsmtool machine ")[1:]
+    assert len(examples) == 2
+    for example in examples:
+        result = run(*example.split())
+        assert result.exit_code == 0, result.output
+    assert load_machine_file(tmp_path / "m2.toml").machine.L_q_h == pytest.approx(0.014)
+
+
+@pytest.mark.parametrize("command", ["new", "map"])
+def test_a_folder_that_is_not_there(tmp_path, command):
+    path = str(tmp_path / "none" / ("m.toml" if command == "new" else "m.npz"))
+    source = tmp_path / "map.csv"
+    source.write_text(flux_map_csv(saturated_pmsyrm_map()))
+    result = run(*(NEW + EMF if command == "new" else ["map", str(source)]), "-o", path)
+    assert isinstance(result.exception, ConfigError)
+    assert "cannot be written" in str(result.exception)
