@@ -90,7 +90,7 @@ class OperatingMachine:
         i_d, i_q = np.broadcast_arrays(np.asarray(i_d_a, dtype=np.float64), np.asarray(i_q_a, dtype=np.float64))
         if self.flux_map is None:
             return self.psi_f + self.L_d * i_d, self.L_q * i_q
-        i_d, i_q = np.ascontiguousarray(i_d), np.ascontiguousarray(i_q)
+        i_d, i_q = np.asarray(i_d, order="C"), np.asarray(i_q, order="C")
         psi_d, psi_q = np.empty(i_d.shape), np.empty(i_d.shape)
         design_library().pmsm_flux_map_flux_many(
             ctypes.byref(self.flux_map.as_struct(inverse=False)), i_d.size,

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 _REAL_ROOT = 1e-6
 """Largest |imaginary part| of a root in c taken as real; double roots of degree <= 12 scatter by about 1e-8."""
 
-_POLISH_STEPS = 60
-"""Bisections of a crossing; 60 halvings of a bracket are below one unit in the last place."""
+_POLISH_STEPS, _POLISHED = 60, 1e-15
+"""Bracketed secant steps of a crossing (8 to 12 seen), and the relative change that ends them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class SampledLoop:
     def at(self, omega: float | Array) -> NDArray[np.complex128]:
         """Return L(exp(j omega T_s)) at angular frequencies (rad/s)."""
         z = np.exp(1j * np.asarray(omega, dtype=np.float64) * self.T_s)
-        return np.asarray(np.polyval(self.num, z) / np.polyval(self.den, z), dtype=np.complex128)
+        return np.asarray(_horner(self.num, z) / _horner(self.den, z), dtype=np.complex128)
 
     def scaled(self, gain: float) -> SampledLoop:
         """Return the loop with its gain multiplied."""
@@ -180,19 +180,30 @@ def _phase_crossings(loop: SampledLoop) -> Array:
 
 
 def _polished(theta: Array, function: Callable[[Array], Array], loop: SampledLoop) -> Array:
-    """Bisect each crossing between the midpoints to its neighbours; a root without sign change is dropped."""
+    """Refine each crossing between the midpoints to its neighbours (Illinois); one without sign change is dropped."""
     if theta.size == 0:
         return theta
     edges = np.concatenate(([theta[0] * 0.5], 0.5 * (theta[1:] + theta[:-1]), [0.5 * (theta[-1] + math.pi)]))
     low, high = edges[:-1] / loop.T_s, edges[1:] / loop.T_s
-    f_low = function(low)
-    crossing = np.sign(f_low) * np.sign(function(high)) < 0.0
-    low, high, f_low = low[crossing], high[crossing], f_low[crossing]
+    f_low, f_high = function(low), function(high)
+    crossing = np.sign(f_low) * np.sign(f_high) < 0.0
+    low, high, f_low, f_high = low[crossing], high[crossing], f_low[crossing], f_high[crossing]
     for _ in range(_POLISH_STEPS):
-        middle = 0.5 * (low + high)
-        same = np.sign(function(middle)) == np.sign(f_low)
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    return np.asarray(0.5 * (low + high), dtype=np.float64)
+        middle = low + (high - low) * f_low / (f_low - f_high)
+        f = function(middle)
+        if np.all(np.abs(middle - high) <= _POLISHED * middle):
+            return np.asarray(middle, dtype=np.float64)
+        turned = f * f_high < 0.0
+        low, f_low = np.where(turned, high, low), np.where(turned, f_high, 0.5 * f_low)
+        high, f_high = middle, np.where(f == 0.0, np.finfo(np.float64).tiny, f)
+    return np.asarray(high, dtype=np.float64)
+
+
+def _horner(coefficients: tuple[float, ...], z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    value = np.full_like(z, coefficients[0])
+    for coefficient in coefficients[1:]:
+        value = value * z + coefficient
+    return value
 
 
 def _modulus_margin(loop: SampledLoop) -> float:

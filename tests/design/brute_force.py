@@ -84,7 +84,7 @@ def crossings(case: Case, i_d: Array, level: Callable[[Array, Array], Array]) ->
 
 
 def zoom(case: Case, best_of: Callable[[Array], tuple[Array, Array, Array]]) -> tuple[float, float, float]:
-    """Shrink a search along i_d; ``best_of`` gives candidates (i_d, i_q, cost). Returns the best; cost infinite: none."""
+    """Shrink a search along i_d; ``best_of`` gives candidates (i_d, i_q, cost). Infinite cost: no point."""
     low, high = case.i_d_range()
     # The coarsest search starts from several best columns, so that one wrong hill does not decide.
     spans, best = [(low, high)], (math.nan, math.nan, math.inf)

@@ -95,7 +95,7 @@ def test_pulse_response_of_a_fractional_delay() -> None:
             current = current * decay + u * (1.0 - decay) / R
         voltage_before = voltage
         expected.append(current)
-    den, response = np.asarray(loop.den), []
+    den, response = np.asarray(loop.den), list[float]()
     num = np.concatenate((np.zeros(den.size - len(loop.num)), loop.num))
     for k in range(7):
         past = sum(den[m] * response[k - m] for m in range(1, den.size) if k >= m)

@@ -14,12 +14,10 @@ from pmsmtool.design.lookup_table import (
     NONE,
     binding_name,
     electrical_speed,
-    flux_table,
     speed_table,
     torque_limits,
 )
 from pmsmtool.design.operating_machine import OperatingMachine, at_temperature
-from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.parameters import MachineParameters
 from tests.design.brute_force import Case, Flux, extreme_torque, least_current
@@ -42,7 +40,7 @@ M = OperatingMachine(4, 0.0, 1e-3, 2.5e-3, 0.1)
 N = OperatingMachine(4, 0.05, 1e-3, 1e-3, 0.1)
 
 
-def cell(machine: OperatingMachine, torque: float, omega: float, V: float, I_max: float) -> tuple[float, ...]:
+def cell(machine: OperatingMachine, torque: float, omega: float, V: float, I_max: float):
     rpm = omega / machine.pole_pairs * 60.0 / (2.0 * math.pi)
     t = speed_table(machine, torque_nm=[torque], speed_rpm=[rpm], V_max_v=[V], I_max_apk=I_max)
     return float(t.i_d_a[0, 0, 0]), float(t.i_q_a[0, 0, 0]), float(t.achieved_torque_nm[0, 0, 0]), t.binding[0, 0, 0]
@@ -162,7 +160,7 @@ def spline(i_d: np.ndarray, i_q: np.ndarray, psi_d: np.ndarray, psi_q: np.ndarra
 
     def flux(d: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         d, q = np.broadcast_arrays(d, q)
-        return tuple(part.ev(d.ravel(), q.ravel()).reshape(d.shape) for part in parts)  # type: ignore[return-value]
+        return tuple(part.ev(d.ravel(), q.ravel()).reshape(d.shape) for part in parts)
 
     return flux
 
@@ -228,7 +226,7 @@ def test_every_kind_of_cell_against_brute_force(name: str) -> None:
             check_cell(case, table, x, y, float(wanted), (least, largest), T_top)
 
 
-def check_cell(case: Case, table, x: int, y: int, wanted: float, bounds: tuple[float, float], T_top: float) -> None:  # type: ignore[no-untyped-def]
+def check_cell(case: Case, table, x: int, y: int, wanted: float, bounds: tuple[float, float], T_top: float) -> None:
     limits, i_d, i_q = int(table.limits[x, y, 0]), table.i_d_a[x, y, 0], table.i_q_a[x, y, 0]
     where = f"{wanted:.5g} N m at {table.y[y]:.5g} rpm: ({i_d:.6g}, {i_q:.6g}) A, {binding_name(limits)}, {bounds}"
     if math.isnan(bounds[0]):

@@ -1,0 +1,118 @@
+"""``pmsmtool tune``: from a machine file to a design and its parameter set."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmsmtool.cli.options import FILE, examples, output_options
+from pmsmtool.cli.output import Output, table
+from pmsmtool.cli.output_file import inside, write_file
+
+if TYPE_CHECKING:
+    from pmsmtool.design.design_file import Design
+
+
+@click.command(
+    "tune",
+    epilog=examples(
+        "pmsmtool tune machine.toml -o design.toml",
+        "pmsmtool tune machine.toml -o design.toml --bandwidth-hz 600 --phase-margin-deg 55",
+        "pmsmtool tune machine.toml -o design.toml --method second-order --bandwidth-hz 300 --damping 0.9",
+        "pmsmtool tune machine.toml -o design.toml --speed-bandwidth-hz 12 --notch-hz 180",
+    ),
+)
+@click.argument("machine", type=click.Path(path_type=Path))
+@click.option("-o", "--output", "path", type=FILE, required=True, help="Design file to write.")
+@click.option("--params", "params_path", type=FILE, help="Parameter set to write.  [default: params.toml beside it]")
+@click.option(
+    "--method",
+    type=click.Choice(["imc", "modulus-optimum", "second-order"]),
+    default="imc",
+    help="Rule of the current gains.",
+)
+@click.option("--bandwidth-hz", type=float, metavar="HZ", help="Bandwidth of the current loops (second-order: natural "
+              "frequency).  [default: modulus optimum, lowered to the margins]")  # fmt: skip
+@click.option("--damping", type=float, default=1.0, help="Damping of second-order.")
+@click.option("--phase-margin-deg", type=float, default=45.0, metavar="DEG", help="Least phase margin, delay included.")
+@click.option("--gain-margin-db", type=float, default=6.0, metavar="DB", help="Least gain margin.")
+@click.option("--predictor/--no-predictor", default=False, help="One-step prediction of the current.")
+@click.option(
+    "--speed-method",
+    type=click.Choice(["symmetric-optimum", "pole-placement"]),
+    default="symmetric-optimum",
+    help="Rule of the speed gains.",
+)
+@click.option("--speed-bandwidth-hz", type=float, metavar="HZ", help="Crossover of the speed loop.  [default: from "
+              "--speed-phase-margin-deg]")  # fmt: skip
+@click.option("--speed-phase-margin-deg", type=float, default=60.0, metavar="DEG", help="Of the symmetric optimum.")
+@click.option("--speed-damping", type=float, default=1.0, help="Damping of pole-placement.")
+@click.option("--speed-decimation", type=int, metavar="N", help="Control periods per speed-controller period.")
+@click.option("--speed-filter-hz", type=float, metavar="HZ", help="Cut-off of the speed filter.")
+@click.option("--pll-rad-s", type=float, metavar="RAD/S", help="Pole of the speed estimate.")
+@click.option("--notch-hz", type=float, default=0.0, metavar="HZ", help="Notch on the torque; 0 is off.")
+@click.option("--notch-zeta-num", type=float, default=0.05, help="Numerator damping of the notch.")
+@click.option("--notch-zeta-den", type=float, default=0.5, help="Denominator damping of the notch.")
+@click.option("--voltage-margin", type=float, default=0.08, metavar="RATIO", help="Share of V_max kept for control.")
+@output_options
+def tune_command(machine: Path, path: Path, params_path: Path | None, out: Output, **asked: Any) -> None:
+    """Design the control of MACHINE (a machine file or a run directory).
+
+    Writes the design with the machine embedded and every gain with its unit, method and achieved margin, and beside it
+    the parameter set that flash-params sends. Exit code 1 when the margins asked for cannot be met.
+    """
+    from pmsmtool.design.design_file import design_text
+    from pmsmtool.design.tune import tune
+    from pmsmtool.design.tune_request import TuneRequest
+    from pmsmtool.machine.machine_file import load_machine_file
+
+    design = tune(load_machine_file(inside(machine, "machine.toml")), TuneRequest(**asked))
+    params = design.parameter_set()
+    params_path = path.with_name("params.toml") if params_path is None else params_path
+    write_file(path, design_text(design))
+    write_file(params_path, params.to_toml())
+    data = {
+        "machine": design.name,
+        "design": path,
+        "params": params_path,
+        "content": params.content_hash(),
+        "values": {name: design[name] for name in design.values},
+        "loops": design.loops,
+        "facts": design.facts,
+        "notes": design.notes,
+    }
+    out.result("tune", data, lambda: _lines(design))
+    for note in design.notes:
+        out.note(note)
+    out.note(f"wrote {path}, {params_path}")
+
+
+_SHOWN = (
+    "current.K_p_d_v_per_a", "current.K_i_d_v_per_as", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as",
+    "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad", "speed.tau_max_nm",
+)  # fmt: skip
+
+
+def _lines(design: Design) -> Iterator[str]:
+    from pmsmtool.params.catalogue import BY_NAME
+
+    rows = [(name, f"{design[name]:.6g}", BY_NAME[name].unit, design.values[name].method) for name in _SHOWN]
+    yield from table(("parameter", "value", "unit", "method"), rows)
+    yield ""
+    yield from table(
+        ("loop", "phase deg", "gain dB", "delay us", "bandwidth Hz"),
+        [
+            (
+                name,
+                f"{loop.phase_margin_deg:.1f}",
+                f"{loop.gain_margin_db:.1f}",
+                f"{1e6 * loop.delay_margin_s:.0f}",
+                f"{loop.bandwidth_rad_s / (2.0 * math.pi):.4g}",
+            )
+            for name, loop in design.loops.items()
+        ],
+    )

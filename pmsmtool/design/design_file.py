@@ -1,0 +1,234 @@
+"""The design as a value, and its text ``design.toml``: machine embedded, every number with unit, method and margin."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from pmsmtool.design.sampled_loop import LoopMargins
+from pmsmtool.errors import ConfigError
+from pmsmtool.machine.key import did_you_mean
+from pmsmtool.machine.machine_file import MachineFile, machine_from_tables, machine_tables
+from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
+from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
+from pmsmtool.toml_text import toml_lines, toml_text
+
+SCHEMA = "pmsmtool.design/1"
+
+Scalar = str | bool | int | float
+
+
+@dataclass(frozen=True, slots=True)
+class DesignValue:
+    """One number of a design.
+
+    Attributes
+    ----------
+    value : float
+        In the catalogue's unit.
+    method : str
+        How it was found, one line.
+    loop : str
+        Loop whose margins it decides (a key of ``Design.loops``); empty for none.
+    """
+
+    value: float
+    method: str
+    loop: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """A complete set of drive parameters with their reasons.
+
+    Attributes
+    ----------
+    machine : MachineFile
+        What it was designed for.
+    request : mapping of str to scalar
+        What was asked (``tune.TuneRequest``).
+    values : mapping of str to DesignValue
+        Catalogue name -> number; every row of the catalogue.
+    loops : mapping of str to LoopMargins
+        Achieved margins: ``current_d``, ``current_q``, ``speed`` and variants.
+    facts : mapping of str to scalar
+        Other results worth keeping, unit in the name.
+    notes : tuple of str
+        What a person must know: assumptions and fall-backs.
+    tables : mapping of str to sequence of float
+        Look-up axes and tables (``params.parameter_set.TABLE_NAMES``); empty without one.
+    """
+
+    machine: MachineFile
+    request: Mapping[str, Scalar]
+    values: Mapping[str, DesignValue]
+    loops: Mapping[str, LoopMargins] = field(default_factory=dict)
+    facts: Mapping[str, Scalar] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    tables: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> float:
+        """Return one value by catalogue name."""
+        return self.values[name].value
+
+    @property
+    def name(self) -> str:
+        """Name of the machine."""
+        return self.machine.name
+
+    def parameter_set(self) -> ParameterSet:
+        """Return what ``flash-params`` sends: all values and tables, their methods as provenance."""
+        provenance = {name: value.method for name, value in self.values.items()}
+        provenance["machine"] = f"sha256:{self.machine.content_hash()}"
+        return ParameterSet({name: v.value for name, v in self.values.items()}, self.tables, provenance, self.name)
+
+    def content_hash(self) -> str:
+        """Return ``sha256:<hex>`` over the design's text."""
+        return "sha256:" + hashlib.sha256(design_text(self).encode()).hexdigest()
+
+
+def design_text(design: Design) -> str:
+    """Return ``design.toml``: same machine and request, same bytes."""
+    tables: dict[str, Any] = {
+        "schema": SCHEMA,
+        "machine_sha256": design.machine.content_hash(),
+        "notes": list(design.notes),
+        "request": dict(design.request),
+        "facts": dict(design.facts),
+        "loop": {name: _loop_table(loop) for name, loop in design.loops.items()},
+    }
+    groups: dict[str, dict[str, Any]] = {}
+    for row in CATALOGUE:
+        if row.name in design.values:
+            group, key = row.name.split(".", 1)
+            groups.setdefault(group, {})[key] = _value_table(design, row.name)
+    tables["value"] = groups
+    if design.tables:
+        tables["table"] = {name: list(design.tables[name]) for name in TABLE_NAMES if name in design.tables}
+    tables["machine_file"] = machine_tables(design.machine, embed_flux_map=True)
+    return toml_text({name: table for name, table in tables.items() if table not in ({}, [])}, comment=_COMMENT)
+
+
+_COMMENT = """Design of one drive, written by `pmsmtool tune`. The machine it is for is embedded; params.toml beside it
+holds the same values in the form that is sent to the drive."""
+
+
+def _loop_table(loop: LoopMargins) -> dict[str, Scalar]:
+    return {item.name: getattr(loop, item.name) for item in fields(LoopMargins)}
+
+
+def _value_table(design: Design, name: str) -> dict[str, Scalar]:
+    entry, row = design.values[name], BY_NAME[name]
+    table: dict[str, Scalar] = {
+        "value": int(entry.value) if row.is_integer else float(entry.value),
+        "unit": row.unit,
+        "method": entry.method,
+    }
+    if entry.loop:
+        table["loop"] = entry.loop
+        table["achieved"] = achieved(design.loops[entry.loop])
+    return table
+
+
+def achieved(loop: LoopMargins) -> str:
+    """Return the margins of a loop as one line."""
+    if not loop.stable:
+        return "unstable"
+    gain = "no gain limit" if math.isinf(loop.gain_margin) else f"gain margin {loop.gain_margin_db:.1f} dB"
+    phase = "no crossover" if math.isinf(loop.phase_margin_deg) else f"phase margin {loop.phase_margin_deg:.1f} deg"
+    return f"{phase}, {gain}, bandwidth {loop.bandwidth_rad_s / (2.0 * math.pi):.4g} Hz"
+
+
+def load_design(path: Path) -> Design:
+    """Read ``design.toml``; raises ``ConfigError`` naming the file and everything that is wrong."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError("no such file", where=str(path), hint="`pmsmtool tune MACHINE -o design.toml`") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read as text: {error}", where=str(path)) from None
+    return parse_design(text, where=str(path))
+
+
+def parse_design(text: str, *, where: str = "design.toml") -> Design:
+    """Read the text of a design.
+
+    Raises
+    ------
+    ConfigError
+        Not TOML, another schema, unknown or missing values, or a machine that was changed after the design.
+    """
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"is not TOML: {error}", where=where) from None
+    schema = tables.get("schema")
+    if schema != SCHEMA:
+        hint = "give a design as `tune` writes it"
+        raise ConfigError(f"schema is {schema!r}, expected {SCHEMA!r}", where=where, hint=hint)
+    machine_part = tables.get("machine_file")
+    if not isinstance(machine_part, dict):
+        raise ConfigError("the table [machine_file] is missing", where=where)
+    machine = machine_from_tables(machine_part, where=where, lines=toml_lines(text), path=("machine_file",))
+    if tables.get("machine_sha256") != machine.content_hash():
+        raise ConfigError(
+            "the embedded machine is not the one that was designed for",
+            where=f"{where}:machine_sha256",
+            likely="[machine_file] was edited after the design",
+            hint="run `pmsmtool tune` on the changed machine",
+        )
+    values, wrong = _read_values(tables.get("value"))
+    loops, wrong_loops = _read_loops(tables.get("loop", {}))
+    wrong += wrong_loops
+    lost = {name: v.loop for name, v in values.items() if v.loop not in {"", *loops}}
+    wrong += [f"{name}: names the loop {loop}, which is not there" for name, loop in lost.items()]
+    if wrong:
+        raise ConfigError("the design cannot be used", where=where, violations=wrong)
+    return Design(
+        machine=machine,
+        request=tables.get("request", {}),
+        values=values,
+        loops=loops,
+        facts=tables.get("facts", {}),
+        notes=tuple(tables.get("notes", ())),
+        tables={name: tuple(map(float, array)) for name, array in tables.get("table", {}).items()},
+    )
+
+
+def _read_values(table: Any) -> tuple[dict[str, DesignValue], list[str]]:
+    values: dict[str, DesignValue] = {}
+    wrong: list[str] = []
+    for group, entries in (table if isinstance(table, dict) else {}).items():
+        for key, entry in (entries if isinstance(entries, dict) else {}).items():
+            name = f"{group}.{key}"
+            row = BY_NAME.get(name)
+            number = entry.get("value") if isinstance(entry, dict) else None
+            if row is None:
+                wrong.append(f"{name}: unknown{did_you_mean(name, tuple(BY_NAME))}")
+            elif not isinstance(number, (int, float)) or isinstance(number, bool):
+                wrong.append(f"{name}: its value is not a number")
+            elif entry.get("unit") != row.unit:
+                wrong.append(f"{name}: its unit is {entry.get('unit')!r}, the catalogue says {row.unit!r}")
+            else:
+                values[name] = DesignValue(float(number), str(entry.get("method", "")), str(entry.get("loop", "")))
+    wrong += [f"{row.name}: is missing" for row in CATALOGUE if row.name not in values and not wrong]
+    ordered = {row.name: values[row.name] for row in CATALOGUE if row.name in values}
+    return ordered, wrong
+
+
+def _read_loops(table: Any) -> tuple[dict[str, LoopMargins], list[str]]:
+    names = {item.name for item in fields(LoopMargins)}
+    loops: dict[str, LoopMargins] = {}
+    wrong: list[str] = []
+    for name, entry in (table if isinstance(table, dict) else {}).items():
+        if not isinstance(entry, dict) or set(entry) != names:
+            wrong.append(f"loop.{name}: holds other keys than {', '.join(sorted(names))}")
+        else:
+            numbers = {key: float(value) for key, value in entry.items() if key != "stable"}
+            loops[name] = LoopMargins(stable=bool(entry["stable"]), **numbers)
+    return loops, wrong

@@ -1,0 +1,236 @@
+"""Ratings, protections, inverter and encoder: what the machine file gives, and what is assumed where it is silent.
+
+Every assumption is the value's method, so that it stands in the design file beside the number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pmsmtool.design.design_file import DesignValue
+from pmsmtool.design.lookup_table import RPM, torque_limits
+from pmsmtool.design.operating_machine import at_temperature
+from pmsmtool.errors import ConfigError
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import InverterParameters
+from pmsmtool.params.catalogue import BY_NAME
+
+TRIP_CURRENT_RATIO = 1.5
+"""Trip over I_max: room for the overshoot of a current step under 40 % too little inductance, and for noise."""
+
+TRIP_SPEED_RATIO = 1.2
+"""Overspeed trip over the largest speed."""
+
+U_DC_RANGE = (0.5, 1.25)
+"""Under- and overvoltage trip over the nominal DC-link voltage."""
+
+WINDING_LIMIT_C = 155.0
+"""Winding temperature limit of insulation class F (IEC 60085)."""
+
+OVERLOAD_S = 10.0
+"""Time I_max may flow where the machine file does not say."""
+
+GIVEN = "machine file"
+
+
+@dataclass(frozen=True, slots=True)
+class Ratings:
+    """Currents, speed and torque the design works with.
+
+    Attributes
+    ----------
+    I_nom_apk, I_max_apk, I_cont_apk : float
+        Rated, time-limited and continuous current (A peak).
+    n_max_rpm : float
+        Largest mechanical speed (rpm).
+    tau_max_nm : float
+        Largest torque the speed controller may ask for (N m).
+    i_d_min_a : float
+        Most negative i_d (A).
+    base_speed_rpm : float
+        Speed at which rated torque takes the whole voltage (rpm).
+    methods : mapping of str to str
+        How each of them was found.
+    """
+
+    I_nom_apk: float
+    I_max_apk: float
+    I_cont_apk: float
+    n_max_rpm: float
+    tau_max_nm: float
+    i_d_min_a: float
+    base_speed_rpm: float
+    methods: Mapping[str, str]
+
+
+def ratings(source: MachineFile, V_limit_v: float) -> Ratings:
+    """Collect the ratings.
+
+    Parameters
+    ----------
+    source : MachineFile
+        Machine, inverter and limits.
+    V_limit_v : float
+        Voltage in use (V peak), for the base speed.
+
+    Raises
+    ------
+    ConfigError
+        No current rating at all.
+    """
+    machine, limits = source.machine, source.limits
+    if machine.I_nom_apk is None and machine.I_max_apk is None:
+        raise ConfigError(
+            "no current rating is given",
+            where="machine.I_nom_apk, machine.I_max_apk",
+            hint="put the rated and the largest current (A peak) into [machine]",
+        )
+    methods = dict.fromkeys(("I_nom", "I_max", "I_cont", "n_max", "tau_max", "i_d_min"), GIVEN)
+    I_max = machine.I_max_apk
+    if I_max is None:
+        assert machine.I_nom_apk is not None
+        I_max, methods["I_max"] = machine.I_nom_apk, "I_nom: no larger current is given"
+    I_nom = machine.I_nom_apk
+    if I_nom is None or I_nom > I_max:
+        I_nom, methods["I_nom"] = I_max, "I_max: no rated current below it is given"
+    I_cont = limits.I_cont_apk
+    if I_cont is None:
+        I_cont, methods["I_cont"] = I_nom, "rated current"
+    I_cont = min(I_cont, I_max)
+    i_d_min = limits.i_d_min_apk
+    if i_d_min is None or i_d_min < -I_max:
+        i_d_min, methods["i_d_min"] = -I_max, "-I_max: no nearer demagnetisation limit is given"
+    base = base_speed_rpm(source, I_nom, i_d_min, V_limit_v)
+    n_max = machine.n_max_rpm
+    if n_max is None:
+        if machine.n_nom_rpm is not None:
+            n_max, methods["n_max"] = machine.n_nom_rpm, "rated speed: no largest speed is given"
+        else:
+            n_max, methods["n_max"] = base, "base speed at rated current: no speed is given"
+    plane = at_temperature(machine, source.flux_map)
+    shaft = float(torque_limits(plane, [0.0], [_UNLIMITED_V], I_max, i_d_min).largest_nm[0, 0])
+    methods["tau_max"] = "torque of least current at I_max"
+    if limits.tau_max_nm is not None and limits.tau_max_nm < shaft:
+        shaft, methods["tau_max"] = limits.tau_max_nm, GIVEN
+    return Ratings(I_nom, I_max, I_cont, n_max, shaft, i_d_min, base, methods)
+
+
+_UNLIMITED_V = 1e9
+
+
+def base_speed_rpm(source: MachineFile, I_apk: float, i_d_min_a: float, V_limit_v: float) -> float:
+    """Return the speed at which the largest torque of a current takes the whole voltage (rpm)."""
+    machine = at_temperature(source.machine, source.flux_map)
+    top = torque_limits(machine, [0.0], [_UNLIMITED_V], I_apk, i_d_min_a)
+    i_d, i_q = float(top.largest_i_d_a[0, 0]), float(top.largest_i_q_a[0, 0])
+    psi_d, psi_q = (float(x) for x in machine.flux(i_d, i_q))
+    # |v|^2 = (R i)^2 + 2 R w t + (w psi)^2 = V^2
+    t, g, h = psi_d * i_q - psi_q * i_d, psi_d**2 + psi_q**2, (machine.R * math.hypot(i_d, i_q)) ** 2
+    room = V_limit_v**2 - h
+    if room <= 0.0 or g == 0.0:
+        return 0.0
+    omega = (-machine.R * t + math.sqrt((machine.R * t) ** 2 + g * room)) / g
+    return omega / machine.pole_pairs * RPM
+
+
+def rating_values(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
+    """Return the catalogue values of motor, inverter, protection and encoder."""
+    return {**_motor(source, rated), **_inverter(source), **_protection(source, rated), **_encoder(source)}
+
+
+def _motor(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
+    machine, how = source.machine, rated.methods
+    app = "apparent" if machine.L_d_app_h is not None or machine.L_q_app_h is not None else "as incremental"
+    time, time_how = (machine.I_max_time_s, GIVEN) if machine.I_max_time_s is not None else (OVERLOAD_S, "assumed")
+    given: dict[str, float] = {
+        "pole_pairs": machine.pole_pairs,
+        "R_s_ohm": machine.R_s_ohm,
+        "L_d_h": machine.L_d_h,
+        "L_q_h": machine.L_q_h,
+        "psi_f_wb": machine.psi_f_wb,
+        "T_ref_c": machine.T_ref_c,
+        "alpha_R_per_k": machine.alpha_R_per_k,
+        "alpha_psi_per_k": machine.alpha_psi_per_k,
+    }
+    values = {f"motor.{name}": DesignValue(float(value), GIVEN) for name, value in given.items()}
+    for name, value in (("J_kgm2", machine.J_kgm2), ("B_nms", machine.B_nms), ("tau_c_nm", machine.tau_c_nm)):
+        values[f"motor.{name}"] = DesignValue(value or 0.0, "not known" if value is None else GIVEN)
+    values["motor.I_max_apk"] = DesignValue(rated.I_max_apk, how["I_max"])
+    values["motor.I_nom_apk"] = DesignValue(rated.I_nom_apk, how["I_nom"])
+    values["motor.I_max_time_s"] = DesignValue(time, time_how)
+    values["motor.n_max_rpm"] = DesignValue(rated.n_max_rpm, how["n_max"])
+    values["motor.L_d_app_h"] = DesignValue(machine.L_d_decoupling_h, app)
+    values["motor.L_q_app_h"] = DesignValue(machine.L_q_decoupling_h, app)
+    return values
+
+
+def _inverter(source: MachineFile) -> dict[str, DesignValue]:
+    inverter = source.inverter
+    V_dead, i_knee, how = dead_time_compensation(inverter)
+    on = V_dead > 0.0
+    return {
+        "inverter.T_s_ns": DesignValue(round(1e9 * inverter.T_s), GIVEN),
+        "inverter.voltage_utilisation": DesignValue(inverter.voltage_utilisation, GIVEN),
+        "inverter.dead_time_ns": DesignValue(round(1e9 * inverter.dead_time_s), GIVEN),
+        "inverter.delay_periods": DesignValue(inverter.delay_periods, GIVEN),
+        "inverter.deadtime_compensation": DesignValue(float(on), how),
+        "inverter.V_dead_v": DesignValue(V_dead, how),
+        "inverter.i_knee_apk": DesignValue(i_knee, how),
+        "inverter.U_dc_nom_v": DesignValue(inverter.U_dc_v, GIVEN),
+    }
+
+
+def dead_time_compensation(inverter: InverterParameters) -> tuple[float, float, str]:
+    """Return plateau (V), knee (A) and method of the drive's ramp-shaped voltage-error compensation.
+
+    Where only the identified table is given, the plateau is its last value and the knee makes the ramp miss the same
+    area below the plateau as the table does.
+    """
+    if inverter.V_dead_v is not None:
+        return inverter.V_dead_v, inverter.i_knee_apk or _KNEE_DEFAULT_A, GIVEN
+    current, error = np.asarray(inverter.voltage_error_i_apk), np.asarray(inverter.voltage_error_v)
+    positive = current > 0.0
+    if not positive.any() or error[positive][-1] <= 0.0:
+        return 0.0, _KNEE_DEFAULT_A, "off: no voltage error is identified"
+    i, v = np.concatenate(([0.0], current[positive])), np.concatenate(([0.0], error[positive]))
+    missing = float(np.sum(np.diff(i) * (v[-1] - 0.5 * (v[1:] + v[:-1]))))
+    knee = 2.0 * missing / float(v[-1])
+    return float(v[-1]), max(knee, _KNEE_LEAST_A), "ramp of equal area to the identified voltage error"
+
+
+_KNEE_DEFAULT_A = 0.5
+_KNEE_LEAST_A = 1e-3
+
+
+def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
+    limits, U_dc = source.limits, source.inverter.U_dc_v
+    low, high = U_DC_RANGE
+    highest = BY_NAME["protection.U_dc_max_v"].maximum
+
+    def either(given: float | None, assumed: float, how: str) -> DesignValue:
+        return DesignValue(assumed, how) if given is None else DesignValue(given, GIVEN)
+
+    return {
+        "protection.i_trip_apk": either(
+            limits.i_trip_apk, TRIP_CURRENT_RATIO * rated.I_max_apk, f"{TRIP_CURRENT_RATIO:g} I_max"
+        ),
+        "protection.U_dc_min_v": either(limits.U_dc_min_v, low * U_dc, f"{low:g} U_dc"),
+        "protection.U_dc_max_v": either(limits.U_dc_max_v, min(high * U_dc, highest), f"{high:g} U_dc"),
+        "protection.n_trip_rpm": either(
+            limits.n_trip_rpm, TRIP_SPEED_RATIO * rated.n_max_rpm, f"{TRIP_SPEED_RATIO:g} n_max"
+        ),
+        "protection.T_winding_max_c": either(limits.T_winding_max_c, WINDING_LIMIT_C, "insulation class F assumed"),
+        "protection.I_cont_apk": DesignValue(rated.I_cont_apk, rated.methods["I_cont"]),
+    }
+
+
+def _encoder(source: MachineFile) -> dict[str, DesignValue]:
+    encoder = source.encoder
+    return {
+        "encoder.offset_rad": DesignValue(math.remainder(encoder.offset_rad, 2.0 * math.pi), GIVEN),
+        "encoder.reversed": DesignValue(float(encoder.direction < 0), GIVEN),
+    }

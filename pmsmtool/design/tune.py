@@ -1,0 +1,174 @@
+"""From a machine file and a request to a complete design: every row of the parameter catalogue, with its reason."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pmsmtool.design.bandwidth import CurrentChoice, choose_current
+from pmsmtool.design.current_loop import maximum_delay_periods
+from pmsmtool.design.design_file import Design, DesignValue, Scalar
+from pmsmtool.design.ratings import Ratings, rating_values, ratings
+from pmsmtool.design.sampled_loop import LoopMargins, margins
+from pmsmtool.design.speed_loop import (
+    Notch,
+    SpeedGains,
+    SpeedMethod,
+    SpeedPath,
+    pole_placement,
+    small_time_constants,
+    speed_loop,
+    symmetric_optimum,
+    symmetric_ratio,
+)
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.errors import DesignInfeasible
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.params.catalogue import CATALOGUE
+
+PLL_PER_PERIOD = 0.1
+"""Default pole of the speed estimate times T_s: a tenth of the sampling rate, 1200 rad/s at 12 kHz."""
+
+FILTER_PER_RATE = 1.0 / 60.0
+"""Default cut-off of the speed filter over the sampling rate: 200 Hz at 12 kHz."""
+
+SPEED_RATE_HZ = 1200.0
+"""Default rate of the speed controller; the decimation is rounded to reach it."""
+
+ACCELERATION_SHARE = 0.8
+"""Slope limit of the speed reference: this share of what the largest torque can accelerate."""
+
+_CURRENT_OPTIONS = 0b111
+_PREDICTOR_OPTION = 1 << 4
+
+
+def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
+    """Design a drive.
+
+    Parameters
+    ----------
+    source : MachineFile
+        Machine, inverter, encoder and limits.
+    request : TuneRequest, optional
+        What is asked; the defaults of the class.
+
+    Raises
+    ------
+    ConfigError
+        The machine file lacks what no rule can supply.
+    DesignInfeasible
+        The margins asked for cannot be met with the bandwidth asked for, or a value leaves the drive's range.
+    """
+    request = TuneRequest() if request is None else request
+    rated = ratings(source, (1.0 - request.voltage_margin) * source.inverter.V_max_v)
+    values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}
+    values |= rating_values(source, rated)
+    values["field_weakening.margin"] = DesignValue(request.voltage_margin, "asked for")
+    values["field_weakening.i_d_min_a"] = DesignValue(rated.i_d_min_a, rated.methods["i_d_min"])
+    choice = choose_current(source, request, rated.I_max_apk)
+    current = _design_current(choice)
+    speed = _design_speed(source, request, rated, choice)
+    values |= current.values | speed.values
+    design = Design(
+        source, request.table(), values, {**current.loops, **speed.loops}, {**current.facts, **speed.facts},
+        (*current.notes, *speed.notes),
+    )  # fmt: skip
+    violations = design.parameter_set().violations()
+    if violations:
+        raise DesignInfeasible(
+            "values leave the range of the drive: " + "; ".join(violations),
+            where="parameter catalogue",
+            hint="ask for another bandwidth, or correct the machine file",
+        )
+    return design
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Values of one part of a design, with its loops, facts and notes."""
+
+    values: dict[str, DesignValue]
+    loops: dict[str, LoopMargins]
+    facts: dict[str, Scalar]
+    notes: tuple[str, ...]
+
+
+# -- current loops -------------------------------------------------------------------------------------------
+
+
+def _design_current(current: CurrentChoice) -> _Part:
+    request, alpha = current.request, current.alpha
+    how = f"{request.method}, {alpha / (2.0 * math.pi):.5g} Hz{current.why}"
+    values = {}
+    for axis in "dq":
+        gain = current.gains(axis)
+        values[f"current.K_p_{axis}_v_per_a"] = DesignValue(gain.K_p, how, f"current_{axis}")
+        values[f"current.K_i_{axis}_v_per_as"] = DesignValue(gain.K_i, how, f"current_{axis}")
+    options = _CURRENT_OPTIONS | (_PREDICTOR_OPTION if request.predictor else 0)
+    values["current.options"] = DesignValue(
+        options, "decoupling, emf feed-forward, back-calculation" + (", predictor" if request.predictor else "")
+    )
+    values["governor.alpha_rad_s"] = DesignValue(alpha, "bandwidth of the current loops")
+    facts: dict[str, Scalar] = {"current_bandwidth_rad_s": alpha}
+    for axis in "dq":
+        plant = current.plants[axis]
+        facts[f"maximum_delay_{axis}_periods"] = maximum_delay_periods(
+            current.gains(axis), plant, plant if request.predictor else None
+        )
+    return _Part(values, current.loops(), facts, ())
+
+
+# -- speed loop ----------------------------------------------------------------------------------------------
+
+
+def _design_speed(source: MachineFile, request: TuneRequest, rated: Ratings, current: CurrentChoice) -> _Part:
+    T_s = source.inverter.T_s
+    pll = request.pll_rad_s or PLL_PER_PERIOD / T_s
+    filter_hz = request.speed_filter_hz or FILTER_PER_RATE / T_s
+    decimation = request.speed_decimation or max(1, round(1.0 / (SPEED_RATE_HZ * T_s)))
+    notch = Notch(request.notch_hz, request.notch_zeta_num, request.notch_zeta_den)
+    choice = "asked for" if request.pll_rad_s else "a tenth of the sampling rate"
+    values = {
+        "encoder.pll_bandwidth_rad_s": DesignValue(pll, choice),
+        "speed.filter_hz": DesignValue(filter_hz, "asked for" if request.speed_filter_hz else "rate / 60"),
+        "speed.decimation": DesignValue(
+            decimation, "asked for" if request.speed_decimation else f"nearest to {SPEED_RATE_HZ:g} Hz"
+        ),
+        "speed.tau_max_nm": DesignValue(rated.tau_max_nm, rated.methods["tau_max"]),
+        "speed.notch_hz": DesignValue(notch.hz, "asked for" if notch.hz else "off"),
+        "speed.notch_zeta_num": DesignValue(notch.zeta_num, "request"),
+        "speed.notch_zeta_den": DesignValue(notch.zeta_den, "request"),
+    }
+    J = source.machine.J_kgm2
+    if J is None:
+        off = DesignValue(0.0, "off: the inertia J_kgm2 is not known", "")
+        values |= {"speed.K_p_nms_per_rad": off, "speed.K_i_nm_per_rad": off}
+        return _Part(values, {}, {}, ("speed control is off: the machine file gives no inertia J_kgm2",))
+    path = SpeedPath(J, source.machine.B_nms or 0.0, current.loop("q"), decimation, pll, filter_hz, notch)
+    gains = _speed_gains(request, path, current.alpha)
+    found = margins(speed_loop(gains, path))
+    if not found.stable:
+        raise DesignInfeasible(
+            f"the speed loop with crossover {gains.omega_c / (2.0 * math.pi):.4g} Hz is unstable",
+            where="speed loop",
+            likely="too fast for its delays and filters",
+            hint="ask for a lower --speed-bandwidth-hz, or raise the filter and the speed estimate",
+        )
+    how = f"{gains.method}, {gains.omega_c / (2.0 * math.pi):.4g} Hz"
+    slope = ACCELERATION_SHARE * rated.tau_max_nm / J * 60.0 / (2.0 * math.pi)
+    values |= {
+        "speed.K_p_nms_per_rad": DesignValue(gains.K_p, how, "speed"),
+        "speed.K_i_nm_per_rad": DesignValue(gains.K_i, how, "speed"),
+        "speed.acceleration_rpm_per_s": DesignValue(slope, f"{ACCELERATION_SHARE:g} tau_max / J"),
+    }
+    return _Part(values, {"speed": found}, {"speed_crossover_rad_s": found.crossover_rad_s}, ())
+
+
+def _speed_gains(request: TuneRequest, path: SpeedPath, alpha: float) -> SpeedGains:
+    T_sum = small_time_constants(path, alpha)
+    asked = None if request.speed_bandwidth_hz is None else 2.0 * math.pi * request.speed_bandwidth_hz
+    if request.speed_method == SpeedMethod.POLE_PLACEMENT:
+        ratio = symmetric_ratio(math.radians(request.speed_phase_margin_deg))
+        return pole_placement(path.J, path.B, asked or 0.5 / (ratio * T_sum), request.speed_damping)
+    ratio = symmetric_ratio(math.radians(request.speed_phase_margin_deg)) if asked is None else 1.0 / (asked * T_sum)
+    return symmetric_optimum(path.J, T_sum, ratio)

@@ -1,0 +1,89 @@
+"""What can be asked of a design, checked as a whole."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from pmsmtool.design.current_loop import Method
+from pmsmtool.design.design_file import Scalar
+from pmsmtool.design.speed_loop import SpeedMethod
+from pmsmtool.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class TuneRequest:
+    """What is asked of a design; None leaves the choice to the rule named beside it.
+
+    Attributes
+    ----------
+    method : str
+        Rule of the current gains: ``imc``, ``modulus-optimum`` or ``second-order``.
+    bandwidth_hz : float or None
+        Bandwidth (natural frequency for ``second-order``) of the current loops; the modulus optimum, lowered where
+        the margins ask for it.
+    damping : float
+        Damping of ``second-order``.
+    phase_margin_deg, gain_margin_db : float
+        Least margins of the current loops, delay included, and with a flux map at every current up to I_max.
+    predictor : bool
+        One-step prediction of the current (needs a delay of one period or more).
+    speed_method : str
+        ``symmetric-optimum`` or ``pole-placement``.
+    speed_bandwidth_hz : float or None
+        Crossover of the speed loop; from ``speed_phase_margin_deg`` by the symmetric optimum.
+    speed_phase_margin_deg : float
+        Phase margin the symmetric optimum is laid out for.
+    speed_damping : float
+        Damping of ``pole-placement``.
+    speed_decimation : int or None
+        Control periods per speed-controller period.
+    speed_filter_hz, pll_rad_s : float or None
+        Feedback filter and speed estimate.
+    notch_hz, notch_zeta_num, notch_zeta_den : float
+        Notch on the torque; 0 Hz is off.
+    voltage_margin : float
+        Share of V_max kept for control in steady state.
+    """
+
+    method: str = "imc"
+    bandwidth_hz: float | None = None
+    damping: float = 1.0
+    phase_margin_deg: float = 45.0
+    gain_margin_db: float = 6.0
+    predictor: bool = False
+    speed_method: str = "symmetric-optimum"
+    speed_bandwidth_hz: float | None = None
+    speed_phase_margin_deg: float = 60.0
+    speed_damping: float = 1.0
+    speed_decimation: int | None = None
+    speed_filter_hz: float | None = None
+    pll_rad_s: float | None = None
+    notch_hz: float = 0.0
+    notch_zeta_num: float = 0.05
+    notch_zeta_den: float = 0.5
+    voltage_margin: float = 0.08
+
+    def __post_init__(self) -> None:
+        wrong = []
+        for name, allowed in (("method", Method), ("speed_method", SpeedMethod)):
+            if getattr(self, name) not in {str(one) for one in allowed}:
+                wrong.append(f"{name} is {getattr(self, name)!r}, allowed are {', '.join(allowed)}")
+        for name in ("bandwidth_hz", "damping", "speed_bandwidth_hz", "speed_damping", "speed_filter_hz", "pll_rad_s"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                wrong.append(f"{name} = {value!r} is not a positive number")
+        for name in ("phase_margin_deg", "speed_phase_margin_deg"):
+            if not 0.0 < getattr(self, name) < 90.0:
+                wrong.append(f"{name} = {getattr(self, name)!r} is not between 0 and 90 degree")
+        if not 0.0 <= self.voltage_margin <= 0.5:
+            wrong.append(f"voltage_margin = {self.voltage_margin!r} is outside 0..0.5")
+        if self.speed_decimation is not None and not 1 <= self.speed_decimation <= 1000:
+            wrong.append(f"speed_decimation = {self.speed_decimation!r} is outside 1..1000")
+        if wrong:
+            raise ConfigError("the request cannot be used", where="tune", violations=wrong)
+
+    def table(self) -> dict[str, Scalar]:
+        """Return what was asked, without what was left open."""
+        given = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: value for name, value in given.items() if value is not None}

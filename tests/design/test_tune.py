@@ -1,0 +1,223 @@
+"""Designs: complete, explained, reproducible, refused when they cannot hold."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from pmsmtool.cli.main import cli
+from pmsmtool.design.bandwidth import choose_current, least_inductance
+from pmsmtool.design.current_loop import AxisPlant, axis_loop, imc
+from pmsmtool.design.design_file import Design, design_text, load_design, parse_design
+from pmsmtool.design.ratings import base_speed_rpm, dead_time_compensation
+from pmsmtool.design.sampled_loop import margins
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.errors import ConfigError, DesignInfeasible
+from pmsmtool.machine.flux_map import FluxMap
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.parameters import InverterParameters, MachineLimits, MachineParameters
+from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.params.parameter_set import parse_parameter_set
+
+PROFILES = Path(__file__).resolve().parents[2] / "profiles"
+
+SURFACE = MachineFile(
+    "surface",
+    MachineParameters(4, 0.137, 2.3e-3, 2.1e-3, 0.41, I_nom_apk=28.0, I_max_apk=56.0, n_nom_rpm=620.0, J_kgm2=0.05),
+    InverterParameters(210.0, 12e3),
+)
+
+
+def saturated() -> MachineFile:
+    i = np.linspace(-30.0, 30.0, 13)
+    d, q = np.meshgrid(i, i, indexing="ij")
+    flux_map = FluxMap(i, i, 0.1 + 0.1 * np.tanh(d / 20.0) + 1e-3 * d, 0.3 * np.tanh(q / 12.0) + 2e-3 * q)
+    machine = replace(SURFACE.machine, L_d_h=6e-3, L_q_h=20e-3, I_max_apk=28.0)
+    return replace(SURFACE, flux_map=flux_map, machine=machine)
+
+
+@pytest.mark.parametrize("profile", sorted(PROFILES.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_profile_gives_a_complete_valid_set(profile: Path) -> None:
+    design = tune(load_machine_file(profile))
+    assert set(design.values) == {row.name for row in CATALOGUE}
+    assert all(value.method for value in design.values.values())
+    assert design.parameter_set().violations() == ()
+    assert all(loop.stable for loop in design.loops.values())
+
+
+def test_the_reference_machine_gets_the_modulus_optimum() -> None:
+    design = tune(SURFACE)
+    assert design["current.K_p_d_v_per_a"] == pytest.approx(9.2)
+    assert design["current.K_p_q_v_per_a"] == pytest.approx(8.4)
+    assert design["current.K_i_d_v_per_as"] == pytest.approx(548.0)
+    assert design["inverter.T_s_ns"] == 83333
+    independent = margins(axis_loop(imc(0.137, 2.3e-3, 4000.0), AxisPlant(0.137, 2.3e-3, 1.0 / 12e3, 1.5)))
+    assert design.loops["current_d"] == independent
+    # 0.92 V_max carries 28 A at 620 rpm, as the operating point of the machine was chosen
+    assert base_speed_rpm(SURFACE, 28.0, -56.0, 0.92 * 210.0 / math.sqrt(3.0)) == pytest.approx(620.0, rel=5e-3)
+
+
+def test_text_and_back() -> None:
+    for source in (SURFACE, saturated()):
+        design = tune(source, TuneRequest(bandwidth_hz=120.0, notch_hz=90.0))
+        text = design_text(design)
+        again = parse_design(text)
+        assert design_text(again) == text
+        assert again.values == design.values
+        assert again.loops == design.loops
+        assert again.parameter_set().to_toml() == design.parameter_set().to_toml()
+        assert tune(again.machine, TuneRequest(**dict(again.request))).parameter_set() == design.parameter_set()  # type: ignore[arg-type]
+        assert parse_parameter_set(design.parameter_set().to_toml()).values == design.parameter_set().values
+
+
+def test_same_bytes_for_the_same_machine_wherever_it_lies(tmp_path: Path) -> None:
+    source = PROFILES / "saturated-pmsyrm.toml"
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for name in ("saturated-pmsyrm.toml", "saturated-pmsyrm.csv"):
+        (moved / name).write_bytes((PROFILES / name).read_bytes())
+    here, there = (design_text(tune(load_machine_file(path))) for path in (source, moved / source.name))
+    assert here == there
+    assert str(tmp_path) not in there
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (("R_s_ohm = 0.137", "R_s_ohm = 0.138"), "machine"),
+        (("[value.current.K_p_d_v_per_a]", "[value.current.K_p_d_v_per]"), "did you mean"),
+        (('schema = "pmsmtool.design/1"', 'schema = "pmsmtool.design/9"'), "schema"),
+        (('unit = "V/A"', 'unit = "ohm"'), "unit"),
+        (('loop = "current_d"', 'loop = "current_x"'), "loop"),
+        (("[machine_file]", "[machine_fil]"), "machine_file"),
+        (("[request]", "[request"), "TOML"),
+    ],
+)
+def test_a_damaged_design_is_refused(edit: tuple[str, str], message: str) -> None:
+    text = design_text(tune(SURFACE))
+    assert edit[0] in text
+    with pytest.raises(ConfigError) as caught:
+        parse_design(text.replace(*edit))
+    assert message in str(caught.value)
+
+
+def test_a_bandwidth_beyond_the_delay_is_refused_with_one_that_works() -> None:
+    with pytest.raises(DesignInfeasible) as caught:
+        tune(SURFACE, TuneRequest(bandwidth_hz=3000.0))
+    hint = re.search(r"at most ([\d.]+) Hz", caught.value.hint)
+    assert hint is not None
+    design = tune(SURFACE, TuneRequest(bandwidth_hz=0.9999 * float(hint.group(1))))
+    loop = design.loops["current_d"]
+    # 6 dB bind before 45 degree
+    assert loop.gain_margin_db == pytest.approx(6.0, abs=0.02)
+    assert loop.phase_margin_deg >= 45.0
+
+
+def test_saturation_lowers_the_bandwidth_until_the_least_inductance_holds() -> None:
+    source = saturated()
+    least = least_inductance(source, 28.0)
+    assert least["q"] < 0.25 * source.machine.L_q_h
+    design = tune(source)
+    assert design.loops["current_q_saturated"].gain_margin_db >= 6.0
+    assert design.loops["current_q_saturated"].gain_margin_db == pytest.approx(6.0, abs=0.01)
+    alone = choose_current(replace(source, flux_map=None), TuneRequest(), 28.0)
+    assert design["governor.alpha_rad_s"] < 0.6 * alone.alpha
+
+
+def test_second_order_and_predictor_reach_the_parameters() -> None:
+    design = tune(SURFACE, TuneRequest(method="second-order", bandwidth_hz=250.0, damping=1.0))
+    w_n = 2.0 * math.pi * 250.0
+    assert design["current.K_i_d_v_per_as"] == pytest.approx(w_n**2 * 2.3e-3)
+    assert design["current.K_p_d_v_per_a"] == pytest.approx(2.0 * w_n * 2.3e-3 - 0.137)
+    predicted = tune(SURFACE, TuneRequest(bandwidth_hz=1200.0, predictor=True))
+    assert int(predicted["current.options"]) & 16
+    with pytest.raises(DesignInfeasible):
+        tune(SURFACE, TuneRequest(bandwidth_hz=1200.0))
+    with pytest.raises(DesignInfeasible, match="predict"):
+        tune(replace(SURFACE, inverter=InverterParameters(210.0, 12e3, delay_periods=0.5)), TuneRequest(predictor=True))
+
+
+def test_without_inertia_the_speed_loop_is_off_and_said_so() -> None:
+    design = tune(replace(SURFACE, machine=replace(SURFACE.machine, J_kgm2=None)))
+    assert design["speed.K_p_nms_per_rad"] == design["speed.K_i_nm_per_rad"] == 0.0
+    assert "speed" not in design.loops
+    assert any("inertia" in note for note in design.notes)
+
+
+def test_limits_of_the_machine_file_win_over_assumptions() -> None:
+    limits = MachineLimits(i_d_min_apk=-20.0, i_trip_apk=70.0, I_cont_apk=25.0, U_dc_max_v=280.0, tau_max_nm=50.0)
+    design = tune(replace(SURFACE, limits=limits))
+    assert design["field_weakening.i_d_min_a"] == -20.0
+    assert design["protection.i_trip_apk"] == 70.0
+    assert design["protection.I_cont_apk"] == 25.0
+    assert design["protection.U_dc_max_v"] == 280.0
+    assert design["speed.tau_max_nm"] == 50.0
+    assert design["protection.U_dc_min_v"] == 105.0
+    assert "0.5 U_dc" in design.values["protection.U_dc_min_v"].method
+
+
+def test_encoder_offset_is_wrapped_and_direction_kept() -> None:
+    encoder = replace(SURFACE.encoder, offset_rad=5.0, direction=-1)
+    design = tune(replace(SURFACE, encoder=encoder))
+    assert design["encoder.offset_rad"] == pytest.approx(5.0 - 2.0 * math.pi)
+    assert design["encoder.reversed"] == 1.0
+
+
+def test_voltage_error_table_becomes_the_ramp_of_equal_area() -> None:
+    ramp = InverterParameters(
+        210.0, 12e3, voltage_error_i_apk=(-4.0, -2.0, 2.0, 4.0), voltage_error_v=(-3.0, -3.0, 3.0, 3.0)
+    )
+    assert dead_time_compensation(ramp)[:2] == pytest.approx((3.0, 2.0))
+    given = replace(ramp, V_dead_v=2.5, i_knee_apk=0.7)
+    assert dead_time_compensation(given)[:2] == (2.5, 0.7)
+    design = tune(replace(SURFACE, inverter=ramp))
+    assert design["inverter.deadtime_compensation"] == 1.0
+    assert tune(SURFACE)["inverter.deadtime_compensation"] == 0.0
+
+
+def test_no_current_rating_is_a_question_to_the_machine_file() -> None:
+    with pytest.raises(ConfigError, match="current rating"):
+        tune(replace(SURFACE, machine=replace(SURFACE.machine, I_nom_apk=None, I_max_apk=None)))
+
+
+def test_a_bad_request_lists_everything() -> None:
+    with pytest.raises(ConfigError) as caught:
+        TuneRequest(method="magic", damping=-1.0, voltage_margin=0.9, phase_margin_deg=95.0)
+    assert len(caught.value.violations) == 4
+
+
+def test_values_outside_the_catalogue_are_refused() -> None:
+    with pytest.raises(DesignInfeasible, match="range of the drive"):
+        tune(replace(SURFACE, machine=replace(SURFACE.machine, L_d_h=11.0, L_q_h=11.0)))
+
+
+def run(*arguments: str) -> tuple[int, str, str]:
+    result = CliRunner().invoke(cli, ["tune", *arguments])
+    code = int(getattr(result.exception, "exit_code", result.exit_code))
+    return code, result.stdout, result.stderr
+
+
+def test_command_writes_both_files_and_prints_margins(tmp_path: Path) -> None:
+    source = str(PROFILES / "jercic-2017.toml")
+    code, stdout, _ = run(source, "-o", str(tmp_path / "design.toml"))
+    assert code == 0
+    assert "61.3" in stdout and "current_d" in stdout
+    design: Design = load_design(tmp_path / "design.toml")
+    params = parse_parameter_set((tmp_path / "params.toml").read_text())
+    assert params.content_hash() == design.parameter_set().content_hash()
+
+
+def test_command_exit_codes(tmp_path: Path) -> None:
+    source, target = str(PROFILES / "jercic-2017.toml"), str(tmp_path / "design.toml")
+    assert run(source, "-o", target, "--bandwidth-hz", "5000")[0] == 1
+    assert run(source, "-o", target, "--voltage-margin", "0.9")[0] == 2
+    assert run(str(tmp_path / "missing.toml"), "-o", target)[0] == 2
+    assert run(source, "-o", str(tmp_path / "no" / "design.toml"))[0] == 2
+    assert not Path(target).exists()
