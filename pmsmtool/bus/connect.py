@@ -22,7 +22,7 @@ from typing import Any
 import can
 
 from pmsmtool.bus.clock import Clock, clock_of
-from pmsmtool.errors import BusError, ConfigError
+from pmsmtool.errors import BusError, ConfigError, PmsmtoolError
 
 SOCKETCAND_DEFAULTS: Mapping[str, Any] = {"host": "127.0.0.1", "port": 29536, "channel": "vcan0"}
 """What ``pmsmtool sim serve`` offers; used for what neither the caller nor python-can's files say."""
@@ -371,8 +371,10 @@ def _completed(arguments: dict[str, Any]) -> dict[str, Any]:
     return {"tcp_tune": True, **arguments, **missing}
 
 
-def _open_failure(arguments: Mapping[str, Any], error: Exception) -> BusError:
+def _open_failure(arguments: Mapping[str, Any], error: Exception) -> PmsmtoolError:
     name = arguments.get("interface")
+    if isinstance(error.__cause__, ConfigError):
+        return error.__cause__  # the simulated bus names the key of its channel that is wrong
     if name is None and isinstance(error, can.CanInterfaceNotImplementedError):
         return BusError(
             "no CAN interface is configured",

@@ -159,6 +159,10 @@ class Supervision:
         self._check_emergencies()
         self._check_heartbeat()
 
+    def take_note_of_emergencies(self) -> None:
+        """What came until now raises nothing any more."""
+        self._emergencies_seen = len(self.emergencies)
+
     def _check_emergencies(self) -> None:
         fresh = self.emergencies[self._emergencies_seen :]
         self._emergencies_seen = len(self.emergencies)

@@ -1,0 +1,276 @@
+"""A drive as a CANopen node: typed objects, identity, CiA 402 states, reset and store."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.nmt import reset_node
+from pmsmtool.bus.sdo import Retry, SdoChannel
+from pmsmtool.bus.supervision import Supervision
+from pmsmtool.cia402 import Command, State, command_towards_enabled, error_text, state_of
+from pmsmtool.drive import objects
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.port import Identity
+from pmsmtool.errors import DriveFault, DriveTimeout, SdoAbort
+from pmsmtool.firmware.drive_map import DriveMap, reference_map
+
+STATE_TIMEOUT_S = 2.0
+"""A state transition without motion takes milliseconds; charging a DC link may take longer."""
+STORE_TIMEOUT_S = 10.0
+"""Flash memory of a drive may take seconds (CANopen reference, section 6: 3 to 10 s)."""
+STORE_POLL_S = 0.1
+READY_TIMEOUT_S = 3.0
+"""After boot-up a node answers SDO requests within this time."""
+POLL_S = 0.005
+
+Watcher = Callable[[int, int], None]
+"""Called with index and sub-index before an object is written."""
+
+
+class DriveNode:
+    """One drive on a bus.
+
+    Parameters
+    ----------
+    connection : Connection
+        The bus.
+    node : int
+        Node id.
+    drive_map : DriveMap, optional
+        Which object holds which parameter; the reference drive's when not given.
+
+    Attributes
+    ----------
+    sdo : SdoChannel
+        Confirmed transfers.
+    supervision : Supervision
+        Heartbeat, emergencies, other masters.
+    before_write : callable or None
+        Told of every object that :meth:`put` and :meth:`write_bytes` are about to change.
+    """
+
+    def __init__(self, connection: Connection, node: int, *, drive_map: DriveMap | None = None) -> None:
+        self.connection = connection
+        self.node = node
+        self.map = drive_map or reference_map()
+        self.supervision = Supervision(connection, node)
+        self.sdo = SdoChannel(connection, node, check=self.supervision.check)
+        self.sdo.slow_objects[objects.STORE_ALL] = STORE_TIMEOUT_S
+        self.before_write: Watcher | None = None
+
+    def close(self) -> None:
+        """Stop listening to the node."""
+        self.sdo.close()
+        self.supervision.close()
+
+    # ---- objects --------------------------------------------------------------------------------
+
+    def get(self, item: DriveObject) -> float:
+        """Return the number in an object."""
+        return item.decode(self.sdo.read(item.index, item.sub, size=item.size))
+
+    def whole(self, item: DriveObject) -> int:
+        """Return the whole number in an object."""
+        return int(self.get(item))
+
+    def put(self, item: DriveObject, value: float, *, retry: Retry = Retry.READ_BACK) -> None:
+        """Write a number; see :class:`Retry` for what happens when the answer is lost."""
+        self.write_bytes(item.index, item.sub, item.encode(value), retry=retry)
+
+    def command(self, item: DriveObject, value: int, *, retry: Retry = Retry.REPEAT) -> None:
+        """Write a command: nothing a restore would have to bring back."""
+        self.sdo.download(item.index, item.sub, item.encode(value), retry=retry)
+
+    def write_bytes(self, index: int, sub: int, data: bytes, *, retry: Retry = Retry.READ_BACK) -> None:
+        """Write the bytes of an object."""
+        if self.before_write is not None:
+            self.before_write(index, sub)
+        self.sdo.download(index, sub, data, retry=retry)
+
+    def has(self, index: int, sub: int) -> bool:
+        """Whether the node has an object it lets read."""
+        try:
+            self.sdo.read(index, sub)
+        except SdoAbort:
+            return False
+        return True
+
+    # ---- identity -------------------------------------------------------------------------------
+
+    def identity(self) -> Identity:
+        """Read identity object and names; also the producer heartbeat time, which arms its supervision."""
+        vendor, product, revision, serial = (
+            int.from_bytes(self.sdo.read(objects.IDENTITY, sub, size=4), "little") for sub in range(1, 5)
+        )
+        name, hardware, software = (
+            self._text(*where) for where in (objects.DEVICE_NAME, objects.HARDWARE_VERSION, objects.SOFTWARE_VERSION)
+        )
+        with contextlib.suppress(SdoAbort):
+            self.supervision.heartbeat_period_s = self.get(objects.PRODUCER_HEARTBEAT_MS) / 1000.0 or None
+        return Identity(self.node, vendor, product, revision, serial, name, hardware, software)
+
+    def _text(self, index: int, sub: int) -> str:
+        try:
+            return self.sdo.read(index, sub).rstrip(b"\0").decode("ascii", "replace")
+        except SdoAbort:
+            return ""
+
+    # ---- CiA 402 --------------------------------------------------------------------------------
+
+    def state(self) -> State | None:
+        """Return the state the statusword shows, None for a pattern CiA 402 does not define."""
+        return state_of(self.whole(objects.STATUSWORD))
+
+    def go(self, word: Command) -> None:
+        """Write a controlword; repeating one is harmless."""
+        self.command(objects.CONTROLWORD, word)
+
+    def wait_for_state(
+        self, reached: Callable[[State | None], bool], timeout_s: float = STATE_TIMEOUT_S
+    ) -> State | None:
+        """Poll the statusword until ``reached``; return the last state, reached or not."""
+        deadline = self.connection.clock.now() + timeout_s
+        while True:
+            state = self.state()
+            if reached(state) or self.connection.clock.now() >= deadline:
+                return state
+            self.connection.wait(POLL_S)
+
+    def enable(self) -> None:
+        """Walk to OPERATION ENABLED.
+
+        Raises
+        ------
+        DriveFault
+            The drive is in fault, or stays in a state on the way.
+        """
+        for _ in range(len(State)):
+            state = self.state()
+            if state is State.OPERATION_ENABLED:
+                return
+            word = None if state is None else command_towards_enabled(state)
+            if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+                raise self.fault_error()
+            if word is None:
+                before = state
+                state = self.wait_for_state(lambda now: now is not before)  # noqa: B023 - called before the next turn
+                if state is before:
+                    break
+                continue
+            self.go(word)
+            before = state
+            if self.wait_for_state(lambda now: now is not before) is before:  # noqa: B023
+                break
+        raise DriveFault(
+            f"the drive stays in {_state_name(state)} and does not enable",
+            where=f"node {self.node}, 0x6041:00",
+            likely="no DC-link voltage, or a missing hardware enable or safe-torque-off input",
+            hint="check the supply and the enable inputs",
+        )
+
+    def disable_voltage(self, timeout_s: float = STATE_TIMEOUT_S) -> State | None:
+        """Remove the voltage; return the state that the statusword then shows."""
+        self.go(Command.DISABLE_VOLTAGE)
+        return self.wait_for_state(is_safe, timeout_s)
+
+    def reset_fault(self) -> None:
+        """Reset a fault by the rising edge of its bit.
+
+        Raises
+        ------
+        DriveFault
+            It came back.
+        """
+        self.go(Command.DISABLE_VOLTAGE)
+        self.go(Command.FAULT_RESET)
+        state = self.wait_for_state(lambda now: now not in (State.FAULT, State.FAULT_REACTION_ACTIVE))
+        self.go(Command.DISABLE_VOLTAGE)
+        if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            raise self.fault_error()
+
+    def fault_error(self) -> DriveFault:
+        """Return the error that tells the drive's fault."""
+        code = self.whole(objects.ERROR_CODE)
+        return DriveFault(
+            f"the drive is in fault {code:#06x}: {error_text(code)}",
+            where=f"node {self.node}, 0x603F:00",
+            hint=f"remove the cause, then `pmsmtool fault reset -n {self.node}`",
+        )
+
+    # ---- reset and store ------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Reset the node and wait until it answers again.
+
+        Raises
+        ------
+        DriveTimeout
+            It does not come back.
+        """
+        with self.supervision.expected_reset():
+            reset_node(self.connection, self.node)
+            self._wait_until_ready()
+
+    def _wait_until_ready(self) -> None:
+        deadline = self.connection.clock.now() + READY_TIMEOUT_S
+        while True:
+            try:
+                self.sdo.read(objects.DEVICE_TYPE.index, objects.DEVICE_TYPE.sub)
+                return
+            except (DriveTimeout, SdoAbort):
+                if self.connection.clock.now() >= deadline:
+                    raise
+                self.connection.wait(POLL_S)
+
+    def store(self) -> None:
+        """Store all parameters; the command is sent once, flash memory wears out.
+
+        Raises
+        ------
+        SdoAbort
+            The drive refuses to store.
+        DriveTimeout
+            No answer within ``STORE_TIMEOUT_S``, and the store cannot be seen to have ended.
+        """
+        index, sub = objects.STORE_ALL
+        try:
+            self.sdo.download(index, sub, b"save", retry=Retry.NEVER)
+        except DriveTimeout:
+            self._wait_for_store()
+
+    def _wait_for_store(self) -> None:
+        """The confirmation was lost: the drive has finished when 0x1010 can be read again."""
+        deadline = self.connection.clock.now() + STORE_TIMEOUT_S
+        while self.connection.clock.now() < deadline:
+            with contextlib.suppress(DriveTimeout, SdoAbort):
+                self.sdo.read(*objects.STORE_ALL)
+                return
+            self.connection.wait(STORE_POLL_S)
+        raise DriveTimeout(
+            f"the drive does not finish storing within {2 * STORE_TIMEOUT_S:g} s",
+            where=f"node {self.node}, 0x1010:01",
+            hint="leave it powered; run the command again, it continues where this one ended",
+        )
+
+    @contextmanager
+    def emergencies_tolerated(self) -> Iterator[None]:
+        """While a fault is provoked or cleared on purpose: emergencies do not end the work."""
+        before, self.supervision.stop_at_emergency = self.supervision.stop_at_emergency, False
+        try:
+            yield
+        finally:
+            self.connection.collect()
+            self.supervision.take_note_of_emergencies()
+            self.supervision.stop_at_emergency = before
+
+
+def is_safe(state: State | None) -> bool:
+    """Whether a state certainly drives no current; an undefined pattern does not count as one."""
+    return state is not None and not state.energised
+
+
+def _state_name(state: State | None) -> str:
+    return "an undefined state" if state is None else state.name.replace("_", " ")

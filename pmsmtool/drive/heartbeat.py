@@ -1,0 +1,62 @@
+"""The tool's own heartbeat: the drive stops when it stays away.
+
+It runs on the bus clock as a job of its own (a thread on a real bus), so a main thread busy with
+arithmetic does not stop the machine, and a tool that is killed does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from types import TracebackType
+
+from pmsmtool.bus.clock import Ticker
+from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.nmt import HEARTBEAT_ID, NmtState
+from pmsmtool.errors import BusError
+
+TOOL_NODE = 0x7E
+"""Node id the tool's heartbeat carries; 0x7F is left to a PLC or configuration tool."""
+PERIOD_S = 0.05
+"""Five heartbeats within the drive's consumer time of ``dead_man.CONSUMER_MS``."""
+
+
+class Heartbeat:
+    """Producer of the tool's heartbeat.
+
+    Parameters
+    ----------
+    connection : Connection
+        The bus.
+    """
+
+    def __init__(self, connection: Connection, *, period_s: float = PERIOD_S) -> None:
+        self.failure: BusError | None = None
+        self._connection = connection
+        self._period_s = period_s
+        self._ticker: Ticker | None = None
+
+    def __enter__(self) -> Heartbeat:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Send the first heartbeat now and one every period."""
+        if self._ticker is None:
+            self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)))
+            self._ticker = self._connection.clock.every(self._period_s, self._beat)
+
+    def stop(self) -> None:
+        """Send no more; the drive notices after its consumer time."""
+        ticker, self._ticker = self._ticker, None
+        if ticker is not None:
+            ticker.stop()
+
+    def _beat(self) -> None:
+        # Nobody catches here: the drive notices a lost heartbeat, the next request meets the failed bus.
+        with contextlib.suppress(BusError):
+            self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)))

@@ -1,0 +1,372 @@
+"""The download: a transaction from what a drive holds to what it shall hold.
+
+Gate, journal, staged write with read-back, activation, marks (0x1020 last), one store, reset,
+re-identification, everything read again. Whatever fails on the way, the old set comes back, and
+the error says which set the drive holds. A tool that was killed, or a drive that lost its supply,
+leaves an open journal: the same command, or ``restore``, finishes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+
+from pmsmtool.bus.supervision import NodeReset
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.interruption import interrupts_deferred
+from pmsmtool.drive.parameters import DriveParameters, Progress
+from pmsmtool.drive.port import Identity
+from pmsmtool.errors import (
+    Interrupted,
+    PmsmtoolError,
+    SafetyRefusal,
+    SdoAbort,
+    VerifyMismatch,
+)
+from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
+from pmsmtool.flash.plan import Change, Plan, differences
+from pmsmtool.params.catalogue import layout_signature
+
+LISTEN_S = 0.25
+"""Before the first write the bus is listened to this long: another master would be heard."""
+_STARTS = 2
+
+
+class Phase(IntEnum):
+    """How far a download has come; decides what a roll-back must do."""
+
+    BEFORE = 0
+    STAGING = 1
+    ACTIVE = 2
+    STORING = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a download did.
+
+    Attributes
+    ----------
+    written, equal : int
+        Objects written, objects that held their value already.
+    stored : bool
+        Whether the drive keeps the set over a reset, as seen after one.
+    crc : int or None
+        CRC-32 of the drive's whole set; None where it has none.
+    retries, discarded : int
+        Transfers repeated, frames thrown away.
+    starts : int
+        2 when the node was reset in between and everything started over.
+    """
+
+    written: int
+    equal: int
+    stored: bool
+    crc: int | None
+    retries: int
+    discarded: int
+    starts: int
+
+
+class Download:
+    """One download to one drive.
+
+    Parameters
+    ----------
+    node : DriveNode
+        The drive.
+    identity : Identity
+        As read when the plan was made; it must still be this one.
+    plan : Plan
+        Old and new bytes.
+    marks : mapping of str to bytes
+        What ``flash.journal.MARKS`` shall hold afterwards.
+    folder : JournalFolder
+        Where the journal is kept.
+    say : callable
+        Told one line per step.
+    """
+
+    def __init__(
+        self,
+        node: DriveNode,
+        identity: Identity,
+        plan: Plan,
+        marks: Mapping[str, bytes],
+        folder: JournalFolder,
+        *,
+        say: Callable[[str], None] = lambda text: None,
+        progress: Progress = lambda done, total: None,
+    ) -> None:
+        self.node = node
+        self.identity = identity
+        self.plan = plan
+        self.folder = folder
+        self.phase = Phase.BEFORE
+        self._parameters = DriveParameters(node)
+        self._say = say
+        self._progress = progress
+        self._wanted_marks = dict(marks)
+        self._old_marks: dict[str, bytes] = {}
+        self._was_stored = False
+        self._crc_before: int | None = None
+
+    def run(self, *, store: bool = True, restoring: bool = False) -> Outcome:
+        """Carry the plan out.
+
+        Parameters
+        ----------
+        store : bool
+            Also keep it in non-volatile memory; otherwise it acts until the next reset.
+        restoring : bool
+            The plan brings a journal's old contents back: that journal is closed, no new one begun.
+
+        Raises
+        ------
+        PmsmtoolError
+            With the old set back on the drive, or with what to do said.
+        Interrupted
+            Ctrl-C, after the roll-back.
+        """
+        self._gate()
+        self._old_marks = self._read_marks()
+        self._was_stored = self._parameters.is_stored()
+        self._crc_before = self._parameters.crc_active if self.node.map.staging else None
+        if self._nothing_to_do(store):
+            self._close_stale(restoring)
+            return self._outcome(0, starts=1, stored=self._was_stored)
+        journal = self._journal(restoring)
+        starts = 0
+        while True:
+            starts += 1
+            try:
+                self._forward(store)
+                break
+            except NodeReset as reset:
+                if starts == _STARTS or self.phase >= Phase.STORING:
+                    raise self._roll_back(reset, journal) from reset
+                self._say(f"{reset.what}; starting over once")
+                self._start_over()
+            except BaseException as error:
+                raise self._roll_back(error, journal) from error
+        self.folder.close(journal, "restored" if restoring else "done")
+        return self._outcome(len(self.plan.changes), starts=starts, stored=store)
+
+    # ---- before ---------------------------------------------------------------------------------
+
+    def _gate(self) -> None:
+        check_identity(self.node, self.identity)
+        self._parameters.check_layout()
+        refuse_while_enabled(self.node)
+        self.node.connection.wait(LISTEN_S)
+        self.node.supervision.check()
+
+    def _nothing_to_do(self, store: bool) -> bool:
+        same_marks = self._old_marks.get("design_id") == self._wanted_marks.get("design_id")
+        return not self.plan.changes and same_marks and (self._was_stored or not store)
+
+    def _close_stale(self, restoring: bool) -> None:
+        """An interrupted download that had reached its end after all."""
+        last = self.folder.last()
+        if last is not None and last.state == "open":
+            self.folder.close(last, "restored" if restoring else "done")
+
+    def _journal(self, restoring: bool) -> Snapshot:
+        last = self.folder.last()
+        if restoring and last is not None and last.state == "open":
+            return last
+        entries = [Entry(e.name, e.index, e.sub, e.old, e.new) for e in self.plan.entries]
+        entries += [
+            Entry(name, index, sub, self._old_marks[name], self._wanted_marks.get(name))
+            for name, index, sub in MARKS
+            if name in self._old_marks
+        ]
+        snapshot = Snapshot(
+            "journal", "open", self.identity, layout_signature() if self.node.map.staging else 0,
+            self.plan.content, tuple(entries),
+        )  # fmt: skip
+        journal = self.folder.begin(snapshot)
+        self._say(f"journal: {self.folder.path}")
+        return journal
+
+    def _read_marks(self) -> dict[str, bytes]:
+        found = {}
+        for name, index, sub in MARKS:
+            try:
+                found[name] = self.node.sdo.read(index, sub)
+            except SdoAbort:
+                continue  # the drive does not keep this mark
+        return found
+
+    # ---- forward --------------------------------------------------------------------------------
+
+    def _forward(self, store: bool) -> None:
+        self.phase = Phase.STAGING
+        changes = self.plan.changes
+        if changes:
+            self._say(f"writing and reading back {len(changes)} object(s)")
+            self._parameters.replace({change.name: change.new for change in changes}, progress=self._progress)
+        self.phase = Phase.ACTIVE
+        expected = self._parameters.crc_active if self.node.map.staging else None
+        self._write_marks(self._wanted_marks)
+        if not store:
+            return
+        self.phase = Phase.STORING
+        self._say("storing")
+        self.node.store()
+        self._say("resetting the drive and reading everything again")
+        self.node.reset()
+        check_identity(self.node, self.identity)
+        self._verify(self.plan.entries, self._wanted_marks, expected)
+
+    def _write_marks(self, marks: Mapping[str, bytes]) -> None:
+        for name, index, sub in MARKS:
+            if name in self._old_marks and name in marks:
+                self.node.sdo.download(index, sub, marks[name])
+
+    def _verify(
+        self, entries: tuple[Change, ...], marks: Mapping[str, bytes], crc: int | None, *, stored: bool = True
+    ) -> None:
+        """Compare everything, also what was not written: the drive was reset in between."""
+        found = self._parameters.read([entry.name for entry in entries], progress=self._progress)
+        wrong = differences(entries, found)
+        held = self._read_marks()
+        wrong += [
+            f"{name}: wrote {marks[name].hex(' ')}, reads {held[name].hex(' ')}"
+            for name in held
+            if name in marks and held[name] != marks[name]
+        ]
+        if crc is not None:
+            numbers = {"active": self._parameters.crc_active}
+            numbers |= {"stored": self._parameters.crc_stored} if stored else {}
+            wrong += [
+                f"CRC-32 of the {k} set is {v:#010x}, expected {crc:#010x}" for k, v in numbers.items() if v != crc
+            ]
+        if wrong:
+            raise VerifyMismatch(
+                "after the reset the drive does not hold what was stored",
+                where=f"node {self.node.node}",
+                differences=wrong,
+            )
+
+    def _start_over(self) -> None:
+        with self.node.supervision.expected_reset():
+            self.node.connection.wait(LISTEN_S)
+        check_identity(self.node, self.identity)
+        self.phase = Phase.BEFORE
+
+    # ---- back -----------------------------------------------------------------------------------
+
+    def _roll_back(self, error: BaseException, journal: Snapshot) -> BaseException:
+        """Bring the old set back; return the error to raise, which says what the drive holds now."""
+        with interrupts_deferred():
+            self.node.sdo.cancel(None)
+            try:
+                self._say(f"{_name(error)}: bringing the old set back")
+                with self.node.supervision.expected_reset():
+                    self._bring_back()
+                self.folder.close(journal, "restored")
+                state = "the drive holds exactly the old set again"
+            except (PmsmtoolError, OSError) as second:
+                state = self._left_behind(second)
+        return _told(error, state)
+
+    def _bring_back(self) -> None:
+        if (
+            self.phase is Phase.STAGING
+            and self._crc_before is not None
+            and self._parameters.crc_active == self._crc_before
+        ):
+            return  # the staged copy was discarded, or lost in a reset; nothing of it ever acted
+        old = tuple(_reversed(change) for change in self.plan.entries)
+        if self.phase is Phase.ACTIVE and self._was_stored:
+            self.node.reset()
+        else:
+            self._parameters.replace({change.name: change.old for change in self.plan.changes})
+            self._write_marks(self._old_marks)
+            if self.phase is Phase.STORING:
+                # The memory may hold the new set already; the set that acted before is stored over it.
+                self.node.store()
+                self.node.reset()
+        stored = self._was_stored or self.phase is Phase.STORING
+        self._verify(old, self._old_marks, self._crc_before, stored=stored)
+
+    def _left_behind(self, second: BaseException) -> str:
+        holds = (
+            "it holds exactly the old or exactly the new set"
+            if self.node.map.staging
+            else "it may hold a part of the new set"
+        )
+        return (
+            f"the roll-back failed too ({_name(second)}); {holds}. The journal is kept: when the drive answers again, "
+            f"run the same command, or `pmsmtool restore -n {self.node.node}`"
+        )
+
+    def _outcome(self, written: int, *, starts: int, stored: bool) -> Outcome:
+        crc = self._parameters.crc_active if self.node.map.staging else None
+        sdo = self.node.sdo
+        return Outcome(written, len(self.plan.entries) - written, stored, crc, sdo.retries, sdo.discarded, starts)
+
+
+def check_identity(node: DriveNode, expected: Identity) -> None:
+    """Refuse to go on when another drive answers than the one a plan was made for.
+
+    Raises
+    ------
+    SafetyRefusal
+        Vendor, product or serial number differ.
+    """
+    found = node.identity()
+    if (found.vendor, found.product, found.serial) != (expected.vendor, expected.product, expected.serial):
+        raise SafetyRefusal(
+            f"another drive answers: {describe(found)} instead of {describe(expected)}",
+            where=f"node {node.node}, 0x1018",
+            likely="drives were swapped, or two share this node id",
+            hint="check the node id; nothing was written to this drive",
+        )
+
+
+def refuse_while_enabled(node: DriveNode) -> None:
+    """Refuse to write to a drive that may drive current; it is never disabled unasked.
+
+    Raises
+    ------
+    SafetyRefusal
+        The statusword shows an energised state.
+    """
+    state = node.state()
+    if state is None or state.energised:
+        name = "an undefined state" if state is None else state.name.replace("_", " ")
+        raise SafetyRefusal(
+            f"the drive is in {name}: parameters are not written to a drive that may move",
+            where=f"node {node.node}, 0x6041:00",
+            hint=f"`pmsmtool stop -n {node.node}` disables it",
+        )
+
+
+def describe(identity: Identity) -> str:
+    """Return an identity in one line."""
+    numbers = f"vendor {identity.vendor:#010x} product {identity.product:#010x} serial {identity.serial}"
+    return f"{identity.name} ({numbers})" if identity.name else numbers
+
+
+def _reversed(change: Change) -> Change:
+    return Change(change.name, change.index, change.sub, change.new, change.old)
+
+
+def _name(error: BaseException) -> str:
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    text = getattr(error, "what", "") or str(error) or type(error).__name__
+    return str(text).splitlines()[0]
+
+
+def _told(error: BaseException, state: str) -> BaseException:
+    """Return the error with the drive's state in it."""
+    if isinstance(error, KeyboardInterrupt):
+        return Interrupted(f"interrupted; {state}")
+    if isinstance(error, PmsmtoolError):
+        error.what = f"{error.what}; {state}"
+        error.args = (error.what,)
+    return error

@@ -1,0 +1,170 @@
+"""What a download would change: old bytes, new bytes, and what the drive will really hold.
+
+Pure: bytes read from a drive go in, a plan comes out; nothing here speaks to a bus.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.drive_map import DriveMap
+from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.params.diff import table_unit
+from pmsmtool.params.parameter_set import ParameterSet
+
+QUANTISATION_SHOWN = 1e-6
+"""Relative rounding from which the value the drive holds is shown beside the one asked for (binary32: 6e-8)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One object of a plan.
+
+    Attributes
+    ----------
+    name : str
+        Catalogue or table name.
+    index, sub : int
+        The object.
+    old, new : bytes
+        Contents before and after; equal bytes are not written.
+    old_value, wanted, held : float
+        Value on the drive, value asked for, value the drive will hold (SI); NaN for tables.
+    unit : str
+        Of the values.
+    """
+
+    name: str
+    index: int
+    sub: int
+    old: bytes
+    new: bytes
+    old_value: float = math.nan
+    wanted: float = math.nan
+    held: float = math.nan
+    unit: str = ""
+
+    @property
+    def changes(self) -> bool:
+        """Whether the object must be written."""
+        return self.old != self.new
+
+    @property
+    def quantised(self) -> bool:
+        """Whether the drive will visibly hold another value than the one asked for."""
+        return abs(self.held - self.wanted) > QUANTISATION_SHOWN * abs(self.wanted)
+
+    @property
+    def relative(self) -> float:
+        """Relative change, NaN where it has no meaning."""
+        return self.held / self.old_value - 1.0 if self.old_value else math.nan
+
+    @property
+    def where(self) -> str:
+        """The object as people write it."""
+        return f"0x{self.index:04X}:{self.sub:02X}"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All objects of a set, those that already hold their value included.
+
+    Attributes
+    ----------
+    entries : tuple of Change
+        In writing order.
+    missing : tuple of str
+        Entries of the set the drive has no object for.
+    content : str
+        Content hash of the set.
+    """
+
+    entries: tuple[Change, ...]
+    missing: tuple[str, ...] = ()
+    content: str = ""
+
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """Entries that must be written."""
+        return tuple(entry for entry in self.entries if entry.changes)
+
+    def lines(self) -> list[str]:
+        """Return the difference list a person consents to."""
+        rows = [_row(change) for change in self.changes]
+        widths = [max((len(row[k]) for row in rows), default=0) for k in range(4)]
+        lines = [
+            f"{r[0]:<{widths[0]}}  {r[1]:>{widths[1]}} -> {r[2]:>{widths[2]}} {r[3]:<{widths[3]}}  {r[4]}".rstrip()
+            for r in rows
+        ]
+        equal = len(self.entries) - len(rows)
+        lines.append(f"{len(rows)} of {len(self.entries)} objects change, {equal} hold their value already")
+        lines += [f"this drive has no object for {name}" for name in self.missing]
+        return lines
+
+
+def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, bytes]) -> Plan:
+    """Return the plan that brings a drive from what it holds to a set.
+
+    Parameters
+    ----------
+    found : mapping of str to bytes
+        What the drive holds now, for every name of :func:`names_to_read`.
+
+    Raises
+    ------
+    ConfigError
+        Values out of bounds, or that do not fit the drive's types; all of them.
+    """
+    violations = wanted.violations()
+    if violations:
+        raise ConfigError("the parameter set cannot be written", where=wanted.name, violations=violations)
+    encoded = drive_map.encode(wanted)
+    held = drive_map.decode(encoded).values
+    before = drive_map.decode({name: data for name, data in found.items() if name in drive_map.cells}).values
+    entries = []
+    for name, new in encoded.items():
+        index, sub = drive_map.address(name)
+        scalar = name in drive_map.cells
+        values = (before.get(name, math.nan), wanted.values[name], held[name]) if scalar else (math.nan,) * 3
+        unit = BY_NAME[name].unit if scalar else table_unit(name)
+        entries.append(Change(name, index, sub, found[name], new, *values, unit))
+    return Plan(tuple(entries), drive_map.missing(wanted), wanted.content_hash())
+
+
+def names_to_read(drive_map: DriveMap, wanted: ParameterSet) -> tuple[str, ...]:
+    """Return the entries whose present content a plan needs: the set's own, and gains that scale others."""
+    names = [name for name in [*wanted.values, *wanted.tables] if name in drive_map.cells or name in drive_map.tables]
+    gains = [drive_map.cells[n].gain for n in names if n in drive_map.cells and drive_map.cells[n].gain]
+    return tuple(dict.fromkeys([*names, *(gain for gain in gains if gain in drive_map.cells)]))
+
+
+def differences(entries: Sequence[Change], found: Mapping[str, bytes]) -> list[str]:
+    """Return one line per entry whose content is not the planned one."""
+    lines = []
+    for entry in entries:
+        data = found.get(entry.name, b"")
+        if data != entry.new:
+            lines.append(f"{entry.name} ({entry.where}): wrote {_hex(entry.new)}, reads {_hex(data)}")
+    return lines
+
+
+def _hex(data: bytes) -> str:
+    return data.hex(" ") if len(data) <= 8 else f"{data[:4].hex(' ')} .. ({len(data)} bytes)"
+
+
+def _row(change: Change) -> tuple[str, str, str, str, str]:
+    if math.isnan(change.wanted):
+        return change.name, f"{len(change.old)} B", f"{len(change.new)} B", "", _cells(change)
+    relative = "" if math.isnan(change.relative) else f"{100.0 * change.relative:+.3g} %"
+    held = f"(asked for {change.wanted:.9g})" if change.quantised else ""
+    unit = "" if change.unit == "1" else change.unit
+    return change.name, f"{change.old_value:.7g}", f"{change.held:.7g}", unit, f"{relative}  {held}".strip()
+
+
+def _cells(change: Change) -> str:
+    words = range(0, max(len(change.old), len(change.new)), 4)
+    different = sum(change.old[k : k + 4] != change.new[k : k + 4] for k in words)
+    return f"{different} of {len(words)} words differ"

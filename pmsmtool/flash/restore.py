@@ -1,0 +1,128 @@
+"""Backups of a drive, and plans that bring one back."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Mapping
+
+from pmsmtool.bus.sdo import Mode
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.parameters import DriveParameters, Progress
+from pmsmtool.drive.port import Identity
+from pmsmtool.errors import ConfigError, SdoAbort
+from pmsmtool.firmware.drive_map import DriveMap
+from pmsmtool.flash.journal import MARKS, Entry, Snapshot
+from pmsmtool.flash.plan import Change, Plan
+from pmsmtool.params.catalogue import BY_NAME, layout_signature
+from pmsmtool.params.diff import table_unit
+from pmsmtool.params.parameter_set import ParameterSet
+
+CONFIGURATION_EPOCH = datetime.date(1984, 1, 1)
+"""Day 0 of object 0x1020:01 (CiA 301, section 7.5.2.21)."""
+DESIGN_ID_BYTES = 8
+_MARK_NAMES = frozenset(name for name, _, _ in MARKS)
+
+
+def marks_of(content: str, when: datetime.datetime) -> dict[str, bytes]:
+    """Return the marks of a set written at a moment.
+
+    Parameters
+    ----------
+    content : str
+        Content hash ``sha256:<hex>`` of the set.
+    when : datetime
+        Becomes configuration date and time; the drive's users read local time there.
+    """
+    days = (when.date() - CONFIGURATION_EPOCH).days
+    midnight = when.replace(hour=0, minute=0, second=0, microsecond=0)
+    milliseconds = (when - midnight) // datetime.timedelta(milliseconds=1)
+    return {
+        "design_id": bytes.fromhex(content.removeprefix("sha256:"))[:DESIGN_ID_BYTES],
+        "configuration_date": days.to_bytes(4, "little"),
+        "configuration_time": milliseconds.to_bytes(4, "little"),
+    }
+
+
+def take_backup(node: DriveNode, identity: Identity, *, progress: Progress = lambda done, total: None) -> Snapshot:
+    """Read every parameter, table and mark of a drive."""
+    parameters = DriveParameters(node)
+    parameters.check_layout()
+    found = parameters.read([*node.map.cells, *node.map.tables], progress=progress)
+    entries = [Entry(name, *node.map.address(name), data) for name, data in found.items()]
+    for name, index, sub in MARKS:
+        try:
+            entries.append(Entry(name, index, sub, node.sdo.upload(index, sub, mode=Mode.SEGMENTED).data))
+        except SdoAbort:
+            continue  # the drive does not keep this mark
+    signature = layout_signature() if node.map.staging else 0
+    return Snapshot(
+        "backup", "done", identity, signature, snapshot_set(node.map, entries).content_hash(), tuple(entries)
+    )
+
+
+def snapshot_set(drive_map: DriveMap, entries: list[Entry] | tuple[Entry, ...]) -> ParameterSet:
+    """Return the old contents of a snapshot as a parameter set."""
+    known = {e.name: e.old for e in entries if e.name in drive_map.cells or e.name in drive_map.tables}
+    return drive_map.decode(known)
+
+
+def old_marks(snapshot: Snapshot) -> dict[str, bytes]:
+    """Return the marks a snapshot holds."""
+    return {entry.name: entry.old for entry in snapshot.entries if entry.name in _MARK_NAMES}
+
+
+def check_snapshot(drive_map: DriveMap, snapshot: Snapshot, identity: Identity, *, other_drive: bool = False) -> None:
+    """Refuse a snapshot that is not of this drive.
+
+    Parameters
+    ----------
+    other_drive : bool
+        Another serial number of the same product is wanted (a spare part).
+
+    Raises
+    ------
+    ConfigError
+        Another product, another layout, objects the map does not know, or another serial number.
+    """
+    theirs = snapshot.identity
+    if (theirs.vendor, theirs.product) != (identity.vendor, identity.product):
+        raise ConfigError(
+            f"the snapshot is of vendor {theirs.vendor:#010x} product {theirs.product:#010x}, "
+            f"the drive is vendor {identity.vendor:#010x} product {identity.product:#010x}",
+            hint="give a snapshot of this kind of drive",
+        )
+    if theirs.serial != identity.serial and not other_drive:
+        raise ConfigError(
+            f"the snapshot is of the drive with serial number {theirs.serial}, this one is {identity.serial}",
+            hint="--other-drive when it shall go into this drive (a spare part)",
+        )
+    if drive_map.staging and snapshot.signature != layout_signature():
+        raise ConfigError(
+            f"the snapshot's layout {snapshot.signature:#010x} is not this program's {layout_signature():#010x}"
+        )
+    unknown = [e.name for e in snapshot.entries if e.name not in (*drive_map.cells, *drive_map.tables, *_MARK_NAMES)]
+    if unknown:
+        raise ConfigError("the drive's map does not know all objects of the snapshot", violations=unknown)
+
+
+def restore_plan(drive_map: DriveMap, snapshot: Snapshot, found: Mapping[str, bytes]) -> Plan:
+    """Return the plan that brings the old contents of a snapshot back, byte for byte."""
+    wanted = snapshot_set(drive_map, snapshot.entries).values
+    before = drive_map.decode({name: data for name, data in found.items() if name in drive_map.cells}).values
+    entries = []
+    for entry in snapshot.entries:
+        if entry.name in _MARK_NAMES:
+            continue
+        scalar = entry.name in drive_map.cells
+        value = wanted[entry.name] if scalar else math.nan
+        old_value = before.get(entry.name, math.nan) if scalar else math.nan
+        unit = BY_NAME[entry.name].unit if scalar else table_unit(entry.name)
+        change = Change(entry.name, entry.index, entry.sub, found[entry.name], entry.old, old_value, value, value, unit)
+        entries.append(change)
+    return Plan(tuple(entries), (), snapshot.content)
+
+
+def names_of(snapshot: Snapshot) -> tuple[str, ...]:
+    """Return the parameters and tables of a snapshot."""
+    return tuple(entry.name for entry in snapshot.entries if entry.name not in _MARK_NAMES)
