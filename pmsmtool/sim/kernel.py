@@ -431,6 +431,10 @@ class Simulation:
         """Return a writable view of a part's bytes."""
         return (ctypes.c_uint8 * size).from_address(self.part(part))
 
+    def floats_at(self, part: Part, count: int) -> Any:
+        """Return a writable view of a part's binary32 values."""
+        return (_f32 * count).from_address(self.part(part))
+
     def lut_words(self) -> Any:
         """Return the drive's look-up words."""
         return (_u32 * LUT_CAPACITY_WORDS).from_address(self.part(Part.LUT))

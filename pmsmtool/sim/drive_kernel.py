@@ -1,0 +1,248 @@
+"""The simulated drive behind the CANopen node: ``node.drive_core.DriveCore`` on the kernel.
+
+Every method reads or writes a few words of the C structs; time passes only in :meth:`KernelCore.run`, N control periods
+in one call. What the drive takes over at its next period (an excitation, a recorder set-up) is reported as taken
+at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from pmsmtool.drive.port import Excitation
+from pmsmtool.errors import ConfigError
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.params.parameter_set import default_set
+from pmsmtool.sim.closed_loop import image_of
+from pmsmtool.sim.kernel import Part, Simulation
+from pmsmtool.sim.node.drive_core import (
+    BUFFER_SAMPLES,
+    TRACE_BYTES,
+    TRACE_CHANNELS,
+    Averages,
+    AverageState,
+    Command,
+    ControlMode,
+    ExcitationState,
+    RecorderSetup,
+    RecorderState,
+    RecorderStatus,
+    Signal,
+)
+from pmsmtool.sim.simulated_machine import (
+    RECORD_COMPENSATION,
+    build_setup,
+    own_compensation,
+    records_compensation,
+    settings_of,
+)
+
+STOP, ARM, START = 0, 1, 2
+"""Commands of excitation, recorder (START: force) and averages (ARM: start) in ``drive.h``."""
+
+IDEAL_ENCODER_COUNTS = 1 << 24
+"""Counts per turn that a drive with an ideal encoder (``encoder_bits = 0``) claims."""
+
+
+class KernelCore:
+    """A drive's application with its machine, as the node sees it.
+
+    Parameters
+    ----------
+    machine_file : MachineFile
+        Machine and ``[simulation]``.
+    seed : int
+        Seed of the noise.
+
+    Attributes
+    ----------
+    simulation : Simulation
+        The kernel, for tests that look at the truth; the node does not.
+    """
+
+    def __init__(self, machine_file: MachineFile, seed: int) -> None:
+        setup, keep = build_setup(machine_file, seed=seed)
+        settings = settings_of(machine_file)
+        bits = settings.whole("encoder_bits")
+        self._counts = 1 << bits if bits else IDEAL_ENCODER_COUNTS
+        self._compensation = own_compensation(machine_file)
+        self._records_compensation = records_compensation(machine_file)
+        self._image = image_of(machine_file, default_set())
+        self._averaged: Sequence[Signal] = ()
+        self.simulation = Simulation(setup, self._image, keep)
+        self.simulation.library.pmsm_sim_watch(self.simulation.sim, 1)
+        self._parameters_changed()
+
+    # ---- parameters and modes --------------------------------------------------------------------------
+
+    @property
+    def period_ns(self) -> int:
+        """Control period of the loaded parameters (ns)."""
+        return int(self.simulation.params.inverter_T_s_ns)
+
+    @property
+    def encoder_counts(self) -> int:
+        """Encoder counts per mechanical turn."""
+        return self._counts
+
+    def load(self, image: bytes) -> None:
+        """Take a parameter image; controller memory is kept."""
+        self.simulation.load(image)
+        self._image = image
+        self._parameters_changed()
+
+    def _parameters_changed(self) -> None:
+        """Lay the compensation that is built into the drive over the parameters; no object shows it."""
+        params = self.simulation.params
+        for name, value in self._compensation.items():
+            member = name.replace(".", "_")
+            setattr(params, member, type(getattr(params, member))(value))
+        if self._records_compensation:
+            params.current_options |= RECORD_COMPENSATION
+
+    def restart(self) -> None:
+        """Firmware reset: gates off, memory of the application cleared; the rotor moves on."""
+        self.simulation.library.pmsm_drive_init(self.simulation.drive)
+        self._averaged = ()
+        self.load(self._image)
+
+    def command(self, command: Command) -> None:
+        """Set mode and references from the next period on; mode OFF removes the gate signals at once."""
+        reference = self.simulation.reference
+        reference.mode = int(command.mode)
+        reference.i_d_ref, reference.i_q_ref = command.i_d_a, command.i_q_a
+        reference.tau_ref, reference.omega_M_ref = command.torque_nm, command.omega_m_rad_s
+        reference.u_d_inject = reference.u_q_inject = reference.bias_bandwidth = 0.0
+        self.simulation.fixed_angle.value = command.fixed_angle_rad
+        self.simulation.word(Part.QUICK_STOP).value = int(command.quick_stop)
+        self.simulation.word(Part.ENABLED).value = int(command.mode != ControlMode.OFF)
+
+    # ---- time --------------------------------------------------------------------------------------------
+
+    def run(self, periods: int) -> int:
+        """Run at most ``periods`` control periods; early return when a state that the node reports changed."""
+        return self.simulation.run(periods)
+
+    def signal(self, signal: Signal) -> float:
+        """Return a signal as it would be recorded now."""
+        return float(self.simulation.library.pmsm_drive_signal(self.simulation.drive, int(signal)))
+
+    def trip(self) -> int:
+        """Return the latched trip code, 0 when there is none."""
+        return int(self.simulation.word(Part.TRIP).value)
+
+    def reset_fault(self) -> None:
+        """Clear the trip latch."""
+        self.simulation.library.pmsm_drive_reset_fault(self.simulation.drive)
+
+    # ---- excitation ----------------------------------------------------------------------------------------
+
+    def excite(self, excitation: Excitation | None) -> None:
+        """Start an excitation, change the running one, or end it with None.
+
+        Raises
+        ------
+        ConfigError
+            The buffer is longer than the drive's.
+        """
+        out = self.simulation.excitation
+        if excitation is None:
+            out.command = STOP
+            return
+        if len(excitation.buffer) > BUFFER_SAMPLES:
+            raise ConfigError(f"{len(excitation.buffer)} samples do not fit the buffer of {BUFFER_SAMPLES}")
+        running = self.excitation_state() is ExcitationState.RUNNING
+        out.shape, out.point, out.hold_periods = excitation.shape, excitation.point, excitation.hold_periods
+        out.amplitude, out.amplitude_q = excitation.amplitude, excitation.amplitude_q
+        out.bias_d, out.bias_q = excitation.bias_d_a, excitation.bias_q_a
+        out.bias_bandwidth = excitation.bias_bandwidth_rad_s
+        out.f0, out.f1, out.duration = excitation.f0_hz, excitation.f1_hz, excitation.duration_s
+        out.fixed_angle = math.nan if excitation.fixed_angle_rad is None else excitation.fixed_angle_rad
+        out.i_limit_d, out.i_limit_q = excitation.i_limit_d_a, excitation.i_limit_q_a
+        out.i_centre_d = excitation.i_centre_d_a
+        out.abort_current, out.abort_speed = excitation.abort_current_apk, excitation.abort_speed_rad_s
+        out.buffer_samples = len(excitation.buffer)
+        if excitation.buffer:
+            self.simulation.floats_at(Part.BUFFER, len(excitation.buffer))[:] = list(excitation.buffer)
+        if not running:
+            out.command = START
+
+    def excitation_state(self) -> ExcitationState:
+        """Return the state; a start or stop that the next period takes over counts as taken."""
+        out = self.simulation.excitation
+        pending = {STOP: ExcitationState.IDLE, START: ExcitationState.RUNNING}.get(out.command)
+        return ExcitationState(out.state) if pending is None else pending
+
+    # ---- recorder ------------------------------------------------------------------------------------------
+
+    def record(self, setup: RecorderSetup | None) -> None:
+        """Arm the recorder, or stop it with None.
+
+        Raises
+        ------
+        ConfigError
+            Too many channels, or rows that do not fit the memory.
+        """
+        out = self.simulation.recorder
+        if setup is None:
+            out.command = STOP
+            return
+        if len(setup.channels) > TRACE_CHANNELS or 4 * len(setup.channels) * setup.depth > TRACE_BYTES:
+            raise ConfigError(f"{setup.depth} rows of {len(setup.channels)} channels do not fit the recorder")
+        out.decimation, out.depth, out.pretrigger = setup.decimation, setup.depth, setup.pretrigger
+        out.trigger, out.trigger_signal, out.trigger_level = setup.trigger, setup.source, setup.level
+        out.channel[:] = _padded(setup.channels)
+        out.command = ARM
+
+    def force_trigger(self) -> None:
+        """Trigger an armed recorder now; one that was armed in this instant is not armed yet, so it starts at once."""
+        out = self.simulation.recorder
+        if out.command == ARM:
+            out.trigger = 0
+        else:
+            out.command = START
+
+    def recorder(self) -> RecorderStatus:
+        """Return the state of the recorder."""
+        out = self.simulation.recorder
+        if out.command == ARM:
+            return RecorderStatus(RecorderState.ARMED)
+        return RecorderStatus(RecorderState(out.state), out.stored, out.trigger_position)
+
+    def recording(self) -> bytes:
+        """Return the stored rows, oldest first."""
+        out = self.simulation.recorder
+        channels = sum(channel != Signal.NONE for channel in out.channel)
+        return bytes(self.simulation.bytes_at(Part.TRACE, 4 * channels * out.stored))
+
+    # ---- averages ------------------------------------------------------------------------------------------
+
+    def average(self, signals: Sequence[Signal], periods: int) -> None:
+        """Start a window average over the next ``periods`` periods; 0 stops it."""
+        out = self.simulation.average
+        self._averaged = tuple(signals)
+        out.signal[:] = _padded(signals)
+        out.periods = periods
+        out.command = ARM if periods else STOP
+
+    def averages(self) -> Averages:
+        """Return the state and, when complete, means and standard deviations."""
+        out = self.simulation.average
+        pending = {STOP: AverageState.IDLE, ARM: AverageState.RUNNING}.get(out.command)
+        state = AverageState(out.state) if pending is None else pending
+        if state is not AverageState.COMPLETE:
+            return Averages(state)
+        count = len(self._averaged)
+        return Averages(state, tuple(out.mean[:count]), tuple(out.std[:count]))
+
+
+def _padded(signals: Sequence[Signal]) -> list[int]:
+    if len(signals) > TRACE_CHANNELS:
+        raise ConfigError(f"{len(signals)} signals do not fit {TRACE_CHANNELS} channels")
+    return [*map(int, signals), *[0] * (TRACE_CHANNELS - len(signals))]
+
+
+def create(machine_file: MachineFile, seed: int) -> KernelCore:
+    """Return the application of one simulated drive; what the bus plug-in calls for each drive on a line."""
+    return KernelCore(machine_file, seed)
