@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from pmsmtool.errors import PmsmtoolError
+from pmsmtool.errors import ConfigError, PmsmtoolError
 
 DataFolder = Literal["profiles", "firmware-params"]
 
@@ -44,11 +44,19 @@ def user_folder() -> Path:
     """Return the folder for what must outlive a run: journals, crash reports; not created here.
 
     ``PMSMTOOL_HOME`` if set, else the platform's place for application data.
+
+    Raises
+    ------
+    ConfigError
+        The user has no home folder (a container with a bare user number).
     """
     chosen = os.environ.get("PMSMTOOL_HOME")
     if chosen:
         return Path(chosen)
-    home = Path.home()
+    try:
+        home = Path.home()
+    except RuntimeError as error:
+        raise ConfigError("this user has no home folder", hint="set PMSMTOOL_HOME to a folder") from error
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local") / "pmsmtool"
     if sys.platform == "darwin":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import sys
 from collections.abc import Iterator
@@ -9,7 +10,16 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.errors import ConfigError, ExitCode, PmsmtoolError, StopNotConfirmed, VerifyMismatch
+from pmsmtool.errors import (
+    CheckFailed,
+    ConfigError,
+    Declined,
+    ExitCode,
+    Interrupted,
+    PmsmtoolError,
+    StopNotConfirmed,
+    VerifyMismatch,
+)
 
 READER_GONE = 141
 """Exit code when whoever read standard output went away, as of a filter that SIGPIPE ends (128 + 13)."""
@@ -65,6 +75,8 @@ def report(error: BaseException, verbosity: int = 0) -> int:
         return chosen.exit_code
     if isinstance(chosen, PmsmtoolError):
         _tell(chosen)
+        if chosen is not error or isinstance(chosen, StopNotConfirmed):
+            _tell_others(error, chosen)
         return int(chosen.exit_code)
     if isinstance(chosen, click.ClickException):
         return _tell_usage(chosen)
@@ -78,8 +90,24 @@ def report(error: BaseException, verbosity: int = 0) -> int:
     return _tell_bug(error)
 
 
+_LABELS: tuple[tuple[type[PmsmtoolError], str], ...] = (
+    (StopNotConfirmed, "STOP NOT CONFIRMED"),
+    (CheckFailed, "not good"),
+    (Declined, "declined"),
+    (Interrupted, "interrupted"),
+)
+
+
+def _tell_others(error: BaseException, told: BaseException) -> None:
+    """Name what else went wrong when one error outranked the others."""
+    for other in related(error):
+        if other is not told and not isinstance(other, BaseExceptionGroup):
+            first = (str(other) or "no message").splitlines()[0]
+            _echo(f"  {'also:':<8}{type(other).__name__}: {first}")
+
+
 def _tell(error: PmsmtoolError) -> None:
-    label = "STOP NOT CONFIRMED" if isinstance(error, StopNotConfirmed) else "error"
+    label = next((text for kind, text in _LABELS if isinstance(error, kind)), "error")
     _echo(f"{click.style(label, fg='red', bold=True)}: {error.what}")
     details = error.violations if isinstance(error, ConfigError) else ()
     details = error.differences if isinstance(error, VerifyMismatch) else details
@@ -133,7 +161,10 @@ def _keep(text: str) -> Path | None:
 
     head = f"pmsmtool {__version__}, Python {platform.python_version()}, {platform.platform()}\n{' '.join(sys.argv)}\n"
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S%fZ")
-    for folder in (user_folder() / "crashes", Path(tempfile.gettempdir())):
+    folders = [Path(tempfile.gettempdir())]
+    with contextlib.suppress(ConfigError):
+        folders.insert(0, user_folder() / "crashes")
+    for folder in folders:
         path = folder / f"pmsmtool-crash-{stamp}.txt"
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -57,7 +57,7 @@ What is generated (designs, sets, tables, C, DCF) holds no dates, paths or names
 ENVIRONMENT = """\
 PMSMTOOL_INTERFACE PMSMTOOL_CHANNEL PMSMTOOL_BITRATE PMSMTOOL_NODE PMSMTOOL_SIM PMSMTOOL_TRACE_CAN
                        as -i -c -b -n --sim --trace-can; an option that is typed wins
-PMSMTOOL_JSON_OUTPUT PMSMTOOL_VERBOSE PMSMTOOL_QUIET
+PMSMTOOL_JSON PMSMTOOL_VERBOSE PMSMTOOL_QUIET
                        as --json -v -q
 PMSMTOOL_HOME          folder for what must outlive a run (journals, crash reports); now {home}
 CAN_INTERFACE CAN_CHANNEL CAN_BITRATE CAN_CONFIG

@@ -102,7 +102,14 @@ def _bus_parameters(auto: bool) -> list[Option]:
 
 def _output_parameters(auto: bool) -> list[Option]:
     return [
-        click.option("--json", "json_output", is_flag=True, allow_from_autoenv=auto, help="Print one JSON object."),
+        click.option(
+            "--json",
+            "json_output",
+            is_flag=True,
+            envvar="PMSMTOOL_JSON" if auto else None,
+            allow_from_autoenv=False,
+            help="Print one JSON object.",
+        ),
         *_verbosity_parameters(auto),
     ]
 
@@ -260,11 +267,11 @@ def bus_options(function: Function) -> Function:
 
 
 def _output(ctx: click.Context, verbose: int, quiet: bool, json_output: bool) -> Output:
-    root = ctx.find_root().params
-    verbosity = -1 if quiet or root.get("quiet") else verbose + root.get("verbose", 0)
+    above = ctx.find_root().params if ctx.parent else {}
+    verbosity = -1 if quiet or above.get("quiet") else verbose + above.get("verbose", 0)
     ctx.meta[VERBOSITY] = verbosity
     set_up_logging(verbosity)
-    return Output(json_output or bool(root.get("json_output")), verbosity)
+    return Output(json_output or bool(above.get("json_output")), verbosity)
 
 
 def output_options(function: Function) -> Function:

@@ -135,7 +135,7 @@ def test_option_before_a_command_that_ignores_it_is_refused() -> None:
     done = fresh("--json", "completion", "bash")
     assert done.returncode == 2
     assert "completion takes no --json" in done.stderr
-    assert fresh("-q", "help", "units", PMSMTOOL_JSON_OUTPUT="1").returncode == 0
+    assert fresh("-q", "help", "units", PMSMTOOL_JSON="1").returncode == 0
 
 
 def test_did_you_mean() -> None:
@@ -273,7 +273,9 @@ def test_stop_not_confirmed_outranks_everything(
     action: Callable[[], object], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert exit_code(action, monkeypatch) == 8
-    assert "STOP NOT CONFIRMED: no answer to quick stop" in capsys.readouterr().err
+    printed = capsys.readouterr().err
+    assert "STOP NOT CONFIRMED: no answer to quick stop" in printed
+    assert "also:   " in printed
 
 
 def test_message_says_what_where_likely_and_try(capsys: pytest.CaptureFixture[str]) -> None:
@@ -341,6 +343,14 @@ def test_help_topic(topic: str) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert len(done.stdout.splitlines()) > 5
     assert max(map(len, done.stdout.splitlines())) <= 130
+
+
+def test_help_names_every_variable_of_the_global_options() -> None:
+    text = TOPICS["environment"][1]()
+    for parameter in main.cli.params:
+        variable = parameter.envvar or f"PMSMTOOL_{(parameter.name or '').upper()}"
+        wanted = parameter.name not in ("yes", "version")
+        assert (str(variable) in text.split()) == wanted
 
 
 def test_help_of_nothing_known() -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from pmsmtool import resources
-from pmsmtool.errors import PmsmtoolError
+from pmsmtool.errors import ConfigError, PmsmtoolError
 from pmsmtool.packaging import contents, cross_wheels, wheel
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -140,3 +140,13 @@ def test_user_folder(
     monkeypatch.setattr(sys, "platform", platform)
     monkeypatch.setattr(Path, "home", lambda: Path("/h"))
     assert resources.user_folder() == Path(expected)
+
+
+def test_user_without_a_home_is_told_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("PMSMTOOL_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    with pytest.raises(ConfigError, match="PMSMTOOL_HOME"):
+        resources.user_folder()
