@@ -208,4 +208,5 @@ _GROUPS: dict[int, str] = {
     0x84: "speed controller",
     0x90: "external error",
     0xF0: "additional functions",
+    0xFF: "manufacturer-specific error",
 }
