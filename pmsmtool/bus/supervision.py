@@ -159,6 +159,13 @@ class Supervision:
         self._check_emergencies()
         self._check_heartbeat()
 
+    def begin(self) -> None:
+        """What happened until now is no error of the work that begins."""
+        self._connection.collect()
+        self._boots_seen = self.boot_ups
+        self._foreign_seen = self.foreign_requests
+        self.take_note_of_emergencies()
+
     def take_note_of_emergencies(self) -> None:
         """What came until now raises nothing any more."""
         self._emergencies_seen = len(self.emergencies)

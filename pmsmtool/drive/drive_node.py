@@ -101,7 +101,8 @@ class DriveNode:
     # ---- identity -------------------------------------------------------------------------------
 
     def identity(self) -> Identity:
-        """Read identity object and names; also the producer heartbeat time, which arms its supervision."""
+        """Read identity object and names; also the producer heartbeat time; supervision begins here."""
+        self.supervision.begin()
         vendor, product, revision, serial = (
             int.from_bytes(self.sdo.read(objects.IDENTITY, sub, size=4), "little") for sub in range(1, 5)
         )

@@ -43,6 +43,9 @@ class SetState(IntEnum):
     REJECTED = 4
 
 
+_STAGED = (SetState.STAGING, SetState.VALID, SetState.REJECTED)
+
+
 def _no_progress(done: int, total: int) -> None:
     """Nobody wants to know."""
 
@@ -108,6 +111,23 @@ class DriveParameters:
                 likely="firmware and tool are of different versions",
                 hint="update the older of the two",
             )
+
+    def settle(self) -> bool:
+        """Discard a staged copy that an interrupted run left: reads would show it instead of the active set.
+
+        Returns
+        -------
+        bool
+            Whether there was one.
+        """
+        if not self.is_staged():
+            return False
+        self.node.command(objects.SET_COMMAND, SetCommand.DISCARD)
+        return True
+
+    def is_staged(self) -> bool:
+        """Whether a staged copy is open."""
+        return self.map.staging and self.node.whole(objects.SET_STATE) in _STAGED
 
     @property
     def crc_active(self) -> int:

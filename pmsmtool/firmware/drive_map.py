@@ -222,7 +222,8 @@ def encode_table(name: str, numbers: Sequence[float], values: Mapping[str, float
             return struct.pack(f"<{len(numbers)}f", *numbers)
         lsb = values["lut.lsb_a"]
         steps = (LUT_INT16_NO_POINT if math.isnan(x) else round(x / lsb) for x in numbers)
-        return struct.pack(f"<{len(numbers)}h", *steps)
+        # Padded as in the image, so that the drive reads the same back before and after a reset.
+        return struct.pack(f"<{len(numbers)}h", *steps) + bytes(2 * (len(numbers) % 2))
     except (struct.error, OverflowError, KeyError, ZeroDivisionError) as error:
         raise ConfigError(
             "a number does not fit the table's format", where=name, hint="choose a larger lut.lsb_a"
@@ -234,14 +235,14 @@ def decode_table(name: str, data: bytes, values: Mapping[str, float]) -> tuple[f
     if name.startswith("lut.axis_") or values.get("lut.format") != LUT_FORMAT_INT16:
         return tuple(map(shortest_binary32, struct.unpack(f"<{len(data) // 4}f", data[: len(data) // 4 * 4])))
     lsb = values["lut.lsb_a"]
-    steps = struct.unpack(f"<{len(data) // 2}h", data[: len(data) // 2 * 2])
+    cells = math.prod(int(values.get(f"lut.n_{axis}", 0)) for axis in "xyz") or len(data) // 2
+    steps = struct.unpack(f"<{len(data) // 2}h", data[: len(data) // 2 * 2])[:cells]
     return tuple(math.nan if k == LUT_INT16_NO_POINT else k * lsb for k in steps)
 
 
 def look_up_words(encoded: Mapping[str, bytes]) -> bytes:
-    """Return axes and tables as they stand in the parameter image: in order, each padded to four bytes."""
-    parts = (encoded.get(name, b"") for name in TABLE_NAMES)
-    return b"".join(part + bytes(-len(part) % 4) for part in parts)
+    """Return axes and tables as they stand in the parameter image, one after the other."""
+    return b"".join(encoded.get(name, b"") for name in TABLE_NAMES)
 
 
 def shortest_binary32(value: float) -> float:

@@ -1,0 +1,117 @@
+"""Downloads that end at a chosen frame: the drive loses its supply, or the tool is killed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import can
+
+from pmsmtool.errors import PmsmtoolError
+from pmsmtool.firmware.image import crc32
+from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.sim.node.memory import RamStorage
+from pmsmtool.sim.node.parameter_set import ParameterImage
+from tests.flash.rig import attach, open_rig
+
+How = Literal["power cut", "killed"]
+
+
+class Killed(BaseException):
+    """SIGKILL, as far as a test in one process can have it: nothing the tool does afterwards has an effect."""
+
+
+@dataclass(frozen=True)
+class End:
+    """What was found after an interruption.
+
+    ``held`` is ``old`` or ``new``; ``finished`` tells whether the interruption came too late to matter.
+    """
+
+    held: str
+    finished: bool
+
+
+def frames_of(wanted: ParameterSet, root: Path) -> int:
+    """Return how many frames an undisturbed download takes from its first request on."""
+    rig = open_rig(root)
+    before = rig.bench.line.frames
+    rig.download(wanted)
+    return rig.bench.line.frames - before
+
+
+def interrupt(wanted: ParameterSet, root: Path, at: int, how: How, *, finish: Literal["again", "restore"]) -> End:
+    """Interrupt a download ``at`` frames after its first request, check the drive, finish, check again.
+
+    Raises AssertionError when the drive holds anything but the old or the new set, with a valid CRC.
+    """
+    storage = RamStorage()
+    rig = open_rig(root, storage=storage)
+    old = rig.image()
+    new = _image_after(old, wanted, root)
+    last = rig.bench.line.frames + at
+    deliver = rig.bench.line.deliver
+
+    def counted(sender: object, frame: object) -> None:
+        deliver(sender, frame)  # type: ignore[arg-type]
+        if rig.bench.line.frames == last:
+            if how == "power cut":
+                rig.bench.node.power_cut()
+            else:
+                rig.bench.bus.send = killed  # type: ignore[method-assign]
+
+    def killed(msg: can.Message, timeout: float | None = None) -> None:
+        raise Killed
+
+    rig.bench.line.deliver = counted  # type: ignore[method-assign]
+    finished = False
+    try:
+        rig.download(wanted)
+        finished = True
+    except (PmsmtoolError, Killed):
+        pass
+    rig.bench.line.deliver = deliver  # type: ignore[method-assign]
+    if how == "killed":
+        del rig.bench.bus.send
+    if not rig.bench.node.powered:
+        rig.bench.node.power_on()
+    rig.bench.wait(2.0)  # a store that was under way ends, a node that booted is up
+    assert_whole(rig.bench.node.session, old, new)
+    rig.bench.bus.clock.wait(0.1)
+    while rig.bench.bus.recv(0.0) is not None:
+        pass
+    again = attach(rig.bench, root)
+    held = "new" if again.image() == new else "old"
+    if finish == "again":
+        again.download(wanted)
+        assert again.image() == new
+    elif again.folder.last() is not None:
+        again.restore()
+        assert again.image() == old
+    journal = again.folder.last()
+    assert journal is None or journal.state != "open"
+    again.node.reset()
+    assert again.image() == (new if finish == "again" else old) or journal is None
+    assert_whole(again.bench.node.session, old, new)
+    again.bench.bus.shutdown()
+    return End(held, finished)
+
+
+def assert_whole(session: object, old: bytes, new: bytes) -> None:
+    """The active and the stored set are the old or the new one, and their CRCs say so."""
+    active = session.parameters.active.pack()  # type: ignore[attr-defined]
+    assert active in (old, new), "a mixed set acts"
+    assert session.parameters.active_crc == crc32(active)  # type: ignore[attr-defined]
+    stored = session.store.stored.get(0x2001 << 8)  # type: ignore[attr-defined]
+    assert stored in (None, old, new), "a mixed set is stored"
+
+
+def _image_after(old: bytes, wanted: ParameterSet, root: Path) -> bytes:
+    """The image the drive will hold, made without the download."""
+    from pmsmtool.firmware.drive_map import look_up_words, reference_map
+
+    image = ParameterImage.of_bytes(old)
+    for name, value in wanted.values.items():
+        image.set(name, value)
+    return bytes(image.words) + look_up_words(reference_map().encode(wanted))

@@ -1,0 +1,292 @@
+"""The download as a transaction: what arrives, what comes back, what survives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.bus.supervision import SecondMaster
+from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.errors import ConfigError, DriveFault, NotAvailable, PmsmtoolError, SafetyRefusal, VerifyMismatch
+from pmsmtool.firmware.drive_map import Cell, DriveMap, reference_map
+from pmsmtool.params.parameter_set import ParameterSet, default_set
+from tests.flash.rig import SMALL, Rig, attach, open_rig, with_tables
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Rig:
+    return open_rig(tmp_path)
+
+
+def test_set_arrives_is_stored_and_dated(rig: Rig) -> None:
+    outcome = rig.download(SMALL)
+    assert (outcome.written, outcome.equal, outcome.stored, outcome.starts) == (4, 0, True, 1)
+    image_crc, active, stored = rig.crcs()
+    assert image_crc == active == stored == outcome.crc
+    held = rig.node.map.decode(DriveParameters(rig.node).read(SMALL.values))
+    assert held.values == SMALL.values
+    assert rig.node.sdo.read(0x2000, 9) == bytes.fromhex(SMALL.content_hash()[7:])[:8]
+    assert int.from_bytes(rig.node.sdo.read(0x1020, 1), "little") == 15665  # days from 1984-01-01 to 2026-11-21
+    assert int.from_bytes(rig.node.sdo.read(0x1020, 2), "little") == 34_200_250
+    journal = rig.folder.last()
+    assert journal is not None and journal.state == "done"
+
+
+def test_second_run_writes_nothing(rig: Rig) -> None:
+    rig.download(SMALL)
+    before = rig.bench.line.frames
+    outcome = rig.download(SMALL)
+    assert (outcome.written, outcome.equal) == (0, 4)
+    writes = rig.bench.line.frames - before
+    assert writes < 120, "identity, old values and marks are read, nothing is written"
+    assert rig.bench.core.restarts == 1, "only the first download reset the drive"
+
+
+@pytest.mark.parametrize("kind", [1, 2])
+def test_tables_travel_and_are_held(rig: Rig, kind: int) -> None:
+    wanted = with_tables(17, kind)
+    rig.download(wanted)
+    held = rig.node.map.decode(DriveParameters(rig.node).read([*wanted.values, *wanted.tables]))
+    assert held.tables["lut.i_q_a"] == pytest.approx(wanted.tables["lut.i_q_a"], abs=1e-6)
+    assert len(set(rig.crcs())) == 1
+
+
+def test_full_set_and_part_of_a_table_later(rig: Rig) -> None:
+    rig.download(default_set().merged(with_tables()))
+    moved = ParameterSet({}, {"lut.i_d_a": [-1.0] * 81})
+    wanted = ParameterSet(
+        {"lut.format": 1, "lut.n_x": 9, "lut.n_y": 9, "lut.n_z": 1}, {**with_tables().tables, **moved.tables}
+    )
+    outcome = rig.download(wanted)
+    assert outcome.written == 1 and len(set(rig.crcs())) == 1
+
+
+def test_without_store_the_next_reset_forgets(rig: Rig) -> None:
+    before = rig.image()
+    rig.download(SMALL, store=False)
+    assert rig.image() != before
+    rig.node.reset()
+    assert rig.image() == before
+
+
+def test_restore_brings_back_the_very_bytes(rig: Rig) -> None:
+    rig.download(SMALL)
+    first = rig.image()
+    mark = rig.node.sdo.read(0x2000, 9)
+    rig.download(with_tables())
+    rig.restore()
+    assert rig.image() == first
+    assert rig.node.sdo.read(0x2000, 9) == mark
+    journal = rig.folder.last()
+    assert journal is not None and journal.state == "restored" and len(list(rig.folder.path.parent.iterdir())) == 3
+
+
+# ---- refusals before anything is written ---------------------------------------------------------
+
+
+def test_enabled_drive_is_left_alone(rig: Rig) -> None:
+    rig.node.enable()
+    before = rig.image()
+    with pytest.raises(SafetyRefusal, match="OPERATION ENABLED"):
+        rig.download(SMALL)
+    assert rig.image() == before and not rig.folder.path.exists()
+
+
+def test_another_drive_is_refused(rig: Rig) -> None:
+    rig.identity = replace(rig.identity, serial=99)
+    with pytest.raises(SafetyRefusal, match="another drive answers"):
+        rig.download(SMALL)
+    assert not rig.folder.path.exists()
+
+
+def test_second_master_is_refused_before_writing(rig: Rig) -> None:
+    plan = rig.plan(SMALL)
+    rig.bench.bus.clock.after(0.1, lambda: rig.bench.line.deliver(None, _frame(0x601, b"\x40\x41\x60\0" + bytes(4))))
+    with pytest.raises(SecondMaster):
+        rig.job(plan, {}).run()
+    assert not rig.folder.path.exists()
+
+
+def _frame(can_id: int, data: bytes) -> object:
+    from pmsmtool.sim.line import Frame
+
+    return Frame(can_id, data)
+
+
+def test_unknown_layout_is_refused(rig: Rig) -> None:
+    session = rig.bench.node.session
+    assert session is not None
+    session.dictionary["parameter_set.signature"].put(1)
+    with pytest.raises(NotAvailable, match="different versions"):
+        rig.download(SMALL)
+
+
+def test_unwritable_folder_is_refused_before_writing(rig: Rig, tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    rig.root = blocked
+    before = rig.image()
+    with pytest.raises(ConfigError, match="cannot be written"):
+        rig.download(SMALL)
+    assert rig.image() == before
+
+
+def test_bad_values_are_all_named_before_writing(rig: Rig) -> None:
+    wrong = ParameterSet({"motor.R_s_ohm": -1.0, "motor.pole_pairs": 99, "motor.L_d_h": 0.002})
+    with pytest.raises(ConfigError) as caught:
+        rig.download(wrong)
+    assert len(caught.value.violations) == 2
+
+
+# ---- failures on the way -------------------------------------------------------------------------
+
+
+def test_refused_values_are_all_named_and_the_old_set_comes_back(tmp_path: Path) -> None:
+    faults = (
+        '[[refuse]]\nobject = "0x2010:02"\ncode = 0x06090030\n[[refuse]]\nobject = "0x2010:03"\ncode = 0x06090031\n'
+    )
+    rig = open_rig(tmp_path, faults=faults)
+    before = rig.image()
+    with pytest.raises(DriveFault) as caught:
+        rig.download(SMALL)
+    message = str(caught.value)
+    assert "refused 2 of 4" in message and "motor.R_s_ohm" in message and "motor.L_d_h" in message
+    assert "holds exactly the old set again" in message
+    assert rig.image() == before and caught.value.exit_code == 4
+    journal = rig.folder.last()
+    assert journal is not None and journal.state == "restored"
+
+
+def test_refused_store_brings_the_old_set_back(tmp_path: Path) -> None:
+    rig = open_rig(tmp_path, faults='[[refuse]]\nobject = "0x1010:01"\ncode = 0x08000020\ncount = 1\n')
+    before = rig.image()
+    with pytest.raises(DriveFault, match="holds exactly the old set again"):
+        rig.download(SMALL)
+    assert rig.image() == before
+
+
+def test_slow_store_is_waited_for_and_sent_once(tmp_path: Path) -> None:
+    rig = open_rig(tmp_path, faults="[store]\nfactor = 20.0\n")
+    outcome = rig.download(SMALL)
+    assert outcome.stored and outcome.retries == 0
+
+
+def test_store_that_loses_its_answer_is_not_sent_twice(tmp_path: Path) -> None:
+    rig = open_rig(tmp_path)
+    session = rig.bench.node.session
+    assert session is not None
+    stores: list[bytes] = []
+    sink = session.dictionary["store.all"].sink
+    assert sink is not None
+    session.dictionary["store.all"].sink = lambda data: (stores.append(data), sink(data))[1]
+    session.sdo.finish = lambda: session.sdo.reset()  # type: ignore[method-assign]
+    rig.download(SMALL)
+    assert stores == [b"save"] and len(set(rig.crcs())) == 1
+
+
+def test_node_reset_in_the_middle_starts_over_once(tmp_path: Path) -> None:
+    rig = open_rig(tmp_path)
+    plan = rig.plan(SMALL)
+    job = rig.job(plan, {})
+    writes = 0
+
+    def progress(done: int, total: int) -> None:
+        nonlocal writes
+        writes += 1
+        if writes == 2:
+            rig.bench.nmt(0x81)
+            rig.connection.sent[0].append(bytes((0x81, 1)))
+            rig.bench.wait(0.1)
+
+    job._progress = progress
+    outcome = job.run()
+    assert outcome.starts == 2 and len(set(rig.crcs())) == 1
+
+
+def test_silent_rounding_is_caught(tmp_path: Path) -> None:
+    """A drive that stores something else than it confirmed."""
+    rig = open_rig(tmp_path)
+    session = rig.bench.node.session
+    assert session is not None
+    entry = session.dictionary["motor.L_d_h"]
+    sink = entry.sink
+    assert sink is not None
+    entry.sink = lambda data: sink(b"\0" + data[1:])
+    before = rig.image()
+    with pytest.raises(VerifyMismatch, match="motor.L_d_h"):
+        rig.download(SMALL)
+    assert rig.image() == before
+
+
+def test_ctrl_c_rolls_back_and_exits_130(rig: Rig) -> None:
+    before = rig.image()
+    job = rig.job(rig.plan(SMALL), {})
+
+    def progress(done: int, total: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    job._progress = progress
+    with pytest.raises(PmsmtoolError) as caught:
+        job.run()
+    assert caught.value.exit_code == 130 and "old set again" in str(caught.value)
+    assert rig.image() == before
+
+
+def test_drive_gone_keeps_the_journal_and_says_what_to_do(rig: Rig) -> None:
+    before = rig.image()
+    job = rig.job(rig.plan(SMALL), {})
+    job._progress = lambda done, total: rig.bench.node.power_cut() if done == 2 else None
+    with pytest.raises(PmsmtoolError) as caught:
+        job.run()
+    assert caught.value.exit_code == 3
+    assert "roll-back failed too" in str(caught.value) and "pmsmtool restore -n 1" in str(caught.value)
+    journal = rig.folder.last()
+    assert journal is not None and journal.state == "open"
+    rig.bench.node.power_on()
+    rig.bench.wait(0.2)
+    again = attach(rig.bench, rig.root)
+    assert again.image() == before
+    again.download(SMALL)
+    finished = again.folder.last()
+    assert finished is not None and finished.state == "done" and len(set(again.crcs())) == 1
+
+
+# ---- a drive without staging ---------------------------------------------------------------------
+
+
+def unstaged() -> DriveMap:
+    full = reference_map()
+    return DriveMap("plain", full.vendor, full.product, {n: c for n, c in full.cells.items() if n.startswith("motor.")})
+
+
+def test_drive_without_staging_is_written_read_back_and_rolled_back(tmp_path: Path) -> None:
+    rig = open_rig(tmp_path, drive_map=unstaged())
+    outcome = rig.download(SMALL)
+    assert outcome.written == 3 and outcome.crc is None
+    assert rig.plan(SMALL).missing == ("current.K_p_d_v_per_a",)
+    other = ParameterSet({"motor.R_s_ohm": 0.3, "motor.pole_pairs": 7, "motor.L_q_h": 0.004})
+    session = rig.bench.node.session
+    assert session is not None
+    sink = session.dictionary["motor.L_q_h"].sink
+    assert sink is not None
+    session.dictionary["motor.L_q_h"].sink = lambda data: sink(b"\0" + data[1:])
+    before = rig.image()
+    with pytest.raises(VerifyMismatch):
+        rig.download(other)
+    session.dictionary["motor.L_q_h"].sink = sink
+    assert rig.node.map.decode(DriveParameters(rig.node).read(["motor.R_s_ohm", "motor.pole_pairs"])).values == {
+        "motor.R_s_ohm": 0.25,
+        "motor.pole_pairs": 5,
+    }
+    assert rig.image()[:12] == before[:12]
+
+
+def test_quantised_values_are_shown_in_the_plan(rig: Rig) -> None:
+    cell = Cell("motor.I_max_apk", 0x2010, 6, "UNSIGNED32", 0.25)
+    scaled = DriveMap("scaled", rig.identity.vendor, rig.identity.product, {cell.name: cell})
+    rig.node.map = scaled
+    text = "\n".join(rig.plan(ParameterSet({"motor.I_max_apk": 40.1})).lines())
+    assert "(asked for 40.1)" in text and " 40 A" in text
