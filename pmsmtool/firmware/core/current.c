@@ -66,8 +66,63 @@ void pmsm_current_demand(pmsm_period *period)
 
 uint32_t pmsm_uses_predictor(const pmsm_params *params)
 {
-    const uint32_t asked = params->current_options & (uint32_t)PMSM_CURRENT_PREDICTOR;
+    const uint32_t governed = (params->governor_mode != PMSM_GOVERNOR_OFF) ? params->governor_options : 0u;
+    const uint32_t asked =
+        (params->current_options & (uint32_t)PMSM_CURRENT_PREDICTOR) | (governed & (uint32_t)PMSM_GOVERNOR_PREDICTOR);
     return (asked != 0u && params->inverter_delay_periods >= 1.0F) ? 1u : 0u;
+}
+
+void pmsm_current_row(pmsm_period *period, pmsm_row *row)
+{
+    const pmsm_dq reference = period->reference;
+    const pmsm_dq zero = {PMSM_C(0.0), PMSM_C(0.0)};
+    period->reference = zero;
+    pmsm_current_demand(period);
+    period->reference = reference;
+    row->m_dd = (pmsm_real)period->params->current_K_p_d_v_per_a;
+    row->m_dq = PMSM_C(0.0);
+    row->m_qd = PMSM_C(0.0);
+    row->m_qq = (pmsm_real)period->params->current_K_p_q_v_per_a;
+    row->c_d = period->u.d;
+    row->c_q = period->u.q;
+    row->V = period->V_max;
+}
+
+pmsm_dq pmsm_model_voltage(const pmsm_period *period, pmsm_dq i)
+{
+    const pmsm_params *params = period->params;
+    pmsm_dq u;
+    u.d = period->R_s * i.d - period->omega_e * (pmsm_real)params->motor_L_q_app_h * i.q;
+    u.q = period->R_s * i.q +
+          period->omega_e * ((pmsm_real)params->motor_L_d_app_h * i.d + (pmsm_real)params->motor_psi_f_wb);
+    return u;
+}
+
+/* Voltage that the model lacks, from what acted over the last period: the applied voltage minus the model's at the
+ * mean current and its change. First-order filter of gain observer_gain per period. */
+void pmsm_observe_disturbance(pmsm_period *period)
+{
+    pmsm_state *state = period->state;
+    const pmsm_params *params = period->params;
+    const pmsm_real gain = (pmsm_real)params->governor_observer_gain;
+    const pmsm_dq held = (params->inverter_delay_periods >= 1.0F) ? state->voltage_before : state->voltage_committed;
+    const pmsm_ab stator = {held.d, held.q};
+    pmsm_real sine;
+    pmsm_real cosine;
+    pmsm_sincos(PMSM_C(-0.5) * state->derived.T_s * period->omega_e, &sine, &cosine);
+    const pmsm_real sine_mean = period->sine * cosine + period->cosine * sine;
+    const pmsm_real cosine_mean = period->cosine * cosine - period->sine * sine;
+    const pmsm_dq u = pmsm_park(stator, sine_mean, cosine_mean);
+    const pmsm_dq i = {PMSM_C(0.5) * (period->i.d + state->current_before.d),
+                       PMSM_C(0.5) * (period->i.q + state->current_before.q)};
+    const pmsm_dq model = pmsm_model_voltage(period, i);
+    const pmsm_real rate = PMSM_C(1.0) / state->derived.T_s;
+    const pmsm_real slope_d = (period->i.d - state->current_before.d) * rate;
+    const pmsm_real slope_q = (period->i.q - state->current_before.q) * rate;
+    const pmsm_real z_d = u.d - model.d - (pmsm_real)params->motor_L_d_h * slope_d;
+    const pmsm_real z_q = u.q - model.q - (pmsm_real)params->motor_L_q_h * slope_q;
+    state->disturbance.d += gain * (z_d - state->disturbance.d);
+    state->disturbance.q += gain * (z_q - state->disturbance.q);
 }
 
 /* What the limiter took, as a change of the reference. A controller without a proportional part has none: at the limit

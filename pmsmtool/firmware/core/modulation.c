@@ -18,6 +18,20 @@ static pmsm_dq limit_to_circle(pmsm_period *period, pmsm_dq u)
     return u;
 }
 
+/* Circle, or in the hexagon U_dc over the largest line voltage of the unit vector. */
+pmsm_real pmsm_voltage_radius(const pmsm_period *period, pmsm_dq u)
+{
+    if (period->hexagon == 0u) {
+        return period->V_max;
+    }
+    const pmsm_abc legs = pmsm_clarke_inverse(pmsm_park_inverse(u, period->sine_out, period->cosine_out));
+    const pmsm_real ab = pmsm_abs(legs.a - legs.b);
+    const pmsm_real bc = pmsm_abs(legs.b - legs.c);
+    const pmsm_real ca = pmsm_abs(legs.c - legs.a);
+    const pmsm_real most = (ab > bc) ? ((ab > ca) ? ab : ca) : ((bc > ca) ? bc : ca);
+    return (most > PMSM_C(0.0)) ? period->U_dc * PMSM_SQRT(pmsm_square(u)) / most : period->V_max;
+}
+
 static pmsm_real error_shape(pmsm_real i, pmsm_real i_knee)
 {
     return pmsm_clamp(i / i_knee, PMSM_C(-1.0), PMSM_C(1.0));
@@ -71,8 +85,7 @@ static uint32_t set_duties(pmsm_abc u, pmsm_real U_dc, pmsm_output *output)
 void pmsm_modulate(pmsm_period *period, pmsm_output *output)
 {
     const uint32_t options = period->params->current_options;
-    const pmsm_dq limited =
-        ((options & PMSM_CURRENT_HEXAGON) != 0u) ? period->u : limit_to_circle(period, period->u);
+    const pmsm_dq limited = (period->hexagon != 0u) ? period->u : limit_to_circle(period, period->u);
     pmsm_ab stator = pmsm_park_inverse(limited, period->sine_out, period->cosine_out);
     const pmsm_abc wanted = pmsm_clarke_inverse(stator);
     const pmsm_abc error = dead_time_voltage(period);
@@ -87,7 +100,7 @@ void pmsm_modulate(pmsm_period *period, pmsm_output *output)
         stator = pmsm_clarke(applied);
         period->u_realised = pmsm_park(stator, period->sine_out, period->cosine_out);
         period->flags |= (uint32_t)PMSM_FLAG_DUTY_CLIPPED;
-        period->flags |= ((options & PMSM_CURRENT_HEXAGON) != 0u) ? (uint32_t)PMSM_FLAG_VOLTAGE_LIMITED : 0u;
+        period->flags |= (period->hexagon != 0u) ? (uint32_t)PMSM_FLAG_VOLTAGE_LIMITED : 0u;
     }
     output->u_alpha = stator.alpha;
     output->u_beta = stator.beta;

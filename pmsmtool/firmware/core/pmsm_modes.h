@@ -28,6 +28,19 @@ enum pmsm_governor_option {
     PMSM_GOVERNOR_MINIMUM_TIME = 1u << 4   /* steer the flux along the minimum-time direction */
 };
 
+/* pmsm_live.binding: a prediction row 0..PMSM_GOVERNOR_ROWS - 1, or one of these. */
+enum pmsm_binding {
+    PMSM_BINDING_MINIMUM_TIME = 250, /* the reference steers the flux along the minimum-time direction */
+    PMSM_BINDING_PRE_PROJECTION = 251, /* only the request itself was moved */
+    PMSM_BINDING_CURRENT = 252,      /* |reference| <= I_transient */
+    PMSM_BINDING_STEADY_STATE = 253,
+    PMSM_BINDING_EMPTY = 254,        /* no reference satisfies all rows: fallback */
+    PMSM_BINDING_NONE = 255
+};
+
+/* Prediction rows the core can hold; a longer k_max is cut to this, the steady-state row covers what follows. */
+#define PMSM_GOVERNOR_ROWS 64u
+
 enum pmsm_fw_mode {
     PMSM_FW_OFF = 0,
     PMSM_FW_LUT = 1,

@@ -9,6 +9,7 @@
 #include "pmsm_core.h"
 #include "pmsm_math.h"
 #include "pmsm_modes.h"
+#include "pmsm_projection.h"
 
 typedef struct {
     const pmsm_params *params;
@@ -28,6 +29,7 @@ typedef struct {
     pmsm_dq u;                 /* V, demanded */
     pmsm_dq u_realised;        /* V, after the limits, without dead-time compensation */
     pmsm_dq u_compensation;    /* V, dead-time compensation, when it is to be recorded */
+    uint32_t hexagon;          /* 1: the demand may use the inverter's hexagon, only the legs limit it */
     uint32_t flags;
 } pmsm_period;
 
@@ -49,9 +51,19 @@ pmsm_dq pmsm_lookup(pmsm_period *period, pmsm_real tau);
 uint32_t pmsm_uses_predictor(const pmsm_params *params);
 void pmsm_current_demand(pmsm_period *period);
 void pmsm_current_integrate(pmsm_period *period);
+void pmsm_current_row(pmsm_period *period, pmsm_row *row); /* demand as a function of the reference */
+pmsm_dq pmsm_model_voltage(const pmsm_period *period, pmsm_dq i); /* steady state, nominal flux */
+void pmsm_observe_disturbance(pmsm_period *period);
 pmsm_dq pmsm_predict_current(const pmsm_period *period);
 
+/* governor.c: period->reference becomes the governed one */
+void pmsm_govern(pmsm_period *period);
+
+/* minimum_time.c: 1 and the reference that steers along the minimum-time direction, or 0 */
+uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq target, pmsm_dq *v);
+
 /* modulation.c */
+pmsm_real pmsm_voltage_radius(const pmsm_period *period, pmsm_dq u); /* what the inverter gives in direction u */
 void pmsm_modulate(pmsm_period *period, pmsm_output *output);
 
 #endif

@@ -27,6 +27,7 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->reference_realised = zero;
     state->disturbance = zero;
     state->fw_reference = zero;
+    state->time_to_go = PMSM_C(0.0);
     state->speed_integrator = PMSM_C(0.0);
     state->notch_1 = PMSM_C(0.0);
     state->notch_2 = PMSM_C(0.0);
@@ -56,6 +57,13 @@ static pmsm_real winding_resistance(const pmsm_params *params, pmsm_real T_windi
     return (rise == rise) ? R_s * (PMSM_C(1.0) + (pmsm_real)params->motor_alpha_R_per_k * rise) : R_s;
 }
 
+static uint32_t uses_hexagon(const pmsm_params *params)
+{
+    const uint32_t governed = (params->governor_mode != PMSM_GOVERNOR_OFF) ? params->governor_options : 0u;
+    return ((params->current_options & PMSM_CURRENT_HEXAGON) != 0u || (governed & PMSM_GOVERNOR_HEXAGON) != 0u) ? 1u
+                                                                                                                : 0u;
+}
+
 static void transform(pmsm_period *period, const pmsm_measurement *m, pmsm_real advance)
 {
     const pmsm_abc phases = {m->i_a, m->i_b, m->i_c};
@@ -68,6 +76,7 @@ static void transform(pmsm_period *period, const pmsm_measurement *m, pmsm_real 
     period->U_dc = m->U_dc;
     period->V_max = (pmsm_real)period->params->inverter_voltage_utilisation * m->U_dc;
     period->R_s = winding_resistance(period->params, m->T_winding);
+    period->hexagon = uses_hexagon(period->params);
 }
 
 /* The current the mode asks for. */
@@ -91,6 +100,10 @@ static void control(pmsm_period *period, pmsm_output *output)
     period->reference = request;
     if (pmsm_uses_predictor(period->params) != 0u) {
         period->i_model = pmsm_predict_current(period);
+    }
+    if (period->params->governor_mode != PMSM_GOVERNOR_OFF) {
+        pmsm_observe_disturbance(period);
+        pmsm_govern(period);
     }
     pmsm_current_demand(period);
     pmsm_modulate(period, output);
