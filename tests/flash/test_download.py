@@ -12,6 +12,7 @@ from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.errors import ConfigError, DriveFault, NotAvailable, PmsmtoolError, SafetyRefusal, VerifyMismatch
 from pmsmtool.firmware.drive_map import Cell, DriveMap, reference_map
 from pmsmtool.params.parameter_set import ParameterSet, default_set
+from pmsmtool.sim.line import Frame
 from tests.flash.rig import SMALL, Rig, attach, open_rig, with_tables
 
 
@@ -103,16 +104,10 @@ def test_another_drive_is_refused(rig: Rig) -> None:
 
 def test_second_master_is_refused_before_writing(rig: Rig) -> None:
     plan = rig.plan(SMALL)
-    rig.bench.bus.clock.after(0.1, lambda: rig.bench.line.deliver(None, _frame(0x601, b"\x40\x41\x60\0" + bytes(4))))
+    rig.bench.bus.clock.after(0.1, lambda: rig.bench.line.deliver(None, Frame(0x601, b"\x40\x41\x60\0" + bytes(4))))
     with pytest.raises(SecondMaster):
         rig.job(plan, {}).run()
     assert not rig.folder.path.exists()
-
-
-def _frame(can_id: int, data: bytes) -> object:
-    from pmsmtool.sim.line import Frame
-
-    return Frame(can_id, data)
 
 
 def test_unknown_layout_is_refused(rig: Rig) -> None:
@@ -180,8 +175,16 @@ def test_store_that_loses_its_answer_is_not_sent_twice(tmp_path: Path) -> None:
     stores: list[bytes] = []
     sink = session.dictionary["store.all"].sink
     assert sink is not None
-    session.dictionary["store.all"].sink = lambda data: (stores.append(data), sink(data))[1]
-    session.sdo.finish = lambda: session.sdo.reset()  # type: ignore[method-assign]
+
+    def store(data: bytes) -> bool | None:
+        stores.append(data)
+        return sink(data)
+
+    def finish(code: int | None = None) -> None:
+        session.sdo.reset()  # the confirmation never leaves
+
+    session.dictionary["store.all"].sink = store
+    session.sdo.finish = finish  # type: ignore[method-assign]
     rig.download(SMALL)
     assert stores == [b"save"] and len(set(rig.crcs())) == 1
 
