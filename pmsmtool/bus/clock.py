@@ -8,6 +8,7 @@ passes when somebody waits for one, and at once; periodic jobs (a heartbeat) are
 from __future__ import annotations
 
 import heapq
+import importlib
 import signal
 import threading
 import time
@@ -24,8 +25,9 @@ _JOINT_STEP_NS = 10_000_000
 # Several runners advance together in steps of this size, so that none is far ahead when another stops early.
 
 _MAIN_THREAD = threading.main_thread().ident
-# signal.signal without its enum conversions: it runs twice per frame.
-_set_handler: Callable[[int, Any], Any] = getattr(signal.signal, "__wrapped__", signal.signal)
+_SIGINT = int(signal.SIGINT)
+_signal: Any = importlib.import_module("_signal")
+# The module behind ``signal``: its enum conversions would cost a third of the time of a frame.
 
 
 class Ticker(Protocol):
@@ -120,7 +122,7 @@ class _Held:
         if threading.get_ident() == _MAIN_THREAD:
             if self._depth == 0:
                 # First the handler, then the lock: an interrupt in between leaves neither behind.
-                self._previous = _set_handler(signal.SIGINT, self._remember)
+                self._previous = _signal.signal(_SIGINT, self._remember)
             self._depth += 1
         self._lock.acquire()
 
@@ -132,10 +134,10 @@ class _Held:
             self._depth -= 1
             if self._depth == 0:
                 previous = self._previous
-                _set_handler(signal.SIGINT, signal.SIG_DFL if previous is None else previous)
+                _signal.signal(_SIGINT, _signal.SIG_DFL if previous is None else previous)
                 if self._pending:
                     self._pending = False
-                    signal.raise_signal(signal.SIGINT)
+                    _signal.raise_signal(_SIGINT)
 
 
 class _VirtualTicker:

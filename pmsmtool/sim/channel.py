@@ -156,9 +156,9 @@ CoreMaker = Callable[["MachineFile", int], "DriveCore"]
 
 
 def _kernel(machine_file: MachineFile, seed: int) -> DriveCore:
-    from pmsmtool.sim import drive_kernel
+    from pmsmtool.sim.drive_kernel import create
 
-    return drive_kernel.create(machine_file, seed)
+    return create(machine_file, seed)
 
 
 def build_line(

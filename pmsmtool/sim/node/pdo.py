@@ -1,0 +1,261 @@
+"""Process data objects of the node: four each way, freely mapped (CiA 301: 7.2.2, 7.5.2.35 to 7.5.2.38)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.clock import Timer
+from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+from pmsmtool.sim.node.schedule import Schedule
+
+COUNT = 4
+MAX_OBJECTS = 8
+TOO_SHORT = 0x8210
+_OFF = 1 << 31
+_SYNC_TYPES = range(1, 241)
+_EVENT_TYPES = (254, 255)
+_TICK_NS = 100_000
+_MS_NS = 1_000_000
+
+
+@dataclass(slots=True)
+class _Pdo:
+    """One PDO: its keys' prefix and what it carries now."""
+
+    name: str
+    entries: list[Entry] = field(default_factory=list)
+    last: bytes = b""
+    free_ns: int = 0
+    syncs: int = 0
+    waiting: bytes | None = None
+    event: Timer | None = None
+    deferred: Timer | None = None
+
+
+class ProcessData:
+    """All PDOs of a session.
+
+    Parameters
+    ----------
+    operational : callable
+        Whether the NMT state lets PDOs pass.
+    send : callable
+        Transmits (COB-ID, data).
+    fault : callable
+        Reports an emergency code.
+    """
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        schedule: Schedule,
+        operational: Callable[[], bool],
+        send: Callable[[int, bytes], None],
+        fault: Callable[[int], None],
+    ) -> None:
+        self._dictionary = dictionary
+        self._schedule = schedule
+        self._operational = operational
+        self._send = send
+        self._fault = fault
+        self.receive_ids: dict[int, _Pdo] = {}
+        self._rpdos = [_Pdo(f"rpdo{number + 1}") for number in range(COUNT)]
+        self._tpdos = [_Pdo(f"tpdo{number + 1}") for number in range(COUNT)]
+        for pdo in (*self._rpdos, *self._tpdos):
+            self._hook(pdo)
+        self.configure()
+
+    # ---- configuration -------------------------------------------------------------------------
+
+    def _number(self, pdo: _Pdo, key: str) -> int:
+        return self._dictionary[f"{pdo.name}.{key}"].integer()
+
+    def _hook(self, pdo: _Pdo) -> None:
+        entries = self._dictionary.by_key
+        entries[f"{pdo.name}.cob_id"].sink = self._cob_id_sink(pdo)
+        entries[f"{pdo.name}.count"].sink = self._count_sink(pdo)
+        for number in range(MAX_OBJECTS):
+            entries[f"{pdo.name}.object_{number + 1}"].sink = self._object_sink(pdo, number)
+        for key in ("type", "event_ms"):
+            if f"{pdo.name}.{key}" in entries:
+                entries[f"{pdo.name}.{key}"].sink = self._plain_sink(f"{pdo.name}.{key}")
+
+    def _plain_sink(self, key: str) -> Callable[[bytes], None]:
+        def sink(data: bytes) -> None:
+            if key.endswith("type") and 241 <= data[0] <= 253:
+                raise Refused(AbortCode.VALUE)  # reserved, or on remote request only
+            self._dictionary[key].value = data
+            self.configure()
+
+        return sink
+
+    def _cob_id_sink(self, pdo: _Pdo) -> Callable[[bytes], None]:
+        def sink(data: bytes) -> None:
+            entry = self._dictionary[f"{pdo.name}.cob_id"]
+            old, new = entry.integer(), int.from_bytes(data, "little")
+            if new & 0x1FFFF800 or (not (old | new) & _OFF and (old ^ new) & 0x7FF):
+                raise Refused(AbortCode.VALUE)  # 29-bit identifiers; or a valid PDO's identifier changed
+            entry.value = data
+            self.configure()
+
+        return sink
+
+    def _object_sink(self, pdo: _Pdo, number: int) -> Callable[[bytes], None]:
+        def sink(data: bytes) -> None:
+            if self._number(pdo, "count"):
+                raise Refused(AbortCode.ACCESS)
+            word = int.from_bytes(data, "little")
+            if word:
+                self._mapped(pdo, word)
+            self._dictionary[f"{pdo.name}.object_{number + 1}"].value = data
+
+        return sink
+
+    def _count_sink(self, pdo: _Pdo) -> Callable[[bytes], None]:
+        def sink(data: bytes) -> None:
+            if not self._number(pdo, "cob_id") & _OFF:
+                raise Refused(AbortCode.ACCESS)
+            self._collect(pdo, data[0])
+            self._dictionary[f"{pdo.name}.count"].value = data
+            self.configure()
+
+        return sink
+
+    def _mapped(self, pdo: _Pdo, word: int) -> Entry:
+        entry = self._dictionary.find(word >> 16, word >> 8 & 0xFF)
+        row = entry.row
+        direction = "R" if pdo.name.startswith("rpdo") else "T"
+        # What can be received is mappable for sending too (its value is read back), not the other way round.
+        if row.pdo != direction and not (direction == "T" and row.pdo == "R"):
+            raise Refused(AbortCode.NOT_MAPPABLE)
+        if word & 0xFF != 8 * entry.size:
+            raise Refused(AbortCode.PDO_LENGTH)
+        return entry
+
+    def _collect(self, pdo: _Pdo, count: int) -> list[Entry]:
+        words = [self._number(pdo, f"object_{number + 1}") for number in range(count)]
+        entries = [self._mapped(pdo, word) for word in words]
+        if sum(entry.size for entry in entries) > 8:
+            raise Refused(AbortCode.PDO_LENGTH)
+        return entries
+
+    def configure(self) -> None:
+        """Take over what the communication and mapping objects say."""
+        self.receive_ids.clear()
+        for pdo in self._rpdos:
+            pdo.entries = self._collect(pdo, self._number(pdo, "count"))
+            cob_id = self._number(pdo, "cob_id")
+            if not cob_id & _OFF:
+                self.receive_ids[cob_id & 0x7FF] = pdo
+        for pdo in self._tpdos:
+            pdo.entries = self._collect(pdo, self._number(pdo, "count"))
+            pdo.last = b""
+            if pdo.event is not None:
+                pdo.event.cancel()
+            self._plan_event(pdo)
+
+    def _is_valid(self, pdo: _Pdo) -> bool:
+        return bool(pdo.entries) and not self._number(pdo, "cob_id") & _OFF
+
+    # ---- received ------------------------------------------------------------------------------
+
+    def receive(self, can_id: int, data: bytes) -> bool:
+        """Take a received PDO; returns whether the identifier is one of ours."""
+        pdo = self.receive_ids.get(can_id)
+        if pdo is None or not self._operational():
+            return pdo is not None
+        length = sum(entry.size for entry in pdo.entries)
+        if len(data) < length:
+            self._fault(TOO_SHORT)
+        elif self._number(pdo, "type") in _SYNC_TYPES or self._number(pdo, "type") == 0:
+            pdo.waiting = data
+        else:
+            self._take(pdo, data)
+        return True
+
+    def _take(self, pdo: _Pdo, data: bytes) -> None:
+        position = 0
+        for entry in pdo.entries:
+            piece = data[position : position + entry.size]
+            position += entry.size
+            try:
+                self._dictionary.write(entry, piece)
+            except Refused:
+                continue  # a PDO is not answered; the value in force stays
+
+    # ---- transmitted ---------------------------------------------------------------------------
+
+    def _content(self, pdo: _Pdo) -> bytes:
+        return b"".join(entry.read() for entry in pdo.entries)
+
+    def start(self) -> None:
+        """The node has become operational: every event-driven PDO is sent once."""
+        for pdo in self._tpdos:
+            pdo.last = b""
+            self._plan_event(pdo)
+        self.changed()
+
+    def changed(self) -> None:
+        """Send the event-driven PDOs whose content has changed."""
+        if not self._operational():
+            return
+        for pdo in self._tpdos:
+            if self._is_valid(pdo) and self._number(pdo, "type") in _EVENT_TYPES:
+                content = self._content(pdo)
+                if content != pdo.last:
+                    self._emit(pdo, content)
+
+    def _emit(self, pdo: _Pdo, content: bytes) -> None:
+        now = self._schedule.now_ns
+        if now < pdo.free_ns:
+            if pdo.deferred is None:
+                pdo.deferred = self._schedule.at(pdo.free_ns, lambda: self._emit_deferred(pdo))
+            return
+        pdo.last = content
+        pdo.free_ns = now + self._number(pdo, "inhibit") * _TICK_NS
+        self._send(self._number(pdo, "cob_id") & 0x7FF, content)
+
+    def _emit_deferred(self, pdo: _Pdo) -> None:
+        pdo.deferred = None
+        if self._operational() and self._is_valid(pdo):
+            self._emit(pdo, self._content(pdo))
+
+    def _plan_event(self, pdo: _Pdo) -> None:
+        if pdo.event is not None:
+            pdo.event.cancel()
+            pdo.event = None
+        period_ns = self._number(pdo, "event_ms") * _MS_NS
+        if period_ns and self._is_valid(pdo) and self._number(pdo, "type") in _EVENT_TYPES and self._operational():
+            pdo.event = self._schedule.at(self._schedule.now_ns + period_ns, lambda: self._on_event(pdo))
+
+    def _on_event(self, pdo: _Pdo) -> None:
+        pdo.event = None
+        if self._operational() and self._is_valid(pdo):
+            self._emit(pdo, self._content(pdo))
+        self._plan_event(pdo)
+
+    def sync(self) -> None:
+        """A SYNC has arrived."""
+        if not self._operational():
+            return
+        for pdo in self._rpdos:
+            if pdo.waiting is not None:
+                data, pdo.waiting = pdo.waiting, None
+                self._take(pdo, data)
+        for pdo in self._tpdos:
+            if self._is_valid(pdo):
+                self._sync_one(pdo)
+
+    def _sync_one(self, pdo: _Pdo) -> None:
+        kind = self._number(pdo, "type")
+        if kind == 0:
+            content = self._content(pdo)
+            if content != pdo.last:
+                self._emit(pdo, content)
+        elif kind in _SYNC_TYPES:
+            pdo.syncs += 1
+            if pdo.syncs >= kind:
+                pdo.syncs = 0
+                self._emit(pdo, self._content(pdo))

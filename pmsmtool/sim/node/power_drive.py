@@ -1,0 +1,376 @@
+"""The CiA 402 power drive system of the node: state machine, modes, references, reactions.
+
+Torque values travel in permille of the rated torque 0x6076 (mN m), currents in permille of the rated current 0x6075
+(mA rms), speeds in thousandths of a mechanical revolution per minute (mrpm).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.clock import NS, Timer
+from pmsmtool.cia402 import AbortConnection, Control, FaultReaction, Mode, QuickStop, State, Status
+from pmsmtool.sim.node.dictionary import Dictionary, Refused
+from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore, Signal
+from pmsmtool.sim.node.emergency import Emergency
+from pmsmtool.sim.node.schedule import Schedule
+
+RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
+HEARTBEAT_LOST = 0x8130
+EXCITATION_ABORTED = 0xFF10
+STANDSTILL_SHARE = 0.002
+"""Share of n_max below which the machine counts as standing."""
+STANDSTILL_FLOOR_RPM = 2.0
+CURRENT_GONE_SHARE = 0.02
+"""Share of I_nom below which a ramped-down current counts as zero."""
+_STOP_POLL_S = 0.002
+_STOP_MARGIN_S = 0.5
+_STOP_FACTOR = 1.5
+_SLOPE_STEP_S = 0.001
+_SPEED_MODES = (Mode.PROFILE_VELOCITY, Mode.CYCLIC_VELOCITY)
+_TORQUE_MODES = (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE)
+_LIMIT_FLAGS = 0x01 | 0x02 | 0x04 | 0x100
+# Flags of the core that show as "internal limit active": voltage, duty, current, I2t.
+
+
+class Plant(Protocol):
+    """What the power drive needs of the hardware it sits on."""
+
+    core: DriveCore
+
+    def look(self) -> None:
+        """Bring the core to the present instant."""
+
+    def parameter(self, name: str) -> float:
+        """Return an active parameter."""
+
+
+class PowerDrive:
+    """State machine and references.
+
+    Attributes
+    ----------
+    state : State
+        Present state.
+    on_state, on_leave : callables
+        Called after every change of the state; when normal operation ends, by a stop, a fault or another mode.
+    speed_injection : bool
+        Whether the identification mode needs the speed controller (set by the excitation).
+    """
+
+    def __init__(self, dictionary: Dictionary, schedule: Schedule, plant: Plant, emergency: Emergency) -> None:
+        self.state = State.SWITCH_ON_DISABLED
+        self.on_state: Callable[[], None] = lambda: None
+        self.on_leave: Callable[[], None] = lambda: None
+        self.speed_injection = False
+        self._dictionary = dictionary
+        self._schedule = schedule
+        self._plant = plant
+        self._emergency = emergency
+        self._controlword = 0
+        self._error_code = 0
+        self._torque_demand = 0.0
+        self._slope_timer: Timer | None = None
+        self._stop_timer: Timer | None = None
+        self._stop_deadline_ns = 0
+        self._after_stop = State.SWITCH_ON_DISABLED
+        self._hook()
+
+    # ---- objects -------------------------------------------------------------------------------
+
+    def _hook(self) -> None:
+        entries = self._dictionary.by_key
+        entries["cia402.controlword"].sink = self._write_controlword
+        entries["cia402.mode"].sink = self._write_mode
+        entries["cia402.quick_stop"].sink = self._write_quick_stop
+        for key in ("target_torque", "torque_offset", "target_velocity"):
+            entries[f"cia402.{key}"].sink = self._reference_sink(f"cia402.{key}")
+        for key in ("i_d_a", "i_q_a", "fixed_angle_rad"):
+            entries[f"set_point.{key}"].sink = self._reference_sink(f"set_point.{key}")
+        sources: dict[str, Callable[[], float]] = {
+            "error_code": lambda: self._error_code,
+            "statusword": self.statusword,
+            "mode_display": lambda: self.mode,
+            "position": self._position,
+            "velocity": lambda: self.omega_m() / RAD_S_PER_MRPM,
+            "torque_demand": lambda: self._torque_demand,
+            "torque": lambda: self._signal(Signal.TAU) / self._rated_torque_nm() * 1000.0,
+            "current": self._current,
+            "dc_link": lambda: 1000.0 * self._signal(Signal.U_DC),
+        }
+        for key, value in sources.items():
+            self._hook_source(f"cia402.{key}", value)
+        entries["cia402.encoder_counts"].put(self._plant.core.encoder_counts)
+
+    def _hook_source(self, key: str, value: Callable[[], float]) -> None:
+        entry = self._dictionary[key]
+        entry.source = lambda: entry.encode(value())
+
+    def _reference_sink(self, key: str) -> Callable[[bytes], None]:
+        def sink(data: bytes) -> None:
+            self._dictionary[key].value = data
+            self.apply()
+
+        return sink
+
+    def _write_quick_stop(self, data: bytes) -> None:
+        if int.from_bytes(data, "little", signed=True) not in set(QuickStop):
+            raise Refused(AbortCode.VALUE)
+        self._dictionary["cia402.quick_stop"].value = data
+
+    def _number(self, key: str) -> float:
+        return self._dictionary[f"cia402.{key}"].number()
+
+    def _signal(self, signal: Signal) -> float:
+        self._plant.look()
+        return self._plant.core.signal(signal)
+
+    def _rated_torque_nm(self) -> float:
+        return self._number("rated_torque") / 1000.0
+
+    def _current(self) -> float:
+        i_d, i_q = self._signal(Signal.I_D), self._signal(Signal.I_Q)
+        milliampere_rms = 1000.0 * math.copysign(math.hypot(i_d, i_q), i_q) / math.sqrt(2.0)
+        return 1000.0 * milliampere_rms / self._number("rated_current")
+
+    def _position(self) -> float:
+        count = round(self._signal(Signal.THETA_M) / (2.0 * math.pi) * self._plant.core.encoder_counts)
+        return (count + (1 << 31)) % (1 << 32) - (1 << 31)
+
+    def omega_m(self) -> float:
+        """Return the mechanical speed the drive sees (rad/s)."""
+        return self._signal(Signal.OMEGA_E) / max(1.0, self._plant.parameter("motor.pole_pairs"))
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of operation."""
+        return Mode(self._dictionary["cia402.mode"].integer())
+
+    def statusword(self) -> int:
+        """Return the statusword."""
+        word = Status(self.state) | Status.REMOTE
+        if self._signal(Signal.U_DC) >= self._plant.parameter("protection.U_dc_min_v"):
+            word |= Status.VOLTAGE_ENABLED
+        if self.state is State.OPERATION_ENABLED:
+            if int(self._signal(Signal.FLAGS)) & _LIMIT_FLAGS:
+                word |= Status.INTERNAL_LIMIT
+            word |= self._mode_bits()
+        return int(word)
+
+    def _mode_bits(self) -> Status:
+        if self.mode in _SPEED_MODES:
+            omega = self.omega_m()
+            reached = abs(omega - self._target_speed()) <= self._standstill_rad_s()
+            bits = Status.TARGET_REACHED if reached else Status(0)
+            return bits | (Status.SPEED_ZERO if abs(omega) <= self._standstill_rad_s() else Status(0))
+        if self.mode in _TORQUE_MODES:
+            target = self._target_torque()
+            return Status.TARGET_REACHED if self._torque_demand == target else Status(0)
+        return Status(0)
+
+    # ---- state machine -------------------------------------------------------------------------
+
+    def _write_controlword(self, data: bytes) -> None:
+        word = int.from_bytes(data, "little")
+        rising = word & ~self._controlword
+        self._controlword = word
+        self._dictionary["cia402.controlword"].value = data
+        self._plant.look()
+        if self.state is State.FAULT:
+            if rising & Control.FAULT_RESET:
+                self._reset_fault()
+            return
+        if self.state is not State.FAULT_REACTION_ACTIVE:
+            self._command(word)
+
+    def _command(self, word: int) -> None:
+        state = self.state
+        if not word & Control.ENABLE_VOLTAGE:
+            if state is not State.SWITCH_ON_DISABLED:
+                self._to(State.SWITCH_ON_DISABLED)
+        elif not word & Control.QUICK_STOP_OFF:
+            if state is State.OPERATION_ENABLED:
+                self._begin_stop(self._quick_stop_option())
+            elif state in (State.READY_TO_SWITCH_ON, State.SWITCHED_ON):
+                self._to(State.SWITCH_ON_DISABLED)
+        elif not word & Control.SWITCH_ON:
+            if state in (State.SWITCH_ON_DISABLED, State.SWITCHED_ON, State.OPERATION_ENABLED):
+                self._to(State.READY_TO_SWITCH_ON)
+        elif not word & Control.ENABLE_OPERATION:
+            if state in (State.READY_TO_SWITCH_ON, State.OPERATION_ENABLED):
+                self._to(State.SWITCHED_ON)
+        elif state is State.OPERATION_ENABLED:
+            self.apply()  # the halt bit may have changed
+        elif state in (State.READY_TO_SWITCH_ON, State.SWITCHED_ON) or self._may_resume():
+            self._to(State.OPERATION_ENABLED)
+
+    def _may_resume(self) -> bool:
+        return self.state is State.QUICK_STOP_ACTIVE and self._quick_stop_option().stays
+
+    def _quick_stop_option(self) -> QuickStop:
+        return QuickStop(int(self._number("quick_stop")))
+
+    def _to(self, state: State) -> None:
+        was_energised = self.state.energised
+        self.state = state
+        if self._stop_timer is not None and state not in (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE):
+            self._stop_timer.cancel()
+            self._stop_timer = None
+        if state is State.OPERATION_ENABLED:
+            self._torque_demand = 0.0
+            self.apply()
+        elif not state.energised:
+            self._plant.core.command(Command())
+            if was_energised:
+                self.on_leave()
+        self.on_state()
+
+    def _begin_stop(self, option: QuickStop, *, fault: bool = False) -> None:
+        """Quick stop (transition 11) or fault reaction with a ramp (transition 13)."""
+        if option is QuickStop.DISABLE:
+            self._to(State.FAULT if fault else State.SWITCH_ON_DISABLED)
+            return
+        self.on_leave()
+        self._after_stop = State.FAULT if fault else State.SWITCH_ON_DISABLED
+        deceleration = self._number("quick_stop_deceleration") / 60.0 * 2.0 * math.pi
+        seconds = _STOP_MARGIN_S + _STOP_FACTOR * abs(self.omega_m()) / deceleration
+        self._stop_deadline_ns = self._schedule.now_ns + round(seconds * NS)
+        mode = self._control_mode()
+        self._plant.core.command(Command(mode, quick_stop=True))
+        self._to(State.FAULT_REACTION_ACTIVE if fault else State.QUICK_STOP_ACTIVE)
+        self._stop_timer = self._schedule.after(_STOP_POLL_S, self._poll_stop)
+
+    def _poll_stop(self) -> None:
+        self._stop_timer = None
+        if self.state not in (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE):
+            return
+        if not self._has_stopped() and self._schedule.now_ns < self._stop_deadline_ns:
+            self._stop_timer = self._schedule.after(_STOP_POLL_S, self._poll_stop)
+            return
+        if self._after_stop is State.FAULT or not self._quick_stop_option().stays:
+            self._to(self._after_stop)
+
+    def _has_stopped(self) -> bool:
+        if self._control_mode() is ControlMode.SPEED:
+            return abs(self.omega_m()) <= self._standstill_rad_s()
+        current = math.hypot(self._signal(Signal.I_D), self._signal(Signal.I_Q))
+        return current <= CURRENT_GONE_SHARE * self._plant.parameter("motor.I_nom_apk")
+
+    def _standstill_rad_s(self) -> float:
+        rpm = max(STANDSTILL_FLOOR_RPM, STANDSTILL_SHARE * self._plant.parameter("motor.n_max_rpm"))
+        return rpm / 60.0 * 2.0 * math.pi
+
+    def _reset_fault(self) -> None:
+        core = self._plant.core
+        core.reset_fault()
+        if core.trip():
+            return
+        self._error_code = 0
+        self._emergency.clear()
+        self._to(State.SWITCH_ON_DISABLED)
+
+    def fail(self, code: int, detail: bytes = b"", *, ramp: bool = False) -> None:
+        """Enter the fault state; with ``ramp`` by the fault reaction option code, else at once."""
+        if self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            return
+        self._error_code = code
+        self._emergency.raise_error(code, detail)
+        reaction = FaultReaction(int(self._number("fault_reaction")))
+        if ramp and self.state.energised and reaction is not FaultReaction.DISABLE:
+            self._begin_stop(QuickStop.QUICK_STOP_RAMP, fault=True)
+        else:
+            self._to(State.FAULT)
+
+    def check_trip(self) -> None:
+        """Report a trip the core has latched."""
+        code = self._plant.core.trip()
+        if code and self.state is not State.FAULT:
+            if self.state is State.FAULT_REACTION_ACTIVE:
+                self._error_code = code
+                self._to(State.FAULT)
+                self._emergency.raise_error(code)
+            else:
+                self.fail(code)
+
+    def connection_lost(self, node: int) -> None:
+        """React to a lost heartbeat as object 0x6007 says."""
+        option = AbortConnection(int(self._number("abort_connection")))
+        self._plant.look()
+        if option is AbortConnection.FAULT:
+            self.fail(HEARTBEAT_LOST, bytes((node,)), ramp=True)
+            return
+        self._emergency.raise_error(HEARTBEAT_LOST, bytes((node,)))
+        if option is AbortConnection.DISABLE_VOLTAGE and self.state.energised:
+            self._to(State.SWITCH_ON_DISABLED)
+        elif option is AbortConnection.QUICK_STOP and self.state is State.OPERATION_ENABLED:
+            self._begin_stop(self._quick_stop_option())
+
+    # ---- modes and references ------------------------------------------------------------------
+
+    def _write_mode(self, data: bytes) -> None:
+        number = int.from_bytes(data, "little", signed=True)
+        if number not in set(Mode):
+            raise Refused(AbortCode.VALUE)
+        changed = self._dictionary["cia402.mode"].value != data
+        self._dictionary["cia402.mode"].value = data
+        if changed and self.state is State.OPERATION_ENABLED:
+            self.on_leave()
+            self._torque_demand = 0.0
+            self.apply()
+
+    def _control_mode(self) -> ControlMode:
+        mode = self.mode
+        if mode in _SPEED_MODES or (mode is Mode.IDENTIFICATION and self.speed_injection):
+            return ControlMode.SPEED
+        return ControlMode.TORQUE if mode in _TORQUE_MODES else ControlMode.CURRENT
+
+    def _target_speed(self) -> float:
+        if self._controlword & Control.HALT:
+            return 0.0
+        limit = self._number("max_speed") * 1000.0
+        return min(max(self._number("target_velocity"), -limit), limit) * RAD_S_PER_MRPM
+
+    def _target_torque(self) -> float:
+        """Return the target torque in permille of rated."""
+        if self._controlword & Control.HALT:
+            return 0.0
+        limit = self._number("max_torque")
+        return min(max(self._number("target_torque") + self._number("torque_offset"), -limit), limit)
+
+    def apply(self) -> None:
+        """Give the references of the present mode to the core."""
+        if self.state is not State.OPERATION_ENABLED:
+            return
+        self._plant.look()
+        control = self._control_mode()
+        if control is ControlMode.TORQUE:
+            self._step_torque()
+        elif control is ControlMode.SPEED:
+            self._plant.core.command(Command(control, omega_m_rad_s=self._target_speed()))
+        elif self.mode is Mode.IDENTIFICATION and not self._controlword & Control.HALT:
+            i_d, i_q, angle = (
+                self._dictionary[f"set_point.{key}"].number() for key in ("i_d_a", "i_q_a", "fixed_angle_rad")
+            )
+            self._plant.core.command(Command(control, i_d_a=i_d, i_q_a=i_q, fixed_angle_rad=angle))
+        else:
+            self._plant.core.command(Command(control))
+
+    def _step_torque(self) -> None:
+        """Move the demand towards the target by the torque slope, once per millisecond."""
+        if self._slope_timer is not None:
+            self._slope_timer.cancel()
+            self._slope_timer = None
+        if self.state is not State.OPERATION_ENABLED or self._control_mode() is not ControlMode.TORQUE:
+            return
+        target = self._target_torque()
+        step = self._number("torque_slope") * _SLOPE_STEP_S
+        self._torque_demand += min(max(target - self._torque_demand, -step), step)
+        torque = self._torque_demand / 1000.0 * self._rated_torque_nm()
+        self._plant.core.command(Command(ControlMode.TORQUE, torque_nm=torque))
+        if self._torque_demand != target:
+            self._slope_timer = self._schedule.after(_SLOPE_STEP_S, self._step_torque)
+
+

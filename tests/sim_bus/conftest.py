@@ -1,0 +1,5 @@
+"""Benches for the tests of the bus; see ``tests/node``."""
+
+from tests.node.conftest import bench, make_bench
+
+__all__ = ["bench", "make_bench"]
