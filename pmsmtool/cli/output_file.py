@@ -2,21 +2,46 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from pmsmtool.errors import ConfigError
 
 
 def write_file(path: Path, content: bytes | str) -> None:
-    """Write a file; raises ``ConfigError`` naming it when that fails."""
+    """Write a file in one step: a reader finds the old or the new one, never a part.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be written; the old file, if there was one, is still there.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        if path.exists() and not path.is_file():  # a device such as /dev/stdout cannot be replaced
+            path.write_bytes(data)
+            return
+        part.write_bytes(data)
+        os.replace(part, path)
     except OSError as error:
-        raise ConfigError(
-            f"cannot be written: {error.strerror}", where=str(path), hint="choose another folder"
-        ) from None
+        raise _unwritable(path, error) from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it; raises ``ConfigError`` when that fails."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error) from None
 
 
 def inside(path: Path, name: str) -> Path:
     """Return a file, or the file of that name in a run directory."""
     return path / name if path.is_dir() else path
+
+
+def _unwritable(path: Path, error: OSError) -> ConfigError:
+    return ConfigError(f"cannot be written: {error.strerror}", where=str(path), hint="choose another folder")

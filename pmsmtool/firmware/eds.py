@@ -6,6 +6,7 @@ object list with a warning, or refused when nothing usable remains. Nothing rais
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -79,7 +80,8 @@ class Section:
 
 def decode(data: bytes) -> tuple[str, str]:
     """Return text and the name of the encoding that fits: UTF-8 (with or without mark), cp1252, Latin-1."""
-    for encoding in ("utf-8-sig", "cp1252"):
+    marked = data.startswith(codecs.BOM_UTF8)
+    for encoding in ("utf-8-sig" if marked else "utf-8", "cp1252"):
         try:
             return data.decode(encoding), encoding
         except UnicodeDecodeError:

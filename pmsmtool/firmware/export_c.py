@@ -44,11 +44,7 @@ def c_files(image: bytes, *, prefix: str = "pmsm", design_id: str = "") -> dict[
     ConfigError
         If the prefix is no C identifier, or the image is refused.
     """
-    if not _PREFIX.match(prefix):
-        raise ConfigError(
-            f"{prefix!r} cannot be the prefix of C names",
-            hint="use letters, digits and underscores, starting with a letter",
-        )
+    _check_prefix(prefix)
     values, lut = unpack_image(image)
     return {
         f"{prefix}_cfg.h": _header(prefix, image, lut, design_id),
@@ -60,11 +56,20 @@ def c_files(image: bytes, *, prefix: str = "pmsm", design_id: str = "") -> dict[
 
 def header_file(image: bytes, *, prefix: str = "pmsm", design_id: str = "") -> str:
     """Return the configuration alone as one header: the macros and a ``static const`` instance."""
+    _check_prefix(prefix)
     values, lut = unpack_image(image)
     head = _header(prefix, image, lut, design_id)
     instance = _instance(prefix, values, lut, "static const")
     declaration = f"extern const {prefix}_cfg_type {prefix}_cfg;\n"
     return head.replace(declaration, instance)
+
+
+def _check_prefix(prefix: str) -> None:
+    if not _PREFIX.match(prefix):
+        raise ConfigError(
+            f"{prefix!r} cannot be the prefix of C names",
+            hint="use letters, digits and underscores, starting with a letter",
+        )
 
 
 def core_files() -> Iterator[tuple[str, str]]:

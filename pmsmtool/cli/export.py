@@ -1,0 +1,194 @@
+"""``pmsmtool export``: a design or a parameter set in the forms other programs take."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmsmtool.cli.options import FILE, NODE, examples, text_options
+from pmsmtool.cli.output import Output
+from pmsmtool.cli.output_file import write_file
+
+if TYPE_CHECKING:
+    from pmsmtool.firmware.drive_map import DriveMap
+    from pmsmtool.params.parameter_set import ParameterSet
+
+_SOURCE = click.argument("design", type=click.Path(path_type=Path))
+_OUTPUT = click.option("-o", "--output", "path", type=FILE, help="File to write.  [default: standard output]")
+_MAP = click.option("--drive-map", "map_path", type=FILE, help="Map of the drive's objects.  [default: the reference]")
+_PREFIX = click.option("--prefix", default="pmsm", help="C identifier in front of every name.")
+
+
+@click.group("export")
+def export_command() -> None:
+    """Write a design as files for other programs.
+
+    DESIGN is design.toml, params.toml, a .dcf or a run directory. Each file depends on the parameters alone: no date,
+    no path, no name of a person.
+    """
+
+
+def _written(command: Callable[..., bytes | str]) -> Callable[..., None]:
+    """Write what a command returns to ``-o`` or to standard output."""
+
+    @functools.wraps(command)
+    def write(path: Path | None, out: Output, **given: Any) -> None:
+        content = command(out=out, **given)
+        if path is None:
+            if isinstance(content, bytes) and b"\0" in content and sys.stdout.isatty():
+                raise click.UsageError("binary data is not printed on a terminal: give -o FILE")
+            click.echo(content, nl=False)
+        else:
+            write_file(path, content)
+            out.note(f"wrote {path}")
+
+    return write
+
+
+def _drive_map(path: Path | None) -> DriveMap:
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.firmware.drive_map import parse_drive_map, reference_map
+
+    if path is None:
+        return reference_map()
+    try:
+        return parse_drive_map(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read: {error}", where=str(path)) from None
+
+
+def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
+    """Read the set and say what the drive has no object for."""
+    from pmsmtool.workflow.parameter_source import load_parameters
+
+    wanted = load_parameters(design, drive_map)
+    missing = drive_map.missing(wanted)
+    if missing:
+        out.warn(f"drive family {drive_map.name} has no object for {', '.join(missing)}")
+    return wanted
+
+
+@export_command.command(
+    "dcf",
+    epilog=examples(
+        "pmsmtool export dcf design.toml --node 5 -o drive5.dcf",
+        "pmsmtool export dcf design.toml --into vendor.eds --drive-map vendor-map.toml -o drive.dcf",
+    ),
+)
+@_SOURCE
+@click.option("--into", type=FILE, help="EDS or DCF to lay the values into; its other bytes are kept.")
+@click.option("-n", "--node", "node_id", type=NODE, default=1, help="Node id for a file that names none.")
+@_MAP
+@_OUTPUT
+@text_options
+@_written
+def dcf_command(design: Path, into: Path | None, node_id: int, map_path: Path | None, out: Output) -> bytes:
+    """Write a device configuration file (CiA 306)."""
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.workflow.export import dcf_file
+
+    drive_map = _drive_map(map_path)
+    if into is None and map_path is not None:
+        raise click.UsageError("--drive-map needs --into: the data sheet of that drive")
+    try:
+        base = None if into is None else into.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {error.strerror}", where=str(into)) from None
+    wanted = _parameters(design, drive_map, out)
+    return dcf_file(wanted, drive_map=drive_map, base=base, node_id=node_id, where=str(into or "EDS"))
+
+
+@export_command.command("cdcf", epilog=examples("pmsmtool export cdcf design.toml -o drive.cdcf"))
+@_SOURCE
+@_MAP
+@_OUTPUT
+@text_options
+@_written
+def cdcf_command(design: Path, map_path: Path | None, out: Output) -> bytes:
+    """Write a concise DCF (CiA 302-2): what a CANopen manager sends at boot-up.
+
+    A complete set is framed by the staging commands of the drive, which then takes it as a whole.
+    """
+    from pmsmtool.workflow.export import concise_dcf
+
+    drive_map = _drive_map(map_path)
+    return concise_dcf(_parameters(design, drive_map, out), drive_map=drive_map)
+
+
+@export_command.command("header", epilog=examples("pmsmtool export header design.toml --prefix left -o left_cfg.h"))
+@_SOURCE
+@_PREFIX
+@_OUTPUT
+@text_options
+@_written
+def header_command(design: Path, prefix: str, out: Output) -> str:
+    """Write one C header with the parameters as a static constant."""
+    from pmsmtool.firmware.export_c import header_file
+    from pmsmtool.workflow.export import image_of
+    from pmsmtool.workflow.parameter_source import load_parameters
+
+    wanted = load_parameters(design)
+    return header_file(image_of(wanted), prefix=prefix, design_id=wanted.content_hash())
+
+
+@export_command.command("c", epilog=examples("pmsmtool export c design.toml --prefix left -o firmware"))
+@_SOURCE
+@_PREFIX
+@click.option(
+    "-o",
+    "--output",
+    "folder",
+    type=click.Path(file_okay=False, path_type=Path),
+    required=True,
+    help="Folder to write into; made when it is not there.",
+)
+@text_options
+def c_command(design: Path, prefix: str, folder: Path, out: Output) -> None:
+    """Write the parameters and the control core as C99 sources.
+
+    The core is what the simulated drive runs, byte for byte; the compiler flags it is checked with stand at the top of
+    the configuration.
+    """
+    from pmsmtool.cli.output_file import make_folder
+    from pmsmtool.firmware.export_c import c_files
+    from pmsmtool.workflow.export import image_of
+    from pmsmtool.workflow.parameter_source import load_parameters
+
+    wanted = load_parameters(design)
+    files = c_files(image_of(wanted), prefix=prefix, design_id=wanted.content_hash())
+    make_folder(folder)
+    for name, text in files.items():
+        write_file(folder / name, text)
+    out.note(f"wrote {len(files)} files to {folder}")
+
+
+@export_command.command("csv", epilog=examples("pmsmtool export csv design.toml -o parameters.csv"))
+@_SOURCE
+@_MAP
+@_OUTPUT
+@text_options
+@_written
+def csv_command(design: Path, map_path: Path | None, out: Output) -> str:
+    """Write a table: value asked for and held, unit, object, type, bytes, meaning."""
+    from pmsmtool.workflow.export import csv_text
+
+    drive_map = _drive_map(map_path)
+    return csv_text(_parameters(design, drive_map, out), drive_map=drive_map)
+
+
+@export_command.command("params", epilog=examples("pmsmtool export params design.toml -o params.toml"))
+@_SOURCE
+@_OUTPUT
+@text_options
+@_written
+def params_command(design: Path, out: Output) -> str:
+    """Write the parameter set that flash-params sends."""
+    from pmsmtool.workflow.export import checked
+    from pmsmtool.workflow.parameter_source import load_parameters
+
+    return checked(load_parameters(design)).to_toml()

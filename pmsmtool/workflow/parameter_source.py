@@ -1,0 +1,78 @@
+"""Where parameters come from: a parameter set, a design, a run directory or a device configuration file."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+from pmsmtool.design import design_file
+from pmsmtool.design.design_file import parse_design
+from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.dcf import values_of
+from pmsmtool.firmware.drive_map import DriveMap, reference_map
+from pmsmtool.firmware.eds import parse_eds
+from pmsmtool.params import parameter_set
+from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
+
+_IN_A_RUN = ("params.toml", "design.toml")
+_DCF_SUFFIXES = (".dcf", ".eds")
+
+
+def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterSet:
+    """Return the parameter set that a file or a run directory holds.
+
+    Parameters
+    ----------
+    path : Path
+        ``params.toml``, ``design.toml`` (told apart by their schema), a ``.dcf``, or a run directory.
+    drive_map : DriveMap, optional
+        What the objects of a DCF mean; the reference drive's when not given.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, is none of these, or what is wrong with it.
+    """
+    path = _file(path)
+    if path.suffix.lower() in _DCF_SUFFIXES:
+        return _from_dcf(path, drive_map or reference_map())
+    try:
+        text = path.read_text(encoding="utf-8")
+        schema = tomllib.loads(text).get("schema")
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"cannot be read: {error}", where=str(path)) from error
+    if schema == design_file.SCHEMA:
+        return parse_design(text, where=str(path)).parameter_set()
+    if schema == parameter_set.SCHEMA:
+        return parse_parameter_set(text, str(path))
+    raise ConfigError(
+        f"schema is {schema!r}, expected {design_file.SCHEMA!r} or {parameter_set.SCHEMA!r}",
+        where=str(path),
+        hint="give design.toml or params.toml as `tune` writes them",
+    )
+
+
+def _file(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    found = next((path / name for name in _IN_A_RUN if (path / name).is_file()), None)
+    if found is None:
+        raise ConfigError("there is no design in this folder", where=str(path), hint="`pmsmtool tune` writes one")
+    return found
+
+
+def _from_dcf(path: Path, drive_map: DriveMap) -> ParameterSet:
+    try:
+        sheet = parse_eds(path.read_bytes(), str(path))
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
+    values = values_of(sheet)
+    names = (*drive_map.cells, *drive_map.tables)
+    found = {name: values[drive_map.address(name)] for name in names if drive_map.address(name) in values}
+    if not found:
+        raise ConfigError(
+            f"holds no parameter of the drive family {drive_map.name}",
+            where=str(path),
+            likely="an EDS without values, or the file of another drive",
+        )
+    return drive_map.decode(found)
