@@ -70,7 +70,8 @@ def test_with_a_bit_rate_every_frame_takes_its_stuffed_length(make_bench: BenchM
 
 
 def test_the_lowest_identifier_wins_when_the_wire_becomes_free(bench: Bench) -> None:
-    frames = [Frame(0x300, b"a"), Frame(0x7FF, b"b"), Frame(0x123 << 18 | 5, b"c", 1), Frame(0x123, b"d"), Frame(0x080, b"")]
+    standard = [Frame(can_id, b"a") for can_id in (0x300, 0x7FF, 0x123, 0x080)]
+    frames = [*standard, Frame(0x123 << 18 | 5, b"c", 1)]
     with bench.bus.clock.held:
         for frame in frames:
             bench.bus._in_flight += 1

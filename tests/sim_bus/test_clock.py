@@ -31,7 +31,11 @@ def test_actions_run_at_their_instant_in_the_order_they_were_planned() -> None:
     clock.at(200, lambda: seen.append(("c", clock.now_ns)))
     cancelled = clock.at(150, lambda: seen.append(("never", clock.now_ns)))
     cancelled.cancel()
-    clock.at(100, lambda: clock.at(100, lambda: seen.append(("a2", clock.now_ns))))
+
+    def plan_another() -> None:
+        clock.at(100, lambda: seen.append(("a2", clock.now_ns)))
+
+    clock.at(100, plan_another)
     assert clock.next_ns() == 100
     clock.run_until(1000)
     assert seen == [("a", 100), ("a2", 100), ("b", 200), ("c", 200)]

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from pmsmtool.bus.frame_time import frame_bits, unstuffed_bits
 
 
-def transmitted_bits(can_id: int, data: bytes, extended: bool, remote: bool = False, dlc: int | None = None):
+def transmitted_bits(
+    can_id: int, data: bytes, extended: bool, remote: bool = False, dlc: int | None = None
+) -> list[int]:
     """Build the frame as a list of bits: fields, CRC by long division, stuffing by counting."""
 
     def field(value: int, width: int) -> list[int]:
