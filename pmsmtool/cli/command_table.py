@@ -45,6 +45,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("machine", "pmsmtool.cli.machine:machine_command", Section.COMPUTE, "Make a machine file from a datasheet."),
     Row("tune", "pmsmtool.cli.tune:tune_command", Section.COMPUTE, "Design the control of a machine."),
     Row("export", "pmsmtool.cli.export:export_command", Section.COMPUTE, "Write a design as DCF, C, CSV."),
+    Row("lut", "pmsmtool.cli.lut:lut_command", Section.COMPUTE, "Make current references over torque and speed."),
     Row("help", "pmsmtool.cli.help_topics:help_command", Section.TOOL, "Explain a topic or a command."),
     Row("completion", "pmsmtool.cli.completion:completion_command", Section.TOOL, "Print a shell's completion script."),
 )

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pmsmtool.errors import ConfigError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def write_file(path: Path, content: bytes | str) -> None:
@@ -36,6 +40,34 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _unwritable(path, error) from None
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Save a figure in the format of the suffix, the same bytes for the same figure.
+
+    Raises
+    ------
+    ConfigError
+        A suffix matplotlib does not know, or a file that cannot be written.
+    """
+    import io
+
+    import matplotlib
+
+    suffix = path.suffix.lower().lstrip(".")
+    if suffix not in _FIGURE_METADATA:
+        raise ConfigError(f"{path.name} has no figure format", where=str(path), hint="use .svg, .png or .pdf")
+    out = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "pmsmtool", "svg.fonttype": "path"}):
+        figure.savefig(out, format=suffix, metadata=_FIGURE_METADATA[suffix])
+    write_file(path, out.getvalue())
+
+
+_FIGURE_METADATA: dict[str, dict[str, None]] = {
+    "svg": {"Date": None},
+    "png": {"Software": None},
+    "pdf": {"CreationDate": None},
+}
 
 
 def inside(path: Path, name: str) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -13,7 +14,7 @@ from typing import Any
 from pmsmtool.design.sampled_loop import LoopMargins
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.key import did_you_mean
-from pmsmtool.machine.machine_file import MachineFile, machine_from_tables, machine_tables
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_from_tables, machine_tables
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 from pmsmtool.toml_text import toml_lines, toml_text
@@ -153,6 +154,19 @@ def load_design(path: Path) -> Design:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot be read as text: {error}", where=str(path)) from None
     return parse_design(text, where=str(path))
+
+
+def load_machine_or_design(path: Path) -> tuple[MachineFile, Design | None]:
+    """Read a machine file or a design, told apart by their schema; a design brings its own machine."""
+    text = ""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        pass  # the reader below says what is wrong
+    if re.search(rf'^schema\s*=\s*"{re.escape(SCHEMA)}"', text, re.MULTILINE):
+        design = load_design(path)
+        return design.machine, design
+    return load_machine_file(path), None
 
 
 def parse_design(text: str, *, where: str = "design.toml") -> Design:

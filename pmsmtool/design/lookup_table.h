@@ -19,6 +19,18 @@ PMSM_EXPORT int32_t pmsm_lookup_table(const pmsm_plane *plane, int32_t n_T, cons
                                       const double *omega, int32_t n_V, const double *V, double *i_d, double *i_q,
                                       double *achieved, uint8_t *limits, double *extreme);
 
+/* Error of the linearly interpolated table x (torque) x y (speed or flux limit) x z (voltage), m points per interval.
+ *
+ * omega_per_y: electrical speed over y, null for a flux table (omega 1, limit y); limit[n_z]: voltage limit at the
+ * nodes of z, null for a flux table. range[fine y][fine z][2]: least and largest torque there (N m).
+ * worst: [n_x - 1][n_y - 1][3][3]: for points between nodes of x only (0), of y only (1), inside the cell (2): largest
+ * |torque - nearest admissible torque| (N m), |v| - limit (V or Wb), |i| - I_max (A), each also negative where the
+ * limit is far; -infinity where nothing was sampled. A point on a node counts for kind 0. */
+PMSM_EXPORT void pmsm_lookup_error(const pmsm_plane *plane, int32_t n_x, const double *x, int32_t n_y, const double *y,
+                                   const double *omega_per_y, int32_t n_z, const double *z, const double *limit,
+                                   const double *i_d, const double *i_q, int32_t m, const double *range,
+                                   double *worst);
+
 /* sizeof(pmsm_plane), to check the caller's idea of it. */
 PMSM_EXPORT uint32_t pmsm_plane_size(void);
 

@@ -120,6 +120,11 @@ class LookupTable:
         names = np.array([binding_name(k) for k in range(64)])
         return names[self.limits]
 
+    def binding_counts(self) -> tuple[list[str], list[int]]:
+        """Return the names of the limits that bind somewhere, and in how many cells."""
+        names, counts = np.unique(self.binding, return_counts=True)
+        return names.tolist(), counts.tolist()
+
     def with_currents(self, i_d_a: Array, i_q_a: Array) -> LookupTable:
         """Return the table with other stored currents (rounded ones); torque and margins follow from them."""
         voltage, limit = _demand(self, i_d_a, i_q_a)

@@ -50,6 +50,10 @@ def design_library() -> Any:
     data, integer, plane = ctypes.c_void_p, ctypes.c_int32, ctypes.POINTER(PlaneStruct)
     lib.pmsm_lookup_table.argtypes = (plane, *(integer, data) * 3, *(data,) * 5)
     lib.pmsm_lookup_table.restype = integer
+    lib.pmsm_lookup_error.argtypes = (
+        plane, integer, data, integer, data, data, integer, data, data, data, data, integer, data, data,
+    )  # fmt: skip
+    lib.pmsm_lookup_error.restype = None
     return lib
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from pmsmtool.design.lookup_table import (
     CUT,
     NONE,
+    LookupTable,
     binding_name,
     electrical_speed,
     speed_table,
@@ -40,7 +42,7 @@ M = OperatingMachine(4, 0.0, 1e-3, 2.5e-3, 0.1)
 N = OperatingMachine(4, 0.05, 1e-3, 1e-3, 0.1)
 
 
-def cell(machine: OperatingMachine, torque: float, omega: float, V: float, I_max: float):
+def cell(machine: OperatingMachine, torque: float, omega: float, V: float, I_max: float) -> tuple[Any, ...]:
     rpm = omega / machine.pole_pairs * 60.0 / (2.0 * math.pi)
     t = speed_table(machine, torque_nm=[torque], speed_rpm=[rpm], V_max_v=[V], I_max_apk=I_max)
     return float(t.i_d_a[0, 0, 0]), float(t.i_q_a[0, 0, 0]), float(t.achieved_torque_nm[0, 0, 0]), t.binding[0, 0, 0]
@@ -226,7 +228,9 @@ def test_every_kind_of_cell_against_brute_force(name: str) -> None:
             check_cell(case, table, x, y, float(wanted), (least, largest), T_top)
 
 
-def check_cell(case: Case, table, x: int, y: int, wanted: float, bounds: tuple[float, float], T_top: float) -> None:
+def check_cell(
+    case: Case, table: LookupTable, x: int, y: int, wanted: float, bounds: tuple[float, float], T_top: float
+) -> None:
     limits, i_d, i_q = int(table.limits[x, y, 0]), table.i_d_a[x, y, 0], table.i_q_a[x, y, 0]
     where = f"{wanted:.5g} N m at {table.y[y]:.5g} rpm: ({i_d:.6g}, {i_q:.6g}) A, {binding_name(limits)}, {bounds}"
     if math.isnan(bounds[0]):

@@ -1,0 +1,112 @@
+"""``pmsmtool lut``: current references over torque and speed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmsmtool.cli.options import FILE, Quantity, examples, output_options
+from pmsmtool.cli.output import Output, table
+from pmsmtool.cli.output_file import inside, save_figure, write_file
+
+if TYPE_CHECKING:
+    from pmsmtool.design.lookup_design import LookupDesign
+
+_TEMPERATURE = Quantity("temperature")
+
+
+@click.command(
+    "lut",
+    epilog=examples(
+        "pmsmtool lut design.toml -o lut.npz",
+        "pmsmtool lut machine.toml -o lut.npz --torque-points 100 --speed-points 100 --plot lut.svg",
+        "pmsmtool lut machine.toml -o hot.npz --winding 140degC --magnet 110degC --u-dc 480V --u-dc 540V",
+    ),
+)
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("-o", "--output", "path", type=FILE, required=True, help="Table to write (.npz); a .csv goes beside it.")
+@click.option("--axis", type=click.Choice(["speed", "flux"]), default="speed", help="Second axis.")
+@click.option("--torque-points", type=int, metavar="N", help="Uniform torque axis.  [default: refined to the bounds]")
+@click.option("--speed-points", "y_points", type=int, metavar="N", help="Uniform second axis.")
+@click.option("--torque-bound", type=float, default=0.01, metavar="RATIO", help="Torque error between nodes / T_max.")
+@click.option("--voltage-bound", type=float, default=0.01, metavar="RATIO", help="Voltage excess there / limit.")
+@click.option("--stored", type=click.Choice(["auto", "float32", "int16"]), default="auto", help="Format in the drive.")
+@click.option("--u-dc", "U_dc_v", type=Quantity("voltage"), multiple=True, help="DC-link voltage; several: an axis.")
+@click.option("--winding", "T_winding_c", type=_TEMPERATURE, help="Winding temperature, e.g. 140degC.")
+@click.option("--magnet", "T_magnet_c", type=_TEMPERATURE, help="Magnet temperature.")
+@click.option("--n-max", "n_max_rpm", type=Quantity("rpm"), help="Largest speed, e.g. 3000rpm.")
+@click.option("--voltage-margin", type=float, metavar="RATIO", help="Share of V_max kept.  [default: the design's]")
+@click.option("--iron-loss", type=FILE, help="Iron-loss map (.npz): least total loss instead of least copper loss.")
+@click.option("--plot", "plot_path", type=FILE, help="Figure to write (.svg, .png, .pdf).")
+@output_options
+def lut_command(
+    source: Path,
+    path: Path,
+    voltage_margin: float | None,
+    iron_loss: Path | None,
+    plot_path: Path | None,
+    out: Output,
+    **asked: Any,
+) -> None:
+    """Make the current references of SOURCE, a machine file, a design or a run directory.
+
+    Least loss for every torque and speed within current, voltage, demagnetisation and map; motoring and generating;
+    with the limit that binds and the margins of every cell. Exit code 1 when the bounds do not fit the drive's memory.
+    """
+    from pmsmtool.design.iron_loss import load_iron_loss_map
+    from pmsmtool.design.lookup_design import LookupRequest, design_table
+    from pmsmtool.design.lookup_file import table_csv, table_facts, table_npz
+    from pmsmtool.design.lookup_loci import loci
+
+    file = inside(source, "design.toml" if (source / "design.toml").is_file() else "machine.toml")
+    machine, rated, margin = _limits(file, voltage_margin)
+    if iron_loss is None and machine.machine.iron_loss_map is not None:
+        iron_loss = file.parent / machine.machine.iron_loss_map
+    loss_map = None if iron_loss is None else load_iron_loss_map(iron_loss)
+    made = design_table(machine, rated, LookupRequest(**asked), margin, loss_map)
+    facts = table_facts(made.table, made.stored, made.error)
+    lines = loci(made.table) if made.table.axis_kind == "speed" else {}
+    write_file(path, table_npz(made.table, facts, lines))
+    write_file(path.with_suffix(".csv"), table_csv(made.table))
+    written = [path, path.with_suffix(".csv")]
+    if plot_path is not None:
+        from pmsmtool.design.lookup_plot import lookup_figure
+
+        save_figure(lookup_figure(made.table, lines), plot_path)
+        written.append(plot_path)
+    out.result("lut", {"files": written, "notes": made.notes, **facts, **_counts(made)}, lambda: _lines(made))
+    for note in made.notes:
+        out.note(note)
+    out.note(f"wrote {', '.join(map(str, written))}")
+
+
+def _limits(file: Path, voltage_margin: float | None) -> tuple[Any, Any, float]:
+    from pmsmtool.design.design_file import load_machine_or_design
+    from pmsmtool.design.ratings import ratings
+    from pmsmtool.design.tune_request import TuneRequest
+
+    machine, design = load_machine_or_design(file)
+    if voltage_margin is None:
+        voltage_margin = TuneRequest().voltage_margin if design is None else design["field_weakening.margin"]
+    return machine, ratings(machine, (1.0 - voltage_margin) * machine.inverter.V_max_v), voltage_margin
+
+
+def _counts(made: LookupDesign) -> dict[str, Any]:
+    names, counts = made.table.binding_counts()
+    return {"cells": dict(zip(names, counts, strict=True)), "shape": made.table.i_d_a.shape}
+
+
+def _lines(made: LookupDesign) -> Iterator[str]:
+    lookup, error = made.table, made.error
+    shape = " x ".join(map(str, lookup.i_d_a.shape))
+    end = f"torque to {lookup.torque_nm[-1]:.4g} N m, {lookup.axis_kind} to {lookup.y[-1]:.5g}"
+    yield f"{shape} cells, {made.stored}; {end}"
+    yield (
+        f"between nodes: torque within {error.torque_nm:.3g} N m, voltage at most {error.voltage_v:.3g} "
+        f"and current at most {error.current_a:.3g} A beyond their limits"
+    )
+    yield ""
+    yield from table(("limit", "cells"), zip(*lookup.binding_counts(), strict=True))

@@ -1,0 +1,257 @@
+"""The table as the drive uses it: stored numbers, the error between its nodes, and a grid that keeps it in bounds.
+
+A table is exact at its nodes and linear between them; over the kinks where another limit takes over the currents
+bend, and linear interpolation misses torque and overshoots limits. The error is measured with the numbers as stored
+(binary32, or int16 times a step) on points inside every cell, and axes are refined where it is largest.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.design.lookup_table import RPM, LookupTable, torque_limits
+from pmsmtool.design.operating_machine import design_library
+from pmsmtool.errors import DesignInfeasible
+from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS
+
+Array = NDArray[np.float64]
+StoredFormat = Literal["float32", "int16"]
+
+POINTS_PER_INTERVAL = 10
+"""Points per interval and axis at which the error is measured."""
+
+BOUND_SAFETY = 1.05
+"""The reported bound over the largest error measured: peaks between the points (measured: at most 1.02)."""
+
+INT16_LARGEST = 32767
+"""Full scale of a stored current; -32768 says that a cell has no point."""
+
+AXIS_NODES_MAX = 255
+"""Nodes of an axis in the drive (``lut.n_x`` is one byte)."""
+
+
+@dataclass(frozen=True, slots=True)
+class InterpolationError:
+    """Largest errors of a stored table between its nodes, each a bound (``BOUND_SAFETY`` included).
+
+    Attributes
+    ----------
+    torque_nm : float
+        |torque of the interpolated currents - nearest admissible torque| (N m).
+    voltage_v : float
+        Voltage beyond the limit (V; Wb for a flux table); 0 when it is never exceeded.
+    current_a : float
+        Current beyond I_max (A); 0 when it is never exceeded.
+    torque_at : tuple of float
+        Torque (N m) and speed (rpm; Wb) of the cell that decides ``torque_nm``.
+    holes : int
+        Cells with a corner without a point; the bounds hold outside them only as far as points exist.
+    """
+
+    torque_nm: float
+    voltage_v: float
+    current_a: float
+    torque_at: tuple[float, float]
+    holes: int
+
+
+def stored_axes(*axes: Array) -> tuple[Array, ...]:
+    """Round axes to binary32, as the drive holds them."""
+    return tuple(axis.astype(np.float32).astype(np.float64) for axis in axes)
+
+
+def lsb_a(table: LookupTable) -> float:
+    """Return the int16 step (A) that spans the table's currents, a binary32 number."""
+    largest = max(float(np.nanmax(np.abs(t), initial=0.0)) for t in (table.i_d_a, table.i_q_a))
+    step = np.float32(max(largest, 1e-6) / INT16_LARGEST)
+    return float(step if float(step) * INT16_LARGEST >= largest else np.nextafter(step, np.float32(np.inf)))
+
+
+def as_stored(table: LookupTable, stored: StoredFormat) -> LookupTable:
+    """Return the table with the currents the drive will read back; torque and margins follow them."""
+    if stored == "float32":
+        currents = (t.astype(np.float32).astype(np.float64) for t in (table.i_d_a, table.i_q_a))
+    else:
+        step = lsb_a(table)
+        currents = (np.rint(t / step) * step for t in (table.i_d_a, table.i_q_a))
+    return table.with_currents(*currents)
+
+
+def cell_errors(table: LookupTable, points: int = POINTS_PER_INTERVAL) -> Array:
+    """Measure a stored table between its nodes.
+
+    Returns
+    -------
+    ndarray, shape (n_x - 1, n_y - 1, 3, 3)
+        Between nodes of torque only, of speed only, inside the cell; each torque error (N m), voltage and current
+        beyond the limit (negative: below), as ``pmsm_lookup_error`` says.
+    """
+    worst = np.empty((table.torque_nm.size - 1, table.y.size - 1, 3, 3))
+    speed = table.axis_kind == "speed"
+    per_y = ctypes.c_double(table.machine.pole_pairs / RPM)
+    plane = table.machine.as_struct(table.I_max_apk, table.i_d_min_a)
+    if not speed:
+        plane.R = 0.0
+    range_nm = _fine_limits(table, points)
+    x, y, z = (np.ascontiguousarray(a) for a in (table.torque_nm, table.y, table.U_dc_v))
+    limit = np.ascontiguousarray(table.V_max_v)
+    i_d, i_q = np.ascontiguousarray(table.i_d_a), np.ascontiguousarray(table.i_q_a)
+    design_library().pmsm_lookup_error(
+        ctypes.byref(plane), x.size, x.ctypes.data, y.size, y.ctypes.data, ctypes.addressof(per_y) if speed else None,
+        z.size, z.ctypes.data, limit.ctypes.data if speed else None, i_d.ctypes.data, i_q.ctypes.data, points,
+        range_nm.ctypes.data, worst.ctypes.data,
+    )  # fmt: skip
+    return worst
+
+
+def _fine(axis: Array, points: int) -> Array:
+    if axis.size < 2:
+        return axis
+    share = np.arange(points) / points
+    inner = axis[:-1, None] + np.diff(axis)[:, None] * share
+    return np.append(inner.ravel(), axis[-1])
+
+
+def _fine_limits(table: LookupTable, points: int) -> Array:
+    """Least and largest torque at the fine nodes of y and z, shape (f_y, f_z, 2)."""
+    y = _fine(table.y, points)
+    if table.axis_kind == "flux":
+        from dataclasses import replace
+
+        bounds = torque_limits(replace(table.machine, R=0.0), [1.0], y, table.I_max_apk, table.i_d_min_a)
+        return np.ascontiguousarray(np.stack((bounds.least_nm.T, bounds.largest_nm.T), axis=-1))
+    omega = y * table.machine.pole_pairs / RPM
+    bounds = torque_limits(table.machine, omega, _fine(table.V_max_v, points), table.I_max_apk, table.i_d_min_a)
+    return np.ascontiguousarray(np.stack((bounds.least_nm, bounds.largest_nm), axis=-1))
+
+
+def interpolation_error(table: LookupTable, points: int = POINTS_PER_INTERVAL) -> InterpolationError:
+    """Return the bounds of a stored table (see :func:`as_stored`)."""
+    worst = cell_errors(table, points).max(axis=2)
+    cell = np.unravel_index(int(np.argmax(worst[..., 0])), worst.shape[:2])
+    missing = np.asarray(np.isnan(table.i_d_a).any(axis=2))
+    holes = missing[:-1, :-1] | missing[1:, :-1] | missing[:-1, 1:] | missing[1:, 1:]
+    torque, voltage, current = (max(0.0, BOUND_SAFETY * float(worst[..., k].max())) for k in range(3))
+    centre = (
+        0.5 * float(table.torque_nm[cell[0]] + table.torque_nm[cell[0] + 1]),
+        0.5 * float(table.y[cell[1]] + table.y[cell[1] + 1]),
+    )
+    return InterpolationError(torque, voltage, current, centre, int(holes.sum()))
+
+
+@dataclass(frozen=True, slots=True)
+class GridBounds:
+    """What is asked of a grid.
+
+    Attributes
+    ----------
+    torque_nm, voltage_v : float
+        Largest error between the nodes.
+    stored : {"float32", "int16"}
+        Number format in the drive.
+    capacity_words : int
+        Four-byte words for axes and tables.
+    """
+
+    torque_nm: float
+    voltage_v: float
+    stored: StoredFormat = "float32"
+    capacity_words: int = LUT_CAPACITY_WORDS
+
+
+def table_words(n_x: int, n_y: int, n_z: int, stored: StoredFormat) -> int:
+    """Return the words of axes and tables in the drive."""
+    cells = n_x * n_y * n_z
+    return n_x + n_y + n_z + 2 * (cells if stored == "float32" else (cells + 1) // 2)
+
+
+Solver = Callable[[Array, Array], LookupTable]
+"""Solve a table over a torque and a second axis."""
+
+
+def refined_table(
+    solve: Solver, torque_nm: Array, y: Array, bounds: GridBounds
+) -> tuple[LookupTable, InterpolationError]:
+    """Refine the axes until the stored table keeps its bounds.
+
+    Parameters
+    ----------
+    solve : callable
+        Solves a table over both axes.
+    torque_nm, y : ndarray
+        First axes; their nodes are kept.
+    bounds : GridBounds
+        What is asked.
+
+    Raises
+    ------
+    DesignInfeasible
+        The drive's memory is full before the bounds hold; the message names what was reached.
+    """
+    x, y = stored_axes(np.asarray(torque_nm, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    while True:
+        table = as_stored(solve(x, y), bounds.stored)
+        worst = cell_errors(table)
+        error = interpolation_error(table)
+        if error.torque_nm <= bounds.torque_nm and error.voltage_v <= bounds.voltage_v:
+            return table, error
+        finer = _split(x, y, worst, bounds, table.U_dc_v.size)
+        if finer is None:
+            raise DesignInfeasible(
+                f"{x.size} x {y.size} nodes keep the torque within {error.torque_nm:.3g} N m and the voltage within "
+                f"{error.voltage_v:.3g} V; asked for: {bounds.torque_nm:.3g} N m, {bounds.voltage_v:.3g} V",
+                where=f"look-up table ({bounds.stored}, {bounds.capacity_words} words)",
+                likely="the drive's memory for tables is full",
+                hint="ask for larger bounds, take int16, or reduce the range of torque or speed"
+                + ("; closer DC-link voltages may be missing too" if table.U_dc_v.size > 1 else ""),
+            )
+        x, y = finer
+
+
+_SPLIT_SHARES = (0.5, 0.7, 0.85, 0.95, 1.0)
+"""Intervals whose error is at least this share of the largest are split together; fewer where memory ends."""
+
+
+def _split(x: Array, y: Array, worst: Array, bounds: GridBounds, n_z: int) -> tuple[Array, Array] | None:
+    """Halve the intervals that matter, each along the axis whose interpolation alone is the worse one."""
+    excess = np.maximum(worst[..., 0] / bounds.torque_nm, worst[..., 1] / bounds.voltage_v)
+    total = excess.max(axis=2)
+    for share in _SPLIT_SHARES:
+        cells = total >= max(1.0 / BOUND_SAFETY, share * float(total.max()))
+        along_x = cells & (excess[..., 0] >= excess[..., 1])
+        finer = _halved(x, along_x.any(axis=1)), _halved(y, (cells & ~along_x).any(axis=0))
+        n_x, n_y = finer[0].size, finer[1].size
+        fits = table_words(n_x, n_y, n_z, bounds.stored) <= bounds.capacity_words and max(n_x, n_y) <= AXIS_NODES_MAX
+        if fits and n_x + n_y > x.size + y.size:
+            return finer
+    return None
+
+
+def _halved(axis: Array, split: NDArray[np.bool_]) -> Array:
+    middle = 0.5 * (axis[:-1] + axis[1:])[split]
+    return np.unique(np.concatenate((axis, stored_axes(middle)[0])))
+
+
+def largest_speed_rpm(reachable: Callable[[float], bool], n_max_rpm: float) -> float:
+    """Return the largest speed up to n_max at which an operating point exists (rpm), a binary32 number.
+
+    Parameters
+    ----------
+    reachable : callable
+        Whether a speed (rpm) has a point.
+    n_max_rpm : float
+        Largest speed of interest (rpm).
+    """
+    if reachable(n_max_rpm):
+        return n_max_rpm
+    low, high = 0.0, n_max_rpm
+    while high - low > 1e-9 * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if reachable(middle) else (low, middle)
+    return float(np.nextafter(np.float32(low), np.float32(0.0)))
