@@ -1,0 +1,311 @@
+"""The drive port over CANopen: CiA 402 for states and modes, the reference drive's objects for the rest."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.supervision import NodeReset
+from pmsmtool.cia402 import Command, Mode, QuickStop, State
+from pmsmtool.drive import objects
+from pmsmtool.drive.drive_node import DriveNode, is_safe
+from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.drive.recorder import Recorder
+from pmsmtool.errors import BusError, ConfigError, DriveFault, NotAvailable, PmsmtoolError, SdoAbort, StopNotConfirmed
+from pmsmtool.firmware.drive_map import DriveMap
+from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.trace import Trace
+
+RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
+"""The reference drive counts speed in thousandths of a mechanical revolution per minute."""
+STOP_MARGIN_S = 1.0
+"""Beyond the time the deceleration ramp needs."""
+STOP_TRIES = 4
+"""A stop is asked for this often: each kind of alarm may end one attempt."""
+STANDSTILL_RAD_S = 1.0
+"""Electrical speed below which a drive that stays in quick stop counts as standing."""
+
+
+class CanopenDrive:
+    """A drive on a CANopen bus; implements ``drive.port.Drive``.
+
+    Parameters
+    ----------
+    connection : Connection
+        The bus.
+    node_id : int
+        The drive's node id.
+    drive_map : DriveMap, optional
+        Which object holds which parameter.
+
+    Attributes
+    ----------
+    node : DriveNode
+        The node beneath, for what the port does not have.
+    identity : Identity
+        As read when the drive was opened.
+    period_s : float
+        Control period (s).
+    recorder : Recorder
+        Traces and averages.
+    """
+
+    def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
+        self.node = DriveNode(connection, node_id, drive_map=drive_map)
+        self.parameters = DriveParameters(self.node)
+        self.identity = self.node.identity()
+        self.period_s = 1e-9 * self.parameters.read_value("inverter.T_s_ns")
+        self.recorder = Recorder(self.node, self.period_s)
+
+    def close(self) -> None:
+        """Stop listening to the drive."""
+        self.node.close()
+
+    # ---- parameters and live values -------------------------------------------------------------
+
+    def read(self, name: str) -> float:
+        """Return one parameter by catalogue name, in SI."""
+        return self.parameters.read_value(name)
+
+    def live(self, name: str) -> float:
+        """Return one live quantity by its name in ``objects.LIVE``."""
+        return self.node.get(objects.LIVE[name])
+
+    def write(self, values: Mapping[str, float]) -> None:
+        """Write parameters and read them back: together while the drive is off, live gains while it is enabled.
+
+        Raises
+        ------
+        NotAvailable
+            The drive has no object for one of them.
+        ConfigError
+            A value is out of bounds.
+        DriveFault
+            The drive is enabled and a parameter is not live, or it refuses a value.
+        """
+        wanted = ParameterSet(values)
+        missing = self.node.map.missing(wanted)
+        if missing:
+            raise NotAvailable(f"the drive has no object for {', '.join(missing)}", where=f"node {self.node.node}")
+        violations = wanted.violations()
+        if violations:
+            raise ConfigError("values cannot be written", violations=violations)
+        new = self.node.map.encode(wanted)
+        old = self.parameters.read(new)
+        changed = {name: data for name, data in new.items() if data != old[name]}
+        if not changed:
+            return
+        if is_safe(self.node.state()):
+            self.parameters.replace(changed)
+            return
+        fixed = [name for name in changed if not BY_NAME[name].live]
+        if fixed:
+            raise DriveFault(
+                f"{', '.join(fixed)} cannot change while the drive is enabled",
+                where=f"node {self.node.node}",
+                hint="disable the drive first",
+            )
+        self.parameters.write_live(changed)
+
+    # ---- states ---------------------------------------------------------------------------------
+
+    def enable(self) -> None:
+        """Bring the drive to operation enabled at zero reference, in the identification mode."""
+        self._zero_references()
+        self._set_mode(Mode.IDENTIFICATION)
+        self.node.enable()
+
+    def disable(self) -> None:
+        """Remove the voltage; returns when the statusword confirms it.
+
+        Raises
+        ------
+        StopNotConfirmed
+            It does not.
+        """
+        state = self.node.disable_voltage()
+        if not is_safe(state):
+            raise self._not_confirmed(f"the statusword still shows {_shown(state)}")
+
+    def quick_stop(self) -> None:
+        """Quick stop, zero current, voltage off, each confirmed from the statusword.
+
+        Raises
+        ------
+        StopNotConfirmed
+            The drive did not confirm; the machine may be energised.
+        """
+        failure: PmsmtoolError | None = None
+        for _ in range(STOP_TRIES):
+            try:
+                with self.node.emergencies_tolerated():
+                    self._stop_once()
+                return
+            except StopNotConfirmed:
+                raise
+            except NodeReset as reset:
+                failure = reset  # a drive that boots is off; the next round confirms it
+            except (BusError, DriveFault) as error:
+                failure = error
+                with contextlib.suppress(BusError):
+                    self.disable_at_once()
+        raise self._not_confirmed(failure.what if failure else "no answer") from failure
+
+    def disable_at_once(self) -> None:
+        """Send the controlword that removes the voltage, without waiting for anything."""
+        self.node.sdo.post(
+            objects.CONTROLWORD.index, objects.CONTROLWORD.sub, objects.CONTROLWORD.encode(Command.DISABLE_VOLTAGE)
+        )
+
+    def _stop_once(self) -> None:
+        state = self.node.state()
+        if not is_safe(state):
+            self.node.go(Command.QUICK_STOP)
+            self.node.wait_for_state(self._has_stopped, self._stop_time_s())
+            self.disable()
+        self._zero_references()
+
+    def _has_stopped(self, state: State | None) -> bool:
+        if is_safe(state):
+            return True
+        stays = QuickStop(self.node.whole(objects.QUICK_STOP_OPTION)).stays
+        return state is State.QUICK_STOP_ACTIVE and stays and abs(self.live("omega_e_rad_s")) < STANDSTILL_RAD_S
+
+    def _stop_time_s(self) -> float:
+        """Time the ramp of 0x6085 needs from the present speed."""
+        rpm = abs(self.node.get(objects.VELOCITY_MRPM)) / 1000.0
+        return STOP_MARGIN_S + 2.0 * rpm / max(self.node.get(objects.QUICK_STOP_DECELERATION), 1.0)
+
+    def _not_confirmed(self, why: str) -> StopNotConfirmed:
+        return StopNotConfirmed(
+            f"the drive did not confirm that it stopped ({why}): the machine may be energised",
+            where=f"node {self.node.node}, 0x6041:00",
+            likely="the bus or the drive does not answer; its heartbeat supervision stops it if that was set",
+            hint="use the hardware stop (emergency stop, safe torque off, or mains), then check cable and supply",
+        )
+
+    # ---- references -----------------------------------------------------------------------------
+
+    def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
+        """Hold a current vector (A peak), in the rotor frame or at a fixed electrical angle."""
+        self._set_mode(Mode.IDENTIFICATION)
+        # The angle first: turning the frame under a flowing current would be a jump.
+        self.node.put(objects.SET_POINT_ANGLE, objects.FOLLOW_ROTOR if fixed_angle_rad is None else fixed_angle_rad)
+        self.node.put(objects.SET_POINT_D, i_d_a)
+        self.node.put(objects.SET_POINT_Q, i_q_a)
+
+    def command_speed(self, omega_m_rad_s: float) -> None:
+        """Run at a mechanical speed (rad/s)."""
+        self.node.put(objects.TARGET_VELOCITY_MRPM, omega_m_rad_s / RAD_S_PER_MRPM)
+        self._set_mode(Mode.PROFILE_VELOCITY)
+
+    def _set_mode(self, mode: Mode) -> None:
+        if self.node.whole(objects.MODE_DISPLAY) == mode:
+            return
+        try:
+            self.node.put(objects.MODE, mode)
+        except SdoAbort as abort:
+            raise NotAvailable(
+                f"the drive has no mode of operation {mode.name.lower().replace('_', ' ')} ({int(mode)})",
+                where=f"node {self.node.node}, 0x6060:00",
+                hint="`pmsmtool caps` lists what this drive can give",
+            ) from abort
+
+    def _zero_references(self) -> None:
+        """End an excitation and bring all references to zero; a drive without these objects needs none."""
+        with contextlib.suppress(SdoAbort):
+            self.node.command(objects.EXCITATION_COMMAND, 0)
+        for reference in (objects.SET_POINT_D, objects.SET_POINT_Q, objects.TARGET_VELOCITY_MRPM):
+            with contextlib.suppress(SdoAbort):
+                if self.node.get(reference) != 0.0:
+                    self.node.put(reference, 0.0)
+
+    # ---- measurements ---------------------------------------------------------------------------
+
+    def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
+        """Return means over a window of control periods, taken inside the drive."""
+        self.recorder.start_average(signals, periods)
+        self.wait(periods * self.period_s)
+        return self.recorder.finish_average(signals)
+
+    def record(
+        self,
+        signals: Sequence[str],
+        samples: int,
+        *,
+        decimation: int = 1,
+        excitation: Excitation | None = None,
+        pretrigger: int = 0,
+    ) -> Trace:
+        """Record signals every ``decimation`` periods, starting with the excitation if there is one.
+
+        Raises
+        ------
+        NotAvailable
+            More signals or samples than the recorder holds.
+        DriveFault
+            The drive tripped, or the excitation left its abort limits.
+        """
+        if excitation is not None:
+            self.prepare(excitation)
+        self.begin_record(signals, samples, decimation=decimation, excitation=excitation, pretrigger=pretrigger)
+        try:
+            self.wait(samples * decimation * self.period_s)
+            return self.finish_record(signals, decimation=decimation, excitation=excitation)
+        finally:
+            if excitation is not None:
+                self.node.command(objects.EXCITATION_COMMAND, 0)
+
+    def prepare(self, excitation: Excitation) -> None:
+        """Write the fields of an excitation; nothing moves yet."""
+        for name, item in objects.EXCITATION_FIELDS.items():
+            value = getattr(excitation, name)
+            self.node.put(item, objects.FOLLOW_ROTOR if value is None else value)
+        if excitation.shape is Shape.BUFFER:
+            data = b"".join(objects.DriveObject(0, 0, "f").encode(value) for value in excitation.buffer)
+            self.node.write_bytes(*objects.EXCITATION_BUFFER, data)
+
+    def begin_record(
+        self,
+        signals: Sequence[str],
+        samples: int,
+        *,
+        decimation: int,
+        excitation: Excitation | None,
+        pretrigger: int,
+    ) -> None:
+        """Arm the recorder and start the (prepared) excitation."""
+        self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=excitation is not None)
+        if excitation is not None:
+            self.wait(pretrigger * decimation * self.period_s)
+            if excitation.point is not Injection.SPEED:
+                self._set_mode(Mode.IDENTIFICATION)
+            self.node.command(objects.EXCITATION_COMMAND, 2)
+
+    def finish_record(self, signals: Sequence[str], *, decimation: int, excitation: Excitation | None) -> Trace:
+        """Wait until the recorder is complete and return its trace."""
+        trace = self.recorder.fetch(signals, decimation)
+        if excitation is None:
+            return trace
+        return replace(trace, meta={**trace.meta, "excitation": _excitation_facts(excitation)})
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass on the bus clock; an alarm of the drive ends it."""
+        self.node.connection.wait(seconds)
+        self.node.supervision.check()
+
+
+def _excitation_facts(excitation: Excitation) -> dict[str, object]:
+    """Return an excitation as JSON-serialisable facts."""
+    facts: dict[str, object] = {name: getattr(excitation, name) for name in objects.EXCITATION_FIELDS}
+    facts |= {"shape": excitation.shape.name.lower(), "point": excitation.point.name.lower()}
+    return {**facts, "buffer": list(excitation.buffer)}
+
+
+def _shown(state: State | None) -> str:
+    return "an undefined state" if state is None else state.name.replace("_", " ")

@@ -1,0 +1,81 @@
+"""The motion envelope: what a person allows the machine to do, shown before anything moves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from pmsmtool.errors import SafetyRefusal
+from pmsmtool.units import format_current
+
+Shaft = Literal["free", "locked", "coupled"]
+Load = Literal["none", "gravity"]
+Brake = Literal["open", "drive", "none"]
+
+_MAY = {
+    "free": "may turn freely",
+    "locked": "is locked: it must not turn",
+    "coupled": "is coupled: whatever hangs on it moves too",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """Limits of an experiment.
+
+    Attributes
+    ----------
+    i_max_apk : float
+        Largest current vector (A peak).
+    speed_max_rad_s : float
+        Largest mechanical speed (rad/s).
+    duration_s : float
+        Longest time the machine is energised (s).
+    energy_j : float
+        Largest copper loss in the winding (J).
+    travel_rad : float
+        Largest mechanical way from where the shaft stands (rad); infinity: not limited.
+    shaft : str
+        What the shaft may do.
+    load, brake : str
+        What pulls on it, and the holding brake.
+    """
+
+    i_max_apk: float
+    speed_max_rad_s: float
+    duration_s: float = 600.0
+    energy_j: float = math.inf
+    travel_rad: float = math.inf
+    shaft: Shaft = "free"
+    load: Load = "none"
+    brake: Brake = "none"
+
+    def lines(self) -> list[str]:
+        """Return the envelope as a person reads it before consenting."""
+        rpm = self.speed_max_rad_s * 60.0 / (2.0 * math.pi)
+        travel = "not limited" if math.isinf(self.travel_rad) else f"{math.degrees(self.travel_rad):.4g} deg (mech)"
+        energy = "not limited" if math.isinf(self.energy_j) else f"{self.energy_j:.4g} J"
+        return [
+            f"current   at most {format_current(self.i_max_apk)}",
+            f"speed     at most {rpm:.4g} rpm",
+            f"travel    {travel}",
+            f"energy    {energy} in the winding",
+            f"duration  at most {self.duration_s:.4g} s",
+            f"shaft     {self.shaft}: {_MAY[self.shaft]}; load {self.load}, brake {self.brake}",
+        ]
+
+    def refuse_gravity(self) -> None:
+        """Refuse a load that falls when the torque is zero.
+
+        Raises
+        ------
+        SafetyRefusal
+            Gravity load on a shaft that is not locked: the dead-man proof and every stop hold zero torque.
+        """
+        if self.load == "gravity" and self.shaft != "locked":
+            raise SafetyRefusal(
+                "a gravity load falls when the torque is zero, and every stop ends at zero torque",
+                likely="--load gravity was given and the shaft is not locked",
+                hint="uncouple the load, or lock the shaft and say --shaft locked",
+            )

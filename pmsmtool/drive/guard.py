@@ -1,0 +1,403 @@
+"""The guard: the only way an experiment gets a drive.
+
+It keeps the motion envelope before and during every command, in the tool and in the drive, notes
+every object that is changed, proves the dead-man, and whatever happens leaves a machine that is
+stopped (confirmed from the statusword) and a drive that holds what it held before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+from pmsmtool.bus.sdo import Mode
+from pmsmtool.drive import objects
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.dead_man import DeadManProof, prove_dead_man
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.heartbeat import Heartbeat
+from pmsmtool.drive.interruption import interrupts_deferred
+from pmsmtool.drive.port import Excitation, Identity, Injection, Shape
+from pmsmtool.errors import (
+    BusError,
+    DriveFault,
+    Interrupted,
+    LimitExceeded,
+    NotAvailable,
+    PmsmtoolError,
+    SdoAbort,
+    StopNotConfirmed,
+    VerifyMismatch,
+)
+from pmsmtool.trace import Trace
+
+WATCH_S = 0.05
+"""The machine is looked at this often while time passes."""
+OVERSHOOT = 1.25
+"""Measured current or speed over its limit that ends an experiment: regulation overshoots, noise peaks."""
+_ROUNDING = 1e-9
+_Object = tuple[int, int]
+_MARKS: tuple[_Object, ...] = tuple(
+    (mark.index, mark.sub) for mark in (objects.CONFIGURATION_DATE, objects.CONFIGURATION_TIME)
+)
+
+
+class GuardedDrive:
+    """A drive within an envelope; implements ``drive.port.Drive``.
+
+    Made by :func:`guarded` only.
+
+    Attributes
+    ----------
+    proof : DeadManProof or None
+        Of the dead-man, once it was shown.
+    energy_j, energised_s : float
+        Copper loss and time spent so far.
+    """
+
+    def __init__(self, drive: CanopenDrive, envelope: Envelope) -> None:
+        self.envelope = envelope
+        self.identity: Identity = drive.identity
+        self.period_s = drive.period_s
+        self.proof: DeadManProof | None = None
+        self.energy_j = 0.0
+        self.energised_s = 0.0
+        self._drive = drive
+        self._node = drive.node
+        self._heartbeat = Heartbeat(drive.node.connection)
+        self._before: dict[_Object, bytes] = {}
+        self._start_rad: float | None = None
+        self._pole_pairs = 1.0
+        self._R_s_ohm = 0.0
+        self._enabled = False
+
+    # ---- beginning and end ----------------------------------------------------------------------
+
+    def begin(self, *, prove: bool = True) -> None:
+        """Note the marks, bring the limits into the drive, prove the dead-man; the drive is off on return."""
+        self.envelope.refuse_gravity()
+        self._drive.parameters.settle()
+        self._node.before_write = self._note
+        for mark in _MARKS:
+            self._note(*mark)
+        self._pole_pairs = self._drive.read("motor.pole_pairs")
+        self._R_s_ohm = self._drive.read("motor.R_s_ohm")
+        self._limit_in_drive()
+        if prove:
+            self.proof = prove_dead_man(self._drive, self._heartbeat)
+
+    def _limit_in_drive(self) -> None:
+        """Make the drive itself keep current and speed (0x6073, 0x6080), where it can."""
+        node = self._node
+        try:
+            rated_apk = 1e-3 * node.get(objects.RATED_CURRENT_MA) * math.sqrt(2.0)
+            # Rounded up: a permille of the rated current must not cut what the envelope allows.
+            permille = math.ceil(1000.0 * self.envelope.i_max_apk / rated_apk)
+            if permille < node.get(objects.MAX_CURRENT_PERMILLE):
+                node.put(objects.MAX_CURRENT_PERMILLE, permille)
+            rpm = math.ceil(self.envelope.speed_max_rad_s * 60.0 / (2.0 * math.pi))
+            if rpm < node.get(objects.MAX_SPEED_RPM):
+                node.put(objects.MAX_SPEED_RPM, rpm)
+        except SdoAbort as abort:
+            raise NotAvailable(
+                "the drive has no current and speed limit of its own (0x6073, 0x6075, 0x6080)",
+                where=abort.where,
+                hint="without them nothing is moved",
+            ) from abort
+
+    def stop(self) -> None:
+        """Stop and confirm it; a Ctrl-C meanwhile removes the voltage at once.
+
+        Raises
+        ------
+        StopNotConfirmed
+            The drive does not confirm.
+        """
+        self._enabled = False
+        while True:
+            try:
+                self._drive.quick_stop()
+                return
+            except KeyboardInterrupt:
+                self._drive.disable_at_once()
+
+    def restore(self) -> int:
+        """Bring every changed object back to what it held, read it back, end the heartbeat.
+
+        Returns
+        -------
+        int
+            Objects brought back.
+
+        Raises
+        ------
+        VerifyMismatch
+            An object does not hold its old content; each is named.
+        """
+        self._node.before_write = None
+        try:
+            with self._node.emergencies_tolerated():
+                return self._restore()
+        finally:
+            self._heartbeat.stop()
+
+    def _restore(self) -> int:
+        names = {self._drive.parameters.map.address(n): n for n in (*self._node.map.cells, *self._node.map.tables)}
+        parameters = {names[key]: data for key, data in self._before.items() if key in names}
+        others = {key: data for key, data in self._before.items() if key not in names and key not in _MARKS}
+        changed = {n: data for n, data in parameters.items() if self._drive.parameters.read([n])[n] != data}
+        lines = []
+        if changed:
+            self._drive.parameters.replace(changed)
+        back = len(changed)
+        # The marks last: every change of another object clears them.
+        for (index, sub), data in [
+            *reversed(others.items()),
+            *((m, self._before[m]) for m in _MARKS if m in self._before),
+        ]:
+            try:
+                if self._read(index, sub) != data:
+                    self._node.sdo.download(index, sub, data)
+                    back += 1
+                if self._read(index, sub) != data:
+                    lines.append(f"0x{index:04X}:{sub:02X} does not hold {data[:8].hex(' ')} again")
+            except SdoAbort as abort:
+                lines.append(f"0x{index:04X}:{sub:02X}: {abort.what}")
+        if lines:
+            raise VerifyMismatch(
+                "not everything could be restored",
+                where=f"node {self._node.node}",
+                differences=lines,
+                hint="reset the drive: it comes back with what it has stored",
+            )
+        return back
+
+    def _note(self, index: int, sub: int) -> None:
+        if (index, sub) not in self._before:
+            try:
+                self._before[index, sub] = self._read(index, sub)
+            except SdoAbort:
+                return  # cannot be read, so it cannot be restored; nothing the guard writes is of that kind
+
+    def _read(self, index: int, sub: int) -> bytes:
+        domain = (index, sub) in (objects.EXCITATION_BUFFER, *self._node.map.tables.values())
+        return self._node.sdo.upload(index, sub, mode=Mode.BLOCK if domain else Mode.SEGMENTED).data
+
+    # ---- the port -------------------------------------------------------------------------------
+
+    def read(self, name: str) -> float:
+        """Return one parameter by catalogue name, in SI."""
+        return self._drive.read(name)
+
+    def live(self, name: str) -> float:
+        """Return one live quantity."""
+        return self._drive.live(name)
+
+    def write(self, values: Mapping[str, float]) -> None:
+        """Write parameters; they are restored when the guard ends."""
+        self._drive.write(values)
+
+    def enable(self) -> None:
+        """Bring the drive to operation enabled at zero reference."""
+        self._drive.enable()
+        self._enabled = True
+        if self._start_rad is None:
+            self._start_rad = self._drive.live("theta_m_rad")
+
+    def disable(self) -> None:
+        """Remove the voltage and confirm it."""
+        self._drive.disable()
+        self._enabled = False
+
+    def quick_stop(self) -> None:
+        """Stop as fast as the drive can and confirm it."""
+        self.stop()
+
+    def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
+        """Hold a current vector (A peak) within the envelope."""
+        self._check("current", math.hypot(i_d_a, i_q_a), self.envelope.i_max_apk, "A")
+        self._drive.command_current(i_d_a, i_q_a, fixed_angle_rad=fixed_angle_rad)
+
+    def command_speed(self, omega_m_rad_s: float) -> None:
+        """Run at a mechanical speed (rad/s) within the envelope."""
+        self._check("speed", abs(omega_m_rad_s), self.envelope.speed_max_rad_s, "rad/s")
+        self._drive.command_speed(omega_m_rad_s)
+
+    def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
+        """Return means over a window of control periods, taken inside the drive."""
+        self._drive.recorder.start_average(signals, periods)
+        self.wait(periods * self.period_s)
+        return self._drive.recorder.finish_average(signals)
+
+    def record(
+        self,
+        signals: Sequence[str],
+        samples: int,
+        *,
+        decimation: int = 1,
+        excitation: Excitation | None = None,
+        pretrigger: int = 0,
+    ) -> Trace:
+        """Record signals, with an excitation whose abort limits are at most the envelope's."""
+        seconds = samples * decimation * self.period_s
+        within = None if excitation is None else self._within(excitation)
+        if within is not None:
+            self._drive.prepare(within)
+        self._drive.begin_record(signals, samples, decimation=decimation, excitation=within, pretrigger=pretrigger)
+        try:
+            self.wait(seconds)
+            return self._drive.finish_record(signals, decimation=decimation, excitation=within)
+        finally:
+            if within is not None:
+                self._node.command(objects.EXCITATION_COMMAND, 0)
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass, looking at the machine in between."""
+        clock = self._node.connection.clock
+        end = clock.now() + seconds
+        while True:
+            left = end - clock.now()
+            step = min(left, WATCH_S)
+            self._drive.wait(max(step, 0.0))
+            if self._enabled:
+                self._watch(step)
+            if left <= WATCH_S:
+                return
+
+    # ---- limits ---------------------------------------------------------------------------------
+
+    def _within(self, excitation: Excitation) -> Excitation:
+        """Check an excitation and return it with the envelope as its abort limits."""
+        i_max = self.envelope.i_max_apk
+        peak = (
+            max(map(abs, excitation.buffer), default=0.0)
+            if excitation.shape is Shape.BUFFER
+            else abs(excitation.amplitude)
+        )
+        bias = math.hypot(excitation.bias_d_a, excitation.bias_q_a)
+        if excitation.point in (Injection.I_D, Injection.I_Q):
+            self._check("current", bias + peak, i_max, "A")
+        else:
+            self._check("current", bias, i_max, "A")
+        if excitation.shape is Shape.HYSTERESIS:
+            largest = math.hypot(abs(excitation.i_centre_d_a) + excitation.i_limit_d_a, excitation.i_limit_q_a)
+            self._check("current", largest, i_max, "A")
+        if excitation.point is Injection.SPEED:
+            self._check("speed", peak, self.envelope.speed_max_rad_s, "rad/s")
+        speed = self._pole_pairs * self.envelope.speed_max_rad_s
+        return replace(
+            excitation,
+            abort_current_apk=min(excitation.abort_current_apk or math.inf, OVERSHOOT * i_max),
+            abort_speed_rad_s=min(excitation.abort_speed_rad_s or math.inf, OVERSHOOT * speed),
+        )
+
+    def _watch(self, seconds: float) -> None:
+        i_d, i_q = self._drive.live("i_d_a"), self._drive.live("i_q_a")
+        current = math.hypot(i_d, i_q)
+        self.energised_s += seconds
+        self.energy_j += 1.5 * self._R_s_ohm * current * current * seconds
+        envelope = self.envelope
+        speed = abs(self._drive.live("omega_e_rad_s")) / self._pole_pairs
+        checks = [
+            ("current", current, OVERSHOOT * envelope.i_max_apk, "A"),
+            ("speed", speed, OVERSHOOT * envelope.speed_max_rad_s, "rad/s"),
+            ("time energised", self.energised_s, envelope.duration_s, "s"),
+            ("energy in the winding", self.energy_j, envelope.energy_j, "J"),
+        ]
+        if not math.isinf(envelope.travel_rad) and self._start_rad is not None:
+            way = abs(self._drive.live("theta_m_rad") - self._start_rad)
+            checks.append(("travel", way, envelope.travel_rad, "rad"))
+        for quantity, value, limit, unit in checks:
+            if value > limit:
+                self.stop()
+                self._check(quantity, value, limit, unit)
+
+    def _check(self, quantity: str, value: float, limit: float, unit: str) -> None:
+        if value > limit * (1.0 + _ROUNDING):
+            raise LimitExceeded(
+                quantity,
+                value,
+                limit,
+                unit,
+                where=f"node {self._node.node}",
+                hint="raise the limit knowingly (--i-max, --speed-max), or ask for less",
+            )
+
+
+@contextmanager
+def guarded(
+    drive: CanopenDrive,
+    envelope: Envelope,
+    *,
+    prove: bool = True,
+    say: Callable[[str], None] = lambda text: None,
+) -> Iterator[GuardedDrive]:
+    """Lend a drive to an experiment, within an envelope.
+
+    Parameters
+    ----------
+    drive : CanopenDrive
+        The drive; off.
+    envelope : Envelope
+        Its limits.
+    prove : bool
+        Whether the dead-man is proven first; without it nothing may be enabled.
+    say : callable
+        Told one line per step.
+
+    Raises
+    ------
+    StopNotConfirmed
+        The machine may be energised; outranks whatever ended the experiment.
+    Interrupted
+        Ctrl-C, after a confirmed stop and the restore.
+    SafetyRefusal
+        The dead-man could not be shown.
+    """
+    guard = GuardedDrive(drive, envelope)
+    interrupted = False
+    stopped = False
+    try:
+        try:
+            guard.begin(prove=prove)
+            if guard.proof is not None:
+                say(str(guard.proof))
+            yield guard
+        except KeyboardInterrupt:
+            interrupted = True
+            say("interrupted: stopping the machine (Ctrl-C again removes the voltage at once)")
+        finally:
+            guard.stop()
+            stopped = True
+    finally:
+        if not stopped:
+            _stop_again(guard)
+        with interrupts_deferred() as noted:
+            count = _restored(guard)
+        say(f"voltage off, drive restored ({count} objects)")
+        interrupted = interrupted or bool(noted)
+    if interrupted:
+        raise Interrupted("interrupted: the machine is stopped, voltage off, and the drive restored")
+
+
+def _stop_again(guard: GuardedDrive) -> None:
+    """The first stop was itself ended, by its failure or by a signal in the wrong microsecond."""
+    guard.stop()
+
+
+def _restored(guard: GuardedDrive) -> int:
+    try:
+        return guard.restore()
+    except StopNotConfirmed:
+        raise
+    except (BusError, DriveFault) as error:
+        raise _not_restored(error) from error
+
+
+def _not_restored(error: PmsmtoolError) -> PmsmtoolError:
+    error.what = f"{error.what}; the machine is stopped, but the drive could not be restored"
+    error.args = (error.what,)
+    error.hint = error.hint or "reset the drive: it comes back with what it has stored"
+    return error
