@@ -14,8 +14,8 @@
 #define SIGN_SUBSTEPS 4u        /* substeps that resolve the sign shape */
 #define LAG_SUBSTEPS 4u         /* with a sensor lag, so that the current is straight over a substep */
 #define DIODE_SUBSTEPS 4u       /* with gates off */
-#define COMMUTATION_STEP 0.4    /* substep of a floating node, in sqrt(L C) */
-#define COMMUTATION_STEPS_MAX 32
+#define COMMUTATION_STEP 0.3    /* substep of a floating node, in sqrt(L C) */
+#define COMMUTATION_STEPS_MAX 64
 #define FIRM_CURRENT 4.0        /* a current this many times what a dead time can change keeps its sign */
 
 /* ---- averaged error --------------------------------------------------------------------------------- */

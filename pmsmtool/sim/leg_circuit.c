@@ -41,14 +41,15 @@ static void follow_lag(pmsm_current_lag *lag, const double i_start[3], const dou
 void pmsm_leg_advance(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, const pmsm_supply *supply,
                       double h)
 {
-    if (lag) {
-        double i_start[3], i_end[3];
+    double i_start[3], i_end[3];
+    if (lag)
         leg_currents(plant, i_start);
-        pmsm_plant_advance(plant, supply, h);
+    pmsm_plant_advance(plant, supply, h);
+    if (supply->blocked >= 0 && supply->blocked < 3)
+        pmsm_plant_clear_current(plant, supply->blocked); /* its slope was held at zero: take out what the step left */
+    if (lag) {
         leg_currents(plant, i_end);
         follow_lag(lag, i_start, i_end, h);
-    } else {
-        pmsm_plant_advance(plant, supply, h);
     }
     inverter->volt_seconds_alpha += plant->u_alpha * h;
     inverter->volt_seconds_beta += plant->u_beta * h;
@@ -87,7 +88,8 @@ static void set_supply(pmsm_supply *supply, const pmsm_inverter *inverter, const
 }
 
 /* All currents zero: do the bands hold them there? If not, the pair with the largest excess conducts. */
-static int release_pair(pmsm_inverter *inverter, const pmsm_plant *plant, const pmsm_leg_sources *sources)
+static int release_pair(pmsm_inverter *inverter, const pmsm_plant *plant, const pmsm_leg_sources *sources,
+                        uint32_t held)
 {
     double emf[3], low = -FAR, high = FAR;
     int out = 0, in = 0;
@@ -105,7 +107,7 @@ static int release_pair(pmsm_inverter *inverter, const pmsm_plant *plant, const 
             in = x;
         }
     }
-    if (low - high <= V_SAME || out == in)
+    if (low - high <= V_SAME || out == in || (held >> out & 1u) || (held >> in & 1u))
         return 0;
     inverter->leg[out].sign = 1;
     inverter->leg[in].sign = -1;
@@ -136,7 +138,7 @@ static void settle(pmsm_inverter *inverter, const pmsm_plant *plant, const pmsm_
             leg->sign = i[x] > 0.0 ? 1 : -1;
         without += leg->sign == 0;
     }
-    const int at_rest = without >= 2 && !release_pair(inverter, plant, sources);
+    const int at_rest = without >= 2 && !release_pair(inverter, plant, sources, held);
     set_supply(supply, inverter, sources, banded);
     if (at_rest || without == 0)
         return;

@@ -221,25 +221,59 @@ static inline void step_free(pmsm_plant *m, const pmsm_supply *supply, double h,
     pmsm_keep_point(m, &at);
 }
 
+/* No current flows all along: the shaft alone, and the flux is the magnet's. */
+static void step_open(pmsm_plant *m, double h, int moves_freely, double omega, double acceleration)
+{
+    static const double place[4] = {0.0, 0.5, 0.5, 1.0}, weight[4] = {1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0};
+    pmsm_plant_state *state = &m->state;
+    double d_theta = omega * h + 0.5 * acceleration * h * h;
+    if (moves_freely) {
+        double kw = 0.0, kl = 0.0, w = state->omega_M, wl = state->omega_load, at = 0.0, twist = state->twist;
+        double sum_w = 0.0, sum_l = 0.0, sum_theta = 0.0, sum_twist = 0.0;
+        for (int j = 0; j < 4; j++) {
+            const double hj = h * place[j];
+            at = hj * w;
+            twist = state->twist + hj * (w - wl);
+            w = state->omega_M + hj * kw;
+            wl = state->omega_load + hj * kl;
+            accelerations(m, 0.0, state->theta_M + at, w, twist, wl, &kw, &kl);
+            sum_w += weight[j] * kw;
+            sum_l += weight[j] * kl;
+            sum_theta += weight[j] * w;
+            sum_twist += weight[j] * (w - wl);
+        }
+        state->omega_M += h * sum_w;
+        state->omega_load += h * sum_l;
+        state->twist += h * sum_twist;
+        d_theta = h * sum_theta;
+    } else {
+        state->omega_M = omega + acceleration * h;
+    }
+    set_angle(state, state->theta_M + d_theta);
+    pmsm_real64_sincos(m->machine.pole_pairs * state->theta_M, &state->sin_e, &state->cos_e);
+    state->turned = 0;
+    m->u_alpha = m->u_beta = 0.0;
+    pmsm_plant_clear_current(m, PMSM_ALL_LEGS);
+}
+
 static void step(pmsm_plant *m, const pmsm_supply *supply, double h)
 {
     const int moves_freely = m->machine.rotor == PMSM_ROTOR_FREE && !m->state.sticking;
-    const int general = supply->general && supply->blocked != PMSM_ALL_LEGS;
-    if (moves_freely) {
-        if (general)
+    const double omega = m->state.sticking ? 0.0 : m->state.omega_M;
+    const double acceleration = m->machine.rotor == PMSM_ROTOR_DRIVEN ? m->acceleration : 0.0;
+    if (supply->blocked == PMSM_ALL_LEGS) {
+        step_open(m, h, moves_freely, omega, acceleration);
+    } else if (moves_freely) {
+        if (supply->general)
             step_free(m, supply, h, 1);
         else
             step_free(m, supply, h, 0);
     } else {
-        const double omega = m->state.sticking ? 0.0 : m->state.omega_M;
-        const double acceleration = m->machine.rotor == PMSM_ROTOR_DRIVEN ? m->acceleration : 0.0;
-        if (general)
+        if (supply->general)
             step_imposed(m, supply, h, omega, acceleration, 1);
         else
             step_imposed(m, supply, h, omega, acceleration, 0);
     }
-    if (supply->blocked == PMSM_ALL_LEGS) /* no current all along: the flux is the magnet's */
-        pmsm_plant_clear_current(m, PMSM_ALL_LEGS);
 }
 
 /* ---- stick-slip ------------------------------------------------------------------------------------ */
