@@ -2,64 +2,27 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 
-from pmsmtool.firmware.core_binding import CoreBinding, core
-from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.firmware.core_binding import core
+from tests.firmware.closed_loop import (
+    FLAG_CURRENT,
+    FLAG_DUTY,
+    FLAG_EDGE,
+    FLAG_I2T,
+    FLAG_NO_POINT,
+    FLAG_VOLTAGE,
+    MODE_CURRENT,
+    MODE_SPEED,
+    MODE_TORQUE,
+    MODE_VOLTAGE,
+    Loop,
+    tuned,
+)
 from tests.firmware.core_twin import Twin, f, sincos
-from tests.firmware.linear_plant import LinearPlant
-
-DEFAULTS = {row.name: row.default for row in CATALOGUE}
-MODE_VOLTAGE, MODE_CURRENT, MODE_TORQUE, MODE_SPEED = 1, 2, 3, 4
-FLAG_VOLTAGE, FLAG_DUTY, FLAG_CURRENT, FLAG_EDGE, FLAG_NO_POINT, FLAG_I2T = 1, 2, 4, 8, 16, 256
-
-
-def tuned(alpha: float = 2 * math.pi * 400, **changes: float) -> dict[str, float]:
-    """Table 1 machine with the gains of the injected controller, K_p = alpha L, K_i = 4 alpha R."""
-    values = dict(DEFAULTS)
-    for axis in "dq":
-        values[f"current.K_p_{axis}_v_per_a"] = alpha * values[f"motor.L_{axis}_h"]
-        values[f"current.K_i_{axis}_v_per_as"] = 4 * alpha * values["motor.R_s_ohm"]
-    values.update({name.replace("__", "."): value for name, value in changes.items()})
-    return values
-
-
-class Loop:
-    """The core and a plant; one call of step() is one period."""
-
-    def __init__(self, binding: CoreBinding, values: dict[str, float], *, omega: float, U_dc: float = 540.0,
-                 lut: bytes = b"") -> None:
-        self.binding, self.values, self.U_dc = binding, values, U_dc
-        self.params = binding.params(values, lut)
-        self.lut = (ctypes.c_uint32 * (len(lut) // 4)).from_buffer_copy(lut) if lut else None
-        self.state = binding.state()
-        self.output = binding.make("pmsm_output")
-        self.measurement = binding.make("pmsm_measurement", T_winding=values["motor.T_ref_c"], U_dc=U_dc)
-        self.reference = binding.make("pmsm_reference")
-        self.plant = LinearPlant(
-            R=values["motor.R_s_ohm"], L_d=values["motor.L_d_h"], L_q=values["motor.L_q_h"],
-            psi=values["motor.psi_f_wb"], T_s=1e-9 * values["inverter.T_s_ns"], omega=omega,
-            delayed=values["inverter.delay_periods"] >= 1,
-        )
-
-    def step(self, **reference: float) -> Any:
-        m = self.measurement
-        m.i_a, m.i_b, m.i_c = self.plant.phases()
-        m.theta_e, m.omega_e = self.plant.theta, self.plant.omega
-        for name, value in reference.items():
-            setattr(self.reference, name, value)
-        self.binding.library.pmsm_step(self.state, self.params, self.lut, m, self.reference, self.output)
-        d = (self.output.duty_a, self.output.duty_b, self.output.duty_c)
-        gates = self.output.gates
-        u_alpha = gates * self.U_dc * (2 * d[0] - d[1] - d[2]) / 3
-        u_beta = gates * self.U_dc * (d[1] - d[2]) / math.sqrt(3)
-        self.plant.advance(u_alpha, u_beta)
-        return self.state.live
 
 
 def bits(*values: float | np.float32) -> bytes:

@@ -72,6 +72,13 @@ uint32_t pmsm_uses_predictor(const pmsm_params *params)
     return (asked != 0u && params->inverter_delay_periods >= 1.0F) ? 1u : 0u;
 }
 
+pmsm_dq pmsm_hold_voltage(const pmsm_period *period, pmsm_dq i)
+{
+    const pmsm_dq rotation = feed_forward(period, i);
+    const pmsm_dq u = {period->state->integrator.d + rotation.d, period->state->integrator.q + rotation.q};
+    return u;
+}
+
 void pmsm_current_row(pmsm_period *period, pmsm_row *row)
 {
     const pmsm_dq reference = period->reference;

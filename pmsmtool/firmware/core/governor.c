@@ -293,7 +293,7 @@ static void observe(pmsm_period *period, const rows_of_period *rows)
     const uint32_t found = solve_exact(rows, rows->count, period->reference, &v, &active, &steps);
     live->kappa = share_of_way(period->state->reference_held, period->reference, v);
     live->binding = (found != 0u) ? binding_of(rows, active) : (uint32_t)PMSM_BINDING_EMPTY;
-    live->iterations = steps;
+    live->iterations += steps;
 }
 
 /* Whatever tolerance a solver left: the demanded voltage ends inside its limit. */
@@ -350,7 +350,7 @@ static void choose(pmsm_period *period, const rows_of_period *rows)
     }
     live->kappa = share_of_way(period->state->reference_held, request, v);
     live->binding = binding;
-    live->iterations = steps;
+    live->iterations += steps;
     period->reference = v;
 }
 

@@ -112,6 +112,8 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_dq reference_realised; /* A, reference of the last period that its limited voltage stood for */
     pmsm_real tau_granted;   /* N m, torque of the reference that the limits left */
     pmsm_real time_to_go;    /* s, of the minimum-time transfer in progress, 0 when there is none */
+    pmsm_real fw_tau;        /* N m, request of the last optimisation */
+    uint32_t fw_empty;       /* 1: it found no current that satisfies both limits */
     pmsm_real i2t_carry;     /* rounding remainder of i2t */
     uint32_t i2t_exhausted;  /* 1 from a used-up budget until a tenth of it has recovered */
     uint32_t prepared;       /* 0 fresh from pmsm_init(), 1 derived is valid, 2 derived is stale */

@@ -44,6 +44,9 @@ pmsm_dq pmsm_torque_to_current(pmsm_period *period, pmsm_real tau);
 pmsm_dq pmsm_limit_current(pmsm_period *period, pmsm_dq i);
 pmsm_real pmsm_torque(const pmsm_params *params, pmsm_dq i);
 
+/* field_weakening.c: currents of a torque by optimisation, every N_fw periods; sets the flag of an empty set */
+pmsm_dq pmsm_field_weakening(pmsm_period *period, pmsm_real tau);
+
 /* lookup.c: currents of a torque from the tables; sets the look-up flags */
 pmsm_dq pmsm_lookup(pmsm_period *period, pmsm_real tau);
 
@@ -53,6 +56,7 @@ void pmsm_current_demand(pmsm_period *period);
 void pmsm_current_integrate(pmsm_period *period);
 void pmsm_current_row(pmsm_period *period, pmsm_row *row); /* demand as a function of the reference */
 pmsm_dq pmsm_model_voltage(const pmsm_period *period, pmsm_dq i); /* steady state, nominal flux */
+pmsm_dq pmsm_hold_voltage(const pmsm_period *period, pmsm_dq i); /* what the controller gives without an error */
 void pmsm_observe_disturbance(pmsm_period *period);
 pmsm_dq pmsm_predict_current(const pmsm_period *period);
 

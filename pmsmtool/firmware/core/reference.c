@@ -74,10 +74,13 @@ pmsm_dq pmsm_torque_to_current(pmsm_period *period, pmsm_real tau)
 {
     const pmsm_params *params = period->params;
     pmsm_dq i;
-    if (params->field_weakening_mode == PMSM_FW_LUT && params->lut_format != PMSM_LUT_NONE && period->lut != NULL) {
+    const uint32_t mode = params->field_weakening_mode;
+    if (mode == PMSM_FW_LUT && params->lut_format != PMSM_LUT_NONE && period->lut != NULL) {
         i = pmsm_lookup(period, tau);
-    } else {
+    } else if (mode == PMSM_FW_OFF || mode == PMSM_FW_LUT) {
         i = direct_current(period, tau);
+    } else {
+        i = pmsm_field_weakening(period, tau);
     }
     const pmsm_real i_d_min = (pmsm_real)params->field_weakening_i_d_min_a;
     if (i.d < i_d_min) {

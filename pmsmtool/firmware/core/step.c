@@ -36,6 +36,8 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->omega_filtered = omega_M;
     state->omega_ref_ramped = omega_M;
     state->fw_count = 0u;
+    state->fw_tau = PMSM_C(0.0);
+    state->fw_empty = 0u;
     state->speed_count = 0u;
     for (uint32_t k = 0u; k < 12u; k++) {
         state->polar[k] = PMSM_C(0.0);
@@ -174,6 +176,9 @@ void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut
     period.lut = lut;
     period.request = reference;
     period.state = state;
+    state->live.kappa = PMSM_C(1.0);
+    state->live.binding = PMSM_BINDING_NONE;
+    state->live.iterations = 0u;
     transform(&period, measurement, advance);
     pmsm_update_i2t(&period);
     state->omega_filtered += state->derived.speed_filter * (period.omega_M - state->omega_filtered);

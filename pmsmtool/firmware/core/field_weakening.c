@@ -1,0 +1,241 @@
+/* Field weakening as an optimisation, Jercic et al. 2017, section 4:
+ *
+ *   minimise h1 (T* - T(x))^2 + h2 (i_d - i_dLM)^2   subject to |v(x)| <= V_m, |x| <= I_m               (43), (44)
+ *
+ * The voltage row uses what the integrators hold, v = (K_i I_ed - w L_q i_q, K_i I_eq + w (psi + L_d i_d)) (42), so errors
+ * of R_s, L and psi do not matter in the steady state; the uncompensated variant takes the nominal ellipse (33). Solved
+ * by projected gradient steps with Armijo's rule (45)-(48), or by FISTA with restart. One call per N_fw periods.
+ * The search is kept to i_d <= max(0, i_dLM), where the cost is well behaved for salient machines, and to
+ * i_d >= i_d_min.
+ */
+#include "pmsm_period.h"
+
+#define STEP_END PMSM_C(1e-4)        /* A: a smaller change ends the iteration */
+#define HALVINGS 8u                  /* of an Armijo step */
+#define TORQUE_EVENT PMSM_C(0.02)    /* of rated torque: a larger change of the request is answered at once */
+#define IGNORED_SHARE PMSM_C(1e-3)   /* below this share of V_m the rotation voltage of I_m does not matter */
+
+typedef struct {
+    pmsm_row row[2];       /* current circle, voltage ellipse */
+    uint32_t rows;
+    pmsm_real d_min, d_max;
+    pmsm_real h1, h2, i_d_lm, tau;
+    pmsm_real k_t, k_s;    /* T = (k_t + k_s i_d) i_q */
+    uint32_t empty;        /* 1: no current satisfied both rows */
+    uint32_t steps;
+} problem;
+
+static pmsm_dq voltage_offset(const pmsm_period *period)
+{
+    const pmsm_params *params = period->params;
+    pmsm_dq c = {PMSM_C(0.0), period->omega_e * (pmsm_real)params->motor_psi_f_wb};
+    if (params->field_weakening_mode != PMSM_FW_UNCOMPENSATED) {
+        const pmsm_dq hold = pmsm_hold_voltage(period, period->i);
+        c.d = hold.d + period->omega_e * (pmsm_real)params->motor_L_q_app_h * period->i.q;
+        c.q = hold.q - period->omega_e * (pmsm_real)params->motor_L_d_app_h * period->i.d;
+    }
+    return c;
+}
+
+static problem state_problem(const pmsm_period *period, pmsm_real tau)
+{
+    const pmsm_params *p = period->params;
+    const pmsm_real I_m = pmsm_current_limit(period);
+    const pmsm_real X_d = period->omega_e * (pmsm_real)p->motor_L_d_app_h;
+    const pmsm_real X_q = period->omega_e * (pmsm_real)p->motor_L_q_app_h;
+    const pmsm_real V_m = (PMSM_C(1.0) - (pmsm_real)p->field_weakening_margin) * period->V_max;
+    const pmsm_dq c = voltage_offset(period);
+    const pmsm_real i_d_lm = (pmsm_real)p->field_weakening_i_d_lm_a;
+    const problem q = {
+        {{1, 0, 0, 1, 0, 0, I_m}, {0, -X_q, X_d, 0, c.d, c.q, V_m}},
+        ((pmsm_abs(X_d) + pmsm_abs(X_q)) * I_m > IGNORED_SHARE * V_m) ? 2u : 1u,
+        (pmsm_real)p->field_weakening_i_d_min_a,
+        (i_d_lm > PMSM_C(0.0)) ? i_d_lm : PMSM_C(0.0),
+        (pmsm_real)p->field_weakening_h1,
+        (pmsm_real)p->field_weakening_h2,
+        i_d_lm,
+        tau,
+        period->state->derived.torque_per_flux * (pmsm_real)p->motor_psi_f_wb,
+        period->state->derived.torque_per_flux * ((pmsm_real)p->motor_L_d_app_h - (pmsm_real)p->motor_L_q_app_h),
+        0u,
+        0u};
+    return q;
+}
+
+/* Interval of i_q that a row leaves at a given i_d, intersected with [low, high]; 0 when there is none. */
+static uint32_t cut_interval(const pmsm_row *row, pmsm_real d, pmsm_real *low, pmsm_real *high)
+{
+    const pmsm_dq on_axis = {d, PMSM_C(0.0)};
+    const pmsm_dq a = pmsm_row_voltage(row, on_axis);
+    const pmsm_real A = row->m_dq * row->m_dq + row->m_qq * row->m_qq;
+    const pmsm_real B = a.d * row->m_dq + a.q * row->m_qq;
+    const pmsm_real D = B * B - A * (pmsm_square(a) - row->V * row->V);
+    if (D < PMSM_C(0.0) || A <= PMSM_C(0.0)) {
+        const pmsm_real nearest = (A > PMSM_C(0.0)) ? pmsm_clamp(-B / A, *low, *high) : PMSM_C(0.0);
+        *low = nearest;
+        *high = nearest;
+        return 0u;
+    }
+    const pmsm_real root = PMSM_SQRT(D);
+    const pmsm_real from = pmsm_clamp((-B - root) / A, *low, *high);
+    const pmsm_real to = pmsm_clamp((-B + root) / A, *low, *high);
+    const uint32_t common = ((-B + root) / A >= *low && (-B - root) / A <= *high) ? 1u : 0u;
+    *low = from;
+    *high = to;
+    return common;
+}
+
+/* Nearest point on the line of a bound of i_d. */
+static pmsm_dq project_on_bound(problem *q, pmsm_real d, pmsm_real i_q)
+{
+    const pmsm_real I_m = q->row[0].V;
+    const pmsm_real rest = I_m * I_m - d * d;
+    const pmsm_real reach = (rest > PMSM_C(0.0)) ? PMSM_SQRT(rest) : PMSM_C(0.0);
+    pmsm_real low = -reach;
+    pmsm_real high = reach;
+    if (q->rows > 1u && cut_interval(&q->row[1], d, &low, &high) == 0u) {
+        q->empty = 1u;
+    }
+    const pmsm_dq x = {d, pmsm_clamp(i_q, low, high)};
+    return x;
+}
+
+/* Projection on (44). Empty: the point of the circle with the smallest voltage, flagged. */
+static pmsm_dq project(problem *q, pmsm_dq y)
+{
+    pmsm_dq x = y;
+    uint32_t active;
+    q->empty = 0u;
+    if (pmsm_project_rows(q->row, q->rows, y, &x, &active, &q->steps) == PMSM_PROJECTION_EMPTY) {
+        x = pmsm_smallest_voltage(&q->row[1], &q->row[0], &q->steps);
+        q->empty = 1u;
+    }
+    if (x.d > q->d_max) {
+        return project_on_bound(q, q->d_max, y.q);
+    }
+    if (x.d < q->d_min) {
+        return project_on_bound(q, q->d_min, y.q);
+    }
+    return x;
+}
+
+static pmsm_real torque_error(const problem *q, pmsm_dq x)
+{
+    return q->tau - (q->k_t + q->k_s * x.d) * x.q;
+}
+
+static pmsm_real cost(const problem *q, pmsm_dq x)
+{
+    const pmsm_real e = torque_error(q, x);
+    const pmsm_real off = x.d - q->i_d_lm;
+    return q->h1 * e * e + q->h2 * off * off;
+}
+
+static pmsm_dq gradient(const problem *q, pmsm_dq x)
+{
+    const pmsm_real e = torque_error(q, x);
+    const pmsm_dq g = {PMSM_C(2.0) * (q->h2 * (x.d - q->i_d_lm) - q->h1 * e * q->k_s * x.q),
+                       PMSM_C(-2.0) * q->h1 * e * (q->k_t + q->k_s * x.d)};
+    return g;
+}
+
+static pmsm_real distance(pmsm_dq x, pmsm_dq y)
+{
+    return pmsm_abs(x.d - y.d) + pmsm_abs(x.q - y.q);
+}
+
+/* (45)-(48) with gamma = 1. */
+static pmsm_dq gradient_steps(problem *q, const pmsm_params *params, pmsm_dq x)
+{
+    const pmsm_real sigma = (pmsm_real)params->field_weakening_sigma;
+    x = project(q, x);
+    for (uint32_t k = 0u; k < params->field_weakening_iterations && q->empty == 0u; k++) {
+        const pmsm_dq g = gradient(q, x);
+        const pmsm_real now = cost(q, x);
+        pmsm_real beta = (pmsm_real)params->field_weakening_beta;
+        pmsm_dq z = x;
+        for (uint32_t l = 0u; l < HALVINGS; l++) {
+            const pmsm_dq y = {x.d - beta * g.d, x.q - beta * g.q};
+            z = project(q, y);
+            if (cost(q, z) <= now - sigma * (g.d * (x.d - z.d) + g.q * (x.q - z.q))) {
+                break;
+            }
+            beta *= PMSM_C(0.5);
+        }
+        q->steps++;
+        const pmsm_real change = distance(z, x);
+        x = z;
+        if (change < STEP_END) {
+            break;
+        }
+    }
+    return x;
+}
+
+/* FISTA (Beck, Teboulle, DOI 10.1137/080716542) with gradient restart, step 1/L from a local bound of the curvature. */
+static pmsm_dq accelerated_steps(problem *q, const pmsm_params *params, pmsm_dq x)
+{
+    pmsm_real t = PMSM_C(1.0);
+    x = project(q, x);
+    pmsm_dq y = x;
+    for (uint32_t k = 0u; k < params->field_weakening_iterations && q->empty == 0u; k++) {
+        const pmsm_real e = torque_error(q, y);
+        const pmsm_real slope = q->k_t + q->k_s * y.d;
+        const pmsm_real side = q->k_s * y.q;
+        const pmsm_real curvature = PMSM_C(2.1) * q->h1 * (slope * slope + side * side + pmsm_abs(q->k_s * e)) +
+                                    PMSM_C(2.0) * q->h2;
+        if (curvature <= PMSM_C(0.0)) {
+            break;
+        }
+        const pmsm_dq g = gradient(q, y);
+        const pmsm_dq down = {y.d - g.d / curvature, y.q - g.q / curvature};
+        const pmsm_dq z = project(q, down);
+        q->steps++;
+        if ((y.d - z.d) * (z.d - x.d) + (y.q - z.q) * (z.q - x.q) > PMSM_C(0.0)) {
+            t = PMSM_C(1.0);
+        }
+        const pmsm_real t_next = PMSM_C(0.5) * (PMSM_C(1.0) + PMSM_SQRT(PMSM_C(1.0) + PMSM_C(4.0) * t * t));
+        const pmsm_real ahead = (t - PMSM_C(1.0)) / t_next;
+        const pmsm_real change = distance(z, x);
+        y.d = z.d + ahead * (z.d - x.d);
+        y.q = z.q + ahead * (z.q - x.q);
+        x = z;
+        t = t_next;
+        if (change < STEP_END) {
+            break;
+        }
+    }
+    return x;
+}
+
+static uint32_t is_due(const pmsm_period *period, pmsm_real tau)
+{
+    const pmsm_state *state = period->state;
+    const pmsm_params *params = period->params;
+    if (state->fw_count == 0u) {
+        return 1u;
+    }
+    const pmsm_real rated =
+        state->derived.torque_per_flux * (pmsm_real)params->motor_psi_f_wb * (pmsm_real)params->motor_I_nom_apk;
+    const uint32_t event = (pmsm_abs(tau - state->fw_tau) > TORQUE_EVENT * rated) ? 1u : 0u;
+    return (params->field_weakening_mode == PMSM_FW_ACCELERATED) ? event : 0u;
+}
+
+pmsm_dq pmsm_field_weakening(pmsm_period *period, pmsm_real tau)
+{
+    pmsm_state *state = period->state;
+    const pmsm_params *params = period->params;
+    if (is_due(period, tau) != 0u) {
+        problem q = state_problem(period, tau);
+        state->fw_reference = (params->field_weakening_mode == PMSM_FW_ACCELERATED)
+                                  ? accelerated_steps(&q, params, state->fw_reference)
+                                  : gradient_steps(&q, params, state->fw_reference);
+        state->fw_tau = tau;
+        state->fw_empty = q.empty;
+        state->fw_count = params->field_weakening_N_fw;
+        state->live.iterations += q.steps;
+    }
+    state->fw_count--;
+    period->flags |= (state->fw_empty != 0u) ? (uint32_t)PMSM_FLAG_FW_EMPTY : 0u;
+    return state->fw_reference;
+}
