@@ -125,9 +125,7 @@ def simulate(
     """
     changed = dict(scenario.simulation) | ({"rotor": scenario.rotor} if scenario.rotor else {})
     machine_file = with_simulation(machine_file, changed)
-    setup, keep = build_setup(
-        machine_file, seed=seed, application=application, start_rad_s=RPM * scenario.start_rpm
-    )
+    setup, keep = build_setup(machine_file, seed=seed, application=application, start_rad_s=RPM * scenario.start_rpm)
     _check(machine_file, params, scenario, setup.machine.rotor)
     simulation = Simulation(setup, image_of(machine_file, params), keep)
     T_s = 1e-9 * simulation.params.inverter_T_s_ns
@@ -141,9 +139,7 @@ def simulate(
     simulation.reference.mode = MODES[scenario.mode]
     simulation.word(Part.ENABLED).value = 1
     columns: dict[str, tuple[Any, str]] = {**DRIVE_SIGNALS, **TRUE_SIGNALS}
-    record = simulation.record(
-        [Truth.T, *(signal for signal, _ in columns.values())], rows, scenario.decimation
-    )
+    record = simulation.record([Truth.T, *(signal for signal, _ in columns.values())], rows, scenario.decimation)
     simulation.run(periods)
     values = np.ascontiguousarray(record[: simulation.recorded_rows].T)
     return Trace(

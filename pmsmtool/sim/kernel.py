@@ -1,6 +1,6 @@
 """The simulation kernel ``pmsm_sim`` through ctypes: mirrored structs, declared functions, owned memory.
 
-Field names and their meaning are those of ``closed_loop.h``, ``plant.h``, ``inverter.h``, ``sensors.h`` and ``drive.h``;
+Field names and their meaning are those of ``closed_loop.h``, ``plant.h``, ``inverter.h``, ``sensors.h``, ``drive.h``;
 every mirrored struct is checked against the library's size when it is loaded.
 """
 
@@ -458,9 +458,7 @@ class Simulation:
         names = np.ascontiguousarray(signals, dtype=np.uint32)
         out = np.zeros((rows, len(names)))
         self._buffers["record"] = (out, names)
-        self.library.pmsm_sim_set_record(
-            self.sim, out.ctypes.data, rows, len(names), names.ctypes.data, decimation
-        )
+        self.library.pmsm_sim_set_record(self.sim, out.ctypes.data, rows, len(names), names.ctypes.data, decimation)
         return out
 
     @property

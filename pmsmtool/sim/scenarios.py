@@ -24,6 +24,7 @@ import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,8 @@ def _violations(scenario: Scenario) -> list[str]:
     if not 0.0 < scenario.duration_s <= LONGEST_S:
         found.append(f"duration_s = {scenario.duration_s:g} is outside 0..{LONGEST_S:g} s")
     if scenario.mode not in MODES:
-        found.append(f"mode = {scenario.mode!r} is none of {', '.join(MODES)}{did_you_mean(scenario.mode, list(MODES))}")
+        near = did_you_mean(scenario.mode, list(MODES))
+        found.append(f"mode = {scenario.mode!r} is none of {', '.join(MODES)}{near}")
     if scenario.rotor and scenario.rotor not in ROTORS:
         found.append(f"rotor = {scenario.rotor!r} is none of {', '.join(ROTORS)}")
     if scenario.decimation < 1:
@@ -115,7 +117,7 @@ def _violations(scenario: Scenario) -> list[str]:
             found.append(f"[schedule] {name}: has no nodes")
         elif not all(math.isfinite(t) and math.isfinite(v) for t, v in profile):
             found.append(f"[schedule] {name}: a node is not finite")
-        elif any(b[0] < a[0] for a, b in zip(profile, profile[1:], strict=False)):
+        elif any(b[0] < a[0] for a, b in pairwise(profile)):
             found.append(f"[schedule] {name}: the times decrease")
     return found
 
@@ -235,7 +237,13 @@ def _current_steps(scale: _Scale, name: str) -> Scenario:
         rotor="driven",
         start_rpm=speed,
         schedule={
-            "i_d_a": ((0.0, 0.0), (0.02, 0.0), (0.02, 0.5 * scale.i_d_min_a), (0.08, 0.5 * scale.i_d_min_a), (0.08, 0.0)),
+            "i_d_a": (
+                (0.0, 0.0),
+                (0.02, 0.0),
+                (0.02, 0.5 * scale.i_d_min_a),
+                (0.08, 0.5 * scale.i_d_min_a),
+                (0.08, 0.0),
+            ),
             "i_q_a": ((0.0, 0.0), (0.04, 0.0), (0.04, half), (0.06, half), (0.06, -half)),
             "driven_rpm": ((0.0, speed),),
         },

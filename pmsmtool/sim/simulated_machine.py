@@ -1,7 +1,7 @@
 """From a machine file to the kernel's setup: the truth of ``[simulation]`` over what ``[machine]`` says.
 
-Resistance: ``R_s_ohm`` is the loop. The devices' share (``device_slope_ohm``, in the switched model of an IGBT the mean of
-switch and diode) is taken out of it for the phase, so that the loop is what the file says; only the copper part
+Resistance: ``R_s_ohm`` is the loop. The devices' share (``device_slope_ohm``, in the switched model of an IGBT the mean
+of switch and diode) is taken out of it for the phase, so that the loop is what the file says; only the copper part
 (``R_winding_ohm`` over the phase, all of it when that is not given) follows the temperature.
 """
 
@@ -234,7 +234,9 @@ def _sensors(out: Any, machine_file: MachineFile, settings: Settings, violations
     out.noise = settings.number("sensor_noise_apk")
     out.adc_bits, out.full_scale = settings.whole("adc_bits"), settings.number("adc_full_scale_apk")
     if out.adc_bits and not out.full_scale:
-        violations.append("adc_bits needs adc_full_scale_apk in [simulation] or I_max_apk in [machine]; adc_bits = 0: none")
+        violations.append(
+            "adc_bits needs adc_full_scale_apk in [simulation] or I_max_apk in [machine]; adc_bits = 0: none"
+        )
     out.encoder_bits, out.U_dc_gain = settings.whole("encoder_bits"), settings.number("U_dc_gain")
     out.encoder_offset_e = settings.number("encoder_offset_rad")
     out.encoder_reversed = int(settings.flag("encoder_reversed"))
@@ -261,8 +263,8 @@ def _timing(setup: Setup, machine_file: MachineFile, settings: Settings, violati
 def own_compensation(machine_file: MachineFile) -> dict[str, float]:
     """Return the parameters of the compensation built into the simulated drive; empty when it has none.
 
-    ``compensation = "right"`` has the plateau U_dc t_dead / T_s + V_device, ``"wrong"`` :data:`WRONG_COMPENSATION` times it.
-    ``recorded_voltage = "after"`` sets bit 5 of ``current.options``, which is for the caller to or into the set's.
+    ``compensation = "right"`` has the plateau U_dc t_dead / T_s + V_device, ``"wrong"`` has
+    :data:`WRONG_COMPENSATION` times it.
     """
     settings = settings_of(machine_file)
     kind = settings.text("compensation")

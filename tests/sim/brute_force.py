@@ -1,8 +1,8 @@
 """A switch-level inverter on a locked linear machine, written a second time: explicit steps of a few nanoseconds.
 
-Nothing is shared with the kernel: gate signals come from comparing the duty ratio with a carrier, dead time from a counter
-per leg, every device is a voltage that depends on the current (its sign smoothed over 0.1 mA), the node of a leg in its
-dead time is a capacitor with two diodes.
+Nothing is shared with the kernel: gate signals come from comparing the duty ratio with a carrier, dead time from a
+counter per leg, every device is a voltage that depends on the current (its sign smoothed over 0.1 mA), the node of a
+leg in its dead time is a capacitor with two diodes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Circuit:
     dt: float = 4e-9
 
     def run(self, duties: np.ndarray, i_start: complex = 0j) -> np.ndarray:
-        """Return i_alpha + j i_beta at the start of each period, shape (periods + 1,); duties has shape (periods, 3)."""
+        """Return i_alpha + j i_beta at the start of each period and the end; duties has shape (periods, 3)."""
         steps = round(self.T_s / self.dt)
         dt = self.T_s / steps
         i_a, i_b = i_start.real, i_start.imag

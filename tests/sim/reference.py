@@ -91,7 +91,9 @@ SCENARIOS = (
     Scenario("S2 field weakening", 4, 0.137, 2.3e-3, 2.1e-3, 0.41, 1860, 540, _PI2 * 400, (-30.0, 0.05), (15.0, 0.1)),
     Scenario("S3 2.2-kW IPM", 3, 3.6, 36e-3, 51e-3, 0.545, 1500, 540, _PI2 * 200, (-2.0, 0.05), (5.0, 0.1)),
     Scenario("S4 saturated", 2, 0.63, 25e-3, 100e-3, 0.445, 900, 540, _PI2 * 200, (-4.0, 0.05), (8.0, 0.1), True),
-    Scenario("S5 fast IPM", 3, 17.932e-3, 0.37e-3, 1.2e-3, 65.65e-3, 11000, 400, _PI2 * 300, (-140.0, 0.0), (20.0, 0.1)),
+    Scenario(
+        "S5 fast IPM", 3, 17.932e-3, 0.37e-3, 1.2e-3, 65.65e-3, 11000, 400, _PI2 * 300, (-140.0, 0.0), (20.0, 0.1)
+    ),
 )
 
 
@@ -142,7 +144,9 @@ def simulate(
 
 
 class Measurement(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_float) for name in ("i_a", "i_b", "i_c", "theta_e", "omega_e", "U_dc", "T_winding"))
+    _fields_ = tuple(
+        (name, ctypes.c_float) for name in ("i_a", "i_b", "i_c", "theta_e", "omega_e", "U_dc", "T_winding")
+    )
 
 
 class Output(ctypes.Structure):

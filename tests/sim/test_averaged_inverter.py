@@ -19,7 +19,6 @@ from tests.sim.bench import (
     TURN,
     U_DC,
     VOLTAGE,
-    free,
     open_simulation,
     plant_run,
     record,
@@ -123,7 +122,7 @@ def opened(phase: int, *changes):
 @pytest.mark.parametrize("model", [0, 1])
 @pytest.mark.parametrize("phase", [0, 1, 2])
 def test_open_phase_carries_nothing_and_stays_stable(model, phase):
-    """One second of current control that cannot succeed, at speed, with dead time: bounded, and exactly one phase dead."""
+    """One second of current control that cannot succeed, at speed, with dead time: bounded, one phase dead."""
 
     def change(setup: Setup) -> None:
         opened(phase, turning(80.0), lossy(TANH, drop=0.8))(setup)
@@ -364,7 +363,3 @@ def test_saturated_free_rotor_uses_the_map():
     t, omega, torque = record(simulation, [Truth.T, Truth.OMEGA_M, Truth.TORQUE], 2400)
     integral = np.concatenate(([0.0], np.cumsum(0.5 * (torque[1:] + torque[:-1]) * np.diff(t)))) / 0.02
     assert np.abs(omega - integral).max() < 2e-3 * omega.max()
-
-
-def test_free_rotor_helper_is_used():
-    assert open_simulation(free()).signal(Truth.OMEGA_M) == 0.0

@@ -9,7 +9,6 @@ import pytest
 
 from pmsmtool.sim.kernel import Rotor, Simulation, Target, Truth
 from tests.sim.bench import (
-    CURRENT,
     L_D,
     L_Q,
     POLE_PAIRS,
@@ -190,4 +189,3 @@ def test_rotor_kinds_can_change_between_calls():
     before = simulation.signal(Truth.THETA_M)
     simulation.run(100)
     assert simulation.signal(Truth.THETA_M) == before
-    assert CURRENT == simulation.reference.mode

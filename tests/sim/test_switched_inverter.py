@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from pmsmtool.sim.kernel import Rotor, Setup, Target, Truth
+from pmsmtool.sim.kernel import Setup, Target, Truth
 from tests.sim.bench import (
-    CURRENT,
     L_D,
     L_Q,
     POLE_PAIRS,
@@ -93,7 +92,7 @@ def fast(f_s_hz: float) -> dict[str, float]:
     [(10e3, 4e-3), (40e3, 3e-4), (160e3, 2e-5)],  # measured 1.4e-3, 9e-5, 5.6e-6: falls with T_s squared
 )
 def test_ideal_devices_agree_with_the_averaged_model(f_s_hz, limit):
-    """No dead time, no drops: sampled at the ripple's centre both models see the same current, better with finer PWM."""
+    """No dead time, no drops: at the ripple's centre both models see the same current, better with finer PWM."""
     found = []
     for change in (turning(250.0), with_changes(turning(250.0), switched())):
         simulation = open_simulation(change, params=fast(f_s_hz))
@@ -128,7 +127,9 @@ def test_output_capacitance_takes_voltage_back_at_small_currents():
 
     full = 4.0 / 3.0 * U_DC * 2e-6 / T_S
     knee = 2e-9 * U_DC / 2e-6  # 0.3 A
-    assert lost(20.0, 2e-9) == pytest.approx(full * (1.0 - 0.25 * knee * (0.5 / 20.0 + 1.0 / 20.0) * 4.0 / 3.0), rel=0.02)
+    assert lost(20.0, 2e-9) == pytest.approx(
+        full * (1.0 - 0.25 * knee * (0.5 / 20.0 + 1.0 / 20.0) * 4.0 / 3.0), rel=0.02
+    )
     assert lost(0.2, 2e-9) < 0.6 * lost(0.2, 0.0)
 
 
@@ -151,9 +152,7 @@ def test_channel_conducts_both_ways_without_threshold():
 
 def test_unequal_dead_times_offset_the_legs():
     """Leg a 1 us more, leg b 1 us less: with firm currents the difference is a voltage between the legs."""
-    equal, unequal = (
-        open_simulation(switched(dead_time=dead), mode=VOLTAGE) for dead in (2e-6, (3e-6, 1e-6, 2e-6))
-    )
+    equal, unequal = (open_simulation(switched(dead_time=dead), mode=VOLTAGE) for dead in (2e-6, (3e-6, 1e-6, 2e-6)))
     found = []
     for simulation in (equal, unequal):
         simulation.reference.u_d_inject = 25.0
@@ -234,9 +233,7 @@ def test_rectifier_is_the_same_circuit_in_both_models():
     omega_M = 1.3 * U_DC / math.sqrt(3.0) / (POLE_PAIRS * PSI)
     torque = []
     for model in (0, 1):
-        simulation = open_simulation(
-            with_changes(turning(omega_M), switched(V_diode=0.8, model=model)), mode=0
-        )
+        simulation = open_simulation(with_changes(turning(omega_M), switched(V_diode=0.8, model=model)), mode=0)
         torque.append(np.mean(record(simulation, [Truth.TORQUE], 2000)[0]))
     assert torque[0] == torque[1] < -1.0
 
@@ -250,7 +247,3 @@ def test_dc_link_ripple_and_schedule_reach_the_machine():
     t, U = record(simulation, [Truth.T, Truth.U_DC], 2000)
     expected = np.where(t + 1e-10 < 0.1, U_DC, 250.0) + 10.0 * np.sin(TURN * 300.0 * (t + 0.5 * T_S))
     assert np.abs(U - expected).max() < 1e-9
-
-
-def test_mode_constants():
-    assert (VOLTAGE, CURRENT, Rotor.DRIVEN) == (1, 2, 2)
