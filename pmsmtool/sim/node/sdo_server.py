@@ -397,11 +397,11 @@ class SdoServer:
             self._restart(frame)
             return
         data = bytes(transfer.data)
-        length = len(data) - (frame[0] >> 2 & 7)
-        self._check_complete(transfer, length)
-        data = data[:length]
+        data = data[: len(data) - (frame[0] >> 2 & 7)]
+        # The CRC first: what got lost on the way is a matter of the transport, not of the object's length.
         if transfer.crc_used and crc_hqx(data, 0) != int.from_bytes(frame[1:3], "little"):
             raise Refused(AbortCode.CRC)
+        self._check_complete(transfer, len(data))
         self._commit(transfer.entry, data, b"\xa1" + bytes(7))
 
     def _current(self) -> _Transfer:

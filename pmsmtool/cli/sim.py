@@ -1,0 +1,129 @@
+"""``pmsmtool sim``: simulated drives for other programs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmsmtool.cli.options import BITRATE, FILE, WholeNumber, examples, output_options
+from pmsmtool.cli.output import Output, table
+
+if TYPE_CHECKING:
+    from pmsmtool.sim.serve import SocketcandServer
+
+_PORT = WholeNumber("port", 0, 65535)
+_SEED = WholeNumber("seed", 0, 2**63 - 1)
+_NODE_ID = WholeNumber("node", 1, 255)
+_COUNT = WholeNumber("count", 1, 127)
+
+
+@click.group("sim")
+def sim_command() -> None:
+    """Serve simulated drives to other programs; list the profiles."""
+
+
+@sim_command.command(
+    "serve",
+    epilog=examples(
+        "pmsmtool sim serve                          # then: pmsmtool -i socketcand -c vcan0 scan",
+        "pmsmtool sim serve jercic-2017 --port 0 --json",
+        "pmsmtool sim serve --nodes 3 --faults lossy.toml --bitrate 500000",
+    ),
+)
+@click.argument("profile", required=False)
+@click.option("--host", default="127.0.0.1", help="Address to listen on.")
+@click.option("--port", type=_PORT, default="29536", help="Port to listen on; 0 takes a free one.")
+@click.option("--speed", type=click.FloatRange(0, 1000, min_open=True), default=1.0, help="Multiple of the wall clock.")
+@click.option("--bitrate", type=BITRATE, metavar="BIT/S", help="Pace the frames bit by bit; default: not paced.")
+@click.option("--node", type=_NODE_ID, metavar="ID", help="Node id of the first drive; 255: unconfigured (LSS).")
+@click.option("--nodes", type=_COUNT, metavar="N", help="Number of drives on the bus.")
+@click.option("--seed", type=_SEED, help="Seed of noise and faults.")
+@click.option("--nv", metavar="FILE", help="File of the non-volatile memory, or :memory:.")
+@click.option("--faults", type=FILE, help="File of faults on purpose.")
+@output_options
+def serve_command(out: Output, profile: str | None, host: str, port: int, speed: float, **given: Any) -> None:
+    """Serve simulated drives on a socketcand server until Ctrl-C.
+
+    PROFILE is a profile (`pmsmtool sim list`), a machine file, or a channel string NAME?key=value&...; the options
+    win over its keys. Any program with python-can's socketcand backend can join, several at a time.
+    """
+    from dataclasses import replace
+
+    from pmsmtool.sim.channel import build_line, parse_channel
+    from pmsmtool.sim.serve import SocketcandServer
+
+    channel = replace(parse_channel(profile), **{name: value for name, value in given.items() if value is not None})
+    line = build_line(channel, instant=True)
+    server = SocketcandServer(line, host, port, speed=speed)
+    ids = [node.node_id for node in line.nodes]
+    data = {"interface": "socketcand", "host": host, "port": server.port, "profile": channel.name, "node_ids": ids}
+    out.result("sim-serve", data, [f"socketcand {host}:{server.port}"])
+    out.note(f"simulating {channel.name} as node {', '.join(map(str, ids))}; Ctrl-C ends it")
+    out.note(_how_to_join(host, server.port))
+    _serve(server)
+
+
+def _how_to_join(host: str, port: int) -> str:
+    if (host, port) == ("127.0.0.1", 29536):
+        return "join with: pmsmtool -i socketcand -c vcan0 scan"
+    return f'join with: can.Bus(interface="socketcand", host="{host}", port={port}, channel="vcan0", tcp_tune=True)'
+
+
+def _serve(server: SocketcandServer) -> None:
+    """Serve until SIGINT or SIGTERM; both end the command normally."""
+    import signal
+    import sys
+
+    sys.stdout.flush()
+    ended: list[int] = []
+
+    def end(number: int, frame: object) -> None:
+        ended.append(number)
+
+    previous = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        server.serve(lambda: bool(ended))
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@sim_command.command("list", epilog=examples("pmsmtool sim list", "pmsmtool sim list --json | jq '.profiles[].name'"))
+@output_options
+def list_command(out: Output) -> None:
+    """List the profiles that ship with the package."""
+    from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.sim.channel import DEFAULT_PROFILE, machine_path, profile_names
+
+    rows = []
+    for name in profile_names():
+        machine_file = load_machine_file(machine_path(name))
+        machine, inverter = machine_file.machine, machine_file.inverter
+        rows.append(
+            {
+                "name": name,
+                "description": machine_file.name,
+                "default": name == DEFAULT_PROFILE,
+                "pole_pairs": machine.pole_pairs,
+                "I_nom_apk": machine.I_nom_apk,
+                "U_dc_v": inverter.U_dc_v,
+                "f_s_hz": inverter.f_s_hz,
+                "n_max_rpm": machine.n_max_rpm,
+                "saturated": machine_file.flux_map is not None,
+            }
+        )
+    heads = ("profile", "I_nom/Apk", "U_dc/V", "f_s/kHz", "n_max/rpm", "pole pairs", "magnetics")
+    out.result("sim-list", {"profiles": rows}, lambda: table(heads, [_cells(row) for row in rows]))
+
+
+def _cells(row: dict[str, Any]) -> tuple[object, ...]:
+    return (
+        row["name"] + (" (default)" if row["default"] else ""),
+        "-" if row["I_nom_apk"] is None else f"{row['I_nom_apk']:.4g}",
+        f"{row['U_dc_v']:.4g}",
+        f"{row['f_s_hz'] / 1e3:.4g}",
+        "-" if row["n_max_rpm"] is None else f"{row['n_max_rpm']:.0f}",
+        row["pole_pairs"],
+        "saturated" if row["saturated"] else "linear",
+    )

@@ -1,0 +1,258 @@
+"""Offers simulated drives to other processes: a socketcand server in raw mode, on the wall clock.
+
+Every client hears the drives and the other clients, as programs on one bus do. python-can's stock ``socketcand``
+backend connects with ``host``, ``port`` and any channel name; ``tcp_tune=True`` keeps block transfers fast.
+
+Protocol (linux-can/socketcand, ``doc/protocol.md``): ``< hi >``, ``< open NAME >`` and ``< rawmode >`` answered by
+``< ok >``; then ``< send ID LEN B B ... >`` and ``< frame ID SECONDS DATA >``. That backend reads each answer with one
+``recv``, so the first frames are held for ``HOLD_S`` behind the last ``< ok >``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import selectors
+import socket
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from pmsmtool.bus.clock import NEVER, NS
+from pmsmtool.errors import BusError
+from pmsmtool.sim.line import EXTENDED, REMOTE, Frame, Line
+
+DEFAULT_HOST = "127.0.0.1"
+DEFAULT_PORT = 29536
+HOLD_S = 0.05
+"""Frames wait this long behind the handshake; dropping them instead would lose the first answers."""
+_SLICE_NS = 50_000_000
+_IDLE_S = 0.1
+_RECEIVE_BYTES = 65536
+_BACKLOG_LIMIT = 4 << 20
+_LONGEST_COMMAND = 200
+_GREETING, _OPENED, _RAW = range(3)
+
+
+@dataclass(slots=True, eq=False)
+class Client:
+    """One program that has connected; an endpoint of the line once it is in raw mode."""
+
+    server: SocketcandServer
+    connection: socket.socket
+    echo: bool = False
+    stage: int = _GREETING
+    held_until: float = 0.0
+    incoming: bytes = b""
+    outgoing: bytearray = field(default_factory=bytearray)
+
+    # ---- endpoint of the line ------------------------------------------------------------------
+
+    def hear(self, frame: Frame, own: bool) -> None:
+        """Queue a frame for the program; remote frames have no place in the protocol."""
+        if frame.flags & REMOTE:
+            return
+        identifier = f"{frame.can_id:08X}" if frame.flags & EXTENDED else f"{frame.can_id:03X}"
+        self.outgoing += f"< frame {identifier} {self.server.stamp():.6f} {frame.data.hex()} >".encode("ascii")
+
+    def transmitted(self, acknowledged: bool) -> None:
+        """Nothing waits for it: the program has gone on."""
+
+    def pull(self, recv_raises: bool) -> None:
+        """Fault injection: the adapter is pulled, the connection ends."""
+        self.server.drop(self)
+
+    # ---- the program's commands ----------------------------------------------------------------
+
+    def take(self, data: bytes) -> None:
+        """Take bytes of the program and obey the complete commands in them."""
+        self.incoming += data
+        while (end := self.incoming.find(b">")) >= 0:
+            words = self.incoming[:end].decode("ascii", "replace").strip().removeprefix("<").split()
+            self.incoming = self.incoming[end + 1 :]
+            self._obey(words)
+        if len(self.incoming) > _LONGEST_COMMAND:
+            self.server.drop(self)
+
+    def _obey(self, words: Sequence[str]) -> None:
+        if words[:1] == ["send"] and self.stage == _RAW:
+            self._send(words[1:])
+        elif words[:1] == ["open"] and self.stage == _GREETING:
+            self.stage = _OPENED
+            self.outgoing += b"< ok >"
+        elif words == ["rawmode"] and self.stage == _OPENED:
+            self.outgoing += b"< ok >"
+            self.server.flush(self)
+            self.stage = _RAW
+            self.held_until = time.monotonic() + HOLD_S
+            self.server.line.attach(self)
+        elif words == ["echo"]:
+            self.outgoing += b"< echo >"
+        else:
+            self.outgoing += b"< error unknown command >"
+
+    def _send(self, words: Sequence[str]) -> None:
+        try:
+            can_id, length = int(words[0], 16), int(words[1], 16)
+            data = bytes(int(word, 16) for word in words[2 : 2 + length])
+            extended = len(words[0]) > 3
+            if length > 8 or len(data) != length or not 0 <= can_id <= (0x1FFFFFFF if extended else 0x7FF):
+                raise ValueError("no classic CAN frame")
+        except (ValueError, IndexError):
+            self.outgoing += b"< error could not parse send command >"
+            return
+        self.server.line.queue(self, Frame(can_id, data, EXTENDED if extended else 0))
+
+
+class SocketcandServer:
+    """Serves one line.
+
+    Parameters
+    ----------
+    line : Line
+        Drives and wire; nobody else may move its clock.
+    host, port
+        Where to listen; port 0 chooses a free one.
+    speed : float
+        Virtual seconds per second of the wall clock.
+
+    Raises
+    ------
+    BusError
+        The address is in use or does not exist.
+    """
+
+    def __init__(self, line: Line, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, *, speed: float = 1.0) -> None:
+        self.line = line
+        self._speed = speed
+        self._selector = selectors.DefaultSelector()
+        self._clients: list[Client] = []
+        self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            if hasattr(socket, "SO_EXCLUSIVEADDRUSE"):  # Windows: SO_REUSEADDR would let two servers share a port
+                self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+            else:
+                self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._listener.bind((host, port))
+            self._listener.listen()
+        except OSError as error:
+            self._listener.close()
+            raise BusError(
+                f"cannot listen: {error.strerror or error}",
+                where=f"{host}:{port}",
+                likely="another simulated drive is being served there",
+                hint="choose another --port; 0 takes a free one",
+            ) from error
+        self._listener.setblocking(False)
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._epoch = time.time()
+        self._started = time.monotonic()
+
+    @property
+    def port(self) -> int:
+        """Port the server listens on."""
+        return int(self._listener.getsockname()[1])
+
+    def stamp(self) -> float:
+        """Return the time stamp of a frame that arrives now (s, Unix time at speed 1)."""
+        return self._epoch + self.line.clock.now_ns / NS
+
+    def serve(self, stopped: Callable[[], bool]) -> None:
+        """Serve until ``stopped`` returns True; it is asked at least ten times a second."""
+        self._started = time.monotonic() - self.line.clock.now_ns / NS / self._speed
+        try:
+            while not stopped():
+                for key, events in self._selector.select(self._idle_s()):
+                    self._ready(key.data, events)
+                self._run()
+                for client in tuple(self._clients):
+                    self.flush(client)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Drop all clients and stop listening."""
+        for client in tuple(self._clients):
+            self.drop(client)
+        self._selector.close()
+        self._listener.close()
+
+    # ---- time ----------------------------------------------------------------------------------
+
+    def _now_ns(self) -> int:
+        return round((time.monotonic() - self._started) * self._speed * NS)
+
+    def _run(self) -> None:
+        """Let the line's time follow the wall clock, in slices so that clients are heard in between."""
+        clock = self.line.clock
+        target = min(self._now_ns(), clock.now_ns + _SLICE_NS)
+        with clock.held:
+            clock.step(clock.now_ns)
+        clock.run_until(max(target, clock.now_ns))
+
+    def _idle_s(self) -> float:
+        wall = time.monotonic()
+        limits = [_IDLE_S]
+        next_ns = self.line.clock.next_ns()
+        if next_ns != NEVER:
+            limits.append((next_ns - self._now_ns()) / NS / self._speed)
+        if self._now_ns() - self.line.clock.now_ns > _SLICE_NS:
+            limits.append(0.0)
+        limits += [client.held_until - wall for client in self._clients if client.outgoing and client.held_until > wall]
+        return max(0.0, min(limits))
+
+    # ---- sockets -------------------------------------------------------------------------------
+
+    def _ready(self, client: Client | None, events: int) -> None:
+        if client is None:
+            self._accept()
+            return
+        if events & selectors.EVENT_READ:
+            try:
+                data = client.connection.recv(_RECEIVE_BYTES)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if data:
+                client.take(data)
+            else:
+                self.drop(client)
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:
+            return
+        connection.setblocking(False)
+        with contextlib.suppress(OSError):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client = Client(self, connection)
+        self._clients.append(client)
+        self._selector.register(connection, selectors.EVENT_READ, client)
+        client.outgoing += b"< hi >"
+        self.flush(client)
+
+    def flush(self, client: Client) -> None:
+        """Send what waits for a client, as much as it takes."""
+        if client not in self._clients or client.held_until > time.monotonic():
+            return
+        try:
+            while client.outgoing:
+                sent = client.connection.send(client.outgoing)
+                del client.outgoing[:sent]
+        except BlockingIOError:
+            if len(client.outgoing) > _BACKLOG_LIMIT:
+                self.drop(client)
+        except OSError:
+            self.drop(client)
+        if client in self._clients:
+            wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.outgoing else 0)
+            self._selector.modify(client.connection, wanted, client)
+
+    def drop(self, client: Client) -> None:
+        """Close a client's connection."""
+        if client in self._clients:
+            self._clients.remove(client)
+            self.line.detach(client)
+            self._selector.unregister(client.connection)
+            client.connection.close()
