@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.estimators.estimate import information_weights, scaled_covariance
-from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt
+from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, central_jacobian, levenberg_marquardt
 from pmsmtool.estimators.output_error import AxisModel, bend, recursion, respond
 from pmsmtool.estimators.refusals import refuse
 
@@ -30,7 +30,7 @@ SKIP_SAMPLES = 10
 """First samples that are simulated but not compared: the voltage before the record and the sensor's start."""
 SLOW_FRACTION = 4.0
 """Injection frequency over the highest frequency that is projected out."""
-PASSES = 3
+PASSES = 2
 """Passes of the small non-linear terms; each shrinks what is left by R T/L, the bend or K (h T_s)^2/L."""
 LAG_CENTRE = 0.1
 """Centre of the prior of the sensor time constant (T_s)."""
@@ -40,6 +40,9 @@ R_PRIOR_STD = 0.5
 """Prior of the effective resistance at the injection, relative to the loop resistance (eddy currents raise it)."""
 BEND_PRIOR_STD = 3.0
 """Prior of the bend: relative change of L over one rms ripple, in tenths."""
+LARGEST_LOG_L, LARGEST_LOG_LAG = 3.0, 10.0
+SMALLEST_DECAY, LARGEST_DECAY = -0.3, 5.0
+"""Region of the fit: L relative to its first guess, lag relative to T_s, and R T_s/L."""
 BEND_LIMIT = 10.0
 """Bend at which L would change by its own size over one rms ripple."""
 MOTION_PRIOR_STD = 10.0
@@ -189,6 +192,7 @@ class Layout:
 
     shots: int
     effects: Effects
+    L_scale: float
     R_scale: float
     period_s: float
     ripple_a: float
@@ -226,7 +230,10 @@ class Layout:
         return [
             Response(
                 model=AxisModel(
-                    math.exp(log_L + ratios[2 * k]), R * self.R_scale * (1.0 + ratios[2 * k + 1]), delay, lag
+                    self.L_scale * math.exp(log_L + ratios[2 * k]),
+                    R * self.R_scale * (1.0 + ratios[2 * k + 1]),
+                    delay,
+                    lag,
                 ),
                 start_a=parts["start"][k] * self.ripple_a,
                 c_2=0.1 * b_2 / self.ripple_a,
@@ -259,9 +266,13 @@ class Layout:
     def defined(self, x: Vector) -> bool:
         """Whether the model can be evaluated at x."""
         parts = self.split(x)
-        (log_L, _, delay), log_lag = parts["main"], parts.get("lag", [0.0])[0]
+        (log_L, R, delay), log_lag = parts["main"], parts.get("lag", [0.0])[0]
+        if abs(log_L) > LARGEST_LOG_L:
+            return False
+        decay = R * self.R_scale * self.period_s / (self.L_scale * math.exp(log_L))
+        possible = SMALLEST_DECAY < decay < LARGEST_DECAY
         bent = max(abs(value) for value in parts.get("bend", [0.0]))
-        return 0.0 <= delay <= SKIP_SAMPLES - 3 and abs(log_lag) < 12.0 and abs(log_L) < 60.0 and bent < BEND_LIMIT
+        return possible and 0.0 <= delay <= SKIP_SAMPLES - 3 and abs(log_lag) < LARGEST_LOG_LAG and bent < BEND_LIMIT
 
 
 def simulate(response: Response, shot: Shot, slow: NDArray[np.float64]) -> Vector:
@@ -327,9 +338,30 @@ class _Problem:
             return np.full(self.rows + len(prior), UNPHYSICAL)
         return np.concatenate([*self.per_shot(x), prior])
 
+    def derivative(self, x: Vector) -> NDArray[np.float64]:
+        """Jacobian: differences for what all shots share, the decay of a starting current in closed form."""
+        shared = len(x) - self.layout.shots
+        step = np.full(shared, RELATIVE_STEP)
+        columns = [central_jacobian(lambda head: self(np.concatenate([head, x[shared:]])), x[:shared], step)]
+        first = 0
+        for shot, slow, response in zip(self.shots, self.slow, self.layout.responses(x), strict=True):
+            decay = respond(response.model, np.zeros(len(shot.u_v)), shot.period_s, 1.0)[-len(slow) - 1 : -1]
+            column = np.zeros((len(columns[0]), 1))
+            scale = self.layout.ripple_a / self.sigma_a
+            column[first : first + len(slow), 0] = scale * (decay - slow @ (slow.T @ decay))
+            columns.append(column)
+            first += len(slow)
+        return np.concatenate(columns, axis=1)
+
     def fit(self, x: Vector) -> Fit:
         return levenberg_marquardt(
-            self, x, np.ones(len(x)), iterations=ITERATIONS, tolerance=STEP_TOLERANCE, cost_tolerance=COST_TOLERANCE
+            self,
+            x,
+            np.ones(len(x)),
+            iterations=ITERATIONS,
+            tolerance=STEP_TOLERANCE,
+            cost_tolerance=COST_TOLERANCE,
+            derivative=self.derivative,
         )
 
 
@@ -386,10 +418,10 @@ def fit_axis(shots: Sequence[Shot], sigma_a: float, R_guess: float, *, allow_mot
     L_0 = min((arx_guess(shots[0], delay) for delay in (0, 1, 2)), key=lambda guess: guess[2])[0]
     T_s = shots[0].period_s
     motion_scale = 0.01 * L_0 / (shots[0].half_period * T_s) ** 2
-    base = Layout(len(shots), Effects(), R_guess, T_s, ripple, motion_scale)
+    base = Layout(len(shots), Effects(), L_0, R_guess, T_s, ripple, motion_scale)
     problem = _Problem(shots, slow, sigma_a, base)
     starts = [
-        np.array([math.log(L_0), 1.0, delay, math.log(lag), *([0.0] * len(shots))])
+        np.array([0.0, 1.0, delay, math.log(lag), *([0.0] * len(shots))])
         for delay in DELAY_STARTS
         for lag in LAG_STARTS
     ]
@@ -434,11 +466,11 @@ def _average(
     if not rows:
         raise refuse("E_NOT_CONVERGED", "no model of the axis could be fitted", stage="inductance")
     weights = information_weights([_criterion(fit) for _, fit, _, _ in rows])
-    L = float(sum(w * math.exp(row[1].x[0]) for w, row in zip(weights, rows, strict=True)))
+    L = float(sum(w * row[2].L_scale * math.exp(row[1].x[0]) for w, row in zip(weights, rows, strict=True)))
     variance = 0.0
-    for w, (_, fit, _, covariance) in zip(weights, rows, strict=True):
+    for w, (_, fit, layout, covariance) in zip(weights, rows, strict=True):
         if w > NEGLIGIBLE_WEIGHT:
-            L_m = math.exp(float(fit.x[0]))
+            L_m = layout.L_scale * math.exp(float(fit.x[0]))
             variance += float(w) * (L_m**2 * float(covariance[0, 0]) + (L_m - L) ** 2)
     effects, fit, layout, _ = rows[int(np.argmax(weights))]
     covariance, condition = scaled_covariance(fit.jacobian)

@@ -23,6 +23,8 @@ CHI2_REFUSE = 3.0
 """Reduced chi-square above which no number is given."""
 CONDITION_LIMIT = 1e6
 """Largest condition number of a column-scaled Jacobian (identification reference, section 7)."""
+SINGULAR = 1e-14
+"""Ratio of eigenvalues of the scaled normal matrix below which it counts as singular."""
 COVERAGE_FACTOR = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
 SENSOR_GAIN_TOLERANCE = 0.01
@@ -128,17 +130,18 @@ def information_bound(jacobian: NDArray[np.float64]) -> tuple[NDArray[np.float64
 
 
 def scaled_covariance(jacobian: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Inverse of J'J through the scaled singular value decomposition, and the scaled condition number."""
+    """Inverse of J'J with columns scaled to unit length, and the condition number of the scaled columns."""
     scale = np.sqrt(np.sum(jacobian**2, axis=0))
     if not np.all(scale > 0.0):
         size = jacobian.shape[1]
         return np.full((size, size), np.inf), math.inf
-    _, singular, right = np.linalg.svd(jacobian / scale, full_matrices=False)
-    condition = math.inf if singular[-1] == 0.0 else float(singular[0] / singular[-1])
-    if math.isinf(condition):
-        return np.full((len(scale), len(scale)), np.inf), condition
-    root = right.T / singular
-    return (root @ root.T) / np.outer(scale, scale), condition
+    scaled = jacobian / scale
+    # the normal matrix squares the condition number: good to 1e7, and CONDITION_LIMIT is below that
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    if not values[0] > SINGULAR * values[-1]:
+        return np.full((len(scale), len(scale)), np.inf), math.inf
+    root = vectors / np.sqrt(values)
+    return (root @ root.T) / np.outer(scale, scale), math.sqrt(float(values[-1] / values[0]))
 
 
 def condition_gate(condition: float, pair: str, stage: str) -> None:

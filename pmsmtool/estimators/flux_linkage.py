@@ -6,14 +6,16 @@ For a drive that turns its voltage by the delay times the speed, the command at 
 
 so u = (v* - v_err - R i) (w T_s/2)/sin(w T_s/2) is j w psi: the correction DIVIDES by sinc. Over all speeds
 
-    u_q = x1 w + c sgn(w),        u_d = -L_q w i_q + x2 w - psi w^2 dt,
+    u_q = x1 w + c sgn(w) + m w i_q,        u_d = -L_q w i_q + x2 w - psi w^2 dt,
 
-psi = hypot(x1, x2), frame ahead of the d axis by eps = atan2(x2, x1), and dt what is left of angle and voltage delay.
+psi = hypot(x1, x2), frame ahead of the d axis by eps = atan2(x2, x1), m the coupling (L_d - L_q)/2 sin(2 eps) of a
+frame that is off its axis, and dt what is left of angle and voltage delay.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +40,8 @@ RELATIVE_FLOOR = 5e-5
 OFFSET_FLOOR_RAD = 1e-4
 OFFSET_LIMIT_RAD = math.radians(30.0)
 """Offset above which the speed run cannot have been what it claims; the coarse offset comes first."""
+CURRENT_SETTLE_LIMIT = 0.25
+"""Change of a current between the halves of a window, of the largest q current."""
 SETTLE_LIMIT = 0.02
 """Relative change of the speed between the halves of a window."""
 
@@ -80,6 +84,7 @@ def estimate_flux_linkage(
     *,
     period_s: float,
     inverter: InverterCurve | None = None,
+    waves: Sequence[Trace] = (),
     L_d_h: float = 0.0,
     tolerance: SensorTolerance | None = None,
     T_ref_c: float = 20.0,
@@ -90,14 +95,18 @@ def estimate_flux_linkage(
     Parameters
     ----------
     speeds : Trace
-        One row per speed: ``u_d_v u_q_v i_d_a i_q_a omega_e_rad_s`` (means), ``omega_first_rad_s``,
-        ``omega_second_rad_s`` (halves of the window), ``T_magnet_c`` (NaN without a sensor).
+        One row per speed: ``u_d_v u_q_v i_d_a i_q_a omega_e_rad_s`` (means over whole turns), ``omega_first_rad_s
+        omega_second_rad_s i_d_first_a i_d_second_a i_q_first_a i_q_second_a`` (halves of the window), ``T_magnet_c``
+        (NaN without a sensor).
     R_ohm : float
         Loop resistance at the temperature of the run (ohm).
     period_s : float
         Control period (s).
     inverter : InverterCurve or None
         Voltage error from the DC levels; the intercept takes what is left.
+    waves : sequence of Trace
+        ``i_d_a i_q_a theta_e_rad`` over about the window of each speed: the mean error of a current with ripple near
+        its zero crossing is not the error of the mean current. Empty: the mean currents are used.
     L_d_h : float
         Incremental L_d where known, to refer psi to i_d = 0 (H).
     tolerance : SensorTolerance
@@ -116,16 +125,16 @@ def estimate_flux_linkage(
     i_d, i_q = speeds["i_d_a"], speeds["i_q_a"]
     x = 0.5 * w * period_s
     correction = x / np.sin(x)
-    e_d, e_q = mean_inverter_error(inverter, i_d, i_q) if inverter is not None else (np.zeros_like(w), np.zeros_like(w))
+    e_d, e_q = _inverter_error(inverter, i_d, i_q, waves)
     u_d = (speeds["u_d_v"] - e_d - R_ohm * i_d) * correction
     u_q = (speeds["u_q_v"] - e_q - R_ohm * i_q) * correction - w * L_d_h * i_d
     one = np.ones_like(w)
-    q_fit, q_cov, q_residual, q_condition = linear_solve(np.stack([w, np.sign(w)], axis=1), u_q, one)
+    q_fit, q_cov, q_residual, q_condition = linear_solve(np.stack([w, np.sign(w), w * i_q], axis=1), u_q, one)
     columns = np.stack([-w * i_q, w, -w * w], axis=1)
     d_fit, d_cov, d_residual, d_condition = linear_solve(columns, u_d, one)
     condition_gate(q_condition, "psi and the dead-time voltage", STAGE)
     condition_gate(d_condition, "L_q, the offset and the angle delay", STAGE)
-    dof_q, dof_d = len(w) - 2, len(w) - 3
+    dof_q, dof_d = len(w) - 3, len(w) - 3
     s_q = math.sqrt(float(q_residual @ q_residual) / dof_q)
     s_d = math.sqrt(float(d_residual @ d_residual) / dof_d)
     x1, x2 = float(q_fit[0]), float(d_fit[1])
@@ -178,6 +187,17 @@ def estimate_flux_linkage(
     )
 
 
+def _inverter_error(
+    curve: InverterCurve | None, i_d: Vector, i_q: Vector, waves: Sequence[Trace]
+) -> tuple[Vector, Vector]:
+    if curve is None:
+        return np.zeros_like(i_d), np.zeros_like(i_d)
+    if not waves:
+        return mean_inverter_error(curve, i_d, i_q)
+    errors = [curve.error_dq_v(wave["i_d_a"], wave["i_q_a"], wave["theta_e_rad"]) for wave in waves]
+    return np.array([float(np.mean(e[0])) for e in errors]), np.array([float(np.mean(e[1])) for e in errors])
+
+
 def mean_inverter_error(curve: InverterCurve, i_d: Vector, i_q: Vector) -> tuple[Vector, Vector]:
     """Mean of the three-phase error over one electrical turn, in the rotor frame (V)."""
     angle = np.asarray((np.arange(360) + 0.5) * (2.0 * np.pi / 360.0), dtype=np.float64)
@@ -209,6 +229,17 @@ def _check_speeds(speeds: Trace, w: Vector) -> None:
             f"limit {100 * SETTLE_LIMIT:g} %",
             stage=STAGE,
         )
+    for axis in ("d", "q"):
+        drift = np.abs(speeds[f"i_{axis}_second_a"] - speeds[f"i_{axis}_first_a"])
+        limit = CURRENT_SETTLE_LIMIT * float(np.max(np.abs(speeds["i_q_a"])))
+        if float(np.max(drift)) > limit:
+            worst = int(np.argmax(drift))
+            raise refuse(
+                "E_NOT_SETTLED",
+                f"at {w[worst]:.4g} rad/s i_{axis} still moves by {drift[worst]:.2g} A in one window, "
+                f"limit {limit:.2g} A",
+                stage=STAGE,
+            )
 
 
 def _normalise(measured: Estimate, T_ref_c: float, alpha: float, tolerance: SensorTolerance) -> Estimate:

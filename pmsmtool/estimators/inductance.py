@@ -92,8 +92,8 @@ def estimate_inductances(
     Parameters
     ----------
     d_shots, q_shots : sequence of Trace
-        ``u_d_v u_q_v i_d_a i_q_a theta_e_rad`` (and ``flagged``) in a frozen frame;
-        ``meta["half_period"]`` in samples, ``meta["fixed_angle_rad"]``.
+        ``u_d_v u_q_v i_d_a i_q_a theta_M_rad`` (and ``flagged``) in a frozen frame;
+        ``meta["half_period"]`` in samples, ``meta["fixed_angle_rad"]``, ``meta["pole_pairs"]``.
     noise : Noise
         From the zero-current trace.
     R_ohm : float
@@ -189,7 +189,7 @@ def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, stage: str) -
         )
     if "flagged" in trace.signals and np.any(trace["flagged"] > 0.0):
         raise refuse("E_CLIPPED", f"{int(np.sum(trace['flagged'] > 0.0))} samples limited or clipped", stage=stage)
-    _check_rotor(trace["theta_e_rad"], stage)
+    _check_rotor(float(trace.meta["pole_pairs"]) * trace["theta_M_rad"], stage)
     other = "q" if axis == "d" else "d"
     i, cross = trace[f"i_{axis}_a"], trace[f"i_{other}_a"]
     error = None
@@ -201,12 +201,11 @@ def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, stage: str) -
     return Shot(trace[f"u_{axis}_v"], i, cross, half_period, trace.period_s, error)
 
 
-def _check_rotor(theta: Vector, stage: str) -> None:
-    unwrapped = np.unwrap(theta)
-    moves = np.abs(np.diff(unwrapped))
+def _check_rotor(theta_e: Vector, stage: str) -> None:
+    moves = np.abs(np.diff(theta_e))
     moves = moves[moves > 1e-9]
     step = float(np.min(moves)) if len(moves) else 0.0
-    span = float(np.ptp(unwrapped)) - step
+    span = float(np.ptp(theta_e)) - step
     if span > ROTOR_LIMIT_RAD:
         raise refuse(
             "E_ROTOR_MOVED",

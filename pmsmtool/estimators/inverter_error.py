@@ -12,6 +12,9 @@ from pmsmtool.estimators.least_squares import levenberg_marquardt
 
 Vector = NDArray[np.float64]
 
+SAME_LEVEL = 1.1
+"""Ratio of currents above which two points are different levels."""
+
 
 @dataclass(frozen=True, slots=True)
 class InverterCurve:
@@ -88,8 +91,7 @@ def curve_from_levels(i_vector_a: Vector, u_vector_v: Vector, phase_factor: floa
     odd = np.sign(i_vector_a) * u_vector_v
     order = np.argsort(magnitude, kind="stable")
     magnitude, odd, positive = magnitude[order], odd[order], (i_vector_a > 0.0)[order]
-    step = 0.01 * float(magnitude[-1])
-    edges = np.flatnonzero(np.diff(magnitude) > step) + 1
+    edges = np.flatnonzero(magnitude[1:] > SAME_LEVEL * magnitude[:-1]) + 1
     x, y, differences = [], [], [0.0]
     for group in np.split(np.arange(len(magnitude)), edges):
         x.append(float(np.mean(magnitude[group])))

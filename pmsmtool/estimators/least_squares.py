@@ -85,6 +85,7 @@ def levenberg_marquardt(
     iterations: int = 60,
     tolerance: float = 1e-9,
     cost_tolerance: float = 0.0,
+    derivative: Callable[[Vector], NDArray[np.float64]] | None = None,
 ) -> Fit:
     """Minimise the sum of squares of ``residual(x)``.
 
@@ -103,6 +104,8 @@ def levenberg_marquardt(
     cost_tolerance : float
         Stop when a step lowers the cost by less than this; 1e-4 of a whitened cost is a hundredth of a standard
         deviation.
+    derivative : callable or None
+        Jacobian of the residual, shape (n, k); None: central differences.
 
     References
     ----------
@@ -112,7 +115,8 @@ def levenberg_marquardt(
     step = RELATIVE_STEP * np.asarray(scale, dtype=np.float64)
     r = residual(x)
     cost = float(r @ r)
-    jacobian = central_jacobian(residual, x, step)
+    slope = derivative or (lambda at: central_jacobian(residual, at, step))
+    jacobian = slope(x)
     damping, converged, count = DAMPING_START, False, 0
     while count < iterations and not converged:
         count += 1
@@ -131,7 +135,7 @@ def levenberg_marquardt(
                 gain = cost - cost_trial
                 x, r, cost = trial, r_trial, cost_trial
                 damping = max(damping / 10.0, 1e-12)
-                jacobian = central_jacobian(residual, x, step)
+                jacobian = slope(x)
                 converged = small or gain < cost_tolerance
                 break
             if small or damping > DAMPING_LIMIT:

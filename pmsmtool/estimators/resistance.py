@@ -274,10 +274,11 @@ def _copper_share(copper: Copper, R_loop: float) -> float:
 
 def _fit_tail(t: Vector, i: Vector, v: Vector, peak: float, sigma_v: float, powers: tuple[int, ...]) -> _TailFit:
     used = np.abs(i) >= FIT_FROM * peak
+    span = float(np.ptp(t))
     i, v, t = i[used], v[used], t[used]
     sign, u = np.sign(i), np.abs(i) / peak
     centre = float(np.sum(t * i**2) / np.sum(i**2))
-    drift = i * (t - centre) / max(float(np.ptp(t)), 1e-12)  # zero at the mean heating: R belongs to T_w
+    drift = i * (t - centre) / span  # zero at the mean heating: R belongs to T_w
     columns = np.stack([i, sign, np.ones_like(i), drift, *(sign / u**p for p in powers)], axis=1)
     x, covariance, residual, condition = linear_solve(columns, v, np.full_like(v, 1.0 / sigma_v))
     return _TailFit(powers, x, covariance, float(residual @ residual), len(v) - len(x), condition)

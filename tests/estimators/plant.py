@@ -1,14 +1,14 @@
 """A drive for judging estimators, written apart from them: many machines at once, small steps, ugly on purpose.
 
-Three phases with an inverter error of a drawn shape per phase current, a current sensor with lag, noise and quantisation
-per phase, a sampling instant that may be late, a saturating d axis, a rotor that is held, free or driven. Integrated in
-the stator frame with explicit midpoint steps; nothing here knows the estimators' closed forms.
+Three phases with an inverter error of a drawn shape per phase current, a current sensor with lag, noise and
+quantisation, a sampling instant that may be late, a saturating d axis, a rotor that is held, free or driven.
+Integrated in the stator frame with explicit midpoint steps; nothing here knows the estimators' closed forms.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +121,18 @@ def draw(n: int, rng: np.random.Generator, *, lag_max: float = 0.0, late_max: fl
     )
 
 
+def repeat(drives: Drives, times: int) -> Drives:
+    """The same drives several times over, so that different runs of all of them share the interpreter's loop."""
+    return Drives(**{field.name: np.tile(getattr(drives, field.name), times) for field in fields(Drives)})
+
+
+def curve_points(d: Drives, k: int) -> tuple[Vector, Vector]:
+    """True error of one phase of a drive at the phase currents a level run with fine low levels visits."""
+    i = 0.866 * np.concatenate([[0.004, 0.008, 0.015, 0.025, 0.036], np.linspace(0.05, 1.0, 20)]) * d.I_r[k]
+    kind = np.full(len(i), d.shape[k])
+    return i, d.dV[k] * inverter_shape(kind, i / d.knee[k]) + d.drop[k] * np.tanh(i / (0.3 * d.knee[k]))
+
+
 def abc(alpha: Vector, beta: Vector) -> Vector:
     return np.stack([alpha, -0.5 * alpha + 0.5 * ROOT_3 * beta, -0.5 * alpha - 0.5 * ROOT_3 * beta])
 
@@ -140,19 +152,19 @@ class Run:
     theta: Vector
     omega: Vector
 
-    def trace(self, d: Drives, k: int, skip: int = 0) -> Trace:
+    def trace(self, d: Drives, k: int, skip: int = 0, **meta: object) -> Trace:
         """Trace of one drive."""
         names = {
             "i_d_a": self.i_d,
             "i_q_a": self.i_q,
             "u_d_v": self.u_d,
             "u_q_v": self.u_q,
-            "theta_e_rad": self.theta,
+            "theta_M_rad": self.theta / d.p,
             "omega_e_rad_s": self.omega,
         }
         signals = {name: np.ascontiguousarray(values[skip:, k]) for name, values in names.items()}
         t = np.arange(len(self.i_d) - skip) * d.T_s[k]
-        return Trace(t, signals, {name: name.split("_", 2)[-1] for name in signals}, {})
+        return Trace(t, signals, dict.fromkeys(signals, "1"), {"pole_pairs": d.p[k], **meta})
 
 
 def run(
@@ -165,7 +177,7 @@ def run(
     bias_q: Vector | None = None,
     square_d: Vector | None = None,
     square_q: Vector | None = None,
-    half_period: int = 6,
+    half_period: int | Vector = 6,
     bandwidth: float = 2.0 * math.pi * 15.0,
     imposed_speed: Vector | None = None,
     free: bool = False,
@@ -182,17 +194,26 @@ def run(
     ref_d, ref_q = (zero if b is None else b for b in (bias_d, bias_q))
     sq_d, sq_q = (zero if b is None else b for b in (square_d, square_q))
     theta, omega = np.zeros(n), zero.copy() if imposed_speed is None else imposed_speed.copy()
-    psi_a, psi_b = d.psi.copy(), zero.copy()
-    lagged = np.zeros((3, n))
-    x_d, x_q = d.R * ref_d, d.R * ref_q
-    pending_a, pending_b = zero.copy(), zero.copy()
+    # start at the bias: a square wave that has run for a while, not the settling of the loop, is what is looked at
+    start = zero if frame is None else frame
+    c, s = np.cos(start), np.sin(start)
+    i_a, i_b = c * ref_d - s * ref_q, s * ref_d + c * ref_q
+    root = np.sqrt(1.0 + 2.0 * d.bend * i_a)
+    flux_d = np.where(d.bend > 0.0, (root - 1.0) / np.where(d.bend > 0.0, d.bend, 1.0), i_a) * d.L_d
+    psi_a, psi_b = d.psi + flux_d, d.L_q * i_b
+    lagged = abc(i_a, i_b)
+    kind = np.broadcast_to(d.shape, lagged.shape)
+    error = d.dV * inverter_shape(kind, lagged / d.knee) + d.drop * np.tanh(lagged / (0.3 * d.knee))
+    error_a, error_b = alpha_beta(error)
+    u_a, u_b = d.R * i_a + error_a, d.R * i_b + error_b
+    x_d, x_q = c * u_a + s * u_b, c * u_b - s * u_a
+    pending_a, pending_b = u_a, u_b
     h = d.T_s / substeps
     keep = -np.expm1(-h / np.maximum(d.lag, 1e-12))
     late_step = np.round(d.late * substeps).astype(int)
     sample = np.zeros((3, n))
     angle_at_sample, speed = np.zeros(n), omega.copy()
     out = [np.empty((samples, n)) for _ in range(6)]
-    lead = 1 + int(np.max(late_step) > 0)
 
     def currents(pa: Vector, pb: Vector, th: Vector) -> tuple[Vector, Vector]:
         c, s = np.cos(th), np.sin(th)
@@ -209,7 +230,6 @@ def run(
         ea, eb = alpha_beta(error)
         return va - ea - d.R * ia, vb - eb - d.R * ib, ia, ib
 
-    del lead
     for k in range(-1, samples):
         # samples of this period are taken late by up to a fraction of it; the command they give acts one period later
         va, vb = pending_a, pending_b
@@ -242,17 +262,19 @@ def run(
         if k < 0:
             continue
         step_angle = 2.0 * np.pi * d.p / d.encoder_steps
-        measured = np.floor(angle_at_sample / step_angle) * step_angle
+        measured = np.round(angle_at_sample / step_angle) * step_angle
         f = measured + d.offset if frame is None else frame
         sa, sb = alpha_beta(sample)
         c, s = np.cos(f), np.sin(f)
         i_d, i_q = c * sa + s * sb, c * sb - s * sa
         K_d, K_q = bandwidth * d.L_d, bandwidth * d.L_q
         e_d, e_q = ref_d - i_d, ref_q - i_q
-        x_d, x_q = x_d + bandwidth * d.R * d.T_s * 4.0 * e_d, x_q + bandwidth * d.R * d.T_s * 4.0 * e_q
+        slow = 0.25 * bandwidth**2 * d.T_s  # integral action at a quarter of the bandwidth
+        x_d, x_q = x_d + slow * d.L_d * e_d, x_q + slow * d.L_q * e_q
         w_frame = speed if frame is None else zero
         t = k - square_from
-        sign = 0.0 if t < 0 else (1.0 if ((t + half_period // 2) // half_period) % 2 == 0 else -1.0)
+        # the first half period is halved: a wave that has been running swings about the bias
+        sign = np.where(((t + half_period // 2) // half_period) % 2 == 0, 1.0, -1.0) if t >= 0 else zero
         u_d = x_d + K_d * e_d + sign * sq_d - w_frame * d.L_q * i_q
         u_q = x_q + K_q * e_q + sign * sq_q + w_frame * (d.L_d * i_d + d.psi)
         for store, value in zip(out, (i_d, i_q, u_d, u_q, measured + 0.0, speed), strict=True):

@@ -1,0 +1,248 @@
+"""Incremental L_d and L_q on drives with lag, late sampling, saturation, a free rotor and odd inverters."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR
+from pmsmtool.estimators.inductance import InductanceResult, estimate_inductances
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.noise import Noise
+from pmsmtool.trace import Trace
+from tests.estimators.plant import Drives, Run, curve_points, draw, repeat, run
+
+HALF_PERIODS = (6, 13)
+SETTLE, WINDOW = 40, 1024
+RIPPLE = 0.25  # of I_r, peak to peak
+BIAS = 0.5  # of I_r
+
+
+class Shots:
+    """All drives, both axes, both half periods in one run."""
+
+    def __init__(self, drives: Drives, rng: np.random.Generator, *, free: bool = False) -> None:
+        self.drives = drives
+        self._known: dict[tuple[int, bool, bool], InductanceResult] = {}
+        n = drives.n
+        many = repeat(drives, 4)
+        self.axis = np.repeat(["d", "d", "q", "q"], n)
+        self.half = np.repeat([*HALF_PERIODS, *HALF_PERIODS], n)
+        L = np.where(self.axis == "d", many.L_d, many.L_q)
+        V = np.minimum(RIPPLE * many.I_r * L / (self.half * many.T_s), 0.5 * many.U_dc / math.sqrt(3.0))
+        self.many = many
+        self.result: Run = run(
+            many,
+            rng,
+            SETTLE + WINDOW,
+            frame=many.offset,
+            bias_d=BIAS * many.I_r,
+            square_d=np.where(self.axis == "d", V, 0.0),
+            square_q=np.where(self.axis == "q", V, 0.0),
+            half_period=self.half,
+            bandwidth=2 * math.pi * 30.0,
+            free=free,
+            substeps=20,
+        )
+
+    def trace(self, k: int, axis: str, half: int) -> Trace:
+        row = k + self.drives.n * (HALF_PERIODS.index(half) + (2 if axis == "q" else 0))
+        return self.result.trace(self.many, row, SETTLE, half_period=half, fixed_angle_rad=self.drives.offset[k])
+
+    def estimate(self, k: int, *, offset: bool = True, compensate: bool = True) -> InductanceResult:
+        if (k, offset, compensate) not in self._known:
+            self._known[k, offset, compensate] = self._estimate(k, offset, compensate)
+        return self._known[k, offset, compensate]
+
+    def _estimate(self, k: int, offset: bool, compensate: bool) -> InductanceResult:
+        d = self.drives
+        return estimate_inductances(
+            [self.trace(k, "d", half) for half in HALF_PERIODS],
+            [self.trace(k, "q", half) for half in HALF_PERIODS],
+            Noise(d.sigma_dq[k], 0.0, 0.0, 2048),
+            d.R[k],
+            frame_offset=(d.offset[k], 1e-4) if offset else None,
+            inverter=InverterCurve(*curve_points(d, k), 0.0) if compensate else None,
+        )
+
+    def mean_i_d(self, k: int) -> float:
+        return float(np.mean([np.mean(self.trace(k, axis, half)["i_d_a"]) for axis in "dq" for half in HALF_PERIODS]))
+
+
+def errors_of(shots: Shots) -> tuple[np.ndarray, np.ndarray, list[InductanceResult]]:
+    """Relative errors and half widths, d and q of every drive."""
+    d = shots.drives
+    results = [shots.estimate(k) for k in range(d.n)]
+    errors, widths = [], []
+    for k, result in enumerate(results):
+        i = shots.mean_i_d(k)
+        root = math.sqrt(1.0 + 2.0 * d.bend[k] * i)  # i = x (1 + b x/2), x = flux/L_d: L_inc = L_d/(1 + b x)
+        for estimate, truth in ((result.L_d, d.L_d[k] / root), (result.L_q, d.L_q[k])):
+            errors.append(abs(estimate.value / truth - 1.0))
+            widths.append(COVERAGE_FACTOR * estimate.std / truth)
+    return np.array(errors), np.array(widths), results
+
+
+@pytest.fixture(scope="module")
+def plain() -> Shots:
+    rng = np.random.default_rng(21)
+    return Shots(draw(14, rng), rng)
+
+
+def test_ideal_sensors(plain):
+    errors, widths, results = errors_of(plain)
+    assert np.quantile(errors, 0.9) < 2.5e-3  # measured 0.9e-3
+    assert np.max(errors) < 1e-2  # measured 1.3e-3
+    assert np.mean(errors <= widths) > 0.85
+    assert np.median(widths) < 2e-3
+    assert all(abs(result.delay - 1.0) < 0.02 for result in results)
+
+
+def test_unknown_sensor_lag_and_late_sampling():
+    rng = np.random.default_rng(22)
+    drives = draw(10, rng, lag_max=20e-6, late_max=0.1)
+    errors, widths, results = errors_of(Shots(drives, rng))
+    assert np.quantile(errors, 0.9) < 5e-3  # measured 1.4e-3
+    assert np.max(errors) < 2e-2  # measured 2.0e-3
+    assert np.mean(errors <= widths) > 0.85
+    seen = [result.delay * drives.T_s[k] + result.lag_s for k, result in enumerate(results)]
+    true = (1.0 - np.round(drives.late * 20) / 20) * drives.T_s + drives.lag
+    assert np.max(np.abs(np.array(seen) - true) / drives.T_s) < 0.05
+
+
+def test_a_bend_is_not_taken_for_an_inductance():
+    rng = np.random.default_rng(23)
+    drives = draw(6, rng)
+    drives.bend[:] = 0.4 / drives.I_r
+    errors, _, results = errors_of(Shots(drives, rng))
+    assert np.quantile(errors[::2], 0.9) < 2.5e-3  # the d axis, measured 1.6e-3
+    assert all("bend" in result.axes["d"].effects for result in results)
+
+
+def test_a_free_rotor_follows_the_injection():
+    rng = np.random.default_rng(24)
+    drives = draw(6, rng)
+    drives.offset[:] = 0.0
+    errors, _, _ = errors_of(Shots(drives, rng, free=True))
+    assert np.quantile(errors, 0.9) < 2.5e-3  # measured 1.3e-3
+    assert np.max(errors) < 1e-2
+
+
+def test_the_offset_of_the_frame_is_undone(plain):
+    """Not undoing it mixes the axes by up to (L_q/L_d - 1) sin^2 eps."""
+    d = plain.drives
+    k = int(np.argmax((d.L_q / d.L_d - 1.0) * np.sin(d.offset) ** 2))
+    result = plain.estimate(k)
+    mixed = 1.0 / (np.cos(d.offset[k]) ** 2 / d.L_d[k] + np.sin(d.offset[k]) ** 2 / d.L_q[k])
+    assert result.axes["d"].L_h == pytest.approx(mixed, rel=2e-3)
+    assert abs(result.L_d.value / d.L_d[k] - 1.0) < 0.5 * abs(mixed / d.L_d[k] - 1.0)
+
+
+def test_a_salient_machine_shows_its_axis_without_turning(plain):
+    d = plain.drives
+    salient = [k for k in range(d.n) if d.L_q[k] > 1.3 * d.L_d[k]]
+    assert len(salient) >= 4
+    for k in salient[:4]:
+        result = plain.estimate(k, offset=False)
+        assert result.axis_angle_rad == pytest.approx(d.offset[k], abs=0.01)
+        assert result.L_d.fallback
+
+
+def test_one_shot_of_an_unknown_delay_is_not_biased_by_it(plain):
+    """The textbook fit with the delay fixed at 0 or 2 periods is off by ten percent and more; the delay is found."""
+    k = 0
+    shifted = [
+        replace(trace, signals={**trace.signals, f"u_{axis}_v": np.roll(trace[f"u_{axis}_v"], 1)})
+        for axis in "dq"
+        for trace in [plain.trace(k, axis, half) for half in HALF_PERIODS]
+    ]
+    d = plain.drives
+    result = estimate_inductances(
+        shifted[:2], shifted[2:], Noise(d.sigma_dq[k], 0, 0, 2048), d.R[k], frame_offset=(d.offset[k], 1e-4)
+    )
+    assert result.delay == pytest.approx(0.0, abs=0.03)
+    assert result.L_d.value == pytest.approx(d.L_d[k], rel=3e-3)
+
+
+def test_every_number_says_which_inductance_and_where(plain):
+    result = plain.estimate(0)
+    assert "incremental" in result.L_d.method
+    assert result.L_d.i_d_apk == pytest.approx(BIAS * plain.drives.I_r[0], rel=0.05)
+    assert result.L_d.systematic == pytest.approx(result.L_d.value * math.hypot(0.01, 0.01))
+
+
+def test_two_frequencies_that_disagree_are_both_reported(plain):
+    """Shots of two machines in one estimate: eddy currents would look like that."""
+    d = plain.drives
+    k = 0
+    slow = plain.trace(k, "d", 13)
+    weaker = replace(slow, signals={**slow.signals, "u_d_v": 1.1 * slow["u_d_v"]})
+    result = estimate_inductances(
+        [plain.trace(k, "d", 6), weaker],
+        [plain.trace(k, "q", half) for half in HALF_PERIODS],
+        Noise(d.sigma_dq[k], 0, 0, 2048),
+        d.R[k],
+        frame_offset=(d.offset[k], 1e-4),
+    )
+    assert result.frequency_dependent == ("d",)
+    assert result.verdict == "warn"
+    (_, fast_L), (_, slow_L) = result.by_frequency["d"]
+    assert slow_L / fast_L == pytest.approx(1.1, rel=0.01)
+
+
+def test_efficiency_against_the_bound():
+    """sd over realisations / Cramer-Rao bound of the model with delay, lag, R and starting current as nuisance."""
+    rng = np.random.default_rng(25)
+    one = draw(1, rng)
+    one.dV[:] = 0.0
+    one.drop[:] = 0.0
+    one.offset[:] = 0.0
+    count = 16
+    shots = Shots(repeat(one, count), rng)
+    results = [shots.estimate(k, compensate=False) for k in range(count)]
+    ratios = []
+    for axis in "dq":
+        values = [result.axes[axis].L_h for result in results]
+        bound = np.mean([result.axes[axis].bound_h for result in results])
+        ratios.append(float(np.std(values, ddof=1) / bound))
+    pooled = math.sqrt(np.mean(np.square(ratios)))
+    assert pooled < 1.3 * (1.0 + 2.0 / math.sqrt(4.0 * count))
+    assert pooled > 0.5
+
+
+def _move(t: Trace) -> dict[str, np.ndarray]:
+    return {"theta_M_rad": t["theta_M_rad"] + np.linspace(0.0, 0.1, len(t))}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (_move, "E_ROTOR_MOVED"),
+        (lambda t: {"flagged": np.r_[1.0, np.zeros(len(t) - 1)]}, "E_CLIPPED"),
+        (lambda t: {"i_d_a": np.full(len(t), np.mean(t["i_d_a"]))}, "E_EXCITATION"),
+        (lambda t: {"i_d_a": np.random.default_rng(1).normal(0, np.ptp(t["i_d_a"]), len(t))}, "E_MODEL_MISMATCH"),
+        (lambda t: {"i_d_a": np.clip(t["i_d_a"], None, np.mean(t["i_d_a"]))}, "E_MODEL_MISMATCH"),
+    ],
+)
+def test_refusals(plain, change, reason):
+    k = 0
+    traces = []
+    for half in HALF_PERIODS:
+        trace = plain.trace(k, "d", half)
+        signals = {**trace.signals, **change(trace)}
+        traces.append(replace(trace, signals=signals, units=dict.fromkeys(signals, "1")))
+    d = plain.drives
+    with pytest.raises(IdentificationError) as caught:
+        estimate_inductances(
+            traces, [plain.trace(k, "q", 6)], Noise(d.sigma_dq[k], 0, 0, 2048), d.R[k], frame_offset=(0.0, 1e-4)
+        )
+    assert caught.value.reason == reason
+
+
+def test_a_short_trace_is_no_excitation(plain):
+    short = plain.trace(0, "d", 13)
+    short = replace(short, t_s=short.t_s[:200], signals={name: values[:200] for name, values in short.signals.items()})
+    with pytest.raises(IdentificationError, match="E_EXCITATION"):
+        estimate_inductances([short], [short], Noise(0.01, 0, 0, 2048), 1.0)
