@@ -6,7 +6,7 @@ import contextlib
 import errno
 import sys
 from collections.abc import Iterator
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -20,6 +20,9 @@ from pmsmtool.errors import (
     StopNotConfirmed,
     VerifyMismatch,
 )
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 READER_GONE = 141
 """Exit code when whoever read standard output went away, as of a filter that SIGPIPE ends (128 + 13)."""
@@ -155,6 +158,7 @@ def _keep(text: str) -> Path | None:
     import datetime
     import platform
     import tempfile
+    from pathlib import Path
 
     from pmsmtool import __version__
     from pmsmtool.resources import user_folder

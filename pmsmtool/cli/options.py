@@ -8,9 +8,9 @@ what is given nowhere is left to python-can's own configuration.
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -20,6 +20,8 @@ from pmsmtool.cli.output import Output, set_up_logging
 from pmsmtool.errors import ConfigError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pmsmtool.bus.connect import Connection
 
 Function = Callable[..., Any]
@@ -68,9 +70,19 @@ class Quantity(click.ParamType[float]):
             self.fail("; ".join(part for part in (error.what, error.likely, error.hint) if part), param, ctx)
 
 
+class FilePath(click.Path):
+    """A path, as ``pathlib.Path``; that module is imported when a path is given, not with this one."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path, or fail as a usage error."""
+        from pathlib import Path
+
+        return Path(os.fsdecode(super().convert(value, param, ctx)))
+
+
 NODE = WholeNumber("node", 1, 127)
 BITRATE = WholeNumber("bit rate", 1, 10**7)
-FILE = click.Path(dir_okay=False, path_type=Path)
+FILE = FilePath(dir_okay=False)
 SERIAL = WholeNumber("serial", 0, 0xFFFFFFFF)
 CURRENT = Quantity("current")
 SPEED = Quantity("angular speed")

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import json
 import math
+import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import click
@@ -33,8 +32,8 @@ def jsonable(value: Any) -> Any:
         return value
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: jsonable(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
@@ -108,6 +107,8 @@ class Output:
 
     def json_line(self, command: str, data: Mapping[str, Any]) -> None:
         """Print one JSON object on a line of its own (``monitor`` prints many)."""
+        import json
+
         content = {"schema": f"pmsmtool.{command}/1", **data}
         click.echo(json.dumps(jsonable(content), allow_nan=False))
 
