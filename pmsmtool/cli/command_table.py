@@ -44,6 +44,7 @@ class Row:
 COMMANDS: tuple[Row, ...] = (
     Row("machine", "pmsmtool.cli.machine:machine_command", Section.COMPUTE, "Make a machine file from a datasheet."),
     Row("tune", "pmsmtool.cli.tune:tune_command", Section.COMPUTE, "Design the control of a machine."),
+    Row("report", "pmsmtool.cli.report:report_command", Section.COMPUTE, "Write the report of a run."),
     Row("export", "pmsmtool.cli.export:export_command", Section.COMPUTE, "Write a design as DCF, C, CSV."),
     Row("lut", "pmsmtool.cli.lut:lut_command", Section.COMPUTE, "Make current references over torque and speed."),
     Row("sim", "pmsmtool.cli.sim:sim_command", Section.TOOL, "Serve simulated drives to other programs."),

@@ -69,7 +69,7 @@ def render(
     return environment.from_string(source).render(
         title=f"Commissioning of {name}, serial {int(drive.get('serial', 0)):#010x}",
         subtitle=f"started {record['started_utc']} by {record['operator']}",
-        verdict=_verdict(latest, complete),
+        verdict=verdict_of(latest, complete),
         stages=latest,
         estimates=[_estimate_row(value) for stage in latest for value in stage.get("values", ()) if "std" in value],
         fallbacks=[f"{stage['name']}: {line}" for stage in latest for line in stage.get("fallbacks", ())],
@@ -86,17 +86,35 @@ def _latest(stages: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     return list({stage["name"]: stage for stage in stages}.values())
 
 
-def _verdict(stages: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> dict[str, Any]:
-    failed = [stage for stage in stages if stage["status"] != "pass"]
-    done = {stage["name"] for stage in stages}
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The first thing a reader sees: ``kind`` is ``pass``, ``fail`` or ``open``; ``lines`` are its reasons."""
+
+    kind: str
+    word: str
+    lines: tuple[str, ...]
+
+
+def verdict_of(stages: Sequence[Mapping[str, Any]], complete: Sequence[str] = COMPLETE) -> Verdict:
+    """Return the verdict on the stages of a run; the last entry of each counts.
+
+    Parameters
+    ----------
+    stages : sequence of mapping
+        ``stages`` of ``run.json``.
+    complete : sequence of str
+        Stages that a green verdict needs.
+    """
+    latest = _latest(stages)
+    failed = [stage for stage in latest if stage["status"] != "pass"]
+    done = {stage["name"] for stage in latest}
     missing = [name for name in complete if name not in done]
     if failed:
-        lines = [f"{stage['name']}: {_failure(stage)}" for stage in failed]
-        return {"kind": "fail", "word": "FAIL", "lines": lines}
+        return Verdict("fail", "FAIL", tuple(f"{stage['name']}: {_failure(stage)}" for stage in failed))
     if missing:
-        return {"kind": "open", "word": "NOT COMPLETE", "lines": [f"not run yet: {', '.join(missing)}"]}
-    criteria = sum(len(stage.get("acceptance", ())) for stage in stages)
-    return {"kind": "pass", "word": "PASS", "lines": [f"{len(stages)} stages, {criteria} criteria, all met"]}
+        return Verdict("open", "NOT COMPLETE", (f"not run yet: {', '.join(missing)}",))
+    criteria = sum(len(stage.get("acceptance", ())) for stage in latest)
+    return Verdict("pass", "PASS", (f"{len(latest)} stages, {criteria} criteria, all met",))
 
 
 def _failure(stage: Mapping[str, Any]) -> str:

@@ -86,6 +86,7 @@ class RunRecord:
     consents: Sequence[Mapping[str, Any]] = ()
     instruments: Sequence[str] = ()
     stages: Sequence[Stage] = ()
+    request: Mapping[str, Any] = field(default_factory=dict)
     schema: str = SCHEMA
 
     def stage(self, name: str) -> Stage | None:
@@ -164,6 +165,16 @@ class RunDirectory:
             os.replace(name, self.path / RECORD)
         except OSError as error:
             raise _unwritable(self.path, error) from error
+
+    def save(self, name: str, content: bytes | str) -> None:
+        """Put a file into the run, in one step; raises ``ConfigError`` when it cannot be written."""
+        data = content.encode() if isinstance(content, str) else content
+        part = self.path / f".{name}.part"
+        try:
+            part.write_bytes(data)
+            os.replace(part, self.path / name)
+        except OSError as error:
+            raise _unwritable(self.path / name, error) from error
 
     def add(self, stage: Stage) -> None:
         """Append a stage to the record, with the hashes of the files it names."""

@@ -1,0 +1,263 @@
+"""Figures of a commissioning report: what was measured, with the model that was fitted to it, as inline SVG.
+
+Same data, same bytes: no date, ids from a fixed salt, text kept as text.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.design.sampled_loop import LoopMargins, SampledLoop
+from pmsmtool.estimators.axis_fit import SKIP_SAMPLES, AxisFit
+from pmsmtool.estimators.flux_linkage import FluxResult, mean_inverter_error
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.report.report import Figure
+from pmsmtool.trace import Trace
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+Vector = NDArray[np.float64]
+
+_SALT = "pmsmtool"
+_SIZE = (9.0, 3.4)
+_MEASURED, _MODEL, _OTHER, _LIMIT = "#1f5fa8", "#c2410c", "#4b5563", "#9ca3af"
+PERIODS_SHOWN = 6
+"""Periods of an injection that are drawn; the fit uses all."""
+BODE_POINTS = 400
+_STYLE: dict[Any, Any] = {
+    "svg.hashsalt": _SALT,
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.grid": True,
+    "grid.color": "#e5e7eb",
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "lines.linewidth": 1.3,
+}
+_ID = re.compile(r' id="([^"]+)"')
+_REFERENCE = re.compile(r'(?:url\(#|xlink:href="#)([^)"]+)')
+
+
+def resistance_figure(levels: Trace, R_ohm: float, curve: InverterCurve) -> Figure:
+    """Draw the DC levels without R i, and the inverter curve they give.
+
+    Parameters
+    ----------
+    levels : Trace
+        ``i_d_a u_d_v`` per level, as ``estimate_resistance`` takes them.
+    R_ohm : float
+        Loop resistance at the temperature of the measurement (ohm).
+    curve : InverterCurve
+        Voltage error of one phase.
+    """
+    i, u = levels["i_d_a"], levels["u_d_v"]
+    offset = float(np.mean(u - R_ohm * i))
+    phase_factor = math.sqrt(3.0) / 2.0  # one phase idle at 30 + k 60 degrees
+    canvas, (left, right) = _canvas(1, 2)
+    left.plot(i, u, "o", ms=3.5, color=_MEASURED, label="levels")
+    fine = np.linspace(float(np.min(i)), float(np.max(i)), 401)
+    error = curve.error_v(phase_factor * fine) / phase_factor
+    left.plot(fine, R_ohm * fine + error + offset, color=_MODEL, label="R i + inverter error")
+    left.plot(fine, R_ohm * fine, "--", color=_LIMIT, label="R i")
+    left.set(xlabel="current along the vector / A", ylabel="commanded voltage / V")
+    left.legend()
+    right.plot(curve.i_phase_a, curve.u_error_v, "o-", ms=3.5, color=_MEASURED)
+    right.set(xlabel="phase current / A", ylabel="voltage error of one phase / V", xlim=(0.0, None))
+    peak = float(np.max(np.abs(i)))
+    caption = (
+        f"DC levels up to {peak:.4g} A and R = {R_ohm:.5g} ohm at the temperature of the measurement; what is left "
+        f"over is the voltage error of one inverter phase, sampled at {len(curve.i_phase_a)} currents."
+    )
+    return Figure(svg(canvas), caption)
+
+
+def inductance_figure(shots: Mapping[str, Trace], fits: Mapping[str, AxisFit], sigma_a: float) -> Figure:
+    """Draw the first periods of the square-wave injection on each axis, with the current the fit predicts.
+
+    Parameters
+    ----------
+    shots : mapping of str to Trace
+        Per axis (``d``, ``q``) the record with the shortest half period.
+    fits : mapping of str to AxisFit
+        Their fits.
+    sigma_a : float
+        Noise of one current sample (A), which whitened the residuals.
+    """
+    canvas, panels = _canvas(1, 2)
+    texts = []
+    for axes, axis in zip(panels, "dq", strict=True):
+        shot, fit = shots[axis], fits[axis]
+        half = int(shot.meta["half_period"])
+        shown = min(2 * half * PERIODS_SHOWN, len(shot) - SKIP_SAMPLES)
+        t_ms = 1e3 * (shot.t_s[SKIP_SAMPLES : SKIP_SAMPLES + shown] - shot.t_s[SKIP_SAMPLES])
+        measured = shot[f"i_{axis}_a"][SKIP_SAMPLES : SKIP_SAMPLES + shown]
+        predicted = measured + sigma_a * fit.residuals[0][:shown]
+        axes.plot(t_ms, predicted, "-", color=_MODEL, label="fitted response")
+        axes.plot(t_ms, measured, ".", ms=4.0, color=_MEASURED, label="measured")
+        axes.set(xlabel="time / ms", ylabel=f"i_{axis} / A")
+        axes.set_title(f"{axis} axis, half period {half} samples", loc="left", fontsize=9)
+        rms = sigma_a * math.sqrt(float(np.mean(fit.residuals[0] ** 2)))
+        texts.append(f"{axis}: rms residual {1e3 * rms:.3g} mA over {len(shot)} samples, chi2 {fit.chi2:.3g}")
+    panels[0].legend()
+    return Figure(svg(canvas), f"Square-wave injection, first periods; {'; '.join(texts)}.")
+
+
+def flux_figure(speeds: Trace, result: FluxResult, curve: InverterCurve | None, *, R_ohm: float, period_s: float,
+                L_d_h: float) -> Figure:  # fmt: skip
+    """Draw the voltage of the magnets over speed, and how far each speed lies off the common flux linkage.
+
+    Parameters
+    ----------
+    speeds : Trace
+        One row per speed, as ``estimate_flux_linkage`` takes them.
+    result : FluxResult
+        The regression.
+    curve, R_ohm, period_s, L_d_h
+        What was taken off the commanded voltage.
+    """
+    w, i_d, i_q = speeds["omega_e_rad_s"], speeds["i_d_a"], speeds["i_q_a"]
+    x = 0.5 * w * period_s
+    e_q = np.zeros_like(w) if curve is None else mean_inverter_error(curve, i_d, i_q)[1]
+    u_q = (speeds["u_q_v"] - e_q - R_ohm * i_q) * x / np.sin(x) - w * L_d_h * i_d - result.intercept_v * np.sign(w)
+    psi = result.psi_measured.value * math.cos(result.frame_offset.value)
+    canvas, (left, right) = _canvas(1, 2)
+    order = np.argsort(w)
+    left.plot(w[order], psi * w[order], color=_MODEL, label="psi_f omega")
+    left.plot(w, u_q, "o", ms=3.5, color=_MEASURED, label="measured")
+    left.set(xlabel="electrical speed / rad/s", ylabel="voltage of the magnets / V")
+    left.legend()
+    right.axhline(0.0, color=_MODEL)
+    right.plot(w, 1e2 * (u_q / (w * psi) - 1.0), "o", ms=3.5, color=_MEASURED)
+    right.set(xlabel="electrical speed / rad/s", ylabel="deviation from psi_f / %")
+    caption = (
+        f"Regression over {len(w)} speeds in both directions: psi_f = {result.psi_measured.value:.5g} Wb at the "
+        f"temperature of the run, {result.intercept_v:+.3g} V left as intercept, residual {result.residual_v:.2g} V."
+    )
+    return Figure(svg(canvas), caption)
+
+
+def bode_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMargins]) -> Figure:
+    """Draw the open loops, gain crossing and phase crossing marked.
+
+    Parameters
+    ----------
+    loops : mapping of str to SampledLoop
+        Open loops, by name.
+    found : mapping of str to LoopMargins
+        Their margins.
+    """
+    canvas, (upper, lower) = _canvas(2, 1, height=1.5, sharex=True)
+    for (name, loop), colour in zip(loops.items(), _colours(len(loops)), strict=True):
+        nyquist = math.pi / loop.T_s
+        omega = np.geomspace(1e-3 * nyquist, 0.999 * nyquist, BODE_POINTS)
+        response = loop.at(omega)
+        hz = omega / (2.0 * math.pi)
+        upper.loglog(hz, np.abs(response), color=colour, label=name)
+        lower.semilogx(hz, np.degrees(np.unwrap(np.angle(response))), color=colour)
+        crossing = found[name].crossover_rad_s
+        if math.isfinite(crossing):
+            angle = -180.0 + found[name].phase_margin_deg
+            upper.plot(crossing / (2.0 * math.pi), 1.0, "o", ms=5, color=colour)
+            lower.plot(crossing / (2.0 * math.pi), angle, "o", ms=5, color=colour)
+    upper.axhline(1.0, color=_LIMIT, lw=0.8)
+    lower.axhline(-180.0, color=_LIMIT, lw=0.8)
+    upper.set(ylabel="|L|")
+    upper.legend()
+    lower.set(xlabel="frequency / Hz", ylabel="phase / deg", ylim=(-270.0, None))
+    texts = [
+        f"{name}: {m.phase_margin_deg:.1f} deg at {m.crossover_rad_s / (2.0 * math.pi):.4g} Hz, "
+        f"{m.gain_margin_db:.1f} dB, {1e6 * m.delay_margin_s:.0f} us"
+        for name, m in found.items()
+        if name in loops
+    ]
+    return Figure(
+        svg(canvas), f"Open loops as sampled, delay included; phase, gain and delay margin: {'; '.join(texts)}."
+    )
+
+
+def envelope_figure(
+    speed_rpm: Vector, largest_nm: Vector, lines: Mapping[str, tuple[Vector, Vector]], binding: Sequence[str] = ()
+) -> Figure:
+    """Draw the torque that can be reached over speed, and the current loci of the table.
+
+    Parameters
+    ----------
+    speed_rpm, largest_nm : ndarray, shape (n,)
+        Largest torque per speed; NaN where there is no admissible point.
+    lines : mapping of str to (i_d, i_q)
+        Loci in the current plane (A).
+    binding : sequence of str
+        Limits that bind somewhere in the table.
+    """
+    canvas, (left, right) = _canvas(1, 2)
+    left.plot(speed_rpm, largest_nm, color=_MEASURED)
+    left.set(xlabel="speed / rpm", ylabel="largest torque / N m", ylim=(0.0, None))
+    for (name, (i_d, i_q)), colour in zip(lines.items(), _colours(len(lines)), strict=True):
+        right.plot(i_d, i_q, color=colour, label=name)
+    right.set(xlabel="i_d / A", ylabel="i_q / A")
+    if lines:
+        right.legend()
+    limits = f" Limits that bind in the table: {', '.join(binding)}." if binding else ""
+    return Figure(svg(canvas), f"Torque over speed and the current loci behind it.{limits}")
+
+
+def band_figure(rows: Mapping[str, tuple[float, float, float, float]], unit: str, caption: str) -> Figure:
+    """Draw numbers with their spread over a tolerance box, each against its limit.
+
+    Parameters
+    ----------
+    rows : mapping of str to (low, middle, high, limit)
+        Per row the 5 % quantile, the median, the 95 % quantile, and the least value allowed (NaN: none).
+    unit : str
+        Of all four.
+    """
+    canvas, (axes,) = _canvas(1, 1, height=0.25 + 0.12 * len(rows))
+    for y, (low, middle, high, limit) in enumerate(rows.values()):
+        axes.plot([low, high], [y, y], "-", lw=5.0, color=_LIMIT, solid_capstyle="butt")
+        axes.plot(middle, y, "o", ms=5, color=_MEASURED)
+        if math.isfinite(limit):
+            axes.plot([limit, limit], [y - 0.35, y + 0.35], color=_MODEL)
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.set(xlabel=unit, ylim=(len(rows) - 0.5, -0.5))
+    return Figure(svg(canvas), caption)
+
+
+def _canvas(rows: int, columns: int, *, height: float = 1.0, sharex: bool = False) -> tuple[Canvas, Any]:
+    """Return a figure and its axes; matplotlib is imported here (0.3 s)."""
+    import matplotlib
+    from matplotlib.figure import Figure as Canvas
+
+    with matplotlib.rc_context(_STYLE):
+        canvas = Canvas(figsize=(_SIZE[0], _SIZE[1] * height), layout="constrained")
+        axes = canvas.subplots(rows, columns, sharex=sharex, squeeze=False)
+    return canvas, list(axes.ravel())
+
+
+def _colours(count: int) -> list[str]:
+    wheel = (_MEASURED, _MODEL, "#15803d", "#7e22ce", _OTHER, "#b45309")
+    return [wheel[k % len(wheel)] for k in range(count)]
+
+
+def svg(canvas: Canvas) -> str:
+    """Return a figure as SVG text without what changes from run to run, ids only where something refers to them."""
+    import matplotlib
+
+    out = io.StringIO()
+    metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
+    with matplotlib.rc_context(_STYLE):
+        canvas.savefig(out, format="svg", metadata=metadata)
+    text = out.getvalue()
+    used = set(_REFERENCE.findall(text))
+    return _ID.sub(lambda match: match[0] if match[1] in used else "", text)

@@ -1,0 +1,126 @@
+"""The stages that compute: control, look-up table. Files of the run in, files of the run and criteria out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design
+from pmsmtool.design.lookup_design import LookupDesign, LookupRequest, design_table
+from pmsmtool.design.lookup_file import lut_values, table_csv, table_facts, table_npz
+from pmsmtool.design.lookup_loci import loci
+from pmsmtool.design.ratings import ratings
+from pmsmtool.design.sampled_loop import LoopMargins
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
+
+SHOWN = (
+    "current.K_p_d_v_per_a", "current.K_i_d_v_per_as", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as",
+    "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad",
+)  # fmt: skip
+"""Values of a design that the record names; all of them stand in ``design.toml``."""
+SPEED_PHASE_MARGIN_DEG = 40.0
+"""Least phase margin of the speed loop: below it a step rings visibly (30 % overshoot)."""
+
+
+def tune_stage(run: RunDirectory, request: TuneRequest) -> Stage:
+    """Design the control of the identified machine; writes ``design.toml``.
+
+    Raises
+    ------
+    DesignInfeasible
+        The margins asked for cannot be met.
+    """
+    design = tune(load_machine_file(run.path / "machine.toml"), request)
+    run.save("design.toml", design_text(design))
+    criteria = [line for name, loop in design.loops.items() for line in _loop_criteria(name, loop, request)]
+    values: list[Mapping[str, Any]] = [
+        {"name": n, "value": design[n], "method": design.values[n].method} for n in SHOWN
+    ]
+    return _stage("tune", criteria, values=values, files=("design.toml",), fallbacks=design.notes)
+
+
+def _loop_criteria(name: str, loop: LoopMargins, request: TuneRequest) -> list[Acceptance]:
+    current = name.startswith("current")
+    phase = request.phase_margin_deg if current else SPEED_PHASE_MARGIN_DEG
+    lines = [_at_least(f"{name}: phase margin", loop.phase_margin_deg, phase, "deg", loop.stable)]
+    if current:
+        lines.append(_at_least(f"{name}: gain margin", loop.gain_margin_db, request.gain_margin_db, "dB", loop.stable))
+    return lines
+
+
+def _at_least(what: str, value: float, least: float, unit: str, stable: bool) -> Acceptance:
+    measured = f"{value:.1f} {unit}" if stable else "unstable"
+    return Acceptance(what, measured, f">= {least:g} {unit}", stable and value >= least)
+
+
+def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
+    """Make the look-up table of the design; writes ``lut.npz``, ``lut.csv`` and the set with it, ``params.toml``.
+
+    Raises
+    ------
+    DesignInfeasible
+        The bounds between the nodes do not fit the drive's memory.
+    """
+    design = load_design(run.path / "design.toml")
+    machine, margin = design.machine, design["field_weakening.margin"]
+    rated = ratings(machine, (1.0 - margin) * machine.inverter.V_max_v)
+    made = design_table(machine, rated, request, margin)
+    table, error = made.table, made.error
+    lines = loci(table) if table.axis_kind == "speed" else {}
+    complete = with_table(design, made)
+    run.save("lut.npz", table_npz(table, table_facts(table, made.stored, error), lines))
+    run.save("lut.csv", table_csv(table))
+    run.save("design.toml", design_text(complete))
+    run.save("params.toml", complete.parameter_set().to_toml())
+    torque = float(max(abs(table.torque_nm[0]), table.torque_nm[-1]))
+    limit = float(table.V_max_v.min()) if table.axis_kind == "speed" else float(table.y[-1])
+    criteria = [
+        _at_most("torque error between nodes", error.torque_nm / torque, request.torque_bound),
+        _at_most("voltage beyond the limit between nodes", error.voltage_v / limit, request.voltage_bound),
+    ]
+    shape = " x ".join(map(str, table.i_d_a.shape))
+    names, counts = table.binding_counts()
+    values: list[Mapping[str, Any]] = [
+        {"name": "cells", "value": shape, "method": made.stored},
+        *({"name": f"cells bound by {name}", "value": count} for name, count in zip(names, counts, strict=True)),
+    ]
+    files = ("lut.npz", "lut.csv", "design.toml", "params.toml")
+    return _stage("lut", criteria, values=values, files=files, fallbacks=made.notes)
+
+
+def _at_most(what: str, value: float, largest: float) -> Acceptance:
+    return Acceptance(what, f"{100.0 * value:.2g} %", f"<= {100.0 * largest:g} %", value <= largest)
+
+
+def with_table(design: Design, made: LookupDesign) -> Design:
+    """Return a design with a look-up table in it."""
+    values, tables = lut_values(made.table, made.stored)
+    how = f"{made.stored}, error-bounded grid"
+    entries = {**design.values, **{name: DesignValue(value, how) for name, value in values.items()}}
+    return replace(design, values={row.name: entries[row.name] for row in CATALOGUE}, tables=tables)
+
+
+def _stage(
+    name: str,
+    criteria: list[Acceptance],
+    *,
+    values: list[Mapping[str, Any]],
+    files: tuple[str, ...],
+    fallbacks: tuple[str, ...] = (),
+) -> Stage:
+    good = all(line.ok for line in criteria)
+    return Stage(
+        name,
+        "pass" if good else "fail",
+        0.0,
+        values=values,
+        acceptance=criteria,
+        files=dict.fromkeys(files, ""),
+        fallbacks=fallbacks,
+        note="" if good else f"{sum(not line.ok for line in criteria)} of {len(criteria)} criteria are not met",
+    )

@@ -1,0 +1,108 @@
+"""From a run directory to its report: the files of the run are read, figures drawn from them, the page rendered.
+
+Nothing is measured, and no number is made that the run does not hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pmsmtool.design.current_loop import AxisPlant, CurrentGains, Method, axis_loop
+from pmsmtool.design.design_file import Design, load_design
+from pmsmtool.design.sampled_loop import SampledLoop
+from pmsmtool.design.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, speed_loop
+from pmsmtool.npz_file import read_npz
+from pmsmtool.report import figures
+from pmsmtool.report.report import Change, Figure, Verdict, render, verdict_of
+from pmsmtool.workflow.run_directory import RunDirectory, RunRecord
+
+NOT_CHECKED = (
+    "Behaviour: the drive's bytes were compared, its step responses were not.",
+    "Scale of the sensors: current and voltage gains are taken from the declared tolerances, nothing in the drive can "
+    "measure them.",
+    "The hardware stop (safe torque off, mains, emergency stop): the stops of this run went over the bus.",
+    "Continuous torque and temperatures under load.",
+    "Saturation beyond the bias points that are named, cogging and slot harmonics, iron losses.",
+)
+"""What a reader of a green report must not assume."""
+
+
+def report_page(path: Path) -> str:
+    """Return the report of a run as one self-contained HTML page.
+
+    Raises
+    ------
+    ConfigError
+        There is no run in the folder, or one of its files is damaged.
+    """
+    run = RunDirectory(path)
+    record = run.read()
+    drawn = [*_design_figures(run.path / "design.toml"), *_table_figures(run.path / "lut.npz")]
+    return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=NOT_CHECKED)
+
+
+def verdict(path: Path) -> Verdict:
+    """Return the verdict of a run; raises ``ConfigError`` when there is none in the folder."""
+    return verdict_of([asdict(stage) for stage in RunDirectory(path).read().stages])
+
+
+def _design_figures(path: Path) -> Iterator[Figure]:
+    if path.is_file():
+        design = load_design(path)
+        loops = open_loops(design)
+        yield figures.bode_figure(loops, {name: design.loops[name] for name in loops})
+
+
+def open_loops(design: Design) -> dict[str, SampledLoop]:
+    """Return the open loops of a design, from the gains that stand in it."""
+    machine, inverter = design.machine.machine, design.machine.inverter
+    alpha = float(design.facts.get("current_bandwidth_rad_s", 0.0))
+    predicts = bool(design.request.get("predictor", False))
+    loops = {}
+    for axis, L in (("d", machine.L_d_h), ("q", machine.L_q_h)):
+        plant = AxisPlant(machine.R_s_ohm, L, inverter.T_s, inverter.delay_periods)
+        gains = CurrentGains(
+            design[f"current.K_p_{axis}_v_per_a"], design[f"current.K_i_{axis}_v_per_as"], alpha, Method.IMC
+        )
+        loops[f"current_{axis}"] = axis_loop(gains, plant, plant if predicts else None)
+    if "speed" in design.loops and machine.J_kgm2 is not None:
+        notch = Notch(design["speed.notch_hz"], design["speed.notch_zeta_num"], design["speed.notch_zeta_den"])
+        path = SpeedPath(
+            machine.J_kgm2, machine.B_nms or 0.0, loops["current_q"], int(design["speed.decimation"]),
+            design["encoder.pll_bandwidth_rad_s"], design["speed.filter_hz"], notch,
+        )  # fmt: skip
+        gain = SpeedGains(
+            design["speed.K_p_nms_per_rad"], design["speed.K_i_nm_per_rad"], 0.0, SpeedMethod.SYMMETRIC_OPTIMUM
+        )
+        loops["speed"] = speed_loop(gain, path)
+    return loops
+
+
+def _table_figures(path: Path) -> Iterator[Figure]:
+    if not path.is_file():
+        return
+    arrays = read_npz(path)
+    if "largest_speed_rpm" not in arrays:
+        return
+    lines = {
+        name: (arrays[f"{name}_i_d_a"], arrays[f"{name}_i_q_a"])
+        for name in ("mtpa", "largest", "mtpv")
+        if f"{name}_i_d_a" in arrays and np.isfinite(arrays[f"{name}_i_d_a"]).any()
+    }
+    binding = [str(name) for name in np.unique(arrays["binding"])]
+    yield figures.envelope_figure(arrays["largest_speed_rpm"], arrays["largest_torque_nm"], lines, binding)
+
+
+def _changes(record: RunRecord) -> Sequence[Change]:
+    stage = record.stage("flash")
+    return [] if stage is None else [_change(row) for row in stage.values if "held" in row]
+
+
+def _change(row: Mapping[str, Any]) -> Change:
+    old, asked, held = (f"{float(row[key]):.7g}" for key in ("old", "asked", "held"))
+    return Change(str(row["name"]), old, asked, held, str(row["unit"]))

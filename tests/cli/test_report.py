@@ -1,0 +1,129 @@
+"""The report: one page that needs nothing else, made from the run's files alone, the same bytes every time."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.cli.main import run as program
+from pmsmtool.design.lookup_design import LookupRequest
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.resources import data_folder
+from pmsmtool.workflow.design_stages import lut_stage, tune_stage
+from pmsmtool.workflow.report_page import open_loops
+from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage, new_record
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with the stages that need no drive, and a download as it is recorded."""
+    folder = tmp_path_factory.mktemp("runs")
+    record = new_record(
+        ["commission"], drive={"name": "bench <2>", "serial": 7}, bus={}, versions={}, operator="A. Engineer"
+    )
+    run = RunDirectory.create(folder, 7, record)
+    shutil.copy(data_folder("profiles") / "interior-2k2.toml", run.path / "machine.toml")
+    run.add(tune_stage(run, TuneRequest()))
+    run.add(lut_stage(run, LookupRequest()))
+    change = {"name": "motor.R_s_ohm", "object": "0x2010:02", "old": 0.2, "asked": 0.137, "held": 0.137, "unit": "ohm"}
+    run.add(Stage("flash", "pass", 1.0, values=[change], acceptance=[Acceptance("read back", "84 of 84", "all", True)]))
+    return run.path
+
+
+def page_of(folder: Path) -> str:
+    assert program(["report", str(folder), "-q"]) == 0
+    return (folder / "report.html").read_text()
+
+
+def test_the_page_needs_nothing_else_and_puts_the_verdict_first(made: Path) -> None:
+    page = page_of(made)
+    assert page.index("NOT COMPLETE") < page.index("<h2")
+    assert "not run yet: identify, margins, verify" in page
+    assert not re.search(r"<(script|link|iframe|img)\b|@import|url\((?!#)", page)
+    assert not re.search(r'(?:src|href)="(?!#)', page)
+    assert page.count("<svg") == 2
+    assert "bench &lt;2&gt;" in page
+    for text in ("motor.R_s_ohm", "84 of 84", "What was not checked", "Behaviour: the drive", "A. Engineer"):
+        assert text in page
+
+
+def test_ids_are_unique_and_referenced(made: Path) -> None:
+    ids = re.findall(r' id="([^"]+)"', page_of(made))
+    used = set(re.findall(r'(?:url\(#|xlink:href="#)([^)"]+)', page_of(made)))
+    assert set(ids) == used
+
+
+def test_same_run_same_bytes(made: Path, tmp_path: Path) -> None:
+    for name in ("one.html", "two.html"):
+        assert program(["report", str(made), "-o", str(tmp_path / name), "-q"]) == 0
+    assert (tmp_path / "one.html").read_bytes() == (tmp_path / "two.html").read_bytes()
+
+
+def test_json_gives_the_verdict_on_stdout_alone(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert program(["report", str(made), "--json", "-o", str(tmp_path / "r.html")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["schema"] == "pmsmtool.report/1"
+    assert found["verdict"] == "NOT COMPLETE"
+
+
+def test_a_failed_stage_makes_the_verdict(made: Path, tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "run")
+    shutil.copytree(made, run.path)
+    run.add(Stage("tune", "fail", 0.0, acceptance=[Acceptance("phase margin", "31 deg", ">= 45 deg", False)]))
+    page = page_of(run.path)
+    assert ">FAIL</strong>" in page and "tune: phase margin: 31 deg, limit &gt;= 45 deg" in page
+
+
+def test_the_loops_drawn_are_those_of_the_design(made: Path) -> None:
+    from pmsmtool.design.design_file import load_design
+    from pmsmtool.design.sampled_loop import margins
+
+    design = load_design(made / "design.toml")
+    loops = open_loops(design)
+    assert set(loops) == {"current_d", "current_q", "speed"}
+    for name, loop in loops.items():
+        again, stated = margins(loop), design.loops[name]
+        assert again.phase_margin_deg == pytest.approx(stated.phase_margin_deg, rel=1e-9), name
+        assert again.gain_margin == pytest.approx(stated.gain_margin, rel=1e-9), name
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda run: (run / "run.json").unlink(), "no run.json here"),
+        (lambda run: (run / "run.json").write_text("{"), "cannot be read"),
+        (lambda run: (run / "design.toml").write_text("x"), "design.toml"),
+        (lambda run: (run / "lut.npz").write_bytes(b"PK"), "lut.npz"),
+        (shutil.rmtree, "no run.json here"),
+    ],
+)
+def test_a_damaged_run_is_named(
+    damage: object, message: str, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(made, folder)
+    (folder / "report.html").unlink(missing_ok=True)
+    damage(folder)  # type: ignore[operator]
+    assert program(["report", str(folder)]) == 2
+    assert message in capsys.readouterr().err
+    assert not (folder / "report.html").exists()
+
+
+def test_a_page_that_cannot_be_written_leaves_the_run_alone(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.read_bytes() for path in made.rglob("*") if path.is_file() and path.name != "report.html"}
+    assert program(["report", str(made), "-o", str(made / "nowhere" / "r.html")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_values_with_a_deviation_become_the_table(made: Path, tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "run")
+    shutil.copytree(made, run.path)
+    value = {"name": "R_s_ohm", "value": 0.13712, "std": 2e-4, "systematic": 1.4e-3, "unit": "ohm", "T_c": 20.0}
+    run.write(replace(run.read(), stages=(Stage("identify", "pass", 9.0, values=[value]), *run.read().stages)))
+    assert "0.1371 +- 0.0015 ohm" in page_of(run.path)
