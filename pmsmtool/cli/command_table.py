@@ -47,6 +47,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("report", "pmsmtool.cli.report:report_command", Section.COMPUTE, "Write the report of a run."),
     Row("export", "pmsmtool.cli.export:export_command", Section.COMPUTE, "Write a design as DCF, C, CSV."),
     Row("lut", "pmsmtool.cli.lut:lut_command", Section.COMPUTE, "Make current references over torque and speed."),
+    Row("simulate", "pmsmtool.cli.simulate:simulate_command", Section.COMPUTE, "Run the closed loop in simulation."),
     Row("sim", "pmsmtool.cli.sim:sim_command", Section.TOOL, "Serve simulated drives to other programs."),
     Row("help", "pmsmtool.cli.help_topics:help_command", Section.TOOL, "Explain a topic or a command."),
     Row("completion", "pmsmtool.cli.completion:completion_command", Section.TOOL, "Print a shell's completion script."),

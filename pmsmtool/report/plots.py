@@ -50,7 +50,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("i_d / A", (("i_d_a", "i_d", "-"), ("i_d_ref_a", "reference", "--"))),
     Panel("i_q / A", (("i_q_a", "i_q", "-"), ("i_q_ref_a", "reference", "--"))),
     Panel("voltage / V", (("u_d_lim_v", "u_d", "-"), ("u_q_lim_v", "u_q", "-"))),
-    Panel("torque / N m", (("torque_true_nm", "shaft side", "-"), ("torque_nm", "drive", "-"), ("load_nm", "load", "--"))),
+    Panel("torque / N m", (("torque_true_nm", "air gap", "-"), ("torque_nm", "drive", "-"), ("load_nm", "load", "--"))),
     Panel("speed / rpm", (("omega_m_rad_s", "speed", "-"),), RPM_PER_RAD_S),
 )
 """What a simulated trace shows; panels whose signals are missing are left out."""
@@ -110,19 +110,16 @@ def thinned(t_s: NDArray[np.float64], value: NDArray[np.float64]) -> tuple[NDArr
     Returns
     -------
     tuple of ndarray
-        The same arrays when they are short; else the first of each stretch's least and largest value, in order.
+        The same arrays when they are short; else the least and the largest value of each stretch, in order of time.
     """
     n = len(t_s)
     if n <= POINTS_MAX:
         return t_s, value
     stretch = -(-n // (POINTS_MAX // 2))
-    whole = n // stretch
-    rows = value[: whole * stretch].reshape(whole, stretch)
-    start = stretch * np.arange(whole)
-    picked = np.column_stack((start + rows.argmin(axis=1), start + rows.argmax(axis=1)))
-    tail = whole * stretch + np.array([0, *((n - whole * stretch - 1,) if n > whole * stretch else ())])[n == whole * stretch :]
-    index = np.unique(np.concatenate((picked.ravel(), tail[tail < n], [n - 1])))
-    return t_s[index], value[index]
+    starts = range(0, n, stretch)
+    index = [start + int(pick(value[start : start + stretch])) for start in starts for pick in (np.argmin, np.argmax)]
+    kept = np.unique([0, *index, n - 1])
+    return t_s[kept], value[kept]
 
 
 def svg_text(figure: Figure) -> str:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.drive_map import encode_table, look_up_words
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import CATALOGUE
@@ -82,6 +81,10 @@ def image_of(machine_file: MachineFile, params: ParameterSet) -> bytes:
         Values out of range, or tables that do not fit their descriptor.
     """
     values = drive_values(machine_file, params)
+    if not params.tables:
+        return pack_image(values)
+    from pmsmtool.firmware.drive_map import encode_table, look_up_words
+
     encoded = {name: encode_table(name, params.tables[name], values) for name in TABLE_NAMES if name in params.tables}
     return pack_image(values, look_up_words(encoded))
 
@@ -123,7 +126,7 @@ def simulate(
     ConfigError
         The machine, the parameters or the scenario cannot be simulated together.
     """
-    changed = dict(scenario.simulation) | ({"rotor": scenario.rotor} if scenario.rotor else {})
+    changed = ({"rotor": scenario.rotor} if scenario.rotor else {}) | dict(scenario.simulation)
     machine_file = with_simulation(machine_file, changed)
     setup, keep = build_setup(machine_file, seed=seed, application=application, start_rad_s=RPM * scenario.start_rpm)
     _check(machine_file, params, scenario, setup.machine.rotor)

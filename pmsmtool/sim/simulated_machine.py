@@ -100,7 +100,8 @@ def with_simulation(machine_file: MachineFile, changes: Mapping[str, Value]) -> 
     from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
 
     violations: list[str] = []
-    checked = check_table(dict(changes), SIMULATION_KEYS, {"": "[simulation]"}, violations, {})
+    where = {"": "[simulation]", **{name: f"[simulation] {name}" for name in changes}}
+    checked = check_table(dict(changes), SIMULATION_KEYS, where, violations, {})
     if violations:
         raise ConfigError("the simulation settings cannot be used", violations=violations)
     return replace(machine_file, simulation={**machine_file.simulation, **checked})
