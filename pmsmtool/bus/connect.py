@@ -105,7 +105,8 @@ class Connection:
         self._writer = writer
         self._subscribers: dict[int, tuple[Callback, ...]] = {}
         self._failure: BusError | None = None
-        self._send_lock = threading.Lock()
+        # Reentrant: on the simulated bus a heartbeat falls due while a frame is on the wire, in the same thread.
+        self._send_lock = threading.RLock()
         self._pump_lock = threading.Lock()
         self._dispatching: int | None = None
         self._closing = False

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from pmsmtool.bus.connect import Connection
-from pmsmtool.bus.supervision import NodeReset
-from pmsmtool.cia402 import Command, Mode, QuickStop, State
-from pmsmtool.drive import objects
+from pmsmtool.cia402 import Mode
+from pmsmtool.drive import objects, stop
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.recorder import Recorder
-from pmsmtool.errors import BusError, ConfigError, DriveFault, NotAvailable, PmsmtoolError, SdoAbort, StopNotConfirmed
+from pmsmtool.errors import ConfigError, DriveFault, NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import ParameterSet
@@ -23,12 +21,6 @@ from pmsmtool.trace import Trace
 
 RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 """The reference drive counts speed in thousandths of a mechanical revolution per minute."""
-STOP_MARGIN_S = 1.0
-"""Beyond the time the deceleration ramp needs."""
-STOP_TRIES = 4
-"""A stop is asked for this often: each kind of alarm may end one attempt."""
-STANDSTILL_RAD_S = 1.0
-"""Electrical speed below which a drive that stays in quick stop counts as standing."""
 
 
 class CanopenDrive:
@@ -53,11 +45,14 @@ class CanopenDrive:
         Control period (s).
     recorder : Recorder
         Traces and averages.
+    may_be_energised : bool
+        From an attempt to enable until a confirmed stop.
     """
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         self.node = DriveNode(connection, node_id, drive_map=drive_map)
         self.parameters = DriveParameters(self.node)
+        self.may_be_energised = False
         self.identity = self.node.identity()
         self.period_s = 1e-9 * self.parameters.read_value("inverter.T_s_ns")
         self.recorder = Recorder(self.node, self.period_s)
@@ -116,78 +111,24 @@ class CanopenDrive:
 
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero reference, in the identification mode."""
-        self._zero_references()
+        stop.zero_references(self.node)
         self._set_mode(Mode.IDENTIFICATION)
+        self.may_be_energised = True
         self.node.enable()
 
     def disable(self) -> None:
-        """Remove the voltage; returns when the statusword confirms it.
-
-        Raises
-        ------
-        StopNotConfirmed
-            It does not.
-        """
-        state = self.node.disable_voltage()
-        if not is_safe(state):
-            raise self._not_confirmed(f"the statusword still shows {_shown(state)}")
+        """Remove the voltage; returns when the statusword confirms it, else ``StopNotConfirmed``."""
+        stop.disable(self.node)
+        self.may_be_energised = False
 
     def quick_stop(self) -> None:
-        """Quick stop, zero current, voltage off, each confirmed from the statusword.
-
-        Raises
-        ------
-        StopNotConfirmed
-            The drive did not confirm; the machine may be energised.
-        """
-        failure: PmsmtoolError | None = None
-        for _ in range(STOP_TRIES):
-            try:
-                with self.node.emergencies_tolerated():
-                    self._stop_once()
-                return
-            except StopNotConfirmed:
-                raise
-            except NodeReset as reset:
-                failure = reset  # a drive that boots is off; the next round confirms it
-            except (BusError, DriveFault) as error:
-                failure = error
-                with contextlib.suppress(BusError):
-                    self.disable_at_once()
-        raise self._not_confirmed(failure.what if failure else "no answer") from failure
+        """Quick stop, voltage off, zero references, confirmed from the statusword, else ``StopNotConfirmed``."""
+        stop.quick_stop(self.node)
+        self.may_be_energised = False
 
     def disable_at_once(self) -> None:
         """Send the controlword that removes the voltage, without waiting for anything."""
-        self.node.sdo.post(
-            objects.CONTROLWORD.index, objects.CONTROLWORD.sub, objects.CONTROLWORD.encode(Command.DISABLE_VOLTAGE)
-        )
-
-    def _stop_once(self) -> None:
-        state = self.node.state()
-        if not is_safe(state):
-            self.node.go(Command.QUICK_STOP)
-            self.node.wait_for_state(self._has_stopped, self._stop_time_s())
-            self.disable()
-        self._zero_references()
-
-    def _has_stopped(self, state: State | None) -> bool:
-        if is_safe(state):
-            return True
-        stays = QuickStop(self.node.whole(objects.QUICK_STOP_OPTION)).stays
-        return state is State.QUICK_STOP_ACTIVE and stays and abs(self.live("omega_e_rad_s")) < STANDSTILL_RAD_S
-
-    def _stop_time_s(self) -> float:
-        """Time the ramp of 0x6085 needs from the present speed."""
-        rpm = abs(self.node.get(objects.VELOCITY_MRPM)) / 1000.0
-        return STOP_MARGIN_S + 2.0 * rpm / max(self.node.get(objects.QUICK_STOP_DECELERATION), 1.0)
-
-    def _not_confirmed(self, why: str) -> StopNotConfirmed:
-        return StopNotConfirmed(
-            f"the drive did not confirm that it stopped ({why}): the machine may be energised",
-            where=f"node {self.node.node}, 0x6041:00",
-            likely="the bus or the drive does not answer; its heartbeat supervision stops it if that was set",
-            hint="use the hardware stop (emergency stop, safe torque off, or mains), then check cable and supply",
-        )
+        stop.disable_at_once(self.node)
 
     # ---- references -----------------------------------------------------------------------------
 
@@ -215,15 +156,6 @@ class CanopenDrive:
                 where=f"node {self.node.node}, 0x6060:00",
                 hint="`pmsmtool caps` lists what this drive can give",
             ) from abort
-
-    def _zero_references(self) -> None:
-        """End an excitation and bring all references to zero; a drive without these objects needs none."""
-        with contextlib.suppress(SdoAbort):
-            self.node.command(objects.EXCITATION_COMMAND, 0)
-        for reference in (objects.SET_POINT_D, objects.SET_POINT_Q, objects.TARGET_VELOCITY_MRPM):
-            with contextlib.suppress(SdoAbort):
-                if self.node.get(reference) != 0.0:
-                    self.node.put(reference, 0.0)
 
     # ---- measurements ---------------------------------------------------------------------------
 
@@ -305,7 +237,3 @@ def _excitation_facts(excitation: Excitation) -> dict[str, object]:
     facts: dict[str, object] = {name: getattr(excitation, name) for name in objects.EXCITATION_FIELDS}
     facts |= {"shape": excitation.shape.name.lower(), "point": excitation.point.name.lower()}
     return {**facts, "buffer": list(excitation.buffer)}
-
-
-def _shown(state: State | None) -> str:
-    return "an undefined state" if state is None else state.name.replace("_", " ")

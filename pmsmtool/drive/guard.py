@@ -16,10 +16,12 @@ from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.dead_man import DeadManProof, prove_dead_man
+from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.port import Excitation, Identity, Injection, Shape
+from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import (
     BusError,
     DriveFault,
@@ -27,6 +29,7 @@ from pmsmtool.errors import (
     LimitExceeded,
     NotAvailable,
     PmsmtoolError,
+    SafetyRefusal,
     SdoAbort,
     StopNotConfirmed,
     VerifyMismatch,
@@ -71,13 +74,18 @@ class GuardedDrive:
         self._start_rad: float | None = None
         self._pole_pairs = 1.0
         self._R_s_ohm = 0.0
-        self._enabled = False
 
     # ---- beginning and end ----------------------------------------------------------------------
 
     def begin(self, *, prove: bool = True) -> None:
         """Note the marks, bring the limits into the drive, prove the dead-man; the drive is off on return."""
         self.envelope.refuse_gravity()
+        if not is_safe(self._node.state()):
+            raise SafetyRefusal(
+                f"the drive is in {state_text(self._node.state())}: somebody else has enabled it",
+                where=f"node {self._node.node}, 0x6041:00",
+                hint=f"`pmsmtool stop -n {self._node.node}`, then run the command again",
+            )
         self._drive.parameters.settle()
         self._node.before_write = self._note
         for mark in _MARKS:
@@ -115,11 +123,9 @@ class GuardedDrive:
         StopNotConfirmed
             The drive does not confirm.
         """
-        self._enabled = False
-        while True:
+        while self._drive.may_be_energised:
             try:
                 self._drive.quick_stop()
-                return
             except KeyboardInterrupt:
                 self._drive.disable_at_once()
 
@@ -202,14 +208,12 @@ class GuardedDrive:
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero reference."""
         self._drive.enable()
-        self._enabled = True
         if self._start_rad is None:
             self._start_rad = self._drive.live("theta_m_rad")
 
     def disable(self) -> None:
         """Remove the voltage and confirm it."""
         self._drive.disable()
-        self._enabled = False
 
     def quick_stop(self) -> None:
         """Stop as fast as the drive can and confirm it."""
@@ -261,7 +265,7 @@ class GuardedDrive:
             left = end - clock.now()
             step = min(left, WATCH_S)
             self._drive.wait(max(step, 0.0))
-            if self._enabled:
+            if self._drive.may_be_energised:
                 self._watch(step)
             if left <= WATCH_S:
                 return
@@ -358,7 +362,6 @@ def guarded(
     """
     guard = GuardedDrive(drive, envelope)
     interrupted = False
-    stopped = False
     try:
         try:
             guard.begin(prove=prove)
@@ -370,21 +373,15 @@ def guarded(
             say("interrupted: stopping the machine (Ctrl-C again removes the voltage at once)")
         finally:
             guard.stop()
-            stopped = True
     finally:
-        if not stopped:
-            _stop_again(guard)
+        # Again: a signal in the wrong microsecond may have ended the first one. It does nothing when that succeeded.
+        guard.stop()
         with interrupts_deferred() as noted:
             count = _restored(guard)
         say(f"voltage off, drive restored ({count} objects)")
         interrupted = interrupted or bool(noted)
     if interrupted:
         raise Interrupted("interrupted: the machine is stopped, voltage off, and the drive restored")
-
-
-def _stop_again(guard: GuardedDrive) -> None:
-    """The first stop was itself ended, by its failure or by a signal in the wrong microsecond."""
-    guard.stop()
 
 
 def _restored(guard: GuardedDrive) -> int:
