@@ -1,0 +1,79 @@
+"""Turn a current vector slowly forward and back: the rotor follows, and the encoder is counted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pmsmtool.drive.port import Drive
+from pmsmtool.experiments.signals import table
+from pmsmtool.trace import Trace
+
+MAX_POLE_PAIRS = 32
+"""A machine with more is not found by turning its vector; the run ends with E_POLE_PAIRS."""
+
+
+@dataclass(frozen=True, slots=True)
+class RotationPlan:
+    """How the vector is turned.
+
+    Attributes
+    ----------
+    i_a : float
+        Length of the vector (A peak).
+    step_rad : float
+        Electrical angle of one step.
+    dwell_s : float
+        Time per step (s).
+    turns_mechanical : float
+        Mechanical turns in each direction.
+    """
+
+    i_a: float
+    step_rad: float = math.radians(20.0)
+    dwell_s: float = 0.01
+    turns_mechanical: float = 1.02
+
+
+def rotate_vector(drive: Drive, plan: RotationPlan, *, start_rad: float = 0.0) -> tuple[Trace, Trace]:
+    """Turn the vector until the shaft has made its turns, then back; return the two runs.
+
+    The drive is enabled on entry; the vector stands where it started, at zero current, on return.
+
+    Returns
+    -------
+    forward, backward : Trace
+        ``theta_imposed_rad`` (electrical, unwrapped) and ``theta_M_rad`` (mechanical, unwrapped), one row per step.
+    """
+    angle = start_rad
+    drive.command_current(plan.i_a, 0.0, fixed_angle_rad=angle)
+    drive.wait(0.3)
+    forward_rows = [_row(drive, angle)]
+    limit = round(2.0 * math.pi * MAX_POLE_PAIRS * plan.turns_mechanical / plan.step_rad)
+    while len(forward_rows) <= limit:
+        angle += plan.step_rad
+        forward_rows.append(_step(drive, plan, angle))
+        way = abs(forward_rows[-1]["theta_M_rad"] - forward_rows[0]["theta_M_rad"])
+        if way >= 2.0 * math.pi * plan.turns_mechanical:
+            break
+    backward_rows = [forward_rows[-1]]
+    for _ in range(len(forward_rows) - 1):
+        angle -= plan.step_rad
+        backward_rows.append(_step(drive, plan, angle))
+    drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
+    return _run(forward_rows, plan), _run(backward_rows, plan)
+
+
+def _step(drive: Drive, plan: RotationPlan, angle: float) -> dict[str, float]:
+    drive.command_current(plan.i_a, 0.0, fixed_angle_rad=angle)
+    drive.wait(plan.dwell_s)
+    return _row(drive, angle)
+
+
+def _row(drive: Drive, angle: float) -> dict[str, float]:
+    measured = drive.average(("theta_m_rad",), max(1, round(0.002 / drive.period_s)))
+    return {"theta_imposed_rad": angle, "theta_M_rad": measured["theta_m_rad"]}
+
+
+def _run(rows: list[dict[str, float]], plan: RotationPlan) -> Trace:
+    return table(rows, [k * plan.dwell_s for k in range(len(rows))], i_command_a=plan.i_a)

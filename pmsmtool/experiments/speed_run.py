@@ -1,0 +1,103 @@
+"""Steady speeds in both directions at i_d = 0: means for the flux linkage and the fine encoder offset."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
+from pmsmtool.experiments.signals import readable, table
+from pmsmtool.trace import Trace
+
+SHARES = (0.25, 0.45, 0.65, 0.85)
+"""Of the largest speed of the run, both directions (identification reference, 3.4)."""
+MEANS = ("u_d_v", "u_q_v", "i_d_a", "i_q_a", "omega_e_rad_s", "T_magnet_c", "T_winding_c", "flags")
+WAVES = ("i_d_a", "i_q_a", "theta_e_rad")
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedPlan:
+    """Speeds to hold.
+
+    Attributes
+    ----------
+    speeds_rad_s : sequence of float
+        Mechanical speeds in the order they are held (rad/s).
+    pole_pairs : int
+        Pole pairs, to average over whole mechanical turns.
+    settle_s : float
+        Time between the set-point and the window (s).
+    window_s : float
+        Shortest window (s); it is rounded up to whole mechanical turns.
+    wave_samples : int
+        Samples of the current waveform recorded at each speed, 0 for none.
+    """
+
+    speeds_rad_s: Sequence[float]
+    pole_pairs: int
+    settle_s: float = 0.5
+    window_s: float = 0.15
+    wave_samples: int = 2048
+
+    def duration_s(self) -> float:
+        """Return about how long the run takes (s)."""
+        return sum(self.settle_s + 2.0 * (self.window_s + 2.0 * math.pi / abs(w)) for w in self.speeds_rad_s)
+
+
+def speeds_of(omega_max_rad_s: float) -> tuple[float, ...]:
+    """Return the speeds: up in one direction, then up in the other, so that the shaft reverses once."""
+    return tuple(sign * share * omega_max_rad_s for sign in (1.0, -1.0) for share in SHARES)
+
+
+def hold_speeds(drive: Drive, plan: SpeedPlan) -> tuple[Trace, list[Trace]]:
+    """Hold the speeds and return one row of means for each, and the current waveforms.
+
+    The drive is enabled on entry with a speed controller that holds the machine; it is asked for standstill on return.
+    """
+    rows = []
+    waves = []
+    times = []
+    elapsed = 0.0
+    for speed in plan.speeds_rad_s:
+        drive.command_speed(speed)
+        drive.wait(plan.settle_s)
+        half = _half_window(drive, plan, speed)
+        first, second = (drive.average(MEANS, half) for _ in range(2))
+        elapsed += plan.settle_s
+        times.append(elapsed)
+        elapsed += 2 * half * drive.period_s
+        row = {name: 0.5 * (first[name] + second[name]) for name in MEANS if name != "flags"}
+        for name in ("i_d", "i_q"):
+            row[f"{name}_first_a"], row[f"{name}_second_a"] = first[f"{name}_a"], second[f"{name}_a"]
+        row["omega_first_rad_s"] = first["omega_e_rad_s"]
+        row["omega_second_rad_s"] = second["omega_e_rad_s"]
+        row["flagged"] = float(first["flags"] + second["flags"] > 0.0)  # a mean of flag words: any bit counts
+        rows.append(row)
+        if plan.wave_samples:
+            waves.append(readable(drive.record(WAVES, plan.wave_samples)))
+    drive.command_speed(0.0)
+    return table(rows, times, pole_pairs=plan.pole_pairs, speeds_rad_s=list(plan.speeds_rad_s)), waves
+
+
+def _half_window(drive: Drive, plan: SpeedPlan, speed: float) -> int:
+    """Periods of half a window: whole mechanical turns, so that what repeats per turn averages out."""
+    turn_s = 2.0 * math.pi / abs(speed)
+    turns = max(1, math.ceil(0.5 * plan.window_s / turn_s))
+    return max(64, round(turns * turn_s / drive.period_s))
+
+
+def push_and_record(drive: Drive, i_q_a: float, samples: int, decimation: int, abort_speed_rad_s: float) -> Trace:
+    """Apply a q current for the length of a record; returns speed, currents and voltages of the acceleration.
+
+    The drive ends the push by itself at the abort speed (electrical rad/s).
+    """
+    excitation = Excitation(
+        shape=Shape.STEP,
+        point=Injection.I_Q,
+        amplitude=i_q_a,
+        duration_s=samples * decimation * drive.period_s,
+        abort_speed_rad_s=abort_speed_rad_s,
+    )
+    names = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "omega_e_rad_s", "theta_m_rad", "flags")
+    return readable(drive.record(names, samples, decimation=decimation, excitation=excitation), i_command_a=i_q_a)

@@ -1,0 +1,119 @@
+"""Square-wave voltage on a current bias in a frozen frame: the drive generates and records it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
+from pmsmtool.experiments.signals import readable
+from pmsmtool.trace import Trace
+
+Axis = Literal["d", "q"]
+
+SIGNALS = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "theta_m_rad", "flags", "T_winding_c")
+SEARCH_SAMPLES = 360
+FIRST_SHARE = 0.01
+"""First amplitude of the search, of the largest voltage: 1 % moves no machine of this population over its limit."""
+SEARCH_STEPS = 12
+ENOUGH = 0.5
+"""A ripple of this share of the wanted one ends the search; the next shot is scaled from it."""
+
+
+@dataclass(frozen=True, slots=True)
+class SquarePlan:
+    """A square wave on a bias.
+
+    Attributes
+    ----------
+    bias_d_a : float
+        Current along the frame's d axis (A peak).
+    half_periods : tuple of int
+        Half periods (control periods), one record each.
+    samples : int
+        Length of a record.
+    ripple_a : float
+        Wanted ripple, peak to peak (A).
+    u_max_v : float
+        Largest amplitude (V).
+    bias_bandwidth_rad_s : float
+        Bandwidth of the loop that holds the bias; far below the injection.
+    lead_samples : int
+        Samples of the injection before the ones that are kept: its own first transient.
+    angle_rad : float
+        Electrical angle of the frozen frame.
+    """
+
+    bias_d_a: float
+    ripple_a: float
+    u_max_v: float
+    half_periods: tuple[int, ...] = (6, 9)
+    samples: int = 2048
+    bias_bandwidth_rad_s: float = 2.0 * math.pi * 15.0
+    lead_samples: int = 200
+    angle_rad: float = 0.0
+
+
+def hold_bias(drive: Drive, plan: SquarePlan) -> None:
+    """Bring the current to the bias with the drive's own current loop, and wait for it."""
+    drive.command_current(plan.bias_d_a, 0.0, fixed_angle_rad=plan.angle_rad)
+    drive.wait(0.3)
+
+
+def find_amplitude(drive: Drive, plan: SquarePlan, axis: Axis) -> float:
+    """Return the amplitude (V) that makes the wanted ripple at the first half period, by rising small shots."""
+    amplitude = min(FIRST_SHARE * plan.u_max_v, plan.u_max_v)
+    for _ in range(SEARCH_STEPS):
+        trace = inject_square(drive, plan, axis, plan.half_periods[0], amplitude, SEARCH_SAMPLES)
+        ripple = ripple_of(trace, axis)
+        wanted = min(plan.u_max_v, amplitude * plan.ripple_a / max(ripple, 1e-9))
+        if ripple >= ENOUGH * plan.ripple_a or amplitude >= plan.u_max_v:
+            return wanted
+        amplitude = min(plan.u_max_v, 3.0 * amplitude, max(wanted, amplitude))
+    return amplitude
+
+
+def ripple_of(trace: Trace, axis: Axis) -> float:
+    """Return the ripple of one axis current, peak to peak (A), robust against single samples and slow drift."""
+    current = trace[f"i_{axis}_a"]
+    half_period = int(trace.meta["half_period"])
+    settled = current[len(current) // 3 :]
+    period = 2 * half_period
+    windows = settled[: len(settled) // period * period].reshape(-1, period)
+    return float(np.median(np.ptp(windows, axis=1)))
+
+
+def inject_square(
+    drive: Drive, plan: SquarePlan, axis: Axis, half_period: int, amplitude_v: float, samples: int | None = None
+) -> Trace:
+    """Record one shot; the bias stays on before and after it.
+
+    Raises
+    ------
+    DriveFault
+        The drive aborted the excitation at one of its limits.
+    """
+    count = plan.samples if samples is None else samples
+    lead = plan.lead_samples
+    excitation = Excitation(
+        shape=Shape.SQUARE,
+        point=Injection.U_D if axis == "d" else Injection.U_Q,
+        amplitude=amplitude_v,
+        bias_d_a=plan.bias_d_a,
+        bias_bandwidth_rad_s=plan.bias_bandwidth_rad_s,
+        hold_periods=half_period,
+        duration_s=(lead + count + 16) * drive.period_s,
+        fixed_angle_rad=plan.angle_rad,
+    )
+    trace = drive.record(SIGNALS, lead + count, excitation=excitation)
+    keep = slice(lead, lead + count)
+    cut = Trace(
+        trace.t_s[keep],
+        {name: values[keep] for name, values in trace.signals.items()},
+        trace.units,
+        trace.meta,
+    )
+    return readable(cut, half_period=half_period, fixed_angle_rad=plan.angle_rad, axis=axis, amplitude_v=amplitude_v)

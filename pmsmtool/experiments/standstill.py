@@ -1,0 +1,119 @@
+"""Experiments with a current vector at a fixed electrical angle: noise, phase check, DC levels.
+
+Set-points only: what is measured goes back as traces, nothing is estimated here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pmsmtool.drive.port import Drive
+from pmsmtool.experiments.signals import readable, table
+from pmsmtool.trace import Trace
+
+NOISE_SAMPLES = 2048
+PHASE_ANGLES_RAD = (0.0, 2.0 * math.pi / 3.0, 4.0 * math.pi / 3.0)
+DC_ANGLE_RAD = math.pi / 2.0
+"""One phase idle (identification reference, 3.1)."""
+
+MEANS = ("u_d_v", "i_d_a", "u_q_v", "i_q_a", "T_winding_c")
+"""What is averaged over a whole window at each level."""
+
+REST_RAD = 2e-3
+"""Motion of the shaft (mechanical) between two looks that still counts as rest."""
+REST_LOOK_S = 0.03
+REST_LIMIT_S = 3.0
+"""A rotor that has not come to rest by then stays as it is; the estimator sees it in the halves of the window."""
+
+
+@dataclass(frozen=True, slots=True)
+class LevelPlan:
+    """DC levels along one vector.
+
+    Attributes
+    ----------
+    levels_a : sequence of float
+        Signed currents in the order they are held (A peak).
+    settle_s : float
+        Time between the set-point and the window (s).
+    window_periods : int
+        Control periods averaged per level, split into two halves.
+    angle_rad : float
+        Electrical angle of the vector in the stator frame.
+    """
+
+    levels_a: Sequence[float]
+    settle_s: float = 0.1
+    window_periods: int = 1600
+    angle_rad: float = DC_ANGLE_RAD
+
+    def duration_s(self, period_s: float) -> float:
+        """Return the time the levels take without waiting for the rotor (s)."""
+        return len(self.levels_a) * (self.settle_s + self.window_periods * period_s)
+
+
+def record_zero_current(drive: Drive, samples: int = NOISE_SAMPLES) -> Trace:
+    """Record both axis currents of a drive that is off, in a fixed frame."""
+    return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "flags"), samples))
+
+
+def hold_phase_vectors(drive: Drive, i_a: float, *, settle_s: float = 0.15, periods: int = 512) -> Trace:
+    """Hold a small vector at 0, 120 and 240 degrees and return one row of means for each.
+
+    The drive is enabled on entry and holds zero current on return.
+    """
+    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a")
+    rows = []
+    for angle in PHASE_ANGLES_RAD:
+        drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
+        drive.wait(settle_s)
+        rows.append(dict(drive.average(names, periods)))
+    drive.command_current(0.0, 0.0, fixed_angle_rad=PHASE_ANGLES_RAD[-1])
+    times = [k * settle_s for k in range(len(rows))]
+    return table(rows, times, i_command_a=i_a, angles_rad=list(PHASE_ANGLES_RAD))
+
+
+def wait_for_rest(drive: Drive, *, limit_s: float = REST_LIMIT_S) -> float:
+    """Wait until the shaft stands still or the limit is over; return the time waited (s)."""
+    periods = max(1, round(0.25 * REST_LOOK_S / drive.period_s))
+    waited = 0.0
+    last = math.inf
+    while waited < limit_s:
+        drive.wait(REST_LOOK_S)
+        now = drive.average(("theta_m_rad",), periods)["theta_m_rad"]
+        waited += REST_LOOK_S
+        if abs(now - last) < REST_RAD:
+            break
+        last = now
+    return waited
+
+
+def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
+    """Hold DC levels and return one row per level: means of the window, of its halves, and the temperature.
+
+    The rotor may turn by half an electrical turn at each sign change; every window waits for it to come to rest. The
+    drive is enabled on entry and holds zero current on return.
+    """
+    names = (*MEANS, "theta_m_rad", "flags")
+    half = max(1, plan.window_periods // 2)
+    rows = []
+    times = []
+    elapsed = 0.0
+    for level in plan.levels_a:
+        drive.command_current(level, 0.0, fixed_angle_rad=plan.angle_rad)
+        drive.wait(plan.settle_s)
+        elapsed += plan.settle_s + wait_for_rest(drive)
+        first, second = (drive.average(names, half) for _ in range(2))
+        times.append(elapsed)
+        elapsed += 2 * half * drive.period_s
+        row = {name: 0.5 * (first[name] + second[name]) for name in MEANS}
+        for name, unit in (("u_d", "v"), ("i_d", "a")):
+            row[f"{name}_first_{unit}"] = first[f"{name}_{unit}"]
+            row[f"{name}_second_{unit}"] = second[f"{name}_{unit}"]
+        row["theta_M_rad"] = second["theta_m_rad"]
+        row["flagged"] = float(first["flags"] + second["flags"] > 0.0)  # a mean of flag words: any bit counts
+        rows.append(row)
+    drive.command_current(0.0, 0.0, fixed_angle_rad=plan.angle_rad)
+    return table(rows, times, samples=2 * half, fixed_angle_rad=plan.angle_rad, i_command_a=list(plan.levels_a))
