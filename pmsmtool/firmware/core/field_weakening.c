@@ -4,13 +4,15 @@
  *
  * The voltage row uses what the integrators hold, v = (K_i I_ed - w L_q i_q, K_i I_eq + w (psi + L_d i_d)) (42), so errors
  * of R_s, L and psi do not matter in the steady state; the uncompensated variant takes the nominal ellipse (33). Solved
- * by projected gradient steps with Armijo's rule (45)-(48), or by FISTA with restart. One call per N_fw periods.
+ * by projected gradient steps with Armijo's rule (45)-(48), or by FISTA with restart. One call per N_fw periods. The
+ * accelerated variant also puts R_s into the row: (41) takes R_s i for constant from call to call, which lets i_q swing
+ * where the ellipse is flat.
  * The search is kept to i_d <= max(0, i_dLM), where the cost is well behaved for salient machines, and to
  * i_d >= i_d_min.
  */
 #include "pmsm_period.h"
 
-#define STEP_END PMSM_C(1e-4)        /* A: a smaller change ends the iteration */
+#define STEP_END PMSM_C(2e-5)        /* A: a smaller change ends the iteration */
 #define HALVINGS 8u                  /* of an Armijo step */
 #define TORQUE_EVENT PMSM_C(0.02)    /* of rated torque: a larger change of the request is answered at once */
 #define IGNORED_SHARE PMSM_C(1e-3)   /* below this share of V_m the rotation voltage of I_m does not matter */
@@ -25,30 +27,32 @@ typedef struct {
     uint32_t steps;
 } problem;
 
-static pmsm_dq voltage_offset(const pmsm_period *period)
+static pmsm_row voltage_row(const pmsm_period *period)
 {
-    const pmsm_params *params = period->params;
-    pmsm_dq c = {PMSM_C(0.0), period->omega_e * (pmsm_real)params->motor_psi_f_wb};
-    if (params->field_weakening_mode != PMSM_FW_UNCOMPENSATED) {
+    const pmsm_params *p = period->params;
+    const pmsm_real omega = period->omega_e;
+    const pmsm_real R = (p->field_weakening_mode == PMSM_FW_ACCELERATED) ? period->R_s : PMSM_C(0.0);
+    pmsm_row row = {R, -omega * (pmsm_real)p->motor_L_q_app_h, omega * (pmsm_real)p->motor_L_d_app_h, R,
+                    PMSM_C(0.0), omega * (pmsm_real)p->motor_psi_f_wb,
+                    (PMSM_C(1.0) - (pmsm_real)p->field_weakening_margin) * period->V_max};
+    if (p->field_weakening_mode != PMSM_FW_UNCOMPENSATED) { /* through the voltage that holds the present current */
         const pmsm_dq hold = pmsm_hold_voltage(period, period->i);
-        c.d = hold.d + period->omega_e * (pmsm_real)params->motor_L_q_app_h * period->i.q;
-        c.q = hold.q - period->omega_e * (pmsm_real)params->motor_L_d_app_h * period->i.d;
+        row.c_d = hold.d - (row.m_dd * period->i.d + row.m_dq * period->i.q);
+        row.c_q = hold.q - (row.m_qd * period->i.d + row.m_qq * period->i.q);
     }
-    return c;
+    return row;
 }
 
 static problem state_problem(const pmsm_period *period, pmsm_real tau)
 {
     const pmsm_params *p = period->params;
     const pmsm_real I_m = pmsm_current_limit(period);
-    const pmsm_real X_d = period->omega_e * (pmsm_real)p->motor_L_d_app_h;
-    const pmsm_real X_q = period->omega_e * (pmsm_real)p->motor_L_q_app_h;
-    const pmsm_real V_m = (PMSM_C(1.0) - (pmsm_real)p->field_weakening_margin) * period->V_max;
-    const pmsm_dq c = voltage_offset(period);
+    const pmsm_row voltage = voltage_row(period);
+    const pmsm_real rotation = (pmsm_abs(voltage.m_qd) + pmsm_abs(voltage.m_dq)) * I_m;
     const pmsm_real i_d_lm = (pmsm_real)p->field_weakening_i_d_lm_a;
     const problem q = {
-        {{1, 0, 0, 1, 0, 0, I_m}, {0, -X_q, X_d, 0, c.d, c.q, V_m}},
-        ((pmsm_abs(X_d) + pmsm_abs(X_q)) * I_m > IGNORED_SHARE * V_m) ? 2u : 1u,
+        {{1, 0, 0, 1, 0, 0, I_m}, voltage},
+        (rotation > IGNORED_SHARE * voltage.V) ? 2u : 1u,
         (pmsm_real)p->field_weakening_i_d_min_a,
         (i_d_lm > PMSM_C(0.0)) ? i_d_lm : PMSM_C(0.0),
         (pmsm_real)p->field_weakening_h1,
