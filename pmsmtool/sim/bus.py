@@ -7,8 +7,8 @@ their power (their non-volatile memory stays).
 Time is virtual and belongs to the line: ``bus.clock``. It advances by the time frames take, by ``clock.wait``, and by
 an idle ``recv``: the thread that opened the bus sees its time-outs pass at once. A reader thread of another program
 (python-can's ``Notifier``) may not run away with the time while its owner thinks, so in any other thread an idle
-``recv`` waits for real, at the pace of the wall clock; frames still arrive at once. For the same bytes in every run,
-receive in the thread that opened the bus.
+``recv`` waits for real, at the pace of the wall clock; frames still arrive at once. A thread that works on a drive
+says so with ``receive_in_this_thread``. For the same bytes in every run, receive in the thread that opened the bus.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class PmsmSimBus(can.BusABC):
         self._waiting = 0
         self._in_flight = 0
         self._unacknowledged = 0
-        self._driver = threading.get_ident()
+        self._drivers = {threading.get_ident()}
         self._pace: _Pace | None = None
         self._pulled = False
         self._recv_raises = False
@@ -189,7 +189,7 @@ class PmsmSimBus(can.BusABC):
         return self._recv_internal(timeout)[0]
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        paced = self._speed is not None or threading.get_ident() != self._driver
+        paced = self._speed is not None or threading.get_ident() not in self._drivers
         clock = self.clock
         deadline = NEVER if timeout is None else clock.now_ns + max(POLL_NS, round(timeout * NS))
         while True:
@@ -247,8 +247,8 @@ class PmsmSimBus(can.BusABC):
         return True
 
     def receive_in_this_thread(self) -> None:
-        """Make the calling thread the one whose idle ``recv`` lets virtual time pass at once."""
-        self._driver = threading.get_ident()
+        """Let time-outs of the calling thread, too, pass at once (one that works on a drive, not a mere reader)."""
+        self._drivers.add(threading.get_ident())
 
     # ---- the rest of python-can's interface ----------------------------------------------------
 

@@ -19,14 +19,16 @@ if TYPE_CHECKING:
 GAIN_SHARE = 0.1
 """Proportional gain as a share of U_max / I_max: far below the stability limit of any machine that fits the drive."""
 INTEGRAL_RATE_RAD_S = 100.0
-TRIP_SHARE = 1.5
+TRIP_SHARE = 1.3
+"""Trip level as a share of I_max, below the full scale of the current sensors (1.5 I_max)."""
 DC_HIGH_SHARE = 1.35
 DC_LOW_SHARE = 0.5
+OVERSPEED_SHARE = 1.5
 
 
 def factory_values(machine_file: MachineFile) -> dict[str, float]:
     """Return the parameters in which the drive differs from the catalogue's defaults (names, SI)."""
-    machine, inverter = machine_file.machine, machine_file.inverter
+    machine, inverter, limits = machine_file.machine, machine_file.inverter, machine_file.limits
     i_max = machine.I_max_apk or machine.I_nom_apk or BY_NAME["motor.I_max_apk"].default
     i_nom = machine.I_nom_apk or i_max / 2.0
     n_max = machine.n_max_rpm or BY_NAME["motor.n_max_rpm"].default
@@ -40,11 +42,11 @@ def factory_values(machine_file: MachineFile) -> dict[str, float]:
         "inverter.dead_time_ns": round(inverter.dead_time_s * 1e9),
         "inverter.delay_periods": inverter.delay_periods,
         "inverter.U_dc_nom_v": inverter.U_dc_v,
-        "protection.i_trip_apk": TRIP_SHARE * i_max,
-        "protection.I_cont_apk": i_nom,
-        "protection.U_dc_min_v": DC_LOW_SHARE * inverter.U_dc_v,
-        "protection.U_dc_max_v": DC_HIGH_SHARE * inverter.U_dc_v,
-        "protection.n_trip_rpm": 1.5 * n_max,
+        "protection.i_trip_apk": limits.i_trip_apk or TRIP_SHARE * i_max,
+        "protection.I_cont_apk": limits.I_cont_apk or i_nom,
+        "protection.U_dc_min_v": limits.U_dc_min_v or DC_LOW_SHARE * inverter.U_dc_v,
+        "protection.U_dc_max_v": limits.U_dc_max_v or DC_HIGH_SHARE * inverter.U_dc_v,
+        "protection.n_trip_rpm": limits.n_trip_rpm or OVERSPEED_SHARE * n_max,
         "governor.I_transient_apk": i_max,
         "field_weakening.i_d_min_a": -i_max,
         "current.K_p_d_v_per_a": gain,

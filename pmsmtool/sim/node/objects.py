@@ -2,6 +2,10 @@
 
 ``firmware-params/pmsmsim/objects.csv`` holds everything that is not a parameter; every row of ``params/catalogue.py``
 becomes an object too. Both the running node and its EDS are built from :func:`object_rows`.
+
+Columns: ``index`` and ``sub`` hexadecimal; ``key``, by which the program names the object; ``type`` (``ARRAY`` and
+``RECORD`` head a group, with 8 they have a writable sub 0); ``access``; ``pdo`` T mappable for sending, R for receiving
+too, 0 neither; ``default``, ``low``, ``high``; ``store`` y: kept by 0x1010.
 """
 
 from __future__ import annotations
