@@ -211,13 +211,18 @@ class CanopenDrive:
         excitation: Excitation | None,
         pretrigger: int,
     ) -> None:
-        """Arm the recorder and start the (prepared) excitation."""
-        self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=excitation is not None)
+        """Arm the recorder and start the (prepared) excitation, or start it first when it has a lead time."""
+        led = excitation is not None and excitation.lead_s > 0.0
+        if not led:
+            self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=excitation is not None)
         if excitation is not None:
-            self.wait(pretrigger * decimation * self.period_s)
+            self.wait(0.0 if led else pretrigger * decimation * self.period_s)
             if excitation.point is not Injection.SPEED:
                 self._set_mode(Mode.IDENTIFICATION)
             self.node.command(objects.EXCITATION_COMMAND, 2)
+        if excitation is not None and led:
+            self.wait(excitation.lead_s)
+            self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=False)
 
     def finish_record(self, signals: Sequence[str], *, decimation: int, excitation: Excitation | None) -> Trace:
         """Wait until the recorder is complete and return its trace."""

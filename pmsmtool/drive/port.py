@@ -54,7 +54,8 @@ class Excitation:
 
     ``amplitude`` is the wave's amplitude at the injection point (V, A or rad/s); ``bias_d_a`` and ``bias_q_a``
     are held by the drive's current loop of bandwidth ``bias_bandwidth_rad_s``; ``fixed_angle_rad`` is
-    None to follow the rotor. ``amplitude_q`` and ``i_limit_*`` are for hysteresis pulses.
+    None to follow the rotor. ``amplitude_q`` and ``i_limit_*`` are for hysteresis pulses. ``lead_s`` is how long it
+    runs before the recorder is started: its own first transient stays out of the record.
     """
 
     shape: Shape
@@ -75,6 +76,7 @@ class Excitation:
     abort_current_apk: float = 0.0
     abort_speed_rad_s: float = 0.0
     buffer: Sequence[float] = field(default=())
+    lead_s: float = 0.0
 
 
 class Drive(Protocol):

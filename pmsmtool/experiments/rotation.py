@@ -12,6 +12,10 @@ from pmsmtool.trace import Trace
 MAX_POLE_PAIRS = 32
 """A machine with more is not found by turning its vector; the run ends with E_POLE_PAIRS."""
 
+ALIGN_S = 0.3
+LEAD_STEPS = 8
+"""Steps before the recorded ones: the rotor's own transient after standstill or reversal."""
+
 
 @dataclass(frozen=True, slots=True)
 class RotationPlan:
@@ -30,8 +34,8 @@ class RotationPlan:
     """
 
     i_a: float
-    step_rad: float = math.radians(20.0)
-    dwell_s: float = 0.01
+    step_rad: float = math.radians(15.0)
+    dwell_s: float = 0.03
     turns_mechanical: float = 1.02
 
 
@@ -45,23 +49,29 @@ def rotate_vector(drive: Drive, plan: RotationPlan, *, start_rad: float = 0.0) -
     forward, backward : Trace
         ``theta_imposed_rad`` (electrical, unwrapped) and ``theta_M_rad`` (mechanical, unwrapped), one row per step.
     """
-    angle = start_rad
-    drive.command_current(plan.i_a, 0.0, fixed_angle_rad=angle)
-    drive.wait(0.3)
-    forward_rows = [_row(drive, angle)]
-    limit = round(2.0 * math.pi * MAX_POLE_PAIRS * plan.turns_mechanical / plan.step_rad)
-    while len(forward_rows) <= limit:
-        angle += plan.step_rad
-        forward_rows.append(_step(drive, plan, angle))
-        way = abs(forward_rows[-1]["theta_M_rad"] - forward_rows[0]["theta_M_rad"])
-        if way >= 2.0 * math.pi * plan.turns_mechanical:
-            break
-    backward_rows = [forward_rows[-1]]
-    for _ in range(len(forward_rows) - 1):
-        angle -= plan.step_rad
-        backward_rows.append(_step(drive, plan, angle))
+    drive.command_current(plan.i_a, 0.0, fixed_angle_rad=start_rad)
+    drive.wait(ALIGN_S)
+    angle, forward = _run(drive, plan, start_rad, plan.step_rad, None)
+    drive.wait(ALIGN_S)
+    angle, backward = _run(drive, plan, angle, -plan.step_rad, len(forward))
     drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
-    return _run(forward_rows, plan), _run(backward_rows, plan)
+    return forward, backward
+
+
+def _run(drive: Drive, plan: RotationPlan, angle: float, step: float, count: int | None) -> tuple[float, Trace]:
+    """Turn in one direction: a lead-in that brings the rotor to speed, then ``count`` steps or the mechanical turns."""
+    for _ in range(LEAD_STEPS):
+        angle += step
+        _step(drive, plan, angle)
+    rows = [_row(drive, angle)]
+    limit = round(2.0 * math.pi * MAX_POLE_PAIRS * plan.turns_mechanical / plan.step_rad) if count is None else count
+    while len(rows) < limit:
+        angle += step
+        rows.append(_step(drive, plan, angle))
+        way = abs(rows[-1]["theta_M_rad"] - rows[0]["theta_M_rad"])
+        if count is None and way >= 2.0 * math.pi * plan.turns_mechanical:
+            break
+    return angle, table(rows, [k * plan.dwell_s for k in range(len(rows))], i_command_a=plan.i_a)
 
 
 def _step(drive: Drive, plan: RotationPlan, angle: float) -> dict[str, float]:
@@ -73,7 +83,3 @@ def _step(drive: Drive, plan: RotationPlan, angle: float) -> dict[str, float]:
 def _row(drive: Drive, angle: float) -> dict[str, float]:
     measured = drive.average(("theta_m_rad",), max(1, round(0.002 / drive.period_s)))
     return {"theta_imposed_rad": angle, "theta_M_rad": measured["theta_m_rad"]}
-
-
-def _run(rows: list[dict[str, float]], plan: RotationPlan) -> Trace:
-    return table(rows, [k * plan.dwell_s for k in range(len(rows))], i_command_a=plan.i_a)

@@ -10,12 +10,15 @@ import numpy as np
 
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
 from pmsmtool.experiments.signals import readable
+from pmsmtool.experiments.standstill import settle
 from pmsmtool.trace import Trace
 
 Axis = Literal["d", "q"]
 
 SIGNALS = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "theta_m_rad", "flags", "T_winding_c")
 SEARCH_SAMPLES = 360
+BUS_ALLOWANCE_S = 2.0
+"""The injection goes on this much longer than lead and record need: slow adapters arm the recorder late."""
 FIRST_SHARE = 0.01
 """First amplitude of the search, of the largest voltage: 1 % moves no machine of this population over its limit."""
 SEARCH_STEPS = 12
@@ -41,8 +44,8 @@ class SquarePlan:
         Largest amplitude (V).
     bias_bandwidth_rad_s : float
         Bandwidth of the loop that holds the bias; far below the injection.
-    lead_samples : int
-        Samples of the injection before the ones that are kept: its own first transient.
+    lead_s : float
+        How long the injection runs before the record: its first half wave pushes the rotor and the bias (s).
     angle_rad : float
         Electrical angle of the frozen frame.
     """
@@ -53,14 +56,14 @@ class SquarePlan:
     half_periods: tuple[int, ...] = (6, 9)
     samples: int = 2048
     bias_bandwidth_rad_s: float = 2.0 * math.pi * 15.0
-    lead_samples: int = 200
+    lead_s: float = 0.3
     angle_rad: float = 0.0
 
 
 def hold_bias(drive: Drive, plan: SquarePlan) -> None:
     """Bring the current to the bias with the drive's own current loop, and wait for it."""
     drive.command_current(plan.bias_d_a, 0.0, fixed_angle_rad=plan.angle_rad)
-    drive.wait(0.3)
+    settle(drive, plan.bias_d_a)
 
 
 def find_amplitude(drive: Drive, plan: SquarePlan, axis: Axis) -> float:
@@ -97,7 +100,8 @@ def inject_square(
         The drive aborted the excitation at one of its limits.
     """
     count = plan.samples if samples is None else samples
-    lead = plan.lead_samples
+    # the lead and the bus time between starting the injection and arming the recorder
+    running_s = plan.lead_s + BUS_ALLOWANCE_S + count * drive.period_s
     excitation = Excitation(
         shape=Shape.SQUARE,
         point=Injection.U_D if axis == "d" else Injection.U_Q,
@@ -105,15 +109,9 @@ def inject_square(
         bias_d_a=plan.bias_d_a,
         bias_bandwidth_rad_s=plan.bias_bandwidth_rad_s,
         hold_periods=half_period,
-        duration_s=(lead + count + 16) * drive.period_s,
+        duration_s=running_s,
         fixed_angle_rad=plan.angle_rad,
+        lead_s=plan.lead_s,
     )
-    trace = drive.record(SIGNALS, lead + count, excitation=excitation)
-    keep = slice(lead, lead + count)
-    cut = Trace(
-        trace.t_s[keep],
-        {name: values[keep] for name, values in trace.signals.items()},
-        trace.units,
-        trace.meta,
-    )
-    return readable(cut, half_period=half_period, fixed_angle_rad=plan.angle_rad, axis=axis, amplitude_v=amplitude_v)
+    trace = drive.record(SIGNALS, count, excitation=excitation)
+    return readable(trace, half_period=half_period, fixed_angle_rad=plan.angle_rad, axis=axis, amplitude_v=amplitude_v)

@@ -23,7 +23,9 @@ MEANS = ("u_d_v", "i_d_a", "u_q_v", "i_q_a", "T_winding_c")
 
 REST_RAD = 2e-3
 """Motion of the shaft (mechanical) between two looks that still counts as rest."""
-REST_LOOK_S = 0.03
+LOOK_S = 0.03
+ARRIVED = 0.02
+"""Distance of the mean current from its set-point, relative, that counts as arrived."""
 REST_LIMIT_S = 3.0
 """A rotor that has not come to rest by then stays as it is; the estimator sees it in the halves of the window."""
 
@@ -59,34 +61,37 @@ def record_zero_current(drive: Drive, samples: int = NOISE_SAMPLES) -> Trace:
     return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "flags"), samples))
 
 
-def hold_phase_vectors(drive: Drive, i_a: float, *, settle_s: float = 0.15, periods: int = 512) -> Trace:
+def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace:
     """Hold a small vector at 0, 120 and 240 degrees and return one row of means for each.
 
     The drive is enabled on entry and holds zero current on return.
     """
     names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a")
     rows = []
+    times = []
+    elapsed = 0.0
     for angle in PHASE_ANGLES_RAD:
         drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
-        drive.wait(settle_s)
+        elapsed += settle(drive, i_a)
+        times.append(elapsed)
         rows.append(dict(drive.average(names, periods)))
     drive.command_current(0.0, 0.0, fixed_angle_rad=PHASE_ANGLES_RAD[-1])
-    times = [k * settle_s for k in range(len(rows))]
     return table(rows, times, i_command_a=i_a, angles_rad=list(PHASE_ANGLES_RAD))
 
 
-def wait_for_rest(drive: Drive, *, limit_s: float = REST_LIMIT_S) -> float:
-    """Wait until the shaft stands still or the limit is over; return the time waited (s)."""
-    periods = max(1, round(0.25 * REST_LOOK_S / drive.period_s))
+def settle(drive: Drive, i_d_a: float, *, limit_s: float = REST_LIMIT_S) -> float:
+    """Wait until the current has arrived and the shaft stands still, or the limit is over; return the time (s)."""
+    periods = max(1, round(0.25 * LOOK_S / drive.period_s))
     waited = 0.0
     last = math.inf
     while waited < limit_s:
-        drive.wait(REST_LOOK_S)
-        now = drive.average(("theta_m_rad",), periods)["theta_m_rad"]
-        waited += REST_LOOK_S
-        if abs(now - last) < REST_RAD:
+        drive.wait(LOOK_S)
+        waited += LOOK_S
+        now = drive.average(("theta_m_rad", "i_d_a"), periods)
+        arrived = abs(now["i_d_a"] - i_d_a) <= ARRIVED * abs(i_d_a)
+        if arrived and abs(now["theta_m_rad"] - last) < REST_RAD:
             break
-        last = now
+        last = now["theta_m_rad"]
     return waited
 
 
@@ -104,7 +109,7 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
     for level in plan.levels_a:
         drive.command_current(level, 0.0, fixed_angle_rad=plan.angle_rad)
         drive.wait(plan.settle_s)
-        elapsed += plan.settle_s + wait_for_rest(drive)
+        elapsed += plan.settle_s + settle(drive, level)
         first, second = (drive.average(names, half) for _ in range(2))
         times.append(elapsed)
         elapsed += 2 * half * drive.period_s
