@@ -46,6 +46,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("tune", "pmsmtool.cli.tune:tune_command", Section.COMPUTE, "Design the control of a machine."),
     Row("report", "pmsmtool.cli.report:report_command", Section.COMPUTE, "Write the report of a run."),
     Row("export", "pmsmtool.cli.export:export_command", Section.COMPUTE, "Write a design as DCF, C, CSV."),
+    Row("margins", "pmsmtool.cli.margins:margins_command", Section.COMPUTE, "Judge a design over its tolerances."),
     Row("lut", "pmsmtool.cli.lut:lut_command", Section.COMPUTE, "Make current references over torque and speed."),
     Row("simulate", "pmsmtool.cli.simulate:simulate_command", Section.COMPUTE, "Run the closed loop in simulation."),
     Row("sim", "pmsmtool.cli.sim:sim_command", Section.TOOL, "Serve simulated drives to other programs."),
