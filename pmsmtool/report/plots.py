@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 POINTS_MAX = 4000
 """Points of a line; a longer signal is shown as the least and the largest value of each of its stretches."""
 
-SVG_SETTINGS = {"svg.hashsalt": "pmsmtool", "svg.fonttype": "path"}
-"""Fixed identifiers and no fonts of this machine: identical bytes everywhere."""
-
 RPM_PER_RAD_S = 9.549296585513721
 
 
@@ -127,6 +124,7 @@ def svg_text(figure: Figure) -> str:
     import matplotlib
 
     out = io.BytesIO()
-    with matplotlib.rc_context(SVG_SETTINGS):
+    # fixed identifiers and no fonts of this machine: identical bytes everywhere
+    with matplotlib.rc_context({"svg.hashsalt": "pmsmtool", "svg.fonttype": "path"}):
         figure.savefig(out, format="svg", metadata={"Date": None})
     return out.getvalue().decode("utf-8")

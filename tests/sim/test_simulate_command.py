@@ -1,0 +1,154 @@
+"""``pmsmtool simulate`` as a program, and the figures it draws."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from pmsmtool.report.plots import POINTS_MAX, Panel, svg_text, thinned, trace_figure
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import read_trace
+
+
+def pmsmtool(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "pmsmtool", *arguments], capture_output=True, text=True, check=False)
+
+
+def test_writes_trace_and_figure_the_same_bytes_twice(tmp_path):
+    for name in ("first", "second"):
+        done = pmsmtool(
+            "simulate", "interior-2k2", "--scenario", "q-step", "-o", str(tmp_path / f"{name}.npz"),
+            "--plot", str(tmp_path / f"{name}.svg"), "--seed", "5",
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert "i_q_a" in done.stdout
+        assert "wrote" in done.stderr
+    for suffix in ("npz", "svg"):
+        assert (tmp_path / f"first.{suffix}").read_bytes() == (tmp_path / f"second.{suffix}").read_bytes()
+    assert (tmp_path / "first.svg").read_text(encoding="utf-8").startswith("<?xml")
+    assert len(read_trace(tmp_path / "first.npz")) == 600
+
+
+def test_csv_holds_the_same_numbers(tmp_path):
+    for name in ("t.npz", "t.csv"):
+        assert pmsmtool("simulate", "interior-2k2", "--scenario", "q-step", "-o", str(tmp_path / name)).returncode == 0
+    npz, csv = read_trace(tmp_path / "t.npz"), read_trace(tmp_path / "t.csv")
+    assert all(np.array_equal(npz[name], csv[name]) for name in npz.signals)
+    assert npz.units == csv.units
+    assert npz.meta == csv.meta
+
+
+def test_json_is_one_object_and_needs_no_file(tmp_path):
+    done = pmsmtool("simulate", "interior-2k2", "--scenario", "q-step", "--json", "--set", "sensor_noise_apk=0")
+    data = json.loads(done.stdout)
+    assert data["schema"] == "pmsmtool.simulate/1"
+    assert data["machine"] == "interior-2k2"
+    assert data["signals"]["i_q_a"]["unit"] == "A"
+    assert data["trace"] is None
+    assert data["meta"]["event_overruns"] == 0
+
+
+def test_duration_and_scenario_file(tmp_path):
+    scenario = tmp_path / "still.toml"
+    scenario.write_text(
+        'schema = "pmsmtool.scenario/1"\nduration_s = 1.0\nmode = "current"\nrotor = "locked"\n', encoding="utf-8"
+    )
+    done = pmsmtool("simulate", "interior-2k2", "--scenario", str(scenario), "--duration", "20ms", "--json")
+    assert json.loads(done.stdout)["rows"] == 240
+    freed = pmsmtool("simulate", "interior-2k2", "--scenario", str(scenario), "--set", "rotor=free", "--json")
+    assert freed.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--scenario", "q-step"), "nothing to write"),
+        (("-o", "t.npz"), "which --scenario"),
+        (("--scenario", "q-step", "-o", "t.xlsx"), "no trace format"),
+        (("--scenario", "q-step", "--plot", "t.gif"), "figure format"),
+        (("--scenario", "no-step", "-o", "t.npz"), "did you mean"),
+        (("--scenario", "q-step", "--json", "--set", "seed"), "not KEY=VALUE"),
+        (("--scenario", "q-step", "--json", "--set", "adc_bits=many"), "adc_bits"),
+        (("--scenario", "q-step", "--json", "--duration", "20"), "has no unit"),
+        (("--scenario", "q-step", "-o", "/nonexistent/t.npz"), "cannot be written"),
+    ],
+)
+def test_bad_use_is_exit_2_with_one_clear_message(arguments, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = pmsmtool("simulate", "interior-2k2", *arguments)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_unknown_design_is_exit_2():
+    done = pmsmtool("simulate", "nothing-here", "--scenario", "q-step", "--json")
+    assert done.returncode == 2
+    assert "nothing-here" in done.stderr
+
+
+def test_trip_is_a_warning_with_its_time(tmp_path):
+    done = pmsmtool("simulate", "jercic-2017", "--scenario", "field-weakening-sweep", "--json")
+    assert done.returncode == 0
+    assert "tripped (error code 0x2310)" in done.stderr
+    assert "field weakening is off" in done.stderr
+
+
+def test_list_names_the_scenarios():
+    done = pmsmtool("simulate", "interior-2k2", "--list")
+    assert done.returncode == 0
+    assert "load-step" in done.stdout
+
+
+def test_simulation_imports_neither_scipy_nor_matplotlib_nor_can():
+    code = (
+        "import contextlib, io, sys; from pmsmtool.cli.main import main\n"
+        "sys.argv[1:] = ['simulate', 'interior-2k2', '--scenario', 'q-step', '--json']\n"
+        "with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):\n"
+        "    main()\n"
+        "print(sorted({'scipy', 'matplotlib', 'can', 'canopen', 'rich', 'jinja2'} & set(sys.modules)))\n"
+        "assert 'pmsmtool.sim.closed_loop' in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_help_has_examples():
+    assert "Examples" in pmsmtool("simulate", "--help").stdout
+
+
+# ---- figures -----------------------------------------------------------------------------------------------------------
+
+
+def trace(n: int) -> Trace:
+    t = np.arange(n) * 1e-4
+    return Trace(t, {"i_d_a": np.sin(50.0 * t), "i_q_a": np.cos(50.0 * t)}, {"i_d_a": "A", "i_q_a": "A"})
+
+
+def test_figure_has_a_panel_per_present_quantity():
+    figure = trace_figure(trace(100), title="test")
+    assert [axes.get_ylabel() for axes in figure.axes] == ["i_d / A", "i_q / A"]
+    assert figure.axes[-1].get_xlabel() == "time / s"
+    assert svg_text(figure) == svg_text(trace_figure(trace(100), title="test"))
+    with pytest.raises(ValueError, match="none of the signals"):
+        trace_figure(trace(100), [Panel("x", (("nothing", "n", "-"),))])
+
+
+def test_thinning_keeps_every_extreme_value():
+    t = np.arange(100_003) * 1e-5
+    value = np.random.default_rng(0).normal(size=len(t))
+    value[77_777] = 40.0
+    kept_t, kept = thinned(t, value)
+    assert len(kept) <= POINTS_MAX + 4
+    assert kept.max() == 40.0
+    assert kept_t[kept.argmax()] == t[77_777]
+    assert kept.min() == value.min()
+    assert (kept_t[0], kept_t[-1]) == (t[0], t[-1])
+    assert np.all(np.diff(kept_t) > 0.0)
+    short = thinned(t[:100], value[:100])
+    assert np.array_equal(short[1], value[:100])
