@@ -28,10 +28,11 @@ SOCKETCAND_DEFAULTS: Mapping[str, Any] = {"host": "127.0.0.1", "port": 29536, "c
 """What ``pmsmtool sim serve`` offers; used for what neither the caller nor python-can's files say."""
 TRACE_SUFFIXES = (".asc", ".blf", ".log", ".trc")
 
+SEND_PATIENCE_S = 0.5
+"""A full transmit queue is waited for this long; a bus where nobody acknowledges stays full."""
+
 _POLL_S = 0.2
 """The reader thread looks this often whether it shall end."""
-_SEND_PATIENCE_S = 0.5
-"""A full transmit queue is waited for this long; a bus where nobody acknowledges stays full."""
 _SEND_PAUSE_S = 0.001
 _RESOLUTION_S = 1e-9  # of the virtual clock; less than that never passes
 _SPIN_LIMIT = 200
@@ -137,8 +138,13 @@ class Connection:
 
     # ---- sending --------------------------------------------------------------------------------
 
-    def send(self, cob_id: int, data: bytes) -> None:
+    def send(self, cob_id: int, data: bytes, *, patience_s: float = SEND_PATIENCE_S) -> None:
         """Send one frame.
+
+        Parameters
+        ----------
+        patience_s : float
+            How long a full transmit queue is waited for; 0 inside an action of the clock.
 
         Raises
         ------
@@ -149,17 +155,16 @@ class Connection:
         message = can.Message(arbitration_id=cob_id, data=data, is_extended_id=False)
         if cob_id in self.sent:
             self.sent[cob_id].append(data)
-        patience = _SEND_PATIENCE_S
         while True:
             try:
                 with self._send_lock:
                     self.bus.send(message)
                 break
             except (can.CanError, OSError, ValueError) as error:
-                if patience <= 0.0 or not _is_full(error):
+                if patience_s <= 0.0 or not _is_full(error):
                     raise self._send_failure(error) from error
             self.clock.wait(_SEND_PAUSE_S)
-            patience -= _SEND_PAUSE_S
+            patience_s -= _SEND_PAUSE_S
         if self._writer is not None:
             message.is_rx = False
             message.timestamp = self._stamp()

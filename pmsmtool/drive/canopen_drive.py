@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from pmsmtool.bus.connect import Connection
-from pmsmtool.cia402 import Mode
+from pmsmtool.cia402 import Mode, State
 from pmsmtool.drive import objects, stop
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
@@ -225,8 +225,10 @@ class CanopenDrive:
             self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=False)
 
     def finish_record(self, signals: Sequence[str], *, decimation: int, excitation: Excitation | None) -> Trace:
-        """Wait until the recorder is complete and return its trace."""
+        """Wait until the recorder is complete and return its trace, if the drive did not trip meanwhile."""
         trace = self.recorder.fetch(signals, decimation)
+        if self.may_be_energised and self.node.state() in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            raise self.node.fault_error()
         if excitation is None:
             return trace
         return replace(trace, meta={**trace.meta, "excitation": _excitation_facts(excitation)})

@@ -206,7 +206,18 @@ class GuardedDrive:
         self._drive.write(values)
 
     def enable(self) -> None:
-        """Bring the drive to operation enabled at zero reference."""
+        """Bring the drive to operation enabled at zero reference.
+
+        Raises
+        ------
+        SafetyRefusal
+            The dead-man was not proven.
+        """
+        if self.proof is None:
+            raise SafetyRefusal(
+                "the dead-man was not proven, so nothing is enabled", where=f"node {self._node.node}",
+                hint="this is a bug worth reporting",
+            )  # fmt: skip
         self._drive.enable()
         if self._start_rad is None:
             self._start_rad = self._drive.live("theta_m_rad")

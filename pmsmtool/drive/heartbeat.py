@@ -30,7 +30,6 @@ class Heartbeat:
     """
 
     def __init__(self, connection: Connection, *, period_s: float = PERIOD_S) -> None:
-        self.failure: BusError | None = None
         self._connection = connection
         self._period_s = period_s
         self._ticker: Ticker | None = None
@@ -59,4 +58,4 @@ class Heartbeat:
     def _beat(self) -> None:
         # Nobody catches here: the drive notices a lost heartbeat, the next request meets the failed bus.
         with contextlib.suppress(BusError):
-            self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)))
+            self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)), patience_s=0.0)

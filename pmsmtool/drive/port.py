@@ -120,5 +120,8 @@ class Drive(Protocol):
     ) -> Trace:
         """Record signals every ``decimation`` periods, starting with the excitation if there is one."""
 
+    def live(self, name: str) -> float:
+        """Return one live quantity (``drive.objects.LIVE``) as it is now."""
+
     def wait(self, seconds: float) -> None:
         """Let time pass on the bus clock."""

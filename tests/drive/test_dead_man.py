@@ -1,0 +1,118 @@
+"""The dead-man: proven before motion, refused where the drive cannot, and true when it matters."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.clock import WallClock
+from pmsmtool.bus.connect import Connection
+from pmsmtool.cia402 import AbortConnection, State
+from pmsmtool.drive.dead_man import CONSUMER_MS, prove_dead_man
+from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.heartbeat import PERIOD_S, TOOL_NODE, Heartbeat
+from pmsmtool.errors import SafetyRefusal
+from pmsmtool.sim.node.dictionary import Refused
+from tests.bus.scripted import ScriptedBus, ScriptedSlave
+from tests.drive.bench import ENVELOPE, SimBench, sim_bench
+
+
+@pytest.fixture
+def bench() -> Iterator[SimBench]:
+    with sim_bench() as opened:
+        yield opened
+
+
+@pytest.mark.parametrize("option", [AbortConnection.FAULT, AbortConnection.DISABLE_VOLTAGE, AbortConnection.QUICK_STOP])
+def test_every_option_that_stops_is_proven(bench: SimBench, option: AbortConnection) -> None:
+    bench.drive.node.sdo.download(0x6007, 0, int(option).to_bytes(2, "little"))
+    proof = prove_dead_man(bench.drive, Heartbeat(bench.connection))
+    assert proof.abort_connection is option and proof.measured_s <= proof.declared_s
+    assert proof.measured_s > 1e-3 * CONSUMER_MS - PERIOD_S
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def test_option_that_does_nothing_is_changed_for_the_experiment_and_restored(bench: SimBench) -> None:
+    bench.drive.node.sdo.download(0x6007, 0, b"\0\0")
+    with guarded(bench.drive, ENVELOPE) as guard:
+        assert guard.proof is not None and guard.proof.abort_connection is AbortConnection.QUICK_STOP
+    assert bench.drive.node.sdo.read(0x6007, 0) == b"\0\0"
+
+
+@pytest.mark.parametrize("index", [0x1016, 0x6007])
+def test_drive_without_the_objects_is_refused_before_motion(bench: SimBench, index: int) -> None:
+    def absent(data: bytes = b"") -> bytes:
+        raise Refused(AbortCode.NO_OBJECT)
+
+    for entry in bench.session.dictionary:
+        if entry.row.index == index:
+            entry.source = absent
+            entry.sink = lambda data: absent() and None
+    states: list[State] = []
+    bench.session.power.on_state = lambda: states.append(bench.session.power.state)
+    with pytest.raises(SafetyRefusal) as caught, guarded(bench.drive, ENVELOPE):
+        pass
+    assert caught.value.exit_code == 5 and f"0x{index:04X}" in str(caught.value)
+    assert State.OPERATION_ENABLED not in states
+
+
+def test_drive_that_ignores_the_heartbeat_is_refused_and_stopped(bench: SimBench) -> None:
+    bench.session.consumer.heard = lambda node: None  # type: ignore[method-assign]
+    with pytest.raises(SafetyRefusal, match="still enabled 350 ms after"), guarded(bench.drive, ENVELOPE):
+        pass
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def test_all_entries_taken_is_refused(bench: SimBench) -> None:
+    for sub in range(1, 5):
+        bench.drive.node.sdo.download(0x1016, sub, (0x10 + sub << 16 | 500).to_bytes(4, "little"))
+    with pytest.raises(SafetyRefusal, match="taken"), guarded(bench.drive, ENVELOPE):
+        pass
+
+
+def test_busy_main_thread_does_not_stop_the_machine(bench: SimBench) -> None:
+    """Virtual time: two seconds pass without the tool doing anything but its heartbeat."""
+    with guarded(bench.drive, ENVELOPE) as guard:
+        guard.enable()
+        bench.bus.clock.wait(2.0)
+        assert bench.session.power.state is State.OPERATION_ENABLED
+
+
+def test_killed_tool_stops_the_machine(bench: SimBench) -> None:
+    with pytest.raises(Exception, match="0x8130|enabled|fault|QUICK"), guarded(bench.drive, ENVELOPE) as guard:
+        guard.enable()
+        guard._heartbeat.stop()
+        stopped = bench.bus.clock.now()
+        while bench.session.power.state is State.OPERATION_ENABLED:
+            bench.bus.clock.wait(0.001)
+        assert bench.bus.clock.now() - stopped <= 1e-3 * CONSUMER_MS + 0.1
+        guard.enable()
+        raise AssertionError("0x8130")
+
+
+def test_heartbeat_on_the_wall_clock_has_its_own_thread() -> None:
+    """A main thread busy for a second: the gaps between heartbeats stay far below the consumer time."""
+    bus = ScriptedBus(ScriptedSlave())
+    beats: list[float] = []
+    bus.send = lambda msg, timeout=None: beats.append(time.monotonic())  # type: ignore[method-assign]
+    connection = Connection(bus)
+    connection.clock = WallClock()
+    with Heartbeat(connection):
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            sum(range(20_000))
+    gaps = [b - a for a, b in zip(beats, beats[1:], strict=False)]
+    assert len(beats) >= 15 and max(gaps) < 1e-3 * CONSUMER_MS
+    assert threading.active_count() < 10
+
+
+def test_heartbeat_carries_the_tools_node_id(bench: SimBench) -> None:
+    heard: list[int] = []
+    bench.bus.line.nodes[0].receive = lambda can_id, data, flags=0: heard.append(can_id)  # type: ignore[method-assign]
+    with Heartbeat(bench.connection):
+        bench.bus.clock.wait(0.5)
+    assert heard.count(0x700 + TOOL_NODE) in (10, 11)

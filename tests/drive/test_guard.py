@@ -1,0 +1,234 @@
+"""The guard: limits, Ctrl-C at any moment, pulled cables, and a drive that holds what it held."""
+
+from __future__ import annotations
+
+import math
+import random
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from pmsmtool.cia402 import State
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.guard import GuardedDrive, guarded
+from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.errors import (
+    DriveFault,
+    Interrupted,
+    LimitExceeded,
+    PmsmtoolError,
+    SafetyRefusal,
+    StopNotConfirmed,
+    VerifyMismatch,
+)
+from tests.drive.bench import ENVELOPE, SimBench, sim_bench
+
+INTERRUPTIONS = 50
+RUNNING = {
+    "motor.pole_pairs": 3,
+    "encoder.offset_rad": 0.35,
+    "motor.psi_f_wb": 0.545,
+    "speed.K_p_nms_per_rad": 0.05,
+    "speed.K_i_nm_per_rad": 0.5,
+}
+"""What the profile's machine needs to run; a drive fresh from the factory does not know it."""
+
+
+@pytest.fixture
+def bench() -> Iterator[SimBench]:
+    with sim_bench() as opened:
+        yield opened
+
+
+def experiment(guard: GuardedDrive) -> None:
+    """A short experiment that touches everything: parameters, set-points, excitation, recorder, averages."""
+    guard.write({"motor.R_s_ohm": 2.0, "motor.L_d_h": 0.02})
+    guard.enable()
+    guard.command_current(1.0, 0.0, fixed_angle_rad=0.5)
+    guard.wait(0.1)
+    guard.average(["i_d_a", "u_d_v"], 500)
+    square = Excitation(Shape.SQUARE, Injection.U_D, 4.0, bias_d_a=1.0, bias_bandwidth_rad_s=94.0, hold_periods=6)
+    guard.record(["i_d_a", "i_q_a", "u_d_v"], 512, excitation=square)
+    noise = Excitation(Shape.BUFFER, Injection.U_D, 1.0, buffer=[0.5, -0.5] * 20)
+    guard.record(["i_d_a"], 256, excitation=noise)
+
+
+def test_everything_an_experiment_changed_is_restored(bench: SimBench) -> None:
+    bench.drive.node.sdo.download(0x1020, 1, (15000).to_bytes(4, "little"))
+    before = bench.memory()
+    said: list[str] = []
+    with guarded(bench.drive, ENVELOPE, say=said.append) as guard:
+        experiment(guard)
+        assert bench.memory() != before
+    assert bench.memory() == before
+    assert bench.drive.node.state() is State.SWITCH_ON_DISABLED
+    assert "drive restored" in said[-1]
+
+
+def test_failure_in_the_experiment_stops_and_restores(bench: SimBench) -> None:
+    before = bench.memory()
+    with pytest.raises(ZeroDivisionError), guarded(bench.drive, ENVELOPE) as guard:
+        experiment(guard)
+        raise ZeroDivisionError
+    assert bench.memory() == before and bench.drive.node.state() is State.SWITCH_ON_DISABLED
+
+
+def test_envelope_reaches_the_drive_itself(bench: SimBench) -> None:
+    with guarded(bench.drive, Envelope(i_max_apk=2.0, speed_max_rad_s=50.0)):
+        limits = {key: bench.session.dictionary[f"cia402.{key}"].number() for key in ("max_current", "max_speed")}
+    rated_apk = 1e-3 * bench.session.dictionary["cia402.rated_current"].number() * math.sqrt(2.0)
+    assert 2.0 <= limits["max_current"] / 1000.0 * rated_apk < 2.0 + 0.002 * rated_apk
+    assert limits["max_speed"] == math.ceil(50.0 * 60.0 / (2.0 * math.pi))
+
+
+@pytest.mark.parametrize("moment", range(INTERRUPTIONS))
+def test_ctrl_c_at_any_moment_ends_stopped_and_restored(bench: SimBench, moment: int) -> None:
+    before = bench.memory()
+    when = random.Random(moment).uniform(0.0, 1.6)
+    bench.bus.clock.after(when, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(Interrupted) as caught, guarded(bench.drive, ENVELOPE) as guard:
+        experiment(guard)
+        guard.wait(10.0)
+    assert caught.value.exit_code == 130
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+    assert bench.memory() == before
+
+
+@pytest.mark.parametrize("moment", range(8))
+def test_second_ctrl_c_while_stopping_still_ends_confirmed(bench: SimBench, moment: int) -> None:
+    before = bench.memory()
+    for delay in (0.9, 0.9005 + 0.0007 * moment):
+        bench.bus.clock.after(delay, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises((Interrupted, KeyboardInterrupt)), guarded(bench.drive, ENVELOPE) as guard:
+        experiment(guard)
+        guard.wait(10.0)
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+    assert bench.memory() == before
+
+
+def test_second_ctrl_c_removes_the_voltage_at_once(bench: SimBench) -> None:
+    """A quick stop ramp of seconds is cut short."""
+    with guarded(bench.drive, Envelope(i_max_apk=5.0, speed_max_rad_s=100.0)) as guard:
+        bench.drive.node.put(_object(0x6085, "I"), 60)
+        guard.write(RUNNING)
+        guard.enable()
+        guard.command_speed(80.0)
+        guard.wait(2.0)
+        assert guard.live("omega_e_rad_s") > 100.0
+        started = bench.bus.clock.now()
+        bench.bus.clock.after(0.1, lambda: signal.raise_signal(signal.SIGINT))
+        guard.stop()
+        assert 0.1 <= bench.bus.clock.now() - started < 0.2
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def _object(index: int, letter: str) -> object:
+    from pmsmtool.drive.objects import DriveObject
+
+    return DriveObject(index, 0, letter)
+
+
+@pytest.mark.parametrize("moment", [0.8, 0.95, 1.1])
+def test_pulled_cable_is_exit_8_and_says_what_to_do(bench: SimBench, moment: float) -> None:
+    def unplug() -> None:
+        bench.simulated.plugged = False
+
+    bench.bus.clock.after(moment, unplug)
+    with pytest.raises(StopNotConfirmed) as caught, guarded(bench.drive, ENVELOPE) as guard:
+        experiment(guard)
+        guard.wait(10.0)
+    assert caught.value.exit_code == 8 and "hardware stop" in str(caught.value)
+
+
+def test_drive_behind_a_pulled_cable_stops_by_itself(bench: SimBench) -> None:
+    """The dead-man at work: the tool is cut off, the drive leaves operation in the declared time."""
+
+    def unplug() -> None:
+        bench.simulated.plugged = False
+
+    bench.bus.clock.after(1.0, unplug)
+    with pytest.raises(StopNotConfirmed), guarded(bench.drive, ENVELOPE) as guard:
+        experiment(guard)
+        guard.wait(10.0)
+    assert bench.session.power.state is not State.OPERATION_ENABLED
+
+
+def test_unreachable_before_anything_was_enabled_is_a_bus_error(bench: SimBench) -> None:
+    bench.simulated.plugged = False
+    with pytest.raises(PmsmtoolError) as caught, guarded(bench.drive, ENVELOPE):
+        pass
+    assert caught.value.exit_code == 3
+
+
+def test_speed_beyond_the_envelope_stops(bench: SimBench) -> None:
+    with pytest.raises(LimitExceeded, match="speed") as caught, guarded(bench.drive, Envelope(5.0, 20.0)) as guard:
+        guard.write(RUNNING)
+        guard.enable()
+        bench.drive.node.put(_object(0x6080, "I"), 100000)  # the drive's own limit is out of the way
+        bench.drive.command_speed(60.0)
+        guard.wait(5.0)
+    assert caught.value.exit_code == 5
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+@pytest.mark.parametrize(
+    ("envelope", "quantity"),
+    [
+        (Envelope(3.0, 100.0, duration_s=0.5), "time energised"),
+        (Envelope(3.0, 100.0, energy_j=1.0), "energy"),
+        (Envelope(3.0, 100.0, travel_rad=0.01), "travel"),
+    ],
+)
+def test_budgets_end_an_experiment(bench: SimBench, envelope: Envelope, quantity: str) -> None:
+    with pytest.raises(LimitExceeded, match=quantity), guarded(bench.drive, envelope) as guard:
+        guard.write({"motor.R_s_ohm": 3.6})
+        guard.enable()
+        for angle in range(100):
+            guard.command_current(2.5, 0.0, fixed_angle_rad=0.3 * angle)
+            guard.wait(0.1)
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def test_excitation_that_leaves_its_limits_is_a_fault_and_stopped(bench: SimBench) -> None:
+    with pytest.raises(DriveFault, match="abort limit"), guarded(bench.drive, ENVELOPE) as guard:
+        guard.enable()
+        guard.record(["i_d_a"], 2000, excitation=Excitation(Shape.DC, Injection.U_D, 100.0, fixed_angle_rad=0.0))
+    assert not bench.session.power.state.energised
+    bench.drive.node.reset_fault()
+
+
+def test_gravity_load_is_refused_before_anything_is_sent(bench: SimBench) -> None:
+    before = bench.bus.line.frames
+    with pytest.raises(SafetyRefusal, match="gravity"), guarded(bench.drive, Envelope(3.0, 100.0, load="gravity")):
+        pass
+    assert bench.bus.line.frames == before
+    Envelope(3.0, 100.0, load="gravity", shaft="locked").refuse_gravity()
+
+
+def test_drive_that_somebody_else_enabled_is_left_alone(bench: SimBench) -> None:
+    bench.drive.node.enable()
+    with pytest.raises(SafetyRefusal, match="somebody else"), guarded(bench.drive, ENVELOPE):
+        pass
+    assert bench.session.power.state is State.OPERATION_ENABLED
+
+
+def test_nothing_is_enabled_without_the_proof(bench: SimBench) -> None:
+    with pytest.raises(SafetyRefusal, match="not proven"), guarded(bench.drive, ENVELOPE, prove=False) as guard:
+        guard.enable()
+
+
+def test_object_that_refuses_its_old_value_is_named(bench: SimBench) -> None:
+    with pytest.raises(VerifyMismatch, match="0x6085:00") as caught, guarded(bench.drive, ENVELOPE):
+        bench.drive.node.put(_object(0x6085, "I"), 60)
+        entry = bench.session.dictionary["cia402.quick_stop_deceleration"]
+        entry.sink = lambda data: None
+    assert "reset the drive" in caught.value.hint
+
+
+def test_node_that_boots_in_the_middle_ends_the_experiment_stopped(bench: SimBench) -> None:
+    bench.bus.clock.after(1.0, bench.simulated.reset)
+    with pytest.raises(PmsmtoolError, match="was reset") as caught, guarded(bench.drive, ENVELOPE) as guard:
+        experiment(guard)
+        guard.wait(10.0)
+    assert caught.value.exit_code == 3 and bench.session.power.state is State.SWITCH_ON_DISABLED

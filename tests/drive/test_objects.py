@@ -1,0 +1,46 @@
+"""The objects the tool uses are those of the reference drive's EDS."""
+
+from __future__ import annotations
+
+import canopen
+import pytest
+from canopen.objectdictionary import ODVariable
+
+from pmsmtool.drive import objects
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.port import Excitation
+from pmsmtool.resources import data_folder
+
+LETTERS = {0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I", 0x08: "f"}
+
+
+def all_objects() -> dict[str, DriveObject]:
+    found = {name: item for name, item in vars(objects).items() if isinstance(item, DriveObject)}
+    for group in ("EXCITATION_FIELDS", "LIVE"):
+        found |= {f"{group}.{name}": item for name, item in getattr(objects, group).items()}
+    for group in ("TRACE_CHANNELS", "AVERAGE_MEANS", "AVERAGE_CHANNELS"):
+        found |= {f"{group}[{k}]": item for k, item in enumerate(getattr(objects, group))}
+    return found
+
+
+@pytest.fixture(scope="module")
+def dictionary() -> canopen.ObjectDictionary:
+    return canopen.import_od(str(data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds"))
+
+
+@pytest.mark.parametrize("name", all_objects())
+def test_index_sub_and_type(dictionary: canopen.ObjectDictionary, name: str) -> None:
+    item = all_objects()[name]
+    variable = dictionary.get_variable(item.index, item.sub)
+    assert isinstance(variable, ODVariable), f"{name} is not in the EDS"
+    assert LETTERS[variable.data_type] == item.letter
+
+
+def test_every_field_of_an_excitation_has_an_object() -> None:
+    assert set(objects.EXCITATION_FIELDS) | {"buffer"} == set(Excitation.__dataclass_fields__)
+
+
+def test_signal_units() -> None:
+    assert {objects.signal_unit(n) for n in ("i_d_a", "u_q_v", "theta_e_rad", "omega_e_rad_s", "flags", "T_winding_c")} == {
+        "A", "V", "rad", "rad/s", "1", "degC",
+    }  # fmt: skip
