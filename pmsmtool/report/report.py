@@ -77,7 +77,8 @@ def render(
         changes=changes,
         not_checked=list(not_checked),
         conditions=list(_conditions(record)),
-        files=[pair for stage in latest for pair in sorted(stage.get("files", {}).items())],
+        # A later stage may write a file of an earlier one again: the last digest is that of the file.
+        files=sorted({name: digest for stage in latest for name, digest in stage.get("files", {}).items()}.items()),
     )
 
 

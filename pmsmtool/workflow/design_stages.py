@@ -1,7 +1,8 @@
-"""The stages that compute: control, look-up table. Files of the run in, files of the run and criteria out."""
+"""The stages that compute: control, look-up table, margins. Files of the run in, files of the run and criteria out."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -10,8 +11,10 @@ from pmsmtool.design.design_file import Design, DesignValue, design_text, load_d
 from pmsmtool.design.lookup_design import LookupDesign, LookupRequest, design_table
 from pmsmtool.design.lookup_file import lut_values, table_csv, table_facts, table_npz
 from pmsmtool.design.lookup_loci import loci
+from pmsmtool.design.margins import JUDGED_PERCENTILE, MarginRequest, Spread, margin_report
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.sampled_loop import LoopMargins
+from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.machine.machine_file import load_machine_file
@@ -23,8 +26,13 @@ SHOWN = (
     "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad",
 )  # fmt: skip
 """Values of a design that the record names; all of them stand in ``design.toml``."""
+MARGIN_SAMPLES = 4096
+"""Random machines drawn from the tolerance box: the 5 % quantile to about +-0.7 % of probability; 0.4 s."""
 SPEED_PHASE_MARGIN_DEG = 40.0
 """Least phase margin of the speed loop: below it a step rings visibly (30 % overshoot)."""
+
+FROM_TABLE = 1.0
+"""``field_weakening.mode`` of a drive that takes its current references from the table."""
 
 
 def tune_stage(run: RunDirectory, request: TuneRequest) -> Stage:
@@ -41,7 +49,14 @@ def tune_stage(run: RunDirectory, request: TuneRequest) -> Stage:
     values: list[Mapping[str, Any]] = [
         {"name": n, "value": design[n], "method": design.values[n].method} for n in SHOWN
     ]
-    return _stage("tune", criteria, values=values, files=("design.toml",), fallbacks=design.notes)
+    current = [loop for name, loop in design.loops.items() if name.startswith("current")]
+    hertz = float(design.facts["current_bandwidth_rad_s"]) / (2.0 * math.pi)
+    phase, gain = min(loop.phase_margin_deg for loop in current), min(loop.gain_margin_db for loop in current)
+    summary = f"current loops {hertz:.4g} Hz, {phase:.1f} deg, {gain:.1f} dB"
+    if "speed" in design.loops:
+        loop = design.loops["speed"]
+        summary += f"; speed loop {loop.crossover_rad_s / (2.0 * math.pi):.4g} Hz, {loop.phase_margin_deg:.1f} deg"
+    return _stage("tune", summary, criteria, values=values, files=("design.toml",), fallbacks=design.notes)
 
 
 def _loop_criteria(name: str, loop: LoopMargins, request: TuneRequest) -> list[Acceptance]:
@@ -90,23 +105,63 @@ def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
         *({"name": f"cells bound by {name}", "value": count} for name, count in zip(names, counts, strict=True)),
     ]
     files = ("lut.npz", "lut.csv", "design.toml", "params.toml")
-    return _stage("lut", criteria, values=values, files=files, fallbacks=made.notes)
+    summary = f"{shape} cells, {made.stored}; torque to {torque:.4g} N m, {table.axis_kind} to {table.y[-1]:.5g}"
+    return _stage("lut", summary, criteria, values=values, files=files, fallbacks=made.notes)
 
 
 def _at_most(what: str, value: float, largest: float) -> Acceptance:
     return Acceptance(what, f"{100.0 * value:.2g} %", f"<= {100.0 * largest:g} %", value <= largest)
 
 
+def margins_stage(run: RunDirectory, request: MarginRequest) -> Stage:
+    """Judge the design over what the machine may be: interval corners and random samples; writes nothing."""
+    design = load_design(run.path / "design.toml")
+    report = margin_report(design, tolerance_box(design.machine), request, samples=MARGIN_SAMPLES)
+    criteria = [line for spread in report.loops for line in _spread_criteria(spread)]
+    criteria += [line for spread in report.headroom for line in _spread_criteria(spread)]
+    phase = min((s for s in report.loops if s.name.endswith("phase")), key=lambda s: s.worst)
+    gain = min(
+        (s for s in report.loops if s.name.startswith("current") and s.name.endswith("gain")), key=lambda s: s.worst
+    )
+    summary = (
+        f"over {report.corners} corners and {report.samples} samples: phase {phase.worst:.1f} deg ({phase.name}), "
+        f"gain {gain.worst:.1f} dB ({gain.name})"
+    )
+    values = [_spread_value(spread) for spread in (*report.loops, *report.headroom)]
+    return _stage("margins", summary, criteria, values=values, files=(), fallbacks=report.notes)
+
+
+def _spread_criteria(spread: Spread) -> list[Acceptance]:
+    if spread.least is None:
+        return []
+    limit = f">= {spread.least:g} {spread.unit}"
+    found = {"worst corner": spread.worst, "5 % of samples": spread.percentiles[JUDGED_PERCENTILE]}
+    return [
+        Acceptance(f"{spread.name}: {where}", f"{value:.1f} {spread.unit}", limit, value >= spread.least)
+        for where, value in found.items()
+    ]
+
+
+def _spread_value(spread: Spread) -> Mapping[str, Any]:
+    percentiles = {f"p{percentile:g}": value for percentile, value in spread.percentiles.items()}
+    return {
+        "name": spread.name, "unit": spread.unit, "value": spread.nominal, "worst": spread.worst,
+        "at": spread.worst_cell, "least": spread.least, **percentiles,
+    }  # fmt: skip
+
+
 def with_table(design: Design, made: LookupDesign) -> Design:
-    """Return a design with a look-up table in it."""
+    """Return a design with a look-up table in it, and the drive told to take its references from there."""
     values, tables = lut_values(made.table, made.stored)
-    how = f"{made.stored}, error-bounded grid"
+    values["field_weakening.mode"] = FROM_TABLE
+    how = f"look-up table, {made.stored}, error-bounded grid"
     entries = {**design.values, **{name: DesignValue(value, how) for name, value in values.items()}}
     return replace(design, values={row.name: entries[row.name] for row in CATALOGUE}, tables=tables)
 
 
 def _stage(
     name: str,
+    summary: str,
     criteria: list[Acceptance],
     *,
     values: list[Mapping[str, Any]],
@@ -122,5 +177,6 @@ def _stage(
         acceptance=criteria,
         files=dict.fromkeys(files, ""),
         fallbacks=fallbacks,
+        summary=summary,
         note="" if good else f"{sum(not line.ok for line in criteria)} of {len(criteria)} criteria are not met",
     )

@@ -68,6 +68,7 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
     return Stage(
         "flash", "pass" if good else "fail", 0.0, values=values, acceptance=criteria,
         note="" if good else "the drive does not keep the set", fallbacks=missing,
+        summary=f"{outcome.written} of {total} objects written, stored, read back after a reset",
     )  # fmt: skip
 
 
@@ -104,4 +105,5 @@ def verify_stage(run: RunDirectory, drive: CanopenDrive) -> Stage:
     return Stage(
         "verify", "pass" if good else "fail", 0.0, values=values, acceptance=criteria,
         note="" if good else "the drive does not hold the designed set",
+        summary=f"{total} objects hold the designed bytes (behaviour: not compared)",
     )  # fmt: skip

@@ -5,6 +5,7 @@ Nothing is measured, and no number is made that the run does not hold.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -42,7 +43,11 @@ def report_page(path: Path) -> str:
     """
     run = RunDirectory(path)
     record = run.read()
-    drawn = [*_design_figures(run.path / "design.toml"), *_table_figures(run.path / "lut.npz")]
+    drawn = [
+        *_design_figures(run.path / "design.toml"),
+        *_margin_figures(record),
+        *_table_figures(run.path / "lut.npz"),
+    ]
     return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=NOT_CHECKED)
 
 
@@ -81,6 +86,24 @@ def open_loops(design: Design) -> dict[str, SampledLoop]:
         )
         loops["speed"] = speed_loop(gain, path)
     return loops
+
+
+def _margin_figures(record: RunRecord) -> Iterator[Figure]:
+    stage = record.stage("margins")
+    for ending, title in (("phase", "Phase margin"), ("gain", "Gain margin")):
+        rows = {}
+        unit = ""
+        for value in stage.values if stage else ():
+            if str(value["name"]).endswith(ending) and "p5" in value:
+                least = math.nan if value["least"] is None else float(value["least"])
+                rows[str(value["name"])] = (float(value["p5"]), float(value["p50"]), float(value["p95"]), least)
+                unit = str(value["unit"])
+        if rows:
+            caption = (
+                f"{title} over the tolerance box of the machine: 5 % to 95 % of the random machines, their median, and "
+                "the least value asked for."
+            )
+            yield figures.band_figure(rows, unit, caption)
 
 
 def _table_figures(path: Path) -> Iterator[Figure]:

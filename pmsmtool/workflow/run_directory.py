@@ -60,6 +60,8 @@ class Stage:
         File name in the run directory -> SHA-256 of its bytes.
     note : str
         The error text of a stage that did not pass.
+    summary : str
+        What a person reads in the one line of the stage.
     """
 
     name: str
@@ -70,6 +72,7 @@ class Stage:
     fallbacks: Sequence[str] = ()
     files: Mapping[str, str] = field(default_factory=dict)
     note: str = ""
+    summary: str = ""
 
 
 @dataclass(frozen=True, slots=True)
