@@ -123,9 +123,6 @@ class FaultReaction(IntEnum):
     QUICK_STOP_RAMP = 2
 
 
-MOTOR_TYPE_PMSM = 10
-"""Object 0x6402: sinusoidal PM brushless motor."""
-
 ERROR_TEXTS: dict[int, str] = {
     0x0000: "no error",
     0x2310: "continuous over-current at the output",

@@ -7,7 +7,6 @@ end of its time on the wire. Everything runs on the line's own virtual clock.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from pmsmtool.bus.clock import NS, VirtualClock
@@ -90,7 +89,6 @@ class Line:
         self.endpoints: list[Endpoint] = []
         self.frames = 0
         self.wire_ns = 0
-        self.on_traffic: Callable[[], None] = lambda: None
         self._instant = instant
         self._pending: list[tuple[int, int, Node | Endpoint, Frame]] = []
         self._count = 0

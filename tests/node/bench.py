@@ -9,13 +9,18 @@ import can
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.faults import parse_faults
 from pmsmtool.sim.line import Line
-from pmsmtool.sim.node.memory import Memory, RamStorage, Storage
+from pmsmtool.sim.node.memory import PAGE_BYTES, Memory, RamStorage, Storage
 from pmsmtool.sim.node.node import Node, Settings
 from pmsmtool.sim.node.parameter_set import ParameterImage
 from tests.node.raw_client import RawClient
 from tests.node.simple_core import SimpleCore
 
 SERIAL = 0x1234
+
+
+def steps_of(content: bytes) -> int:
+    """Return the write steps of a store: header erased, pages, header written."""
+    return 2 + -(-len(content) // PAGE_BYTES)
 
 
 @dataclass

@@ -2,13 +2,18 @@
 
 import os
 import random
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.sim.node.memory import PAGE_BYTES, SLOT_BYTES, FileStorage, Memory, RamStorage, Storage, steps_of
+from pmsmtool.sim.node.memory import PAGE_BYTES, SLOT_BYTES, FileStorage, Memory, RamStorage, Storage
+from tests.node.bench import steps_of
 
+ROOT = Path(__file__).parents[2]
 OLD = random.Random(1).randbytes(5 * PAGE_BYTES + 13)
 NEW = random.Random(2).randbytes(7 * PAGE_BYTES)
 
@@ -67,6 +72,39 @@ def test_power_cut_inside_a_write_leaves_old_or_new() -> None:
         assert held in (b"old", b"n" * 300)
         seen.add(held)
     assert len(seen) == 2
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from pmsmtool.sim.node.memory import FileStorage, Memory
+memory = Memory(FileStorage(Path(sys.argv[1])))
+number = 0
+while True:
+    number += 1
+    for _ in memory.store(bytes([number % 251]) * 20000):
+        pass
+    print(number, flush=True)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
+def test_a_killed_process_leaves_a_whole_content(tmp_path: Path) -> None:
+    """Ten kills at random moments: what is found is one of the contents that were being written, entire."""
+    generator = random.Random(5)
+    for number in range(10):
+        path = tmp_path / f"{number}.nv"
+        process = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, cwd=ROOT)
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(generator.uniform(0.0, 0.03))
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        held = Memory(FileStorage(path)).load()
+        assert held is not None
+        assert len(held) == 20000
+        assert len(set(held)) == 1
 
 
 def test_an_interrupted_store_does_not_spoil_the_next_one() -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.sim.node import store as storing
-from pmsmtool.sim.node.memory import Memory, RamStorage, steps_of
-from tests.node.bench import Bench
+from pmsmtool.sim.node.memory import Memory, RamStorage
+from tests.node.bench import Bench, steps_of
 from tests.node.conftest import BenchMaker
 from tests.node.raw_client import HEAD, Aborted, Lost
 
@@ -180,6 +180,8 @@ def test_damaged_memory_is_reported_and_the_factory_set_is_active(make_bench: Be
     storage = RamStorage()
     storage.write(0, b"\x01" * 64, durable=True)
     bench = make_bench(storage=storage)
+    assert bench.frames(0x081, 0.1)[0][:2] == b"\x30\x55"
+    bench.nmt(129)
     assert bench.frames(0x081, 0.1)[0][:2] == b"\x30\x55"
     assert values(bench) == DEFAULT
 

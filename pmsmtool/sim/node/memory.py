@@ -162,8 +162,3 @@ class Memory:
         crc = zlib.crc32(content, sequence)
         self._storage.write(base, _HEADER.pack(_MAGIC, sequence, len(content), crc), durable=True)
         yield
-
-
-def steps_of(content: bytes) -> int:
-    """Return the number of write steps storing this content takes."""
-    return 2 + -(-len(content) // PAGE_BYTES)

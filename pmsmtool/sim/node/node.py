@@ -160,6 +160,8 @@ class Node:
             session = self.session
         if session is not None:
             session.boot()
+            if self.memory.is_damaged():
+                session.report_damage()
 
     def power_cut(self) -> None:
         """Take the supply away: everything volatile is gone, an unfinished store too."""
@@ -185,11 +187,6 @@ class Node:
     def listens(self) -> bool:
         """Whether its CAN controller takes part in the line (and acknowledges frames)."""
         return self.plugged and self.session is not None
-
-    @property
-    def powered(self) -> bool:
-        """Whether the drive has its supply."""
-        return self._powered
 
     def set_faults(
         self,
