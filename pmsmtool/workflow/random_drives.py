@@ -187,14 +187,8 @@ def _with_truth(
 
 
 def true_loop_resistance(drive: MachineFile) -> float:
-    """Return R_s at T_ref as the drive can see it: winding plus the mean slope of switch and diode (ohm).
-
-    Near standstill every leg conducts half the period through the switch and half through the diode, so their slopes
-    count half each. A MOSFET's channel carries both halves.
-    """
-    truth = drive.simulation_settings()
-    slope = 0.5 * (_number(truth, "device_slope_ohm") + _number(truth, "diode_slope_ohm"))
-    return _number(truth, "R_s_ohm") + slope
+    """Return R_s at T_ref as the drive can see it (ohm): ``[simulation] R_s_ohm`` is the loop, devices included."""
+    return _number(drive.simulation_settings(), "R_s_ohm")
 
 
 def _number(values: dict[str, Value], key: str) -> float:
