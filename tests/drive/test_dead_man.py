@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Iterator
 
+import can
 import pytest
 
 from pmsmtool.bus.abort_codes import AbortCode
@@ -45,13 +47,16 @@ def test_option_that_does_nothing_is_changed_for_the_experiment_and_restored(ben
 
 @pytest.mark.parametrize("index", [0x1016, 0x6007])
 def test_drive_without_the_objects_is_refused_before_motion(bench: SimBench, index: int) -> None:
-    def absent(data: bytes = b"") -> bytes:
+    def absent() -> bytes:
+        raise Refused(AbortCode.NO_OBJECT)
+
+    def refused(data: bytes) -> None:
         raise Refused(AbortCode.NO_OBJECT)
 
     for entry in bench.session.dictionary:
         if entry.row.index == index:
             entry.source = absent
-            entry.sink = lambda data: absent() and None
+            entry.sink = refused
     states: list[State] = []
     bench.session.power.on_state = lambda: states.append(bench.session.power.state)
     with pytest.raises(SafetyRefusal) as caught, guarded(bench.drive, ENVELOPE):
@@ -98,21 +103,29 @@ def test_heartbeat_on_the_wall_clock_has_its_own_thread() -> None:
     """A main thread busy for a second: the gaps between heartbeats stay far below the consumer time."""
     bus = ScriptedBus(ScriptedSlave())
     beats: list[float] = []
-    bus.send = lambda msg, timeout=None: beats.append(time.monotonic())  # type: ignore[method-assign]
+
+    def note(msg: can.Message, timeout: float | None = None) -> None:
+        beats.append(time.monotonic())
+
+    bus.send = note  # type: ignore[method-assign]
     connection = Connection(bus)
     connection.clock = WallClock()
     with Heartbeat(connection):
         end = time.monotonic() + 1.0
         while time.monotonic() < end:
             sum(range(20_000))
-    gaps = [b - a for a, b in zip(beats, beats[1:], strict=False)]
+    gaps = [b - a for a, b in itertools.pairwise(beats)]
     assert len(beats) >= 15 and max(gaps) < 1e-3 * CONSUMER_MS
     assert threading.active_count() < 10
 
 
 def test_heartbeat_carries_the_tools_node_id(bench: SimBench) -> None:
     heard: list[int] = []
-    bench.bus.line.nodes[0].receive = lambda can_id, data, flags=0: heard.append(can_id)  # type: ignore[method-assign]
+
+    def note(can_id: int, data: bytes, flags: int = 0) -> None:
+        heard.append(can_id)
+
+    bench.simulated.receive = note  # type: ignore[method-assign]
     with Heartbeat(bench.connection):
         bench.bus.clock.wait(0.5)
     assert heard.count(0x700 + TOOL_NODE) in (10, 11)

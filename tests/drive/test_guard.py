@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from pmsmtool.cia402 import State
+from pmsmtool.drive import objects
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import GuardedDrive, guarded
 from pmsmtool.drive.port import Excitation, Injection, Shape
@@ -25,6 +26,7 @@ from pmsmtool.errors import (
 from tests.drive.bench import ENVELOPE, SimBench, sim_bench
 
 INTERRUPTIONS = 50
+DECELERATION = objects.QUICK_STOP_DECELERATION
 RUNNING = {
     "motor.pole_pairs": 3,
     "encoder.offset_rad": 0.35,
@@ -110,7 +112,7 @@ def test_second_ctrl_c_while_stopping_still_ends_confirmed(bench: SimBench, mome
 def test_second_ctrl_c_removes_the_voltage_at_once(bench: SimBench) -> None:
     """A quick stop ramp of seconds is cut short."""
     with guarded(bench.drive, Envelope(i_max_apk=5.0, speed_max_rad_s=100.0)) as guard:
-        bench.drive.node.put(_object(0x6085, "I"), 60)
+        bench.drive.node.put(DECELERATION, 60)
         guard.write(RUNNING)
         guard.enable()
         guard.command_speed(80.0)
@@ -121,12 +123,6 @@ def test_second_ctrl_c_removes_the_voltage_at_once(bench: SimBench) -> None:
         guard.stop()
         assert 0.1 <= bench.bus.clock.now() - started < 0.2
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
-
-
-def _object(index: int, letter: str) -> object:
-    from pmsmtool.drive.objects import DriveObject
-
-    return DriveObject(index, 0, letter)
 
 
 @pytest.mark.parametrize("moment", [0.8, 0.95, 1.1])
@@ -165,7 +161,7 @@ def test_speed_beyond_the_envelope_stops(bench: SimBench) -> None:
     with pytest.raises(LimitExceeded, match="speed") as caught, guarded(bench.drive, Envelope(5.0, 20.0)) as guard:
         guard.write(RUNNING)
         guard.enable()
-        bench.drive.node.put(_object(0x6080, "I"), 100000)  # the drive's own limit is out of the way
+        bench.drive.node.put(objects.MAX_SPEED_RPM, 100000)  # the drive's own limit is out of the way
         bench.drive.command_speed(60.0)
         guard.wait(5.0)
     assert caught.value.exit_code == 5
@@ -220,7 +216,7 @@ def test_nothing_is_enabled_without_the_proof(bench: SimBench) -> None:
 
 def test_object_that_refuses_its_old_value_is_named(bench: SimBench) -> None:
     with pytest.raises(VerifyMismatch, match="0x6085:00") as caught, guarded(bench.drive, ENVELOPE):
-        bench.drive.node.put(_object(0x6085, "I"), 60)
+        bench.drive.node.put(DECELERATION, 60)
         entry = bench.session.dictionary["cia402.quick_stop_deceleration"]
         entry.sink = lambda data: None
     assert "reset the drive" in caught.value.hint
