@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from pmsmtool.bus.connect import Connection
@@ -185,8 +185,10 @@ class CanopenDrive:
         """
         if excitation is not None:
             self.prepare(excitation)
-        self.begin_record(signals, samples, decimation=decimation, excitation=excitation, pretrigger=pretrigger)
         try:
+            self.begin_record(
+                signals, samples, decimation=decimation, excitation=excitation, pretrigger=pretrigger, wait=self.wait
+            )
             self.wait(samples * decimation * self.period_s)
             return self.finish_record(signals, decimation=decimation, excitation=excitation)
         finally:
@@ -210,19 +212,20 @@ class CanopenDrive:
         decimation: int,
         excitation: Excitation | None,
         pretrigger: int,
+        wait: Callable[[float], None],
     ) -> None:
-        """Arm the recorder and start the (prepared) excitation, or start it first when it has a lead time."""
-        led = excitation is not None and excitation.lead_s > 0.0
-        if not led:
-            self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=excitation is not None)
-        if excitation is not None:
-            self.wait(0.0 if led else pretrigger * decimation * self.period_s)
-            if excitation.point is not Injection.SPEED:
-                self._set_mode(Mode.IDENTIFICATION)
+        """Start the (prepared) excitation and the recorder, in the order its ``lead_s`` asks for."""
+        lead_s = 0.0 if excitation is None else excitation.lead_s
+        if excitation is not None and excitation.point is not Injection.SPEED:
+            self._set_mode(Mode.IDENTIFICATION)
+        if lead_s > 0.0:
             self.node.command(objects.EXCITATION_COMMAND, 2)
-        if excitation is not None and led:
-            self.wait(excitation.lead_s)
-            self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=False)
+            wait(lead_s)
+        at_start = excitation is not None and lead_s <= 0.0
+        self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=at_start)
+        if at_start:
+            wait(pretrigger * decimation * self.period_s)
+            self.node.command(objects.EXCITATION_COMMAND, 2)
 
     def finish_record(self, signals: Sequence[str], *, decimation: int, excitation: Excitation | None) -> Trace:
         """Wait until the recorder is complete and return its trace, if the drive did not trip meanwhile."""

@@ -260,8 +260,10 @@ class GuardedDrive:
         within = None if excitation is None else self._within(excitation)
         if within is not None:
             self._drive.prepare(within)
-        self._drive.begin_record(signals, samples, decimation=decimation, excitation=within, pretrigger=pretrigger)
         try:
+            self._drive.begin_record(
+                signals, samples, decimation=decimation, excitation=within, pretrigger=pretrigger, wait=self.wait
+            )
             self.wait(seconds)
             return self._drive.finish_record(signals, decimation=decimation, excitation=within)
         finally:

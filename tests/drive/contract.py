@@ -83,6 +83,13 @@ class DriveContract:
         assert np.all(np.abs(trace["theta_e_rad"]) < 1e-6)
         assert trace.meta["excitation"]["shape"] == "square" and trace.meta["voltage_lag"] in (0, 1, 2)
 
+    def test_trace_after_a_lead_shows_the_settled_wave_only(self, drive: CanopenDrive) -> None:
+        sine = Excitation(Shape.SINE, Injection.U_D, 5.0, f0_hz=200.0, fixed_angle_rad=0.0, lead_s=0.05)
+        with guarded(drive, ENVELOPE) as guard:
+            guard.enable()
+            trace = guard.record(["u_d_v"], 1200, excitation=sine)
+        assert np.ptp(trace["u_d_v"][:120]) > 5.0, "the wave runs from the first row on"
+
     def test_recording_without_excitation(self, drive: CanopenDrive) -> None:
         trace = drive.record(["i_a_a", "i_b_a", "i_c_a", "U_dc_v"], 512, decimation=2)
         assert len(trace) == 512 and trace.period_s == pytest.approx(2 * drive.period_s, rel=1e-9)
