@@ -184,11 +184,11 @@ def held_by(bench: Bench) -> bytes:
     return bench.node.session.dictionary["lut.table_i_d"].read()
 
 
-@pytest.mark.parametrize(("probability", "needed"), [(0.001, 0.99), (0.01, 0.0)])
+@pytest.mark.parametrize(("probability", "needed"), [(0.001, 0.99), (0.01, 0.9)])
 def test_block_transfers_under_loss_are_right_or_reported(
     make_bench: BenchMaker, probability: float, needed: float
 ) -> None:
-    """60 transfers of 4 KiB each way. Measured: 0.1 % 120 of 120, 1 % 96 of 120 (three tries, no retry inside)."""
+    """60 transfers of 4 KiB each way, at most three tries each. Measured: 120 of 120 at 0.1 % and at 1 %."""
     bench = make_bench(faults=f'[[frame]]\naction="drop"\nids=["0x601", "0x581"]\nprobability={probability}', seed=9)
     client = bench.client
     succeeded = 0
