@@ -32,7 +32,7 @@ from pmsmtool.design.tolerance import NORMAL_95, Samples, tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.design.vector_margins import current_response, vector_margins
-from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import load_machine_file
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
@@ -267,16 +267,6 @@ def test_command(tmp_path: Path) -> None:
     assert data["schema"] == "pmsmtool.margins/1"
     assert data["ok"] is False
     assert run(str(path), "--u-dc", "300V", "200V")[0] == 2
-
-
-def test_a_cluster_without_its_package_names_the_extra(tmp_path: Path) -> None:
-    try:
-        import distributed  # type: ignore[import-not-found]  # noqa: F401
-    except ImportError:
-        from pmsmtool.cli.scheduler import executor
-
-        with pytest.raises(NotAvailable, match="distributed"), executor("tcp://127.0.0.1:1"):
-            pass
 
 
 def test_box_names_and_columns_agree() -> None:
