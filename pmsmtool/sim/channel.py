@@ -27,6 +27,7 @@ from pmsmtool.resources import data_folder
 from pmsmtool.sim.faults import load_faults
 from pmsmtool.sim.line import Line
 from pmsmtool.sim.node.factory import drive_settings
+from pmsmtool.sim.node.lss import UNCONFIGURED
 from pmsmtool.sim.node.memory import FileStorage, Memory, RamStorage, Storage
 from pmsmtool.sim.node.node import Node
 
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 DEFAULT_PROFILE = "interior-2k2"
 """Profile of a channel without a name."""
 DEFAULT_NODE_ID = 1
+LARGEST_NODE_ID = 127
 MEMORY_FOLDER = Path(".pmsmsim")
 VOLATILE = ":memory:"
 _RATES = range(10_000, 1_000_001)
@@ -104,9 +106,6 @@ def parse_channel(text: str | None) -> Channel:
             values[key] = _KEYS[key](value)
         except ValueError as error:
             violations.append(f"{key} = {value!r}: {error}")
-    first, count = values.get("node", DEFAULT_NODE_ID), values.get("nodes", 1)
-    if first != 255 and first + count - 1 > 127:
-        violations.append(f"node ids {first} .. {first + count - 1} exceed 127")
     if violations:
         raise ConfigError(
             "the channel of the simulated bus cannot be used",
@@ -180,21 +179,24 @@ def build_line(
     Raises
     ------
     ConfigError
-        The machine file, the faults file or the memory cannot be used.
+        The machine file, the faults file or the memory cannot be used, or there are not so many node ids.
     """
     from pmsmtool.machine.machine_file import load_machine_file
 
+    first = DEFAULT_NODE_ID if channel.node is None else channel.node
+    if first != UNCONFIGURED and first + channel.nodes - 1 > LARGEST_NODE_ID:
+        raise ConfigError(
+            f"node ids {first} .. {first + channel.nodes - 1} exceed {LARGEST_NODE_ID}", where=f"channel {channel.name}"
+        )
     path = machine_path(channel.name)
     machine_file = load_machine_file(path)
     plan = None if channel.faults is None else load_faults(channel.faults)
     seed = int(machine_file.simulation.get("seed", 0)) if channel.seed is None else channel.seed  # type: ignore[arg-type]
     line = Line(channel.bitrate or bitrate, plan, seed=seed, instant=instant)
-    first = DEFAULT_NODE_ID if channel.node is None else channel.node
+    fixed = channel.node not in (None, UNCONFIGURED)
     for position in range(channel.nodes):
-        node_id = first if first == 255 else first + position
-        settings = drive_settings(
-            machine_file, path.stem, node_id, position, fixed_node_id=channel.node not in (None, 255)
-        )
+        node_id = first if first == UNCONFIGURED else first + position
+        settings = drive_settings(machine_file, path.stem, node_id, position, fixed_node_id=fixed)
         memory = Memory(_storage(channel, path.stem, position))
         line.add_node(Node(line, make_core(machine_file, seed + position), memory, settings))
     line.arm_faults()

@@ -37,13 +37,17 @@ def test_everything_a_string_can_say() -> None:
         ("p?bitrate=fast", "bitrate"),
         ("p?bitrate=1", "bitrate"),
         ("p?node=0", "node"),
-        ("p?node=126&nodes=3", "exceed 127"),
         ("p?speed=0", "speed"),
     ],
 )
 def test_what_a_string_cannot_say(text: str, named: str) -> None:
     with pytest.raises(ConfigError, match=named):
         parse_channel(text)
+
+
+def test_more_drives_than_node_ids_are_refused() -> None:
+    with pytest.raises(ConfigError, match="exceed 127"):
+        build_line(Channel(node=126, nodes=3), make_core=lambda machine_file, seed: SimpleCore())
 
 
 def test_all_mistakes_are_listed_at_once() -> None:
