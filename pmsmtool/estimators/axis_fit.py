@@ -258,7 +258,8 @@ class Layout:
         richer = replace(self, effects=effects)
         parts = self.split(x)
         if self.effects.lag and not effects.lag:
-            parts["main"][2] += math.exp(parts["lag"][0])  # the pure delay takes over what the lag was
+            # the pure delay takes over what the lag was, as far as the record allows
+            parts["main"][2] = min(parts["main"][2] + math.exp(parts["lag"][0]), SKIP_SAMPLES - 3.5)
         start = {"bend": [0.0, 0.0], "motion": [0.0], "dispersion": [0.0] * (2 * (self.shots - 1))}
         values = [value for name, _ in richer.blocks() for value in parts.get(name, start.get(name, []))]
         return richer, np.array(values)
@@ -266,13 +267,13 @@ class Layout:
     def defined(self, x: Vector) -> bool:
         """Whether the model can be evaluated at x."""
         parts = self.split(x)
-        (log_L, R, delay), log_lag = parts["main"], parts.get("lag", [0.0])[0]
-        if abs(log_L) > LARGEST_LOG_L:
-            return False
-        decay = R * self.R_scale * self.period_s / (self.L_scale * math.exp(log_L))
-        possible = SMALLEST_DECAY < decay < LARGEST_DECAY
+        (log_L, _, delay), log_lag = parts["main"], parts.get("lag", [0.0])[0]
+        sizes = [log_L, *(log_L + ratio for ratio in parts.get("dispersion", [0.0])[::2])]
         bent = max(abs(value) for value in parts.get("bend", [0.0]))
-        return possible and 0.0 <= delay <= SKIP_SAMPLES - 3 and abs(log_lag) < LARGEST_LOG_LAG and bent < BEND_LIMIT
+        if max(map(abs, sizes)) > LARGEST_LOG_L or abs(log_lag) > LARGEST_LOG_LAG or bent > BEND_LIMIT:
+            return False
+        decays = [r.model.R_ohm * self.period_s / r.model.L_h for r in self.responses(x)]
+        return 0.0 <= delay <= SKIP_SAMPLES - 3 and min(decays) > SMALLEST_DECAY and max(decays) < LARGEST_DECAY
 
 
 def simulate(response: Response, shot: Shot, slow: NDArray[np.float64]) -> Vector:
