@@ -113,7 +113,7 @@ def draw(n: int, rng: np.random.Generator, *, lag_max: float = 0.0, late_max: fl
         lsb=lsb,
         adc_noise=rng.uniform(0.5, 2.0, n) * lsb,
         offset=rng.uniform(-0.1, 0.1, n),
-        encoder_steps=2.0 ** rng.integers(12, 20, n),
+        encoder_steps=np.asarray(2.0 ** rng.integers(12, 20, n), dtype=np.float64),
         lag=rng.uniform(0.0, lag_max, n) if lag_max else np.zeros(n),
         late=rng.uniform(0.0, late_max, n) if late_max else np.zeros(n),
         bend=np.zeros(n),

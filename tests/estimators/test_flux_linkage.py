@@ -1,6 +1,7 @@
 """psi_f and the encoder offset on drives outside the estimator's model class."""
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,8 @@ from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, curve_points, draw, repeat, run
+
+Change = Callable[[Trace], Mapping[str, np.ndarray]]
 
 SPEEDS = np.array([sign * fraction for fraction in (0.25, 0.45, 0.65, 0.85) for sign in (1.0, -1.0)])
 SETTLE, WINDOW = 600, 1700
@@ -92,7 +95,7 @@ def population() -> Population:
     return Population(11)
 
 
-def test_psi_and_offset_over_drives(population):
+def test_psi_and_offset_over_drives(population: Population) -> None:
     drives: Drives = population.drives
     results = [population.estimate(k) for k in range(drives.n)]
     errors = np.array([abs(r.psi_measured.value / drives.psi[k] - 1.0) for k, r in enumerate(results)])
@@ -106,12 +109,12 @@ def test_psi_and_offset_over_drives(population):
     assert np.median(half_widths) < 1e-3
 
 
-def test_the_q_inductance_comes_out_beside(population):
+def test_the_q_inductance_comes_out_beside(population: Population) -> None:
     errors = [abs(population.estimate(k).L_q_h / population.drives.L_q[k] - 1.0) for k in range(population.drives.n)]
     assert np.median(errors) < 0.05  # a check of L_q, not a measurement: 10 % of I_r only
 
 
-def test_without_the_sampled_data_correction_psi_is_low(population):
+def test_without_the_sampled_data_correction_psi_is_low(population: Population) -> None:
     """Omitting the division by sinc costs (w T_s)^2/24, weighted with the fast speeds."""
     drives = population.drives
     k = int(np.argmax(drives.w_base * drives.T_s))
@@ -126,7 +129,7 @@ def test_without_the_sampled_data_correction_psi_is_low(population):
     assert error == pytest.approx(expected, rel=0.3)
 
 
-def test_temperature_moves_psi_to_its_reference(population):
+def test_temperature_moves_psi_to_its_reference(population: Population) -> None:
     trace = population.speeds(0)
     warm = replace(trace, signals={**trace.signals, "T_magnet_c": np.full(len(trace), 70.0)})
     result = estimate_flux_linkage(warm, population.drives.R[0], period_s=population.drives.T_s[0])
@@ -149,7 +152,7 @@ def _changed(trace: Trace, **signals: np.ndarray) -> Trace:
         (lambda t: {"i_d_second_a": t["i_d_first_a"] + np.max(np.abs(t["i_q_a"]))}, "E_NOT_SETTLED"),
     ],
 )
-def test_refusals(population, change, reason):
+def test_refusals(population: Population, change: Change, reason: str) -> None:
     trace = population.speeds(0)
     with pytest.raises(IdentificationError, match=reason):
         estimate_flux_linkage(
@@ -157,7 +160,7 @@ def test_refusals(population, change, reason):
         )
 
 
-def test_refuses_limited_samples(population):
+def test_refuses_limited_samples(population: Population) -> None:
     trace = population.speeds(0)
     flagged = replace(
         trace,

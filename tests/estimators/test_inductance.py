@@ -1,6 +1,7 @@
 """Incremental L_d and L_q on drives with lag, late sampling, saturation, a free rotor and odd inverters."""
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,8 @@ from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, Run, curve_points, draw, repeat, run
+
+Change = Callable[[Trace], Mapping[str, np.ndarray]]
 
 HALF_PERIODS = (6, 13)
 SETTLE, WINDOW = 40, 1024
@@ -91,7 +94,7 @@ def plain() -> Shots:
     return Shots(draw(14, rng), rng)
 
 
-def test_ideal_sensors(plain):
+def test_ideal_sensors(plain: Shots) -> None:
     errors, widths, results = errors_of(plain)
     assert np.quantile(errors, 0.9) < 2.5e-3  # measured 0.9e-3
     assert np.max(errors) < 1e-2  # measured 1.3e-3
@@ -100,7 +103,7 @@ def test_ideal_sensors(plain):
     assert all(abs(result.delay - 1.0) < 0.02 for result in results)
 
 
-def test_unknown_sensor_lag_and_late_sampling():
+def test_unknown_sensor_lag_and_late_sampling() -> None:
     rng = np.random.default_rng(22)
     drives = draw(10, rng, lag_max=20e-6, late_max=0.1)
     errors, widths, results = errors_of(Shots(drives, rng))
@@ -112,7 +115,7 @@ def test_unknown_sensor_lag_and_late_sampling():
     assert np.max(np.abs(np.array(seen) - true) / drives.T_s) < 0.05
 
 
-def test_a_bend_is_not_taken_for_an_inductance():
+def test_a_bend_is_not_taken_for_an_inductance() -> None:
     rng = np.random.default_rng(23)
     drives = draw(6, rng)
     drives.bend[:] = 0.4 / drives.I_r
@@ -121,7 +124,7 @@ def test_a_bend_is_not_taken_for_an_inductance():
     assert all("bend" in result.axes["d"].effects for result in results)
 
 
-def test_a_free_rotor_follows_the_injection():
+def test_a_free_rotor_follows_the_injection() -> None:
     rng = np.random.default_rng(24)
     drives = draw(6, rng)
     drives.offset[:] = 0.0
@@ -130,7 +133,7 @@ def test_a_free_rotor_follows_the_injection():
     assert np.max(errors) < 1e-2
 
 
-def test_the_offset_of_the_frame_is_undone(plain):
+def test_the_offset_of_the_frame_is_undone(plain: Shots) -> None:
     """Not undoing it mixes the axes by up to (L_q/L_d - 1) sin^2 eps."""
     d = plain.drives
     k = int(np.argmax((d.L_q / d.L_d - 1.0) * np.sin(d.offset) ** 2))
@@ -140,7 +143,7 @@ def test_the_offset_of_the_frame_is_undone(plain):
     assert abs(result.L_d.value / d.L_d[k] - 1.0) < 0.5 * abs(mixed / d.L_d[k] - 1.0)
 
 
-def test_a_salient_machine_shows_its_axis_without_turning(plain):
+def test_a_salient_machine_shows_its_axis_without_turning(plain: Shots) -> None:
     d = plain.drives
     salient = [k for k in range(d.n) if d.L_q[k] > 1.3 * d.L_d[k]]
     assert len(salient) >= 4
@@ -150,7 +153,7 @@ def test_a_salient_machine_shows_its_axis_without_turning(plain):
         assert result.L_d.fallback
 
 
-def test_one_shot_of_an_unknown_delay_is_not_biased_by_it(plain):
+def test_one_shot_of_an_unknown_delay_is_not_biased_by_it(plain: Shots) -> None:
     """The textbook fit with the delay fixed at 0 or 2 periods is off by ten percent and more; the delay is found."""
     k = 0
     shifted = [
@@ -166,14 +169,14 @@ def test_one_shot_of_an_unknown_delay_is_not_biased_by_it(plain):
     assert result.L_d.value == pytest.approx(d.L_d[k], rel=3e-3)
 
 
-def test_every_number_says_which_inductance_and_where(plain):
+def test_every_number_says_which_inductance_and_where(plain: Shots) -> None:
     result = plain.estimate(0)
     assert "incremental" in result.L_d.method
     assert result.L_d.i_d_apk == pytest.approx(BIAS * plain.drives.I_r[0], rel=0.05)
     assert result.L_d.systematic == pytest.approx(result.L_d.value * math.hypot(0.01, 0.01))
 
 
-def test_two_frequencies_that_disagree_are_both_reported(plain):
+def test_two_frequencies_that_disagree_are_both_reported(plain: Shots) -> None:
     """Shots of two machines in one estimate: eddy currents would look like that."""
     d = plain.drives
     k = 0
@@ -192,7 +195,7 @@ def test_two_frequencies_that_disagree_are_both_reported(plain):
     assert slow_L / fast_L == pytest.approx(1.1, rel=0.01)
 
 
-def test_efficiency_against_the_bound():
+def test_efficiency_against_the_bound() -> None:
     """sd over realisations / Cramer-Rao bound of the model with delay, lag, R and starting current as nuisance."""
     rng = np.random.default_rng(25)
     one = draw(1, rng)
@@ -226,7 +229,7 @@ def _move(t: Trace) -> dict[str, np.ndarray]:
         (lambda t: {"i_d_a": np.clip(t["i_d_a"], None, np.mean(t["i_d_a"]))}, "E_MODEL_MISMATCH"),
     ],
 )
-def test_refusals(plain, change, reason):
+def test_refusals(plain: Shots, change: Change, reason: str) -> None:
     k = 0
     traces = []
     for half in HALF_PERIODS:
@@ -241,7 +244,7 @@ def test_refusals(plain, change, reason):
     assert caught.value.reason == reason
 
 
-def test_a_short_trace_is_no_excitation(plain):
+def test_a_short_trace_is_no_excitation(plain: Shots) -> None:
     short = plain.trace(0, "d", 13)
     short = replace(short, t_s=short.t_s[:200], signals={name: values[:200] for name, values in short.signals.items()})
     with pytest.raises(IdentificationError, match="E_EXCITATION"):

@@ -1,6 +1,7 @@
 """R_s from DC levels on inverter shapes outside the estimator's model class."""
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,8 @@ from pmsmtool.estimators.resistance import (
 )
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, draw, inverter_shape
+
+Change = Callable[[Trace], Mapping[str, np.ndarray]]
 
 ALPHA = 0.00393
 LEVELS = (0.004, 0.008, 0.015, 0.025, 0.036, *np.linspace(0.05, 1.0, 20))
@@ -47,7 +50,7 @@ def levels_of(
         "u_d_second_v": v,
         "T_winding_c": T if sensor else np.full(n, math.nan),
     }
-    return Trace(np.arange(n) * 0.25, signals, dict.fromkeys(signals, "1"), {"samples": SAMPLES})
+    return Trace(np.arange(n, dtype=np.float64) * 0.25, signals, dict.fromkeys(signals, "1"), {"samples": SAMPLES})
 
 
 def noise_of(d: Drives, k: int) -> Noise:
@@ -55,18 +58,18 @@ def noise_of(d: Drives, k: int) -> Noise:
 
 
 def summary(
-    count: int, seed: int, **kwargs: float | bool
+    count: int, seed: int, *, heating_k: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[ResistanceResult]]:
     """Relative errors, 95 % half widths and V_dead/(R I) of a population."""
     rng = np.random.default_rng(seed)
     d = draw(count, rng)
-    results = [estimate_resistance(levels_of(d, k, rng, **kwargs), noise_of(d, k)) for k in range(count)]
+    results = [estimate_resistance(levels_of(d, k, rng, heating_k=heating_k), noise_of(d, k)) for k in range(count)]
     errors = np.array([abs(r.R_s.value / d.R[k] - 1.0) for k, r in enumerate(results)])
     widths = np.array([COVERAGE_FACTOR * r.R_s.std / d.R[k] for k, r in enumerate(results)])
     return errors, widths, d.dV / (d.R * d.I_r), results
 
 
-def test_accuracy_and_coverage_over_drives():
+def test_accuracy_and_coverage_over_drives() -> None:
     errors, widths, hardness, _ = summary(200, 1)
     easy = hardness < 3.0
     assert np.quantile(errors[easy], 0.9) < 2.5e-3  # measured 0.8e-3
@@ -75,7 +78,7 @@ def test_accuracy_and_coverage_over_drives():
     assert np.median(widths[easy]) < 4e-3  # an interval that says nothing would cover, too
 
 
-def test_a_simpler_formula_is_ten_times_worse_on_the_same_levels():
+def test_a_simpler_formula_is_ten_times_worse_on_the_same_levels() -> None:
     rng = np.random.default_rng(1)
     d = draw(60, rng)
     ours, two_point, single = [], [], []
@@ -88,17 +91,17 @@ def test_a_simpler_formula_is_ten_times_worse_on_the_same_levels():
     assert np.median(single) > 0.2
 
 
-def test_twelve_kelvin_of_heating_do_not_matter():
+def test_twelve_kelvin_of_heating_do_not_matter() -> None:
     errors, _, hardness, results = summary(40, 3, heating_k=12.0)
     easy = hardness < 3.0
     assert np.quantile(errors[easy], 0.9) < 2.5e-3
     assert results[0].R_s.T_c == pytest.approx(26.0, abs=0.5)
 
 
-def test_without_a_temperature_sensor_the_value_belongs_to_the_mean_heating():
+def test_without_a_temperature_sensor_the_value_belongs_to_the_mean_heating() -> None:
     rng = np.random.default_rng(4)
     d = draw(20, rng)
-    for k in np.flatnonzero(d.dV / (d.R * d.I_r) < 3.0):
+    for k in map(int, np.flatnonzero(d.dV / (d.R * d.I_r) < 3.0)):
         result = estimate_resistance(levels_of(d, k, rng, heating_k=3.0, sensor=False), noise_of(d, k))
         assert math.isnan(result.R_s.T_c)
         assert "not normalised" in result.R_s.fallback
@@ -107,7 +110,7 @@ def test_without_a_temperature_sensor_the_value_belongs_to_the_mean_heating():
         assert result.drift == pytest.approx(ALPHA * 3.0, rel=0.15)
 
 
-def test_only_the_copper_part_is_normalised():
+def test_only_the_copper_part_is_normalised() -> None:
     rng = np.random.default_rng(5)
     d = replace_inverter(draw(1, rng))
     hot = levels_of(d, 0, rng)
@@ -127,7 +130,7 @@ def replace_inverter(d: Drives) -> Drives:
     return d
 
 
-def test_the_inverter_curve_is_the_one_of_the_plant():
+def test_the_inverter_curve_is_the_one_of_the_plant() -> None:
     rng = np.random.default_rng(6)
     d = draw(12, rng)
     for k in range(d.n):
@@ -141,12 +144,12 @@ def test_the_inverter_curve_is_the_one_of_the_plant():
         assert 0.2 * d.knee[k] < knee < 8.0 * d.knee[k]
 
 
-def test_sixteen_tail_models():
+def test_sixteen_tail_models() -> None:
     assert len(tail_models()) == 16
     assert len(set(tail_models())) == 16
 
 
-def test_efficiency_against_the_bound_of_the_same_tail_terms():
+def test_efficiency_against_the_bound_of_the_same_tail_terms() -> None:
     """sd over noise realisations / Cramer-Rao bound of the model with the two tail terms 1/i and 1/i^2."""
     rng = np.random.default_rng(7)
     d = replace_inverter(draw(1, rng))
@@ -186,7 +189,7 @@ def _flat(t: Trace) -> dict[str, np.ndarray]:
         ),
     ],
 )
-def test_refusals(change, reason):
+def test_refusals(change: Change, reason: str) -> None:
     rng = np.random.default_rng(8)
     d = replace_inverter(draw(1, rng))
     trace = levels_of(d, 0, rng)
@@ -198,7 +201,7 @@ def test_refusals(change, reason):
     assert caught.value.hint
 
 
-def test_a_hard_drive_is_refused_by_name_when_the_interval_is_too_wide():
+def test_a_hard_drive_is_refused_by_name_when_the_interval_is_too_wide() -> None:
     rng = np.random.default_rng(9)
     d = draw(1, rng)
     d.dV[:] = 40.0 * d.R * d.I_r

@@ -1,0 +1,141 @@
+"""Pole pairs, direction, coarse offset; the three-vector phase check; noise; the table of refusals."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pmsmtool.errors import ExitCode, IdentificationError
+from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
+from pmsmtool.estimators.noise import Noise, estimate_noise
+from pmsmtool.estimators.phase_check import check_phases
+from pmsmtool.estimators.refusals import REFUSALS, refuse
+from pmsmtool.trace import Trace
+
+
+def trace(meta: dict[str, object] | None = None, **signals: np.ndarray) -> Trace:
+    n = len(next(iter(signals.values())))
+    return Trace(np.arange(n, dtype=np.float64), signals, dict.fromkeys(signals, "1"), meta or {})
+
+
+def rotation(
+    pole_pairs: float, direction: int, offset: float, *, lag: float = 0.0, ripple: float = 0.0, turns: float = 1.02
+) -> tuple[Trace, Trace]:
+    """Both runs of a rotor that lags the vector and cogs six times per turn (rad electrical)."""
+    imposed = np.linspace(0.0, 2.0 * math.pi * pole_pairs * turns, 400)
+    runs = []
+    for sign, angle in ((1.0, imposed), (-1.0, imposed[::-1])):
+        theta_e = angle - sign * lag + ripple * np.sin(6.0 * angle / pole_pairs)
+        runs.append(trace(theta_imposed_rad=angle, theta_M_rad=direction * (theta_e + offset) / pole_pairs))
+    return runs[0], runs[1]
+
+
+@pytest.mark.parametrize("pole_pairs", [1, 2, 5, 10, 21])
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("offset", [-3.0, -0.4, 0.0, 1.7])
+def test_pole_pairs_direction_and_offset(pole_pairs: int, direction: int, offset: float) -> None:
+    result: EncoderResult = estimate_encoder(*rotation(pole_pairs, direction, offset, lag=0.12, ripple=0.05))
+    assert result.pole_pairs.value == pole_pairs
+    assert result.direction == direction
+    assert math.remainder(result.offset.value - offset, 2.0 * math.pi) == pytest.approx(0.0, abs=2e-3)
+    assert abs(result.lag_rad) == pytest.approx(0.12, abs=2e-3)  # friction cancels in the offset and is reported
+
+
+def test_a_gear_or_a_wrong_encoder_resolution_gives_no_integer() -> None:
+    with pytest.raises(IdentificationError) as caught:
+        estimate_encoder(*rotation(3.4, 1, 0.2))
+    assert caught.value.reason == "E_POLE_PAIRS"
+
+
+def test_a_rotor_that_follows_only_one_way_is_refused() -> None:
+    forward, backward = rotation(4, 1, 0.0)
+    mirrored = trace(theta_imposed_rad=backward["theta_imposed_rad"], theta_M_rad=-backward["theta_M_rad"])
+    with pytest.raises(IdentificationError, match="E_POLE_PAIRS"):
+        estimate_encoder(forward, mirrored)
+
+
+def test_a_locked_shaft_is_refused() -> None:
+    angle = np.linspace(0.0, 25.0, 400)
+    still = trace(theta_imposed_rad=angle, theta_M_rad=np.zeros(400))
+    with pytest.raises(IdentificationError, match="E_POLE_PAIRS"):
+        estimate_encoder(still, still)
+
+
+def test_half_a_turn_is_not_enough() -> None:
+    with pytest.raises(IdentificationError, match="E_EXCITATION"):
+        estimate_encoder(*rotation(4, 1, 0.0, turns=0.5))
+
+
+def test_a_cogging_rotor_that_leaves_the_vector_is_refused() -> None:
+    with pytest.raises(IdentificationError, match="E_ROTOR_MOVED"):
+        estimate_encoder(*rotation(4, 1, 0.0, ripple=math.radians(40.0)))
+
+
+def vectors(i: float = 0.5, R: float = 1.0, phases: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Trace:
+    """Three vectors of a drive whose phase currents and resistances are scaled per phase."""
+    angles = np.radians([0.0, 120.0, 240.0])
+    rows = [[i * math.cos(a - shift) * f for shift, f in zip(angles, phases, strict=True)] for a in angles]
+    abc = np.array(rows)
+    along = np.array([i * phases[k] for k in range(3)])
+    return trace(
+        i_a_a=abc[:, 0],
+        i_b_a=abc[:, 1],
+        i_c_a=abc[:, 2],
+        i_d_a=along,
+        i_q_a=np.zeros(3),
+        u_d_v=R * np.full(3, i),
+    )
+
+
+NOISE = Noise(0.005, 0.0, 0.0, 2048)
+
+
+def test_a_healthy_motor_passes() -> None:
+    result = check_phases(vectors(phases=(1.0, 0.98, 1.01)), NOISE)
+    assert result.spread == pytest.approx(0.03, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("phases", "reason"),
+    [
+        ((0.0, 0.0, 0.0), "E_NOT_CONNECTED"),
+        ((0.0, 1.0, 1.0), "E_PHASE_OPEN"),
+        ((1.0, 0.0, 1.0), "E_PHASE_OPEN"),
+        ((1.0, 1.0, 0.1), "E_PHASE_OPEN"),
+        ((1.0, 0.85, 1.0), "E_UNBALANCED"),
+    ],
+)
+def test_a_bad_motor_is_named(phases: tuple[float, float, float], reason: str) -> None:
+    with pytest.raises(IdentificationError) as caught:
+        check_phases(vectors(phases=phases), NOISE)
+    assert caught.value.reason == reason
+
+
+def test_noise_is_found_and_a_slow_drift_is_not_noise() -> None:
+    rng = np.random.default_rng(1)
+    n = 4096
+    drift = np.linspace(-0.1, 0.1, n)
+    result = estimate_noise(
+        trace(i_d_a=0.02 * rng.standard_normal(n) + drift, i_q_a=0.02 * rng.standard_normal(n) + 0.3)
+    )
+    assert result.sigma_a == pytest.approx(0.02, rel=0.03)
+    assert result.offset_q_a == pytest.approx(0.3, abs=2e-3)
+
+
+def test_a_quantiser_that_hides_the_noise_is_refused() -> None:
+    with pytest.raises(IdentificationError, match="E_SNR"):
+        estimate_noise(trace(i_d_a=np.full(1000, 0.1), i_q_a=np.zeros(1000)))
+
+
+def test_too_few_samples_for_a_noise_are_refused() -> None:
+    with pytest.raises(IdentificationError, match="E_EXCITATION"):
+        estimate_noise(trace(i_d_a=np.arange(100.0), i_q_a=np.arange(100.0)))
+
+
+@pytest.mark.parametrize("name", sorted(REFUSALS))
+def test_every_refusal_says_what_to_do(name: str) -> None:
+    error = refuse(name, "measured 3, limit 2", stage="somewhere")
+    assert error.reason == name
+    assert error.exit_code is ExitCode.NOT_TRUSTWORTHY
+    assert error.likely and error.hint
+    assert str(error).startswith(f"somewhere: {name}: measured 3, limit 2")
