@@ -53,6 +53,8 @@ DRIFT_SECOND_ORDER = 0.02
 SETTLE_SIGMA = 6.0
 SETTLE_FLOOR = 2e-3
 """Change of v - R i between the halves of one window, of R I_r, that still counts as settled."""
+CURVE_SETTLE = 0.02
+"""The same, of the largest voltage, for the low levels that only draw the inverter curve: they do not enter R."""
 HALF_WIDTH_LIMIT = 0.03
 """Relative 95 % half width above which R and V_dead count as not told apart."""
 HARD_RATIO = 3.0
@@ -256,12 +258,15 @@ def _check_levels(levels: Trace, i: Vector, peak: float, R_0: float, noise: Nois
         raise refuse("E_CLIPPED", f"{int(np.sum(levels['flagged'] > 0))} levels with limited samples", stage=STAGE)
     change = (levels["u_d_second_v"] - levels["u_d_first_v"]) - R_0 * (levels["i_d_second_a"] - levels["i_d_first_a"])
     sigma = 2.0 * R_0 * noise.sigma_a / math.sqrt(samples)  # difference of two halves
-    limit = max(SETTLE_SIGMA * sigma, SETTLE_FLOOR * R_0 * peak)
-    worst = int(np.argmax(np.abs(change)))
-    if abs(change[worst]) > limit:
+    fit_limit = max(SETTLE_SIGMA * sigma, SETTLE_FLOOR * R_0 * peak)
+    curve_limit = max(fit_limit, CURVE_SETTLE * float(np.max(np.abs(levels["u_d_v"]))))
+    limit = np.where(used, fit_limit, curve_limit)
+    worst = int(np.argmax(np.abs(change) / limit))
+    if abs(change[worst]) > limit[worst]:
         raise refuse(
             "E_NOT_SETTLED",
-            f"at {i[worst]:.3g} A the voltage still moves by {change[worst]:.3g} V in one window, limit {limit:.3g} V",
+            f"at {i[worst]:.3g} A the voltage still moves by {change[worst]:.3g} V in one window, "
+            f"limit {limit[worst]:.3g} V",
             stage=STAGE,
         )
 
