@@ -1,0 +1,238 @@
+"""From the stored traces of a run to the identified machine: pure arithmetic, the same bytes at every replay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
+from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
+from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
+from pmsmtool.estimators.inductance import InductanceResult, estimate_inductances
+from pmsmtool.estimators.inertia import InertiaResult, estimate_inertia
+from pmsmtool.estimators.noise import Noise, estimate_noise
+from pmsmtool.estimators.phase_check import PhaseCheck, check_phases
+from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.trace import Trace
+
+COPPER_ALPHA_PER_K = 0.00393
+"""Temperature coefficient of copper at 20 degC (IEC 60028)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """What the traces of a run say; None where an experiment was not run."""
+
+    noise: Noise
+    phases: PhaseCheck | None = None
+    resistance: ResistanceResult | None = None
+    encoder: EncoderResult | None = None
+    inductance: InductanceResult | None = None
+    flux: FluxResult | None = None
+    inertia: InertiaResult | None = None
+
+    @property
+    def offset(self) -> Estimate | None:
+        """Encoder offset: the slow rotation's, made fine by the speed run where there was one (rad)."""
+        if self.encoder is None:
+            return None
+        if self.flux is None:
+            return self.encoder.offset
+        fine = self.flux.frame_offset
+        return replace(fine, value=wrapped(self.encoder.offset.value + fine.value))
+
+    def estimates(self) -> dict[str, Estimate]:
+        """Return every estimate by its machine-file key."""
+        found: dict[str, Estimate] = {}
+        if self.resistance is not None:
+            found["R_s_ohm"] = self.resistance.R_s
+        if self.inductance is not None:
+            found["L_d_h"], found["L_q_h"] = self.inductance.L_d, self.inductance.L_q
+        if self.flux is not None:
+            found["psi_f_wb"] = self.flux.psi_f
+        if self.encoder is not None:
+            found["pole_pairs"] = self.encoder.pole_pairs
+        if self.offset is not None:
+            found["offset_rad"] = self.offset
+        if self.inertia is not None:
+            found["J_kgm2"], found["tau_c_nm"] = self.inertia.J, self.inertia.tau_c
+        return found
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle within (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)
+
+
+def evaluate(
+    traces: Mapping[str, Trace], period_s: float, *, T_ref_c: float = 20.0, tolerance: SensorTolerance | None = None
+) -> Evaluation:
+    """Estimate everything the traces allow.
+
+    Parameters
+    ----------
+    traces : mapping of str to Trace
+        As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``levels``, ``rotation_forward``,
+        ``rotation_backward``, ``square_d_<half period>``, ``square_q_<half period>``, ``pushes_<k>``, ``speeds``,
+        ``wave_<k>``.
+    period_s : float
+        Control period (s).
+    T_ref_c : float
+        Temperature the values are referred to (degC).
+    tolerance : SensorTolerance
+        Declared sensor tolerances.
+
+    Raises
+    ------
+    IdentificationError
+        The first refusal, by its name.
+    ConfigError
+        There is no zero-current trace.
+    """
+    if "zero_current" not in traces:
+        raise ConfigError("the run has no zero-current trace", hint="run identify again")
+    result = Evaluation(estimate_noise(traces["zero_current"]))
+    if "phase_vectors" in traces:
+        result = replace(result, phases=check_phases(traces["phase_vectors"], result.noise))
+    if "levels" in traces:
+        result = replace(result, resistance=resistance_of(traces["levels"], result.noise, T_ref_c, tolerance))
+    if "rotation_forward" in traces:
+        encoder = estimate_encoder(traces["rotation_forward"], traces["rotation_backward"])
+        result = replace(result, encoder=encoder)
+    if "speeds" in traces and result.resistance is not None:
+        flux = flux_of(traces, result.resistance, period_s, T_ref_c, tolerance)
+        result = replace(result, flux=flux)
+    if result.resistance is not None and result.encoder is not None and any(k.startswith("square_d") for k in traces):
+        result = replace(result, inductance=inductance_of(traces, result, tolerance))
+    if result.encoder is not None and result.flux is not None and "push_0" in traces:
+        inertia = estimate_inertia(
+            pushes_of(traces), result.flux.psi_measured, round(result.encoder.pole_pairs.value), tolerance
+        )
+        result = replace(result, inertia=inertia)
+    return result
+
+
+def resistance_of(
+    levels: Trace, noise: Noise, T_ref_c: float = 20.0, tolerance: SensorTolerance | None = None
+) -> ResistanceResult:
+    """Return the resistance at a reference temperature."""
+    return estimate_resistance(levels, noise, tolerance=tolerance, copper=Copper(T_ref_c, COPPER_ALPHA_PER_K))
+
+
+def pushes_of(traces: Mapping[str, Trace]) -> list[Trace]:
+    """Return the pushes in the order they were made."""
+    return [traces[f"push_{k}"] for k in range(sum(name.startswith("push_") for name in traces))]
+
+
+def flux_of(
+    traces: Mapping[str, Trace],
+    resistance: ResistanceResult,
+    period_s: float,
+    T_ref_c: float,
+    tolerance: SensorTolerance | None,
+) -> FluxResult:
+    """Return the flux linkage, with the resistance at the temperature of the speed run."""
+    speeds = traces["speeds"]
+    waves = [traces[f"wave_{k}"] for k in range(len(speeds)) if f"wave_{k}" in traces]
+    R = resistance.R_measured
+    T = float(np.mean(speeds["T_winding_c"]))
+    warmer = COPPER_ALPHA_PER_K * (T - R.T_c) if math.isfinite(T) and math.isfinite(R.T_c) else 0.0
+    return estimate_flux_linkage(
+        speeds,
+        R.value * (1.0 + warmer),
+        period_s=period_s,
+        inverter=resistance.curve,
+        waves=waves,
+        tolerance=tolerance,
+        T_ref_c=T_ref_c,
+    )
+
+
+def inductance_of(
+    traces: Mapping[str, Trace], result: Evaluation, tolerance: SensorTolerance | None = None
+) -> InductanceResult:
+    """Return the incremental inductances, with the frame's angle from the encoder."""
+    assert result.resistance is not None and result.encoder is not None
+    pole_pairs = round(result.encoder.pole_pairs.value)
+    shots = {axis: shots_of(traces, axis, pole_pairs) for axis in "dq"}
+    offset = result.offset
+    frame = None
+    if offset is not None and result.flux is not None:
+        frame = (_frame_ahead(shots["d"] + shots["q"], result.encoder, offset.value), max(offset.std, 1e-6))
+    return estimate_inductances(
+        shots["d"],
+        shots["q"],
+        result.noise,
+        result.resistance.R_measured.value,
+        frame_offset=frame,
+        inverter=result.resistance.curve,
+        tolerance=tolerance,
+    )
+
+
+def shots_of(traces: Mapping[str, Trace], axis: str, pole_pairs: int) -> list[Trace]:
+    """Return the square-wave shots of one axis, the shorter half period first."""
+    names = sorted((name for name in traces if name.startswith(f"square_{axis}_")), key=lambda name: int(name[9:]))
+    return [
+        Trace(trace.t_s, trace.signals, trace.units, {**trace.meta, "pole_pairs": pole_pairs})
+        for trace in (traces[name] for name in names)
+    ]
+
+
+def _frame_ahead(shots: Sequence[Trace], encoder: EncoderResult, offset: float) -> float:
+    """Return the angle of the frozen frame ahead of the rotor's d axis, from where the rotor stood (rad)."""
+    pole_pairs = encoder.direction * round(encoder.pole_pairs.value)
+    angles = [
+        float(shot.meta["fixed_angle_rad"]) - (pole_pairs * float(np.mean(shot["theta_M_rad"])) - offset)
+        for shot in shots
+    ]
+    return math.atan2(sum(map(math.sin, angles)), sum(map(math.cos, angles)))
+
+
+def machine_of(evaluation: Evaluation, nameplate: MachineFile, conditions: Mapping[str, object]) -> MachineFile:
+    """Return the machine file with every identified value in place of the nameplate's.
+
+    What was not identified keeps the nameplate's value; ``[estimate]`` names what was.
+    """
+    found = evaluation.estimates()
+    values = {name: found[name].value for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2") if name in found}
+    machine = replace(nameplate.machine, **values)  # type: ignore[arg-type]
+    if evaluation.inertia is not None:
+        machine = replace(machine, tau_c_nm=max(0.0, evaluation.inertia.tau_c.value), B_nms=None)
+    inverter, encoder = nameplate.inverter, nameplate.encoder
+    if evaluation.encoder is not None and evaluation.offset is not None:
+        machine = replace(machine, pole_pairs=round(evaluation.encoder.pole_pairs.value))
+        encoder = replace(encoder, offset_rad=evaluation.offset.value, direction=evaluation.encoder.direction)
+    if evaluation.resistance is not None:
+        curve = evaluation.resistance.curve
+        plateau = max(0.0, evaluation.resistance.V_dead_v)
+        inverter = replace(
+            inverter,
+            V_dead_v=plateau,
+            i_knee_apk=curve.knee_a(plateau),
+            voltage_error_i_apk=tuple(map(float, curve.i_phase_a)),
+            voltage_error_v=tuple(map(float, curve.u_error_v)),
+        )
+    measurable = {name: estimate for name, estimate in found.items() if name != "pole_pairs"}
+    return replace(
+        nameplate,
+        machine=machine,
+        inverter=inverter,
+        encoder=encoder,
+        std={**nameplate.std, **{name: e.std for name, e in measurable.items()}},
+        systematic={**nameplate.systematic, **{name: e.systematic for name, e in measurable.items()}},
+        estimates={**nameplate.estimates, **found},
+        conditions=dict(conditions),
+        simulation={},
+    )
+
+
+def relative_total(estimate: Estimate) -> float:
+    """Return the total 95 % half width relative to the value."""
+    return total_half_width(estimate) / abs(estimate.value) if estimate.value else math.inf
