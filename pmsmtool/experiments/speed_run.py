@@ -15,6 +15,12 @@ SHARES = (0.25, 0.45, 0.65, 0.85)
 MEANS = ("u_d_v", "u_q_v", "i_d_a", "i_q_a", "omega_e_rad_s", "T_magnet_c", "T_winding_c", "flags")
 WAVES = ("i_d_a", "i_q_a", "theta_e_rad")
 
+LOOK_S = 0.05
+NEAR = 0.005
+"""Relative distance from the set speed that counts as reached."""
+REACH_LIMIT_S = 8.0
+"""A speed that is not reached by then is measured as it is; the estimator sees it in the halves of the window."""
+
 
 @dataclass(frozen=True, slots=True)
 class SpeedPlan:
@@ -27,7 +33,7 @@ class SpeedPlan:
     pole_pairs : int
         Pole pairs, to average over whole mechanical turns.
     settle_s : float
-        Time between the set-point and the window (s).
+        Time between reaching the speed and the window (s).
     window_s : float
         Shortest window (s); it is rounded up to whole mechanical turns.
     wave_samples : int
@@ -36,7 +42,7 @@ class SpeedPlan:
 
     speeds_rad_s: Sequence[float]
     pole_pairs: int
-    settle_s: float = 0.5
+    settle_s: float = 0.25
     window_s: float = 0.15
     wave_samples: int = 2048
 
@@ -61,6 +67,7 @@ def hold_speeds(drive: Drive, plan: SpeedPlan) -> tuple[Trace, list[Trace]]:
     elapsed = 0.0
     for speed in plan.speeds_rad_s:
         drive.command_speed(speed)
+        elapsed += reach(drive, speed * plan.pole_pairs)
         drive.wait(plan.settle_s)
         half = _half_window(drive, plan, speed)
         first, second = (drive.average(MEANS, half) for _ in range(2))
@@ -78,6 +85,19 @@ def hold_speeds(drive: Drive, plan: SpeedPlan) -> tuple[Trace, list[Trace]]:
             waves.append(readable(drive.record(WAVES, plan.wave_samples)))
     drive.command_speed(0.0)
     return table(rows, times, pole_pairs=plan.pole_pairs, speeds_rad_s=list(plan.speeds_rad_s)), waves
+
+
+def reach(drive: Drive, omega_e_rad_s: float, *, limit_s: float = REACH_LIMIT_S) -> float:
+    """Wait until the speed has arrived, seen twice, or the limit is over; return the time (s)."""
+    periods = max(1, round(0.5 * LOOK_S / drive.period_s))
+    waited = 0.0
+    seen = 0
+    while waited < limit_s and seen < 2:
+        drive.wait(0.5 * LOOK_S)
+        omega = drive.average(("omega_e_rad_s",), periods)["omega_e_rad_s"]
+        waited += LOOK_S
+        seen = seen + 1 if abs(omega - omega_e_rad_s) <= NEAR * abs(omega_e_rad_s) else 0
+    return waited
 
 
 def _half_window(drive: Drive, plan: SpeedPlan, speed: float) -> int:
@@ -99,5 +119,6 @@ def push_and_record(drive: Drive, i_q_a: float, samples: int, decimation: int, a
         duration_s=samples * decimation * drive.period_s,
         abort_speed_rad_s=abort_speed_rad_s,
     )
+    drive.command_current(0.0, 0.0)  # the frame follows the rotor again, whatever was held before
     names = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "omega_e_rad_s", "theta_m_rad", "flags")
     return readable(drive.record(names, samples, decimation=decimation, excitation=excitation), i_command_a=i_q_a)

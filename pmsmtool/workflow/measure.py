@@ -1,0 +1,298 @@
+"""The order of the experiments on one drive: each uses what the ones before it found, and leaves its traces.
+
+Noise and phases at five percent of the rated current come first, then resistance and inverter, pole pairs and offset,
+inductances at standstill, and last what turns the shaft. Between two experiments the drive is off while what was found
+goes into its parameters, so that its own control fits the machine; the guard puts everything back at the end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from pmsmtool.design.current_loop import imc
+from pmsmtool.drive.port import Drive
+from pmsmtool.errors import LimitExceeded
+from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
+from pmsmtool.estimators.noise import Noise, estimate_noise
+from pmsmtool.estimators.phase_check import check_phases
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.resistance import ResistanceResult, level_sequence
+from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
+from pmsmtool.trace import Trace
+from pmsmtool.workflow.evaluate import resistance_of
+
+PHASE_CHECK_SHARE = 0.05
+LEVELS = 12
+LOWEST_LEVEL = 0.08
+"""Lowest DC level, of the largest; the low ones serve the inverter curve."""
+ROTATION_SHARE = 0.7
+BIAS_SHARE = 0.5
+RIPPLE_SHARE = 0.25
+RIPPLE_SHARE_SATURATED = 0.05
+U_SHARE = 0.5
+"""Largest injection amplitude, of the largest voltage."""
+RUN_BANDWIDTH_RAD_S = 2.0 * math.pi * 120.0
+"""Current bandwidth of the runs that turn the shaft, at most a fifteenth of the sampling rate."""
+PUSH_SHARES = (0.25, 0.5)
+PUSH_SPEED_SHARE = 0.12
+PUSH_SAMPLES = 1024
+SPEED_LOOP_RAD_S = 25.0
+EMF_SHARE = 0.85
+"""Largest speed of the flux run: back-emf of this share of the largest voltage."""
+
+QUANTITIES = ("R", "L", "psi", "encoder", "poles", "inverter", "mechanics")
+NEEDS: Mapping[str, tuple[str, ...]] = {
+    "R": ("levels",),
+    "inverter": ("levels",),
+    "poles": ("rotation",),
+    "encoder": ("levels", "rotation", "square", "speeds"),
+    "L": ("levels", "rotation", "square"),
+    "psi": ("levels", "rotation", "square", "speeds"),
+    "mechanics": ("levels", "rotation", "square", "speeds"),
+}
+"""Experiments behind each quantity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the experiments may use.
+
+    Attributes
+    ----------
+    I_nom_apk : float
+        Rated current; the scale of every amplitude (A peak).
+    i_max_apk : float
+        Largest current of the envelope (A peak).
+    omega_max_rad_s : float
+        Largest mechanical speed of the envelope (rad/s).
+    V_max_v : float
+        Largest voltage (V peak).
+    """
+
+    I_nom_apk: float
+    i_max_apk: float
+    omega_max_rad_s: float
+    V_max_v: float
+
+    @property
+    def I_test_apk(self) -> float:
+        """Largest steady current of an experiment: the rated one, or what the envelope leaves."""
+        return min(self.I_nom_apk, self.i_max_apk / 1.1)
+
+
+@dataclass(slots=True)
+class Measurement:
+    """One run of the experiments.
+
+    Parameters
+    ----------
+    drive : Drive
+        Guarded, and off.
+    limits : Limits
+        What may be used.
+    keep : callable
+        Stores a trace under its name as soon as it is there.
+    say : callable
+        Told one line per experiment.
+    ripple_share : float
+        Ripple of the injection, peak to peak, of the rated current.
+    """
+
+    drive: Drive
+    limits: Limits
+    keep: Callable[[str, Trace], None]
+    say: Callable[[str], None]
+    ripple_share: float = RIPPLE_SHARE
+
+    def run(self, quantities: tuple[str, ...]) -> None:
+        """Run what the quantities need.
+
+        Raises
+        ------
+        IdentificationError
+            A trap was seen; nothing more is moved.
+        """
+        steps = {step for quantity in quantities for step in NEEDS[quantity]}
+        noise = self._zero_current()
+        self._phase_check(noise)
+        resistance = self._levels(noise) if "levels" in steps else None
+        encoder = self._rotation() if "rotation" in steps else None
+        if resistance is None or encoder is None:
+            return
+        inductances = self._square(resistance, encoder) if "square" in steps else None
+        if inductances is not None and "speeds" in steps:
+            self._turn(resistance, encoder, inductances)
+
+    def _zero_current(self) -> Noise:
+        self.say("noise: currents of the drive at rest")
+        trace = standstill.record_zero_current(self.drive)
+        self.keep("zero_current", trace)
+        return estimate_noise(trace)
+
+    def _phase_check(self, noise: Noise) -> None:
+        i_a = PHASE_CHECK_SHARE * self.limits.I_test_apk
+        self.say(f"phases: three vectors of {i_a:.3g} A")
+        self.drive.enable()
+        trace = standstill.hold_phase_vectors(self.drive, i_a)
+        self.keep("phase_vectors", trace)
+        check_phases(trace, noise)
+
+    def _levels(self, noise: Noise) -> ResistanceResult:
+        largest = self.limits.I_test_apk
+        ratio = (1.0 / LOWEST_LEVEL) ** (1.0 / (LEVELS - 1))
+        magnitudes = [largest * max(LOWEST_LEVEL, (k + 1) / LEVELS) for k in range(LEVELS)]
+        magnitudes[:2] = [largest * LOWEST_LEVEL, largest * LOWEST_LEVEL * ratio]
+        plan = standstill.LevelPlan(level_sequence(sorted(set(magnitudes))))
+        self.say(f"R and inverter: {len(plan.levels_a)} levels up to {largest:.3g} A")
+        trace = standstill.hold_levels(self.drive, plan)
+        self.keep("levels", trace)
+        return resistance_of(trace, noise)
+
+    def _rotation(self) -> EncoderResult:
+        plan = rotation.RotationPlan(i_a=ROTATION_SHARE * self.limits.I_test_apk)
+        self.say("pole pairs, direction, offset: one slow turn each way")
+        forward, backward = rotation.rotate_vector(self.drive, plan)
+        self.keep("rotation_forward", forward)
+        self.keep("rotation_backward", backward)
+        return estimate_encoder(forward, backward)
+
+    def _square(self, resistance: ResistanceResult, encoder: EncoderResult) -> tuple[float, float]:
+        """Record the shots; return rough inductances (H) from ripple and voltage, enough for a current controller."""
+        limits = self.limits
+        self.drive.disable()
+        self.drive.write(
+            {
+                "motor.R_s_ohm": resistance.R_measured.value,
+                "motor.pole_pairs": encoder.pole_pairs.value,
+                "encoder.offset_rad": encoder.offset.value,
+                "encoder.reversed": float(encoder.direction < 0),
+            }
+        )
+        self.drive.enable()
+        plan = square_injection.SquarePlan(
+            bias_d_a=BIAS_SHARE * limits.I_test_apk,
+            ripple_a=self.ripple_share * limits.I_test_apk,
+            u_max_v=U_SHARE * limits.V_max_v,
+        )
+        self.say(f"L_d, L_q: square wave on {plan.bias_d_a:.3g} A, {plan.ripple_a:.3g} A peak to peak")
+        square_injection.hold_bias(self.drive, plan)
+        rough = []
+        for axis in ("d", "q"):
+            amplitude = square_injection.find_amplitude(self.drive, plan, axis)
+            for half_period in plan.half_periods:
+                shot = square_injection.inject_square(self.drive, plan, axis, half_period, amplitude)
+                self.keep(f"square_{axis}_{half_period}", shot)
+            ripple = square_injection.ripple_of(shot, axis)
+            rough.append(amplitude * plan.half_periods[-1] * self.drive.period_s / ripple)
+        self.drive.command_current(0.0, 0.0, fixed_angle_rad=plan.angle_rad)
+        return rough[0], rough[1]
+
+    # ---- what turns the shaft ---------------------------------------------------------------------
+
+    def _turn(self, resistance: ResistanceResult, encoder: EncoderResult, L: tuple[float, float]) -> None:
+        pole_pairs = round(encoder.pole_pairs.value)
+        alpha = min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s))
+        d, q = (imc(resistance.R_measured.value, inductance, alpha) for inductance in L)
+        self.drive.disable()
+        self.drive.write(
+            {
+                "motor.L_d_h": L[0],
+                "motor.L_q_h": L[1],
+                "motor.L_d_app_h": L[0],
+                "motor.L_q_app_h": L[1],
+                "current.K_p_d_v_per_a": d.K_p,
+                "current.K_i_d_v_per_as": d.K_i,
+                "current.K_p_q_v_per_a": q.K_p,
+                "current.K_i_q_v_per_as": q.K_i,
+            }
+        )
+        self.drive.enable()
+        psi, J = self._pushes(resistance, pole_pairs)
+        self._speeds(psi, J, pole_pairs)
+
+    def _pushes(self, resistance: ResistanceResult, pole_pairs: int) -> tuple[float, float]:
+        """Push the rotor both ways; return rough flux linkage (Wb) and inertia (kg m2)."""
+        limits = self.limits
+        self.say("flux and inertia, roughly: short pushes both ways")
+        target = PUSH_SPEED_SHARE * limits.omega_max_rad_s
+        rate = self._acceleration_per_ampere(target, pole_pairs)
+        pushes = []
+        k = 0
+        for share in PUSH_SHARES:
+            current = share * limits.I_test_apk
+            decimation = max(1, round(target / (rate * current) / (PUSH_SAMPLES * self.drive.period_s)))
+            for sign in (1.0, -1.0, -1.0, 1.0):
+                push = self._push(sign * current, PUSH_SAMPLES, decimation, pole_pairs)
+                self.keep(f"push_{k}", push)
+                pushes.append(push)
+                k += 1
+        fastest = max(pushes, key=lambda trace: float(abs(trace["omega_e_rad_s"][-64:].mean())))
+        tail = slice(-64, None)
+        omega = float(fastest["omega_e_rad_s"][tail].mean())
+        i_q = float(fastest["i_q_a"][tail].mean())
+        error = resistance.V_dead_v * (1.0 if i_q > 0.0 else -1.0) * 4.0 / math.pi
+        psi = (float(fastest["u_q_v"][tail].mean()) - resistance.R_measured.value * i_q - error) / omega
+        if not psi > 0.0:
+            raise refuse(
+                "E_EXCITATION",
+                f"the voltage at {omega:.3g} rad/s shows no flux linkage ({psi:.3g} Wb)",
+                stage="speed run",
+                likely="the pushes were too slow for this inverter's dead time",
+                hint="allow a higher --speed-max",
+            )
+        return psi, 1.5 * pole_pairs * psi / rate
+
+    def _acceleration_per_ampere(self, target: float, pole_pairs: int) -> float:
+        """Return the acceleration per ampere (rad/s2/A), from pushes that grow until the shaft answers."""
+        current, seconds = 0.1 * self.limits.I_test_apk, 0.02
+        for _ in range(8):
+            decimation = max(1, round(seconds / (256 * self.drive.period_s)))
+            push = self._push(current, 256, decimation, pole_pairs)
+            omega = push["omega_e_rad_s"] / pole_pairs
+            change = float(omega[-16:].mean() - omega[:16].mean())
+            self._push(-current, 256, decimation, pole_pairs)
+            if abs(change) > 0.15 * target:
+                return abs(change) / (0.94 * seconds * current)
+            if current < 0.4 * self.limits.I_test_apk:
+                current *= 2.0
+            else:
+                seconds *= min(4.0, 0.5 * target / max(abs(change), 1e-3 * target))
+        raise refuse(
+            "E_EXCITATION",
+            "the shaft does not answer a push",
+            stage="speed run",
+            likely="a locked shaft, a brake that is closed, or an encoder that does not count",
+        )
+
+    def _push(self, i_q_a: float, samples: int, decimation: int, pole_pairs: int) -> Trace:
+        omega_e = 0.9 * pole_pairs * self.limits.omega_max_rad_s
+        return speed_run.push_and_record(self.drive, i_q_a, samples, decimation, omega_e)
+
+    def _speeds(self, psi: float, J: float, pole_pairs: int) -> None:
+        limits = self.limits
+        largest = min(limits.omega_max_rad_s / 1.1, EMF_SHARE * limits.V_max_v / (psi * pole_pairs))
+        if largest <= 0.0:
+            raise LimitExceeded("speed", 0.0, largest, "rad/s")
+        tau = 0.5 * 1.5 * pole_pairs * psi * limits.I_test_apk
+        slope = tau / J
+        self.drive.disable()
+        self.drive.write(
+            {
+                "motor.psi_f_wb": psi,
+                "motor.J_kgm2": J,
+                "current.options": 7.0,
+                "speed.K_p_nms_per_rad": 2.0 * SPEED_LOOP_RAD_S * J,
+                "speed.K_i_nm_per_rad": SPEED_LOOP_RAD_S**2 * J,
+                "speed.tau_max_nm": 1.6 * tau,
+                "speed.acceleration_rpm_per_s": slope * 30.0 / math.pi,
+            }
+        )
+        self.drive.enable()
+        plan = speed_run.SpeedPlan(speed_run.speeds_of(largest / max(speed_run.SHARES)), pole_pairs)
+        self.say(f"psi_f and fine offset: {len(plan.speeds_rad_s)} speeds up to {largest * 30 / math.pi:.0f} rpm")
+        speeds, waves = speed_run.hold_speeds(self.drive, plan)
+        self.keep("speeds", speeds)
+        for k, wave in enumerate(waves):
+            self.keep(f"wave_{k}", wave)
