@@ -255,7 +255,14 @@ def _forward_in_c(struct: FluxMapStruct, i_d: Array, i_q: Array) -> tuple[Array,
     return psi, np.moveaxis(jac, 0, 2)
 
 
-def _require_invertible(flux_map: FluxMap) -> None:
+def require_monotonic(flux_map: FluxMap) -> None:
+    """Refuse a map whose flux does not rise with the current everywhere: no machine has it, nothing can invert it.
+
+    Raises
+    ------
+    ConfigError
+        At how many of the sampled points, and where it is worst.
+    """
     i_d, i_q, jac = jacobian_samples(flux_map)
     det = jac[0, 0] * jac[1, 1] - jac[0, 1] * jac[1, 0]
     bad = np.flatnonzero((det <= 0.0) | (jac[0, 0] <= 0.0) | (jac[1, 1] <= 0.0))
@@ -265,7 +272,7 @@ def _require_invertible(flux_map: FluxMap) -> None:
             f"the flux map cannot be inverted: flux does not rise with current at {bad.size} of {det.size} points, "
             f"worst near i_d = {i_d[worst]:.4g} A, i_q = {i_q[worst]:.4g} A",
             likely="noise, a hole filled badly, or axes swapped",
-            hint="check the map, or cut it to the currents in use",
+            hint="`pmsmtool machine map FILE` shows more; correct the map, or cut it to the currents in use",
         )
 
 
@@ -278,7 +285,7 @@ def _inverse_axes(flux_map: FluxMap) -> tuple[Array, Array]:
 
 
 def _build(flux_map: FluxMap) -> FluxTables:
-    _require_invertible(flux_map)
+    require_monotonic(flux_map)
     struct = _forward_struct(flux_map)
     psi_d, psi_q = _inverse_axes(flux_map)
     struct.psi_d_min, struct.psi_d_step = psi_d[0], (psi_d[-1] - psi_d[0]) / (len(psi_d) - 1)
@@ -318,4 +325,4 @@ def meta_json(flux_map: FluxMap) -> str:
     return json.dumps(dict(flux_map.meta), sort_keys=True, ensure_ascii=True)
 
 
-__all__ = ["FluxMap", "FluxTables", "INVERSE_NODES", "jacobian_samples", "meta_json"]
+__all__ = ["FluxMap", "FluxTables", "INVERSE_NODES", "jacobian_samples", "meta_json", "require_monotonic"]

@@ -150,13 +150,16 @@ def _settings(arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[Kind, tup
         raise ConfigError(f"kind is {str(arrays['kind'])!r}, allowed are bicubic and bilinear", where=where)
     nodes = INVERSE_NODES
     if "inverse_nodes" in arrays:
-        first, second = (int(n) for n in np.ravel(arrays["inverse_nodes"])[:2])
+        try:
+            first, second = (int(n) for n in np.ravel(arrays["inverse_nodes"]))
+        except ValueError:
+            raise ConfigError("inverse_nodes is not two whole numbers", where=where) from None
         nodes = (first, second)
     try:
-        meta = json.loads(str(arrays["meta"])) if "meta" in arrays else {}
-    except json.JSONDecodeError:
-        raise ConfigError("meta is not JSON", where=where) from None
-    return kind, nodes, dict(meta)
+        meta = dict(json.loads(str(arrays["meta"]))) if "meta" in arrays else {}
+    except (TypeError, ValueError):
+        raise ConfigError("meta is not JSON with names", where=where) from None
+    return kind, nodes, meta
 
 
 def _grid(i_d: Array, i_q: Array, psi_d: Array, psi_q: Array, *, own: bool, where: str, notes: list[str]) -> FluxGrid:

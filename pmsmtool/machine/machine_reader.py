@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.flux_map import FluxMap
+from pmsmtool.machine.flux_map import FluxMap, require_monotonic
 from pmsmtool.machine.flux_map_import import load_flux_map
 from pmsmtool.machine.flux_map_table import flux_map_from_table
 from pmsmtool.machine.key import Key, check_table, did_you_mean
@@ -131,22 +131,21 @@ class MachineReader:
         return found
 
     def flux_map(self, file: str | None, folder: Path | None) -> FluxMap | None:
-        """The map of ``machine.flux_map`` or of the table ``[flux_map]``."""
+        """The map of ``machine.flux_map`` or of the table ``[flux_map]``; only one that a machine can have."""
         table = self.tables.get("flux_map")
+        if table is None and file is None:
+            return None
         try:
             if table is not None and file is not None:
                 raise ConfigError("is embedded and also named as a file in [machine]; keep one")
-            if table is not None:
-                return flux_map_from_table(table)
-            if file is None:
-                return None
-            if folder is None:
-                raise ConfigError("names a file, but these tables have no folder; embed the map")
-            return load_flux_map(folder / file)
+            found = flux_map_from_table(table) if file is None else _map_file(file, folder)
+            require_monotonic(found)
+            return found
         except ConfigError as error:
             place = self.place("flux_map") if table is not None else self.place("machine", "flux_map")
             reason = f"{place}: {f'{error.where}: ' if error.where else ''}{error.what}"
-            self.violations.append("; ".join([reason, *error.violations]))
+            advice = [f"try: {error.hint}"] if error.hint else []
+            self.violations.append("; ".join([reason, *error.violations, *advice]))
             return None
 
     def iron_loss_map(self, file: str | None, folder: Path | None) -> None:
@@ -177,3 +176,9 @@ class MachineReader:
             )
         elif any(b <= a for a, b in pairwise(currents)):
             self.violations.append(f"{self.place('inverter', 'voltage_error_i_apk')} does not increase")
+
+
+def _map_file(file: str, folder: Path | None) -> FluxMap:
+    if folder is None:
+        raise ConfigError("names a file, but these tables have no folder; embed the map")
+    return load_flux_map(folder / file)

@@ -185,7 +185,10 @@ def good(small):
         ({"i_d_a": np.array([-26.0, -18.0, -10.0, -12.0, 6.0, 14.0, 22.0])}, "does not increase"),
         ({"kind": np.array("quintic")}, "'quintic'"),
         ({"meta": np.array("{")}, "meta is not JSON"),
+        ({"meta": np.array("[1, 2]")}, "meta is not JSON with names"),
         ({"inverse_nodes": np.array([2, 2])}, "inverse_nodes is 2"),
+        ({"inverse_nodes": np.array([64])}, "not two whole numbers"),
+        ({"inverse_nodes": np.array(["a", "b"])}, "not two whole numbers"),
     ],
 )
 def test_a_bad_npz_says_why(tmp_path, small, change, says):
