@@ -12,8 +12,10 @@
 #define STIFFNESS 1.0           /* largest h g / L of an averaged substep (RK4 is stable to 2.78) */
 #define SUBSTEPS_MAX 64u
 #define SIGN_SUBSTEPS 4u        /* substeps that resolve the sign shape */
-#define LAG_SUBSTEPS 4u         /* with a sensor lag, so that the current is straight over a substep */
+#define LAG_SUBSTEPS 4u         /* with a slow sensor lag, so that the current is straight over a substep */
+#define LAG_MEMORY 8.0          /* time constants after which a sensor lag has forgotten: exp(-8) = 3e-4 */
 #define DIODE_SUBSTEPS 4u       /* with gates off */
+#define REST_SHARE 0.8          /* of the DC link, for the line back-EMF of an idle machine */
 #define COMMUTATION_STEP 0.3    /* substep of a floating node, in sqrt(L C) */
 #define COMMUTATION_STEPS_MAX 64
 #define FIRM_CURRENT 4.0        /* a current this many times what a dead time can change keeps its sign */
@@ -341,18 +343,39 @@ void pmsm_inverter_begin(pmsm_inverter *inverter, const double duty[3], uint32_t
     }
 }
 
-/* Equal substeps of the averaged model and of gates off. */
-static void run_substeps(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double h)
+/* Gates off, no current, and a back-EMF far from the DC link: nothing will happen within a period. */
+static int is_at_rest(const pmsm_inverter *inverter, const pmsm_plant *plant)
 {
-    uint32_t n = inverter->substeps;
-    if (lag && n < LAG_SUBSTEPS)
-        n = LAG_SUBSTEPS;
+    double emf[3];
+    if (inverter->gates || plant->state.i_alpha != 0.0 || plant->state.i_beta != 0.0)
+        return 0;
+    pmsm_plant_emf(plant, emf);
+    const double low[3] = {-emf[0], -emf[1], -emf[2]};
+    return largest(emf) + largest(low) < REST_SHARE * inverter->U_dc;
+}
+
+/* Equal substeps of the averaged model and of gates off. */
+static void run_equal(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double h, uint32_t n)
+{
     const double dt = h / (double)n;
     for (uint32_t k = 0; k < n; k++) {
         if (inverter->circuit)
             run_circuit(inverter, plant, lag, dt);
         else
             pmsm_leg_advance(inverter, plant, lag, &inverter->averaged, dt);
+    }
+}
+
+static void run_substeps(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double h)
+{
+    const uint32_t n = is_at_rest(inverter, plant) ? 1u : inverter->substeps;
+    const double tail = lag ? LAG_MEMORY * lag->tau : 0.0;
+    if (lag && n < LAG_SUBSTEPS && 2.0 * tail < h) {
+        /* a filter that follows a straight line forgets within the tail what curvature the rest had */
+        run_equal(inverter, plant, lag, h - tail, n);
+        run_equal(inverter, plant, lag, tail, 1u);
+    } else {
+        run_equal(inverter, plant, lag, h, lag && n < LAG_SUBSTEPS ? LAG_SUBSTEPS : n);
     }
 }
 
