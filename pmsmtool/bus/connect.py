@@ -94,6 +94,8 @@ class Connection:
         COB-IDs seen.
     sent : dict of int to deque
         The last requests sent per watched COB-ID, to tell our own echo from a second master.
+    listeners : list of callable
+        Given every message received, error frames too.
     """
 
     def __init__(self, bus: can.BusABC, *, writer: Any = None) -> None:
@@ -103,6 +105,7 @@ class Connection:
         self.error_frames = 0
         self.heard: set[int] = set()
         self.sent: dict[int, deque[bytes]] = {}
+        self.listeners: list[Callable[[can.Message], None]] = []
         self._writer = writer
         self._subscribers: dict[int, tuple[Callback, ...]] = {}
         self._failure: BusError | None = None
@@ -293,6 +296,8 @@ class Connection:
     def _dispatch(self, message: can.Message) -> None:
         if self._writer is not None:
             self._write(message)
+        for listener in self.listeners:
+            listener(message)
         if message.is_error_frame:
             self.error_frames += 1
             return

@@ -42,6 +42,18 @@ class Row:
 
 
 COMMANDS: tuple[Row, ...] = (
+    Row("doctor", "pmsmtool.cli.doctor:doctor_command", Section.LOOK, "Examine adapters, wiring and bit rate."),
+    Row("scan", "pmsmtool.cli.scan:scan_command", Section.LOOK, "List the nodes on a bus."),
+    Row("info", "pmsmtool.cli.info:info_command", Section.LOOK, "Show identity, state and parameter set."),
+    Row("monitor", "pmsmtool.cli.monitor:monitor_command", Section.LOOK, "Show live values."),
+    Row("fault", "pmsmtool.cli.fault:fault_command", Section.LOOK, "Show or reset faults."),
+    Row("stop", "pmsmtool.cli.stop:stop_command", Section.MOVE, "Stop a drive, confirmed."),
+    Row("jog", "pmsmtool.cli.jog:jog_command", Section.MOVE, "Move shortly, within limits."),
+    Row("param", "pmsmtool.cli.param:param_command", Section.WRITE, "Read, write, compare parameters."),
+    Row("flash-params", "pmsmtool.cli.flash_params:flash_params_command", Section.WRITE, "Write and store a set."),
+    Row("verify", "pmsmtool.cli.verify:verify_command", Section.LOOK, "Compare what a drive holds."),
+    Row("backup", "pmsmtool.cli.backup:backup_command", Section.LOOK, "Save everything a drive holds."),
+    Row("restore", "pmsmtool.cli.restore:restore_command", Section.WRITE, "Bring a backup or download back."),
     Row("machine", "pmsmtool.cli.machine:machine_command", Section.COMPUTE, "Make a machine file from a datasheet."),
     Row("tune", "pmsmtool.cli.tune:tune_command", Section.COMPUTE, "Design the control of a machine."),
     Row("report", "pmsmtool.cli.report:report_command", Section.COMPUTE, "Write the report of a run."),

@@ -246,4 +246,4 @@ def _excitation_facts(excitation: Excitation) -> dict[str, object]:
     """Return an excitation as JSON-serialisable facts."""
     facts: dict[str, object] = {name: getattr(excitation, name) for name in objects.EXCITATION_FIELDS}
     facts |= {"shape": excitation.shape.name.lower(), "point": excitation.point.name.lower()}
-    return {**facts, "buffer": list(excitation.buffer)}
+    return {**facts, "buffer": list(excitation.buffer), "lead_s": excitation.lead_s}

@@ -130,10 +130,7 @@ class Download:
             Ctrl-C, after the roll-back.
         """
         self._gate()
-        self._old_marks = self._read_marks()
-        self._was_stored = self._parameters.is_stored()
-        self._crc_before = self._parameters.crc_active if self.node.map.staging else None
-        if self._nothing_to_do(store):
+        if not self.has_work(store=store):
             self._close_stale(restoring)
             return self._outcome(0, starts=1, stored=self._was_stored)
         journal = self._journal(restoring)
@@ -155,6 +152,14 @@ class Download:
 
     # ---- before ---------------------------------------------------------------------------------
 
+    def has_work(self, *, store: bool = True) -> bool:
+        """Whether anything would be written, marks and storing included; only reads the drive."""
+        self._old_marks = self._read_marks()
+        self._was_stored = self._parameters.is_stored()
+        self._crc_before = self._parameters.crc_active if self.node.map.staging else None
+        same_marks = self._old_marks.get("design_id") == self._wanted_marks.get("design_id")
+        return bool(self.plan.changes) or not same_marks or (store and not self._was_stored)
+
     def _gate(self) -> None:
         check_identity(self.node, self.identity)
         self._parameters.check_layout()
@@ -168,10 +173,6 @@ class Download:
             )
         self.node.connection.wait(LISTEN_S)
         self.node.supervision.check()
-
-    def _nothing_to_do(self, store: bool) -> bool:
-        same_marks = self._old_marks.get("design_id") == self._wanted_marks.get("design_id")
-        return not self.plan.changes and same_marks and (self._was_stored or not store)
 
     def _close_stale(self, restoring: bool) -> None:
         """An interrupted download that had reached its end after all."""

@@ -13,7 +13,7 @@ from pmsmtool.drive.port import Identity
 from pmsmtool.errors import ConfigError, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.flash.journal import MARKS, Entry, Snapshot
-from pmsmtool.flash.plan import Change, Plan
+from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
 from pmsmtool.params.catalogue import BY_NAME, layout_signature
 from pmsmtool.params.diff import table_unit
 from pmsmtool.params.parameter_set import ParameterSet
@@ -44,10 +44,34 @@ def marks_of(content: str, when: datetime.datetime) -> dict[str, bytes]:
     }
 
 
-def take_backup(node: DriveNode, identity: Identity, *, progress: Progress = lambda done, total: None) -> Snapshot:
-    """Read every parameter, table and mark of a drive."""
+def plan_download(node: DriveNode, wanted: ParameterSet) -> Plan:
+    """Read what a drive holds and return the plan that brings it to a set; nothing is written.
+
+    Raises
+    ------
+    NotAvailable
+        The drive's parameter set has another layout than this program's.
+    ConfigError
+        Values out of bounds, or that do not fit the drive's types.
+    """
+    return make_plan(node.map, wanted, _settled(node).read(names_to_read(node.map, wanted)))
+
+
+def plan_restore(node: DriveNode, snapshot: Snapshot) -> Plan:
+    """Read what a drive holds and return the plan that brings a snapshot's old contents back."""
+    return restore_plan(node.map, snapshot, _settled(node).read(names_of(snapshot)))
+
+
+def _settled(node: DriveNode) -> DriveParameters:
     parameters = DriveParameters(node)
     parameters.check_layout()
+    parameters.settle()
+    return parameters
+
+
+def take_backup(node: DriveNode, identity: Identity, *, progress: Progress = lambda done, total: None) -> Snapshot:
+    """Read every parameter, table and mark of a drive."""
+    parameters = _settled(node)
     found = parameters.read([*node.map.cells, *node.map.tables], progress=progress)
     entries = [Entry(name, *node.map.address(name), data) for name, data in found.items()]
     for name, index, sub in MARKS:

@@ -8,14 +8,13 @@ from pathlib import Path
 
 from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Identity
 from pmsmtool.firmware.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.image import crc32
 from pmsmtool.flash.download import Download, Outcome
 from pmsmtool.flash.journal import JournalFolder
-from pmsmtool.flash.plan import Plan, make_plan, names_to_read
-from pmsmtool.flash.restore import marks_of, names_of, old_marks, restore_plan
+from pmsmtool.flash.plan import Plan
+from pmsmtool.flash.restore import marks_of, old_marks, plan_download, plan_restore
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.node.memory import RamStorage
 from tests.node.bench import Bench, open_bench
@@ -49,9 +48,7 @@ class Rig:
     root: Path
 
     def plan(self, wanted: ParameterSet) -> Plan:
-        parameters = DriveParameters(self.node)
-        parameters.settle()
-        return make_plan(self.node.map, wanted, parameters.read(names_to_read(self.node.map, wanted)))
+        return plan_download(self.node, wanted)
 
     def download(self, wanted: ParameterSet, **options: bool) -> Outcome:
         plan = self.plan(wanted)
@@ -68,10 +65,7 @@ class Rig:
         """What ``pmsmtool restore`` without arguments does."""
         journal = self.folder.last()
         assert journal is not None
-        parameters = DriveParameters(self.node)
-        parameters.settle()
-        plan = restore_plan(self.node.map, journal, parameters.read(names_of(journal)))
-        return self.job(plan, old_marks(journal)).run(restoring=True)
+        return self.job(plan_restore(self.node, journal), old_marks(journal)).run(restoring=True)
 
     def image(self) -> bytes:
         """The drive's active set, asked of the drive itself behind the tool's back."""

@@ -1,0 +1,214 @@
+"""Examination of a bus: what is heard, what answers, how fast, and what that tells about the wiring."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import can
+from can.interfaces import BACKENDS
+
+from pmsmtool.bus.connect import Connection, connect
+from pmsmtool.bus.frame_time import frame_bits
+from pmsmtool.bus.scan import FoundNode, find_nodes
+from pmsmtool.bus.sdo import SdoChannel
+from pmsmtool.errors import BusError, PmsmtoolError, SdoAbort
+
+BITRATES = (1_000_000, 800_000, 500_000, 250_000, 125_000, 100_000, 50_000, 20_000, 10_000)
+"""Rates of CiA 301, section 5.3, and 100 kbit/s."""
+LISTEN_S = 1.0
+ROUND_TRIPS = 50
+NODES_TIMED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Adapter:
+    """One python-can interface: whether its driver loads, and why not."""
+
+    name: str
+    ready: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """Findings on one bus.
+
+    Attributes
+    ----------
+    frames, error_frames : int
+        Heard while only listening.
+    listened_s : float
+        For how long (s).
+    load : float or None
+        Share of the time frames took, from their exact lengths; None without a bit rate.
+    state : str
+        Controller state as the adapter tells it; empty where it does not.
+    nodes : tuple of FoundNode
+        Who answers or was heard.
+    round_trip_s : mapping of int to (float, float)
+        Median and 95th percentile of an SDO read by node (s).
+    findings : tuple of (str, str)
+        Verdict PASS, WARN or FAIL and its sentence.
+    """
+
+    frames: int
+    error_frames: int
+    listened_s: float
+    load: float | None
+    state: str
+    nodes: tuple[FoundNode, ...]
+    round_trip_s: Mapping[int, tuple[float, float]]
+    findings: tuple[tuple[str, str], ...] = field(default=())
+
+    @property
+    def ok(self) -> bool:
+        """Whether a node answered and nothing failed."""
+        return all(verdict != "FAIL" for verdict, _ in self.findings)
+
+
+def adapters() -> list[Adapter]:
+    """Return every interface python-can knows here, with whether its module loads."""
+    return [_load(name, module, class_name) for name, (module, class_name) in sorted(BACKENDS.items())]
+
+
+def _load(name: str, module: str, class_name: str) -> Adapter:
+    complaints = _Complaints()
+    log = logging.getLogger("can")
+    propagate, log.propagate = log.propagate, False
+    log.addHandler(complaints)
+    try:
+        getattr(importlib.import_module(module), class_name)
+    except Exception as error:  # a vendor's module may fail in any way while it loads its driver
+        return Adapter(name, False, str(error).splitlines()[0] if str(error) else type(error).__name__)
+    finally:
+        log.removeHandler(complaints)
+        log.propagate = propagate
+    # Most modules without their driver do load, and only complain.
+    return Adapter(name, not complaints.texts, complaints.texts[0] if complaints.texts else "")
+
+
+class _Complaints(logging.Handler):
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(record.getMessage().splitlines()[0])
+
+
+def examine(connection: Connection, bitrate: int | None, *, listen_s: float = LISTEN_S) -> Examination:
+    """Listen first, then ask; nothing is written to any node.
+
+    Parameters
+    ----------
+    bitrate : int or None
+        To turn frame lengths into bus load.
+    """
+    bits = _Bits(connection)
+    before, errors_before = connection.frames_received, connection.error_frames
+    connection.wait(listen_s)
+    frames, error_frames = connection.frames_received - before, connection.error_frames - errors_before
+    load = None if not bitrate else bits.total / bitrate / listen_s
+    bits.close()
+    findings = [_heard(frames, error_frames, load)]
+    nodes: tuple[FoundNode, ...] = ()
+    times: dict[int, tuple[float, float]] = {}
+    try:
+        nodes = tuple(find_nodes(connection))
+        answering = [entry.node for entry in nodes if entry.device_type is not None]
+        times = {node: _round_trip(connection, node) for node in answering[:NODES_TIMED]}
+        findings.append(_answered(connection, nodes, answering))
+        findings += [_timing(node, *seconds) for node, seconds in times.items()]
+    except BusError as error:
+        findings.append(("FAIL", f"{error.what}; likely: {error.likely}"))
+    state = _state(connection.bus)
+    if state == "ERROR":
+        findings.append(("FAIL", "the controller is bus-off: wrong bit rate, a short circuit, or no termination"))
+    return Examination(frames, error_frames, listen_s, load, state, nodes, times, tuple(findings))
+
+
+def find_bitrate(
+    interface: str | None, channel: str | None, rates: Sequence[int] = BITRATES, *, listen_s: float = LISTEN_S
+) -> dict[int, tuple[int, int]]:
+    """Open the bus at each rate, only listening where the adapter can, and count (frames, error frames)."""
+    found = {}
+    for rate in rates:
+        try:
+            with connect(interface, channel, rate) as connection:
+                with contextlib.suppress(Exception):  # most adapters cannot be told after opening
+                    connection.bus.state = can.BusState.PASSIVE
+                connection.wait(listen_s)
+                found[rate] = connection.frames_received, connection.error_frames
+        except PmsmtoolError:
+            continue  # the adapter does not have this rate
+    return found
+
+
+class _Bits:
+    """Sum of the exact lengths of all frames heard."""
+
+    def __init__(self, connection: Connection) -> None:
+        self.total = 0
+        self._connection = connection
+        connection.listeners.append(self._add)
+
+    def _add(self, message: can.Message) -> None:
+        if not message.is_error_frame:
+            self.total += frame_bits(
+                message.arbitration_id, bytes(message.data), extended=message.is_extended_id,
+                remote=message.is_remote_frame, dlc=message.dlc if message.is_remote_frame else None,
+            )  # fmt: skip
+
+    def close(self) -> None:
+        self._connection.listeners.remove(self._add)
+
+
+def _heard(frames: int, error_frames: int, load: float | None) -> tuple[str, str]:
+    if error_frames and not frames:
+        return "FAIL", f"only error frames ({error_frames}): wrong bit rate, or a bus without termination"
+    if error_frames:
+        return "WARN", f"{error_frames} error frames among {frames} frames: termination, stub lengths, or a loose plug"
+    if not frames:
+        return "WARN", "nothing was heard: no node sends by itself (heartbeat off), no power, or another channel"
+    used = "" if load is None else f", bus load {100.0 * load:.1f} %"
+    return "PASS", f"{frames} frames heard, no error frames{used}"
+
+
+def _answered(connection: Connection, nodes: Sequence[FoundNode], answering: Sequence[int]) -> tuple[str, str]:
+    if answering:
+        return "PASS", f"node(s) {', '.join(map(str, answering))} answer"
+    if nodes:
+        return "FAIL", f"node(s) {', '.join(str(n.node) for n in nodes)} are heard but answer no SDO: stopped by NMT?"
+    return "FAIL", f"no node answers; likely: {connection.explain_silence(0)[0]}"
+
+
+def _timing(node: int, median_s: float, slow_s: float) -> tuple[str, str]:
+    text = f"node {node}: round trip {1e3 * median_s:.3g} ms median, {1e3 * slow_s:.3g} ms at 95 %"
+    return ("WARN" if slow_s > 0.05 else "PASS"), text
+
+
+def _round_trip(connection: Connection, node: int) -> tuple[float, float]:
+    channel = SdoChannel(connection, node)
+    times = []
+    try:
+        for _ in range(ROUND_TRIPS):
+            started = connection.clock.now()
+            with contextlib.suppress(SdoAbort):
+                channel.read(0x1000, 0)
+            times.append(connection.clock.now() - started)
+    finally:
+        channel.close()
+    return statistics.median(times), sorted(times)[int(0.95 * len(times))]
+
+
+def _state(bus: Any) -> str:
+    # Some adapters have no state at all (python-can #736); then there is nothing to tell.
+    with contextlib.suppress(Exception):
+        return str(bus.state.name)
+    return ""

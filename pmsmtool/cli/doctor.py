@@ -1,0 +1,95 @@
+"""``pmsmtool doctor``: adapters, wiring, bit rate, round trip."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmsmtool.cli.options import TIME, BusOptions, bus_options, examples, output_options
+from pmsmtool.cli.output import Output
+
+if TYPE_CHECKING:
+    from pmsmtool.bus.examination import Adapter, Examination
+
+
+@click.command(
+    "doctor",
+    epilog=examples(
+        "pmsmtool doctor                                  # adapters and configuration only",
+        "pmsmtool -i pmsmsim doctor",
+        "pmsmtool -i socketcan -c can0 doctor --find-bitrate",
+    ),
+)
+@click.option("--find-bitrate", is_flag=True, help="Open at every usual bit rate and only listen.")
+@click.option("--listen", "listen_s", type=TIME, default="1s", help="How long to listen before anything is sent.")
+@bus_options
+@output_options
+def doctor_command(bus: BusOptions, out: Output, find_bitrate: bool, listen_s: float) -> None:
+    """Examine adapters, then the bus: listen first, ask then; nothing is written to any node.
+
+    Exit code 3 when a bus is configured and no node answers on it.
+    """
+    from pmsmtool.bus import examination
+    from pmsmtool.errors import BusError
+
+    found = examination.adapters()
+    configured = _configuration(bus)
+    data: dict[str, Any] = {"adapters": found, "configuration": configured}
+    lines = _adapter_lines(found, configured)
+    failed = ""
+    if find_bitrate:
+        rates = examination.find_bitrate(bus.interface, bus.channel, listen_s=listen_s)
+        data["bitrates"] = {str(rate): {"frames": n, "error_frames": e} for rate, (n, e) in rates.items()}
+        lines += [_rate_line(rate, n, e) for rate, (n, e) in rates.items()]
+    elif configured.get("interface") is not None:
+        with bus.connect() as connection:
+            bitrate = bus.bitrate or _number(configured.get("bitrate"))
+            result = examination.examine(connection, bitrate, listen_s=listen_s)
+        data["examination"] = result
+        lines += _finding_lines(result)
+        failed = "; ".join(text for verdict, text in result.findings if verdict == "FAIL")
+    else:
+        lines.append("no bus is configured: give -i and -c, or configure python-can (~/.canrc, CAN_INTERFACE)")
+    out.result("doctor", data, lines)
+    if failed:
+        raise BusError(
+            failed, where=" ".join(str(v) for v in (bus.interface, bus.channel) if v), hint="see the lines above"
+        )
+
+
+def _configuration(bus: BusOptions) -> dict[str, Any]:
+    """Return what python-can will use, from options, files and environment."""
+    import can
+
+    given = {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate}
+    typed = {key: value for key, value in given.items() if value is not None}
+    try:
+        loaded = can.util.load_config(config=dict(typed))
+    except (can.CanError, ValueError):
+        return typed
+    return {key: loaded.get(key) for key in ("interface", "channel", "bitrate") if loaded.get(key) is not None}
+
+
+def _adapter_lines(found: list[Adapter], configured: dict[str, Any]) -> list[str]:
+    ready = [adapter.name for adapter in found if adapter.ready]
+    lines = [f"python-can loads: {', '.join(ready)}"]
+    chosen = next((a for a in found if a.name == configured.get("interface")), None)
+    if chosen is not None and not chosen.ready:
+        lines.append(f"FAIL  {chosen.name}: {chosen.reason}")
+    used = "  ".join(f"{key} {value}" for key, value in configured.items())
+    return [*lines, f"configured: {used or 'nothing'}"]
+
+
+def _finding_lines(result: Examination) -> list[str]:
+    lines = [f"{verdict:<4}  {text}" for verdict, text in result.findings]
+    return [*lines, f"controller state {result.state}"] if result.state else lines
+
+
+def _rate_line(rate: int, frames: int, errors: int) -> str:
+    verdict = "PASS" if frames and not errors else "FAIL" if errors else "    "
+    return f"{verdict:<4}  {rate:>8} bit/s  {frames} frames, {errors} error frames"
+
+
+def _number(value: Any) -> int | None:
+    return int(value) if str(value).isdigit() else None

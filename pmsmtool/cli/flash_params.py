@@ -1,0 +1,54 @@
+"""``pmsmtool flash-params``: a parameter set into a drive, as a transaction."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from pmsmtool.cli.drive_access import map_option, open_node, read_map
+from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, output_options, write_options
+from pmsmtool.cli.output import Output
+
+
+@click.command(
+    "flash-params",
+    epilog=examples(
+        "pmsmtool -i pmsmsim --yes flash-params params.toml",
+        "pmsmtool -n 5 flash-params design.toml --dry-run",
+        "pmsmtool -n 5 flash-params params.toml --check     # exit code 1 when the drive differs",
+    ),
+)
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("--dry-run", is_flag=True, help="Show what would change and stop.")
+@click.option("--check", is_flag=True, help="As --dry-run; exit code 1 when something would change.")
+@click.option("--no-store", is_flag=True, help="Let it act until the next reset only.")
+@map_option
+@bus_options
+@write_options
+@output_options
+def flash_params_command(
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    source: Path,
+    dry_run: bool,
+    check: bool,
+    no_store: bool,
+    map_file: Path | None,
+) -> None:
+    """Write a parameter set, a design, a DCF or a run's parameters to the drive and store it.
+
+    Only what differs is written. Before the first write the old contents are in a journal; everything is read back,
+    activated together, stored, and compared again after a reset. Whatever fails, the old set comes back; after a power
+    cut or a killed tool, the same command or `pmsmtool restore` finishes.
+    """
+    from pmsmtool.cli.flash_session import carry_out
+    from pmsmtool.workflow.parameter_source import load_parameters
+
+    drive_map = read_map(map_file)
+    wanted = load_parameters(source, drive_map)
+    with open_node(bus, drive_map) as node:
+        carry_out(
+            node, wanted, bus, motion, out, command="flash-params", store=not no_store, dry_run=dry_run, check=check
+        )

@@ -1,0 +1,129 @@
+"""What the writing commands share: plan, consent, download, one result."""
+
+from __future__ import annotations
+
+import datetime
+from typing import TYPE_CHECKING, Any
+
+from pmsmtool.cli.options import BusOptions, MotionOptions
+from pmsmtool.cli.output import Output
+
+if TYPE_CHECKING:
+    from pmsmtool.drive.drive_node import DriveNode
+    from pmsmtool.drive.port import Identity
+    from pmsmtool.flash.download import Outcome
+    from pmsmtool.flash.plan import Change, Plan
+    from pmsmtool.params.parameter_set import ParameterSet
+
+
+def carry_out(
+    node: DriveNode,
+    wanted: ParameterSet,
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    *,
+    command: str,
+    store: bool = True,
+    dry_run: bool = False,
+    check: bool = False,
+) -> None:
+    """Plan, ask, write, print."""
+    from pmsmtool.errors import CheckFailed
+    from pmsmtool.flash.restore import marks_of, plan_download
+
+    identity = checked_identity(node)
+    plan = plan_download(node, wanted)
+    if dry_run or check:
+        out.result(command, {"identity": identity, **plan_facts(plan)}, plan.lines())
+        if check and plan.changes:
+            raise CheckFailed(
+                f"{len(plan.changes)} object(s) differ",
+                where=f"node {node.node}",
+                hint="run without --check to write them",
+            )
+        return
+    outcome = write_plan(
+        node, identity, plan, marks_of(plan.content, datetime.datetime.now()), bus, motion, out, store=store
+    )
+    out.result(command, {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])
+
+
+def write_plan(
+    node: DriveNode,
+    identity: Identity,
+    plan: Plan,
+    marks: dict[str, bytes],
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    *,
+    store: bool = True,
+    restoring: bool = False,
+) -> Outcome:
+    """Ask for the consent to a plan and carry it out."""
+    from pmsmtool.cli.consent import ask_writing
+    from pmsmtool.flash.download import Download
+    from pmsmtool.flash.journal import JournalFolder
+
+    job = Download(
+        node, identity, plan, marks, JournalFolder(identity), say=out.note,
+        progress=lambda done, total: out.status(f"{done}/{total}"),
+    )  # fmt: skip
+    if job.has_work(store=store):
+        lines = [*plan.lines(), "the set is stored, and the drive is reset to see it" if store else "not stored"]
+        ask_writing(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
+    return job.run(store=store, restoring=restoring)
+
+
+def checked_identity(node: DriveNode) -> Identity:
+    """Read the identity and refuse a drive the map is not for.
+
+    Raises
+    ------
+    ConfigError
+        Vendor or product are not the map's.
+    """
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.flash.download import describe
+
+    identity = node.identity()
+    if (identity.vendor, identity.product) != (node.map.vendor, node.map.product):
+        raise ConfigError(
+            f"the map {node.map.name!r} is for vendor {node.map.vendor:#010x} product {node.map.product:#x}, "
+            f"the drive is {describe(identity)}",
+            where=f"node {node.node}, 0x1018",
+            hint="give the map of this drive with --map; nothing was written",
+        )
+    return identity
+
+
+def told(outcome: Outcome, node: DriveNode) -> str:
+    """Return the outcome of a download in one line."""
+    kept = "stored" if outcome.stored else "active until the next reset"
+    crc = "" if outcome.crc is None else f", CRC-32 {outcome.crc:#010x}"
+    retries = f", {outcome.retries} transfer(s) repeated" if outcome.retries else ""
+    return f"node {node.node}  {outcome.written} written, {outcome.equal} held already, {kept}{crc}{retries}"
+
+
+def plan_facts(plan: Plan) -> dict[str, Any]:
+    """Return a plan for ``--json``."""
+    return {
+        "content": plan.content,
+        "changes": [_change_facts(change) for change in plan.changes],
+        "equal": len(plan.entries) - len(plan.changes),
+        "missing": plan.missing,
+    }
+
+
+def _change_facts(change: Change) -> dict[str, Any]:
+    return {
+        "name": change.name,
+        "object": change.where,
+        "old": change.old_value,
+        "wanted": change.wanted,
+        "held": change.held,
+        "unit": change.unit,
+        "old_bytes": change.old.hex(),
+        "new_bytes": change.new.hex(),
+    }

@@ -1,0 +1,133 @@
+"""``pmsmtool info``: what one drive says about itself."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmsmtool.cli.drive_access import open_node
+from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
+from pmsmtool.cli.output import Output
+
+if TYPE_CHECKING:
+    from pmsmtool.drive.drive_node import DriveNode
+
+
+HEARTBEAT_PERIODS = 1.2
+PATIENCE_S = 1.0
+"""The NMT state is only in the heartbeat; a slow one is not waited for."""
+
+
+@click.command("info", epilog=examples("pmsmtool -i pmsmsim info", "pmsmtool -n 5 info --json | jq .identity.serial"))
+@bus_options
+@output_options
+def info_command(bus: BusOptions, out: Output) -> None:
+    """Show identity, state, faults and parameter set of a drive."""
+    with open_node(bus) as node:
+        facts = read_facts(node)
+    out.result("info", facts, lambda: _lines(facts))
+
+
+def read_facts(node: DriveNode) -> dict[str, Any]:
+    """Return what ``info`` shows, read from the drive; what it does not have is None."""
+    from pmsmtool.cia402 import error_text
+    from pmsmtool.drive import objects
+
+    identity = node.identity()
+    if node.supervision.heartbeat_period_s is not None:
+        node.connection.wait(min(HEARTBEAT_PERIODS * node.supervision.heartbeat_period_s, PATIENCE_S))
+    code = _whole(node, objects.ERROR_CODE)
+    days, milliseconds = _whole(node, objects.CONFIGURATION_DATE), _whole(node, objects.CONFIGURATION_TIME)
+    return {
+        "identity": identity,
+        "device_type": _whole(node, objects.DEVICE_TYPE),
+        "state": node.state(),
+        "mode": _whole(node, objects.MODE_DISPLAY),
+        "nmt_state": node.supervision.nmt_state,
+        "heartbeat_s": node.supervision.heartbeat_period_s,
+        "error_code": code,
+        "error_text": None if code is None else error_text(code),
+        "error_register": _whole(node, objects.ERROR_REGISTER),
+        "supported_modes": _whole(node, objects.SUPPORTED_MODES),
+        "parameter_set": _parameter_set(node),
+        "configured": _moment(days, milliseconds),
+        "limits": _limits(node),
+    }
+
+
+def _parameter_set(node: DriveNode) -> dict[str, Any] | None:
+    from pmsmtool.drive import objects
+    from pmsmtool.params.catalogue import SCHEMA_VERSION, layout_signature
+
+    schema, signature = _whole(node, objects.SET_SCHEMA), _whole(node, objects.SET_SIGNATURE)
+    if schema is None or signature is None:
+        return None
+    active, stored = _whole(node, objects.SET_CRC_ACTIVE), _whole(node, objects.SET_CRC_STORED)
+    return {
+        "schema": schema,
+        "signature": signature,
+        "known": (schema, signature) == (SCHEMA_VERSION, layout_signature()),
+        "crc_active": active,
+        "crc_stored": stored,
+        "stored": active == stored,
+    }
+
+
+def _limits(node: DriveNode) -> dict[str, float | None]:
+    from pmsmtool.drive import objects
+
+    rated = _whole(node, objects.RATED_CURRENT_MA)
+    return {
+        "rated_current_arms": None if rated is None else rated / 1000.0,
+        "max_speed_rpm": _whole(node, objects.MAX_SPEED_RPM),
+    }
+
+
+def _whole(node: DriveNode, item: Any) -> int | None:
+    from pmsmtool.errors import SdoAbort
+
+    with contextlib.suppress(SdoAbort):
+        return node.whole(item)
+    return None
+
+
+def _moment(days: int | None, milliseconds: int | None) -> str | None:
+    """Object 0x1020 as a date; zero means: something changed since it was written."""
+    from pmsmtool.flash.restore import CONFIGURATION_EPOCH
+
+    if not days:
+        return None
+    midnight = datetime.datetime.combine(CONFIGURATION_EPOCH, datetime.time())
+    try:
+        moment = midnight + datetime.timedelta(days=days, milliseconds=milliseconds or 0)
+    except OverflowError:
+        return None
+    return moment.isoformat(sep=" ", timespec="seconds")
+
+
+def _lines(facts: dict[str, Any]) -> list[str]:
+    identity, state, held = facts["identity"], facts["state"], facts["parameter_set"]
+    lines = [
+        f"node      {identity.node}  {identity.name}  hw {identity.hardware or '-'}  sw {identity.software or '-'}",
+        f"identity  vendor {identity.vendor:#010x}  product {identity.product:#x}  revision {identity.revision:#x}  "
+        f"serial {identity.serial}",
+        f"state     {'undefined' if state is None else state.name.replace('_', ' ')}  mode {facts['mode']}  "
+        f"NMT {'-' if facts['nmt_state'] is None else facts['nmt_state'].name.replace('_', '-')}",
+    ]
+    if facts["error_code"]:
+        lines.append(f"fault     {facts['error_code']:#06x} {facts['error_text']}")
+    rated = facts["limits"]["rated_current_arms"]
+    if rated is not None:
+        lines.append(f"rated     {rated:g} Arms ({rated * 2**0.5:.4g} Apk)")
+    if held is not None:
+        known = "known" if held["known"] else "UNKNOWN to this program"
+        stored = "stored" if held["stored"] else "NOT stored: a reset brings another set back"
+        if held["crc_stored"] == 0:
+            stored = "nothing is stored: a reset brings the factory values back"
+        lines.append(f"set       schema {held['schema']}  signature {held['signature']:#010x} ({known})")
+        lines.append(f"          CRC-32 {held['crc_active']:#010x}, {stored}")
+    lines.append(f"changed   {facts['configured'] or 'since the last download, or never written by one'}")
+    return lines

@@ -1,0 +1,111 @@
+"""``pmsmtool jog``: a short motion within limits."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import click
+
+from pmsmtool.cli.options import (
+    CURRENT,
+    SPEED,
+    TIME,
+    BusOptions,
+    MotionOptions,
+    Quantity,
+    bus_options,
+    examples,
+    motion_options,
+    output_options,
+)
+from pmsmtool.cli.output import Output, table
+
+SPEED_MARGIN = 1.5
+"""Speed limit over the wanted speed when --speed-max is not given."""
+CURRENT_JOG_SPEED_RAD_S = 2.0 * math.pi
+"""Speed limit of a current jog without --speed-max: one turn per second."""
+SAMPLE_S = 0.05
+
+
+@click.command(
+    "jog",
+    epilog=examples(
+        "pmsmtool -i pmsmsim --yes jog --current 2Apk --angle 90deg --for 1s",
+        "pmsmtool -n 5 jog --speed 100rpm --for 2s --i-max 5Apk --shaft free",
+    ),
+)
+@click.option("--current", "current_apk", type=CURRENT, help="Hold this current vector, e.g. 2Apk.")
+@click.option("--angle", "angle_rad", type=Quantity("angle"), default="0deg", help="Electrical angle of the vector.")
+@click.option("--speed", "speed_rad_s", type=SPEED, help="Run at this speed, e.g. 100rpm.")
+@click.option("--for", "seconds", type=TIME, default="1s", help="How long.")
+@bus_options
+@motion_options
+@output_options
+def jog_command(
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    current_apk: float | None,
+    angle_rad: float,
+    speed_rad_s: float | None,
+    seconds: float,
+) -> None:
+    """Hold a current vector at a fixed angle, or run at a speed, for a short time; then stop and restore everything.
+
+    A speed jog needs a drive that knows its machine: pole pairs, encoder offset, gains.
+    """
+    from pmsmtool.cli.consent import ask_motion
+    from pmsmtool.cli.drive_access import open_drive
+    from pmsmtool.drive.envelope import Envelope
+    from pmsmtool.drive.guard import guarded
+    from pmsmtool.errors import ConfigError
+
+    if (current_apk is None) == (speed_rad_s is None):
+        raise ConfigError("give one of --current and --speed")
+    with open_drive(bus) as drive:
+        i_nom_apk = drive.read("motor.I_nom_apk")
+        speed = abs(speed_rad_s) * SPEED_MARGIN if speed_rad_s is not None else CURRENT_JOG_SPEED_RAD_S
+        envelope = Envelope(
+            i_max_apk=motion.i_max_apk or (i_nom_apk if current_apk is None else min(current_apk, i_nom_apk)),
+            speed_max_rad_s=motion.speed_max_rad_s or speed,
+            duration_s=seconds + 2.0,
+            shaft=motion.shaft or "free",
+            load=motion.load,
+            brake=motion.brake,
+        )
+        envelope.refuse_gravity()
+        ask_motion(envelope.lines(), motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
+        with guarded(drive, envelope, say=out.note) as guard:
+            guard.enable()
+            if current_apk is not None:
+                guard.command_current(current_apk, 0.0, fixed_angle_rad=angle_rad)
+            elif speed_rad_s is not None:
+                guard.command_speed(speed_rad_s)
+            readings = _watch(guard, seconds)
+    facts = {"seconds": seconds, "envelope": envelope, "dead_man": guard.proof, "readings": readings}
+    heads = ("quantity", "mean", "unit")
+    out.result(
+        "jog", facts, lambda: table(heads, [(name, f"{value:.6g}", unit) for name, value, unit in _means(readings)])
+    )
+
+
+def _watch(guard: Any, seconds: float) -> list[dict[str, float]]:
+    from pmsmtool.drive.objects import signal_unit
+
+    names = [n for n in ("i_d_a", "i_q_a", "omega_e_rad_s", "U_dc_v", "theta_m_rad") if signal_unit(n)]
+    readings = []
+    left = seconds
+    while left > 0.0:
+        guard.wait(min(SAMPLE_S, left))
+        left -= SAMPLE_S
+        readings.append({name: guard.live(name) for name in names})
+    return readings
+
+
+def _means(readings: list[dict[str, float]]) -> list[tuple[str, float, str]]:
+    """Mean of the second half of the motion: what it settled to."""
+    from pmsmtool.drive.objects import signal_unit
+
+    half = readings[len(readings) // 2 :]
+    return [(name, sum(r[name] for r in half) / len(half), signal_unit(name)) for name in half[0]]

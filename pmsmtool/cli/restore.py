@@ -1,0 +1,67 @@
+"""``pmsmtool restore``: bring a backup, or an interrupted download, back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from pmsmtool.cli.drive_access import map_option, open_node, read_map
+from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, output_options, write_options
+from pmsmtool.cli.output import Output
+
+
+@click.command(
+    "restore",
+    epilog=examples(
+        "pmsmtool -n 5 restore                 # what the drive held before the last download",
+        "pmsmtool -n 5 restore drive.json",
+        "pmsmtool -n 6 restore drive.json --other-drive --dry-run",
+    ),
+)
+@click.argument("snapshot_file", metavar="[FILE]", type=FILE, required=False)
+@click.option("--other-drive", is_flag=True, help="The backup is of another drive of this kind (a spare part).")
+@click.option("--dry-run", is_flag=True, help="Show what would change and stop.")
+@map_option
+@bus_options
+@write_options
+@output_options
+def restore_command(
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    snapshot_file: Path | None,
+    other_drive: bool,
+    dry_run: bool,
+    map_file: Path | None,
+) -> None:
+    """Bring back what a backup holds, or without FILE what this drive held before its last download.
+
+    The journal is found by the drive's serial number. An interrupted download ends here too.
+    """
+    from pmsmtool.cli.flash_session import checked_identity, plan_facts, told, write_plan
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.flash.journal import JournalFolder, read_snapshot
+    from pmsmtool.flash.restore import check_snapshot, old_marks, plan_restore
+
+    with open_node(bus, read_map(map_file)) as node:
+        identity = checked_identity(node)
+        folder = JournalFolder(identity)
+        snapshot = folder.last() if snapshot_file is None else read_snapshot(snapshot_file)
+        if snapshot is None:
+            raise ConfigError(
+                f"there is no journal of the drive with serial number {identity.serial}",
+                where=str(folder.path),
+                likely="nothing was ever written to this drive from this account",
+                hint="give the file of a backup",
+            )
+        check_snapshot(node.map, snapshot, identity, other_drive=other_drive)
+        out.note(f"{snapshot.kind} of serial {snapshot.identity.serial}, state {snapshot.state}")
+        plan = plan_restore(node, snapshot)
+        if dry_run:
+            out.result("restore", {"identity": identity, **plan_facts(plan)}, plan.lines())
+            return
+        outcome = write_plan(
+            node, identity, plan, old_marks(snapshot), bus, motion, out, restoring=snapshot_file is None
+        )
+        out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])

@@ -1,0 +1,48 @@
+"""``pmsmtool verify``: compare what a drive holds, byte by byte."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from pmsmtool.cli.drive_access import map_option, open_node, read_map
+from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
+from pmsmtool.cli.output import Output
+
+
+@click.command(
+    "verify", epilog=examples("pmsmtool -i pmsmsim verify params.toml", "pmsmtool -n 5 verify runs/last --json")
+)
+@click.argument("source", type=click.Path(path_type=Path))
+@map_option
+@bus_options
+@output_options
+def verify_command(bus: BusOptions, out: Output, source: Path, map_file: Path | None) -> None:
+    """Compare the drive's bytes with a parameter set, a design, a DCF, a run or a backup; exit code 1 when they differ.
+
+    Bytes only. Whether the machine behaves as designed is what `pmsmtool prove` shows.
+    """
+    from pmsmtool.cli.flash_session import checked_identity, plan_facts
+    from pmsmtool.errors import VerifyMismatch
+    from pmsmtool.flash.journal import read_snapshot
+    from pmsmtool.flash.restore import plan_download, plan_restore
+    from pmsmtool.workflow.parameter_source import load_parameters
+
+    drive_map = read_map(map_file)
+    with open_node(bus, drive_map) as node:
+        identity = checked_identity(node)
+        if source.suffix == ".json":
+            plan = plan_restore(node, read_snapshot(source))
+        else:
+            plan = plan_download(node, load_parameters(source, drive_map))
+    equal = len(plan.entries) - len(plan.changes)
+    text = [f"{equal} of {len(plan.entries)} objects hold these bytes (behaviour: run `prove`)"]
+    out.result("verify", {"identity": identity, "ok": not plan.changes, **plan_facts(plan)}, text)
+    if plan.changes:
+        raise VerifyMismatch(
+            f"{len(plan.changes)} of {len(plan.entries)} objects hold something else",
+            where=f"node {identity.node}",
+            differences=plan.lines()[: len(plan.changes)],
+            hint="`pmsmtool flash-params` writes the set",
+        )
