@@ -41,7 +41,9 @@ OFFSET_FLOOR_RAD = 1e-4
 OFFSET_LIMIT_RAD = math.radians(30.0)
 """Offset above which the speed run cannot have been what it claims; the coarse offset comes first."""
 CURRENT_SETTLE_LIMIT = 0.25
-"""Change of a current between the halves of a window, of the largest q current."""
+"""Change of a current between the halves of a window, of the largest current."""
+I_D_SPREAD = 0.5
+"""Spread of i_d over the speeds, of the largest current, from which on L_d is fitted with psi."""
 SETTLE_LIMIT = 0.02
 """Relative change of the speed between the halves of a window."""
 
@@ -129,12 +131,17 @@ def estimate_flux_linkage(
     u_d = (speeds["u_d_v"] - e_d - R_ohm * i_d) * correction
     u_q = (speeds["u_q_v"] - e_q - R_ohm * i_q) * correction - w * L_d_h * i_d
     one = np.ones_like(w)
-    q_fit, q_cov, q_residual, q_condition = linear_solve(np.stack([w, np.sign(w), w * i_q], axis=1), u_q, one)
-    columns = np.stack([-w * i_q, w, -w * w], axis=1)
-    d_fit, d_cov, d_residual, d_condition = linear_solve(columns, u_d, one)
+    q_columns = [w, np.sign(w), w * i_q]
+    d_columns = [-w * i_q, w, -w * w]
+    if np.ptp(i_d) > I_D_SPREAD * float(np.max(np.hypot(i_d, i_q))):
+        # the flux of i_d and its share on the q axis of a frame that is off are unknowns of the same run
+        q_columns.append(w * i_d)
+        d_columns.append(-w * i_d)
+    q_fit, q_cov, q_residual, q_condition = linear_solve(np.stack(q_columns, axis=1), u_q, one)
+    d_fit, d_cov, d_residual, d_condition = linear_solve(np.stack(d_columns, axis=1), u_d, one)
     condition_gate(q_condition, "psi and the dead-time voltage", STAGE)
     condition_gate(d_condition, "L_q, the offset and the angle delay", STAGE)
-    dof_q, dof_d = len(w) - 3, len(w) - 3
+    dof_q, dof_d = len(w) - len(q_columns), len(w) - len(d_columns)
     s_q = math.sqrt(float(q_residual @ q_residual) / dof_q)
     s_d = math.sqrt(float(d_residual @ d_residual) / dof_d)
     x1, x2 = float(q_fit[0]), float(d_fit[1])
@@ -231,7 +238,7 @@ def _check_speeds(speeds: Trace, w: Vector) -> None:
         )
     for axis in ("d", "q"):
         drift = np.abs(speeds[f"i_{axis}_second_a"] - speeds[f"i_{axis}_first_a"])
-        limit = CURRENT_SETTLE_LIMIT * float(np.max(np.abs(speeds["i_q_a"])))
+        limit = CURRENT_SETTLE_LIMIT * float(np.max(np.hypot(speeds["i_d_a"], speeds["i_q_a"])))
         if float(np.max(drift)) > limit:
             worst = int(np.argmax(drift))
             raise refuse(

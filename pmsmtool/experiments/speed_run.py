@@ -51,29 +51,34 @@ class SpeedPlan:
         return sum(self.settle_s + 2.0 * (self.window_s + 2.0 * math.pi / abs(w)) for w in self.speeds_rad_s)
 
 
-def speeds_of(omega_max_rad_s: float) -> tuple[float, ...]:
-    """Return the speeds: up in one direction, then up in the other, so that the shaft reverses once."""
-    return tuple(sign * share * omega_max_rad_s for sign in (1.0, -1.0) for share in SHARES)
+def speeds_of(omega_max_rad_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the speeds in two groups, one for each sign of i_d; each has every second share in each direction."""
+    odd, even = SHARES[::2], SHARES[1::2]
+    groups = ((odd, even), (even, odd))
+    return tuple(  # type: ignore[return-value]
+        tuple(
+            sign * share * omega_max_rad_s for sign, shares in zip((1.0, -1.0), group, strict=True) for share in shares
+        )
+        for group in groups
+    )
 
 
-def hold_speeds(drive: Drive, plan: SpeedPlan) -> tuple[Trace, list[Trace]]:
+Rows = list[dict[str, float]]
+
+
+def hold_speeds(drive: Drive, plan: SpeedPlan) -> tuple[Rows, list[Trace]]:
     """Hold the speeds and return one row of means for each, and the current waveforms.
 
     The drive is enabled on entry with a speed controller that holds the machine; it is asked for standstill on return.
     """
-    rows = []
+    rows: Rows = []
     waves = []
-    times = []
-    elapsed = 0.0
     for speed in plan.speeds_rad_s:
         drive.command_speed(speed)
-        elapsed += reach(drive, speed * plan.pole_pairs)
+        reach(drive, speed * plan.pole_pairs)
         drive.wait(plan.settle_s)
         half = _half_window(drive, plan, speed)
         first, second = (drive.average(MEANS, half) for _ in range(2))
-        elapsed += plan.settle_s
-        times.append(elapsed)
-        elapsed += 2 * half * drive.period_s
         row = {name: 0.5 * (first[name] + second[name]) for name in MEANS if name != "flags"}
         for name in ("i_d", "i_q"):
             row[f"{name}_first_a"], row[f"{name}_second_a"] = first[f"{name}_a"], second[f"{name}_a"]
@@ -84,7 +89,12 @@ def hold_speeds(drive: Drive, plan: SpeedPlan) -> tuple[Trace, list[Trace]]:
         if plan.wave_samples:
             waves.append(readable(drive.record(WAVES, plan.wave_samples)))
     drive.command_speed(0.0)
-    return table(rows, times, pole_pairs=plan.pole_pairs, speeds_rad_s=list(plan.speeds_rad_s)), waves
+    return rows, waves
+
+
+def speeds_trace(rows: Rows, pole_pairs: int) -> Trace:
+    """Return the rows of all groups as one trace; its time base counts them."""
+    return table(rows, [float(k) for k in range(len(rows))], pole_pairs=pole_pairs)
 
 
 def reach(drive: Drive, omega_e_rad_s: float, *, limit_s: float = REACH_LIMIT_S) -> float:

@@ -39,6 +39,7 @@ PUSH_SHARES = (0.25, 0.5)
 PUSH_SPEED_SHARE = 0.12
 PUSH_SAMPLES = 1024
 SPEED_LOOP_RAD_S = 25.0
+RUN_I_D_SHARE = 0.25
 EMF_SHARE = 0.85
 """Largest speed of the flux run: back-emf of this share of the largest voltage."""
 
@@ -277,8 +278,7 @@ class Measurement:
             raise LimitExceeded("speed", 0.0, largest, "rad/s")
         tau = 0.5 * 1.5 * pole_pairs * psi * limits.I_test_apk
         slope = tau / J
-        self.drive.disable()
-        self.drive.write(
+        self._off_and_write(
             {
                 "motor.psi_f_wb": psi,
                 "motor.J_kgm2": J,
@@ -289,10 +289,24 @@ class Measurement:
                 "speed.acceleration_rpm_per_s": slope * 30.0 / math.pi,
             }
         )
-        self.drive.enable()
-        plan = speed_run.SpeedPlan(speed_run.speeds_of(largest / max(speed_run.SHARES)), pole_pairs)
-        self.say(f"psi_f and fine offset: {len(plan.speeds_rad_s)} speeds up to {largest * 30 / math.pi:.0f} rpm")
-        speeds, waves = speed_run.hold_speeds(self.drive, plan)
-        self.keep("speeds", speeds)
-        for k, wave in enumerate(waves):
-            self.keep(f"wave_{k}", wave)
+        groups = speed_run.speeds_of(largest / max(speed_run.SHARES))
+        rows: speed_run.Rows = []
+        for sign, speeds in zip((1.0, -1.0), groups, strict=True):
+            # i_d keeps the phase currents away from zero, where the inverter's error is not known well; the two signs
+            # cancel its flux
+            i_d = sign * RUN_I_D_SHARE * limits.I_test_apk
+            self._off_and_write({"field_weakening.i_d_lm_a": i_d})
+            self.drive.enable()
+            self.say(
+                f"psi_f and fine offset: {len(speeds)} speeds up to {largest * 30 / math.pi:.0f} rpm, i_d {i_d:.3g} A"
+            )
+            more, waves = speed_run.hold_speeds(self.drive, speed_run.SpeedPlan(speeds, pole_pairs))
+            for wave in waves:
+                self.keep(f"wave_{len(rows)}", wave)
+                rows.append(more.pop(0))
+            speed_run.reach(self.drive, 0.0, limit_s=1.0)
+        self.keep("speeds", speed_run.speeds_trace(rows, pole_pairs))
+
+    def _off_and_write(self, values: Mapping[str, float]) -> None:
+        self.drive.disable()
+        self.drive.write(values)
