@@ -74,8 +74,7 @@ def interrupt(wanted: ParameterSet, root: Path, at: int, how: How, *, finish: Li
     rig.bench.line.deliver = deliver  # type: ignore[method-assign]
     if how == "killed":
         del rig.bench.bus.send
-    if not rig.bench.node.powered:
-        rig.bench.node.power_on()
+    rig.bench.node.power_on()
     rig.bench.wait(2.0)  # a store that was under way ends, a node that booted is up
     assert_whole(rig.bench.node.session, old, new)
     rig.bench.bus.clock.wait(0.1)
