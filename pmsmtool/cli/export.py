@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import FILE, NODE, examples, text_options
 from pmsmtool.cli.output import Output
 from pmsmtool.cli.output_file import write_file
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
 _SOURCE = click.argument("design", type=click.Path(path_type=Path))
 _OUTPUT = click.option("-o", "--output", "path", type=FILE, help="File to write.  [default: standard output]")
-_MAP = click.option("--drive-map", "map_path", type=FILE, help="Map of the drive's objects.  [default: the reference]")
 _PREFIX = click.option("--prefix", default="pmsm", help="C identifier in front of every name.")
 
 
@@ -50,18 +50,6 @@ def _written(command: Callable[..., bytes | str]) -> Callable[..., None]:
     return write
 
 
-def _drive_map(path: Path | None) -> DriveMap:
-    from pmsmtool.errors import ConfigError
-    from pmsmtool.firmware.drive_map import parse_drive_map, reference_map
-
-    if path is None:
-        return reference_map()
-    try:
-        return parse_drive_map(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read: {error}", where=str(path)) from None
-
-
 def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
     """Read the set and say what the drive has no object for."""
     from pmsmtool.workflow.parameter_source import load_parameters
@@ -77,24 +65,24 @@ def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
     "dcf",
     epilog=examples(
         "pmsmtool export dcf design.toml --node 5 -o drive5.dcf",
-        "pmsmtool export dcf design.toml --into vendor.eds --drive-map vendor-map.toml -o drive.dcf",
+        "pmsmtool export dcf design.toml --into vendor.eds --map vendor-map.toml -o drive.dcf",
     ),
 )
 @_SOURCE
 @click.option("--into", type=FILE, help="EDS or DCF to lay the values into; its other bytes are kept.")
 @click.option("-n", "--node", "node_id", type=NODE, default=1, help="Node id for a file that names none.")
-@_MAP
+@map_option
 @_OUTPUT
 @text_options
 @_written
-def dcf_command(design: Path, into: Path | None, node_id: int, map_path: Path | None, out: Output) -> bytes:
+def dcf_command(design: Path, into: Path | None, node_id: int, map_file: Path | None, out: Output) -> bytes:
     """Write a device configuration file (CiA 306)."""
     from pmsmtool.errors import ConfigError
     from pmsmtool.workflow.export import dcf_file
 
-    drive_map = _drive_map(map_path)
-    if into is None and map_path is not None:
-        raise click.UsageError("--drive-map needs --into: the data sheet of that drive")
+    drive_map = read_map(map_file)
+    if into is None and map_file is not None:
+        raise click.UsageError("--map needs --into: the data sheet of that drive")
     try:
         base = None if into is None else into.read_bytes()
     except OSError as error:
@@ -105,18 +93,18 @@ def dcf_command(design: Path, into: Path | None, node_id: int, map_path: Path | 
 
 @export_command.command("cdcf", epilog=examples("pmsmtool export cdcf design.toml -o drive.cdcf"))
 @_SOURCE
-@_MAP
+@map_option
 @_OUTPUT
 @text_options
 @_written
-def cdcf_command(design: Path, map_path: Path | None, out: Output) -> bytes:
+def cdcf_command(design: Path, map_file: Path | None, out: Output) -> bytes:
     """Write a concise DCF (CiA 302-2): what a CANopen manager sends at boot-up.
 
     A complete set is framed by the staging commands of the drive, which then takes it as a whole.
     """
     from pmsmtool.workflow.export import concise_dcf
 
-    drive_map = _drive_map(map_path)
+    drive_map = read_map(map_file)
     return concise_dcf(_parameters(design, drive_map, out), drive_map=drive_map)
 
 
@@ -169,15 +157,15 @@ def c_command(design: Path, prefix: str, folder: Path, out: Output) -> None:
 
 @export_command.command("csv", epilog=examples("pmsmtool export csv design.toml -o parameters.csv"))
 @_SOURCE
-@_MAP
+@map_option
 @_OUTPUT
 @text_options
 @_written
-def csv_command(design: Path, map_path: Path | None, out: Output) -> str:
+def csv_command(design: Path, map_file: Path | None, out: Output) -> str:
     """Write a table: value asked for and held, unit, object, type, bytes, meaning."""
     from pmsmtool.workflow.export import csv_text
 
-    drive_map = _drive_map(map_path)
+    drive_map = read_map(map_file)
     return csv_text(_parameters(design, drive_map, out), drive_map=drive_map)
 
 

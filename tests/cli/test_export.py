@@ -151,7 +151,7 @@ def test_csv_through_another_drives_map(folder: Path, tmp_path: Path) -> None:
         ),
     }
     (tmp_path / "map.toml").write_text(dump_drive_map(DriveMap("other", 1, 2, cells)))
-    outcome = CliRunner().invoke(cli, ["export", "csv", str(folder), "--drive-map", str(tmp_path / "map.toml")])
+    outcome = CliRunner().invoke(cli, ["export", "csv", str(folder), "--map", str(tmp_path / "map.toml")])
     assert outcome.exit_code == 0
     rows = {row["name"]: row for row in csv.DictReader(io.StringIO(outcome.stdout))}
     K_p, K_i = (float(rows[name]["value"]) for name in cells)
@@ -180,7 +180,7 @@ BAD = {
     "out of bounds": (["dcf", "bounds.toml", "-o", "out"], "outside"),
     "incomplete for C": (["header", "gain.toml", "-o", "out"], "missing"),
     "prefix": (["header", "params.toml", "--prefix", "2x", "-o", "out"], "prefix"),
-    "map without sheet": (["dcf", "params.toml", "--drive-map", "map.toml"], "needs --into"),
+    "map without sheet": (["dcf", "params.toml", "--map", "map.toml"], "needs --into"),
     "no folder": (["csv", "params.toml", "-o", "nowhere/out"], "cannot be written"),
     "a file in the way": (["c", "params.toml", "-o", "params.toml/c"], "cannot be written"),
 }
