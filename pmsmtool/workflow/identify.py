@@ -1,0 +1,313 @@
+"""Identify the machine on a drive: envelope and consent, the experiments, and the machine file from their traces.
+
+What the estimates are is decided from the stored traces alone (``evaluate``), so that :func:`replay` gives the same
+bytes years later. Nothing is stored in the drive.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft
+from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.port import Drive
+from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.estimators.estimate import SensorTolerance, Verdict, coverage_factor, total_half_width
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.parameters import (
+    EncoderParameters,
+    Estimate,
+    InverterParameters,
+    MachineLimits,
+    MachineParameters,
+)
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import read_trace, trace_npz
+from pmsmtool.units import format_estimate
+from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
+from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Limits, Measurement
+from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
+
+MACHINE = "machine.toml"
+NAMEPLATE = "nameplate.toml"
+
+LIMIT: Mapping[str, float] = {"R_s_ohm": 0.03, "L_d_h": 0.05, "L_q_h": 0.05, "psi_f_wb": 0.03, "J_kgm2": 0.10}
+"""Largest relative 95 % total half width of an accepted value; measured with 1 % sensors: 1.7, 1.4, 1.4, 1.1, 3 %."""
+OFFSET_LIMIT_RAD = math.radians(1.0)
+"""Largest 95 % half width of the encoder offset (electrical)."""
+ENERGY_ROOM = 3.0
+"""The energy budget of the envelope over what the plan predicts."""
+ELECTRICAL = ("R", "L", "psi", "encoder", "poles", "inverter", "mechanics")
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifyRequest:
+    """What is asked, and what the machine may do meanwhile; None leaves the choice to the drive's own ratings.
+
+    Attributes
+    ----------
+    quantities : tuple of str
+        Out of ``R L psi encoder poles inverter mechanics``.
+    i_max_apk, speed_max_rad_s : float or None
+        Envelope (A peak, rad/s mechanical).
+    shaft, load, brake : str
+        What hangs on the shaft and may happen to it.
+    tolerance : SensorTolerance
+        Declared sensor tolerances.
+    """
+
+    quantities: tuple[str, ...] = QUANTITIES
+    i_max_apk: float | None = None
+    speed_max_rad_s: float | None = None
+    shaft: Shaft = "free"
+    load: Load = "none"
+    brake: Brake = "none"
+    tolerance: SensorTolerance = field(default_factory=SensorTolerance)
+
+    def check(self) -> None:
+        """Refuse what cannot be asked.
+
+        Raises
+        ------
+        ConfigError
+            An unknown quantity.
+        NotAvailable
+            A quantity that needs a turning shaft, on a shaft that must not turn.
+        """
+        unknown = [name for name in self.quantities if name not in NEEDS]
+        if unknown or not self.quantities:
+            raise ConfigError(
+                f"cannot identify {', '.join(unknown) or 'nothing'}", hint=f"choose from {', '.join(NEEDS)}, or all"
+            )
+        turning = [name for name in self.quantities if set(NEEDS[name]) & {"rotation", "speeds"}]
+        if turning and self.shaft == "locked":
+            raise NotAvailable(
+                f"{', '.join(turning)} cannot be identified on a locked shaft: the rotor must turn",
+                hint="free the shaft, or identify R and inverter only",
+            )
+
+
+def nameplate_of(drive: Drive, name: str) -> MachineFile:
+    """Return the machine file of a drive before anything is identified: its ratings, and what its set says so far."""
+
+    def read(parameter: str) -> float:
+        return drive.read(parameter)
+
+    machine = MachineParameters(
+        pole_pairs=round(read("motor.pole_pairs")),
+        R_s_ohm=read("motor.R_s_ohm"),
+        L_d_h=read("motor.L_d_h"),
+        L_q_h=read("motor.L_q_h"),
+        psi_f_wb=read("motor.psi_f_wb"),
+        I_nom_apk=read("motor.I_nom_apk"),
+        I_max_apk=read("motor.I_max_apk"),
+        I_max_time_s=read("motor.I_max_time_s"),
+        n_max_rpm=read("motor.n_max_rpm"),
+        T_ref_c=read("motor.T_ref_c"),
+    )
+    inverter = InverterParameters(
+        U_dc_v=read("inverter.U_dc_nom_v"),
+        f_s_hz=1e9 / read("inverter.T_s_ns"),
+        dead_time_s=1e-9 * read("inverter.dead_time_ns"),
+        delay_periods=read("inverter.delay_periods"),
+        voltage_utilisation=read("inverter.voltage_utilisation"),
+    )
+    limits = MachineLimits(
+        i_d_min_apk=read("field_weakening.i_d_min_a"),
+        i_trip_apk=read("protection.i_trip_apk"),
+        I_cont_apk=read("protection.I_cont_apk"),
+        U_dc_min_v=read("protection.U_dc_min_v"),
+        U_dc_max_v=read("protection.U_dc_max_v"),
+        n_trip_rpm=read("protection.n_trip_rpm"),
+        T_winding_max_c=read("protection.T_winding_max_c"),
+    )
+    return MachineFile(
+        name,
+        machine,
+        inverter,
+        encoder=EncoderParameters(),
+        limits=limits,
+        provenance={"source": "parameter set and ratings of the drive; what was identified stands in [estimate]"},
+    )
+
+
+def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
+    """Return the motion envelope: what the request says, else the drive's ratings.
+
+    Raises
+    ------
+    ConfigError
+        The nameplate has no rated current or speed, and none was given.
+    """
+    machine = nameplate.machine
+    if machine.I_nom_apk is None or machine.n_max_rpm is None:
+        raise ConfigError("rated current and largest speed must be known", hint="give --i-max and --speed-max")
+    i_max = 1.2 * machine.I_nom_apk if request.i_max_apk is None else request.i_max_apk
+    speed = machine.n_max_rpm * math.pi / 30.0 if request.speed_max_rad_s is None else request.speed_max_rad_s
+    return Envelope(
+        i_max_apk=i_max,
+        speed_max_rad_s=speed,
+        duration_s=300.0,
+        shaft=request.shaft,
+        load=request.load,
+        brake=request.brake,
+    )
+
+
+def plan_lines(envelope: Envelope, request: IdentifyRequest) -> list[str]:
+    """Return what a person reads before consenting: the envelope and what will happen inside it."""
+    steps = {step for quantity in request.quantities for step in NEEDS[quantity]}
+    lines = [*envelope.lines(), "the rotor aligns with current vectors: it may jump by half an electrical turn"]
+    if "rotation" in steps:
+        lines.append("the shaft turns slowly through one turn each way")
+    if "speeds" in steps:
+        lines.append("the shaft is pushed both ways and runs at eight steady speeds, both directions")
+    lines.append("nothing is stored in the drive; every changed object is restored")
+    return lines
+
+
+def identify_stage(
+    run: RunDirectory,
+    drive: CanopenDrive,
+    nameplate: MachineFile,
+    request: IdentifyRequest,
+    allow_motion: Callable[[Sequence[str]], None],
+    say: Callable[[str], None],
+) -> Stage:
+    """Run the experiments and write ``machine.toml`` and the traces.
+
+    Raises
+    ------
+    Declined
+        The person did not consent; nothing was moved.
+    IdentificationError
+        A trap was seen; no number is given.
+    StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
+        As the guard ends the experiment.
+    """
+    request.check()
+    envelope = envelope_of(nameplate, request)
+    envelope.refuse_gravity()
+    allow_motion(plan_lines(envelope, request))
+    run.save(NAMEPLATE, dump_machine_file(nameplate))
+    limits = Limits(
+        I_nom_apk=nameplate.machine.I_nom_apk or envelope.i_max_apk,
+        i_max_apk=envelope.i_max_apk,
+        omega_max_rad_s=envelope.speed_max_rad_s,
+        V_max_v=nameplate.inverter.V_max_v,
+    )
+
+    def keep(name: str, trace: Trace) -> None:
+        run.save(f"traces/{name}.npz", trace_npz(trace))
+
+    clock = drive.node.connection.clock
+    start = clock.now()
+    with guarded(drive, envelope, say=say) as guard:
+        Measurement(guard, limits, keep, say).run(request.quantities)
+    stage = evaluated_stage(run, nameplate, request)
+    return replace(stage, seconds=clock.now() - start)
+
+
+def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: IdentifyRequest) -> Stage:
+    """Estimate from the stored traces, write ``machine.toml``, and judge every value.
+
+    Raises
+    ------
+    IdentificationError
+        A trap was seen; no machine file is written.
+    """
+    traces = stored_traces(run)
+    evaluation = evaluate(
+        traces, nameplate.inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, tolerance=request.tolerance
+    )
+    machine = machine_of(evaluation, nameplate, _conditions(evaluation, request))
+    run.save(MACHINE, dump_machine_file(machine))
+    found = evaluation.estimates()
+    acceptance = [_accepted(name, estimate) for name, estimate in found.items() if _limit(name) is not None]
+    return Stage(
+        "identify",
+        "pass" if all(line.ok for line in acceptance) else "fail",
+        0.0,
+        values=[_value(name, estimate) for name, estimate in found.items()],
+        acceptance=acceptance,
+        fallbacks=[f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback],
+        files={MACHINE: "", NAMEPLATE: "", **{f"traces/{name}.npz": "" for name in traces}},
+        note="; ".join(warnings_of(evaluation)),
+        summary=", ".join(
+            f"{name} {format_estimate(found[name].value, total_half_width(found[name]), found[name].unit)}"
+            for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
+            if name in found
+        ),
+    )
+
+
+def replay(run: RunDirectory, request: IdentifyRequest) -> Stage:
+    """Recompute every estimate of a run from its traces.
+
+    Raises
+    ------
+    ConfigError
+        The run has no nameplate or no traces.
+    IdentificationError
+        A trap is seen in the traces.
+    """
+    path = run.path / NAMEPLATE
+    if not path.is_file():
+        raise ConfigError("the run has no nameplate.toml", where=str(run.path), hint="it is not a run of identify")
+    return evaluated_stage(run, load_machine_file(path), request)
+
+
+def stored_traces(run: RunDirectory) -> dict[str, Trace]:
+    """Return the traces of a run by name."""
+    return {path.stem: read_trace(path) for path in sorted((run.path / "traces").glob("*.npz"))}
+
+
+def warnings_of(evaluation: Evaluation) -> list[str]:
+    """Return what a reader should know about a result that was accepted all the same."""
+    lines = []
+    if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
+        lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
+    inductance = evaluation.inductance
+    if inductance is not None and inductance.verdict is Verdict.WARN:
+        dependent = ", ".join(inductance.frequency_dependent)
+        lines.append(f"L: {'depends on frequency on ' + dependent if dependent else 'chi-square above its limit'}")
+    return lines
+
+
+def _conditions(evaluation: Evaluation, request: IdentifyRequest) -> dict[str, Any]:
+    conditions: dict[str, Any] = {
+        "shaft": request.shaft,
+        "current_gain_tolerance": request.tolerance.current_gain,
+        "voltage_gain_tolerance": request.tolerance.voltage_gain,
+        "noise_apk": evaluation.noise.sigma_a,
+    }
+    if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
+        conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
+    return conditions
+
+
+def _value(name: str, estimate: Estimate) -> dict[str, Any]:
+    facts = {key: getattr(estimate, key) for key in ("value", "std", "systematic", "unit", "n", "method", "source")}
+    for key in ("chi2", "T_c", "i_d_apk", "i_q_apk"):
+        number = getattr(estimate, key)
+        facts[key] = number if math.isfinite(number) else None
+    return {"name": name, **facts, "coverage_factor": coverage_factor(estimate.dof)}
+
+
+def _limit(name: str) -> float | None:
+    return OFFSET_LIMIT_RAD if name == "offset_rad" else LIMIT.get(name)
+
+
+def _accepted(name: str, estimate: Estimate) -> Acceptance:
+    limit = _limit(name)
+    assert limit is not None
+    half = total_half_width(estimate)
+    what = f"{name}: total 95 % interval"
+    if name == "offset_rad":
+        return Acceptance(what, f"{math.degrees(half):.3g} deg", f"{math.degrees(limit):.3g} deg", half <= limit)
+    relative = half / abs(estimate.value)
+    return Acceptance(what, f"{100.0 * relative:.2g} %", f"{100.0 * limit:.2g} %", relative <= limit)
