@@ -48,6 +48,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("monitor", "pmsmtool.cli.monitor:monitor_command", Section.LOOK, "Show live values."),
     Row("fault", "pmsmtool.cli.fault:fault_command", Section.LOOK, "Show or reset faults."),
     Row("stop", "pmsmtool.cli.stop:stop_command", Section.MOVE, "Stop a drive, confirmed."),
+    Row("identify", "pmsmtool.cli.identify:identify_command", Section.MOVE, "Measure the machine on its drive."),
     Row("jog", "pmsmtool.cli.jog:jog_command", Section.MOVE, "Move shortly, within limits."),
     Row("param", "pmsmtool.cli.param:param_command", Section.WRITE, "Read, write, compare parameters."),
     Row("flash-params", "pmsmtool.cli.flash_params:flash_params_command", Section.WRITE, "Write and store a set."),

@@ -1,0 +1,138 @@
+"""``pmsmtool identify``: measure the machine on its drive, or recompute a run from its traces."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
+from pmsmtool.cli.output import Output
+
+if TYPE_CHECKING:
+    from pmsmtool.workflow.identify import IdentifyRequest
+    from pmsmtool.workflow.run_directory import RunDirectory, Stage
+
+FOLDER = click.Path(file_okay=False, path_type=Path)
+
+
+@click.command(
+    "identify",
+    epilog=examples(
+        "pmsmtool --sim interior-2k2 --yes identify",
+        "pmsmtool -i socketcan -c can0 -n 5 identify R L --i-max 6Apk",
+        "pmsmtool identify --replay runs/20260101T120000Z-000055f1",
+    ),
+)
+@click.argument("quantities", nargs=-1, metavar="[R|L|psi|encoder|poles|inverter|mechanics|all]...")
+@click.option("--method", type=click.Choice(["auto", "inject"]), default="auto", help="How: by injection and trace.")
+@click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="Recompute from the traces of a run; moves nothing.")
+@click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
+@click.option("--sensor-tol", type=click.FloatRange(0.0, 0.2), default=0.01, help="95 % tolerance of sensor gains.")
+@bus_options
+@motion_options
+@output_options
+def identify_command(
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    quantities: tuple[str, ...],
+    method: str,
+    replay: Path | None,
+    runs: Path,
+    sensor_tol: float,
+) -> None:
+    """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
+
+    The limits are printed and consent is asked before anything moves. Every number comes with its statistical and its
+    systematic part; what cannot be trusted is refused by name. The run directory keeps raw traces and machine.toml;
+    nothing is stored in the drive.
+    """
+    from pmsmtool.estimators.estimate import SensorTolerance
+    from pmsmtool.workflow.identify import IdentifyRequest
+    from pmsmtool.workflow.measure import QUANTITIES
+
+    chosen = QUANTITIES if not quantities or "all" in quantities else quantities
+    request = IdentifyRequest(
+        quantities=tuple(chosen),
+        i_max_apk=motion.i_max_apk,
+        speed_max_rad_s=motion.speed_max_rad_s,
+        shaft=motion.shaft or "free",
+        load=motion.load,
+        brake=motion.brake,
+        tolerance=SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol),
+    )
+    request.check()
+    if replay is not None:
+        from pmsmtool.workflow.identify import replay as recompute
+        from pmsmtool.workflow.run_directory import RunDirectory
+
+        run = RunDirectory(replay)
+        run.read()
+        _show(run, recompute(run, request), out)
+        return
+    run, stage = _measure(bus, motion, out, request, runs)
+    _show(run, stage, out)
+
+
+def _measure(
+    bus: BusOptions, motion: MotionOptions, out: Output, request: IdentifyRequest, runs: Path
+) -> tuple[RunDirectory, Stage]:
+    from dataclasses import asdict
+
+    from pmsmtool import __version__
+    from pmsmtool.cli.consent import Consent, ask_motion
+    from pmsmtool.cli.drive_access import open_drive
+    from pmsmtool.workflow.identify import identify_stage, nameplate_of
+    from pmsmtool.workflow.run_directory import RunDirectory, new_record
+
+    consents: list[Consent] = []
+    with open_drive(bus) as drive:
+        identity = drive.identity
+
+        def allow(lines: Any) -> None:
+            consents.append(ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out))
+
+        record = new_record(
+            ["pmsmtool", *sys.argv[1:]],
+            drive=asdict(identity),
+            bus={"interface": bus.interface, "channel": bus.channel, "node": identity.node},
+            versions={"pmsmtool": __version__},
+        )
+        nameplate = nameplate_of(drive, identity.name or f"drive {identity.serial:#010x}")
+        run = RunDirectory.create(runs, identity.serial, record)
+        stage = identify_stage(run, drive, nameplate, request, allow, out.note)
+    run.add(stage)
+    return run, stage
+
+
+def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
+    from pmsmtool.cli.output import table
+    from pmsmtool.errors import IdentificationError
+    from pmsmtool.report.report import total_interval
+    from pmsmtool.units import format_estimate, format_quantity
+
+    rows = []
+    for value in stage.values:
+        total = total_interval(value["std"], value["systematic"], value["coverage_factor"])
+        rows.append(
+            (
+                value["name"],
+                format_estimate(value["value"], total, value["unit"]),
+                format_quantity(value["coverage_factor"] * value["std"], value["unit"], 2),
+                format_quantity(value["systematic"], value["unit"], 2),
+                "" if value["T_c"] is None else f"{value['T_c']:.1f} degC",
+                value["method"],
+            )
+        )
+    heads = ("quantity", "value, total 95 %", "statistical", "systematic", "at", "method")
+    data = {"run": str(run.path), "values": list(stage.values), "status": stage.status, "warnings": stage.note}
+    out.result("identify", data, table(heads, rows))
+    for line in (*stage.fallbacks, *([stage.note] if stage.note else [])):
+        out.warn(line)
+    out.note(f"-> {run.path / 'machine.toml'}")
+    if stage.status != "pass":
+        broken = [f"{line.what}: {line.measured}, limit {line.limit}" for line in stage.acceptance if not line.ok]
+        raise IdentificationError("E_NOT_ACCEPTED", "; ".join(broken), where=str(run.path))
