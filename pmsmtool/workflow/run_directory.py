@@ -172,12 +172,13 @@ class RunDirectory:
     def save(self, name: str, content: bytes | str) -> None:
         """Put a file into the run, in one step; raises ``ConfigError`` when it cannot be written."""
         data = content.encode() if isinstance(content, str) else content
-        part = self.path / f".{name}.part"
+        target = self.path / name
+        part = target.with_name(f".{target.name}.part")
         try:
             part.write_bytes(data)
-            os.replace(part, self.path / name)
+            os.replace(part, target)
         except OSError as error:
-            raise _unwritable(self.path / name, error) from error
+            raise _unwritable(target, error) from error
 
     def add(self, stage: Stage) -> None:
         """Append a stage to the record, with the hashes of the files it names."""
