@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmsmtool.firmware.core_binding import core, params_values
+from pmsmtool.firmware.drive_map import reference_map
 from pmsmtool.firmware.image import (
     SCALAR_BYTES,
     SCALAR_WORDS,
@@ -26,26 +27,29 @@ from pmsmtool.firmware.image import (
     unpack_image,
 )
 from pmsmtool.firmware.params_header import CORE_DIRECTORY, c_float, generated_files
-from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, Parameter, layout_signature
+from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, SCHEMA_VERSION, Parameter, layout_signature
+from pmsmtool.sim.node.parameter_set import ParameterImage
 
 DEFAULTS = {row.name: row.default for row in CATALOGUE}
+CELLS = reference_map().cells
+"""What the tool writes to the objects of the reference drive."""
 RANDOM_SETS = 10_000
 
 
-def random_value(row: Parameter, rng: np.random.Generator) -> float:
+def random_value(row: Parameter, choice: int, share: float) -> float:
     """A value anywhere inside the bounds, with the bounds themselves well represented."""
-    choice = rng.integers(8)
     if choice < 2:
         return (row.minimum, row.maximum)[choice]
     if row.is_integer:
-        return int(rng.integers(int(row.minimum), int(row.maximum) + 1))
+        return int(row.minimum) + int(share * (int(row.maximum) - int(row.minimum) + 1))
     if row.minimum > 0 and choice < 5:
-        return float(math.exp(rng.uniform(math.log(row.minimum), math.log(row.maximum))))
-    return float(rng.uniform(row.minimum, row.maximum))
+        return float(row.minimum * (row.maximum / row.minimum) ** share)
+    return float(row.minimum + share * (row.maximum - row.minimum))
 
 
 def random_values(rng: np.random.Generator) -> dict[str, float]:
-    values = {row.name: random_value(row, rng) for row in CATALOGUE}
+    choices, shares = rng.integers(8, size=len(CATALOGUE)).tolist(), rng.random(len(CATALOGUE)).tolist()
+    values = {row.name: random_value(row, *drawn) for row, *drawn in zip(CATALOGUE, choices, shares, strict=True)}
     values |= {"lut.format": int(rng.integers(3)), "lut.n_x": int(rng.integers(2, 6)),
                "lut.n_y": int(rng.integers(2, 6)), "lut.n_z": int(rng.integers(1, 4))}
     return values
@@ -98,13 +102,26 @@ def test_struct_is_the_catalogue_in_order() -> None:
     assert ctypes.sizeof(params) == SCALAR_BYTES == 4 * SCALAR_WORDS
 
 
-def test_c_and_python_give_the_same_image_for_random_sets() -> None:
+def object_image(node: ParameterImage, values: dict[str, float], lut: bytes) -> bytes:
+    """The image as the drive holds it after every object was written, each with the bytes the tool sends."""
+    for name, cell in CELLS.items():
+        node.set_wire(BY_NAME[name], cell.encode(values[name], values))
+    position = 0
+    for key, (_, padded) in node.part_sizes().items():
+        node.parts[key] = lut[position : position + padded]
+        position += padded
+    return node.pack()
+
+
+def test_c_python_and_objects_give_the_same_image_for_random_sets() -> None:
     rng = np.random.default_rng(2026)
+    node = ParameterImage.of_values({})
     for _ in range(RANDOM_SETS):
         values = random_values(rng)
         lut = random_lut(values, rng)
         image = pack_image(values, lut)
         assert c_image(values, lut) == image
+        assert object_image(node, values, lut) == image
         assert core().library.pmsm_image_crc32(image, len(image)) == crc32(image)
         back, back_lut = unpack_image(image)
         assert back_lut == lut
