@@ -23,6 +23,8 @@ MEANS = ("u_d_v", "i_d_a", "u_q_v", "i_q_a", "T_winding_c")
 
 REST_RAD = 2e-3
 """Motion of the shaft (mechanical) between two looks that still counts as rest."""
+TRIES = 4
+"""Windows taken at one level until the shaft did not move in one; the last stands as it is."""
 LOOK_S = 0.03
 ARRIVED = 0.02
 """Distance of the mean current from its set-point, relative, that counts as arrived."""
@@ -103,16 +105,21 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
     """
     names = (*MEANS, "theta_m_rad", "flags")
     half = max(1, plan.window_periods // 2)
-    rows = []
-    times = []
+    rows: list[dict[str, float]] = []
+    times: list[float] = []
     elapsed = 0.0
     for level in plan.levels_a:
         drive.command_current(level, 0.0, fixed_angle_rad=plan.angle_rad)
         drive.wait(plan.settle_s)
-        elapsed += plan.settle_s + settle(drive, level)
-        first, second = (drive.average(names, half) for _ in range(2))
-        times.append(elapsed)
-        elapsed += 2 * half * drive.period_s
+        elapsed += plan.settle_s
+        for _ in range(TRIES):
+            elapsed += settle(drive, level)
+            first, second = (drive.average(names, half) for _ in range(2))
+            times[len(rows) :] = [elapsed]
+            elapsed += 2 * half * drive.period_s
+            # a rotor that creeps out of an unstable position looks at rest just before it jumps
+            if abs(second["theta_m_rad"] - first["theta_m_rad"]) < REST_RAD:
+                break
         row = {name: 0.5 * (first[name] + second[name]) for name in MEANS}
         for name, unit in (("u_d", "v"), ("i_d", "a")):
             row[f"{name}_first_{unit}"] = first[f"{name}_{unit}"]

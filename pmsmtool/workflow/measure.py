@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pmsmtool.design.current_loop import imc
 from pmsmtool.drive.port import Drive
-from pmsmtool.errors import LimitExceeded
+from pmsmtool.errors import IdentificationError, LimitExceeded
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import check_phases
@@ -27,8 +27,13 @@ PHASE_CHECK_SHARE = 0.05
 LEVELS = 12
 LOWEST_LEVEL = 0.08
 """Lowest DC level, of the largest; the low ones serve the inverter curve."""
-ROTATION_SHARE = 0.7
+ROTATION_SHARES = (0.35, 0.18, 0.09)
+"""Above psi/(L_q - L_d) a d current is no stable position: a reluctance machine follows a smaller vector only."""
+OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 BIAS_SHARE = 0.5
+BIAS_TRIES = 4
+BIAS_OFF_RAD = math.radians(12.0)
+"""Angle between rotor and bias vector that a load or friction may make (electrical)."""
 RIPPLE_SHARE = 0.25
 RIPPLE_SHARE_SATURATED = 0.05
 U_SHARE = 0.5
@@ -152,12 +157,19 @@ class Measurement:
         return resistance_of(trace, noise)
 
     def _rotation(self) -> EncoderResult:
-        plan = rotation.RotationPlan(i_a=ROTATION_SHARE * self.limits.I_test_apk)
-        self.say("pole pairs, direction, offset: one slow turn each way")
-        forward, backward = rotation.rotate_vector(self.drive, plan)
-        self.keep("rotation_forward", forward)
-        self.keep("rotation_backward", backward)
-        return estimate_encoder(forward, backward)
+        """Turn the vector; with less current again when the rotor did not stay on it."""
+        for share in ROTATION_SHARES:
+            plan = rotation.RotationPlan(i_a=share * self.limits.I_test_apk)
+            self.say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
+            forward, backward = rotation.rotate_vector(self.drive, plan)
+            self.keep("rotation_forward", forward)
+            self.keep("rotation_backward", backward)
+            try:
+                return estimate_encoder(forward, backward)
+            except IdentificationError as error:
+                if error.reason not in OFF_THE_VECTOR or share == ROTATION_SHARES[-1]:
+                    raise
+        raise AssertionError("the last share returns or raises")
 
     def _square(self, resistance: ResistanceResult, encoder: EncoderResult) -> tuple[float, float]:
         """Record the shots; return rough inductances (H) from ripple and voltage, enough for a current controller."""
@@ -177,8 +189,7 @@ class Measurement:
             ripple_a=self.ripple_share * limits.I_test_apk,
             u_max_v=U_SHARE * limits.V_max_v,
         )
-        self.say(f"L_d, L_q: square wave on {plan.bias_d_a:.3g} A, {plan.ripple_a:.3g} A peak to peak")
-        square_injection.hold_bias(self.drive, plan)
+        plan = self._hold_stable_bias(plan, encoder)
         rough = []
         for axis in ("d", "q"):
             amplitude = square_injection.find_amplitude(self.drive, plan, axis)
@@ -189,6 +200,27 @@ class Measurement:
             rough.append(amplitude * plan.half_periods[-1] * self.drive.period_s / ripple)
         self.drive.command_current(0.0, 0.0, fixed_angle_rad=plan.angle_rad)
         return rough[0], rough[1]
+
+    def _hold_stable_bias(
+        self, plan: square_injection.SquarePlan, encoder: EncoderResult
+    ) -> square_injection.SquarePlan:
+        """Hold the bias, or as much of it as leaves the rotor's d axis on the vector; returns the plan with it."""
+        for _ in range(BIAS_TRIES):
+            self.say(f"L_d, L_q: square wave on {plan.bias_d_a:.3g} A, {plan.ripple_a:.3g} A peak to peak")
+            square_injection.hold_bias(self.drive, plan)
+            periods = max(1, round(0.02 / self.drive.period_s))
+            theta_M = self.drive.average(("theta_m_rad",), periods)["theta_m_rad"]
+            theta_e = encoder.direction * encoder.pole_pairs.value * theta_M - encoder.offset.value
+            ahead = math.remainder(theta_e - plan.angle_rad, 2.0 * math.pi)
+            if abs(ahead) <= BIAS_OFF_RAD + 2.0 * abs(encoder.lag_rad):
+                return plan
+            plan = replace(plan, bias_d_a=0.5 * plan.bias_d_a, ripple_a=0.5 * plan.ripple_a)
+        raise refuse(
+            "E_ROTOR_MOVED",
+            f"the rotor stands {math.degrees(ahead):.3g} deg (electrical) off the bias vector",
+            stage="inductance",
+            likely="a load on the shaft, or a machine with much more reluctance than magnet torque",
+        )
 
     # ---- what turns the shaft ---------------------------------------------------------------------
 
