@@ -11,6 +11,7 @@ import contextlib
 import errno
 import logging
 import queue
+import socket
 import threading
 import time
 from collections import deque
@@ -34,6 +35,7 @@ SEND_PATIENCE_S = 0.5
 _POLL_S = 0.2
 """The reader thread looks this often whether it shall end."""
 _SEND_PAUSE_S = 0.001
+_SERVER_TIMEOUT_S = 3.0
 _RESOLUTION_S = 1e-9  # of the virtual clock; less than that never passes
 _SPIN_LIMIT = 200
 _SPIN_S = 0.001
@@ -378,6 +380,9 @@ def _completed(arguments: dict[str, Any]) -> dict[str, Any]:
         return arguments
     logging.getLogger("can.interfaces.socketcand").setLevel(logging.CRITICAL)
     missing = {key: value for key, value in SOCKETCAND_DEFAULTS.items() if configured.get(key) is None}
+    server = {**configured, **missing}
+    # python-can tries for ten seconds; where nobody listens that is known at once.
+    socket.create_connection((server["host"], int(server["port"])), _SERVER_TIMEOUT_S).close()
     # Without tcp_tune Nagle's algorithm makes block transfers 17 times slower (CANopen reference, section 1).
     return {"tcp_tune": True, **arguments, **missing}
 
