@@ -42,8 +42,13 @@ def start(server: Server, home: Path, *arguments: str) -> subprocess.Popen[str]:
     consent = ["--yes", "--i-max", "1Apk", "--speed-max", "1rpm", "--shaft", "free", "--serial", "22001"]
     return subprocess.Popen(
         [sys.executable, "-m", "pmsmtool", "-n", "1", *arguments, *consent],
-        cwd=home, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL,
-    )  # fmt: skip
+        cwd=home,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 def held(connection: Connection) -> tuple[bytes, int, int]:

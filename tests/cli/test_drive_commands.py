@@ -1,0 +1,325 @@
+"""The commands that look at, move and write a drive, on the simulated one; the table of bad buses and bad drives."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from pmsmtool.cli.main import run
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
+
+ROOT = Path(__file__).resolve().parents[2]
+Result = tuple[int, str, str]
+Tool = Callable[..., Result]
+WANTED = ParameterSet({"motor.R_s_ohm": 0.25, "motor.L_d_h": 0.003, "current.K_p_d_v_per_a": 7.5})
+
+
+@pytest.fixture
+def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Tool:
+    """Run a command line in this process, in an empty folder, on a simulated drive with a memory file there."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(can.util, "VALID_INTERFACES", frozenset({*can.util.VALID_INTERFACES, "pmsmsim"}))
+    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+
+    def call(*arguments: str, channel: str = "interior-2k2?seed=3") -> Result:
+        capsys.readouterr()
+        code = run(["-i", "pmsmsim", "-c", channel, *arguments])
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
+
+    return call
+
+
+def loaded(result: Result) -> dict[str, Any]:
+    code, out, err = result
+    assert code == 0, err
+    found: dict[str, Any] = json.loads(out)
+    return found
+
+
+# ---- looking ----------------------------------------------------------------------------------------------
+
+
+def test_scan_lists_all_nodes(tool: Tool) -> None:
+    found = loaded(tool("scan", "--json", channel="interior-2k2?nodes=3&nv=:memory:"))
+    assert found["schema"] == "pmsmtool.scan/1"
+    assert [(n["node"], n["profile"], n["state"]) for n in found["nodes"]] == [
+        (k, 402, "switch-on-disabled") for k in (1, 2, 3)
+    ]
+    assert len({n["serial"] for n in found["nodes"]}) == 3
+
+
+def test_info(tool: Tool) -> None:
+    found = loaded(tool("info", "--json"))
+    assert found["identity"]["serial"] == 22001 and found["parameter_set"]["known"] is True
+    assert found["parameter_set"]["stored"] is False and found["configured"] is None
+    code, text, _ = tool("info")
+    assert code == 0 and "serial 22001" in text and "SWITCH ON DISABLED" in text
+
+
+def test_the_only_drive_is_found_and_several_must_be_named(tool: Tool) -> None:
+    assert tool("info", channel="interior-2k2?node=42&nv=:memory:")[0] == 0
+    code, _, err = tool("info", channel="interior-2k2?nodes=2&nv=:memory:")
+    assert code == 2 and "1, 2" in err and "-n" in err
+
+
+def test_monitor_counts_and_prints_units(tool: Tool) -> None:
+    code, out, _ = tool("monitor", "--for", "1s", "--rate", "10Hz", "-g", "i_[dq]_a|U_dc", "--csv")
+    rows = out.splitlines()
+    assert code == 0 and rows[0] == "t_s,i_d_a,i_q_a,U_dc_v" and rows[1] == "s,A,A,V" and len(rows) == 12
+    code, out, _ = tool("monitor", "--for", "0.5s", "--json")
+    readings = [json.loads(line) for line in out.splitlines()]
+    assert code == 0 and len(readings) == 3 and readings[0]["values"]["U_dc_v"] == pytest.approx(540.0, rel=0.05)
+
+
+def test_monitor_of_nothing(tool: Tool) -> None:
+    assert tool("monitor", "-g", "nothing")[0] == 9
+    assert tool("monitor", "-g", "(")[0] == 2
+
+
+def test_fault_show_and_reset(tool: Tool, tmp_path: Path) -> None:
+    code, out, _ = tool("fault", "show")
+    assert code == 0 and "no error" in out
+    found = loaded(tool("fault", "reset", "--json"))
+    assert found["state"] == "switch-on-disabled" and found["error_code"] == 0
+
+
+def test_doctor_passes_on_a_good_bus(tool: Tool) -> None:
+    found = loaded(tool("doctor", "--json", channel="interior-2k2?nv=:memory:&bitrate=500000"))
+    assert found["examination"]["error_frames"] == 0
+    assert {verdict for verdict, _ in found["examination"]["findings"]} == {"PASS"}
+    assert any(a["name"] == "virtual" and a["ready"] for a in found["adapters"])
+
+
+def test_doctor_names_the_wrong_bit_rate(tool: Tool) -> None:
+    code, out, err = tool("-b", "250000", "doctor", channel="interior-2k2?nv=:memory:&bitrate=500000")
+    assert code == 3 and "wrong bit rate" in out and "wrong bit rate" in err
+
+
+def test_doctor_finds_the_bit_rate(tool: Tool) -> None:
+    found = loaded(tool("doctor", "--find-bitrate", "--json", channel="interior-2k2?nv=:memory:&bitrate=250000"))
+    good = [rate for rate, counts in found["bitrates"].items() if counts["frames"] and not counts["error_frames"]]
+    assert good == ["250000"]
+
+
+# ---- parameters -------------------------------------------------------------------------------------------
+
+
+def test_param_get_by_name_wildcard_and_object(tool: Tool) -> None:
+    found = loaded(tool("param", "get", "motor.R_*", "0x2010:01", "0x1018:04", "--json"))["parameters"]
+    assert [(p["name"], p["value"]) for p in found[:2]] == [("motor.R_s_ohm", 0.137), ("motor.pole_pairs", 4)]
+    assert bytes.fromhex(found[2]["bytes"]) == (22001).to_bytes(4, "little")
+
+
+def test_param_get_unknown(tool: Tool) -> None:
+    code, _, err = tool("param", "get", "motor.R_s")
+    assert code == 2 and "did you mean motor.R_s_ohm" in err
+
+
+def test_param_set_acts_until_the_reset_and_store_keeps(tool: Tool) -> None:
+    code, out, err = tool("param", "set", "motor.R_s_ohm=0.2", "motor.L_d_h=2.5mH", "--yes", "--store")
+    assert code == 0 and "stored" in out and "0.137" in err
+    found = loaded(tool("param", "get", "motor.R_s_ohm", "motor.L_d_h", "--json"))["parameters"]
+    assert [p["value"] for p in found] == [0.2, 0.0025], "kept by the drive's memory over its power-off"
+    assert tool("param", "set", "motor.R_s_ohm=0.3", "--yes")[0] == 0
+    assert loaded(tool("param", "get", "motor.R_s_ohm", "--json"))["parameters"][0]["value"] == 0.2
+
+
+@pytest.mark.parametrize(
+    ("assignment", "code", "text"),
+    [
+        ("motor.R_s_ohm", 2, "NAME=VALUE"),
+        ("motor.R_s_ohm=abc", 2, "motor.R_s_ohm"),
+        ("motor.R_s_ohm=5mH", 2, "inductance"),
+        ("motor.R_s_ohm=-1", 2, "outside"),
+        ("0x6040:00=6", 2, "map"),
+    ],
+)
+def test_param_set_refuses(tool: Tool, assignment: str, code: int, text: str) -> None:
+    found = tool("param", "set", assignment, "--yes")
+    assert found[0] == code and text in found[2]
+
+
+def test_param_dump_is_what_flash_params_takes(tool: Tool, tmp_path: Path) -> None:
+    code, out, _ = tool("param", "dump", "--all")
+    assert code == 0 and len(parse_parameter_set(out).values) > 80
+    (tmp_path / "all.toml").write_text(out)
+    assert tool("verify", "all.toml")[0] == 0
+    code, out, _ = tool("param", "dump")
+    assert code == 0 and "R_s_ohm" not in out and "I_max_apk" in out
+
+
+def test_param_diff(tool: Tool, tmp_path: Path) -> None:
+    (tmp_path / "wanted.toml").write_text(WANTED.to_toml())
+    found = loaded(tool("param", "diff", "device", "wanted.toml", "--json"))["differences"]
+    assert {d["name"]: d["new"] for d in found} == WANTED.values
+    assert tool("param", "diff", "device", "wanted.toml", "--check")[0] == 1
+    assert tool("param", "diff", "wanted.toml", "wanted.toml", "--check")[0] == 0
+
+
+def test_param_help(tool: Tool, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["param", "help", "governor.*"]) == 0
+    assert "horizon in T_s" in capsys.readouterr().out
+
+
+# ---- writing ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def wanted(tmp_path: Path) -> str:
+    (tmp_path / "wanted.toml").write_text(WANTED.to_toml())
+    return "wanted.toml"
+
+
+def test_flash_verify_backup_restore(tool: Tool, wanted: str, tmp_path: Path) -> None:
+    assert tool("backup", "-o", "before.json")[0] == 0
+    dry = loaded(tool("flash-params", wanted, "--dry-run", "--json"))
+    assert {c["name"]: c["wanted"] for c in dry["changes"]} == WANTED.values
+    assert tool("flash-params", wanted, "--check")[0] == 1
+    done = loaded(tool("flash-params", wanted, "--yes", "--json"))
+    assert done["outcome"]["written"] == 3 and done["outcome"]["stored"] is True
+    code, out, _ = tool("verify", wanted)
+    assert code == 0 and "behaviour: run `prove`" in out
+    assert tool("verify", "before.json")[0] == 1
+    assert tool("flash-params", wanted, "--check")[0] == 0
+    assert tool("restore", "--yes")[0] == 0
+    assert tool("verify", "before.json")[0] == 0
+    code, _, err = tool("verify", wanted)
+    assert code == 1 and "motor.R_s_ohm" in err
+    assert tool("restore", "before.json", "--yes")[0] == 0
+
+
+def test_backup_into_a_spare_part(tool: Tool, wanted: str) -> None:
+    assert tool("flash-params", wanted, "--yes")[0] == 0
+    assert tool("backup", "-o", "one.json")[0] == 0
+    assert tool("backup", "-o", "one.json")[0] == 2, "a backup is not overwritten"
+    spare = "interior-2k2?nv=spare.nv&nodes=2"
+    code, _, err = tool("-n", "2", "restore", "one.json", "--yes", channel=spare)
+    assert code == 2 and "serial number 22001" in err and "--other-drive" in err
+    assert tool("-n", "2", "restore", "one.json", "--yes", "--other-drive", channel=spare)[0] == 0
+    assert tool("-n", "2", "verify", wanted, channel=spare)[0] == 0
+
+
+def test_restore_without_a_journal(tool: Tool) -> None:
+    code, _, err = tool("restore", "--yes")
+    assert code == 2 and "no journal" in err
+
+
+def test_nobody_to_ask_writes_nothing(tool: Tool, wanted: str, tmp_path: Path) -> None:
+    code, _, err = tool("flash-params", wanted)
+    assert code == 7 and "nothing was done" in err and "motor.R_s_ohm" in err
+    assert not (tmp_path / "home").exists(), "not even a journal"
+    assert tool("verify", wanted)[0] == 1
+
+
+def test_faults_on_purpose_leave_the_old_set(tool: Tool, wanted: str, tmp_path: Path) -> None:
+    (tmp_path / "faults.toml").write_text('[[refuse]]\nobject = "0x2010:03"\ncode = 0x06090031\n')
+    code, _, err = tool("flash-params", wanted, "--yes", channel="interior-2k2?faults=faults.toml")
+    assert code == 4 and "motor.L_d_h" in err and "old set again" in err
+    assert tool("verify", wanted)[0] == 1
+
+
+# ---- moving -----------------------------------------------------------------------------------------------
+
+
+def test_jog_current(tool: Tool) -> None:
+    found = loaded(tool("jog", "--current", "2Apk", "--angle", "90deg", "--for", "0.5s", "--yes", "--json"))
+    assert found["readings"][-1]["i_d_a"] == pytest.approx(2.0, abs=0.1)
+    assert found["dead_man"]["measured_s"] <= found["dead_man"]["declared_s"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (("--for", "1s", "--yes"), 2, "one of --current and --speed"),
+        (("--current", "2Apk"), 7, "at most 2 Apk"),
+        (("--current", "50Apk", "--yes"), 5, "outside the limit"),
+        (("--current", "2Apk", "--load", "gravity", "--yes"), 5, "gravity"),
+        (("--current", "2A", "--yes"), 2, "peak"),
+    ],
+)
+def test_jog_refuses(tool: Tool, arguments: tuple[str, ...], code: int, text: str) -> None:
+    found = tool("jog", *arguments)
+    assert found[0] == code and text in found[2]
+
+
+def test_stop(tool: Tool) -> None:
+    found = loaded(tool("stop", "--all", "--json", channel="interior-2k2?nodes=2&nv=:memory:"))
+    assert [entry["node"] for entry in found["stopped"]] == [1, 2]
+
+
+def test_stop_that_is_not_confirmed_is_exit_8(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(DriveNode, "state", lambda self: None)
+    code, _, err = tool("-n", "1", "stop")
+    assert code == 8 and "STOP NOT CONFIRMED" in err and "hardware stop" in err
+
+
+def test_stop_without_a_drive_is_exit_8_when_the_node_was_named(tool: Tool) -> None:
+    assert tool("-n", "99", "stop")[0] == 8
+
+
+# ---- bad buses and bad drives -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "channel", "code", "text"),
+    [
+        (("info",), "no-such-profile", 2, "no profile"),
+        (("info",), "interior-2k2?sed=1", 2, "did you mean seed"),
+        (("-n", "77", "info"), "interior-2k2?nv=:memory:", 3, "only node(s) 1 were heard"),
+        (("-b", "250000", "-n", "1", "info"), "interior-2k2?nv=:memory:&bitrate=500000", 3, "only error frames"),
+        (("-b", "250000", "scan"), "interior-2k2?nv=:memory:&bitrate=500000", 3, "wrong bit rate"),
+        (("--trace-can", "bus.xyz", "scan"), "interior-2k2?nv=:memory:", 2, ".asc"),
+        (("--trace-can", "no/folder/bus.asc", "scan"), "interior-2k2?nv=:memory:", 2, "cannot be written"),
+        (("flash-params", "missing.toml", "--yes"), "interior-2k2?nv=:memory:", 2, "missing.toml"),
+        (("restore", "missing.json", "--yes"), "interior-2k2?nv=:memory:", 2, "missing.json"),
+        (("verify", "missing.toml", "--map", "none.toml"), "interior-2k2?nv=:memory:", 2, "none.toml"),
+    ],
+)
+def test_bad_bus_message_and_exit_code(
+    tool: Tool, arguments: tuple[str, ...], channel: str, code: int, text: str
+) -> None:
+    found = tool(*arguments, channel=channel)
+    assert (found[0], found[1]) == (code, "") and text in found[2], found
+
+
+def test_trace_records_both_directions(tool: Tool, tmp_path: Path) -> None:
+    assert tool("--trace-can", "bus.asc", "info")[0] == 0
+    with can.LogReader(str(tmp_path / "bus.asc")) as reader:
+        ids = {message.arbitration_id for message in reader}
+    assert {0x601, 0x581} <= ids
+
+
+def test_python_cans_own_configuration_decides(tmp_path: Path) -> None:
+    environment = {
+        **os.environ,
+        "HOME": str(tmp_path),
+        "PYTHONPATH": str(ROOT),
+        "CAN_INTERFACE": "virtual",
+        "CAN_CHANNEL": "nobody",
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "pmsmtool", "scan"], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 3 and "nobody" in done.stderr
+
+
+def test_no_interface_at_all_says_how_to_name_one(tmp_path: Path) -> None:
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("CAN_")} | {
+        "HOME": str(tmp_path),
+        "PYTHONPATH": str(ROOT),
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "pmsmtool", "scan"], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 3 and "no CAN interface is configured" in done.stderr and "-i pmsmsim" in done.stderr
