@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from pmsmtool.trace import Trace
+if TYPE_CHECKING:  # numpy is not for commands that only read a parameter
+    from pmsmtool.trace import Trace
 
 
 class Injection(IntEnum):

@@ -28,7 +28,7 @@ def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     """Run a command line in this process, in an empty folder, on a simulated drive with a memory file there."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr(can.util, "VALID_INTERFACES", frozenset({*can.util.VALID_INTERFACES, "pmsmsim"}))
+    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
     monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
 
     def call(*arguments: str, channel: str = "interior-2k2?seed=3") -> Result:
