@@ -45,7 +45,11 @@ PUSH_SPEED_SHARE = 0.12
 PUSH_SAMPLES = 1024
 SPEED_LOOP_RAD_S = 25.0
 RUN_I_D_SHARE = 0.25
-EMF_SHARE = 0.85
+TORQUE_LOSS_SHARE = 0.2
+"""Part of the magnet torque that i_d may take away by reluctance: psi + (L_d - L_q) i_d."""
+REACTANCE_SHARE = 0.25
+"""Voltage that the accelerating current may need at the largest speed, of the largest voltage."""
+EMF_SHARE = 0.8
 """Largest speed of the flux run: back-emf of this share of the largest voltage."""
 
 QUANTITIES = ("R", "L", "psi", "encoder", "poles", "inverter", "mechanics")
@@ -243,7 +247,7 @@ class Measurement:
         )
         self.drive.enable()
         psi, J = self._pushes(resistance, pole_pairs)
-        self._speeds(psi, J, pole_pairs)
+        self._speeds(psi, J, pole_pairs, L)
 
     def _pushes(self, resistance: ResistanceResult, pole_pairs: int) -> tuple[float, float]:
         """Push the rotor both ways; return rough flux linkage (Wb) and inertia (kg m2)."""
@@ -303,12 +307,19 @@ class Measurement:
         omega_e = 0.9 * pole_pairs * self.limits.omega_max_rad_s
         return speed_run.push_and_record(self.drive, i_q_a, samples, decimation, omega_e)
 
-    def _speeds(self, psi: float, J: float, pole_pairs: int) -> None:
+    def _speeds(self, psi: float, J: float, pole_pairs: int, L: tuple[float, float]) -> None:
         limits = self.limits
-        largest = min(limits.omega_max_rad_s / 1.1, EMF_SHARE * limits.V_max_v / (psi * pole_pairs))
+        saliency = abs(L[0] - L[1])
+        run_i_d = RUN_I_D_SHARE * limits.I_test_apk
+        if saliency * run_i_d > TORQUE_LOSS_SHARE * psi:
+            run_i_d = TORQUE_LOSS_SHARE * psi / saliency
+        flux = psi + L[0] * run_i_d
+        largest = min(limits.omega_max_rad_s / 1.1, EMF_SHARE * limits.V_max_v / (flux * pole_pairs))
         if largest <= 0.0:
             raise LimitExceeded("speed", 0.0, largest, "rad/s")
-        tau = 0.5 * 1.5 * pole_pairs * psi * limits.I_test_apk
+        # the accelerating current must leave voltage for itself: omega_e L_q i_q stands beside the back-emf
+        i_run = min(0.5 * limits.I_test_apk, REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L)))
+        tau = 1.5 * pole_pairs * psi * i_run
         slope = tau / J
         self._off_and_write(
             {
@@ -326,7 +337,7 @@ class Measurement:
         for sign, speeds in zip((1.0, -1.0), groups, strict=True):
             # i_d keeps the phase currents away from zero, where the inverter's error is not known well; the two signs
             # cancel its flux
-            i_d = sign * RUN_I_D_SHARE * limits.I_test_apk
+            i_d = sign * run_i_d
             self._off_and_write({"field_weakening.i_d_lm_a": i_d})
             self.drive.enable()
             self.say(
