@@ -1,7 +1,7 @@
 """Cost and accuracy of the simulation, as ratios to a bare C loop compiled in the same run.
 
-Run from the repository: ``python benchmarks/simulation.py`` (``--accuracy`` adds the comparison with scipy's DOP853 over
-1 s of all scenarios, about a minute). The bare loop (``bare_loop.c``) is one float PI controller and one RK4 step
+Run from the repository: ``python benchmarks/simulation.py`` (``--accuracy`` adds the comparison with scipy's DOP853
+over 1 s of all scenarios, about a minute). The bare loop (``bare_loop.c``) is one float PI controller and one RK4 step
 of the linear machine per period in one function, compiled with the kernel's flags. Times are processor
 times, best of several; the ratios are what counts. Exit code 1 when a limit is missed.
 """
@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.native import library_name
@@ -53,7 +55,7 @@ class BareSetup(ctypes.Structure):
 
     _fields_ = tuple(
         (name, ctypes.c_double)
-        for name in "R_s L_d L_q psi_f U_dc omega_e T_s K_p_d K_p_q K_i i_d_ref i_q_ref".split()
+        for name in ("R_s", "L_d", "L_q", "psi_f", "U_dc", "omega_e", "T_s", "K_p_d", "K_p_q", "K_i", "i_d_ref", "i_q_ref")
     )
 
 
@@ -249,12 +251,11 @@ def main() -> int:
     for name, error in errors.items():
         print(f"{name:38} {error:8.1e} of the largest current against DOP853  (limit {ERROR_LIMIT:g})")
     low, high = MOTULATOR_US
-    print(f"context: motulator 0.18 on the same scenario took {low:g} to {high:g} us per step where a bare loop took 71 ns")
+    print(f"context: motulator 0.18 on the same scenario, {low:g} to {high:g} us per step where a bare loop took 71 ns")
     for line in missed:
         print(f"MISSED {line}")
     return int(bool(missed))
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
     sys.exit(main())

@@ -147,7 +147,10 @@ def _declare(library: ctypes.CDLL, types: Mapping[str, CType]) -> None:
         "pmsm_project_row": (dq, [row, dq, steps]),
         "pmsm_project_rows": (u32, [row, u32, dq, pointer(dq), words, steps]),
         "pmsm_smallest_voltage": (dq, [row, row, steps]),
-        "pmsm_project_half_planes": (u32, [pointer(dq), pointer(types["pmsm_real"]), u32, dq, pointer(dq), words, steps]),
+        "pmsm_project_half_planes": (
+            u32,
+            [pointer(dq), pointer(types["pmsm_real"]), u32, dq, pointer(dq), words, steps],
+        ),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)
