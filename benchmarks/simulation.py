@@ -55,7 +55,10 @@ class BareSetup(ctypes.Structure):
 
     _fields_ = tuple(
         (name, ctypes.c_double)
-        for name in ("R_s", "L_d", "L_q", "psi_f", "U_dc", "omega_e", "T_s", "K_p_d", "K_p_q", "K_i", "i_d_ref", "i_q_ref")
+        for name in (
+            *("R_s", "L_d", "L_q", "psi_f", "U_dc", "omega_e", "T_s"),
+            *("K_p_d", "K_p_q", "K_i", "i_d_ref", "i_q_ref"),
+        )
     )
 
 
