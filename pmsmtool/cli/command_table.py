@@ -47,6 +47,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("info", "pmsmtool.cli.info:info_command", Section.LOOK, "Show identity, state and parameter set."),
     Row("monitor", "pmsmtool.cli.monitor:monitor_command", Section.LOOK, "Show live values."),
     Row("fault", "pmsmtool.cli.fault:fault_command", Section.LOOK, "Show or reset faults."),
+    Row("commission", "pmsmtool.cli.commission:commission_command", Section.MOVE, "Identify, design, flash, verify."),
     Row("stop", "pmsmtool.cli.stop:stop_command", Section.MOVE, "Stop a drive, confirmed."),
     Row("identify", "pmsmtool.cli.identify:identify_command", Section.MOVE, "Measure the machine on its drive."),
     Row("jog", "pmsmtool.cli.jog:jog_command", Section.MOVE, "Move shortly, within limits."),

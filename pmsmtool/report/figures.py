@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.design.sampled_loop import LoopMargins, SampledLoop
 from pmsmtool.estimators.axis_fit import SKIP_SAMPLES, AxisFit
-from pmsmtool.estimators.flux_linkage import FluxResult, mean_inverter_error
+from pmsmtool.estimators.flux_linkage import I_D_SPREAD, FluxResult, mean_inverter_error
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.report.report import Figure
 from pmsmtool.trace import Trace
@@ -114,38 +114,68 @@ def inductance_figure(shots: Mapping[str, Trace], fits: Mapping[str, AxisFit], s
     return Figure(svg(canvas), f"Square-wave injection, first periods; {'; '.join(texts)}.")
 
 
-def flux_figure(speeds: Trace, result: FluxResult, curve: InverterCurve | None, *, R_ohm: float, period_s: float,
-                L_d_h: float) -> Figure:  # fmt: skip
+def flux_figure(
+    speeds: Trace,
+    result: FluxResult,
+    curve: InverterCurve | None,
+    waves: Sequence[Trace] = (),
+    *,
+    R_ohm: float,
+    period_s: float,
+) -> Figure:
     """Draw the voltage of the magnets over speed, and how far each speed lies off the common flux linkage.
 
     Parameters
     ----------
-    speeds : Trace
-        One row per speed, as ``estimate_flux_linkage`` takes them.
+    speeds, waves : Trace
+        As ``estimate_flux_linkage`` takes them.
     result : FluxResult
         The regression.
-    curve, R_ohm, period_s, L_d_h
+    curve, R_ohm, period_s
         What was taken off the commanded voltage.
     """
-    w, i_d, i_q = speeds["omega_e_rad_s"], speeds["i_d_a"], speeds["i_q_a"]
-    x = 0.5 * w * period_s
-    e_q = np.zeros_like(w) if curve is None else mean_inverter_error(curve, i_d, i_q)[1]
-    u_q = (speeds["u_q_v"] - e_q - R_ohm * i_q) * x / np.sin(x) - w * L_d_h * i_d - result.intercept_v * np.sign(w)
-    psi = result.psi_measured.value * math.cos(result.frame_offset.value)
+    w = speeds["omega_e_rad_s"]
+    psi, residual = _flux_regression(speeds, _mean_error_q(speeds, curve, waves), R_ohm, period_s)
     canvas, (left, right) = _canvas(1, 2)
     order = np.argsort(w)
     left.plot(w[order], psi * w[order], color=_MODEL, label="psi_f omega")
-    left.plot(w, u_q, "o", ms=3.5, color=_MEASURED, label="measured")
+    left.plot(w, psi * w + residual, "o", ms=3.5, color=_MEASURED, label="measured")
     left.set(xlabel="electrical speed / rad/s", ylabel="voltage of the magnets / V")
     left.legend()
     right.axhline(0.0, color=_MODEL)
-    right.plot(w, 1e2 * (u_q / (w * psi) - 1.0), "o", ms=3.5, color=_MEASURED)
+    right.plot(w, 1e2 * residual / (w * psi), "o", ms=3.5, color=_MEASURED)
     right.set(xlabel="electrical speed / rad/s", ylabel="deviation from psi_f / %")
     caption = (
         f"Regression over {len(w)} speeds in both directions: psi_f = {result.psi_measured.value:.5g} Wb at the "
         f"temperature of the run, {result.intercept_v:+.3g} V left as intercept, residual {result.residual_v:.2g} V."
     )
     return Figure(svg(canvas), caption)
+
+
+def _mean_error_q(speeds: Trace, curve: InverterCurve | None, waves: Sequence[Trace]) -> Vector:
+    """Mean inverter error on the q axis at each speed (V)."""
+    if curve is None:
+        return np.zeros_like(speeds["i_q_a"])
+    if not waves:
+        return mean_inverter_error(curve, speeds["i_d_a"], speeds["i_q_a"])[1]
+    errors = [curve.error_dq_v(wave["i_d_a"], wave["i_q_a"], wave["theta_e_rad"])[1] for wave in waves]
+    return np.array([float(np.mean(error)) for error in errors])
+
+
+def _flux_regression(speeds: Trace, e_q: Vector, R_ohm: float, period_s: float) -> tuple[float, Vector]:
+    """Return the q-axis flux of the magnets (Wb) and what every speed's voltage is off (V).
+
+    The model of ``estimators.flux_linkage``; what is not the magnets' (intercept, coupling, flux of i_d) is fitted too.
+    """
+    w, i_d, i_q = speeds["omega_e_rad_s"], speeds["i_d_a"], speeds["i_q_a"]
+    x = 0.5 * w * period_s
+    u_q = (speeds["u_q_v"] - e_q - R_ohm * i_q) * x / np.sin(x)
+    columns = [w, np.sign(w), w * i_q]
+    if np.ptp(i_d) > I_D_SPREAD * float(np.max(np.hypot(i_d, i_q))):
+        columns.append(w * i_d)
+    matrix = np.stack(columns, axis=1)
+    fit = np.linalg.lstsq(matrix, u_q, rcond=None)[0]
+    return float(fit[0]), np.asarray(u_q - matrix @ fit, dtype=np.float64)
 
 
 def bode_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMargins]) -> Figure:

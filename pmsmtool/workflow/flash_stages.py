@@ -9,35 +9,18 @@ from typing import Any
 
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.firmware.image import crc32
 from pmsmtool.flash.download import Download
 from pmsmtool.flash.journal import JournalFolder
-from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
-from pmsmtool.flash.restore import marks_of
-from pmsmtool.params.parameter_set import ParameterSet, read_parameter_set
+from pmsmtool.flash.plan import Change
+from pmsmtool.flash.restore import marks_of, plan_download
+from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.workflow.export import image_of
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
 Say = Callable[[str], None]
 Consent = Callable[[Sequence[str]], None]
 """Told the lines a person must agree to; raises ``Declined``."""
-
-
-def plan_for(drive: CanopenDrive, wanted: ParameterSet) -> Plan:
-    """Return the plan that brings a drive to a set; reads the drive, writes nothing.
-
-    Raises
-    ------
-    NotAvailable
-        Firmware and tool have different layouts.
-    ConfigError
-        Values out of bounds, or that do not fit the drive's types.
-    """
-    parameters = DriveParameters(drive.node)
-    parameters.check_layout()
-    parameters.settle()
-    return make_plan(drive.node.map, wanted, parameters.read(names_to_read(drive.node.map, wanted)))
 
 
 def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: Say) -> Stage:
@@ -51,12 +34,12 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
         The download failed; the error says which set the drive holds.
     """
     wanted = read_parameter_set(run.path / "params.toml")
-    plan = plan_for(drive, wanted)
-    if plan.changes:
-        consent(plan.lines())
-    folder = JournalFolder(drive.identity)
+    plan = plan_download(drive.node, wanted)
     marks = marks_of(wanted.content_hash(), datetime.datetime.now())
-    outcome = Download(drive.node, drive.identity, plan, marks, folder, say=say).run()
+    download = Download(drive.node, drive.identity, plan, marks, JournalFolder(drive.identity), say=say)
+    if download.has_work(store=True):
+        consent([*plan.lines(), "the set is stored, and the drive is reset to see it"])
+    outcome = download.run()
     total = len(plan.entries)
     criteria = [
         Acceptance("objects read back as written, after a reset", f"{total} of {total}", "all", True),
@@ -88,7 +71,7 @@ def _change(change: Change) -> dict[str, Any]:
 def verify_stage(run: RunDirectory, drive: CanopenDrive) -> Stage:
     """Compare every byte the drive holds with ``params.toml``; behaviour is not compared."""
     wanted = read_parameter_set(run.path / "params.toml")
-    plan = plan_for(drive, wanted)
+    plan = plan_download(drive.node, wanted)
     wrong = [f"{c.name}: {c.old_value:.7g} instead of {c.held:.7g}" for c in plan.changes]
     total = len(plan.entries)
     shown = f"{total - len(wrong)} of {total}" + (f" ({'; '.join(wrong[:3])})" if wrong else "")

@@ -5,6 +5,7 @@ Nothing is measured, and no number is made that the run does not hold.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -17,9 +18,13 @@ from pmsmtool.design.current_loop import AxisPlant, CurrentGains, Method, axis_l
 from pmsmtool.design.design_file import Design, load_design
 from pmsmtool.design.sampled_loop import SampledLoop
 from pmsmtool.design.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, speed_loop
+from pmsmtool.errors import IdentificationError
 from pmsmtool.npz_file import read_npz
 from pmsmtool.report import figures
 from pmsmtool.report.report import Change, Figure, Verdict, render, verdict_of
+from pmsmtool.trace import Trace
+from pmsmtool.workflow.evaluate import Evaluation, evaluate, shots_of
+from pmsmtool.workflow.identify import stored_traces
 from pmsmtool.workflow.run_directory import RunDirectory, RunRecord
 
 NOT_CHECKED = (
@@ -44,6 +49,7 @@ def report_page(path: Path) -> str:
     run = RunDirectory(path)
     record = run.read()
     drawn = [
+        *_identification_figures(run),
         *_design_figures(run.path / "design.toml"),
         *_margin_figures(record),
         *_table_figures(run.path / "lut.npz"),
@@ -54,6 +60,40 @@ def report_page(path: Path) -> str:
 def verdict(path: Path) -> Verdict:
     """Return the verdict of a run; raises ``ConfigError`` when there is none in the folder."""
     return verdict_of([asdict(stage) for stage in RunDirectory(path).read().stages])
+
+
+def _identification_figures(run: RunDirectory) -> Iterator[Figure]:
+    """Draw what the traces of the run say, evaluated again; of a run that was refused, what can be evaluated."""
+    traces = stored_traces(run)
+    if "zero_current" not in traces:
+        return
+    period_s = traces["zero_current"].period_s
+    found = _evaluated(traces, period_s)
+    if found is None:
+        return
+    resistance, inductance, flux = found.resistance, found.inductance, found.flux
+    if resistance is not None:
+        yield figures.resistance_figure(traces["levels"], resistance.R_measured.value, resistance.curve)
+    if inductance is not None and found.encoder is not None:
+        shots = {axis: shots_of(traces, axis, round(found.encoder.pole_pairs.value))[0] for axis in "dq"}
+        yield figures.inductance_figure(shots, inductance.axes, found.noise.sigma_a)
+    if flux is not None and resistance is not None:
+        waves = [traces[f"wave_{k}"] for k in range(len(traces["speeds"])) if f"wave_{k}" in traces]
+        R_ohm = resistance.R_measured.value
+        yield figures.flux_figure(traces["speeds"], flux, resistance.curve, waves, R_ohm=R_ohm, period_s=period_s)
+
+
+_EXPERIMENTS = ("phase_vectors", "levels", "rotation", "square", "speeds", "push")
+"""How the names of the traces begin, in the order the experiments were made."""
+
+
+def _evaluated(traces: Mapping[str, Trace], period_s: float) -> Evaluation | None:
+    """Evaluate the traces, leaving out the last experiments until nothing is refused; None when all is."""
+    for count in range(len(_EXPERIMENTS), -1, -1):
+        kept = ("zero_current", "wave", *_EXPERIMENTS[:count])
+        with contextlib.suppress(IdentificationError):
+            return evaluate({name: trace for name, trace in traces.items() if name.startswith(kept)}, period_s)
+    return None
 
 
 def _design_figures(path: Path) -> Iterator[Figure]:

@@ -11,9 +11,8 @@ import pytest
 from pmsmtool.design.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.design.sampled_loop import margins
 from pmsmtool.estimators.axis_fit import SKIP_SAMPLES, AxisFit
-from pmsmtool.estimators.flux_linkage import FluxResult
+from pmsmtool.estimators.flux_linkage import estimate_flux_linkage
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.machine.parameters import Estimate
 from pmsmtool.report import figures
 from pmsmtool.trace import Trace
 
@@ -74,21 +73,25 @@ def test_the_fitted_response_is_measured_plus_residual(canvases: list[Any]) -> N
     assert predicted - measured == pytest.approx(sigma * residual[: len(measured)])
 
 
-def test_flux_takes_off_what_the_regression_takes_off(canvases: list[Any]) -> None:
+@pytest.mark.parametrize("i_d_a", [0.0, 0.3])
+def test_flux_shows_the_residual_of_the_regression(i_d_a: float, canvases: list[Any]) -> None:
     w = np.array([-400.0, -300.0, -200.0, -100.0, 100.0, 200.0, 300.0, 400.0])
-    T, R, psi, L_d, c = 1e-4, 0.5, 0.2, 2e-3, 0.05
-    i_d, i_q = np.full_like(w, -0.3), 0.4 * np.sign(w)
+    T, R, psi, L_d = 1e-4, 0.5, 0.2, 2e-3
+    i_d, i_q = i_d_a * np.sign(w), np.array([-0.4, -0.41, -0.39, -0.4, 0.4, 0.42, 0.4, 0.38])
     x = 0.5 * w * T
     off = np.where(w == 300.0, 0.01, 0.0)
-    u_q = (w * (psi * (1.0 + off) + L_d * i_d) + c * np.sign(w)) * np.sin(x) / x + R * i_q
-    speeds = trace({"omega_e_rad_s": w, "i_d_a": i_d, "i_q_a": i_q, "u_q_v": u_q})
-    offset = Estimate(0.0, 1e-4, 0.0, "rad")
-    flux = Estimate(psi, 1e-5, 0.0, "Wb")
-    result = FluxResult(flux, flux, offset, 3e-3, 1e-5, 0.0, c, 1e-4)
-    figures.flux_figure(speeds, result, None, R_ohm=R, period_s=T, L_d_h=L_d)
-    deviation = canvases[0].axes[1].lines[1].get_ydata()
-    assert deviation == pytest.approx(100.0 * off, abs=1e-9)
-    assert lines(canvases[0])["measured"][1] == pytest.approx(psi * (1.0 + off) * w)
+    u_q = (w * (psi * (1.0 + off) + L_d * i_d) + 0.05 * np.sign(w)) * np.sin(x) / x + R * i_q
+    rows = {"omega_e_rad_s": w, "i_d_a": i_d, "i_q_a": i_q, "u_q_v": u_q, "u_d_v": -w * 3e-3 * i_q + R * i_d}
+    halves = {f"{n}_{k}_{u}": 0 * w + v for n, v, u in (("i_d", i_d, "a"), ("i_q", i_q, "a"), ("omega", w, "rad_s"))
+              for k in ("first", "second")}  # fmt: skip
+    speeds = trace({**rows, **halves, "T_magnet_c": np.full_like(w, math.nan)})
+    result = estimate_flux_linkage(speeds, R, period_s=T)
+    figures.flux_figure(speeds, result, None, R_ohm=R, period_s=T)
+    w_drawn, deviation = canvases[0].axes[1].lines[1].get_data()
+    drawn = np.asarray(deviation) / 100.0 * w_drawn * result.psi_measured.value
+    dof = 8 - (4 if i_d_a else 3)
+    assert math.sqrt(float(drawn @ drawn) / dof) == pytest.approx(result.residual_v, rel=1e-3)
+    assert int(np.argmax(np.abs(drawn))) == 6
 
 
 def test_the_crossings_lie_on_the_curves(canvases: list[Any]) -> None:

@@ -1,0 +1,247 @@
+"""``pmsmtool commission``: from an unknown machine to flashed and checked parameters, in one command."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmsmtool.cli.drive_access import map_option, open_drive, read_map
+from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
+from pmsmtool.cli.output import Output
+from pmsmtool.cli.progress import StageProgress
+
+if TYPE_CHECKING:
+    from pmsmtool.drive.canopen_drive import CanopenDrive
+    from pmsmtool.workflow.commission import Commissioning
+    from pmsmtool.workflow.run_directory import RunDirectory
+
+FOLDER = click.Path(file_okay=False, path_type=Path)
+
+
+@click.command(
+    "commission",
+    epilog=examples(
+        "pmsmtool commission --sim interior-2k2 --yes",
+        "pmsmtool commission -i socketcan -c can0 -n 5 --i-max 12Apk --speed-max 3000rpm --shaft free",
+        "pmsmtool commission --resume runs/20260101T120000Z-000055f1",
+    ),
+)
+@click.argument("machine", required=False, type=FILE)
+@click.option("--resume", type=FOLDER, metavar="RUN_DIR", help="Go on with a run where it ended.")
+@click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
+@click.option("--bandwidth-hz", type=float, metavar="HZ", help="Bandwidth of the current loops.  [default: modulus "
+              "optimum, lowered to the margins]")  # fmt: skip
+@click.option("--phase-margin-deg", type=float, default=45.0, metavar="DEG", help="Least phase margin of the design.")
+@click.option("--gain-margin-db", type=float, default=6.0, metavar="DB", help="Least gain margin of the design.")
+@click.option("--sensor-tol", type=click.FloatRange(0.0, 0.2), default=0.01, help="95 % tolerance of sensor gains.")
+@map_option
+@bus_options
+@motion_options
+@output_options
+def commission_command(
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    machine: Path | None,
+    resume: Path | None,
+    runs: Path,
+    map_file: Path | None,
+    sensor_tol: float,
+    **design: float | None,
+) -> None:
+    """Identify the machine, design its control, make the look-up table, judge the margins, flash, verify, report.
+
+    MACHINE is a machine file with what is known (ratings, limits); without it the drive's own ratings are the start.
+    Two consents are asked: the motion envelope before anything moves, the list of differences before anything is
+    written. The chain ends at the first criterion that is not met, with the drive off and as it was; --resume goes on
+    there. A simulated drive starts from factory memory unless its channel names a memory file (nv=).
+    """
+    from pmsmtool.cli.flash_session import checked_identity
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.workflow.run_directory import RunDirectory
+
+    begun = RunDirectory(resume) if resume is not None else None
+    if begun is not None and machine is not None:
+        raise ConfigError("MACHINE and --resume exclude each other", hint="a run keeps the machine it began with")
+    if begun is not None:
+        bus = _as_begun(bus, begun)
+    elif bus.simulated():
+        _erase_memory(bus, out)
+    with open_drive(bus, read_map(map_file)) as drive:
+        checked_identity(drive.node)
+        run = begun or _begin(runs, drive, bus)
+        progress = StageProgress(out)
+        person = _Person(run, drive, bus, motion, out, progress)
+        chain = _chain(run, drive, person, progress, machine, motion, sensor_tol, design)
+        with _reported(run, out, fresh=begun is None):
+            chain.carry_out()
+
+
+def _as_begun(bus: BusOptions, run: RunDirectory) -> BusOptions:
+    """Fill in the bus of a run where the command line names none."""
+    recorded = run.read().bus
+    if bus.interface is None and bus.channel is None:
+        bus = replace(bus, **{key: recorded.get(key) for key in ("interface", "channel", "bitrate")})
+    return replace(bus, node=recorded.get("node")) if bus.node is None else bus
+
+
+def _erase_memory(bus: BusOptions, out: Output) -> None:
+    from pmsmtool.workflow.factory_memory import erase_memory
+
+    channel = bus.channel
+    if channel is None and bus.interface is None:
+        import can
+
+        channel = can.util.load_config().get("channel")
+    for path in erase_memory(None if channel is None else str(channel)):
+        out.detail(f"erased {path}: the simulated drive starts from factory memory")
+
+
+def _begin(runs: Path, drive: CanopenDrive, bus: BusOptions) -> RunDirectory:
+    from importlib.metadata import version
+
+    from pmsmtool import __version__
+    from pmsmtool.workflow.commission import drive_facts
+    from pmsmtool.workflow.run_directory import RunDirectory, new_record
+
+    identity = drive.identity
+    record = new_record(
+        ["pmsmtool", *sys.argv[1:]],
+        drive=drive_facts(identity),
+        bus={"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate, "node": identity.node},
+        versions={"pmsmtool": __version__, **{name: version(name) for name in ("numpy", "python-can")}},
+    )
+    return RunDirectory.create(runs, identity.serial, record)
+
+
+def _chain(
+    run: RunDirectory,
+    drive: CanopenDrive,
+    person: _Person,
+    progress: StageProgress,
+    machine: Path | None,
+    motion: MotionOptions,
+    sensor_tol: float,
+    design: dict[str, Any],
+) -> Commissioning:
+    from pmsmtool.design.tune_request import TuneRequest
+    from pmsmtool.estimators.estimate import SensorTolerance
+    from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.workflow.commission import Commissioning
+    from pmsmtool.workflow.identify import NAMEPLATE, IdentifyRequest
+
+    if machine is None and (run.path / NAMEPLATE).is_file():
+        machine = run.path / NAMEPLATE
+    wanted = IdentifyRequest(
+        i_max_apk=motion.i_max_apk,
+        speed_max_rad_s=motion.speed_max_rad_s,
+        shaft=motion.shaft or "free",
+        load=motion.load,
+        brake=motion.brake,
+        tolerance=SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol),
+    )
+    wanted.check()
+    return Commissioning(
+        run,
+        drive,
+        person,
+        progress,
+        nameplate=None if machine is None else load_machine_file(machine),
+        identify=wanted,
+        tune=TuneRequest(**design),
+    )
+
+
+class _Person:
+    """Asks on the terminal, or lets ``--yes`` answer; keeps what was agreed to in the record."""
+
+    def __init__(
+        self,
+        run: RunDirectory,
+        drive: CanopenDrive,
+        bus: BusOptions,
+        motion: MotionOptions,
+        out: Output,
+        progress: StageProgress,
+    ) -> None:
+        self._run = run
+        self._progress = progress
+        self._asked: dict[str, Any] = {
+            "options": motion, "simulated": bus.simulated(), "serial": drive.identity.serial, "out": out,
+        }  # fmt: skip
+
+    def allow_motion(self, lines: Sequence[str]) -> None:
+        """Ask for the motion envelope."""
+        from pmsmtool.cli.consent import ask_motion
+
+        self._ask(ask_motion, lines)
+
+    def allow_writing(self, lines: Sequence[str]) -> None:
+        """Ask for the list of differences."""
+        from pmsmtool.cli.consent import ask_writing
+
+        self._ask(ask_writing, lines)
+
+    def _ask(self, ask: Any, lines: Sequence[str]) -> None:
+        from dataclasses import asdict
+
+        self._progress.pause()
+        given = ask(lines, **self._asked)
+        self._progress.resume()
+        record = self._run.read()
+        self._run.write(replace(record, consents=(*record.consents, asdict(given))))
+
+
+@contextmanager
+def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
+    """Write the report whatever ends the chain; a run that was declined before anything moved leaves no trace."""
+    from pmsmtool.errors import Declined, PmsmtoolError
+
+    try:
+        yield
+    except BaseException as error:
+        if isinstance(error, Declined) and fresh and not run.read().passed("identify"):
+            shutil.rmtree(run.path, ignore_errors=True)
+            raise
+        try:
+            _write_report(run)
+            out.note(f"report: {run.path / 'report.html'}; go on with: pmsmtool commission --resume {run.path}")
+        except PmsmtoolError as second:
+            out.warn(f"the report could not be written: {second.what}")
+        raise
+    _write_report(run)
+    _show(run, out)
+
+
+def _write_report(run: RunDirectory) -> None:
+    from pmsmtool.workflow.report_page import report_page
+
+    run.save("report.html", report_page(run.path))
+
+
+def _show(run: RunDirectory, out: Output) -> None:
+    from pmsmtool.workflow.report_page import verdict
+
+    record, found = run.read(), verdict(run.path)
+    stages = [
+        {"name": stage.name, "status": stage.status, "summary": stage.summary, "seconds": stage.seconds}
+        for name in dict.fromkeys(stage.name for stage in record.stages)
+        if (stage := record.stage(name)) is not None
+    ]
+    identified = record.stage("identify")
+    data = {
+        "run": run.path,
+        "report": run.path / "report.html",
+        "verdict": found.word,
+        "stages": stages,
+        "values": [] if identified is None else list(identified.values),
+    }
+    lines = [f"{found.word}: {'; '.join(found.lines)}", f"report: {run.path / 'report.html'}"]
+    out.result("commission", data, lines)

@@ -1,0 +1,254 @@
+"""The whole chain: identify, tune, lut, margins, flash, verify; one run directory, resumable at every stage.
+
+A stage that is recorded as passed is not run again. The chain ends at the first stage that does not pass, whatever
+it had done is recorded, and the drive is off: experiments run inside the guard, a download rolls back by itself, and
+what is left is asked of the statusword.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Protocol
+
+from pmsmtool.design.lookup_design import LookupRequest
+from pmsmtool.design.margins import MarginRequest
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import is_safe
+from pmsmtool.drive.port import Identity
+from pmsmtool.drive.stop import quick_stop
+from pmsmtool.errors import (
+    CheckFailed,
+    ConfigError,
+    Declined,
+    IdentificationError,
+    Interrupted,
+    NotAvailable,
+    PmsmtoolError,
+    SafetyRefusal,
+    VerifyMismatch,
+)
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
+from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
+from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplate_of
+from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, Status
+
+STAGES = ("identify", "tune", "lut", "margins", "flash", "verify")
+
+
+class Person(Protocol):
+    """Who consents; each method returns when agreed, else it raises ``Declined``."""
+
+    def allow_motion(self, lines: Sequence[str]) -> None:
+        """Agree to the motion envelope."""
+
+    def allow_writing(self, lines: Sequence[str]) -> None:
+        """Agree to the list of differences."""
+
+
+class Progress(Protocol):
+    """Who is told how far the chain has come."""
+
+    def skip(self, name: str, number: int, count: int) -> None:
+        """Tell that a stage has passed before."""
+
+    def begin(self, name: str, number: int, count: int) -> None:
+        """Tell that a stage begins."""
+
+    def say(self, text: str) -> None:
+        """Tell a step inside the stage."""
+
+    def end(self, stage: Stage, number: int, count: int) -> None:
+        """Tell how the stage ended."""
+
+
+def due_stages(run: RunDirectory, record: RunRecord) -> tuple[str, ...]:
+    """Return the stages still to be run: from the first that has not passed, or whose files are gone, to the last.
+
+    Raises
+    ------
+    ConfigError
+        A file is not what its stage left.
+    """
+    expected: dict[str, str] = {}
+    position = -1
+    for k, name in enumerate(STAGES):
+        places = [place for place, stage in enumerate(record.stages) if stage.name == name]
+        latest = record.stages[places[-1]] if places else None
+        fresh = latest is not None and latest.status == "pass" and places[-1] > position
+        if latest is None or not fresh or not all((run.path / file).is_file() for file in latest.files):
+            _check_unchanged(run, expected, OUTPUTS.get(name, ()))
+            return STAGES[k:]
+        position = places[-1]
+        expected |= latest.files
+    _check_unchanged(run, expected, ())
+    return ()
+
+
+OUTPUTS: Mapping[str, tuple[str, ...]] = {
+    "identify": ("machine.toml",),
+    "tune": ("design.toml",),
+    "lut": ("lut.npz", "lut.csv", "design.toml", "params.toml"),
+}
+"""Files a stage writes, also half-way: a run that was killed may hold them before they are recorded."""
+
+
+def _check_unchanged(run: RunDirectory, expected: Mapping[str, str], rewritten: Sequence[str]) -> None:
+    changed = [name for name, digest in expected.items() if name not in rewritten and run.sha256(name) != digest]
+    if changed:
+        raise ConfigError(
+            f"{', '.join(changed)}: not what the stage left that wrote it",
+            where=str(run.path),
+            likely="edited after the run",
+            hint="delete the file to have its stage run again, or use tune, lut and flash-params one by one",
+        )
+
+
+@dataclass(slots=True)
+class Commissioning:
+    """One run of the chain.
+
+    Parameters
+    ----------
+    run : RunDirectory
+        Where everything goes; its record names the drive.
+    drive : CanopenDrive
+        The drive; off.
+    person : Person
+        Gives the two consents.
+    progress : Progress
+        Is told.
+    nameplate : MachineFile, optional
+        What is known of the machine; the drive's own ratings and set when not given.
+    identify, tune, lookup, margins
+        What is asked.
+    """
+
+    run: RunDirectory
+    drive: CanopenDrive
+    person: Person
+    progress: Progress
+    nameplate: MachineFile | None = None
+    identify: IdentifyRequest = field(default_factory=IdentifyRequest)
+    tune: TuneRequest = field(default_factory=TuneRequest)
+    lookup: LookupRequest = field(default_factory=LookupRequest)
+    margins: MarginRequest = field(default_factory=MarginRequest)
+
+    def carry_out(self) -> None:
+        """Run what is due.
+
+        Raises
+        ------
+        PmsmtoolError
+            Whatever ended the chain; it is recorded.
+        StopNotConfirmed
+            The machine may be energised; outranks whatever ended the chain.
+        """
+        record = self.run.read()
+        self._check_drive(record)
+        due = due_stages(self.run, record)
+        try:
+            for number, name in enumerate(STAGES, 1):
+                if name in due:
+                    self._carry_out(name, number)
+                else:
+                    self.progress.skip(name, number, len(STAGES))
+        except KeyboardInterrupt:
+            raise Interrupted("interrupted; the machine is off") from None
+        finally:
+            self._make_sure()
+
+    def _check_drive(self, record: RunRecord) -> None:
+        found = drive_facts(self.drive.identity)
+        wrong = [
+            f"{key} {found[key]} instead of {record.drive[key]}" for key in IDENTITY if found[key] != record.drive[key]
+        ]
+        if wrong:
+            raise SafetyRefusal(
+                f"another drive answers than the run was begun with: {', '.join(wrong)}",
+                where=f"node {self.drive.identity.node}, 0x1018",
+                likely="drives were swapped, or this is the run of another drive",
+                hint="begin a new run for this drive; nothing was moved and nothing written",
+            )
+
+    def _carry_out(self, name: str, number: int) -> None:
+        clock = self.drive.node.connection.clock
+        self.progress.begin(name, number, len(STAGES))
+        start = clock.now()
+        try:
+            stage = replace(self._steps()[name](), seconds=clock.now() - start)
+        except BaseException as error:
+            failed = Stage(name, _status(error), clock.now() - start, note=_text(error))
+            # The error that ended the stage outranks a record that cannot be written.
+            with contextlib.suppress(ConfigError):
+                self.run.add(failed)
+            self.progress.end(failed, number, len(STAGES))
+            raise
+        self.run.add(stage)
+        self.progress.end(stage, number, len(STAGES))
+        if stage.status != "pass":
+            raise _not_good(stage, self.run)
+
+    def _steps(self) -> dict[str, Callable[[], Stage]]:
+        say = self.progress.say
+        return {
+            "identify": self._identify,
+            "tune": lambda: tune_stage(self.run, self.tune),
+            "lut": lambda: lut_stage(self.run, self.lookup),
+            "margins": lambda: margins_stage(self.run, self.margins),
+            "flash": lambda: flash_stage(self.run, self.drive, self.person.allow_writing, say),
+            "verify": lambda: verify_stage(self.run, self.drive),
+        }
+
+    def _identify(self) -> Stage:
+        identity = self.drive.identity
+        known = self.nameplate or nameplate_of(self.drive, identity.name or f"drive {identity.serial:#010x}")
+        return identify_stage(self.run, self.drive, known, self.identify, self.person.allow_motion, self.progress.say)
+
+    def _make_sure(self) -> None:
+        """Leave the machine off, confirmed, where this program may have energised it."""
+        if self.drive.may_be_energised and not is_safe(self.drive.node.state()):
+            quick_stop(self.drive.node)
+
+
+def _status(error: BaseException) -> Status:
+    if isinstance(error, KeyboardInterrupt | Interrupted):
+        return "interrupted"
+    if isinstance(error, SafetyRefusal | Declined | IdentificationError | NotAvailable):
+        return "refused"
+    return "fail"
+
+
+def _text(error: BaseException) -> str:
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    return str(error) or type(error).__name__
+
+
+def _not_good(stage: Stage, run: RunDirectory) -> PmsmtoolError:
+    """Return the error of a stage whose criteria are not met, with its exit code."""
+    broken = [f"{line.what}: {line.measured}, limit {line.limit}" for line in stage.acceptance if not line.ok]
+    what = f"{stage.name}: {'; '.join(broken) or stage.note}"
+    where = str(run.path)
+    if stage.name == "identify":
+        return IdentificationError("E_NOT_ACCEPTED", what, where=where)
+    if stage.name == "verify":
+        return VerifyMismatch(what, where=where, hint="flash again: commission --resume " + where)
+    return CheckFailed(what, where=where, hint=f"pmsmtool report {where}")
+
+
+IDENTITY = ("vendor", "product", "serial")
+"""What must agree before a run is resumed."""
+
+
+def drive_facts(identity: Identity) -> dict[str, Any]:
+    """Return a drive's identity as the record keeps it."""
+    return asdict(identity)
+
+
+def request_table(tune: TuneRequest, lookup: LookupRequest) -> dict[str, Any]:
+    """Return what was asked, as the record keeps it for ``--resume``."""
+    return {"tune": tune.table(), "lut": {"torque_bound": lookup.torque_bound, "voltage_bound": lookup.voltage_bound}}

@@ -1,0 +1,259 @@
+"""The chain without its experiments: from an identified machine to a drive that holds the design, and every way out."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.bus.connect import Connection
+from pmsmtool.design.margins import MarginRequest
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import is_safe
+from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.errors import CheckFailed, ConfigError, Declined, ExitCode, Interrupted, SafetyRefusal, VerifyMismatch
+from pmsmtool.firmware.image import crc32
+from pmsmtool.params.parameter_set import read_parameter_set
+from pmsmtool.resources import data_folder
+from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.workflow import commission
+from pmsmtool.workflow.commission import STAGES, Commissioning, drive_facts, due_stages
+from pmsmtool.workflow.export import image_of
+from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage, new_record
+
+PROFILE = "interior-2k2"
+
+
+class Told:
+    """A person who agrees unless told otherwise, and notes what was shown."""
+
+    def __init__(self, *, writes: bool = True) -> None:
+        self.writes = writes
+        self.shown: list[Sequence[str]] = []
+
+    def allow_motion(self, lines: Sequence[str]) -> None:
+        raise AssertionError("nothing moves here")
+
+    def allow_writing(self, lines: Sequence[str]) -> None:
+        self.shown.append(lines)
+        if not self.writes:
+            raise Declined("no")
+
+
+class Noted:
+    """Notes which stages ran and which were skipped."""
+
+    def __init__(self) -> None:
+        self.skipped: list[str] = []
+        self.ended: list[tuple[str, str]] = []
+
+    def skip(self, name: str, number: int, count: int) -> None:
+        self.skipped.append(name)
+
+    def begin(self, name: str, number: int, count: int) -> None:
+        pass
+
+    def say(self, text: str) -> None:
+        pass
+
+    def end(self, stage: Stage, number: int, count: int) -> None:
+        self.ended.append((stage.name, stage.status))
+
+
+@contextmanager
+def drive_on(channel: str) -> Iterator[CanopenDrive]:
+    with Connection(PmsmSimBus(channel)) as connection:
+        drive = CanopenDrive(connection, 1)
+        try:
+            yield drive
+        finally:
+            drive.close()
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Iterator[CanopenDrive]:
+    with drive_on(f"{PROFILE}?nv={tmp_path / 'drive.nv'}") as found:
+        yield found
+
+
+def identified(folder: Path, drive: CanopenDrive) -> RunDirectory:
+    """A run whose identification has passed, as if the profile's own numbers had been measured."""
+    run = RunDirectory.create(
+        folder, drive.identity.serial, new_record(["commission"], drive=drive_facts(drive.identity), bus={}, versions={})
+    )
+    shutil.copy(data_folder("profiles") / f"{PROFILE}.toml", run.path / "machine.toml")
+    good = [Acceptance("measured", "yes", "yes", True)]
+    run.add(Stage("identify", "pass", 9.0, acceptance=good, files={"machine.toml": ""}))
+    return run
+
+
+def finish(run: RunDirectory, drive: CanopenDrive, person: Told | None = None, **asked: object) -> Noted:
+    progress = Noted()
+    Commissioning(run, drive, person or Told(), progress, **asked).carry_out()  # type: ignore[arg-type]
+    return progress
+
+
+def active_crc(drive: CanopenDrive) -> int:
+    return DriveParameters(drive.node).crc_active
+
+
+def test_the_drive_holds_the_design_and_the_record_says_so(tmp_path: Path, drive: CanopenDrive) -> None:
+    run, person = identified(tmp_path, drive), Told()
+    progress = finish(run, drive, person)
+    assert progress.skipped == ["identify"]
+    assert progress.ended == [(name, "pass") for name in STAGES[1:]]
+    assert len(person.shown) == 1 and any("current.K_p_d_v_per_a" in line for line in person.shown[0])
+    wanted = read_parameter_set(run.path / "params.toml")
+    assert active_crc(drive) == DriveParameters(drive.node).crc_stored == crc32(image_of(wanted))
+    record = run.read()
+    assert all(record.passed(name) for name in STAGES)
+    assert all(line.ok for stage in record.stages for line in stage.acceptance)
+    recorded = {name: digest for stage in record.stages for name, digest in stage.files.items()}
+    assert {name: run.sha256(name) for name in recorded} == recorded
+    assert set(recorded) == {"machine.toml", "design.toml", "lut.npz", "lut.csv", "params.toml"}
+    assert is_safe(drive.node.state())
+    assert due_stages(run, record) == ()
+    assert finish(run, drive, Told(writes=False)).skipped == list(STAGES)
+
+
+@pytest.mark.parametrize("ended_after", STAGES[:-1])
+def test_a_chain_that_ended_goes_on_where_it_ended(
+    ended_after: str, tmp_path: Path, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = identified(tmp_path, drive)
+    later = STAGES[STAGES.index(ended_after) + 1 :]
+    steps = Commissioning._steps
+
+    def ending(self: Commissioning) -> dict[str, Callable[[], Stage]]:
+        def end() -> Stage:
+            raise KeyboardInterrupt
+
+        return {**steps(self), later[0]: end}
+
+    monkeypatch.setattr(Commissioning, "_steps", ending)
+    with pytest.raises(Interrupted):
+        finish(run, drive)
+    assert run.read().stages[-1].status == "interrupted"
+    monkeypatch.setattr(Commissioning, "_steps", steps)
+    progress = finish(run, drive)
+    assert progress.ended == [(name, "pass") for name in later]
+
+
+@pytest.mark.parametrize("lost", ["machine.toml", "design.toml", "lut.npz", "params.toml"])
+def test_a_lost_file_has_its_stage_and_all_later_ones_run_again(
+    lost: str, tmp_path: Path, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = identified(tmp_path, drive)
+    finish(run, drive)
+    (run.path / lost).unlink()
+    first = {"machine.toml": "identify", "design.toml": "tune"}.get(lost, "lut")
+    assert due_stages(run, run.read()) == STAGES[STAGES.index(first) :]
+
+
+def test_a_stage_that_ran_again_makes_the_later_ones_stale(tmp_path: Path, drive: CanopenDrive) -> None:
+    run = identified(tmp_path, drive)
+    finish(run, drive)
+    run.add(run.read().stage("tune"))  # type: ignore[arg-type]
+    assert due_stages(run, run.read()) == STAGES[2:]
+
+
+@pytest.mark.parametrize("name", ["machine.toml", "design.toml", "params.toml", "lut.csv"])
+def test_an_edited_file_is_named_and_nothing_is_done(name: str, tmp_path: Path, drive: CanopenDrive) -> None:
+    run = identified(tmp_path, drive)
+    finish(run, drive)
+    crc = active_crc(drive)
+    with (run.path / name).open("a") as file:
+        file.write("# mine\n")
+    with pytest.raises(ConfigError, match=name) as caught:
+        finish(run, drive)
+    assert caught.value.exit_code == ExitCode.USAGE
+    assert active_crc(drive) == crc
+
+
+def test_declined_writing_changes_nothing_and_can_be_taken_back(tmp_path: Path, drive: CanopenDrive) -> None:
+    run, crc = identified(tmp_path, drive), active_crc(drive)
+    with pytest.raises(Declined):
+        finish(run, drive, Told(writes=False))
+    assert active_crc(drive) == crc
+    assert (run.read().stages[-1].name, run.read().stages[-1].status) == ("flash", "refused")
+    assert finish(run, drive).ended == [("flash", "pass"), ("verify", "pass")]
+
+
+def test_the_chain_ends_at_the_first_criterion_that_is_not_met(tmp_path: Path, drive: CanopenDrive) -> None:
+    run, crc, person = identified(tmp_path, drive), active_crc(drive), Told()
+    with pytest.raises(CheckFailed, match="current_d_phase") as caught:
+        finish(run, drive, person, margins=MarginRequest(phase_margin_deg=75.0))
+    assert caught.value.exit_code == ExitCode.CHECK_FAILED
+    assert person.shown == [] and active_crc(drive) == crc
+    assert run.read().stages[-1].name == "margins" and run.read().stages[-1].status == "fail"
+
+
+def test_verify_finds_a_byte_that_somebody_changed(tmp_path: Path, drive: CanopenDrive) -> None:
+    run = identified(tmp_path, drive)
+    finish(run, drive)
+    record = run.read()
+    run.write(replace(record, stages=[stage for stage in record.stages if stage.name != "verify"]))
+    drive.write({"motor.R_s_ohm": 2.0})
+    with pytest.raises(VerifyMismatch, match=r"motor\.R_s_ohm: 2 instead of 3\.6") as caught:
+        finish(run, drive)
+    assert caught.value.exit_code == ExitCode.CHECK_FAILED
+    assert [line.ok for line in run.read().stages[-1].acceptance] == [False, False, True]
+
+
+def test_another_drive_is_refused(tmp_path: Path, drive: CanopenDrive) -> None:
+    run = identified(tmp_path, drive)
+    run.write(replace(run.read(), drive={**run.read().drive, "serial": 4711}))
+    with pytest.raises(SafetyRefusal, match="instead of 4711"):
+        finish(run, drive)
+    assert len(run.read().stages) == 1
+
+
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.4, 0.6, 0.8, 0.97])
+def test_ctrl_c_in_the_middle_leaves_old_or_new_and_goes_on(
+    share: float, tmp_path: Path, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal while a frame is awaited, at a share of all the frames that the chain takes."""
+    total = _frames(identified(tmp_path / "count", drive), drive, monkeypatch, None)
+    with drive_on(f"{PROFILE}?nv={tmp_path / 'second.nv'}") as second:
+        run, crc = identified(tmp_path / "cut", second), active_crc(second)
+        with pytest.raises(Interrupted) as caught:
+            _frames(run, second, monkeypatch, int(share * total))
+        assert caught.value.exit_code == ExitCode.INTERRUPTED
+        assert is_safe(second.node.state())
+        after = active_crc(second)
+        assert after in (crc, crc32(image_of(read_parameter_set(run.path / "params.toml"))))
+        assert run.read().stages[-1].status == "interrupted"
+        finish(run, second)
+
+
+def _frames(run: RunDirectory, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch, stop_at: int | None) -> int:
+    count = 0
+    bus = drive.node.connection.bus
+    send = bus.send
+
+    def counted(*arguments: object, **options: object) -> None:
+        nonlocal count
+        count += 1
+        if count == stop_at:
+            signal.raise_signal(signal.SIGINT)
+        send(*arguments, **options)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bus, "send", counted)
+        finish(run, drive)
+    return count
+
+
+def test_every_stage_has_a_step(tmp_path: Path, drive: CanopenDrive) -> None:
+    assert tuple(Commissioning(identified(tmp_path, drive), drive, Told(), Noted())._steps()) == STAGES
+    assert set(commission.OUTPUTS) <= set(STAGES)
