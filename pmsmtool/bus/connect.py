@@ -206,12 +206,12 @@ class Connection:
             except queue.Empty:
                 self.raise_if_failed()
                 return None
-        with contextlib.suppress(queue.Empty):
+        if not frames.empty():
             return frames.get_nowait()
         deadline = self.clock.now() + timeout_s
         while True:
             self.pump(max(timeout_s, 0.0))
-            with contextlib.suppress(queue.Empty):
+            if not frames.empty():
                 return frames.get_nowait()
             timeout_s = deadline - self.clock.now()
             if timeout_s < _RESOLUTION_S:
