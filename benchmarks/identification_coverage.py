@@ -1,0 +1,173 @@
+"""Identify many random drives over CANopen frames and say how often the truth lies in the printed interval.
+
+    python -m benchmarks.identification_coverage --drives 200 --around jercic-2017 interior-2k2 saturated-pmsyrm
+    python -m benchmarks.identification_coverage --drives 400 --block timing
+
+Drives follow from their seeds (``workflow/random_drives.py``); the tool sees their nameplate only. Printed per
+quantity: error quantiles, coverage of the 95 % interval with its Clopper-Pearson interval, and every refusal by name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from pmsmtool.bus.connect import connect
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.guard import guarded
+from pmsmtool.errors import PmsmtoolError
+from pmsmtool.estimators.estimate import statistical_half_width, total_half_width
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.resources import data_folder
+from pmsmtool.trace import Trace
+from pmsmtool.workflow.evaluate import Evaluation, evaluate
+from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of
+from pmsmtool.workflow.measure import Limits, Measurement
+from pmsmtool.workflow.random_drives import draw_around, draw_drive, true_loop_resistance
+
+QUANTITIES = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "offset_rad", "J_kgm2")
+DRAWN_SPREAD = 0.10
+"""Spread of the drives around a profile (standard deviation of the log of each parameter)."""
+
+
+def truth_of(drive: MachineFile, evaluation: Evaluation) -> dict[str, float]:
+    """Return what the estimates should be: of a saturated machine the incremental values at the printed bias."""
+    settings = drive.simulation_settings()
+    truth = {
+        name: float(settings[name])
+        for name in ("L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")  # type: ignore[arg-type]
+    }
+    truth["R_s_ohm"] = true_loop_resistance(drive)
+    truth["offset_rad"] = float(settings["encoder_offset_rad"])  # type: ignore[arg-type]
+    if drive.flux_map is not None and evaluation.inductance is not None:
+        bias = evaluation.inductance.L_d
+        incremental = drive.flux_map.incremental_inductance(bias.i_d_apk, 0.0)
+        truth["L_d_h"], truth["L_q_h"] = float(incremental[0, 0]), float(incremental[1, 1])
+        truth["psi_f_wb"] = float(drive.flux_map.flux(0.0, 0.0)[0])
+    return truth
+
+
+def identify_one(job: tuple[str, int, str]) -> dict[str, Any]:
+    """Identify one drive; returns errors, half widths and refusal, all JSON."""
+    profile, seed, block = job
+    if profile:
+        source = data_folder("profiles") / f"{profile}.toml"
+        base = load_machine_file(source)
+        drive = draw_around(base, seed, block, spread=DRAWN_SPREAD)  # type: ignore[arg-type]
+    else:
+        drive = draw_drive(seed, block)  # type: ignore[arg-type]
+    row: dict[str, Any] = {"profile": profile, "seed": seed, "block": block}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.toml"
+        path.write_text(dump_machine_file(drive, embed_flux_map=drive.flux_map is not None), encoding="utf-8")
+        try:
+            evaluation, seconds = _measure(path)
+        except PmsmtoolError as error:
+            row["refused"] = getattr(error, "reason", type(error).__name__)
+            row["text"] = str(error).splitlines()[0]
+            return row
+    truth = truth_of(drive, evaluation)
+    found = evaluation.estimates()
+    row["seconds"] = seconds
+    row["hardness"] = evaluation.resistance.hardness if evaluation.resistance else math.nan
+    for name in QUANTITIES:
+        estimate = found[name]
+        error = estimate.value - truth[name]
+        if name == "offset_rad":
+            error = math.remainder(error, 2.0 * math.pi)
+        scale = 1.0 if name == "offset_rad" else truth[name]
+        total = total_half_width(estimate) if block == "gains" else statistical_half_width(estimate)
+        row[name] = {"error": error / scale, "half": total / scale}
+    return row
+
+
+def _measure(path: Path) -> tuple[Evaluation, float]:
+    traces: dict[str, Trace] = {}
+    with connect("pmsmsim", f"{path}?nv=:memory:") as connection:
+        drive = CanopenDrive(connection, 1)
+        nameplate = nameplate_of(drive, "random")
+        request = IdentifyRequest()
+        envelope = envelope_of(nameplate, request)
+        limits = Limits(
+            nameplate.machine.I_nom_apk or envelope.i_max_apk,
+            envelope.i_max_apk,
+            envelope.speed_max_rad_s,
+            nameplate.inverter.V_max_v,
+        )
+        start = connection.clock.now()
+        with guarded(drive, envelope) as guard:
+            Measurement(guard, limits, traces.__setitem__, lambda text: None).run(request.quantities)
+        seconds = connection.clock.now() - start
+        drive.close()
+    return evaluate(traces, nameplate.inverter.T_s, T_ref_c=nameplate.machine.T_ref_c), seconds
+
+
+def clopper_pearson(hits: int, n: int) -> tuple[float, float]:
+    """Return the exact two-sided 95 % interval of a share."""
+    from scipy.stats import beta
+
+    low = 0.0 if hits == 0 else float(beta.ppf(0.025, hits, n - hits + 1))
+    high = 1.0 if hits == n else float(beta.ppf(0.975, hits + 1, n - hits))
+    return low, high
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """Return the table."""
+    accepted = [row for row in rows if "refused" not in row]
+    lines = [f"{len(rows)} drives, {len(accepted)} accepted"]
+    for reason, count in Counter(row["refused"] for row in rows if "refused" in row).most_common():
+        lines.append(f"  refused {reason}: {count}")
+    if not accepted:
+        return "\n".join(lines)
+    lines.append("quantity     median      p90       max   covered   share (95 % interval)")
+    for name in QUANTITIES:
+        errors = sorted(abs(row[name]["error"]) for row in accepted)
+        hits = sum(abs(row[name]["error"]) <= row[name]["half"] for row in accepted)
+        low, high = clopper_pearson(hits, len(accepted))
+        unit, scale = ("deg", 180.0 / math.pi) if name == "offset_rad" else ("%", 100.0)
+        quantiles = [errors[min(len(errors) - 1, round(q * (len(errors) - 1)))] * scale for q in (0.5, 0.9, 1.0)]
+        lines.append(
+            f"{name:10s} " + " ".join(f"{q:8.4f}{unit:3s}" for q in quantiles) + f" {hits:4d}/{len(accepted)}"
+            f"   {hits / len(accepted):.3f} ({low:.3f} .. {high:.3f})"
+        )
+    times = sorted(row["seconds"] for row in accepted)
+    lines.append(f"bus time per drive: median {times[len(times) // 2]:.1f} s, longest {times[-1]:.1f} s")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the program."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--drives", type=int, default=200, help="number of drives (with --around: in all)")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--block", choices=["ideal", "timing", "gains"], default="ideal")
+    parser.add_argument("--around", nargs="*", default=[], metavar="PROFILE", help="draw around these profiles")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--rows", type=Path, help="write every drive's result there (JSON lines)")
+    options = parser.parse_args()
+    profiles = options.around or [""]
+    seeds = range(options.first, options.first + options.drives)
+    jobs = [(profiles[k % len(profiles)], seed, options.block) for k, seed in enumerate(seeds)]
+    with multiprocessing.Pool(options.processes) as pool:
+        rows = []
+        for row in pool.imap_unordered(identify_one, jobs):
+            rows.append(row)
+            if options.rows:
+                with options.rows.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps(row) + "\n")
+    for profile in profiles:
+        print(f"== {profile or 'population'}, block {options.block}")
+        print(summary([row for row in rows if row["profile"] == profile]))
+    if len(profiles) > 1:
+        print("== all")
+        print(summary(rows))
+
+
+if __name__ == "__main__":
+    main()
