@@ -136,6 +136,7 @@ ERROR_TEXTS: dict[int, str] = {
     0x6320: "parameter error",
     0x7300: "sensor fault",
     0x7305: "encoder fault",
+    0x8100: "connection ended while the drive was enabled",
     0x8130: "heartbeat of the master lost",
     0x8210: "PDO not processed: too short",
     0x8480: "over-speed",

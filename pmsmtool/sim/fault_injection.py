@@ -38,6 +38,7 @@ class Injector:
                 refuse=_Refuser(self._plan.refusals) if self._plan.refusals else None,
                 distort=self._distort if self._plan.lies else None,
                 store_scale=self._plan.store_factor,
+                absent=self._plan.absences,
             )
 
     def _arm_when(self, at_frame: int | None, at_s: float | None, action: Callable[[], None]) -> None:

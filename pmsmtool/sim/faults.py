@@ -33,6 +33,9 @@
     announce = 16              # bytes announced beyond those sent
     cut = 0                    # bytes left out at the end
 
+    [[absent]]                 # an object this firmware does not have
+    object = "0x1016"          # all of an index, or one sub-object: "0x6007:00"
+
     [store]
     factor = 20.0              # a store takes that many times as long
 
@@ -114,6 +117,14 @@ class Lie:
 
 
 @dataclass(frozen=True, slots=True)
+class Absence:
+    """An object the drive does not have (``[[absent]]``); ``sub`` None: the whole index."""
+
+    index: int
+    sub: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class FaultPlan:
     """All faults of a file."""
 
@@ -122,6 +133,7 @@ class FaultPlan:
     adapters: tuple[AdapterFault, ...] = ()
     refusals: tuple[Refusal, ...] = ()
     lies: tuple[Lie, ...] = ()
+    absences: tuple[Absence, ...] = ()
     store_factor: float = 1.0
 
 
@@ -195,6 +207,11 @@ def _object(value: Any) -> tuple[int, int]:
     return int(index, 0), int(sub or "0", 16)
 
 
+def _absence(value: Any) -> Absence:
+    index, sub = _object(value)
+    return Absence(index, sub if ":" in str(value) else None)
+
+
 def _ids(value: Any) -> tuple[tuple[int, int], ...]:
     items = value if isinstance(value, list) else [value]
     ranges = []
@@ -224,8 +241,9 @@ _DRIVE: dict[str, Callable[[Any], Any]] = {
 _ADAPTER: dict[str, Callable[[Any], Any]] = {**_WHEN, "recv_raises": _flag}
 _REFUSE: dict[str, Callable[[Any], Any]] = {"object": _object, "code": _integer, "count": _whole(1)}
 _LIE: dict[str, Callable[[Any], Any]] = {"object": _object, "announce": _whole(-(1 << 31)), "cut": _whole(0)}
+_ABSENT: dict[str, Callable[[Any], Any]] = {"object": _absence}
 _STORE: dict[str, Callable[[Any], Any]] = {"factor": _number(0.01, 1e4)}
-_TABLES = ("frame", "drive", "adapter", "refuse", "lie", "store")
+_TABLES = ("frame", "drive", "adapter", "refuse", "lie", "absent", "store")
 
 
 def parse_faults(text: str, where: str = "faults") -> FaultPlan:
@@ -289,6 +307,7 @@ def _plan(reader: _Reader, document: Mapping[str, Any]) -> FaultPlan:
         adapters=tuple(AdapterFault(**row) for row in adapters),
         refusals=tuple(Refusal(row["object"], row["code"], row.get("count")) for row in refusals),
         lies=tuple(Lie(row["object"], row.get("announce", 0), row.get("cut", 0)) for row in lies),
+        absences=tuple(row["object"] for row in _rows(reader, document, "absent", _ABSENT, "object")),
         store_factor=reader.table("[store]", store, _STORE).get("factor", 1.0),
     )
 

@@ -47,6 +47,7 @@ class SimpleCore:
         self.restarts = 0
         self.i_d = self.i_q = self.omega = self.theta = self.u_d = self.u_q = 0.0
         self.flags = 0
+        self.driven = False
         self.command_seen = Command()
         self.persistent_trip = 0
         self.trip_at: dict[int, int] = {}
@@ -121,7 +122,9 @@ class SimpleCore:
             i_d, i_q = i_d + self._excitation.bias_d_a, i_q + self._excitation.bias_q_a
         self.i_d += CURRENT_SHARE * (i_d - self.i_d)
         self.i_q += CURRENT_SHARE * (i_q - self.i_q)
-        if command.mode is ControlMode.SPEED:
+        if self.driven:
+            pass  # something stronger turns the shaft
+        elif command.mode is ControlMode.SPEED:
             target = 0.0 if command.quick_stop else command.omega_m_rad_s
             step = SPEED_SLOPE * T_s
             self.omega += min(max(target - self.omega, -step), step)

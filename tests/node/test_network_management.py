@@ -40,16 +40,41 @@ def test_reset_ends_in_boot_up_and_pre_operational(bench: Bench, command: int) -
     assert set(frames[1:]) == {b"\x7f"}
 
 
-def test_reset_node_takes_the_gates_away_and_reset_communication_does_not(bench: Bench) -> None:
+@pytest.mark.parametrize("command", [2, 129, 130])
+def test_a_master_that_ends_the_connection_does_not_leave_the_drive_enabled(bench: Bench, command: int) -> None:
     enable(bench)
-    bench.nmt(130)
-    bench.wait(0.1)
-    assert int(bench.client.number(0x6041, 0, "H")) & 0x6F == 0x27
-    bench.nmt(129)
-    bench.wait(0.1)
-    assert bench.core.restarts == 1
+    bench.nmt(command)
+    bench.wait(0.2)
+    bench.nmt(128)
     bench.client.drain()
     assert int(bench.client.number(0x6041, 0, "H")) & 0x6F == 0x40
+    assert bench.core.restarts == (command == 129)
+
+
+@pytest.mark.parametrize(("option", "state"), [(0, 0x27), (1, 0x08), (2, 0x40), (3, 0x40)])
+def test_abort_connection_option_also_holds_for_an_nmt_stop(bench: Bench, option: int, state: int) -> None:
+    bench.client.put(0x6007, 0, option, "h")
+    enable(bench)
+    bench.nmt(2)
+    bench.wait(0.2)
+    bench.nmt(128)
+    assert int(bench.client.number(0x6041, 0, "H")) & (0x4F if state in (0x08, 0x40) else 0x6F) == state
+    assert bench.client.number(0x603F, 0, "H") == (0x8100 if option == 1 else 0)
+
+
+def test_an_nmt_stop_of_a_disabled_drive_is_no_fault(bench: Bench) -> None:
+    bench.client.put(0x6007, 0, 1, "h")
+    bench.nmt(2)
+    bench.nmt(128)
+    assert int(bench.client.number(0x6041, 0, "H")) & 0x6F == 0x40
+
+
+def test_no_emergency_is_sent_while_stopped(bench: Bench) -> None:
+    bench.nmt(2)
+    bench.core.trip_at[bench.core.periods + 20] = 0x2310
+    assert bench.frames(0x081, 0.1) == []
+    bench.nmt(128)
+    assert bench.client.number(0x1003, 1) == 0x2310
 
 
 def test_reset_communication_brings_back_communication_defaults_only(bench: Bench) -> None:
@@ -80,6 +105,35 @@ def test_a_lost_heartbeat_is_reported_after_its_time_and_not_before(bench: Bench
     emergencies = [message for message in bench.listen(0.5) if message.arbitration_id == 0x081]
     assert [bytes(message.data) for message in emergencies] == [bytes.fromhex("3081117f00000000")]
     assert emergencies[0].timestamp - started == pytest.approx(0.01, abs=0.002)
+
+
+def test_a_heartbeat_that_comes_back_clears_the_error(bench: Bench) -> None:
+    consume(bench, 0x7F, 100)
+    bench.client.send(b"\x05", 0x77F)
+    assert bench.frames(0x081, 0.2) == [bytes.fromhex("3081117f00000000")]
+    assert bench.client.number(0x1001, 0, "B") == 0x11
+    bench.client.send(b"\x05", 0x77F)
+    assert bench.frames(0x081, 0.05) == [bytes(8)]
+    assert bench.client.number(0x1001, 0, "B") == 0
+    assert bench.client.number(0x1003, 0, "B") == 1, "the history keeps it"
+
+
+def test_a_consumer_that_is_taken_away_clears_the_error(bench: Bench) -> None:
+    consume(bench, 0x7F, 100)
+    bench.client.send(b"\x05", 0x77F)
+    bench.wait(0.2)
+    bench.client.put(0x1016, 1, 0)
+    assert bench.client.number(0x1001, 0, "B") == 0
+
+
+def test_errors_without_a_fault_are_acknowledged_by_a_fault_reset_and_others_stay_listed(bench: Bench) -> None:
+    bench.nmt(1)
+    bench.client.send(b"\x06", 0x201)
+    bench.wait(0.01)
+    assert bench.client.number(0x1001, 0, "B") == 0x11
+    bench.client.put(0x6040, 0, 0x80, "H")
+    assert bench.client.number(0x1001, 0, "B") == 0
+    assert bench.client.heard(0x081) == [bytes.fromhex("1082110000000000"), bytes(8)]
 
 
 def test_watching_begins_with_the_first_heartbeat(bench: Bench) -> None:

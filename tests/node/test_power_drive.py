@@ -110,12 +110,78 @@ def test_velocity_mode_reaches_its_target_and_quick_stop_brings_it_to_rest(bench
     assert abs(bench.core.omega) < 3 * RPM
 
 
+def turning(bench: Bench, mode: Mode, gain: float, option: int, slope_rpm_s: int) -> float:
+    """Quick-stop from 300 rpm in a mode and return the time until the gates were off (s)."""
+    bench.client.put(0x2021, 1, gain, "f")
+    bench.client.put(0x605A, 0, option, "h")
+    bench.client.put(0x6085, 0, slope_rpm_s)
+    enable(bench, mode)
+    bench.core.omega = 300 * RPM
+    started = bench.bus.clock.now()
+    control(bench, Command.QUICK_STOP)
+    while state(bench) is State.QUICK_STOP_ACTIVE:
+        bench.wait(0.001)
+    assert state(bench) is State.SWITCH_ON_DISABLED
+    return bench.bus.clock.now() - started
+
+
+@pytest.mark.parametrize("mode", [Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE, Mode.PROFILE_VELOCITY])
+def test_quick_stop_brakes_a_turning_machine_by_the_ramp(bench: Bench, mode: Mode) -> None:
+    """300 rpm at 600 rpm/s: 0.5 s."""
+    assert turning(bench, mode, 0.1, 2, 600) == pytest.approx(0.5, abs=0.02)
+    assert abs(bench.core.omega) < 3 * RPM
+
+
+@pytest.mark.parametrize(("gain", "option"), [(0.0, 2), (0.1, 3)])
+def test_quick_stop_brakes_at_the_limit_without_a_tuned_speed_controller_or_when_asked(
+    bench: Bench, gain: float, option: int
+) -> None:
+    """The simple machine brakes with 400 rad/s2 at most: 0.08 s."""
+    assert turning(bench, Mode.PROFILE_TORQUE, gain, option, 600) == pytest.approx(0.08, abs=0.01)
+    assert abs(bench.core.omega) < 3 * RPM
+
+
+def test_quick_stop_in_identification_only_takes_the_current_away(bench: Bench) -> None:
+    bench.client.put(0x2052, 1, 5.0, "f")
+    assert turning(bench, Mode.IDENTIFICATION, 0.1, 2, 600) < 0.02
+    assert bench.core.omega > 250 * RPM
+
+
+def test_a_mode_written_during_a_stop_does_not_change_how_it_ends(bench: Bench) -> None:
+    bench.client.put(0x2021, 1, 0.1, "f")
+    bench.client.put(0x6085, 0, 600)
+    enable(bench, Mode.PROFILE_VELOCITY)
+    bench.core.omega = 300 * RPM
+    control(bench, Command.QUICK_STOP)
+    bench.client.put(0x6060, 0, Mode.IDENTIFICATION, "b")
+    bench.wait(0.3)
+    assert state(bench) is State.QUICK_STOP_ACTIVE
+    bench.wait(0.3)
+    assert state(bench) is State.SWITCH_ON_DISABLED
+    assert abs(bench.core.omega) < 3 * RPM
+
+
+def test_a_stop_that_does_not_succeed_ends_without_current_after_its_time(bench: Bench) -> None:
+    """Ramp of 0.03 s, 1.5 times that and 0.5 s: a machine that something else drives is let go."""
+    bench.client.put(0x2021, 1, 0.1, "f")
+    enable(bench, Mode.PROFILE_VELOCITY)
+    bench.core.omega = 300 * RPM
+    bench.core.driven = True
+    control(bench, Command.QUICK_STOP)
+    bench.wait(0.5)
+    assert state(bench) is State.QUICK_STOP_ACTIVE
+    bench.wait(0.1)
+    assert state(bench) is State.SWITCH_ON_DISABLED
+    assert bench.core.command_seen.mode is ControlMode.OFF
+
+
 def test_quick_stop_that_stays_can_be_resumed(bench: Bench) -> None:
     bench.client.put(0x605A, 0, 6, "h")
     enable(bench, Mode.PROFILE_VELOCITY)
     control(bench, Command.QUICK_STOP)
     bench.wait(0.5)
     assert state(bench) is State.QUICK_STOP_ACTIVE
+    assert bench.core.command_seen.mode is ControlMode.OFF
     control(bench, Command.ENABLE_OPERATION)
     assert state(bench) is State.OPERATION_ENABLED
 

@@ -8,6 +8,7 @@ import zlib
 import pytest
 
 from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.errors import ConfigError
 from pmsmtool.sim.node import store as storing
 from pmsmtool.sim.node.memory import Memory, RamStorage
 from tests.node.bench import Bench, steps_of
@@ -184,6 +185,36 @@ def test_damaged_memory_is_reported_and_the_factory_set_is_active(make_bench: Be
     bench.nmt(129)
     assert bench.frames(0x081, 0.1)[0][:2] == b"\x30\x55"
     assert values(bench) == DEFAULT
+
+
+class BrokenStorage(RamStorage):
+    """Can be read, but not written any more after a number of writes."""
+
+    writes_left = 0
+
+    def write(self, offset: int, data: bytes, *, durable: bool) -> None:
+        if self.writes_left == 0:
+            raise ConfigError("the drive's memory cannot be used: Read-only file system")
+        self.writes_left -= 1
+        super().write(offset, data, durable=durable)
+
+
+@pytest.mark.parametrize("writes", [0, 1])
+@pytest.mark.parametrize(("index", "signature"), [(0x1010, SAVE), (0x1011, LOAD)])
+def test_a_memory_that_cannot_be_written_refuses_the_store(
+    make_bench: BenchMaker, index: int, signature: int, writes: int
+) -> None:
+    storage = BrokenStorage()
+    storage.writes_left = writes
+    bench = make_bench(storage=storage, timeout_s=2.0)
+    with pytest.raises(Aborted) as caught:
+        bench.client.put(index, 1, signature)
+    assert (caught.value.code, caught.value.index) == (AbortCode.HARDWARE, index)
+    assert bench.client.number(0x1003, 1) == 0x5530
+    assert bench.client.number(0x2000, 4) == 0, "nothing counts as stored"
+    storage.writes_left = 1000
+    save(bench)
+    assert bench.client.number(0x2000, 4) == bench.client.number(0x2000, 3)
 
 
 def test_stored_values_encode_and_decode() -> None:

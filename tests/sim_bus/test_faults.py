@@ -152,6 +152,30 @@ def test_a_slow_store(make_bench: BenchMaker) -> None:
     assert bench.client.number(0x1018, 4) == SERIAL
 
 
+def test_absent_objects(make_bench: BenchMaker) -> None:
+    bench = make_bench(faults='[[absent]]\nobject="0x1016"\n[[absent]]\nobject="0x6007:00"\n[[absent]]\nobject="0x1018:04"')
+    for _ in range(2):
+        for index, sub, code in ((0x1016, 0, 0x06020000), (0x1016, 1, 0x06020000), (0x6007, 0, 0x06020000),
+                                 (0x1018, 4, 0x06090011)):  # fmt: skip
+            for request in (HEAD.pack(0x40, index, sub) + bytes(4), HEAD.pack(0x23, index, sub) + bytes(4)):
+                answer = bench.client.ask(request)
+                assert answer == b"\x80" + request[1:4] + code.to_bytes(4, "little")
+        assert bench.client.number(0x1018, 1) == 0x706D736D
+        bench.nmt(129)
+        bench.wait(0.1)
+        bench.client.drain()
+
+
+def test_a_mapped_object_that_is_absent_empties_its_pdo(make_bench: BenchMaker) -> None:
+    bench = make_bench(faults='[[absent]]\nobject="0x6041"')
+    for command in (130, 1):
+        bench.nmt(command)
+        bench.wait(0.1)
+    assert 0x181 not in bench.ids(0.5)
+    with pytest.raises(ConfigError, match="no object 0x4711"):
+        make_bench(faults='[[absent]]\nobject="0x4711"')
+
+
 def test_an_empty_file_is_no_fault() -> None:
     assert parse_faults("") == FaultPlan()
 
@@ -168,6 +192,7 @@ def test_an_empty_file_is_no_fault() -> None:
         ('[[drive]]\naction="reset"\nat_s=1\nat_frame=2', "exactly one of"),
         ('[[refuse]]\nobject="0x2010:02"', "code missing"),
         ('[[lie]]\nobject="here"', "object"),
+        ('[[absent]]\nobject="here"', "object"),
         ("[store]\nfactor=0", "factor"),
         ("frame = 3", "array of tables"),
         ("[[frame", "not a TOML file"),

@@ -7,6 +7,7 @@ import struct
 from collections.abc import Callable, Iterator
 
 from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.errors import ConfigError
 from pmsmtool.sim.node.objects import ObjectRow, object_rows
 
 Sink = Callable[[bytes], bool | None]
@@ -126,6 +127,7 @@ class Dictionary:
         self._indices = {row.index for row in object_rows()}
         self.by_key = {entry.row.key: entry for entry in self._entries.values() if entry.row.key}
         self.on_change: Callable[[Entry], None] = lambda entry: None
+        self._hidden: set[int] = set()
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._entries.values())
@@ -145,6 +147,24 @@ class Dictionary:
         if entry is None:
             raise Refused(AbortCode.NO_SUBINDEX if index in self._indices else AbortCode.NO_OBJECT)
         return entry
+
+    def hide(self, index: int, sub: int | None = None) -> None:
+        """Fault injection: answer as if there were no such object; the application still finds it by key.
+
+        Raises
+        ------
+        ConfigError
+            There is no such object.
+        """
+        hidden = [key for key in self._entries if key >> 8 == index and sub in (None, key & 0xFF)]
+        if not hidden and index not in self._hidden:
+            raise ConfigError(
+                f"the drive has no object 0x{index:04X}" + ("" if sub is None else f":{sub:02X}"), where="[[absent]]"
+            )
+        for key in hidden:
+            del self._entries[key]
+        self._hidden.add(index)
+        self._indices = {key >> 8 for key in self._entries}
 
     def readable(self, index: int, sub: int) -> Entry:
         """Return an entry that can be read, else refuse."""

@@ -25,8 +25,7 @@ class Emergency:
     """Errors present, their history, and the messages about them."""
 
     def __init__(self, dictionary: Dictionary, schedule: Schedule, send: Callable[[int, bytes], None]) -> None:
-        self.register = 0
-        self.last_code = 0
+        self._present: set[int] = set()
         self._history: list[int] = []
         self._dictionary = dictionary
         self._schedule = schedule
@@ -39,6 +38,14 @@ class Emergency:
         for number in range(_HISTORY):
             dictionary[f"error.history_{number + 1}"].source = self._history_source(number)
 
+    @property
+    def register(self) -> int:
+        """Error register: the bits of all errors present."""
+        bits = 0
+        for code in self._present:
+            bits |= register_bits(code)
+        return bits
+
     def _history_source(self, number: int) -> Callable[[], bytes]:
         return lambda: (self._history[number] if number < len(self._history) else 0).to_bytes(4, "little")
 
@@ -47,17 +54,16 @@ class Emergency:
 
     def raise_error(self, code: int, detail: bytes = b"") -> None:
         """Report an error: register, history, message."""
-        self.register |= register_bits(code)
-        self.last_code = code
+        self._present.add(code)
         self._history.insert(0, code)
         del self._history[_HISTORY:]
         self._message(code, detail)
 
-    def clear(self) -> None:
-        """All errors are gone."""
-        if self.register:
-            self.register = 0
-            self.last_code = 0
+    def clear(self, code: int | None = None) -> None:
+        """One error is gone, or all are; the message "error reset" shows in its register what is left."""
+        gone = self._present if code is None else self._present & {code}
+        if gone:
+            self._present = self._present - gone
             self._message(0, b"")
 
     def _message(self, code: int, detail: bytes) -> None:

@@ -51,11 +51,17 @@ class HeartbeatConsumer:
     ----------
     lost : callable
         Called with the node id when a heartbeat is overdue.
+    regained : callable
+        Called when every heartbeat that was lost has come back.
     """
 
-    def __init__(self, dictionary: Dictionary, schedule: Schedule, lost: Callable[[int], None]) -> None:
+    def __init__(
+        self, dictionary: Dictionary, schedule: Schedule, lost: Callable[[int], None], regained: Callable[[], None]
+    ) -> None:
         self._schedule = schedule
         self._lost = lost
+        self._regained = regained
+        self._missing: set[int] = set()
         self._entries = [dictionary[f"heartbeat.consumer_{number + 1}"] for number in range(CONSUMERS)]
         self._deadline: dict[int, int] = {}
         self._timers: dict[int, Timer] = {}
@@ -70,13 +76,17 @@ class HeartbeatConsumer:
             entry = dictionary[key]
             previous = entry.value[2]
             entry.value = data
+            was_missing = bool(self._missing)
             for stale in {previous, node}:
                 self._forget(stale)
+            if was_missing and not self._missing:
+                self._regained()
 
         return sink
 
     def _forget(self, node: int) -> None:
         self._deadline.pop(node, None)
+        self._missing.discard(node)
         timer = self._timers.pop(node, None)
         if timer is not None:
             timer.cancel()
@@ -87,15 +97,15 @@ class HeartbeatConsumer:
                 return int.from_bytes(entry.value[:2], "little") * _MS
         return 0
 
-    def is_watching(self) -> bool:
-        """Whether any heartbeat is being watched now."""
-        return bool(self._deadline)
-
     def heard(self, node: int) -> None:
         """A heartbeat of a node has arrived."""
         period_ns = self._period_ns(node)
         if not period_ns:
             return
+        if node in self._missing:
+            self._missing.remove(node)
+            if not self._missing:
+                self._regained()
         self._deadline[node] = self._schedule.now_ns + period_ns
         if node not in self._timers:
             self._plan(node)
@@ -112,4 +122,5 @@ class HeartbeatConsumer:
             self._plan(node)
             return
         self._forget(node)
+        self._missing.add(node)
         self._lost(node)

@@ -37,7 +37,7 @@ class LssSlave:
     active_id, pending_id : callables
         The node id in use; the one that holds after the next reset.
     set_pending, store : callables
-        Take a new node id; keep it in non-volatile memory.
+        Take a new node id; keep it in non-volatile memory and then call back with the error (0: stored).
     leave : callable
         Called when configuration ends (an unconfigured node starts then).
     send : callable
@@ -52,7 +52,7 @@ class LssSlave:
         active_id: Callable[[], int],
         pending_id: Callable[[], int],
         set_pending: Callable[[int], None],
-        store: Callable[[], bool],
+        store: Callable[[Callable[[int], None]], None],
         leave: Callable[[], None],
         send: Callable[[bytes], None],
     ) -> None:
@@ -148,7 +148,7 @@ class LssSlave:
             fits = known and self._bitrate in (None, _BIT_TIMINGS[frame[2]])
             self._answer(0x13, 0 if fits else 1)
         elif command == 0x17:
-            self._answer(0x17, 0 if self._store() else 2)
+            self._store(lambda error: self._answer(0x17, error))
         elif command in _INQUIRE:
             self._send(bytes((command,)) + self._identity[command - 0x5A].to_bytes(4, "little") + bytes(3))
         elif command == 0x5E:

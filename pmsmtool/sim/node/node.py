@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from pmsmtool.bus.clock import VirtualClock
+from pmsmtool.sim.faults import Absence
 from pmsmtool.sim.node import store as storing
 from pmsmtool.sim.node.drive_core import DriveCore
 from pmsmtool.sim.node.lss import UNCONFIGURED
@@ -96,6 +97,7 @@ class Node:
         self.on_store_step: Callable[[], None] = lambda: None
         self._distort: Callable[[int, int, bytes], tuple[int, bytes]] | None = None
         self._refuse: Callable[[int, int], int | None] | None = None
+        self._absent: tuple[Absence, ...] = ()
         self._settings = settings
         self.node_id = self.next_node_id = self._power_on_id()
         self._powered = True
@@ -123,7 +125,7 @@ class Node:
         self._generation += 1
         self.node_id = self.next_node_id
         self.session = Session(self, Schedule(self.line.clock))
-        self.session.sdo.refuse, self.session.sdo.distort = self._refuse, self._distort
+        self._spoil(self.session)
 
     def _drop(self) -> None:
         self._generation += 1
@@ -194,12 +196,19 @@ class Node:
         refuse: Callable[[int, int], int | None] | None,
         distort: Callable[[int, int, bytes], tuple[int, bytes]] | None,
         store_scale: float,
+        absent: Sequence[Absence] = (),
     ) -> None:
-        """Fault injection: refused writes, lies about sizes, slow store (``sim/faults.py``)."""
+        """Fault injection: refused writes, lies about sizes, slow store, missing objects (``sim/faults.py``)."""
         self._refuse, self._distort = refuse, distort
         self.store_scale = store_scale
+        self._absent = tuple(absent)
         if self.session is not None:
-            self.session.sdo.refuse, self.session.sdo.distort = refuse, distort
+            self._spoil(self.session)
+
+    def _spoil(self, session: Session) -> None:
+        session.sdo.refuse, session.sdo.distort = self._refuse, self._distort
+        for absence in self._absent:
+            session.dictionary.hide(absence.index, absence.sub)
 
     def make_store(self, session: Session) -> Store:
         """Return the storing objects of a session."""

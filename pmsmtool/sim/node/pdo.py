@@ -141,16 +141,23 @@ class ProcessData:
             raise Refused(AbortCode.PDO_LENGTH)
         return entries
 
+    def _mapping(self, pdo: _Pdo) -> list[Entry]:
+        """Return what a PDO carries; nothing when it maps an object this firmware does not have."""
+        try:
+            return self._collect(pdo, self._number(pdo, "count"))
+        except Refused:
+            return []
+
     def configure(self) -> None:
         """Take over what the communication and mapping objects say."""
         self.receive_ids.clear()
         for pdo in self._rpdos:
-            pdo.entries = self._collect(pdo, self._number(pdo, "count"))
+            pdo.entries = self._mapping(pdo)
             cob_id = self._number(pdo, "cob_id")
             if not cob_id & _OFF:
                 self.receive_ids[cob_id & 0x7FF] = pdo
         for pdo in self._tpdos:
-            pdo.entries = self._collect(pdo, self._number(pdo, "count"))
+            pdo.entries = self._mapping(pdo)
             pdo.last = b""
             if pdo.event is not None:
                 pdo.event.cancel()

@@ -11,24 +11,21 @@ from collections.abc import Callable
 from typing import Protocol
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.bus.clock import NS, Timer
+from pmsmtool.bus.clock import Timer
 from pmsmtool.cia402 import AbortConnection, Control, FaultReaction, Mode, QuickStop, State, Status
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore, Signal
 from pmsmtool.sim.node.emergency import Emergency
+from pmsmtool.sim.node.quick_stop import Stopping
 from pmsmtool.sim.node.schedule import Schedule
 
 RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 HEARTBEAT_LOST = 0x8130
+CONNECTION_ENDED = 0x8100
 EXCITATION_ABORTED = 0xFF10
 STANDSTILL_SHARE = 0.002
 """Share of n_max below which the machine counts as standing."""
 STANDSTILL_FLOOR_RPM = 2.0
-CURRENT_GONE_SHARE = 0.02
-"""Share of I_nom below which a ramped-down current counts as zero."""
-_STOP_POLL_S = 0.002
-_STOP_MARGIN_S = 0.5
-_STOP_FACTOR = 1.5
 _SLOPE_STEP_S = 0.001
 _SPEED_MODES = (Mode.PROFILE_VELOCITY, Mode.CYCLIC_VELOCITY)
 _TORQUE_MODES = (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE)
@@ -74,9 +71,16 @@ class PowerDrive:
         self._error_code = 0
         self._torque_demand = 0.0
         self._slope_timer: Timer | None = None
-        self._stop_timer: Timer | None = None
-        self._stop_deadline_ns = 0
         self._after_stop = State.SWITCH_ON_DISABLED
+        self._stopping = Stopping(
+            dictionary,
+            schedule,
+            plant.core,
+            omega_m=self.omega_m,
+            standstill_rad_s=self._standstill_rad_s,
+            parameter=plant.parameter,
+            done=self._stopped,
+        )
         self._hook()
 
     # ---- objects -------------------------------------------------------------------------------
@@ -144,6 +148,10 @@ class PowerDrive:
         """Return the mechanical speed the drive sees (rad/s)."""
         return self._signal(Signal.OMEGA_E) / max(1.0, self._plant.parameter("motor.pole_pairs"))
 
+    def _standstill_rad_s(self) -> float:
+        rpm = max(STANDSTILL_FLOOR_RPM, STANDSTILL_SHARE * self._plant.parameter("motor.n_max_rpm"))
+        return 1000.0 * rpm * RAD_S_PER_MRPM
+
     @property
     def mode(self) -> Mode:
         """Mode of operation."""
@@ -183,6 +191,8 @@ class PowerDrive:
             if rising & Control.FAULT_RESET:
                 self._reset_fault()
             return
+        if rising & Control.FAULT_RESET:
+            self._emergency.clear()  # acknowledges what is past and caused no fault
         if self.state is not State.FAULT_REACTION_ACTIVE:
             self._command(word)
 
@@ -216,9 +226,8 @@ class PowerDrive:
     def _to(self, state: State) -> None:
         was_energised = self.state.energised
         self.state = state
-        if self._stop_timer is not None and state not in (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE):
-            self._stop_timer.cancel()
-            self._stop_timer = None
+        if state not in (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE):
+            self._stopping.cancel()
         if state is State.OPERATION_ENABLED:
             self._torque_demand = 0.0
             self.apply()
@@ -233,35 +242,17 @@ class PowerDrive:
         if option is QuickStop.DISABLE:
             self._to(State.FAULT if fault else State.SWITCH_ON_DISABLED)
             return
+        control = self._control_mode()
         self.on_leave()
         self._after_stop = State.FAULT if fault else State.SWITCH_ON_DISABLED
-        deceleration = self._number("quick_stop_deceleration") / 60.0 * 2.0 * math.pi
-        seconds = _STOP_MARGIN_S + _STOP_FACTOR * abs(self.omega_m()) / deceleration
-        self._stop_deadline_ns = self._schedule.now_ns + round(seconds * NS)
-        mode = self._control_mode()
-        self._plant.core.command(Command(mode, quick_stop=True))
+        self._stopping.begin(control, option)
         self._to(State.FAULT_REACTION_ACTIVE if fault else State.QUICK_STOP_ACTIVE)
-        self._stop_timer = self._schedule.after(_STOP_POLL_S, self._poll_stop)
 
-    def _poll_stop(self) -> None:
-        self._stop_timer = None
-        if self.state not in (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE):
-            return
-        if not self._has_stopped() and self._schedule.now_ns < self._stop_deadline_ns:
-            self._stop_timer = self._schedule.after(_STOP_POLL_S, self._poll_stop)
-            return
+    def _stopped(self) -> None:
         if self._after_stop is State.FAULT or not self._quick_stop_option().stays:
             self._to(self._after_stop)
-
-    def _has_stopped(self) -> bool:
-        if self._control_mode() is ControlMode.SPEED:
-            return abs(self.omega_m()) <= self._standstill_rad_s()
-        current = math.hypot(self._signal(Signal.I_D), self._signal(Signal.I_Q))
-        return current <= CURRENT_GONE_SHARE * self._plant.parameter("motor.I_nom_apk")
-
-    def _standstill_rad_s(self) -> float:
-        rpm = max(STANDSTILL_FLOOR_RPM, STANDSTILL_SHARE * self._plant.parameter("motor.n_max_rpm"))
-        return rpm / 60.0 * 2.0 * math.pi
+        else:
+            self._plant.core.command(Command())  # stays in quick stop active, without current
 
     def _reset_fault(self) -> None:
         core = self._plant.core
@@ -297,12 +288,33 @@ class PowerDrive:
 
     def connection_lost(self, node: int) -> None:
         """React to a lost heartbeat as object 0x6007 says."""
-        option = AbortConnection(int(self._number("abort_connection")))
         self._plant.look()
-        if option is AbortConnection.FAULT:
+        if self._abort_connection() is AbortConnection.FAULT:
             self.fail(HEARTBEAT_LOST, bytes((node,)), ramp=True)
             return
         self._emergency.raise_error(HEARTBEAT_LOST, bytes((node,)))
+        self._leave_operation()
+
+    def connection_regained(self) -> None:
+        """All heartbeats that were lost are back; a fault they caused stays until it is reset."""
+        if self.state not in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            self._emergency.clear(HEARTBEAT_LOST)
+
+    def connection_ended(self) -> None:
+        """React to an NMT stop or a reset of the communication as object 0x6007 says (CiA 402-2)."""
+        self._plant.look()
+        if not self.state.energised:
+            return
+        if self._abort_connection() is AbortConnection.FAULT:
+            self.fail(CONNECTION_ENDED, ramp=True)
+        else:
+            self._leave_operation()
+
+    def _abort_connection(self) -> AbortConnection:
+        return AbortConnection(int(self._number("abort_connection")))
+
+    def _leave_operation(self) -> None:
+        option = self._abort_connection()
         if option is AbortConnection.DISABLE_VOLTAGE and self.state.energised:
             self._to(State.SWITCH_ON_DISABLED)
         elif option is AbortConnection.QUICK_STOP and self.state is State.OPERATION_ENABLED:

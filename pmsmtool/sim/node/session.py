@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Protocol
 
@@ -23,6 +24,8 @@ from pmsmtool.sim.node.store import Group, Store, Stored
 
 SET_LOST = 0x6310
 MEMORY_DAMAGED = 0x5530
+LSS_NOT_STORED = 2
+"""LSS error code: storage media access error (CiA 305)."""
 RESET_COMMUNICATION_S = 0.005
 """Silence of the node during a reset of its communication."""
 _CONFIGURATION_INDEX = 0x1020
@@ -103,12 +106,14 @@ class Session:
         active, lost = self._stored_set()
         self.parameters = ParameterSet(self.dictionary, active, self.is_energised, self._take_set)
         self._note_stored_set()
-        self.emergency = Emergency(self.dictionary, schedule, hardware.send)
+        self.emergency = Emergency(self.dictionary, schedule, self._send_emergency)
         self.power = PowerDrive(self.dictionary, schedule, hardware, self.emergency)
         self.measurement = Measurement(self.dictionary, hardware, self.power)
         self.sdo = SdoServer(self.dictionary, schedule, self._send_sdo, self._withdraw_sdo)
         self.heartbeat = HeartbeatProducer(self.dictionary, schedule, self.send_state)
-        self.consumer = HeartbeatConsumer(self.dictionary, schedule, self._heartbeat_lost)
+        self.consumer = HeartbeatConsumer(
+            self.dictionary, schedule, self._heartbeat_lost, self.power.connection_regained
+        )
         self.pdo = ProcessData(
             self.dictionary, schedule, self._is_operational, hardware.send, self.emergency.raise_error
         )
@@ -172,12 +177,18 @@ class Session:
     def _set_node_id(self, node_id: int) -> None:
         self.hardware.next_node_id = node_id
 
-    def _store_node_id(self) -> bool:
+    def _store_node_id(self, done: Callable[[int], None]) -> None:
         if self.store.busy:
-            return False
+            done(LSS_NOT_STORED)
+            return
         content = {**self.store.stored, storing.NODE_ID_KEY: bytes((self.hardware.next_node_id,))}
-        self.store.write(content, lambda: None)
-        return True
+
+        def stored(code: int | None) -> None:
+            if code is not None:
+                self.report_damage()
+            done(0 if code is None else LSS_NOT_STORED)
+
+        self.store.write(content, stored)
 
     def _lss_left(self) -> None:
         if self.nmt is NmtState.INITIALISING and self.hardware.next_node_id <= 127:
@@ -234,10 +245,13 @@ class Session:
             values[storing.SIGNATURE_KEY] = self.dictionary["parameter_set.signature"].value
         return values
 
-    def store_finished(self) -> None:
-        """A store of 0x1010 or 0x1011 is complete."""
-        self._note_stored_set()
-        self.sdo.finish()
+    def store_finished(self, code: int | None) -> None:
+        """A store of 0x1010 or 0x1011 is complete, or was given up with an abort code."""
+        if code is None:
+            self._note_stored_set()
+        else:
+            self.report_damage()
+        self.sdo.finish(code)
 
     def _note_stored_set(self) -> None:
         image = self.store.stored.get(storing.IMAGE_KEY)
@@ -258,7 +272,7 @@ class Session:
         self.heartbeat.start()
 
     def report_damage(self) -> None:
-        """The memory held nothing valid although it was written before."""
+        """The memory held nothing valid although it was written before, or cannot be written."""
         self.emergency.raise_error(MEMORY_DAMAGED)
 
     def _is_operational(self) -> bool:
@@ -278,16 +292,21 @@ class Session:
             self.nmt = NmtState.OPERATIONAL
             self.pdo.start()
         elif command == NmtCommand.STOP:
-            self.nmt = NmtState.STOPPED
-            self.sdo.reset()
+            self._stop()
+            self.power.connection_ended()
         elif command == NmtCommand.PRE_OPERATIONAL:
             self.nmt = NmtState.PRE_OPERATIONAL
 
+    def _stop(self) -> None:
+        self.nmt = NmtState.STOPPED
+        self.sdo.reset()
+
     def _reset_communication(self) -> None:
-        """Give 0x1000 to 0x1FFF their power-on values; the application goes on."""
+        """Give 0x1000 to 0x1FFF their power-on values; the application does what object 0x6007 says."""
         if self.hardware.next_node_id != self.hardware.node_id:
             self.hardware.reset()  # identifiers of the whole dictionary follow the node id
             return
+        self.power.connection_ended()
         self.nmt = NmtState.INITIALISING
         self.sdo.reset()
         fresh = Dictionary(self.hardware.node_id)
@@ -304,13 +323,16 @@ class Session:
             self.hardware.send(0x700 + self.hardware.node_id, bytes((self.nmt,)))
 
     def _heartbeat_lost(self, node: int) -> None:
+        self.power.connection_lost(node)
         behaviour = self.dictionary["error.behaviour"].integer()
         if behaviour == 0 and self.nmt is NmtState.OPERATIONAL:
             self.nmt = NmtState.PRE_OPERATIONAL
         elif behaviour == 2:
-            self.nmt = NmtState.STOPPED
-            self.sdo.reset()
-        self.power.connection_lost(node)
+            self._stop()
+
+    def _send_emergency(self, can_id: int, data: bytes) -> None:
+        if self.nmt in (NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL):  # CiA 301, 7.3.2.2.5: not in STOPPED
+            self.hardware.send(can_id, data)
 
     def _send_sdo(self, frame: bytes) -> None:
         self.hardware.send(0x580 + self.hardware.node_id, frame)

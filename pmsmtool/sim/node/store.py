@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import Enum
 
 from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.errors import ConfigError
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.memory import Memory
 from pmsmtool.sim.node.schedule import Schedule
@@ -78,7 +79,7 @@ class Store:
     energised : callable
         Whether the power stage may drive current: then nothing is stored.
     finish : callable
-        Confirms the pending write.
+        Confirms the pending write, or refuses it with an abort code.
     scale : callable
         Fault injection: returns the factor on the time a store takes.
     step_done : callable
@@ -98,7 +99,7 @@ class Store:
         *,
         current: Callable[[Group], Stored],
         energised: Callable[[], bool],
-        finish: Callable[[], None],
+        finish: Callable[[int | None], None],
         scale: Callable[[], float] = lambda: 1.0,
         step_done: Callable[[], None] = lambda: None,
     ) -> None:
@@ -136,25 +137,29 @@ class Store:
         """Whether a store is under way."""
         return self._busy
 
-    def write(self, content: Stored, done: Callable[[], None]) -> None:
-        """Store values step by step, then call ``done``."""
+    def write(self, content: Stored, done: Callable[[int | None], None]) -> None:
+        """Store values step by step, then call ``done`` with None, or with the abort code of what went wrong."""
         self._busy = True
         packed = encode(content)
         steps = self._memory.store(packed)
 
-        def complete() -> None:
+        def complete(code: int | None) -> None:
             self._busy = False
-            self.stored = content
-            done()
+            if code is None:
+                self.stored = content
+            done(code)
 
         self._next_step(steps, ERASE_S, complete)
 
-    def _next_step(self, steps: Iterator[None], seconds: float, complete: Callable[[], None]) -> None:
+    def _next_step(self, steps: Iterator[None], seconds: float, complete: Callable[[int | None], None]) -> None:
         def step() -> None:
             try:
                 next(steps)
             except StopIteration:
-                complete()
+                complete(None)
+                return
+            except ConfigError:  # the file cannot be written; on a drive: the memory is broken
+                complete(AbortCode.HARDWARE)
                 return
             self._step_done()
             self._next_step(steps, PAGE_S, complete)
