@@ -96,8 +96,8 @@ class Adapter(can.BusABC):
             message.is_rx = True
         return message, False
 
-    @property
-    def state(self) -> can.BusState:  # type: ignore[misc]
+    @property  # type: ignore[misc]
+    def state(self) -> can.BusState:
         raise NotImplementedError("as python-can #736")
 
     def shutdown(self) -> None:
