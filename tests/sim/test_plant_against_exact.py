@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,6 +57,16 @@ def test_plant_alone_against_the_exact_transition(scenario):
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 def test_closed_loop_against_dop853(scenario):
     assert relative_error(simulate(scenario, PERIODS), reference_run(scenario, PERIODS)) <= CLOSED_LOOP_LIMIT
+
+
+@pytest.mark.parametrize(("rpm", "U_dc"), [(620.0, 540.0), (4500.0, 1500.0), (11_000.0, 1900.0)])
+def test_saturated_machine_over_the_speeds(rpm, U_dc):
+    """Measured 2.8e-8, 1.5e-7 and 3.5e-7; the DC link is as high as the speed needs."""
+    scenario = replace(SCENARIOS[3], rpm=rpm, U_dc=U_dc, i_d=(-10.0, 0.0), i_q=(2.0, 0.015))
+    assert scenario.saturated
+    found, expected = simulate(scenario, 360), reference_run(scenario, 360)
+    assert expected[-1, 1] > 1.5  # the step of i_q is in the run
+    assert relative_error(found, expected) <= CLOSED_LOOP_LIMIT
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
