@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from pmsmtool.cli.drive_access import map_option, open_node, read_map
+from pmsmtool.cli.fleet import NodeList, flash_fleet
 from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output
 
@@ -17,11 +18,13 @@ from pmsmtool.cli.output import Output
         "pmsmtool -i pmsmsim --yes flash-params params.toml",
         "pmsmtool -n 5 flash-params design.toml --dry-run",
         "pmsmtool -n 5 flash-params params.toml --check     # exit code 1 when the drive differs",
+        "pmsmtool -i socketcan -c can0 flash-params params.toml --nodes 1-6",
     ),
 )
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--dry-run", is_flag=True, help="Show what would change and stop.")
 @click.option("--check", is_flag=True, help="As --dry-run; exit code 1 when something would change.")
+@click.option("--nodes", type=NodeList(), metavar="LIST", help="Several drives of the bus, e.g. 1-3,7.")
 @click.option("--no-store", is_flag=True, help="Let it act until the next reset only.")
 @map_option
 @bus_options
@@ -35,6 +38,7 @@ def flash_params_command(
     dry_run: bool,
     check: bool,
     no_store: bool,
+    nodes: tuple[int, ...] | None,
     map_file: Path | None,
 ) -> None:
     """Write a parameter set, a design, a DCF or a run's parameters to the drive and store it.
@@ -48,6 +52,11 @@ def flash_params_command(
 
     drive_map = read_map(map_file)
     wanted = load_parameters(source, drive_map)
+    if nodes is not None:
+        flash_fleet(
+            nodes, wanted, drive_map, bus, motion, out, store=not no_store, dry_run=dry_run, check=check
+        )  # fmt: skip
+        return
     with open_node(bus, drive_map) as node:
         carry_out(
             node, wanted, bus, motion, out, command="flash-params", store=not no_store, dry_run=dry_run, check=check

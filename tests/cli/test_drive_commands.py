@@ -229,6 +229,28 @@ def test_faults_on_purpose_leave_the_old_set(tool: Tool, wanted: str, tmp_path: 
     assert tool("verify", wanted)[0] == 1
 
 
+def test_fleet_gets_the_same_set_and_one_table(tool: Tool, wanted: str, tmp_path: Path) -> None:
+    fleet = "interior-2k2?nodes=3&nv=fleet.nv"
+    assert tool("flash-params", wanted, "--nodes", "1-3", "--check", channel=fleet)[0] == 1
+    code, out, _ = tool("flash-params", wanted, "--nodes", "1-3", "--yes", channel=fleet)
+    assert code == 0 and out.count("PASS stored") == 3 and len(out.splitlines()) == 4
+    for node in "123":
+        assert tool("-n", node, "verify", wanted, channel=fleet)[0] == 0
+    assert len(list((tmp_path / "home" / "journals").iterdir())) == 3
+
+
+def test_fleet_with_one_bad_drive_serves_the_others(tool: Tool, wanted: str, tmp_path: Path) -> None:
+    (tmp_path / "faults.toml").write_text('[[refuse]]\nobject = "0x1010:01"\ncode = 0x08000020\ncount = 1\n')
+    fleet = "interior-2k2?nodes=2&nv=fleet.nv&faults=faults.toml"
+    code, out, _ = tool("flash-params", wanted, "--nodes", "1,2", "--yes", channel=fleet)
+    assert code == 4 and out.count("FAIL") >= 1 and len(out.splitlines()) == 3
+
+
+@pytest.mark.parametrize("nodes", ["0", "3-1", "1,x", "200"])
+def test_node_lists_that_are_none(tool: Tool, wanted: str, nodes: str) -> None:
+    assert tool("flash-params", wanted, "--nodes", nodes)[0] == 2
+
+
 # ---- moving -----------------------------------------------------------------------------------------------
 
 
