@@ -21,13 +21,13 @@ DC_ANGLE_RAD = math.pi / 2.0
 MEANS = ("u_d_v", "i_d_a", "u_q_v", "i_q_a", "T_winding_c")
 """What is averaged over a whole window at each level."""
 
-REST_RAD = 2e-3
+REST_RAD = 5e-4
 """Motion of the shaft (mechanical) between two looks that still counts as rest."""
 TRIES = 4
 """Windows taken at one level until the shaft did not move in one; the last stands as it is."""
 LOOK_S = 0.03
-ARRIVED = 0.02
-"""Distance of the mean current from its set-point, relative, that counts as arrived."""
+ARRIVED = 0.03
+"""Distance of the mean current vector from its set-point, relative, that counts as arrived."""
 REST_LIMIT_S = 3.0
 """A rotor that has not come to rest by then stays as it is; the estimator sees it in the halves of the window."""
 
@@ -89,8 +89,8 @@ def settle(drive: Drive, i_d_a: float, *, limit_s: float = REST_LIMIT_S) -> floa
     while waited < limit_s:
         drive.wait(LOOK_S)
         waited += LOOK_S
-        now = drive.average(("theta_m_rad", "i_d_a"), periods)
-        arrived = abs(now["i_d_a"] - i_d_a) <= ARRIVED * abs(i_d_a)
+        now = drive.average(("theta_m_rad", "i_d_a", "i_q_a"), periods)
+        arrived = math.hypot(now["i_d_a"] - i_d_a, now["i_q_a"]) <= ARRIVED * abs(i_d_a)
         if arrived and abs(now["theta_m_rad"] - last) < REST_RAD:
             break
         last = now["theta_m_rad"]
