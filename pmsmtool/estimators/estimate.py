@@ -30,6 +30,9 @@ COVERAGE_FACTOR = 1.959963984540054
 SENSOR_GAIN_TOLERANCE = 0.01
 """Default tolerance of the current and the voltage scale (95 % half width, relative)."""
 
+BRIDGE_THRESHOLD_V = 0.35
+"""Diode minus switch threshold, one standard deviation (V): IGBT data sheets put either at 0.3 to 1.2 V."""
+
 
 class Verdict(StrEnum):
     """What the gates say about one result."""
@@ -50,12 +53,23 @@ class SensorTolerance:
         Error of the temperature sensor (K).
     device_share_max : float
         Largest part of the loop resistance that devices and shunts may have when the split is unknown (1).
+    bridge_threshold_v, U_dc_v : float
+        Standard deviation of diode minus switch threshold (V; 0 for a bridge of MOSFETs) and the DC link it acts on: a
+        conducting leg swings by U_dc + V_diode - V_switch, which no experiment tells from a voltage gain. It is a model
+        error that differs from drive to drive, so it belongs to the statistical part. Infinite link: not counted.
     """
 
     current_gain: float = SENSOR_GAIN_TOLERANCE
     voltage_gain: float = SENSOR_GAIN_TOLERANCE
     temperature_k: float = 2.0
     device_share_max: float = 0.3
+    bridge_threshold_v: float = BRIDGE_THRESHOLD_V
+    U_dc_v: float = math.inf
+
+    @property
+    def voltage_scale_std(self) -> float:
+        """Relative standard deviation of the applied voltage's scale from the bridge's thresholds."""
+        return self.bridge_threshold_v / self.U_dc_v
 
     @property
     def impedance(self) -> float:

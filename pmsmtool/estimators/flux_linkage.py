@@ -157,7 +157,9 @@ def estimate_flux_linkage(
             hint="identify poles and encoder first",
         )
     std_1, std_2 = s_q * math.sqrt(float(q_cov[0, 0])), s_d * math.sqrt(float(d_cov[1, 1]))
-    std = math.hypot(math.cos(eps) * std_1, math.sin(eps) * std_2, RELATIVE_FLOOR * psi)
+    std = math.hypot(
+        math.cos(eps) * std_1, math.sin(eps) * std_2, RELATIVE_FLOOR * psi, tolerance.voltage_scale_std * psi
+    )
     T = float(np.mean(speeds["T_magnet_c"]))
     measured = Estimate(
         value=psi,

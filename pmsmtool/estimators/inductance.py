@@ -150,7 +150,12 @@ def estimate_inductances(
     estimates = {
         axis: Estimate(
             value=values[axis],
-            std=math.hypot(stds[axis], MODEL_FLOOR * values[axis]),
+            std=math.hypot(
+                stds[axis],
+                MODEL_FLOOR * values[axis],
+                tolerance.voltage_scale_std * values[axis],
+                _commutation_std(shots[axis]),
+            ),
             systematic=tolerance.impedance * values[axis],
             unit="H",
             n=fits[axis].n,
@@ -177,6 +182,22 @@ def estimate_inductances(
         whiteness={axis: min(ljung_box(residual) for residual in fit.residuals) for axis, fit in fits.items()},
         verdict=Verdict.WARN if warned else Verdict.PASS,
     )
+
+
+def _commutation_std(shots: Sequence[Shot]) -> float:
+    """What an inverter error that depends on the current adds to L (H).
+
+    The error acts at switching edges, up to half a period from the middle of the interval where the model puts it; a
+    slope of de/di then looks like an inductance within +-|de/di| T_s/2 (uniform).
+    """
+    worst = 0.0
+    for shot in shots:
+        if shot.error is not None:
+            low, high = float(np.min(shot.i_a)), float(np.max(shot.i_a))
+            rise = shot.error.at(np.array([low, high]))
+            slope = abs(float(rise[1] - rise[0])) / (high - low)
+            worst = max(worst, slope * shot.period_s / 2.0 / math.sqrt(3.0))
+    return worst
 
 
 def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, stage: str) -> Shot:

@@ -197,7 +197,7 @@ def estimate_resistance(
     V_dead = V_vector * math.sqrt(3.0) / 2.0
     hardness = abs(V_dead) / (R_w * peak)
     std = math.sqrt(float(variance)) * (HARD_FACTOR if hardness > HARD_RATIO else 1.0)
-    std = math.hypot(std, DRIFT_SECOND_ORDER * abs(drift) * R_w)
+    std = math.hypot(std, DRIFT_SECOND_ORDER * abs(drift) * R_w, tolerance.voltage_scale_std * R_w)
     _check_result(R_w, std, drift, half_width_limit)
     R_measured = Estimate(
         value=R_w,

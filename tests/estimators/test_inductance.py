@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.estimate import COVERAGE_FACTOR
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance
 from pmsmtool.estimators.inductance import InductanceResult, estimate_inductances
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
@@ -249,3 +249,40 @@ def test_a_short_trace_is_no_excitation(plain: Shots) -> None:
     short = replace(short, t_s=short.t_s[:200], signals={name: values[:200] for name, values in short.signals.items()})
     with pytest.raises(IdentificationError, match="E_EXCITATION"):
         estimate_inductances([short], [short], Noise(0.01, 0, 0, 2048), 1.0)
+
+
+def test_a_bridge_of_unequal_thresholds_is_a_voltage_scale_of_unknown_size(plain: Shots) -> None:
+    """A leg swings by U_dc + V_diode - V_switch; the 0.35 V of unknown devices widen L by 0.35 V/U_dc."""
+    d = plain.drives
+    k = 0
+    shots = {axis: [plain.trace(k, axis, half) for half in HALF_PERIODS] for axis in "dq"}
+    noise = Noise(d.sigma_dq[k], 0, 0, 2048)
+    mosfet, igbt = (
+        estimate_inductances(
+            shots["d"], shots["q"], noise, d.R[k], frame_offset=(d.offset[k], 1e-4), tolerance=tolerance
+        ).L_d
+        for tolerance in (SensorTolerance(), SensorTolerance(U_dc_v=100.0))
+    )
+    assert igbt.value == mosfet.value
+    assert math.sqrt(igbt.std**2 - mosfet.std**2) == pytest.approx(3.5e-3 * mosfet.value, rel=1e-6)
+    assert igbt.systematic == mosfet.systematic  # not a sensor's tolerance
+
+
+def test_commutation_near_the_knee_widens_the_interval(plain: Shots) -> None:
+    """An inverter error of slope r at the bias looks like an inductance within r T_s/2."""
+    d = plain.drives
+    k = 0
+    shots = {axis: [plain.trace(k, axis, half) for half in HALF_PERIODS] for axis in "dq"}
+    noise = Noise(d.sigma_dq[k], 0, 0, 2048)
+    slope = d.R[k]
+    i = np.array([0.01, 1.0]) * d.I_r[k]
+    inverters = (None, InverterCurve(i, slope * i, 0.0))
+    stds = [
+        estimate_inductances(
+            shots["d"], shots["q"], noise, d.R[k], frame_offset=(d.offset[k], 1e-4), inverter=inverter
+        ).L_q.std
+        for inverter in inverters
+    ]
+    # three equal slopes along an axis are one slope of the vector
+    expected = slope * d.T_s[k] / 2.0 / math.sqrt(3.0)
+    assert math.sqrt(stds[1] ** 2 - stds[0] ** 2) == pytest.approx(expected, rel=0.05)

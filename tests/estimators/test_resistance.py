@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.estimate import COVERAGE_FACTOR, total_half_width
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, total_half_width
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import (
     Copper,
@@ -210,3 +210,29 @@ def test_a_hard_drive_is_refused_by_name_when_the_interval_is_too_wide() -> None
     with pytest.raises(IdentificationError) as caught:
         estimate_resistance(levels_of(d, 0, rng), noise_of(d, 0))
     assert caught.value.reason in ("E_NOT_IDENTIFIABLE", "E_MODEL_MISMATCH")
+
+
+def test_a_bridge_of_unequal_thresholds_is_a_voltage_scale_of_unknown_size() -> None:
+    rng = np.random.default_rng(10)
+    d = replace_inverter(draw(1, rng))
+    levels = levels_of(d, 0, rng)
+    mosfet = estimate_resistance(levels, noise_of(d, 0)).R_measured
+    igbt = estimate_resistance(levels, noise_of(d, 0), tolerance=SensorTolerance(U_dc_v=100.0)).R_measured
+    assert igbt.value == mosfet.value
+    assert math.sqrt(igbt.std**2 - mosfet.std**2) == pytest.approx(3.5e-3 * mosfet.value, rel=1e-6)
+
+
+def test_the_low_levels_may_settle_more_slowly_than_those_that_make_R() -> None:
+    rng = np.random.default_rng(12)
+    d = replace_inverter(draw(1, rng))
+    trace = levels_of(d, 0, rng)
+    drift = 0.01 * float(np.max(trace["u_d_v"]))
+    low = np.abs(trace["i_d_a"]) < 0.2 * d.I_r[0]
+    for rows, accepted in ((low, True), (~low, False)):
+        second = trace["u_d_first_v"] + drift * rows
+        slow = replace(trace, signals={**trace.signals, "u_d_second_v": second})
+        if accepted:
+            estimate_resistance(slow, noise_of(d, 0))
+        else:
+            with pytest.raises(IdentificationError, match="E_NOT_SETTLED"):
+                estimate_resistance(slow, noise_of(d, 0))
