@@ -41,17 +41,14 @@ DRAWN_SPREAD = 0.10
 
 def truth_of(drive: MachineFile, evaluation: Evaluation) -> dict[str, float]:
     """Return what the estimates should be: of a saturated machine the incremental values at the printed bias."""
-    settings = drive.simulation_settings()
-    truth = {
-        name: float(settings[name])
-        for name in ("L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")  # type: ignore[arg-type]
-    }
+    values = Settings(drive.simulation_settings())
+    truth = {name: values.number(name) for name in ("L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")}
     truth["R_s_ohm"] = true_loop_resistance(drive)
-    devices = device_slope_ohm(Settings(settings))
-    rise = float(settings["T_winding_c"]) - drive.machine.T_ref_c  # type: ignore[arg-type]
+    devices = device_slope_ohm(values)
+    rise = values.number("T_winding_c") - drive.machine.T_ref_c
     copper = truth["R_s_ohm"] - devices
     truth["R_at_T_ohm"] = devices + copper * (1.0 + drive.machine.alpha_R_per_k * rise)
-    truth["offset_rad"] = float(settings["encoder_offset_rad"])  # type: ignore[arg-type]
+    truth["offset_rad"] = values.number("encoder_offset_rad")
     if drive.flux_map is not None and evaluation.inductance is not None:
         bias = evaluation.inductance.L_d
         incremental = drive.flux_map.incremental_inductance(bias.i_d_apk, 0.0)
