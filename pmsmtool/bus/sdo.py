@@ -221,7 +221,7 @@ class SdoChannel:
     def _persist(
         self, attempt: Attempt, tries: int, once: Callable[[], bytes], recover: Callable[[], bool] | None = None
     ) -> tuple[bytes, int]:
-        """Try until it works; where no block transfer ever did, segments get one more try."""
+        """Try until it works; segments get one more try where the node may be unable to do blocks."""
         count = 0
         while True:
             count += 1
@@ -234,7 +234,7 @@ class SdoChannel:
                     return b"", count
                 if count < tries:
                     continue
-                if attempt.mode is not Mode.BLOCK or (self.block_supported and lost.code != AbortCode.LENGTH):
+                if attempt.mode is not Mode.BLOCK or (self.block_supported and lost.code == AbortCode.TIMED_OUT):
                     raise self._failure(attempt, lost, count) from None
                 attempt.mode = Mode.SEGMENTED
                 attempt.notes.append("by segments now")
