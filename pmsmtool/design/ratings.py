@@ -225,6 +225,7 @@ def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
         ),
         "protection.T_winding_max_c": either(limits.T_winding_max_c, WINDING_LIMIT_C, "insulation class F assumed"),
         "protection.I_cont_apk": DesignValue(rated.I_cont_apk, rated.methods["I_cont"]),
+        "governor.I_transient_apk": DesignValue(rated.I_max_apk, "I_max"),
     }
 
 
