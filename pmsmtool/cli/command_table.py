@@ -48,6 +48,8 @@ COMMANDS: tuple[Row, ...] = (
     Row("monitor", "pmsmtool.cli.monitor:monitor_command", Section.LOOK, "Show live values."),
     Row("fault", "pmsmtool.cli.fault:fault_command", Section.LOOK, "Show or reset faults."),
     Row("commission", "pmsmtool.cli.commission:commission_command", Section.MOVE, "Identify, design, flash, verify."),
+    Row("nmt", "pmsmtool.cli.nmt:nmt_command", Section.WRITE, "Send a network management command."),
+    Row("lss", "pmsmtool.cli.lss:lss_command", Section.WRITE, "Give node ids to nodes without one."),
     Row("stop", "pmsmtool.cli.stop:stop_command", Section.MOVE, "Stop a drive, confirmed."),
     Row("identify", "pmsmtool.cli.identify:identify_command", Section.MOVE, "Measure the machine on its drive."),
     Row("jog", "pmsmtool.cli.jog:jog_command", Section.MOVE, "Move shortly, within limits."),

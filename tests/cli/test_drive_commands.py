@@ -345,3 +345,35 @@ def test_no_interface_at_all_says_how_to_name_one(tmp_path: Path) -> None:
         [sys.executable, "-m", "pmsmtool", "scan"], cwd=tmp_path, env=environment, capture_output=True, text=True
     )
     assert done.returncode == 3 and "no CAN interface is configured" in done.stderr and "-i pmsmsim" in done.stderr
+
+
+# ---- network ----------------------------------------------------------------------------------------------
+
+
+def test_nmt(tool: Tool) -> None:
+    assert loaded(tool("nmt", "start", "--json"))["nmt_state"] == "operational"
+    assert loaded(tool("nmt", "reset-node", "--json"))["nmt_state"] == "boot-up"
+    code, out, err = tool("nmt", "stop")
+    assert code == 0 and "STOPPED" in out, err
+
+
+def test_nmt_is_refused_while_enabled(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pmsmtool.cia402 import State
+
+    monkeypatch.setattr(DriveNode, "state", lambda self: State.OPERATION_ENABLED)
+    assert tool("nmt", "reset-node")[0] == 5
+
+
+def test_lss_finds_a_node_without_an_id_and_gives_it_one(tool: Tool) -> None:
+    fresh = "interior-2k2?node=255&nv=fresh.nv"
+    assert loaded(tool("lss", "scan", "--json", channel=fresh))["found"]["serial"] == 22001
+    assert tool("lss", "set-node", "9", channel=fresh)[0] == 7
+    code, out, err = tool("lss", "set-node", "9", "--store", "--yes", channel=fresh)
+    assert code == 0 and "serial 22001 is node 9" in out, err
+    assert loaded(tool("scan", "--json", channel="interior-2k2?nv=fresh.nv"))["nodes"][0]["node"] == 9
+
+
+def test_lss_with_nobody_to_configure(tool: Tool) -> None:
+    assert "no unconfigured node" in tool("lss", "scan")[1]
+    assert tool("lss", "set-node", "9", "--yes")[0] == 3
+    assert tool("lss", "set-node", "1", "--yes")[0] == 2, "the id is taken"
