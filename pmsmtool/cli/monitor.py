@@ -49,17 +49,25 @@ class _Column:
     epilog=examples(
         "pmsmtool -i pmsmsim monitor --for 1s -g 'i_.*|omega'",
         "pmsmtool -n 5 monitor --rate 20Hz --csv > live.csv",
+        "pmsmtool -n 5 monitor --pdo --rate 100Hz -g 'i_d_a|i_q_a|omega' --csv > fast.csv",
         "pmsmtool -n 5 monitor --json | jq .values.U_dc_v",
     ),
 )
 @click.option("--rate", "rate_hz", type=FREQUENCY, help=f"Readings per second; default {DEFAULT_RATE_HZ:g}Hz.")
 @click.option("--for", "seconds", type=TIME, help="End after this time; default: Ctrl-C.")
 @click.option("-g", "pattern", metavar="REGEX", help="Only quantities whose name matches.")
+@click.option("--pdo", is_flag=True, help="Let the drive send them (at most 6); its PDOs are restored afterwards.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print comma-separated values; the second row holds units.")
 @bus_options
 @output_options
 def monitor_command(
-    bus: BusOptions, out: Output, rate_hz: float | None, seconds: float | None, pattern: str | None, as_csv: bool
+    bus: BusOptions,
+    out: Output,
+    rate_hz: float | None,
+    seconds: float | None,
+    pattern: str | None,
+    pdo: bool,
+    as_csv: bool,
 ) -> None:
     """Show live values with their minimum, maximum and standard deviation; one JSON object per reading with --json."""
     from pmsmtool.drive.objects import signal_unit
@@ -77,7 +85,8 @@ def monitor_command(
             click.echo(",".join(["s", *map(signal_unit, names)]))
         columns = {name: _Column() for name in names}
         try:
-            for t_s, values in _readings(node, names, period_s, seconds):
+            source = _sent if pdo else _readings
+            for t_s, values in source(node, names, period_s, seconds):
                 for name, value in values.items():
                     columns[name].add(value)
                 if as_csv:
@@ -117,6 +126,22 @@ def _readings(
         number += 1
         node.connection.wait(max(0.0, start + number * period_s - clock.now()))
         node.supervision.check()
+
+
+def _sent(
+    node: DriveNode, names: list[str], period_s: float, seconds: float | None
+) -> Iterator[tuple[float, dict[str, float]]]:
+    """As :func:`_readings`, of what the drive sends by itself."""
+    from pmsmtool.drive.process_data import live_values
+
+    clock = node.connection.clock
+    with live_values(node, names, period_s) as live:
+        start = clock.now()
+        while seconds is None or clock.now() - start < seconds:
+            node.connection.wait(period_s)
+            node.supervision.check()
+            if len(live.values) == len(names):
+                yield clock.now() - start, {name: live.values[name] for name in names}
 
 
 def _lines(columns: dict[str, _Column]) -> list[str]:

@@ -82,6 +82,12 @@ def test_monitor_counts_and_prints_units(tool: Tool) -> None:
     assert code == 0 and len(readings) == 3 and readings[0]["values"]["U_dc_v"] == pytest.approx(540.0, rel=0.05)
 
 
+def test_monitor_by_process_data(tool: Tool) -> None:
+    code, out, _ = tool("monitor", "--pdo", "--for", "0.5s", "--rate", "100Hz", "-g", "^i_[dq]_a$", "--csv")
+    assert code == 0 and 45 <= len(out.splitlines()) <= 55
+    assert tool("monitor", "--pdo", "--for", "0.1s")[0] == 9, "more than the PDOs hold"
+
+
 def test_monitor_of_nothing(tool: Tool) -> None:
     assert tool("monitor", "-g", "nothing")[0] == 9
     assert tool("monitor", "-g", "(")[0] == 2

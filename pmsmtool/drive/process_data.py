@@ -1,0 +1,145 @@
+"""Live quantities as process data: the drive sends them by itself (TPDOs, CiA 301, section 7.5.2.35 on).
+
+The transmit PDOs 2 to 4 are borrowed: what they were is noted first and brought back at the end, with
+the NMT state. TPDO 1 is left to whoever watches the statusword.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from pmsmtool.bus.nmt import NmtCommand, NmtState, send_nmt
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.interruption import interrupts_deferred
+from pmsmtool.drive.objects import LIVE
+from pmsmtool.errors import NotAvailable, SdoAbort
+
+BORROWED = (2, 3, 4)
+"""Numbers of the transmit PDOs in use."""
+PDO_BYTES = 8
+EVENT_DRIVEN = 255
+_OFF = 1 << 31
+_NO_RTR = 1 << 30
+_NMT_WAIT_S = 0.05
+
+
+class LiveValues:
+    """Latest values, as they arrive.
+
+    Attributes
+    ----------
+    values : dict of str to float
+        By name; a name is there from its first PDO on.
+    received : int
+        PDOs received.
+    """
+
+    def __init__(self) -> None:
+        self.values: dict[str, float] = {}
+        self.received = 0
+        self._layout: dict[int, list[tuple[str, struct.Struct]]] = {}
+
+    def expect(self, cob_id: int, names: Sequence[str]) -> None:
+        """Say what a COB-ID carries."""
+        self._layout[cob_id] = [(name, struct.Struct("<" + LIVE[name].letter)) for name in names]
+
+    def take(self, cob_id: int, data: bytes, timestamp: float) -> None:
+        """Take the values of one PDO; a short one is left out."""
+        position = 0
+        for name, code in self._layout[cob_id]:
+            if position + code.size > len(data):
+                return
+            self.values[name] = float(code.unpack_from(data, position)[0])
+            position += code.size
+        self.received += 1
+
+
+@contextmanager
+def live_values(node: DriveNode, names: Sequence[str], period_s: float) -> Iterator[LiveValues]:
+    """Have the drive send live quantities every ``period_s``, as long as the context lasts.
+
+    Raises
+    ------
+    NotAvailable
+        More quantities than the borrowed PDOs hold, or a drive without them.
+    """
+    groups = _groups(names)
+    live = LiveValues()
+    before: list[tuple[int, int, bytes]] = []
+    cob_ids = [0x80 + 0x100 * number + node.node for number in BORROWED[: len(groups)]]
+    state = node.supervision.nmt_state
+    try:
+        for number, cob_id, group in zip(BORROWED, cob_ids, groups, strict=False):
+            before += _contents(node, number)
+            _map(node, number, cob_id, group, period_s)
+            live.expect(cob_id, group)
+            node.connection.subscribe(cob_id, live.take)
+        send_nmt(node.connection, NmtCommand.START, node.node)
+        node.connection.wait(_NMT_WAIT_S)
+        yield live
+    except SdoAbort as abort:
+        raise NotAvailable(
+            "the drive cannot send these as process data", where=abort.where, hint="leave --pdo out"
+        ) from abort
+    finally:
+        with interrupts_deferred():
+            for cob_id in cob_ids:
+                node.connection.unsubscribe(cob_id, live.take)
+            if state is not NmtState.OPERATIONAL:
+                send_nmt(node.connection, NmtCommand.PRE_OPERATIONAL, node.node)
+            _bring_back(node, before)
+
+
+def _groups(names: Sequence[str]) -> list[list[str]]:
+    """Fill the PDOs in order."""
+    groups: list[list[str]] = [[]]
+    for name in names:
+        if sum(LIVE[other].size for other in [*groups[-1], name]) > PDO_BYTES:
+            groups.append([])
+        groups[-1].append(name)
+    if len(groups) > len(BORROWED):
+        raise NotAvailable(
+            f"{len(names)} quantities do not fit {len(BORROWED)} process data objects",
+            hint="choose fewer with -g, or leave --pdo out",
+        )
+    return groups
+
+
+def _contents(node: DriveNode, number: int) -> list[tuple[int, int, bytes]]:
+    """Return what a PDO is, in the order in which it can be written back: off, empty, mapping, count, on."""
+    communication, mapping = 0x1800 + number - 1, 0x1A00 + number - 1
+    count = node.sdo.read(mapping, 0, size=1)
+    entries = [(mapping, sub, node.sdo.read(mapping, sub, size=4)) for sub in range(1, max(count[0], 2) + 1)]
+    cob_id = node.sdo.read(communication, 1, size=4)
+    rest = [(communication, 2, node.sdo.read(communication, 2, size=1))]
+    with contextlib.suppress(SdoAbort):
+        rest.append((communication, 5, node.sdo.read(communication, 5, size=2)))
+    return [
+        (communication, 1, _with_off(cob_id)), (mapping, 0, b"\0"), *entries, (mapping, 0, count), *rest,
+        (communication, 1, cob_id),
+    ]  # fmt: skip
+
+
+def _with_off(cob_id: bytes) -> bytes:
+    return (int.from_bytes(cob_id, "little") | _OFF).to_bytes(4, "little")
+
+
+def _map(node: DriveNode, number: int, cob_id: int, names: Sequence[str], period_s: float) -> None:
+    communication, mapping = 0x1800 + number - 1, 0x1A00 + number - 1
+    write = node.sdo.download
+    write(communication, 1, (cob_id | _OFF | _NO_RTR).to_bytes(4, "little"))
+    write(mapping, 0, b"\0")
+    for sub, name in enumerate(names, 1):
+        write(mapping, sub, LIVE[name].mapping_word.to_bytes(4, "little"))
+    write(mapping, 0, bytes((len(names),)))
+    write(communication, 2, bytes((EVENT_DRIVEN,)))
+    write(communication, 5, max(1, round(1000.0 * period_s)).to_bytes(2, "little"))
+    write(communication, 1, (cob_id | _NO_RTR).to_bytes(4, "little"))
+
+
+def _bring_back(node: DriveNode, before: list[tuple[int, int, bytes]]) -> None:
+    for index, sub, data in before:
+        node.sdo.download(index, sub, data)
