@@ -110,8 +110,10 @@ def test_editable_installation_points_to_the_checkout(tmp_path: Path) -> None:
     assert found.probe(tmp_path) == [str(found.sources / "pmsmtool" / "_native"), *data_lines(found.sources)]
 
 
-def test_without_a_compiler_ziglang_builds_the_same_installation(tmp_path: Path) -> None:
-    found = install(tmp_path, editable=False, compilers=False)
+@pytest.mark.parametrize("editable", [False, True])
+def test_without_a_compiler_ziglang_builds_the_same_installation(editable: bool, tmp_path: Path) -> None:
+    found = install(tmp_path, editable=editable, compilers=False)
     assert "compiled by ziglang" in found.log
-    package = next((tmp_path / "environment").rglob("site-packages")) / "pmsmtool"
-    assert found.probe(tmp_path)[0] == str(package / "_native")
+    site = next((tmp_path / "environment").rglob("site-packages"))
+    package, data = (found.sources / "pmsmtool", found.sources) if editable else (site / "pmsmtool", None)
+    assert found.probe(tmp_path) == [str(package / "_native"), *data_lines(data or package / "_data")]
