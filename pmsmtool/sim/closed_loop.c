@@ -275,7 +275,8 @@ static void run_period(pmsm_sim *sim)
     pmsm_sensors sensors;
     double done = 0.0;
 
-    apply_schedules(sim, t, T_s);
+    if (sim->scheduled)
+        apply_schedules(sim, t, T_s);
     sim->U_dc = dc_link(sim, t + 0.5 * T_s);
     const double theta_M = encoder(sim);
     if (shift > 0.0 && delay > 0u) {
@@ -380,8 +381,10 @@ void pmsm_sim_watch(pmsm_sim *sim, uint32_t watch)
 void pmsm_sim_set_schedule(pmsm_sim *sim, uint32_t target, uint32_t n, const double *t, const double *value)
 {
     const pmsm_schedule schedule = {n ? t : NULL, value, n, 0};
-    if (target < (uint32_t)PMSM_TARGET_COUNT)
-        sim->schedule[target] = schedule;
+    if (target >= (uint32_t)PMSM_TARGET_COUNT)
+        return;
+    sim->schedule[target] = schedule;
+    sim->scheduled = n ? sim->scheduled | 1u << target : sim->scheduled & ~(1u << target);
 }
 
 void pmsm_sim_set_record(pmsm_sim *sim, double *record, uint64_t rows, uint32_t n, const uint32_t *signals,

@@ -83,6 +83,7 @@ typedef struct pmsm_sim {
     pmsm_random random;
     uint32_t ideal;            /* 1: current samples are the currents */
     pmsm_schedule schedule[PMSM_TARGET_COUNT];
+    uint32_t scheduled;        /* targets with a schedule, as bits */
     pmsm_output output;        /* of the last period */
     pmsm_output pending[PMSM_DELAY_MAX];
     double early[3];           /* A, currents caught before the period (negative sampling shift) */

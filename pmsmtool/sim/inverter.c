@@ -382,7 +382,10 @@ static void run_substeps(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_curren
 void pmsm_inverter_run(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double t_from, double t_to)
 {
     pmsm_current_lag *active = lag && lag->tau > 0.0 ? lag : NULL;
-    if (!inverter->gates || inverter->setup.model == PMSM_INVERTER_AVERAGED) {
+    if (!inverter->circuit && !active && inverter->substeps == 1u) { /* averaged, nothing to resolve: one step */
+        if (t_to > t_from)
+            pmsm_leg_advance(inverter, plant, NULL, &inverter->averaged, t_to - t_from);
+    } else if (!inverter->gates || inverter->setup.model == PMSM_INVERTER_AVERAGED) {
         if (t_to > t_from)
             run_substeps(inverter, plant, active, t_to - t_from);
     } else {
