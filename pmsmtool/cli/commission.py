@@ -19,7 +19,6 @@ from pmsmtool.cli.progress import StageProgress
 
 if TYPE_CHECKING:
     from pmsmtool.drive.canopen_drive import CanopenDrive
-    from pmsmtool.workflow.commission import Commissioning
     from pmsmtool.workflow.run_directory import RunDirectory
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
@@ -65,11 +64,13 @@ def commission_command(
     """
     from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.errors import ConfigError
+    from pmsmtool.workflow.commission import Commissioning
     from pmsmtool.workflow.run_directory import RunDirectory
 
     begun = RunDirectory(resume) if resume is not None else None
     if begun is not None and machine is not None:
         raise ConfigError("MACHINE and --resume exclude each other", hint="a run keeps the machine it began with")
+    asked = _asked(machine if begun is None else _kept_nameplate(begun), motion, sensor_tol, design)
     if begun is not None:
         bus = _as_begun(bus, begun)
     elif bus.simulated():
@@ -79,9 +80,38 @@ def commission_command(
         run = begun or _begin(runs, drive, bus)
         progress = StageProgress(out)
         person = _Person(run, drive, bus, motion, out, progress)
-        chain = _chain(run, drive, person, progress, machine, motion, sensor_tol, design)
         with _reported(run, out, fresh=begun is None):
-            chain.carry_out()
+            Commissioning(run, drive, person, progress, **asked).carry_out()
+
+
+def _kept_nameplate(run: RunDirectory) -> Path | None:
+    from pmsmtool.workflow.identify import NAMEPLATE
+
+    path = run.path / NAMEPLATE
+    return path if path.is_file() else None
+
+
+def _asked(machine: Path | None, motion: MotionOptions, sensor_tol: float, design: dict[str, Any]) -> dict[str, Any]:
+    """Check and collect what is asked of the chain, before anything is opened."""
+    from pmsmtool.design.tune_request import TuneRequest
+    from pmsmtool.estimators.estimate import SensorTolerance
+    from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.workflow.identify import IdentifyRequest
+
+    wanted = IdentifyRequest(
+        i_max_apk=motion.i_max_apk,
+        speed_max_rad_s=motion.speed_max_rad_s,
+        shaft=motion.shaft or "free",
+        load=motion.load,
+        brake=motion.brake,
+        tolerance=SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol),
+    )
+    wanted.check()
+    return {
+        "nameplate": None if machine is None else load_machine_file(machine),
+        "identify": wanted,
+        "tune": TuneRequest(**design),
+    }
 
 
 def _as_begun(bus: BusOptions, run: RunDirectory) -> BusOptions:
@@ -119,44 +149,6 @@ def _begin(runs: Path, drive: CanopenDrive, bus: BusOptions) -> RunDirectory:
         versions={"pmsmtool": __version__, **{name: version(name) for name in ("numpy", "python-can")}},
     )
     return RunDirectory.create(runs, identity.serial, record)
-
-
-def _chain(
-    run: RunDirectory,
-    drive: CanopenDrive,
-    person: _Person,
-    progress: StageProgress,
-    machine: Path | None,
-    motion: MotionOptions,
-    sensor_tol: float,
-    design: dict[str, Any],
-) -> Commissioning:
-    from pmsmtool.design.tune_request import TuneRequest
-    from pmsmtool.estimators.estimate import SensorTolerance
-    from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.workflow.commission import Commissioning
-    from pmsmtool.workflow.identify import NAMEPLATE, IdentifyRequest
-
-    if machine is None and (run.path / NAMEPLATE).is_file():
-        machine = run.path / NAMEPLATE
-    wanted = IdentifyRequest(
-        i_max_apk=motion.i_max_apk,
-        speed_max_rad_s=motion.speed_max_rad_s,
-        shaft=motion.shaft or "free",
-        load=motion.load,
-        brake=motion.brake,
-        tolerance=SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol),
-    )
-    wanted.check()
-    return Commissioning(
-        run,
-        drive,
-        person,
-        progress,
-        nameplate=None if machine is None else load_machine_file(machine),
-        identify=wanted,
-        tune=TuneRequest(**design),
-    )
 
 
 class _Person:

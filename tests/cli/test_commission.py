@@ -1,0 +1,296 @@
+"""``commission`` from the command line: four machines, another process, Ctrl-C, and everything that can be wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import can
+import click
+import pytest
+
+from pmsmtool.bus.clock import VirtualClock
+from pmsmtool.bus.connect import Connection
+from pmsmtool.cli import consent
+from pmsmtool.cli.main import run
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import is_safe
+from pmsmtool.firmware.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, dump_drive_map, reference_map
+from pmsmtool.flash.restore import take_backup
+from pmsmtool.machine.flux_map_import import load_flux_map
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.resources import data_folder
+from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.workflow.commission import STAGES
+from pmsmtool.workflow.random_drives import true_loop_resistance
+from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, new_record
+from tests.drive.served import serving
+
+MEASURED_MAP = Path(__file__).parents[2].parent / "shared" / "maps" / "baldor_400rpm_map.npz"
+TOLERANCE = 0.01
+"""Largest deviation of an identified value from the truth with ideal sensor gains; measured 0.2 % (benchmarks/
+commissioning.py)."""
+QUANTITIES = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
+Result = tuple[int, str, str]
+Tool = Callable[..., Result]
+
+
+@pytest.fixture
+def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Tool:
+    """Run a command line in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
+    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+
+    def call(*arguments: str) -> Result:
+        capsys.readouterr()
+        code = run(arguments)
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
+
+    return call
+
+
+def the_run() -> tuple[RunDirectory, RunRecord]:
+    (folder,) = Path("runs").iterdir()
+    return RunDirectory(folder), RunDirectory(folder).read()
+
+
+def machine_file(name: str, model: str) -> MachineFile:
+    """A profile, or the measured map on the saturated profile's drive, with one of the two inverter models."""
+    base = load_machine_file(data_folder("profiles") / f"{'saturated-pmsyrm' if name == 'measured' else name}.toml")
+    drive = replace(base, simulation={**base.simulation, "inverter_model": model})
+    if name == "measured":
+        measured = load_flux_map(MEASURED_MAP)
+        machine = replace(base.machine, flux_map=None, psi_f_wb=float(measured.flux(0.0, 0.0)[0]), I_max_apk=18.0)
+        drive = replace(drive, name="measured", machine=machine, flux_map=measured)
+    return drive
+
+
+def truth_of(drive: MachineFile, i_d_apk: float, i_q_apk: float) -> dict[str, float]:
+    """What the estimates should be: of a saturated machine the incremental values at the printed bias."""
+    truth = {name: float(getattr(drive.machine, name)) for name in QUANTITIES}
+    truth["R_s_ohm"] = true_loop_resistance(drive)
+    if drive.flux_map is not None:
+        incremental = drive.flux_map.incremental_inductance(i_d_apk, i_q_apk)
+        truth |= {"L_d_h": float(incremental[0, 0]), "L_q_h": float(incremental[1, 1])}
+        truth["psi_f_wb"] = float(drive.flux_map.flux(0.0, 0.0)[0])
+    return truth
+
+
+def assert_identified(drive: MachineFile, folder: Path) -> None:
+    found = load_machine_file(folder / "machine.toml").estimates
+    bias = found["L_d_h"]
+    assert not math.isnan(bias.i_d_apk)
+    truth = truth_of(drive, bias.i_d_apk, bias.i_q_apk)
+    errors = {name: found[name].value / truth[name] - 1.0 for name in QUANTITIES}
+    assert {name: error for name, error in errors.items() if abs(error) > TOLERANCE} == {}
+
+
+def identified(folder: Path, serial: int = 22001) -> RunDirectory:
+    """A run whose identification has passed, as if the profile's own numbers had been measured."""
+    drive = {"node": 1, "vendor": REFERENCE_VENDOR, "product": REFERENCE_PRODUCT, "serial": serial, "name": "bench"}
+    run = RunDirectory(folder)
+    folder.mkdir()
+    run.write(new_record(["test"], drive=drive, bus={}, versions={}))
+    shutil.copy(data_folder("profiles") / "interior-2k2.toml", folder / "machine.toml")
+    run.add(Stage("identify", "pass", 9.0, files={"machine.toml": ""}))
+    return run
+
+
+# ---- the whole chain --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [
+        ("jercic-2017", "averaged"),
+        ("interior-2k2", "switched"),
+        ("saturated-pmsyrm", "averaged"),
+        ("measured", "switched"),
+    ],
+)
+def test_from_unknown_machine_to_verified_parameters(name: str, model: str, tool: Tool, tmp_path: Path) -> None:
+    if name == "measured" and not MEASURED_MAP.exists():
+        pytest.skip("the measured map is not beside this checkout")
+    drive = machine_file(name, model)
+    Path("drive.toml").write_text(dump_machine_file(drive, embed_flux_map=True))
+    bus = ("-i", "pmsmsim", "-c", "drive.toml")
+    code, out, err = tool("commission", *bus, "--yes", "--json")
+    assert code == 0, err
+    found = json.loads(out)
+    assert found["schema"] == "pmsmtool.commission/1" and found["verdict"] == "PASS"
+    assert [stage["name"] for stage in found["stages"]] == list(STAGES)
+    directory, record = the_run()
+    assert_identified(drive, directory.path)
+    assert [given["subject"] for given in record.consents] == ["motion", "writing"]
+    page = (directory.path / "report.html").read_text()
+    assert ">PASS</strong>" in page and page.count("<svg") >= 6
+    # The drive was switched off and on since: what it holds now comes from its own memory.
+    assert tool("verify", *bus, str(directory.path))[0] == 0
+    stages = [line for line in err.splitlines() if line.startswith("[")]
+    assert len(stages) == len(STAGES) and all(" PASS " in line for line in stages)
+
+
+def test_a_failed_criterion_ends_the_chain_and_resume_goes_on_there(tool: Tool) -> None:
+    bus = ("-i", "pmsmsim", "-c", "interior-2k2?nv=drive.nv")
+    before = backup("interior-2k2?nv=drive.nv")
+    code, out, err = tool("commission", *bus, "--yes", "--gain-margin-db", "12", "--bandwidth-hz", "900")
+    assert code == 1 and out == "" and "asked for: 45 degree, 12 dB" in err
+    directory, record = the_run()
+    assert [(stage.name, stage.status) for stage in record.stages] == [("identify", "pass"), ("tune", "fail")]
+    assert ">FAIL</strong>" in (directory.path / "report.html").read_text()
+    assert backup("interior-2k2?nv=drive.nv") == before
+    measured = (directory.path / "machine.toml").read_bytes()
+    code, out, err = tool("commission", "--resume", str(directory.path), "--yes")
+    assert code == 0, err
+    assert "identify  PASS  as recorded, not run again" in err and out.startswith("PASS: 6 stages")
+    assert (directory.path / "machine.toml").read_bytes() == measured
+    assert tool("verify", *bus, str(directory.path))[0] == 0
+
+
+def test_through_another_process_with_the_limits_a_real_drive_needs(
+    tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive = machine_file("interior-2k2", "averaged")
+    with serving("--nv", str(tmp_path / "served.nv")) as server:
+        monkeypatch.setenv("CAN_INTERFACE", "socketcand")
+        monkeypatch.setenv("CAN_CHANNEL", "vcan0")
+        monkeypatch.setenv("CAN_CONFIG", json.dumps({"host": "127.0.0.1", "port": server.port}))
+        code, _, err = tool("commission", "--yes")
+        assert code == 7 and "missing here: --i-max, --speed-max, --shaft, --serial" in err
+        assert not list(Path("runs").iterdir())
+        limits = ("--i-max", "7.3Apk", "--speed-max", "3000rpm", "--shaft", "free", "--serial", "22001")
+        code, out, err = tool("commission", "--yes", *limits)
+        assert code == 0, err
+        directory, _ = the_run()
+        assert_identified(drive, directory.path)
+        assert out.startswith("PASS: 6 stages")
+        assert tool("verify", str(directory.path))[0] == 0
+
+
+# ---- Ctrl-C -----------------------------------------------------------------------------------------------
+
+
+def backup(channel: str) -> Any:
+    """Everything a drive holds and the objects the guard changes; its state must be safe."""
+    with Connection(PmsmSimBus(channel)) as connection:
+        drive = CanopenDrive(connection, 1)
+        assert is_safe(drive.node.state())
+        entries = take_backup(drive.node, drive.identity).entries
+        limits = [drive.node.sdo.read(*where) for where in ((0x6073, 0), (0x6080, 0), (0x1016, 1), (0x6007, 0))]
+        drive.close()
+    return entries, limits
+
+
+@pytest.mark.parametrize(("command", "wait"), [("identify", 20), ("identify", 300), ("commission", 800)])
+def test_ctrl_c_while_the_machine_moves(command: str, wait: int, tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fifty moments each are tried by ``benchmarks/commissioning.py --interrupts 50``."""
+    channel = "interior-2k2?nv=drive.nv"
+    count = 0
+    pass_time = VirtualClock.wait
+
+    def interrupted(self: VirtualClock, seconds: float) -> None:
+        nonlocal count
+        count += 1
+        if count == wait:
+            signal.raise_signal(signal.SIGINT)
+        pass_time(self, seconds)
+
+    with PmsmSimBus(channel):  # the drive stays powered when the tool leaves
+        before = backup(channel)
+        with monkeypatch.context() as patch:
+            patch.setattr(VirtualClock, "wait", interrupted)
+            code, out, err = tool(command, "-i", "pmsmsim", "-c", channel, "--yes")
+        assert count >= wait, "the moment was never reached"
+        assert code == 130 and out == "", err
+        assert "interrupted: the machine is stopped, voltage off, and the drive restored" in err
+        assert backup(channel) == before
+
+
+# ---- consents ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("subject", ["motion", "writing"])
+def test_each_consent_is_asked_and_each_can_be_declined(
+    subject: str, tool: Tool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    channel = "interior-2k2?nv=drive.nv"
+    before = backup(channel)
+    questions: list[str] = []
+
+    def answer(question: str, **_: Any) -> bool:
+        questions.append(question)
+        return False
+
+    monkeypatch.setattr(consent, "person_present", lambda: True)
+    monkeypatch.setattr(click, "confirm", answer)
+    begun = ("--resume", str(identified(Path("run")).path)) if subject == "writing" else ()
+    code, out, err = tool("commission", "-i", "pmsmsim", "-c", channel, *begun)
+    assert code == 7 and out == "", err
+    assert len(questions) == 1 and ("Write" in questions[0]) == (subject == "writing")
+    assert backup(channel) == before
+    assert not list(Path(".").glob("runs/*")), "what was declined before anything moved leaves nothing"
+    if subject == "writing":
+        record = RunDirectory(Path("run")).read()
+        assert (record.stages[-1].name, record.stages[-1].status) == ("flash", "refused")
+        assert "current.K_p_d_v_per_a" in err and "objects change" in err
+
+
+# ---- bad input and bad drives ------------------------------------------------------------------------------
+
+DRIVE = ("-i", "pmsmsim", "-c", "interior-2k2?nv=drive.nv", "--yes")
+FAULTY = ("-i", "pmsmsim", "--yes", "-c")
+BAD: dict[str, tuple[tuple[str, ...], int, str]] = {
+    "no such interface": (("-i", "nonsense", "--yes"), 3, "Unknown interface type"),
+    "no such profile": (("--sim", "interior-2k", "--yes"), 2, "did you mean interior-2k2"),
+    "unknown node": ((*DRIVE, "-n", "9"), 3, "only node(s) 1 were heard"),
+    "wrong bit rate": ((*FAULTY, "interior-2k2?bitrate=500000&nv=drive.nv", "-b", "250000"), 3, "wrong bit rate"),
+    "another serial number": ((*DRIVE, "--serial", "5"), 7, "serial number is 22001, --serial says 5"),
+    "a map for another drive": ((*DRIVE, "--map", "map.toml"), 2, "the map 'other' is for vendor"),
+    "nobody to ask": (DRIVE[:-1], 7, "nobody can be asked for consent to move the machine"),
+    "drive in fault": ((*FAULTY, "low.toml?nv=drive.nv"), 4, "DC-link under-voltage"),
+    "no heartbeat supervision": ((*FAULTY, "interior-2k2?nv=drive.nv&faults=absent.toml"), 5, "0x1016"),
+    "write refused": ((*FAULTY, "interior-2k2?nv=drive.nv&faults=refuse.toml", "--resume", "run"), 4, "0x06090030"),
+    "another drive than the run's": ((*DRIVE, "--resume", "other"), 5, "serial 22001 instead of 4711"),
+    "an edited file": ((*DRIVE, "--resume", "edited"), 2, "machine.toml: not what the stage left"),
+    "locked shaft": ((*DRIVE, "--shaft", "locked"), 9, "cannot be identified on a locked shaft"),
+    "gravity load": ((*DRIVE, "--load", "gravity"), 5, "a gravity load falls"),
+    "a current without a kind": ((*DRIVE, "--i-max", "7A"), 2, "peak or an rms value"),
+    "a bandwidth that is none": ((*DRIVE, "--bandwidth-hz", "-1"), 2, "bandwidth_hz = -1.0 is not a positive number"),
+    "unwritable folder": ((*DRIVE, "--runs", "taken/below"), 2, "cannot write"),
+    "no such machine file": ((*DRIVE, "nothing.toml"), 2, "no such file"),
+    "a machine file that is none": ((*DRIVE, "taken"), 2, "is not TOML"),
+    "nothing to resume": (("--resume", "taken"), 2, "no run.json here|is a file"),
+    "a machine and a run": (("low.toml", "--resume", "."), 2, "exclude each other"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_and_bad_drives_change_nothing(case: str, tool: Tool) -> None:
+    arguments, code, message = BAD[case]
+    Path("taken").write_text("not a folder, and not TOML")
+    Path("absent.toml").write_text('[[absent]]\nobject = "0x1016"\n')
+    Path("refuse.toml").write_text('[[refuse]]\nobject = "0x2020:01"\ncode = "0x06090030"\n')
+    Path("map.toml").write_text(dump_drive_map(replace(reference_map(), name="other", vendor=1)))
+    identified(Path("run"))
+    identified(Path("other"), serial=4711)
+    with (identified(Path("edited")).path / "machine.toml").open("a") as file:
+        file.write("# mine\n")
+    low = machine_file("interior-2k2", "averaged")
+    Path("low.toml").write_text(dump_machine_file(replace(low, simulation={**low.simulation, "U_dc_v": 120.0})))
+    before = backup("interior-2k2?nv=drive.nv")
+    found = tool("commission", *arguments)
+    assert (found[0], found[1]) == (code, ""), found[2]
+    assert any(part in found[2] for part in message.split("|")), found[2]
+    assert "Traceback" not in found[2]
+    assert backup("interior-2k2?nv=drive.nv") == before
+    runs = [*Path(".").glob("runs/*"), Path("run"), Path("other"), Path("edited")]
+    assert not any(RunDirectory(run).read().passed("flash") for run in runs)
