@@ -160,7 +160,7 @@ static void abort_outside_limits(pmsm_drive *drive)
     const pmsm_ab i = stator_current(drive);
     const double square = (double)i.alpha * (double)i.alpha + (double)i.beta * (double)i.beta;
     const double limit = (double)excitation->abort_current;
-    const double speed = fabs(drive->pll_omega);
+    const double speed = fabs((double)drive->params.motor_pole_pairs * drive->pll_omega); /* electrical, as the limit */
     if ((limit > 0.0 && square > limit * limit) ||
         (excitation->abort_speed > 0.0F && speed > (double)excitation->abort_speed)) {
         excitation->state = STATE_ABORTED;

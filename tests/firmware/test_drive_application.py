@@ -261,10 +261,16 @@ def test_abort_limits_take_the_gates_away_until_the_next_command() -> None:
     bench.excite(STOP)
     bench.run(2)
     assert (bench.drive.excitation.state, bench.output.gates) == (IDLE, 1)
-    fast = Bench(50.0)
-    fast.excite(shape=SINE, point=U_D, amplitude=1.0, f0=100.0, abort_speed=49.0)
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize(("limit", "state"), [(49.0, ABORTED), (51.0, RUNNING)])
+def test_the_abort_speed_is_electrical(limit: float, state: int, direction: float) -> None:
+    fast = Bench(50.0 * direction)
+    assert fast.p > 1
+    fast.excite(shape=SINE, point=U_D, amplitude=1.0, f0=100.0, abort_speed=fast.p * limit)
     fast.run(2)
-    assert fast.drive.excitation.state == ABORTED
+    assert fast.drive.excitation.state == state
 
 
 def test_recorder_triggers_and_keeps_the_oldest_row_first() -> None:
