@@ -106,12 +106,11 @@ pmsm_dq pmsm_model_voltage(const pmsm_period *period, pmsm_dq i)
 }
 
 /* Voltage that the model lacks, from what acted over the last period: the applied voltage minus the model's at the
- * mean current and its change. First-order filter of gain observer_gain per period. */
-void pmsm_observe_disturbance(pmsm_period *period)
+ * mean current and its change. First-order filter of this gain per period. */
+void pmsm_observe_disturbance(pmsm_period *period, pmsm_real gain)
 {
     pmsm_state *state = period->state;
     const pmsm_params *params = period->params;
-    const pmsm_real gain = (pmsm_real)params->governor_observer_gain;
     const pmsm_dq held = (params->inverter_delay_periods >= 1.0F) ? state->voltage_before : state->voltage_committed;
     const pmsm_ab stator = {held.d, held.q};
     pmsm_real sine;
@@ -178,7 +177,9 @@ pmsm_dq pmsm_predict_current(const pmsm_period *period)
     pmsm_real sine;
     pmsm_real cosine;
     pmsm_sincos(period->omega_e * T_s, &sine, &cosine);
-    const pmsm_ab fixed = {psi.d + T_s * u.d - drop * period->i.d, psi.q + T_s * u.q - drop * period->i.q};
+    const pmsm_dq lost = period->state->disturbance; /* what an observer found missing, zero without one */
+    const pmsm_ab fixed = {psi.d + T_s * (u.d - lost.d) - drop * period->i.d,
+                           psi.q + T_s * (u.q - lost.q) - drop * period->i.q};
     const pmsm_dq turned = pmsm_park(fixed, sine, cosine);
     /* half of the drop belongs to the new current itself: i = i_k + L^-1 (turned - drop i - psi) solved for i */
     const pmsm_real L_d = (pmsm_real)params->motor_L_d_h;

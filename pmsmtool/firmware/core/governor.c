@@ -14,6 +14,7 @@
 #define POLYGON 8u                         /* faces that stand for the circle in the linearised mode */
 #define POLYGON_ROWS 16u
 #define POLYGON_INNER PMSM_C(0.92387953251128675613) /* cos(pi/8): the polygon lies inside the circle */
+#define LANDING_REST PMSM_C(0.26)          /* deadbeat would be 0; the rest is for an inductance that is off */
 #define PRE_PROJECTION_MARGIN PMSM_C(0.99999)
 
 typedef struct {
@@ -296,18 +297,52 @@ static void observe(pmsm_period *period, const rows_of_period *rows)
     live->iterations += steps;
 }
 
-/* Whatever tolerance a solver left: the demanded voltage ends inside its limit. */
-static pmsm_dq meet_row_zero(const pmsm_row *now, pmsm_dq v)
+/* Whatever tolerance a solver left, and whatever direction the voltage took in the hexagon (row 0 knows the radius in
+ * the direction of the request only): the demanded voltage ends inside its limit. */
+static pmsm_dq meet_row_zero(const pmsm_period *period, const pmsm_row *now, pmsm_dq v)
 {
     const pmsm_dq w = pmsm_row_voltage(now, v);
     const pmsm_real square = pmsm_square(w);
-    if (square <= now->V * now->V) {
+    const pmsm_real V = pmsm_voltage_radius(period, w);
+    if (square <= V * V) {
         return v;
     }
-    const pmsm_real share = PMSM_C(1.0) - now->V / PMSM_SQRT(square);
+    const pmsm_real share = PMSM_C(1.0) - V / PMSM_SQRT(square);
     v.d -= share * w.d / now->m_dd;
     v.q -= share * w.q / now->m_qq;
     return v;
+}
+
+/* One sample of a faster approach at the end of a transfer: what is left of the error after it is LANDING_REST. */
+static pmsm_real land(pmsm_real i, pmsm_real r, pmsm_real L, pmsm_real K_p, pmsm_real T_s)
+{
+    const pmsm_real gain = (PMSM_C(1.0) - LANDING_REST) * L / (K_p * T_s);
+    return (gain > PMSM_C(1.0)) ? i + gain * (r - i) : r;
+}
+
+/* Minimum-time transfer to an inadmissible request, and its landing once the request is admissible. */
+static uint32_t steer(pmsm_period *period, const rows_of_period *rows, pmsm_dq r, uint32_t binding, pmsm_dq *v)
+{
+    pmsm_state *state = period->state;
+    const pmsm_row *now = &rows->row[0];
+    if (binding == PMSM_BINDING_NONE) {
+        const uint32_t landing = state->landing;
+        state->time_to_go = PMSM_C(0.0);
+        state->landing = 0u;
+        if (landing != 0u) {
+            const pmsm_params *p = period->params;
+            const pmsm_real T_s = state->derived.T_s;
+            v->d = land(period->i_model.d, r.d, (pmsm_real)p->motor_L_d_h, now->m_dd, T_s);
+            v->q = land(period->i_model.q, r.q, (pmsm_real)p->motor_L_q_h, now->m_qq, T_s);
+        }
+        return landing;
+    }
+    if (pmsm_minimum_time(period, now, r, v) == 0u) {
+        state->time_to_go = PMSM_C(0.0);
+        return 0u;
+    }
+    state->landing = 1u;
+    return 1u;
 }
 
 /* The reachable request: inside the steady-state row, and inside the current row where both can be met. */
@@ -334,16 +369,10 @@ static void choose(pmsm_period *period, const rows_of_period *rows)
         r = pre_project(rows, request, &steps);
     }
     pmsm_dq v = solve(period, rows, r, &binding, &steps);
-    uint32_t steered = 0u;
-    if (binding != PMSM_BINDING_NONE &&
-        has_option(period, PMSM_GOVERNOR_MINIMUM_TIME) != 0u) {
-        steered = pmsm_minimum_time(period, &rows->row[0], r, &v);
-        binding = (steered != 0u) ? (uint32_t)PMSM_BINDING_MINIMUM_TIME : binding;
+    if (has_option(period, PMSM_GOVERNOR_MINIMUM_TIME) != 0u && steer(period, rows, r, binding, &v) != 0u) {
+        binding = PMSM_BINDING_MINIMUM_TIME;
     }
-    if (steered == 0u) {
-        period->state->time_to_go = PMSM_C(0.0);
-    }
-    v = meet_row_zero(&rows->row[0], v);
+    v = meet_row_zero(period, &rows->row[0], v);
     if (v.d != request.d || v.q != request.q) {
         period->flags |= (uint32_t)PMSM_FLAG_GOVERNOR_ACTIVE;
         binding = (binding == PMSM_BINDING_NONE) ? (uint32_t)PMSM_BINDING_PRE_PROJECTION : binding;

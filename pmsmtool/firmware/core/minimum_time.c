@@ -13,7 +13,8 @@
 #define ACCURACY PMSM_C(1e-3)        /* of V T */
 
 typedef struct {
-    pmsm_dq a, b, drop;
+    pmsm_dq a, b;             /* Wb, now and at the target */
+    pmsm_dq drop_a, drop_b;   /* V, half the resistance drop of either, turning with the rotor */
     pmsm_real omega, V;
 } transfer;
 
@@ -31,12 +32,14 @@ static transfer_point at_time(const transfer *t, pmsm_real T)
     pmsm_sincos(t->omega * T, &sine, &cosine);
     const pmsm_dq turned = {cosine * t->b.d - sine * t->b.q, sine * t->b.d + cosine * t->b.q};
     transfer_point point;
-    point.m.d = turned.d - t->a.d + t->drop.d * T;
-    point.m.q = turned.q - t->a.q + t->drop.q * T;
+    const pmsm_dq drop = {t->drop_a.d + cosine * t->drop_b.d - sine * t->drop_b.q,
+                          t->drop_a.q + sine * t->drop_b.d + cosine * t->drop_b.q};
+    point.m.d = turned.d - t->a.d + drop.d * T;
+    point.m.q = turned.q - t->a.q + drop.q * T;
     point.size = PMSM_SQRT(pmsm_square(point.m));
     point.gap = point.size - t->V * T;
-    const pmsm_real rate_d = t->drop.d - t->omega * turned.q;
-    const pmsm_real rate_q = t->drop.q + t->omega * turned.d;
+    const pmsm_real rate_d = drop.d - t->omega * turned.q;
+    const pmsm_real rate_q = drop.q + t->omega * turned.d;
     const pmsm_real along = (point.m.d * rate_d + point.m.q * rate_q) / (point.size + PMSM_C(1e-12));
     point.slope = along - t->V;
     return point;
@@ -66,7 +69,8 @@ static uint32_t refine(const transfer *t, pmsm_real *T, transfer_point *point)
  * number of steps bounded. */
 static uint32_t march(const transfer *t, pmsm_real *T, transfer_point *point)
 {
-    const pmsm_real bound = pmsm_abs(t->omega) * PMSM_SQRT(pmsm_square(t->b)) + PMSM_SQRT(pmsm_square(t->drop)) + t->V;
+    const pmsm_real bound = pmsm_abs(t->omega) * PMSM_SQRT(pmsm_square(t->b)) + PMSM_SQRT(pmsm_square(t->drop_a)) +
+                            PMSM_SQRT(pmsm_square(t->drop_b)) + t->V;
     pmsm_real low = PMSM_C(0.0);
     *point = at_time(t, low);
     *T = point->gap / bound;
@@ -151,8 +155,8 @@ uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq tar
     const pmsm_real T_s = state->derived.T_s;
     const pmsm_dq i = period->i_model;
     const pmsm_real half_R = PMSM_C(0.5) * period->R_s;
-    const transfer t = {flux(period->params, i), flux(period->params, target),
-                        {half_R * (i.d + target.d), half_R * (i.q + target.q)}, period->omega_e, period->V_max};
+    const transfer t = {flux(period->params, i), flux(period->params, target), {half_R * i.d, half_R * i.q},
+                        {half_R * target.d, half_R * target.q}, period->omega_e, period->V_max};
     pmsm_real T = state->time_to_go - T_s;
     transfer_point point;
     if (T <= PMSM_C(0.0) || refine(&t, &T, &point) == 0u) {

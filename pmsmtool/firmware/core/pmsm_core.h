@@ -103,7 +103,7 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_dq fw_reference;    /* A */
     uint32_t fw_count;       /* periods since the last optimisation */
     uint32_t speed_count;
-    pmsm_real polar[12];     /* memory of the polar-coordinate laws */
+    pmsm_real polar[12];     /* memory of the polar-coordinate laws, see polar.h */
     pmsm_real tau_speed;     /* N m, last output of the speed controller */
     pmsm_live live;
     /* private to the core */
@@ -112,6 +112,7 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_dq reference_realised; /* A, reference of the last period that its limited voltage stood for */
     pmsm_real tau_granted;   /* N m, torque of the reference that the limits left */
     pmsm_real time_to_go;    /* s, of the minimum-time transfer in progress, 0 when there is none */
+    uint32_t landing;        /* 1: a minimum-time transfer has not reached its target yet */
     pmsm_real fw_tau;        /* N m, request of the last optimisation */
     uint32_t fw_empty;       /* 1: it found no current that satisfies both limits */
     pmsm_real i2t_carry;     /* rounding remainder of i2t */

@@ -57,7 +57,7 @@ void pmsm_current_integrate(pmsm_period *period);
 void pmsm_current_row(pmsm_period *period, pmsm_row *row); /* demand as a function of the reference */
 pmsm_dq pmsm_model_voltage(const pmsm_period *period, pmsm_dq i); /* steady state, nominal flux */
 pmsm_dq pmsm_hold_voltage(const pmsm_period *period, pmsm_dq i); /* what the controller gives without an error */
-void pmsm_observe_disturbance(pmsm_period *period);
+void pmsm_observe_disturbance(pmsm_period *period, pmsm_real gain);
 pmsm_dq pmsm_predict_current(const pmsm_period *period);
 
 /* governor.c: period->reference becomes the governed one */
@@ -65,6 +65,10 @@ void pmsm_govern(pmsm_period *period);
 
 /* minimum_time.c: 1 and the reference that steers along the minimum-time direction, or 0 */
 uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq target, pmsm_dq *v);
+
+/* polar.c: the laws of polar.mode in place of the current controller */
+void pmsm_polar_demand(pmsm_period *period);
+void pmsm_polar_settle(pmsm_period *period);
 
 /* modulation.c */
 pmsm_real pmsm_voltage_radius(const pmsm_period *period, pmsm_dq u); /* what the inverter gives in direction u */

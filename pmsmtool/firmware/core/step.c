@@ -28,6 +28,7 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->disturbance = zero;
     state->fw_reference = zero;
     state->time_to_go = PMSM_C(0.0);
+    state->landing = 0u;
     state->speed_integrator = PMSM_C(0.0);
     state->notch_1 = PMSM_C(0.0);
     state->notch_2 = PMSM_C(0.0);
@@ -93,6 +94,27 @@ static pmsm_dq current_request(pmsm_period *period)
     return pmsm_torque_to_current(period, tau);
 }
 
+static void field_oriented(pmsm_period *period, pmsm_output *output)
+{
+    if (pmsm_uses_predictor(period->params) != 0u) {
+        period->i_model = pmsm_predict_current(period);
+    }
+    if (period->params->governor_mode != PMSM_GOVERNOR_OFF) {
+        pmsm_observe_disturbance(period, (pmsm_real)period->params->governor_observer_gain);
+        pmsm_govern(period);
+    }
+    pmsm_current_demand(period);
+    pmsm_modulate(period, output);
+    pmsm_current_integrate(period);
+}
+
+static void polar(pmsm_period *period, pmsm_output *output)
+{
+    pmsm_polar_demand(period);
+    pmsm_modulate(period, output);
+    pmsm_polar_settle(period);
+}
+
 static void control(pmsm_period *period, pmsm_output *output)
 {
     pmsm_live *live = &period->state->live;
@@ -100,16 +122,11 @@ static void control(pmsm_period *period, pmsm_output *output)
     live->i_d_req = request.d;
     live->i_q_req = request.q;
     period->reference = request;
-    if (pmsm_uses_predictor(period->params) != 0u) {
-        period->i_model = pmsm_predict_current(period);
+    if (period->params->polar_mode != PMSM_POLAR_OFF && period->request->bias_bandwidth <= PMSM_C(0.0)) {
+        polar(period, output);
+    } else {
+        field_oriented(period, output);
     }
-    if (period->params->governor_mode != PMSM_GOVERNOR_OFF) {
-        pmsm_observe_disturbance(period);
-        pmsm_govern(period);
-    }
-    pmsm_current_demand(period);
-    pmsm_modulate(period, output);
-    pmsm_current_integrate(period);
     period->state->reference_held = period->reference;
 }
 
