@@ -13,7 +13,8 @@ from typing import Any
 import can
 from can.interfaces import BACKENDS
 
-from pmsmtool.bus.connect import Connection, connect
+from pmsmtool.bus.connect import connect
+from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.frame_time import frame_bits
 from pmsmtool.bus.scan import FoundNode, find_nodes
 from pmsmtool.bus.sdo import SdoChannel

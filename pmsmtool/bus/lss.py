@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 
-from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.connection import Connection
 from pmsmtool.errors import DriveFault, DriveTimeout
 
 MASTER_ID = 0x7E5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.connection import Connection
 from pmsmtool.errors import DriveTimeout
 
 NMT_ID = 0x000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.nmt import HEARTBEAT_ID, NmtState
 
 NODES = range(1, 128)

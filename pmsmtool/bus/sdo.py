@@ -18,7 +18,7 @@ from contextlib import contextmanager
 
 from pmsmtool.bus import sdo_block
 from pmsmtool.bus.abort_codes import TRANSPORT_CODES, AbortCode, abort_advice, abort_text
-from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.sdo_transfer import MULTIPLEXOR, Attempt, BlockRefused, Mode, Retry, Transfer, TransferLost
 from pmsmtool.errors import BusError, DriveTimeout, PmsmtoolError, SdoAbort
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.nmt import HEARTBEAT_ID, NMT_ID, NmtState
 from pmsmtool.cia402 import error_text
 from pmsmtool.errors import BusError, DriveFault

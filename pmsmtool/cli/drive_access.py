@@ -13,7 +13,7 @@ from pmsmtool.cli.options import FILE, BusOptions
 from pmsmtool.errors import BusError, ConfigError
 
 if TYPE_CHECKING:
-    from pmsmtool.bus.connect import Connection
+    from pmsmtool.bus.connection import Connection
     from pmsmtool.drive.canopen_drive import CanopenDrive
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.firmware.drive_map import DriveMap

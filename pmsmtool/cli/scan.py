@@ -10,7 +10,7 @@ from pmsmtool.cli.options import BusOptions, bus_options, examples, output_optio
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
-    from pmsmtool.bus.connect import Connection
+    from pmsmtool.bus.connection import Connection
     from pmsmtool.bus.scan import FoundNode
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode, State
 from pmsmtool.drive import objects, stop
 from pmsmtool.drive.drive_node import DriveNode, is_safe

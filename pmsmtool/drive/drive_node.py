@@ -6,8 +6,8 @@ import contextlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from pmsmtool.bus.connect import Connection
-from pmsmtool.bus.nmt import reset_node
+from pmsmtool.bus.connection import Connection
+from pmsmtool.bus.nmt import NmtCommand, NmtState, reset_node, send_nmt
 from pmsmtool.bus.sdo import Retry, SdoChannel
 from pmsmtool.bus.supervision import Supervision
 from pmsmtool.cia402 import Command, State, command_towards_enabled, error_text, state_of
@@ -204,16 +204,19 @@ class DriveNode:
     # ---- reset and store ------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Reset the node and wait until it answers again.
+        """Reset the node, wait until it answers again, and start it if it was operational.
 
         Raises
         ------
         DriveTimeout
             It does not come back.
         """
+        operational = self.supervision.nmt_state is NmtState.OPERATIONAL
         with self.supervision.expected_reset():
             reset_node(self.connection, self.node)
             self._wait_until_ready()
+        if operational:
+            send_nmt(self.connection, NmtCommand.START, self.node)
 
     def _wait_until_ready(self) -> None:
         deadline = self.connection.clock.now() + READY_TIMEOUT_S

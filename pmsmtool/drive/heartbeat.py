@@ -10,7 +10,7 @@ import contextlib
 from types import TracebackType
 
 from pmsmtool.bus.clock import Ticker
-from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.nmt import HEARTBEAT_ID, NmtState
 from pmsmtool.errors import BusError
 

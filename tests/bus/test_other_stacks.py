@@ -13,6 +13,7 @@ Deviations met, and what the channel makes of them:
 
 from __future__ import annotations
 
+import importlib
 import random
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -98,15 +99,13 @@ def _soon(connection: Connection, condition: Callable[[], bool]) -> bool:
 @pytest.fixture
 def durand_node(request: pytest.FixtureRequest) -> Iterator[Any]:
     durand = pytest.importorskip("durand")
-    from durand.datatypes import DatatypeEnum
-    from durand.object_dictionary import Variable
-
+    kinds = importlib.import_module("durand.datatypes").DatatypeEnum
+    variable = importlib.import_module("durand.object_dictionary").Variable
     bus = can.Bus(interface="virtual", channel=request.node.name, ignore_config=True)
     network = durand.CANBusNetwork(bus)
     node = durand.MinimalNode(network, NODE)
-    node.object_dictionary[NUMBER[0]] = Variable(DatatypeEnum.UNSIGNED32, "rw", value=0)
-    node.object_dictionary[BLOB[0]] = Variable(DatatypeEnum.DOMAIN, "rw", value=b"")
-    node.nmt.set_state(durand.StateEnum.PRE_OPERATIONAL) if hasattr(durand, "StateEnum") else None
+    node.object_dictionary[NUMBER[0]] = variable(kinds.UNSIGNED32, "rw", value=0)
+    node.object_dictionary[BLOB[0]] = variable(kinds.DOMAIN, "rw", value=b"")
     yield node
     network.stop()
     bus.shutdown()

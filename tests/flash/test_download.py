@@ -208,6 +208,25 @@ def test_node_reset_in_the_middle_starts_over_once(tmp_path: Path) -> None:
     assert outcome.starts == 2 and len(set(rig.crcs())) == 1
 
 
+def test_emergency_in_the_middle_stops_and_rolls_back(rig: Rig) -> None:
+    before = rig.image()
+    job = rig.job(rig.plan(SMALL), {})
+    emergency = Frame(0x081, (0x4310).to_bytes(2, "little") + b"\x09" + bytes(5))
+    job._progress = lambda done, total: rig.bench.line.deliver(None, emergency) if done == 2 else None
+    with pytest.raises(DriveFault, match=r"0x4310 \(motor over-temperature\), register 0x09"):
+        job.run()
+    assert rig.image() == before
+
+
+def test_operational_node_is_operational_again_after_the_reset(rig: Rig) -> None:
+    rig.bench.nmt(1)
+    rig.connection.sent[0].append(bytes((1, 1)))
+    rig.connection.wait(0.5)
+    rig.download(SMALL)
+    session = rig.bench.node.session
+    assert session is not None and session.nmt == 5
+
+
 def test_silent_rounding_is_caught(tmp_path: Path) -> None:
     """A drive that stores something else than it confirmed."""
     rig = open_rig(tmp_path)
