@@ -84,7 +84,7 @@ class Snapshot:
     def dumps(self) -> str:
         """Return the file's text."""
         body = self._body()
-        return json.dumps({**body, "check": _check(body)}, indent=1) + "\n"
+        return json.dumps({**body, "check": check_sum(body)}, indent=1) + "\n"
 
     def _body(self) -> dict[str, Any]:
         identity = asdict(self.identity)
@@ -119,7 +119,7 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
         check = document.pop("check")
         if document["schema"] != SCHEMA:
             raise ConfigError(f"schema is {document['schema']!r}, expected {SCHEMA!r}", where=where)
-        if check != _check(document):
+        if check != check_sum(document):
             raise ConfigError(
                 "the snapshot is damaged: its check sum does not fit", where=where, likely="it was edited or cut"
             )
@@ -248,7 +248,8 @@ def _entry(row: dict[str, Any]) -> Entry:
     )  # fmt: skip
 
 
-def _check(body: dict[str, Any]) -> str:
+def check_sum(body: dict[str, Any]) -> str:
+    """Return the check sum of a snapshot's content."""
     return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
 
 
