@@ -10,12 +10,27 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pmsmtool.bus.connect import connect as connect
+    from pmsmtool.design.design_file import load_design as load_design
+    from pmsmtool.design.margins import margin_report as margin_report
+    from pmsmtool.design.tolerance import tolerance_box as tolerance_box
+    from pmsmtool.design.tune import tune as tune
+    from pmsmtool.design.tune_request import TuneRequest as TuneRequest
+    from pmsmtool.drive.canopen_drive import CanopenDrive as CanopenDrive
+    from pmsmtool.drive.envelope import Envelope as Envelope
+    from pmsmtool.drive.guard import guarded as guarded
     from pmsmtool.errors import ExitCode as ExitCode
     from pmsmtool.errors import PmsmtoolError as PmsmtoolError
+    from pmsmtool.machine.machine_file import MachineFile as MachineFile
+    from pmsmtool.machine.machine_file import load_machine_file as load_machine_file
     from pmsmtool.machine.parameters import Estimate as Estimate
     from pmsmtool.machine.parameters import InverterParameters as InverterParameters
     from pmsmtool.machine.parameters import MachineParameters as MachineParameters
+    from pmsmtool.params.parameter_set import ParameterSet as ParameterSet
     from pmsmtool.trace import Trace as Trace
+    from pmsmtool.workflow.commission import commission as commission
+    from pmsmtool.workflow.parameter_source import load_parameters as load_parameters
+    from pmsmtool.workflow.report_page import report_page as report_page
 
 __version__ = "0.1.0"
 
@@ -23,9 +38,24 @@ _HOME = {
     "PmsmtoolError": "pmsmtool.errors",
     "ExitCode": "pmsmtool.errors",
     "Trace": "pmsmtool.trace",
+    "Estimate": "pmsmtool.machine.parameters",
     "MachineParameters": "pmsmtool.machine.parameters",
     "InverterParameters": "pmsmtool.machine.parameters",
-    "Estimate": "pmsmtool.machine.parameters",
+    "MachineFile": "pmsmtool.machine.machine_file",
+    "load_machine_file": "pmsmtool.machine.machine_file",
+    "ParameterSet": "pmsmtool.params.parameter_set",
+    "load_parameters": "pmsmtool.workflow.parameter_source",
+    "TuneRequest": "pmsmtool.design.tune_request",
+    "tune": "pmsmtool.design.tune",
+    "load_design": "pmsmtool.design.design_file",
+    "tolerance_box": "pmsmtool.design.tolerance",
+    "margin_report": "pmsmtool.design.margins",
+    "connect": "pmsmtool.bus.connect",
+    "CanopenDrive": "pmsmtool.drive.canopen_drive",
+    "Envelope": "pmsmtool.drive.envelope",
+    "guarded": "pmsmtool.drive.guard",
+    "commission": "pmsmtool.workflow.commission",
+    "report_page": "pmsmtool.workflow.report_page",
 }
 """Public name -> module that defines it."""
 
@@ -33,9 +63,24 @@ __all__ = [
     "PmsmtoolError",
     "ExitCode",
     "Trace",
+    "Estimate",
     "MachineParameters",
     "InverterParameters",
-    "Estimate",
+    "MachineFile",
+    "load_machine_file",
+    "ParameterSet",
+    "load_parameters",
+    "TuneRequest",
+    "tune",
+    "load_design",
+    "tolerance_box",
+    "margin_report",
+    "connect",
+    "CanopenDrive",
+    "Envelope",
+    "guarded",
+    "commission",
+    "report_page",
 ]
 
 

@@ -64,7 +64,7 @@ def commission_command(
     """
     from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.errors import ConfigError
-    from pmsmtool.workflow.commission import Commissioning
+    from pmsmtool.workflow.commission import Commissioning, begin_run
     from pmsmtool.workflow.run_directory import RunDirectory
 
     begun = RunDirectory(resume) if resume is not None else None
@@ -77,7 +77,7 @@ def commission_command(
         _erase_memory(bus, out)
     with open_drive(bus, read_map(map_file)) as drive:
         checked_identity(drive.node)
-        run = begun or _begin(runs, drive, bus)
+        run = begun or begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=_recorded(bus))
         progress = StageProgress(out)
         person = _Person(run, drive, bus, motion, out, progress)
         with _reported(run, out, fresh=begun is None):
@@ -114,11 +114,15 @@ def _asked(machine: Path | None, motion: MotionOptions, sensor_tol: float, desig
     }
 
 
+def _recorded(bus: BusOptions) -> dict[str, Any]:
+    return {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate}
+
+
 def _as_begun(bus: BusOptions, run: RunDirectory) -> BusOptions:
     """Fill in the bus of a run where the command line names none."""
     recorded = run.read().bus
     if bus.interface is None and bus.channel is None:
-        bus = replace(bus, **{key: recorded.get(key) for key in ("interface", "channel", "bitrate")})
+        bus = replace(bus, **{key: recorded.get(key) for key in _recorded(bus)})
     return replace(bus, node=recorded.get("node")) if bus.node is None else bus
 
 
@@ -132,23 +136,6 @@ def _erase_memory(bus: BusOptions, out: Output) -> None:
         channel = can.util.load_config().get("channel")
     for path in erase_memory(None if channel is None else str(channel)):
         out.detail(f"erased {path}: the simulated drive starts from factory memory")
-
-
-def _begin(runs: Path, drive: CanopenDrive, bus: BusOptions) -> RunDirectory:
-    from importlib.metadata import version
-
-    from pmsmtool import __version__
-    from pmsmtool.workflow.commission import drive_facts
-    from pmsmtool.workflow.run_directory import RunDirectory, new_record
-
-    identity = drive.identity
-    record = new_record(
-        ["pmsmtool", *sys.argv[1:]],
-        drive=drive_facts(identity),
-        bus={"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate, "node": identity.node},
-        versions={"pmsmtool": __version__, **{name: version(name) for name in ("numpy", "python-can")}},
-    )
-    return RunDirectory.create(runs, identity.serial, record)
 
 
 class _Person:
@@ -195,6 +182,7 @@ class _Person:
 def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
     """Write the report whatever ends the chain; a run that was declined before anything moved leaves no trace."""
     from pmsmtool.errors import Declined, PmsmtoolError
+    from pmsmtool.workflow.commission import write_report
 
     try:
         yield
@@ -203,19 +191,13 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
             shutil.rmtree(run.path, ignore_errors=True)
             raise
         try:
-            _write_report(run)
+            write_report(run)
             out.note(f"report: {run.path / 'report.html'}; go on with: pmsmtool commission --resume {run.path}")
         except PmsmtoolError as second:
             out.warn(f"the report could not be written: {second.what}")
         raise
-    _write_report(run)
+    write_report(run)
     _show(run, out)
-
-
-def _write_report(run: RunDirectory) -> None:
-    from pmsmtool.workflow.report_page import report_page
-
-    run.save("report.html", report_page(run.path))
 
 
 def _show(run: RunDirectory, out: Output) -> None:

@@ -10,13 +10,15 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any, Protocol
 
+from pmsmtool import __version__
 from pmsmtool.design.lookup_design import LookupRequest
 from pmsmtool.design.margins import MarginRequest
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.stop import quick_stop
 from pmsmtool.errors import (
@@ -34,7 +36,8 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
 from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplate_of
-from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, Status
+from pmsmtool.workflow.report_page import report_page
+from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, Status, new_record
 
 STAGES = ("identify", "tune", "lut", "margins", "flash", "verify")
 
@@ -210,7 +213,7 @@ class Commissioning:
 
     def _make_sure(self) -> None:
         """Leave the machine off, confirmed, where this program may have energised it."""
-        if self.drive.may_be_energised and not is_safe(self.drive.node.state()):
+        if self.drive.may_be_energised:
             quick_stop(self.drive.node)
 
 
@@ -249,6 +252,81 @@ def drive_facts(identity: Identity) -> dict[str, Any]:
     return asdict(identity)
 
 
-def request_table(tune: TuneRequest, lookup: LookupRequest) -> dict[str, Any]:
-    """Return what was asked, as the record keeps it for ``--resume``."""
-    return {"tune": tune.table(), "lut": {"torque_bound": lookup.torque_bound, "voltage_bound": lookup.voltage_bound}}
+def begin_run(
+    drive: CanopenDrive, runs: Path, *, command: Sequence[str] = ("commission",), bus: Mapping[str, Any] | None = None
+) -> RunDirectory:
+    """Make the run directory of a drive below ``runs``; raises ``ConfigError`` when it cannot be written."""
+    record = new_record(
+        command,
+        drive=drive_facts(drive.identity),
+        bus={**(bus or {}), "node": drive.identity.node},
+        versions={"pmsmtool": __version__, **{name: version(name) for name in ("numpy", "scipy", "python-can")}},
+    )
+    return RunDirectory.create(runs, drive.identity.serial, record)
+
+
+def write_report(run: RunDirectory) -> None:
+    """Write ``report.html`` of a run from its files."""
+    run.save("report.html", report_page(run.path))
+
+
+class Silent:
+    """A progress nobody is told of."""
+
+    def skip(self, name: str, number: int, count: int) -> None:
+        """Say nothing."""
+
+    def begin(self, name: str, number: int, count: int) -> None:
+        """Say nothing."""
+
+    def say(self, text: str) -> None:
+        """Say nothing."""
+
+    def end(self, stage: Stage, number: int, count: int) -> None:
+        """Say nothing."""
+
+
+def commission(
+    drive: CanopenDrive,
+    runs: Path,
+    person: Person,
+    *,
+    progress: Progress | None = None,
+    nameplate: MachineFile | None = None,
+    identify: IdentifyRequest | None = None,
+    tune: TuneRequest | None = None,
+) -> RunDirectory:
+    """Take a drive from unknown machine to verified parameters, in a new run directory with its report.
+
+    Parameters
+    ----------
+    drive : CanopenDrive
+        The drive; off.
+    runs : Path
+        Folder of the run directories.
+    person : Person
+        Gives the two consents.
+    progress : Progress, optional
+        Is told.
+    nameplate : MachineFile, optional
+        What is known of the machine; the drive's own ratings and set when not given.
+    identify, tune : optional
+        What is asked; the defaults of their classes.
+
+    Raises
+    ------
+    PmsmtoolError
+        Whatever ended the chain; it is recorded and reported, and :meth:`Commissioning.carry_out` goes on there.
+    """
+    run = begin_run(drive, runs)
+    chain = Commissioning(
+        run, drive, person, progress or Silent(), nameplate, identify or IdentifyRequest(), tune or TuneRequest()
+    )
+    try:
+        chain.carry_out()
+    except BaseException:
+        with contextlib.suppress(PmsmtoolError):  # what ended the chain outranks a page that cannot be written
+            write_report(run)
+        raise
+    write_report(run)
+    return run
