@@ -114,7 +114,10 @@ def _measure(path: Path) -> tuple[Evaluation, float]:
             Measurement(guard, limits, traces.__setitem__, lambda text: None).run(request.quantities)
         seconds = connection.clock.now() - start
         drive.close()
-    return evaluate(traces, nameplate.inverter.T_s, T_ref_c=nameplate.machine.T_ref_c), seconds
+    found = evaluate(
+        traces, nameplate.inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=nameplate.inverter.U_dc_v
+    )
+    return found, seconds
 
 
 def clopper_pearson(hits: int, n: int) -> tuple[float, float]:

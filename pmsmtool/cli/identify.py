@@ -30,7 +30,12 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 @click.option("--method", type=click.Choice(["auto", "inject"]), default="auto", help="How: by injection and trace.")
 @click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="Recompute from the traces of a run; moves nothing.")
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
-@click.option("--sensor-tol", type=click.FloatRange(0.0, 0.2), default=0.01, help="95 % tolerance of sensor gains.")
+@click.option(
+    "--sensor-tol",
+    type=click.FloatRange(0.0, 0.2),
+    metavar="SHARE",
+    help="95 % tolerance of sensor gains; default 0.01, with --replay what the run was made with.",
+)
 @bus_options
 @motion_options
 @output_options
@@ -42,7 +47,7 @@ def identify_command(
     method: str,
     replay: Path | None,
     runs: Path,
-    sensor_tol: float,
+    sensor_tol: float | None,
 ) -> None:
     """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
 
@@ -54,6 +59,15 @@ def identify_command(
     from pmsmtool.workflow.identify import IdentifyRequest
     from pmsmtool.workflow.measure import QUANTITIES
 
+    declared = None if sensor_tol is None else SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol)
+    if replay is not None:
+        from pmsmtool.workflow.identify import replay as recompute
+        from pmsmtool.workflow.run_directory import RunDirectory
+
+        run = RunDirectory(replay)
+        run.read()
+        _show(run, recompute(run, declared), out)
+        return
     chosen = QUANTITIES if not quantities or "all" in quantities else quantities
     request = IdentifyRequest(
         quantities=tuple(chosen),
@@ -62,17 +76,9 @@ def identify_command(
         shaft=motion.shaft or "free",
         load=motion.load,
         brake=motion.brake,
-        tolerance=SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol),
+        tolerance=declared or SensorTolerance(),
     )
     request.check()
-    if replay is not None:
-        from pmsmtool.workflow.identify import replay as recompute
-        from pmsmtool.workflow.run_directory import RunDirectory
-
-        run = RunDirectory(replay)
-        run.read()
-        _show(run, recompute(run, request), out)
-        return
     run, stage = _measure(bus, motion, out, request, runs)
     _show(run, stage, out)
 

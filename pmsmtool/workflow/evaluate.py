@@ -10,7 +10,7 @@ import numpy as np
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
-from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
+from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.inductance import InductanceResult, estimate_inductances
 from pmsmtool.estimators.inertia import InertiaResult, estimate_inertia
@@ -23,6 +23,8 @@ from pmsmtool.trace import Trace
 
 COPPER_ALPHA_PER_K = 0.00393
 """Temperature coefficient of copper at 20 degC (IEC 60028)."""
+MOSFET_LINK_V = 100.0
+"""Below this DC link bridges are made of MOSFETs, which have no threshold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +72,19 @@ def wrapped(angle: float) -> float:
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
+def tolerance_on(tolerance: SensorTolerance, U_dc_v: float) -> SensorTolerance:
+    """Return the tolerances with the DC link on which the thresholds of the bridge act (V)."""
+    threshold_v = 0.0 if U_dc_v < MOSFET_LINK_V else tolerance.bridge_threshold_v
+    return replace(tolerance, U_dc_v=U_dc_v, bridge_threshold_v=threshold_v)
+
+
 def evaluate(
-    traces: Mapping[str, Trace], period_s: float, *, T_ref_c: float = 20.0, tolerance: SensorTolerance | None = None
+    traces: Mapping[str, Trace],
+    period_s: float,
+    *,
+    T_ref_c: float = 20.0,
+    U_dc_v: float = math.inf,
+    tolerance: SensorTolerance | None = None,
 ) -> Evaluation:
     """Estimate everything the traces allow.
 
@@ -85,6 +98,8 @@ def evaluate(
         Control period (s).
     T_ref_c : float
         Temperature the values are referred to (degC).
+    U_dc_v : float
+        DC link of the nameplate (V); infinite: the thresholds of the bridge are not counted.
     tolerance : SensorTolerance
         Declared sensor tolerances.
 
@@ -97,6 +112,7 @@ def evaluate(
     """
     if "zero_current" not in traces:
         raise ConfigError("the run has no zero-current trace", hint="run identify again")
+    tolerance = tolerance_on(tolerance or SensorTolerance(), U_dc_v)
     result = Evaluation(estimate_noise(traces["zero_current"]))
     if "phase_vectors" in traces:
         result = replace(result, phases=check_phases(traces["phase_vectors"], result.noise))
@@ -231,8 +247,3 @@ def machine_of(evaluation: Evaluation, nameplate: MachineFile, conditions: Mappi
         conditions=dict(conditions),
         simulation={},
     )
-
-
-def relative_total(estimate: Estimate) -> float:
-    """Return the total 95 % half width relative to the value."""
-    return total_half_width(estimate) / abs(estimate.value) if estimate.value else math.inf

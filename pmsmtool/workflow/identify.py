@@ -6,9 +6,10 @@ bytes years later. Nothing is stored in the drive.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -34,14 +35,13 @@ from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
 MACHINE = "machine.toml"
 NAMEPLATE = "nameplate.toml"
+REQUEST = "request.json"
+"""What was asked, as far as the estimates depend on it: a replay is to give the same bytes."""
 
 LIMIT: Mapping[str, float] = {"R_s_ohm": 0.03, "L_d_h": 0.05, "L_q_h": 0.05, "psi_f_wb": 0.03, "J_kgm2": 0.10}
 """Largest relative 95 % total half width of an accepted value; measured with 1 % sensors: 1.7, 1.4, 1.4, 1.1, 3 %."""
 OFFSET_LIMIT_RAD = math.radians(1.0)
 """Largest 95 % half width of the encoder offset (electrical)."""
-ENERGY_ROOM = 3.0
-"""The energy budget of the envelope over what the plan predicts."""
-ELECTRICAL = ("R", "L", "psi", "encoder", "poles", "inverter", "mechanics")
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +194,7 @@ def identify_stage(
     envelope.refuse_gravity()
     allow_motion(plan_lines(envelope, request))
     run.save(NAMEPLATE, dump_machine_file(nameplate))
+    run.save(REQUEST, dump_request(request))
     limits = Limits(
         I_nom_apk=nameplate.machine.I_nom_apk or envelope.i_max_apk,
         i_max_apk=envelope.i_max_apk,
@@ -222,7 +223,11 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     """
     traces = stored_traces(run)
     evaluation = evaluate(
-        traces, nameplate.inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, tolerance=request.tolerance
+        traces,
+        nameplate.inverter.T_s,
+        T_ref_c=nameplate.machine.T_ref_c,
+        U_dc_v=nameplate.inverter.U_dc_v,
+        tolerance=request.tolerance,
     )
     machine = machine_of(evaluation, nameplate, _conditions(evaluation, request))
     run.save(MACHINE, dump_machine_file(machine))
@@ -235,7 +240,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         values=[_value(name, estimate) for name, estimate in found.items()],
         acceptance=acceptance,
         fallbacks=[f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback],
-        files={MACHINE: "", NAMEPLATE: "", **{f"traces/{name}.npz": "" for name in traces}},
+        files={MACHINE: "", NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
         note="; ".join(warnings_of(evaluation)),
         summary=", ".join(
             f"{name} {format_estimate(found[name].value, total_half_width(found[name]), found[name].unit)}"
@@ -245,20 +250,61 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     )
 
 
-def replay(run: RunDirectory, request: IdentifyRequest) -> Stage:
+def replay(run: RunDirectory, tolerance: SensorTolerance | None = None) -> Stage:
     """Recompute every estimate of a run from its traces.
+
+    Parameters
+    ----------
+    run : RunDirectory
+        Of ``identify`` or ``commission``. When the machine file becomes another one, the stage is recorded anew.
+    tolerance : SensorTolerance, optional
+        Replaces the sensor tolerances that the run was made with.
 
     Raises
     ------
     ConfigError
-        The run has no nameplate or no traces.
+        The run has no nameplate, no record of what was asked, or no traces.
     IdentificationError
         A trap is seen in the traces.
     """
-    path = run.path / NAMEPLATE
-    if not path.is_file():
-        raise ConfigError("the run has no nameplate.toml", where=str(run.path), hint="it is not a run of identify")
-    return evaluated_stage(run, load_machine_file(path), request)
+    for name in (NAMEPLATE, REQUEST):
+        if not (run.path / name).is_file():
+            raise ConfigError(f"the run has no {name}", where=str(run.path), hint="it is not a run of identify")
+    request = parse_request((run.path / REQUEST).read_text(encoding="utf-8"), where=str(run.path / REQUEST))
+    if tolerance is not None:
+        request = replace(request, tolerance=tolerance)
+    recorded = run.read().stage("identify")
+    stage = evaluated_stage(run, load_machine_file(run.path / NAMEPLATE), request)
+    if recorded is not None and recorded.files.get(MACHINE) != run.sha256(MACHINE):
+        run.save(REQUEST, dump_request(request))
+        run.add(replace(stage, seconds=recorded.seconds))
+    return stage
+
+
+def dump_request(request: IdentifyRequest) -> str:
+    """Return a request as JSON: what an estimate depends on besides traces and nameplate."""
+    facts = asdict(request)
+    if math.isinf(request.tolerance.U_dc_v):
+        del facts["tolerance"]["U_dc_v"]  # comes from the nameplate, and JSON has no infinity
+    return json.dumps(facts, indent=1) + "\n"
+
+
+def parse_request(text: str, *, where: str) -> IdentifyRequest:
+    """Return the request of a run.
+
+    Raises
+    ------
+    ConfigError
+        It is not what :func:`dump_request` writes.
+    """
+    try:
+        facts = json.loads(text)
+        tolerance = SensorTolerance(**facts.pop("tolerance"))
+        request = IdentifyRequest(tolerance=tolerance, **{**facts, "quantities": tuple(facts["quantities"])})
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ConfigError(f"the recorded request is damaged: {error}", where=where) from error
+    request.check()
+    return request
 
 
 def stored_traces(run: RunDirectory) -> dict[str, Trace]:

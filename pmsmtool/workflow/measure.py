@@ -34,8 +34,13 @@ BIAS_SHARE = 0.5
 BIAS_TRIES = 4
 BIAS_OFF_RAD = math.radians(12.0)
 """Angle between rotor and bias vector that a load or friction may make (electrical)."""
+BIAS_MOST = 0.8
+"""Largest bias, of the test current: the ripple comes on top."""
 RIPPLE_SHARE = 0.25
-RIPPLE_SHARE_SATURATED = 0.05
+RIPPLE_LEAST = 0.2
+"""Smallest ripple, of the wanted one, that the inverter's knee may leave: below, noise decides."""
+CROSSING = 0.433
+"""A ripple on q reaches the phases at half the bias by sqrt(3)/4 of its peak-to-peak value (reference, 3.2)."""
 U_SHARE = 0.5
 """Largest injection amplitude, of the largest voltage."""
 RUN_BANDWIDTH_RAD_S = 2.0 * math.pi * 120.0
@@ -90,6 +95,31 @@ class Limits:
     def I_test_apk(self) -> float:
         """Largest steady current of an experiment: the rated one, or what the envelope leaves."""
         return min(self.I_nom_apk, self.i_max_apk / 1.1)
+
+
+def clear_ripple(wanted_a: float, bias_a: float, knee_a: float) -> float:
+    """Return the ripple (A peak to peak) that keeps every phase current above the knee, or the least useful one."""
+    return max(RIPPLE_LEAST * wanted_a, min(wanted_a, (0.5 * bias_a - knee_a) / CROSSING))
+
+
+def bias_and_ripple(I_test_apk: float, ripple_share: float, knee_a: float) -> tuple[float, float]:
+    """Return the d bias and the ripple, peak to peak (A), of the square wave.
+
+    No phase current may come into the inverter's knee: bias above 2 (0.433 ripple + knee) (identification reference,
+    3.2). A steep inverter leaves half the test current; a soft one raises the bias, then lowers the ripple.
+
+    Parameters
+    ----------
+    I_test_apk : float
+        Largest steady current (A peak).
+    ripple_share : float
+        Wanted ripple, peak to peak, of that current.
+    knee_a : float
+        Phase current at which the measured error curve reaches its plateau (A).
+    """
+    wanted = ripple_share * I_test_apk
+    bias = min(BIAS_MOST * I_test_apk, max(BIAS_SHARE * I_test_apk, 2.0 * (CROSSING * wanted + knee_a)))
+    return bias, clear_ripple(wanted, bias, knee_a)
 
 
 @dataclass(slots=True)
@@ -188,25 +218,23 @@ class Measurement:
             }
         )
         self.drive.enable()
-        plan = square_injection.SquarePlan(
-            bias_d_a=BIAS_SHARE * limits.I_test_apk,
-            ripple_a=self.ripple_share * limits.I_test_apk,
-            u_max_v=U_SHARE * limits.V_max_v,
-        )
-        plan = self._hold_stable_bias(plan, encoder)
+        knee = resistance.curve.knee_a(max(0.0, resistance.V_dead_v))
+        bias, ripple = bias_and_ripple(limits.I_test_apk, self.ripple_share, knee)
+        plan = square_injection.SquarePlan(bias_d_a=bias, ripple_a=ripple, u_max_v=U_SHARE * limits.V_max_v)
+        plan = self._hold_stable_bias(plan, encoder, knee)
         rough = []
         for axis in ("d", "q"):
             amplitude = square_injection.find_amplitude(self.drive, plan, axis)
             for half_period in plan.half_periods:
                 shot = square_injection.inject_square(self.drive, plan, axis, half_period, amplitude)
                 self.keep(f"square_{axis}_{half_period}", shot)
-            ripple = square_injection.ripple_of(shot, axis)
-            rough.append(amplitude * plan.half_periods[-1] * self.drive.period_s / ripple)
+            found = square_injection.ripple_of(shot, axis)
+            rough.append(amplitude * plan.half_periods[-1] * self.drive.period_s / found)
         self.drive.command_current(0.0, 0.0, fixed_angle_rad=plan.angle_rad)
         return rough[0], rough[1]
 
     def _hold_stable_bias(
-        self, plan: square_injection.SquarePlan, encoder: EncoderResult
+        self, plan: square_injection.SquarePlan, encoder: EncoderResult, knee_a: float
     ) -> square_injection.SquarePlan:
         """Hold the bias, or as much of it as leaves the rotor's d axis on the vector; returns the plan with it."""
         for _ in range(BIAS_TRIES):
@@ -218,7 +246,8 @@ class Measurement:
             ahead = math.remainder(theta_e - plan.angle_rad, 2.0 * math.pi)
             if abs(ahead) <= BIAS_OFF_RAD + 2.0 * abs(encoder.lag_rad):
                 return plan
-            plan = replace(plan, bias_d_a=0.5 * plan.bias_d_a, ripple_a=0.5 * plan.ripple_a)
+            bias = 0.5 * plan.bias_d_a
+            plan = replace(plan, bias_d_a=bias, ripple_a=clear_ripple(0.5 * plan.ripple_a, bias, knee_a))
         raise refuse(
             "E_ROTOR_MOVED",
             f"the rotor stands {math.degrees(ahead):.3g} deg (electrical) off the bias vector",

@@ -1,0 +1,156 @@
+"""``identify`` from the command line: the numbers, the replay, the refusals by name, and what must not happen."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from pmsmtool.bus.connect import Connection
+from pmsmtool.cli.main import run
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import is_safe
+from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.resources import data_folder
+from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.workflow.random_drives import true_loop_resistance
+
+TOLERANCE = 0.01
+"""Largest deviation from the truth with ideal sensor gains; measured 0.15 % (L_q of the switched machine)."""
+OFFSET_TOLERANCE_RAD = math.radians(0.5)
+"""Measured 0.05 deg."""
+
+Result = tuple[int, str, str]
+Tool = Callable[..., Result]
+
+
+@pytest.fixture
+def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Tool:
+    """Run a command line in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
+    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+
+    def call(*arguments: str) -> Result:
+        capsys.readouterr()
+        code = run(arguments)
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
+
+    return call
+
+
+def held(channel: str) -> tuple[int, int, list[bytes]]:
+    """The checksums of the active and the stored set, and the objects the guard changes; the state must be safe."""
+    with Connection(PmsmSimBus(channel)) as connection:
+        drive = CanopenDrive(connection, 1)
+        assert is_safe(drive.node.state())
+        parameters = DriveParameters(drive.node)
+        limits = [drive.node.sdo.read(*where) for where in ((0x6073, 0), (0x6080, 0), (0x1016, 1), (0x6007, 0))]
+        found = parameters.crc_active, parameters.crc_stored, limits
+        drive.close()
+    return found
+
+
+def profile(name: str, **simulation: Any) -> str:
+    """Write a profile with other keys in ``[simulation]``; return its channel."""
+    base = load_machine_file(data_folder("profiles") / f"{name}.toml")
+    drive = replace(base, simulation={**base.simulation, **simulation})
+    Path("drive.toml").write_text(dump_machine_file(drive))
+    return "drive.toml?nv=drive.nv"
+
+
+@pytest.mark.parametrize(("name", "model"), [("interior-2k2", "averaged"), ("jercic-2017", "switched")])
+def test_the_truth_is_found_the_drive_is_as_before_and_the_replay_gives_the_same_bytes(
+    name: str, model: str, tool: Tool
+) -> None:
+    channel = profile(name, inverter_model=model)
+    drive = load_machine_file(Path("drive.toml"))
+    with PmsmSimBus(channel):  # the drive stays powered when the tool leaves
+        before = held(channel)
+        code, out, err = tool("identify", "-i", "pmsmsim", "-c", channel, "--yes", "--json")
+        assert code == 0, err
+        assert held(channel) == before
+    data = json.loads(out)
+    found = {value["name"]: value["value"] for value in data["values"]}
+    truth = {key: getattr(drive.machine, key) for key in ("L_d_h", "L_q_h", "psi_f_wb")}
+    truth["R_s_ohm"] = true_loop_resistance(drive)
+    errors = {key: found[key] / value - 1.0 for key, value in truth.items()}
+    assert {key: error for key, error in errors.items() if abs(error) > TOLERANCE} == {}
+    off = math.remainder(found["offset_rad"] - drive.encoder.offset_rad, 2.0 * math.pi)
+    assert abs(off) < OFFSET_TOLERANCE_RAD
+    assert found["pole_pairs"] == drive.machine.pole_pairs
+
+    (folder,) = Path("runs").iterdir()
+    files = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    (folder / "machine.toml").unlink()
+    code, again, err = tool("identify", "--replay", str(folder), "--json")
+    assert (code, again) == (0, out), err
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == files
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "phase a open": ({"phase_open": "a"}, "E_PHASE_OPEN: phase a"),
+    "phase b open": ({"phase_open": "b"}, "E_PHASE_OPEN: phase b"),
+    "phase c open": ({"phase_open": "c"}, "E_PHASE_OPEN: phase c"),
+    "no motor": ({"drive_fault": "not_connected"}, "E_NOT_CONNECTED"),
+    "encoder stuck": ({"drive_fault": "encoder_stuck"}, "E_NOT_SETTLED"),
+    "rotor locked unsaid": ({"rotor": "locked"}, "E_POLE_PAIRS"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_bad_machine_is_refused_by_name(case: str, tool: Tool) -> None:
+    simulation, name = REFUSED[case]
+    channel = profile("interior-2k2", **simulation)
+    with PmsmSimBus(channel):
+        before = held(channel)
+        code, out, err = tool("identify", "-i", "pmsmsim", "-c", channel, "--yes")
+        assert (code, out) == (6, ""), err
+        assert held(channel) == before
+    assert name in err
+    assert "likely:" in err and "try:" in err
+    assert not list(Path("runs").glob("*/machine.toml"))
+
+
+CHANNEL = "interior-2k2?nv=drive.nv"
+UNMOVED: dict[str, tuple[tuple[str, ...], int, str]] = {
+    "a locked shaft cannot turn": (("--yes", "--shaft", "locked"), 9, "cannot be identified on a locked shaft"),
+    "nobody to ask": ((), 7, "nobody can be asked for consent to move the machine"),
+    "unwritable folder": (("--yes", "--runs", "taken/below"), 2, "cannot write"),
+    "unknown quantity": (("--yes", "Q"), 2, "cannot identify Q"),
+    "gravity load": (("--yes", "--load", "gravity"), 5, "a gravity load falls"),
+    "nothing to replay": (("--replay", "."), 2, "no run.json here"),
+}
+
+
+@pytest.mark.parametrize("case", UNMOVED)
+def test_what_cannot_be_done_moves_nothing(case: str, tool: Tool) -> None:
+    arguments, code, message = UNMOVED[case]
+    Path("taken").write_text("a file")
+    with PmsmSimBus(CHANNEL) as bus:
+        before = held(CHANNEL)
+        clock = bus.clock.now()
+        found = tool("identify", "-i", "pmsmsim", "-c", CHANNEL, *arguments)
+        assert (found[0], found[1]) == (code, ""), found[2]
+        assert held(CHANNEL) == before
+        assert bus.clock.now() - clock < 2.0, "the drive was talked to for longer than reading its nameplate takes"
+    assert message in found[2]
+    assert not list(Path(".").glob("runs/*/traces/*"))
+
+
+def test_resistance_alone_is_possible_on_a_locked_shaft(tool: Tool) -> None:
+    channel = profile("interior-2k2", rotor="locked")
+    found = tool("identify", "-i", "pmsmsim", "-c", channel, "--yes", "--shaft", "locked", "R", "inverter", "--json")
+    assert found[0] == 0, found[2]
+    (value,) = json.loads(found[1])["values"]
+    truth = true_loop_resistance(load_machine_file(Path("drive.toml")))
+    assert value["value"] == pytest.approx(truth, rel=TOLERANCE)
