@@ -235,8 +235,34 @@ class Target(IntEnum):
     U_Q = 8
 
 
+class Seen(IntEnum):
+    """Signals of the drive that a simulated trace shows (``enum pmsm_signal``).
+
+    The same numbers as in ``node.drive_core.Signal``, whose module a simulation without a node need not import; a test
+    compares them.
+    """
+
+    I_D = 1
+    I_Q = 2
+    I_D_REQ = 3
+    I_Q_REQ = 4
+    I_D_REF = 5
+    I_Q_REF = 6
+    U_D = 7
+    U_Q = 8
+    U_D_LIM = 9
+    U_Q_LIM = 10
+    THETA_E = 11
+    OMEGA_E = 12
+    TAU = 13
+    KAPPA = 14
+    FLAGS = 17
+    U_DC = 21
+    T_WINDING = 22
+
+
 class Truth(IntEnum):
-    """Signals of the plant (``enum pmsm_truth``); numbers below 64 are the drive's ``node.drive_core.Signal``."""
+    """Signals of the plant (``enum pmsm_truth``), beside those of the drive (:class:`Seen`)."""
 
     T = 64
     I_D = 65
