@@ -11,7 +11,7 @@ import click
 
 from pmsmtool.cli.options import FILE, examples, output_options
 from pmsmtool.cli.output import Output, table
-from pmsmtool.cli.output_file import inside, write_file
+from pmsmtool.cli.output_file import write_file
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     "tune",
     epilog=examples(
         "pmsmtool tune machine.toml -o design.toml",
-        "pmsmtool tune machine.toml -o design.toml --bandwidth-hz 600 --phase-margin-deg 55",
+        "pmsmtool tune interior-2k2 -o design.toml --bandwidth-hz 600 --phase-margin-deg 55",
         "pmsmtool tune machine.toml -o design.toml --method second-order --bandwidth-hz 300 --damping 0.9",
         "pmsmtool tune machine.toml -o design.toml --speed-bandwidth-hz 12 --notch-hz 180",
     ),
 )
-@click.argument("machine", type=click.Path(path_type=Path))
+@click.argument("machine")
 @click.option("-o", "--output", "path", type=FILE, required=True, help="Design file to write.")
 @click.option("--params", "params_path", type=FILE, help="Parameter set to write.  [default: params.toml beside it]")
 @click.option(
@@ -58,9 +58,22 @@ if TYPE_CHECKING:
 @click.option("--notch-zeta-num", type=float, default=0.05, help="Numerator damping of the notch.")
 @click.option("--notch-zeta-den", type=float, default=0.5, help="Denominator damping of the notch.")
 @click.option("--voltage-margin", type=float, default=0.08, metavar="RATIO", help="Share of V_max kept for control.")
+@click.option(
+    "--governor",
+    type=click.Choice(["off", "paper", "line", "best", "linearised", "observe"]),
+    default="best",
+    help="Reference governor.",
+)
+@click.option("--eps", type=float, metavar="RATIO", help="Tightening of its steady state.  [default: 0.01 or more]")
+@click.option(
+    "--field-weakening",
+    type=click.Choice(["auto", "off", "lookup", "gradient", "accelerated", "uncompensated"]),
+    default="auto",
+    help="auto: a table for a saturated machine, else the accelerated optimisation.",
+)
 @output_options
-def tune_command(machine: Path, path: Path, params_path: Path | None, out: Output, **asked: Any) -> None:
-    """Design the control of MACHINE (a machine file or a run directory).
+def tune_command(machine: str, path: Path, params_path: Path | None, out: Output, **asked: Any) -> None:
+    """Design the control of MACHINE (a machine file, a run directory or a profile).
 
     Writes the design with the machine embedded and every gain with its unit, method and achieved margin, and beside it
     the parameter set that flash-params sends. Exit code 1 when the margins asked for cannot be met.
@@ -69,8 +82,9 @@ def tune_command(machine: Path, path: Path, params_path: Path | None, out: Outpu
     from pmsmtool.design.tune import tune
     from pmsmtool.design.tune_request import TuneRequest
     from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.machine.profile import machine_path
 
-    design = tune(load_machine_file(inside(machine, "machine.toml")), TuneRequest(**asked))
+    design = tune(load_machine_file(machine_path(machine)), TuneRequest(**asked))
     params = design.parameter_set()
     params_path = path.with_name("params.toml") if params_path is None else params_path
     write_file(path, design_text(design))

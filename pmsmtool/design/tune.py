@@ -8,6 +8,12 @@ from dataclasses import dataclass
 from pmsmtool.design.bandwidth import CurrentChoice, choose_current
 from pmsmtool.design.current_loop import maximum_delay_periods
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
+from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
+from pmsmtool.design.field_weakening import design_field_weakening
+from pmsmtool.design.governor import design_governor
+from pmsmtool.design.lookup_design import LookupRequest, design_table
+from pmsmtool.design.lookup_file import lut_values
+from pmsmtool.design.lookup_table import RPM
 from pmsmtool.design.ratings import Ratings, rating_values, ratings
 from pmsmtool.design.sampled_loop import LoopMargins, margins
 from pmsmtool.design.speed_loop import (
@@ -38,6 +44,12 @@ SPEED_RATE_HZ = 1200.0
 ACCELERATION_SHARE = 0.8
 """Slope limit of the speed reference: this share of what the largest torque can accelerate."""
 
+FW_SHARE = 0.8
+"""And at most this share of the slope at which field weakening falls behind by the whole voltage reserve."""
+
+TABLE_BOUNDS = (0.01, 0.02, 0.03, 0.05)
+"""Errors between the nodes of a table that are tried, in this order."""
+
 _CURRENT_OPTIONS = 0b111
 _PREDICTOR_OPTION = 1 << 4
 
@@ -63,16 +75,29 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
     rated = ratings(source, (1.0 - request.voltage_margin) * source.inverter.V_max_v)
     values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}
     values |= rating_values(source, rated)
-    values["field_weakening.margin"] = DesignValue(request.voltage_margin, "asked for")
-    values["field_weakening.i_d_min_a"] = DesignValue(rated.i_d_min_a, rated.methods["i_d_min"])
     choice = choose_current(source, request, rated.I_max_apk)
-    current = _design_current(choice)
-    speed = _design_speed(source, request, rated, choice)
-    values |= current.values | speed.values
+    weakening = design_field_weakening(source, rated, _weakening_mode(source, request), request.voltage_margin)
+    parts = [
+        _design_current(choice),
+        _design_speed(source, request, rated, choice, weakening.ramp_limit_rpm_per_s),
+        _design_governor(source, request, rated, choice),
+        _Part(dict(weakening.values), {}, dict(weakening.facts), ()),
+    ]
+    tables: dict[str, tuple[float, ...]] = {}
+    if weakening.values["field_weakening.mode"].value == FIELD_WEAKENING["lookup"]:
+        table, tables = _design_table(source, request, rated)
+        parts.append(table)
+    for part in parts:
+        values |= part.values
     design = Design(
-        source, request.table(), values, {**current.loops, **speed.loops}, {**current.facts, **speed.facts},
-        (*current.notes, *speed.notes),
-    )  # fmt: skip
+        source,
+        request.table(),
+        values,
+        {name: loop for part in parts for name, loop in part.loops.items()},
+        {name: fact for part in parts for name, fact in part.facts.items()},
+        tuple(note for part in parts for note in part.notes),
+        tables,
+    )
     violations = design.parameter_set().violations()
     if violations:
         raise DesignInfeasible(
@@ -118,10 +143,50 @@ def _design_current(current: CurrentChoice) -> _Part:
     return _Part(values, current.loops(), facts, ())
 
 
+# -- governor and table ----------------------------------------------------------------------------------------
+
+
+def _weakening_mode(source: MachineFile, request: TuneRequest) -> str:
+    if request.field_weakening != "auto":
+        return request.field_weakening
+    return "accelerated" if source.flux_map is None else "lookup"
+
+
+def _design_governor(source: MachineFile, request: TuneRequest, rated: Ratings, current: CurrentChoice) -> _Part:
+    gains = {axis: current.gains(axis) for axis in "dq"}
+    found = design_governor(source, rated, gains, request.governor, predictor=request.predictor, eps=request.eps)
+    return _Part(dict(found.values), {}, dict(found.facts), found.notes)
+
+
+def _design_table(
+    source: MachineFile, request: TuneRequest, rated: Ratings
+) -> tuple[_Part, dict[str, tuple[float, ...]]]:
+    """The table of the look-up mode, with the tightest bound that fits the drive."""
+    refused: DesignInfeasible | None = None
+    for bound in TABLE_BOUNDS:
+        asked = LookupRequest(torque_bound=bound, voltage_bound=bound)
+        try:
+            made = design_table(source, rated, asked, request.voltage_margin)
+        except DesignInfeasible as error:
+            refused = error
+            continue
+        values, tables = lut_values(made.table, made.stored)
+        how = f"{made.stored}, within {100.0 * bound:g} % of torque and voltage between nodes"
+        facts: dict[str, Scalar] = {
+            "table_torque_error_nm": made.error.torque_nm,
+            "table_voltage_excess_v": made.error.voltage_v,
+        }
+        return _Part({name: DesignValue(value, how) for name, value in values.items()}, {}, facts, made.notes), tables
+    assert refused is not None
+    raise refused
+
+
 # -- speed loop ----------------------------------------------------------------------------------------------
 
 
-def _design_speed(source: MachineFile, request: TuneRequest, rated: Ratings, current: CurrentChoice) -> _Part:
+def _design_speed(
+    source: MachineFile, request: TuneRequest, rated: Ratings, current: CurrentChoice, ramp_limit: float
+) -> _Part:
     T_s = source.inverter.T_s
     pll = request.pll_rad_s or PLL_PER_PERIOD / T_s
     filter_hz = request.speed_filter_hz or FILTER_PER_RATE / T_s
@@ -155,11 +220,13 @@ def _design_speed(source: MachineFile, request: TuneRequest, rated: Ratings, cur
             hint="ask for a lower --speed-bandwidth-hz, or raise the filter and the speed estimate",
         )
     how = f"{gains.method}, {gains.omega_c / (2.0 * math.pi):.4g} Hz"
-    slope = ACCELERATION_SHARE * rated.tau_max_nm / J * 60.0 / (2.0 * math.pi)
+    slope, why = ACCELERATION_SHARE * rated.tau_max_nm / J * RPM, f"{ACCELERATION_SHARE:g} tau_max / J"
+    if ramp_limit < math.inf and FW_SHARE * ramp_limit < slope:
+        slope, why = FW_SHARE * ramp_limit, f"{FW_SHARE:g} of the slope that spends the voltage reserve"
     values |= {
         "speed.K_p_nms_per_rad": DesignValue(gains.K_p, how, "speed"),
         "speed.K_i_nm_per_rad": DesignValue(gains.K_i, how, "speed"),
-        "speed.acceleration_rpm_per_s": DesignValue(slope, f"{ACCELERATION_SHARE:g} tau_max / J"),
+        "speed.acceleration_rpm_per_s": DesignValue(slope, why),
     }
     return _Part(values, {"speed": found}, {"speed_crossover_rad_s": found.crossover_rad_s}, ())
 

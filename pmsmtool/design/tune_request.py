@@ -10,6 +10,9 @@ from pmsmtool.design.design_file import Scalar
 from pmsmtool.design.speed_loop import SpeedMethod
 from pmsmtool.errors import ConfigError
 
+GOVERNOR_MODES = ("off", "paper", "line", "best", "linearised", "observe")
+FIELD_WEAKENING_MODES = ("auto", "off", "lookup", "gradient", "accelerated", "uncompensated")
+
 
 @dataclass(frozen=True, slots=True)
 class TuneRequest:
@@ -44,6 +47,13 @@ class TuneRequest:
         Notch on the torque; 0 Hz is off.
     voltage_margin : float
         Share of V_max kept for control in steady state.
+    governor : str
+        Mode of the reference governor (``governor.MODES``).
+    eps : float or None
+        Tightening of its steady-state row.
+    field_weakening : str
+        Mode of field weakening (``field_weakening.MODES``), or ``auto``: a look-up table for a machine with a flux map,
+        the accelerated optimisation for a constant one.
     """
 
     method: str = "imc"
@@ -63,11 +73,20 @@ class TuneRequest:
     notch_zeta_num: float = 0.05
     notch_zeta_den: float = 0.5
     voltage_margin: float = 0.08
+    governor: str = "best"
+    eps: float | None = None
+    field_weakening: str = "auto"
 
     def __post_init__(self) -> None:
         wrong = []
-        for name, allowed in (("method", Method), ("speed_method", SpeedMethod)):
-            if getattr(self, name) not in {str(one) for one in allowed}:
+        choices = {
+            "method": tuple(str(one) for one in Method),
+            "speed_method": tuple(str(one) for one in SpeedMethod),
+            "governor": GOVERNOR_MODES,
+            "field_weakening": FIELD_WEAKENING_MODES,
+        }
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
                 wrong.append(f"{name} is {getattr(self, name)!r}, allowed are {', '.join(allowed)}")
         for name in ("bandwidth_hz", "damping", "speed_bandwidth_hz", "speed_damping", "speed_filter_hz", "pll_rad_s"):
             value = getattr(self, name)
@@ -78,6 +97,8 @@ class TuneRequest:
                 wrong.append(f"{name} = {getattr(self, name)!r} is not between 0 and 90 degree")
         if not 0.0 <= self.voltage_margin <= 0.5:
             wrong.append(f"voltage_margin = {self.voltage_margin!r} is outside 0..0.5")
+        if self.eps is not None and not 0.0 <= self.eps <= 0.5:
+            wrong.append(f"eps = {self.eps!r} is outside 0..0.5")
         if self.speed_decimation is not None and not 1 <= self.speed_decimation <= 1000:
             wrong.append(f"speed_decimation = {self.speed_decimation!r} is outside 1..1000")
         if wrong:

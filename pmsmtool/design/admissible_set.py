@@ -1,0 +1,359 @@
+"""Prediction model of the reference governor and its horizon: how many voltage rows describe all of them.
+
+State x = (i_d, i_q, I_ed, I_eq, v_d, v_q) with the integrated errors I_e (A s) and the held reference v, forward
+Euler: x(k+1) = A x(k), (20); demanded voltage now w = (A_d x, A_q x + w_e psi), (26)-(27) of Jercic et al. 2017, DOI
+10.1080/00051144.2018.1453441. A does not depend on speed; the rows are affine in it.
+
+A has two eigenvalues 1 (the references), so the recursion (28)-(30) does not end by itself: a steady-state row
+|w_inf| <= (1 - eps) V_max is added, and what remains is asked directly: k_max is the smallest k for which no state that
+satisfies rows 0..k and the steady-state row violates row k + 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.design.current_loop import CurrentGains
+from pmsmtool.errors import DesignInfeasible
+
+Array = NDArray[np.float64]
+
+REDUNDANT = 1e-6
+"""A row is redundant when no admissible state exceeds it by more than this share of V_max."""
+
+HORIZON_CAP = 400
+"""Horizons beyond this are reported as not finitely determined."""
+
+START_DIRECTIONS = 8
+"""Directions from which the largest next voltage is sought, before refinement to the maximum."""
+
+_REFINEMENTS, _PULL = 12, 0.9
+"""Turns of a direction towards its own optimum; share of the way a start is pulled back inside."""
+
+_BARRIER_START, _BARRIER_GROWTH, _GAP = 1.0, 30.0, 1e-8
+"""Barrier weight per disc at the start, its growth, and the remaining gap of the objective (share of V_max)."""
+
+_NEWTON_STEPS, _NEWTON_DONE, _RIDGE, _STEP_INSIDE = 40, 1e-4, 1e-15, 0.95
+"""Newton steps per weight, the decrement that ends them, the diagonal added, the share of the way to the border."""
+
+_ROUNDING, _TINY = 1e-13, 1e-300
+_RANK = 1e-11
+"""Singular values below this share of the largest belong to states a voltage does not depend on."""
+
+
+@dataclass(frozen=True, slots=True)
+class PredictionModel:
+    """Machine and controller as the governor predicts them (constant parameters, Euler).
+
+    Attributes
+    ----------
+    R : float
+        Resistance (ohm).
+    L_d, L_q : float
+        Inductances (H).
+    psi_f : float
+        Magnet flux linkage (Wb).
+    T_s : float
+        Control period (s).
+    gains_d, gains_q : CurrentGains
+        PI gains.
+    """
+
+    R: float
+    L_d: float
+    L_q: float
+    psi_f: float
+    T_s: float
+    gains_d: CurrentGains
+    gains_q: CurrentGains
+
+    def system_matrix(self) -> Array:
+        """Return A of (20), shape (6, 6)."""
+        A = np.eye(6)
+        for axis, (L, gains) in enumerate(((self.L_d, self.gains_d), (self.L_q, self.gains_q))):
+            i, integral, v = axis, axis + 2, axis + 4
+            A[i, i] -= self.T_s * (self.R + gains.K_p) / L
+            A[i, integral] = self.T_s * gains.K_i / L
+            A[i, v] = self.T_s * gains.K_p / L
+            A[integral, i], A[integral, v] = -self.T_s, self.T_s
+        return A
+
+    def voltage_rows(self, omega_e: float) -> Array:
+        """Return A_d and A_q of (27), shape (2, 6)."""
+        d, q = self.gains_d, self.gains_q
+        return np.array(
+            [
+                [-d.K_p, -omega_e * self.L_q, d.K_i, 0.0, d.K_p, 0.0],
+                [omega_e * self.L_d, -q.K_p, 0.0, q.K_i, 0.0, q.K_p],
+            ]
+        )
+
+    def steady_state_rows(self, omega_e: float) -> Array:
+        """Return the voltage that holds v, as a function of x, shape (2, 6)."""
+        rows = np.zeros((2, 6))
+        rows[0, 4:] = self.R, -omega_e * self.L_q
+        rows[1, 4:] = omega_e * self.L_d, self.R
+        return rows
+
+    def predicted_rows(self, omega_e: float, count: int) -> Array:
+        """Return C A^j for j = 0..count - 1, shape (count, 2, 6)."""
+        rows = np.empty((count, 2, 6))
+        rows[0] = self.voltage_rows(omega_e)
+        A = self.system_matrix()
+        for j in range(1, count):
+            rows[j] = rows[j - 1] @ A
+        return rows
+
+    def offset(self, omega_e: float) -> Array:
+        """Return the voltage at x = 0, (0, w_e psi)."""
+        return np.array([0.0, omega_e * self.psi_f])
+
+    def closed_loop_poles(self) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """Return the two poles of each axis."""
+        A = self.system_matrix()
+        return tuple(np.linalg.eigvals(A[np.ix_((k, k + 2), (k, k + 2))]) for k in (0, 1))  # type: ignore[return-value]
+
+    def has_straight_segment(self) -> bool:
+        """Whether both axes cancel the plant's pole at one bandwidth.
+
+        Then without integrated error the predicted voltage moves on a straight segment from now to the steady state,
+        and rows 0 and infinity are all there are.
+        """
+        alphas = [g.K_p / L for g, L in ((self.gains_d, self.L_d), (self.gains_q, self.L_q))]
+        cancels = all(
+            math.isclose(g.K_i / g.K_p, self.R / L, rel_tol=1e-9)
+            for g, L in ((self.gains_d, self.L_d), (self.gains_q, self.L_q))
+        )
+        return cancels and math.isclose(*alphas, rel_tol=1e-9)
+
+
+@dataclass(frozen=True, slots=True)
+class StateBounds:
+    """Limits of the states that can occur: |i|, |v| (A) and |K_i I_e - R i| (V)."""
+
+    I_a: float
+    zeta_v: float
+
+
+@dataclass(frozen=True, slots=True)
+class Horizon:
+    """Horizon of a design.
+
+    Attributes
+    ----------
+    k_max : int or None
+        None: not finitely determined below ``HORIZON_CAP``.
+    eps : float or None
+        Tightening of the steady-state row; None without that row.
+    omega_e : float
+        Electrical speed (rad/s).
+    bounds : StateBounds or None
+        States it was determined for; None for all.
+    """
+
+    k_max: int | None
+    eps: float | None
+    omega_e: float
+    bounds: StateBounds | None = None
+
+    @property
+    def text(self) -> str:
+        """The number, or that there is none."""
+        return "not finitely determined" if self.k_max is None else str(self.k_max)
+
+
+def horizon(
+    model: PredictionModel,
+    omega_e: float,
+    V_max: float,
+    eps: float | None,
+    bounds: StateBounds | None = None,
+    cap: int = HORIZON_CAP,
+) -> Horizon:
+    """Find k_max by the global redundancy test.
+
+    Parameters
+    ----------
+    model : PredictionModel
+        What is predicted.
+    omega_e : float
+        Electrical speed (rad/s).
+    V_max : float
+        Voltage limit (V).
+    eps : float or None
+        Tightening of the steady-state row; None leaves that row out, as the paper prints it.
+    bounds : StateBounds, optional
+        Only states inside; all states where none are given.
+    cap : int
+        Largest horizon looked at.
+
+    Raises
+    ------
+    DesignInfeasible
+        The closed loop is not stable in Euler's prediction.
+    """
+    if max(float(np.abs(poles).max()) for poles in model.closed_loop_poles()) >= 1.0:
+        raise DesignInfeasible(
+            "the Euler prediction of the current loop is unstable",
+            where="governor",
+            hint="lower the bandwidth below 2/T_s",
+        )
+    test = _Redundancy(model, omega_e, V_max, eps, bounds, cap)
+    low, high = -1, 0
+    # Horizons are short where they exist: search upwards in growing steps, then bisect.
+    while test.excess(high) > REDUNDANT:
+        if high == cap:
+            return Horizon(None, eps, omega_e, bounds)
+        low, high = high, min(2 * high + 1, cap)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if test.excess(middle) <= REDUNDANT else (middle, high)
+    return Horizon(high, eps, omega_e, bounds)
+
+
+class _Redundancy:
+    """Largest |w_(k+1)| / V_max over the admissible states.
+
+    Maximising |y| over a convex set is a sweep over directions u of max u . y: each a linear objective over discs,
+    solved by a logarithmic barrier. From a direction's optimum y the next direction is y/|y|, which can only rise: the
+    grid of directions leaves no error at a local maximum. (With the same poles in both axes one direction would do and
+    the discs were strips; with different R/L two slow modes nearly cancel along u and reach a little further.)
+    """
+
+    def __init__(
+        self,
+        model: PredictionModel,
+        omega_e: float,
+        V_max: float,
+        eps: float | None,
+        bounds: StateBounds | None,
+        cap: int,
+    ) -> None:
+        offset = model.offset(omega_e) / V_max
+        predicted = model.predicted_rows(omega_e, cap + 2) / V_max
+        steady = model.steady_state_rows(omega_e) / V_max
+        always = [] if eps is None else [(steady, offset, 1.0 - eps)]
+        if bounds is None:
+            # every state may be shifted so that its steady state takes the offset up: the set is symmetric about it
+            offset = np.zeros(2)
+            always = [(rows, offset, radius) for rows, _, radius in always]
+            states = _independent(np.concatenate((steady[None], predicted)))
+            self.start: Array | None = np.zeros(states.shape[1])
+        else:
+            always += _bound_discs(model, bounds)
+            integrals = (bounds.zeta_v / gains.K_i for gains in (model.gains_d, model.gains_q))
+            states = np.diag([bounds.I_a, bounds.I_a, *integrals, bounds.I_a, bounds.I_a])
+            self.start = _inner_state(model, bounds, states, predicted[0] @ states, offset, 1.0 - (eps or 0.0))
+        self.rows, self.offset = predicted @ states, offset
+        self.always = [(rows @ states, shift, radius) for rows, shift, radius in always]
+        turn = math.pi if bounds is None else 2.0 * math.pi
+        self.directions = turn * np.arange(START_DIRECTIONS) / START_DIRECTIONS
+
+    def excess(self, k: int) -> float:
+        """Return max |w_(k+1)| / V_max - 1 over the states that satisfy rows 0..k; infinity when unbounded."""
+        rows, shift, radius = self._discs(k)
+        target = self.rows[k + 1]
+        if self.start is None:
+            return -1.0
+        if _unbounded(rows, target):
+            return math.inf
+        best = -1.0
+        for angle in self.directions:
+            x, direction = self.start, np.array([math.cos(angle), math.sin(angle)])
+            for _ in range(_REFINEMENTS):
+                x = _furthest(rows, shift, radius, direction @ target, x)
+                y = target @ x + self.offset
+                size = float(np.hypot(*y))
+                best = max(best, size - 1.0)
+                if best > REDUNDANT or float(y @ direction) >= size * (1.0 - 1e-7):
+                    break
+                direction, x = y / size, self.start + _PULL * (x - self.start)
+            if best > REDUNDANT:
+                return best
+        return best
+
+    def _discs(self, k: int) -> tuple[Array, Array, Array]:
+        """Rows (m, 2, n), centres (m, 2) and radii (m,) of the discs of horizon k."""
+        rows = np.concatenate((self.rows[: k + 1], *(disc[None] for disc, _, _ in self.always)))
+        shift = np.concatenate((np.tile(self.offset, (k + 1, 1)), *(s[None] for _, s, _ in self.always)))
+        return rows, shift, np.concatenate((np.ones(k + 1), [r for _, _, r in self.always]))
+
+
+def _unbounded(rows: Array, target: Array) -> bool:
+    """Whether the target moves along a state that no disc holds."""
+    flat = rows.reshape(-1, rows.shape[2])
+    _, sizes, directions = np.linalg.svd(flat)
+    rank = int(np.sum(sizes > _RANK * sizes[0]))
+    free = directions[rank:]
+    return bool(free.size and np.abs(target @ free.T).max() > _RANK * np.abs(target).max())
+
+
+def _furthest(rows: Array, shift: Array, radius: Array, objective: Array, x: Array) -> Array:
+    """Maximise objective . x over |rows x + shift| <= radius from a point inside: Newton on a logarithmic barrier."""
+    count, n = len(rows), x.size
+    flat, square = rows.reshape(-1, n), radius**2
+    weight = _BARRIER_START * count
+    while True:
+        for _ in range(_NEWTON_STEPS):
+            y = (flat @ x).reshape(-1, 2) + shift
+            room = square - (y * y).sum(axis=1)
+            if float(room.min()) <= _ROUNDING:
+                return x  # on the border to rounding: nothing left to gain
+            slack = 1.0 / room
+            pull = (y[:, 0, None] * rows[:, 0] + y[:, 1, None] * rows[:, 1]) * slack[:, None]
+            gradient = weight * objective - 2.0 * pull.sum(axis=0)
+            hessian = 2.0 * (flat * np.repeat(slack, 2)[:, None]).T @ flat + 4.0 * pull.T @ pull
+            hessian.flat[:: n + 1] += _RIDGE * np.trace(hessian)
+            step = np.linalg.solve(hessian, gradient)
+            x = x + min(1.0, _STEP_INSIDE * _inside_share((flat @ step).reshape(-1, 2), y, square)) * step
+            if float(gradient @ step) <= _NEWTON_DONE:
+                break
+        if count <= _GAP * weight:
+            return x
+        weight *= _BARRIER_GROWTH
+
+
+def _inside_share(step: Array, y: Array, square: Array) -> float:
+    """Largest share of a step that stays inside every disc."""
+    a, b = (step * step).sum(axis=1), (step * y).sum(axis=1)
+    c = (y * y).sum(axis=1) - square
+    return float(((np.sqrt(b * b - a * c) - b) / np.maximum(a, _TINY)).min())
+
+
+def _independent(rows: Array) -> Array:
+    """Return a basis of the states the voltages depend on, scaled so that rows are of size one."""
+    flat = rows.reshape(-1, 6)
+    scale = np.abs(flat).max(axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    _, sizes, directions = np.linalg.svd(flat / scale, full_matrices=False)
+    kept = sizes > _RANK * sizes[0]
+    return np.asarray((directions[kept] / scale).T / sizes[kept])
+
+
+def _inner_state(
+    model: PredictionModel, bounds: StateBounds, states: Array, now: Array, offset: Array, radius: float
+) -> Array | None:
+    """Return an equilibrium (v = i on the d axis, zeta = 0) inside every limit, in scaled states; None for none."""
+    for share in np.linspace(0.0, -0.98, 99):
+        current = share * bounds.I_a
+        x = np.array([current, 0.0, model.R * current / model.gains_d.K_i, 0.0, current, 0.0])
+        scaled = np.linalg.solve(states, x)
+        if float(np.hypot(*(now @ scaled + offset))) < 0.999 * radius:
+            return scaled
+    return None
+
+
+def _bound_discs(model: PredictionModel, bounds: StateBounds) -> list[tuple[Array, Array, float]]:
+    """Discs of |i|, |v| and zeta = K_i I_e - R i, each scaled to radius one."""
+    zero = np.zeros(2)
+    current, reference, zeta = np.zeros((2, 6)), np.zeros((2, 6)), np.zeros((2, 6))
+    for axis, gains in enumerate((model.gains_d, model.gains_q)):
+        current[axis, axis] = 1.0 / bounds.I_a
+        reference[axis, axis + 4] = 1.0 / bounds.I_a
+        zeta[axis, axis + 2] = gains.K_i / bounds.zeta_v
+        zeta[axis, axis] = -model.R / bounds.zeta_v
+    return [(current, zero, 1.0), (reference, zero, 1.0), (zeta, zero, 1.0)]
