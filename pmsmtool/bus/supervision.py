@@ -86,6 +86,8 @@ class Supervision:
         In order of arrival.
     foreign_requests : int
         SDO requests to the node and NMT commands that this program did not send.
+    stop_at_emergency, stop_at_other_master : bool
+        Whether these end the work; not while the drive is being stopped.
     """
 
     def __init__(self, connection: Connection, node: int) -> None:
@@ -96,6 +98,7 @@ class Supervision:
         self.emergencies: list[Emergency] = []
         self.foreign_requests = 0
         self.stop_at_emergency = True
+        self.stop_at_other_master = True
         self._connection = connection
         self._last_heard_s: float | None = None
         self._boots_seen = 0
@@ -130,6 +133,15 @@ class Supervision:
             self._boots_seen = self.boot_ups
             self._last_heard_s = None
 
+    @contextmanager
+    def other_masters_tolerated(self) -> Iterator[None]:
+        """While the drive is stopped and restored: that is done whoever else talks to it."""
+        before, self.stop_at_other_master = self.stop_at_other_master, False
+        try:
+            yield
+        finally:
+            self.stop_at_other_master = before
+
     def check(self) -> None:
         """Raise what makes further work on the node pointless.
 
@@ -148,7 +160,7 @@ class Supervision:
                 likely="its supply dipped, its watchdog fired, or another master reset it",
                 hint="check the supply, then run the command again",
             )
-        if self.foreign_requests > self._foreign_seen:
+        if self.foreign_requests > self._foreign_seen and self.stop_at_other_master:
             self._foreign_seen = self.foreign_requests
             raise SecondMaster(
                 "another master sends requests to this node",

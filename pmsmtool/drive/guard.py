@@ -144,7 +144,7 @@ class GuardedDrive:
         """
         self._node.before_write = None
         try:
-            with self._node.emergencies_tolerated():
+            with self._node.emergencies_tolerated(), self._node.supervision.other_masters_tolerated():
                 return self._restore()
         finally:
             self._heartbeat.stop()

@@ -29,7 +29,7 @@ def quick_stop(node: DriveNode) -> State:
     failure: PmsmtoolError | None = None
     for _ in range(STOP_TRIES):
         try:
-            with node.emergencies_tolerated():
+            with node.emergencies_tolerated(), node.supervision.other_masters_tolerated():
                 return _stop_once(node)
         except StopNotConfirmed:
             raise
