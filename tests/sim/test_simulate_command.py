@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.report.plots import POINTS_MAX, Panel, svg_text, thinned, trace_figure
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
@@ -93,9 +94,14 @@ def test_unknown_design_is_exit_2():
 
 
 def test_trip_is_a_warning_with_its_time(tmp_path):
-    done = pmsmtool("simulate", "jercic-2017", "--scenario", "field-weakening-sweep", "--json")
+    params = ParameterSet({"protection.i_trip_apk": 4.0, "field_weakening.mode": 0})
+    (tmp_path / "params.toml").write_text(params.to_toml(), encoding="utf-8")
+    done = pmsmtool(
+        "simulate", "jercic-2017", "--scenario", "field-weakening-sweep", "--json",
+        "--params", str(tmp_path / "params.toml"),
+    )  # fmt: skip
     assert done.returncode == 0
-    assert "tripped (error code 0x2310)" in done.stderr
+    assert "tripped (error code 0x2310) at 0.0" in done.stderr
     assert "field weakening is off" in done.stderr
 
 
