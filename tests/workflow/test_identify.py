@@ -1,0 +1,155 @@
+"""Identification as a program sees it: Ctrl-C at any moment, the request and its record, the square wave's bias."""
+
+from __future__ import annotations
+
+import math
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.bus.clock import VirtualClock
+from pmsmtool.bus.connect import Connection
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import is_safe
+from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.errors import ConfigError, ExitCode, Interrupted, NotAvailable
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.workflow.evaluate import tolerance_on
+from pmsmtool.workflow.identify import (
+    MACHINE,
+    REQUEST,
+    IdentifyRequest,
+    dump_request,
+    identify_stage,
+    nameplate_of,
+    parse_request,
+    replay,
+)
+from pmsmtool.workflow.measure import BIAS_MOST, CROSSING, RIPPLE_LEAST, bias_and_ripple
+from pmsmtool.workflow.run_directory import RunDirectory, Stage, new_record
+
+CHANNEL = "interior-2k2?nv=:memory:"
+
+
+def identify(
+    drive: CanopenDrive, folder: Path, quantities: tuple[str, ...], tolerance: SensorTolerance | None = None
+) -> tuple[RunDirectory, Stage]:
+    record = new_record(["test"], drive={}, bus={}, versions={}, operator="nobody")
+    run = RunDirectory.create(folder, drive.identity.serial, record)
+    request = IdentifyRequest(quantities=quantities, tolerance=tolerance or SensorTolerance())
+    stage = identify_stage(run, drive, nameplate_of(drive, "bench"), request, lambda lines: None, lambda text: None)
+    run.add(stage)
+    return run, stage
+
+
+def state_of(drive: CanopenDrive) -> tuple[int, int, list[bytes]]:
+    limits = [
+        drive.node.sdo.read(*where) for where in ((0x6073, 0), (0x6080, 0), (0x1016, 1), (0x6007, 0), (0x6060, 0))
+    ]
+    parameters = DriveParameters(drive.node)
+    return parameters.crc_active, parameters.crc_stored, limits
+
+
+# ---- Ctrl-C -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("moment", [1, 20, 47, 53, 120, 400, 800, 1100, 1230, 1500])
+def test_ctrl_c_at_any_moment_leaves_a_drive_that_is_off_and_as_before(
+    moment: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One run waits 1600 times: the dead-man up to 48, phases to 155, levels to 731, rotation to 1073, square wave to
+    1206, pushes to 1256, and the speeds to the end. All moments: ``benchmarks/interrupted_identification.py``.
+    """
+    count = 0
+    pass_time = VirtualClock.wait
+
+    def interrupted(self: VirtualClock, seconds: float) -> None:
+        nonlocal count
+        count += 1
+        if count == moment:
+            signal.raise_signal(signal.SIGINT)
+        pass_time(self, seconds)
+
+    with Connection(PmsmSimBus(CHANNEL)) as connection:
+        drive = CanopenDrive(connection, 1)
+        before = state_of(drive)
+        with monkeypatch.context() as patch:
+            patch.setattr(VirtualClock, "wait", interrupted)
+            with pytest.raises((Interrupted, KeyboardInterrupt)) as caught:
+                identify(drive, tmp_path, IdentifyRequest().quantities)
+        assert count >= moment
+        if isinstance(caught.value, Interrupted):
+            assert caught.value.exit_code == ExitCode.INTERRUPTED
+        assert is_safe(drive.node.state())
+        assert not drive.may_be_energised
+        assert state_of(drive) == before
+        drive.close()
+    assert not list(tmp_path.glob("*/machine.toml"))
+
+
+# ---- the request and its record -----------------------------------------------------------------------------------
+
+
+def test_what_was_asked_comes_back_from_its_record() -> None:
+    request = IdentifyRequest(("R", "L"), i_max_apk=3.0, shaft="coupled", tolerance=SensorTolerance(0.02, 0.003))
+    assert parse_request(dump_request(request), where="here") == request
+    for text in ("", "[]", "{}", '{"quantities": ["R"], "tolerance": {"nonsense": 1}}'):
+        with pytest.raises(ConfigError, match="damaged"):
+            parse_request(text, where="here")
+    with pytest.raises(NotAvailable):
+        IdentifyRequest(("psi",), shaft="locked").check()
+
+
+def test_a_replay_takes_the_recorded_tolerance_and_another_one_is_recorded(tmp_path: Path) -> None:
+    with Connection(PmsmSimBus(CHANNEL)) as connection:
+        drive = CanopenDrive(connection, 1)
+        run, stage = identify(drive, tmp_path, ("R",), SensorTolerance(0.02, 0.02))
+        drive.close()
+    measured = (run.path / MACHINE).read_bytes()
+    assert stage.values[0]["systematic"] == pytest.approx(0.02 * math.sqrt(2.0) * stage.values[0]["value"], rel=0.3)
+    assert replay(run).values == stage.values
+    assert (run.path / MACHINE).read_bytes() == measured and len(run.read().stages) == 1
+    tighter = replay(run, SensorTolerance(0.001, 0.001))
+    assert tighter.values[0]["systematic"] < 0.5 * stage.values[0]["systematic"]
+    assert (run.path / MACHINE).read_bytes() != measured
+    record = run.read()
+    assert len(record.stages) == 2 and record.stages[-1].files[MACHINE] == run.sha256(MACHINE)
+    assert replay(run).values == tighter.values and len(run.read().stages) == 2
+    (run.path / REQUEST).unlink()
+    with pytest.raises(ConfigError, match="no request.json"):
+        replay(run)
+
+
+def test_the_bridge_of_the_nameplate_widens_the_statistical_part(tmp_path: Path) -> None:
+    """0.35 V of 540 V: 0.065 % of R, in the root sum of squares; a bridge of MOSFETs has no threshold."""
+    assert tolerance_on(SensorTolerance(), 540.0).voltage_scale_std == pytest.approx(0.35 / 540.0)
+    assert tolerance_on(SensorTolerance(), 48.0).voltage_scale_std == 0.0
+    with Connection(PmsmSimBus(CHANNEL)) as connection:
+        drive = CanopenDrive(connection, 1)
+        run, stage = identify(drive, tmp_path, ("R",))
+        drive.close()
+    nameplate = load_machine_file(run.path / "nameplate.toml")
+    low = replace(nameplate, inverter=replace(nameplate.inverter, U_dc_v=270.0))
+    (run.path / "nameplate.toml").write_text(dump_machine_file(low))
+    value, std = stage.values[0]["value"], stage.values[0]["std"]
+    wider = replay(run).values[0]["std"]
+    assert math.sqrt(wider**2 - std**2) == pytest.approx(math.sqrt(3.0) * 0.35 / 540.0 * value, rel=0.05)
+
+
+# ---- the bias of the square wave ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("knee", [0.0, 0.05, 0.139, 0.15, 0.25, 0.3, 0.38, 0.5, 2.0])
+def test_no_phase_current_comes_into_the_knee_where_the_current_allows(knee: float) -> None:
+    I_test = 6.0
+    bias, ripple = bias_and_ripple(I_test, 0.25, knee * I_test)
+    assert 0.5 * I_test <= bias <= BIAS_MOST * I_test
+    assert RIPPLE_LEAST * 0.25 * I_test <= ripple <= 0.25 * I_test
+    clear = bias >= 2.0 * (CROSSING * ripple + knee * I_test) * (1.0 - 1e-12)
+    assert clear == (knee <= 0.5 * BIAS_MOST - CROSSING * RIPPLE_LEAST * 0.25)
+    if knee < 0.1:
+        assert (bias, ripple) == (0.5 * I_test, 0.25 * I_test)
