@@ -10,7 +10,7 @@ import click
 
 from pmsmtool.cli.options import FILE, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, table
-from pmsmtool.cli.output_file import inside, save_figure, write_file
+from pmsmtool.cli.output_file import save_figure, write_file
 
 if TYPE_CHECKING:
     from pmsmtool.design.lookup_design import LookupDesign
@@ -26,7 +26,7 @@ _TEMPERATURE = Quantity("temperature")
         "pmsmtool lut machine.toml -o hot.npz --winding 140degC --magnet 110degC --u-dc 480V --u-dc 540V",
     ),
 )
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("source")
 @click.option("-o", "--output", "path", type=FILE, required=True, help="Table to write (.npz); a .csv goes beside it.")
 @click.option("--axis", type=click.Choice(["speed", "flux"]), default="speed", help="Second axis.")
 @click.option("--torque-points", type=int, metavar="N", help="Uniform torque axis.  [default: refined to the bounds]")
@@ -43,7 +43,7 @@ _TEMPERATURE = Quantity("temperature")
 @click.option("--plot", "plot_path", type=FILE, help="Figure to write (.svg, .png, .pdf).")
 @output_options
 def lut_command(
-    source: Path,
+    source: str,
     path: Path,
     voltage_margin: float | None,
     iron_loss: Path | None,
@@ -51,7 +51,7 @@ def lut_command(
     out: Output,
     **asked: Any,
 ) -> None:
-    """Make the current references of SOURCE, a machine file, a design or a run directory.
+    """Make the current references of SOURCE, a machine file, a design, a run directory or a profile.
 
     Least loss for every torque and speed within current, voltage, demagnetisation and map; motoring and generating;
     with the limit that binds and the margins of every cell. Exit code 1 when the bounds do not fit the drive's memory.
@@ -60,8 +60,11 @@ def lut_command(
     from pmsmtool.design.lookup_design import LookupRequest, design_table
     from pmsmtool.design.lookup_file import table_csv, table_facts, table_npz
     from pmsmtool.design.lookup_loci import loci
+    from pmsmtool.machine.profile import machine_path
 
-    file = inside(source, "design.toml" if (source / "design.toml").is_file() else "machine.toml")
+    file = Path(source) / "design.toml"
+    if not file.is_file():
+        file = machine_path(source)
     machine, rated, margin = _limits(file, voltage_margin)
     if iron_loss is None and machine.machine.iron_loss_map is not None:
         iron_loss = file.parent / machine.machine.iron_loss_map

@@ -94,7 +94,8 @@ def _serve(server: SocketcandServer) -> None:
 def list_command(out: Output) -> None:
     """List the profiles that ship with the package."""
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.sim.channel import DEFAULT_PROFILE, machine_path, profile_names
+    from pmsmtool.machine.profile import machine_path, profile_names
+    from pmsmtool.sim.channel import DEFAULT_PROFILE
 
     rows = []
     for name in profile_names():

@@ -29,7 +29,8 @@ from can.broadcastmanager import (
 
 from pmsmtool.bus.clock import NEVER, NS, Ticker, VirtualClock
 from pmsmtool.errors import ConfigError
-from pmsmtool.sim.channel import build_line, parse_channel, profile_names
+from pmsmtool.machine.profile import profile_names
+from pmsmtool.sim.channel import build_line, parse_channel
 from pmsmtool.sim.line import EXTENDED, REMOTE, Frame, Line
 
 POLL_NS = 10_000

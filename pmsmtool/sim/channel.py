@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.resources import data_folder
+from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.faults import load_faults
 from pmsmtool.sim.line import Line
 from pmsmtool.sim.node.factory import drive_settings
@@ -114,34 +114,6 @@ def parse_channel(text: str | None) -> Channel:
             violations=violations,
         )
     return Channel(name=name or DEFAULT_PROFILE, **values)
-
-
-def profile_names() -> list[str]:
-    """Return the names of the profiles that ship with the package."""
-    return sorted(path.stem for path in data_folder("profiles").glob("*.toml"))
-
-
-def machine_path(name: str) -> Path:
-    """Return the machine file of a profile name or path.
-
-    Raises
-    ------
-    ConfigError
-        There is neither such a profile nor such a file.
-    """
-    path = Path(name)
-    if path.suffix == ".toml" or path.is_file():
-        return path
-    profile = data_folder("profiles") / f"{name}.toml"
-    if profile.is_file():
-        return profile
-    near = get_close_matches(name, profile_names(), 3)
-    raise ConfigError(
-        f"no profile and no file is named {name!r}",
-        where="channel",
-        likely=f"did you mean {' or '.join(near)}?" if near else "",
-        hint="`pmsmtool sim list` names the profiles",
-    )
 
 
 def _storage(channel: Channel, stem: str, position: int) -> Storage:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.sim.channel import MEMORY_FOLDER, machine_path, parse_channel
+from pmsmtool.machine.profile import machine_path
+from pmsmtool.sim.channel import MEMORY_FOLDER, parse_channel
 
 
 def erase_memory(channel: str | None) -> list[Path]:

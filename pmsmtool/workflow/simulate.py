@@ -11,8 +11,8 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import SCHEMA as MACHINE_SCHEMA
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.profile import machine_path
 from pmsmtool.params.parameter_set import ParameterSet, read_parameter_set
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import drive_values, simulate
 from pmsmtool.sim.scenarios import Scenario, built_in, load_scenario
 from pmsmtool.sim.simulated_machine import with_simulation
@@ -85,18 +85,8 @@ def find_drive(source: str, params: Path | None = None) -> SimulatedDrive:
 
 
 def _path(source: str) -> Path:
-    path = Path(source)
-    if path.is_dir():
-        design = path / "design.toml"
-        return design if design.is_file() else path / "machine.toml"
-    if path.is_file():
-        return path
-    profile = data_folder("profiles") / f"{source}.toml"
-    if profile.is_file():
-        return profile
-    from pmsmtool.sim.channel import machine_path
-
-    return machine_path(source)
+    design = Path(source) / "design.toml"
+    return design if design.is_file() else machine_path(source)
 
 
 def _schema(path: Path) -> object:

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.machine.profile import machine_path, profile_names
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.channel import DEFAULT_PROFILE, Channel, build_line, machine_path, parse_channel, profile_names
+from pmsmtool.sim.channel import DEFAULT_PROFILE, Channel, build_line, parse_channel
 from tests.node.raw_client import RawClient
 from tests.node.simple_core import SimpleCore
 
@@ -114,7 +115,6 @@ def test_a_drive_leaves_the_factory_with_its_plate_and_harmless_gains(tmp_path: 
 
 @pytest.mark.parametrize("name", profile_names())
 def test_every_profile_makes_a_drive(name: str) -> None:
-    pytest.importorskip("pmsmtool.sim.drive_kernel")
     line = build_line(parse_channel(f"{name}?nv=:memory:"))
     bus = PmsmSimBus(name, line=line)
     client = RawClient(bus)

@@ -94,7 +94,6 @@ class TestInProcess(Contract):
 class TestWithKernel(Contract):
     @pytest.fixture
     def connection(self) -> Iterator[Connection]:
-        pytest.importorskip("pmsmtool.sim.drive_kernel")
         with Connection(PmsmSimBus("interior-2k2?nv=:memory:")) as connection:
             yield connection
 

@@ -9,12 +9,10 @@ import pytest
 
 from pmsmtool.drive.port import Injection, Shape
 from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.channel import machine_path
 from pmsmtool.sim.node.objects import object_rows
 from tests.node.raw_client import RawClient
-
-pytest.importorskip("pmsmtool.sim.drive_kernel")
 
 PROFILE = "interior-2k2"
 I_D, I_Q, U_D, THETA = 0x20700120, 0x20700220, 0x20700520, 0x20700B20

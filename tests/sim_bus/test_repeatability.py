@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("pmsmtool.sim.drive_kernel")
-
 SCRIPT = Path(__file__).with_name("repeatable_run.py")
 OTHER_PYTHONS = [name for name in os.environ.get("PMSMTOOL_OTHER_PYTHONS", "").split(os.pathsep) if name]
 """Further interpreters with the package's dependencies, for the comparison across versions."""

@@ -205,7 +205,6 @@ def test_a_port_in_use_is_one_clear_error() -> None:
 
 @contextlib.contextmanager
 def command(*arguments: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
-    pytest.importorskip("pmsmtool.sim.drive_kernel")
     process = subprocess.Popen(
         [sys.executable, "-c", "from pmsmtool.cli.main import main; main()", "sim", "serve", "--json", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
