@@ -13,6 +13,7 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -32,7 +33,7 @@ QUADRATURE = 40
 TIME_RESOLUTION = 1e-9
 """Relative resolution of the time."""
 
-LONGEST_S = 10.0
+LONGEST_S = 1.0
 """A transfer that takes longer is reported as impossible."""
 
 
@@ -119,6 +120,16 @@ def minimum_time(
     return high
 
 
+_HALF_TURNS_MAX = 12
+"""More half turns than this are not resolved: a transfer that long ends at rest in the steady state anyway."""
+
+
+@cache
+def _rule(points: int) -> tuple[Array, Array]:
+    nodes, weights = np.polynomial.legendre.leggauss(points)
+    return nodes, weights
+
+
 class _Reach:
     """How far the target is out of the reachable set after a time."""
 
@@ -136,7 +147,7 @@ class _Reach:
         self.F, self.G, self.e = problem.system()
         self.flow = _Flow(self.F)
         # the hexagon's support has corners in time: more points
-        self.nodes, self.weights = np.polynomial.legendre.leggauss(QUADRATURE * (8 if voltage == "hexagon" else 1))
+        self.density = QUADRATURE * (8 if voltage == "hexagon" else 1)
 
     def shortfall(self, T: float) -> float:
         """Return max over q of q . (i_to - i_free) - rho - reach(q); not positive when T is enough."""
@@ -151,12 +162,14 @@ class _Reach:
         return float(values.max())
 
     def _gap(self, T: float, angles: Array) -> Array:
-        t = 0.5 * T * (self.nodes + 1.0)
+        half_turns = abs(self.problem.omega_e) * T / math.pi
+        nodes, weights = _rule(self.density * min(math.ceil(1.0 + half_turns), _HALF_TURNS_MAX))
+        t = 0.5 * T * (nodes + 1.0)
         q = np.array([np.cos(angles), np.sin(angles)])
         # what a voltage at time T - t contributes at T is e^(F t) G u
         pushed = self.G @ (np.swapaxes(self.flow.at(t), 1, 2) @ q)
         support = self._support(pushed, T - t)
-        reach = 0.5 * T * (self.weights @ support)
+        reach = 0.5 * T * (weights @ support)
         free = self.flow.at(np.array([T]))[0] @ self.start + self.flow.integral(T) @ self.e
         return np.asarray((self.end - free) @ q - self.radius - reach)
 

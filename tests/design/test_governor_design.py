@@ -1,0 +1,155 @@
+"""Numbers of governor and field weakening against the reference's own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.design.admissible_set import PredictionModel
+from pmsmtool.design.current_loop import imc
+from pmsmtool.design.field_weakening import (
+    flux_at_temperature,
+    mtpv,
+    mtpva,
+    overshoot_per_slope,
+    ramp_limit_rpm_per_s,
+)
+from pmsmtool.design.governor import (
+    CURRENT_ROW,
+    MINIMUM_TIME,
+    PRE_PROJECTION,
+    PREDICTOR,
+    design_governor,
+    euler_error,
+)
+from pmsmtool.design.lookup_table import torque_limits
+from pmsmtool.design.operating_machine import at_temperature
+from pmsmtool.design.ratings import ratings
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.image import lut_size_words
+from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.parameters import MachineParameters
+
+PROFILES = Path(__file__).resolve().parents[2] / "profiles"
+R, L_D, L_Q, PSI, P, T_S = 0.137, 2.3e-3, 2.1e-3, 0.41, 4, 1.0 / 12e3
+V_MAX = 210.0 / math.sqrt(3.0)
+MODEL = PredictionModel(R, L_D, L_Q, PSI, T_S, imc(R, L_D, 4000.0), imc(R, L_Q, 4000.0))
+MTPV_MACHINE = MachineParameters(4, 0.0, 1e-3, 2.5e-3, 0.1)
+
+
+@pytest.mark.parametrize(("rpm", "percent"), [(620.0, 0.75), (1000.0, 1.55), (3000.0, 10.3), (6000.0, 37.7)])
+def test_prediction_error_of_the_turning_frame(rpm: float, percent: float) -> None:
+    """Reference: 0.7 / 1.5 / 10 / 37 % of V_max."""
+    assert 100.0 * euler_error(MODEL, rpm * P * math.pi / 30.0, V_MAX, 28.0) == pytest.approx(percent, rel=0.01)
+
+
+def test_at_rest_only_the_resistance_is_missed() -> None:
+    assert euler_error(MODEL, 0.0, V_MAX, 28.0) < 2e-3
+
+
+def test_modes_and_options() -> None:
+    source = load_machine_file(PROFILES / "jercic-2017.toml")
+    rated = ratings(source, 0.92 * V_MAX)
+    gains = {"d": imc(R, L_D, 4000.0), "q": imc(R, L_Q, 4000.0)}
+    best = design_governor(source, rated, gains, "best", predictor=True)
+    options = int(best.values["governor.options"].value)
+    assert options == CURRENT_ROW | PRE_PROJECTION | MINIMUM_TIME | PREDICTOR
+    assert best.values["governor.k_max"].value == 0.0
+    assert best.values["governor.eps"].value == 0.01
+    assert best.values["governor.observer_gain"].value == pytest.approx(0.1, rel=0.05)
+    assert best.facts["straight_segment"] is True
+    paper = design_governor(source, rated, gains, "paper", predictor=False)
+    assert paper.values["governor.options"].value == 0.0
+    assert paper.values["governor.eps"].value == pytest.approx(
+        euler_error(MODEL, 1200.0 * P * math.pi / 30.0, V_MAX, 28.0)
+    )
+    assert paper.facts["k_max_eps_0.01"] == 24
+    assert paper.values["governor.k_max"].value == paper.facts["k_max_chosen"]
+    assert any("half of a 12 kHz period" in note for note in paper.notes)
+    with pytest.raises(ConfigError, match="mode"):
+        design_governor(source, rated, gains, "wild", predictor=False)
+
+
+def test_a_salient_machine_is_not_steered_through_its_reluctance_torque() -> None:
+    design = tune(load_machine_file(PROFILES / "mtpv-test.toml"))
+    assert not int(design["governor.options"]) & MINIMUM_TIME
+    assert "reluctance" in design.values["governor.options"].method
+    assert int(tune(load_machine_file(PROFILES / "jercic-2017.toml"))["governor.options"]) & MINIMUM_TIME
+
+
+def test_overshoot_of_the_reference_ramps() -> None:
+    """Excess over V_m on a ramp at N_FW = 50: 0.43 / 1.9 / 3.8 / 7.6 % at 667 / 3000 / 6000 / 12 000 rpm/s."""
+    period = 50.0 * T_S
+    for slope, percent in ((667.0, 0.43), (3000.0, 1.9), (6000.0, 3.8), (12000.0, 7.6)):
+        assert 100.0 * slope * overshoot_per_slope(655.0, period) == pytest.approx(percent, rel=0.03)
+    assert ramp_limit_rpm_per_s(655.0, period, 0.08) == pytest.approx(13_700.0, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("omega", "i_d", "i_q"),
+    [(1000.0, -140.40715, 36.58910), (2000.0, -112.97865, 19.31447), (-1000.0, -140.40715, 36.58910)],
+)
+def test_mtpv_closed_form(omega: float, i_d: float, i_q: float) -> None:
+    assert mtpv(MTPV_MACHINE, omega, 100.0) == pytest.approx((i_d, i_q), rel=1e-6)
+
+
+def test_mtpv_of_a_surface_machine_is_the_characteristic_current() -> None:
+    machine = replace(MTPV_MACHINE, L_q_h=1e-3)
+    assert mtpv(machine, 1000.0, 100.0) == pytest.approx((-100.0, 100.0))
+
+
+def test_mtpva_closed_form() -> None:
+    assert mtpva(MTPV_MACHINE, 600.0, 100.0, 150.0) == pytest.approx((-135.10258, 65.17127), rel=1e-6)
+    assert mtpva(MTPV_MACHINE, 100.0, 100.0, 150.0) is None
+    surface = MachineParameters(4, 0.0, 1e-3, 1e-3, 0.1)
+    found = mtpva(surface, 1000.0, 100.0, 150.0)
+    assert found is not None
+    assert math.hypot(0.1 + 1e-3 * found[0], 1e-3 * found[1]) == pytest.approx(0.1)
+    assert math.hypot(*found) == pytest.approx(150.0)
+
+
+def test_mtpva_is_the_corner_the_table_kernel_finds() -> None:
+    bounds = torque_limits(at_temperature(MTPV_MACHINE), [600.0], [100.0], 150.0)
+    found = mtpva(MTPV_MACHINE, 600.0, 100.0, 150.0)
+    assert found == pytest.approx((float(bounds.largest_i_d_a[0, 0]), float(bounds.largest_i_q_a[0, 0])), rel=1e-9)
+
+
+def test_hot_magnet() -> None:
+    """(36): 150 K at 0.12 %/K are 18 %."""
+    assert flux_at_temperature(MTPV_MACHINE, 170.0) == pytest.approx(0.82 * 0.1)
+
+
+def test_field_weakening_numbers_of_the_reference_machine() -> None:
+    design = tune(load_machine_file(PROFILES / "jercic-2017.toml"))
+    assert design["field_weakening.mode"] == 3.0
+    assert design["field_weakening.N_fw"] == 50.0
+    assert design["field_weakening.h2"] == pytest.approx(1e-3, rel=0.02)
+    assert 0.05 <= design["field_weakening.beta"] <= 0.085
+    assert design["field_weakening.i_d_lm_a"] == pytest.approx(0.38, abs=0.01)  # L_d > L_q: a little positive
+    slope = design["speed.acceleration_rpm_per_s"]
+    assert slope == pytest.approx(0.8 * float(design.facts["ramp_that_spends_the_reserve_rpm_per_s"]))
+
+
+def test_a_saturated_machine_gets_its_table() -> None:
+    design = tune(load_machine_file(PROFILES / "saturated-pmsyrm.toml"))
+    assert design["field_weakening.mode"] == 1.0
+    cells = int(design["lut.n_x"]) * int(design["lut.n_y"]) * int(design["lut.n_z"])
+    assert len(design.tables["lut.i_d_a"]) == cells > 100
+    assert design.parameter_set().violations() == ()
+    assert lut_size_words({name: value.value for name, value in design.values.items()}) > cells
+    assert design["governor.observer_gain"] == 0.0
+
+
+@pytest.mark.parametrize("mode", ["off", "lookup", "gradient", "uncompensated"])
+def test_other_modes_on_request(mode: str) -> None:
+    source = load_machine_file(PROFILES / "jercic-2017.toml")
+    design = tune(source, TuneRequest(field_weakening=mode, governor="line", eps=0.03))
+    assert design["field_weakening.mode"] == ["off", "lookup", "gradient", "accelerated", "uncompensated"].index(mode)
+    assert bool(design.tables) == (mode == "lookup")
+    assert design["governor.mode"] == 2.0
+    assert design["governor.eps"] == 0.03
