@@ -39,6 +39,12 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
               "optimum, lowered to the margins]")  # fmt: skip
 @click.option("--phase-margin-deg", type=float, default=45.0, metavar="DEG", help="Least phase margin of the design.")
 @click.option("--gain-margin-db", type=float, default=6.0, metavar="DB", help="Least gain margin of the design.")
+@click.option(
+    "--field-weakening",
+    type=click.Choice(["lookup", "accelerated", "gradient", "off"]),
+    default="lookup",
+    help="Where the drive's current references come from: the table, or an optimisation in the drive.",
+)
 @click.option("--sensor-tol", type=click.FloatRange(0.0, 0.2), default=0.01, help="95 % tolerance of sensor gains.")
 @map_option
 @bus_options
@@ -53,7 +59,7 @@ def commission_command(
     runs: Path,
     map_file: Path | None,
     sensor_tol: float,
-    **design: float | None,
+    **design: Any,
 ) -> None:
     """Identify the machine, design its control, make the look-up table, judge the margins, flash, verify, report.
 

@@ -39,6 +39,8 @@ from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplat
 from pmsmtool.workflow.report_page import report_page
 from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, Status, new_record
 
+FROM_TABLE = TuneRequest(field_weakening="lookup")
+"""The chain's default design: the drive takes its current references from the table the chain makes and checks."""
 STAGES = ("identify", "tune", "lut", "margins", "flash", "verify")
 
 
@@ -136,7 +138,7 @@ class Commissioning:
     progress: Progress
     nameplate: MachineFile | None = None
     identify: IdentifyRequest = field(default_factory=IdentifyRequest)
-    tune: TuneRequest = field(default_factory=TuneRequest)
+    tune: TuneRequest = FROM_TABLE
     lookup: LookupRequest = field(default_factory=LookupRequest)
     margins: MarginRequest = field(default_factory=MarginRequest)
 
@@ -320,7 +322,7 @@ def commission(
     """
     run = begin_run(drive, runs)
     chain = Commissioning(
-        run, drive, person, progress or Silent(), nameplate, identify or IdentifyRequest(), tune or TuneRequest()
+        run, drive, person, progress or Silent(), nameplate, identify or IdentifyRequest(), tune or FROM_TABLE
     )
     try:
         chain.carry_out()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design
+from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.design.lookup_design import LookupDesign, LookupRequest, design_table
 from pmsmtool.design.lookup_file import lut_values, table_csv, table_facts, table_npz
 from pmsmtool.design.lookup_loci import loci
@@ -15,8 +17,9 @@ from pmsmtool.design.margins import JUDGED_PERCENTILE, MarginRequest, Spread, ma
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.sampled_loop import LoopMargins
 from pmsmtool.design.tolerance import tolerance_box
-from pmsmtool.design.tune import tune
+from pmsmtool.design.tune import TABLE_BOUNDS, tune
 from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
@@ -30,9 +33,6 @@ MARGIN_SAMPLES = 4096
 """Random machines drawn from the tolerance box: the 5 % quantile to about +-0.7 % of probability; 0.4 s."""
 SPEED_PHASE_MARGIN_DEG = 40.0
 """Least phase margin of the speed loop: below it a step rings visibly (30 % overshoot)."""
-
-FROM_TABLE = 1.0
-"""``field_weakening.mode`` of a drive that takes its current references from the table."""
 
 
 def tune_stage(run: RunDirectory, request: TuneRequest) -> Stage:
@@ -74,29 +74,30 @@ def _at_least(what: str, value: float, least: float, unit: str, stable: bool) ->
 
 
 def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
-    """Make the look-up table of the design; writes ``lut.npz``, ``lut.csv`` and the set with it, ``params.toml``.
+    """Make the look-up table of the design.
+
+    Writes ``lut.npz``, ``lut.csv``, the design with it, and ``params.toml``, the set that is flashed. The table goes
+    into the drive when the design takes its references from one (``field_weakening.mode``).
 
     Raises
     ------
     DesignInfeasible
-        The bounds between the nodes do not fit the drive's memory.
+        Not even the widest of ``TABLE_BOUNDS`` fits the drive's memory.
     """
     design = load_design(run.path / "design.toml")
-    machine, margin = design.machine, design["field_weakening.margin"]
-    rated = ratings(machine, (1.0 - margin) * machine.inverter.V_max_v)
-    made = design_table(machine, rated, request, margin)
+    made, bound = _bounded_table(design, request)
     table, error = made.table, made.error
-    lines = loci(table) if table.axis_kind == "speed" else {}
-    complete = with_table(design, made)
-    run.save("lut.npz", table_npz(table, table_facts(table, made.stored, error), lines))
+    used = design["field_weakening.mode"] == FIELD_WEAKENING["lookup"]
+    if used:
+        design = with_table(design, made)
+    run.save("lut.npz", table_npz(table, table_facts(table, made.stored, error), loci(table)))
     run.save("lut.csv", table_csv(table))
-    run.save("design.toml", design_text(complete))
-    run.save("params.toml", complete.parameter_set().to_toml())
+    run.save("design.toml", design_text(design))
+    run.save("params.toml", design.parameter_set().to_toml())
     torque = float(max(abs(table.torque_nm[0]), table.torque_nm[-1]))
-    limit = float(table.V_max_v.min()) if table.axis_kind == "speed" else float(table.y[-1])
     criteria = [
-        _at_most("torque error between nodes", error.torque_nm / torque, request.torque_bound),
-        _at_most("voltage beyond the limit between nodes", error.voltage_v / limit, request.voltage_bound),
+        _at_most("torque error between nodes", error.torque_nm / torque, bound),
+        _at_most("voltage beyond the limit between nodes", error.voltage_v / float(table.V_max_v.min()), bound),
     ]
     shape = " x ".join(map(str, table.i_d_a.shape))
     names, counts = table.binding_counts()
@@ -105,8 +106,27 @@ def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
         *({"name": f"cells bound by {name}", "value": count} for name, count in zip(names, counts, strict=True)),
     ]
     files = ("lut.npz", "lut.csv", "design.toml", "params.toml")
-    summary = f"{shape} cells, {made.stored}; torque to {torque:.4g} N m, {table.axis_kind} to {table.y[-1]:.5g}"
-    return _stage("lut", summary, criteria, values=values, files=files, fallbacks=made.notes)
+    summary = f"{shape} cells, {made.stored}; torque to {torque:.4g} N m, speed to {table.y[-1]:.5g} rpm"
+    notes = made.notes if used else (*made.notes, "the table is for reading: this design finds its references itself")
+    if bound > request.torque_bound:
+        notes = (
+            *notes,
+            f"a table within {100.0 * request.torque_bound:g} % does not fit the drive: {100.0 * bound:g} %",
+        )
+    return _stage("lut", summary, criteria, values=values, files=files, fallbacks=notes)
+
+
+def _bounded_table(design: Design, request: LookupRequest) -> tuple[LookupDesign, float]:
+    """Make the table with the tightest bound that fits the drive, from the one asked for on."""
+    machine, margin = design.machine, design["field_weakening.margin"]
+    rated = ratings(machine, (1.0 - margin) * machine.inverter.V_max_v)
+    bounds = [request.torque_bound, *(bound for bound in TABLE_BOUNDS if bound > request.torque_bound)]
+    for bound in bounds[:-1]:
+        with contextlib.suppress(DesignInfeasible):
+            asked = replace(request, torque_bound=bound, voltage_bound=bound)
+            return design_table(machine, rated, asked, margin), bound
+    asked = replace(request, torque_bound=bounds[-1], voltage_bound=bounds[-1])
+    return design_table(machine, rated, asked, margin), bounds[-1]
 
 
 def _at_most(what: str, value: float, largest: float) -> Acceptance:
@@ -151,9 +171,8 @@ def _spread_value(spread: Spread) -> Mapping[str, Any]:
 
 
 def with_table(design: Design, made: LookupDesign) -> Design:
-    """Return a design with a look-up table in it, and the drive told to take its references from there."""
+    """Return a design with a look-up table in it."""
     values, tables = lut_values(made.table, made.stored)
-    values["field_weakening.mode"] = FROM_TABLE
     how = f"look-up table, {made.stored}, error-bounded grid"
     entries = {**design.values, **{name: DesignValue(value, how) for name, value in values.items()}}
     return replace(design, values={row.name: entries[row.name] for row in CATALOGUE}, tables=tables)

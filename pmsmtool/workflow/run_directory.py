@@ -14,7 +14,6 @@ import hashlib
 import json
 import os
 import platform
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -159,13 +158,13 @@ class RunDirectory:
     def write(self, record: RunRecord) -> None:
         """Replace the record in one step (write beside it, sync, rename)."""
         text = json.dumps(asdict(record), indent=1, allow_nan=True) + "\n"
+        part = self.path / f".{RECORD}.part"
         try:
-            handle, name = tempfile.mkstemp(dir=self.path, prefix=".run-", suffix=".json")
-            with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as stream:
+            with part.open("w", encoding="utf-8", newline="\n") as stream:
                 stream.write(text)
                 stream.flush()
                 os.fsync(stream.fileno())
-            os.replace(name, self.path / RECORD)
+            os.replace(part, self.path / RECORD)
         except OSError as error:
             raise _unwritable(self.path, error) from error
 
