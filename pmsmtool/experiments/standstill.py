@@ -58,6 +58,10 @@ class LevelPlan:
         return len(self.levels_a) * (self.settle_s + self.window_periods * period_s)
 
 
+ARRIVAL_LIMIT_S = 1.0
+"""A small current that has not come by then never comes: a phase is open, and the controller only winds up."""
+
+
 def record_zero_current(drive: Drive, samples: int = NOISE_SAMPLES) -> Trace:
     """Record both axis currents of a drive that is off, in a fixed frame."""
     return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "flags"), samples))
@@ -66,23 +70,27 @@ def record_zero_current(drive: Drive, samples: int = NOISE_SAMPLES) -> Trace:
 def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace:
     """Hold a small vector at 0, 120 and 240 degrees and return one row of means for each.
 
-    The drive is enabled on entry and holds zero current on return.
+    The drive is enabled on entry and holds zero current on return. It is off between two vectors: what its controller
+    has wound up against an open phase must not meet the other two.
     """
     names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a")
-    rows = []
+    rows: list[dict[str, float]] = []
     times = []
     elapsed = 0.0
     for angle in PHASE_ANGLES_RAD:
+        if rows:
+            drive.disable()
+            drive.enable()
         drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
-        elapsed += settle(drive, i_a)
+        elapsed += settle(drive, i_a, arrival_s=ARRIVAL_LIMIT_S)
         times.append(elapsed)
         rows.append(dict(drive.average(names, periods)))
     drive.command_current(0.0, 0.0, fixed_angle_rad=PHASE_ANGLES_RAD[-1])
     return table(rows, times, i_command_a=i_a, angles_rad=list(PHASE_ANGLES_RAD))
 
 
-def settle(drive: Drive, i_d_a: float, *, limit_s: float = REST_LIMIT_S) -> float:
-    """Wait until the current has arrived and the shaft stands still, or the limit is over; return the time (s)."""
+def settle(drive: Drive, i_d_a: float, *, limit_s: float = REST_LIMIT_S, arrival_s: float = REST_LIMIT_S) -> float:
+    """Wait until the current has arrived and the shaft stands still, or a limit is over; return the time (s)."""
     periods = max(1, round(0.25 * LOOK_S / drive.period_s))
     waited = 0.0
     last = math.inf
@@ -91,7 +99,8 @@ def settle(drive: Drive, i_d_a: float, *, limit_s: float = REST_LIMIT_S) -> floa
         waited += LOOK_S
         now = drive.average(("theta_m_rad", "i_d_a", "i_q_a"), periods)
         arrived = math.hypot(now["i_d_a"] - i_d_a, now["i_q_a"]) <= ARRIVED * abs(i_d_a)
-        if arrived and abs(now["theta_m_rad"] - last) < REST_RAD:
+        at_rest = abs(now["theta_m_rad"] - last) < REST_RAD
+        if at_rest if arrived else waited >= arrival_s:
             break
         last = now["theta_m_rad"]
     return waited
