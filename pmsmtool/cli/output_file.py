@@ -54,9 +54,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
     import matplotlib
 
-    suffix = path.suffix.lower().lstrip(".")
-    if suffix not in _FIGURE_METADATA:
-        raise ConfigError(f"{path.name} has no figure format", where=str(path), hint="use .svg, .png or .pdf")
+    suffix = figure_format(path)
     out = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "pmsmtool", "svg.fonttype": "path"}):
         figure.savefig(out, format=suffix, metadata=_FIGURE_METADATA[suffix])
@@ -68,6 +66,14 @@ _FIGURE_METADATA: dict[str, dict[str, None]] = {
     "png": {"Software": None},
     "pdf": {"CreationDate": None},
 }
+
+
+def figure_format(path: Path) -> str:
+    """Return the format that the suffix of a figure asks for; raises ``ConfigError`` when there is none."""
+    suffix = path.suffix.lower().lstrip(".")
+    if suffix not in _FIGURE_METADATA:
+        raise ConfigError(f"{path.name} has no figure format", where=str(path), hint="use .svg, .png or .pdf")
+    return suffix
 
 
 def inside(path: Path, name: str) -> Path:

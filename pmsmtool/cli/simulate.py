@@ -26,10 +26,10 @@ _SUFFIXES = (".npz", ".csv")
         "pmsmtool simulate design.toml --scenario speed-ramp -o trace.npz",
         "pmsmtool simulate jercic-2017 --scenario current-steps -o trace.csv --plot trace.svg",
         "pmsmtool simulate machine.toml --scenario reversal.toml -o trace.npz --set sensor_noise_apk=0 --seed 7",
-        "pmsmtool simulate design.toml --list",
+        "pmsmtool simulate --list",
     ),
 )
-@click.argument("design", metavar="DESIGN")
+@click.argument("design", metavar="DESIGN", required=False)
 @click.option("--scenario", metavar="NAME|FILE", help="A built-in scenario (--list) or a scenario file.")
 @click.option("-o", "--output", "path", type=FILE, help="Trace to write (.npz or .csv).")
 @click.option("--plot", "figure_path", type=FILE, help="Figure to write (.svg, .png, .pdf).")
@@ -42,7 +42,7 @@ _SUFFIXES = (".npz", ".csv")
 @click.option("--list", "list_only", is_flag=True, help="List the built-in scenarios.")
 @output_options
 def simulate_command(
-    design: str,
+    design: str | None,
     scenario: str | None,
     path: Path | None,
     figure_path: Path | None,
@@ -61,23 +61,30 @@ def simulate_command(
     if list_only:
         _list(out)
         return
+    if design is None:
+        raise click.UsageError("missing argument DESIGN: a design, a machine file, a run directory or a profile")
     if scenario is None:
         raise click.UsageError("which --scenario? --list names the built-in ones")
     if path is None and figure_path is None and not out.json:
         raise click.UsageError("nothing to write: give -o, --plot or --json")
     # numpy's linear algebra starts a thread per core when it is imported: 50 ms that a simulation makes no use of
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from pmsmtool.cli.output_file import figure_format
     from pmsmtool.errors import ConfigError
     from pmsmtool.workflow.simulate import find_drive, find_scenario, run_scenario
 
     if path is not None and path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(f"{path.name} has no trace format", where=str(path), hint="use .npz or .csv")
+    if figure_path is not None:
+        figure_format(figure_path)
     drive = find_drive(design, params)
     trace = run_scenario(
         drive, find_scenario(scenario, drive), seed=seed, duration_s=duration_s, simulation=_changes(changes)
     )
     if drive.origin != "design":
         out.note(f"parameters: {drive.origin}")
+    for note in drive.notes:
+        out.note(note)
     if scenario == "field-weakening-sweep" and not drive.params.values.get("field_weakening.mode"):
         out.note("field weakening is off in these parameters (field_weakening.mode = 0)")
     _warn(trace, out)

@@ -200,6 +200,10 @@ def _profile(name: str, nodes: Any, wrong: list[str]) -> Profile:
 # ---- built-in -----------------------------------------------------------------------------------------------------
 
 
+REACHED_SHARE = 0.95
+"""End of the field-weakening sweep over the speed whose back-EMF the most negative i_d still holds."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Scale:
     """What the built-in scenarios are sized with."""
@@ -207,7 +211,7 @@ class _Scale:
     i_a: float
     i_d_min_a: float
     n_rpm: float
-    n_max_rpm: float
+    n_top_rpm: float
     torque_nm: float
     J_kgm2: float
 
@@ -218,11 +222,14 @@ def _scale(machine_file: MachineFile, values: Mapping[str, float]) -> _Scale:
     psi = math.hypot(machine.psi_f_wb, machine.L_q_decoupling_h * i_a)
     base_rpm = 0.9 * machine_file.inverter.V_max_v / (machine.pole_pairs * psi) / RPM
     n_rpm = machine.n_nom_rpm or base_rpm
+    psi_least = machine.psi_f_wb + machine.L_d_h * values["field_weakening.i_d_min_a"]
+    V_m = (1.0 - values["field_weakening.margin"]) * machine_file.inverter.V_max_v
+    reached_rpm = V_m / (machine.pole_pairs * psi_least) / RPM if psi_least > 0.0 else math.inf
     return _Scale(
         i_a=i_a,
         i_d_min_a=max(values["field_weakening.i_d_min_a"], -i_a),
         n_rpm=n_rpm,
-        n_max_rpm=machine.n_max_rpm or 2.0 * n_rpm,
+        n_top_rpm=max(n_rpm, min(machine.n_max_rpm or 2.0 * n_rpm, REACHED_SHARE * reached_rpm)),
         torque_nm=abs(machine.torque_nm(0.0, i_a)),
         J_kgm2=machine.J_kgm2 or 0.0,
     )
@@ -305,7 +312,7 @@ def _field_weakening_sweep(scale: _Scale, name: str) -> Scenario:
         start_rpm=low,
         schedule={
             "torque_nm": ((0.0, 0.0), (0.05, torque)),
-            "driven_rpm": ((0.0, low), (0.1, low), (0.9, scale.n_max_rpm)),
+            "driven_rpm": ((0.0, low), (0.1, low), (0.9, scale.n_top_rpm)),
         },
     )
 
@@ -315,7 +322,10 @@ BUILT_IN: dict[str, tuple[str, Callable[[_Scale, str], Scenario]]] = {
     "q-step": ("one step of i_q to the rated current at half the rated speed, rotor driven", _q_step),
     "speed-ramp": ("speed ramp from standstill to the rated speed, rotor free", _speed_ramp),
     "load-step": ("half the rated torque on and off at half the rated speed, rotor free", _load_step),
-    "field-weakening-sweep": ("half the rated torque while the rotor is driven to n_max", _field_weakening_sweep),
+    "field-weakening-sweep": (
+        "half the rated torque while the rotor is driven to n_max, or as far as i_d_min holds the voltage",
+        _field_weakening_sweep,
+    ),
 }
 """Built-in scenarios: what they do, and how they are sized for a machine."""
 

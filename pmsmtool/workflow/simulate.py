@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pmsmtool.errors import ConfigError
@@ -33,11 +33,14 @@ class SimulatedDrive:
         What the drive runs with.
     origin : str
         ``design``, or how the parameters were found.
+    notes : tuple of str
+        What its design has to say.
     """
 
     machine: MachineFile
     params: ParameterSet
     origin: str
+    notes: tuple[str, ...] = ()
 
 
 def find_drive(source: str, params: Path | None = None) -> SimulatedDrive:
@@ -70,7 +73,8 @@ def find_drive(source: str, params: Path | None = None) -> SimulatedDrive:
         from pmsmtool.design.tune import tune
 
         machine_file = load_machine_file(path)
-        found = SimulatedDrive(machine_file, tune(machine_file).parameter_set(), "designed by the rules of `tune`")
+        made = tune(machine_file)
+        found = SimulatedDrive(machine_file, made.parameter_set(), "designed by the rules of `tune`", made.notes)
     else:
         raise ConfigError(
             f"schema is {schema!r}, expected {DESIGN_SCHEMA!r} or {MACHINE_SCHEMA!r}",
@@ -79,8 +83,8 @@ def find_drive(source: str, params: Path | None = None) -> SimulatedDrive:
         )
     if params is None:
         return found
-    return SimulatedDrive(
-        found.machine, found.params.merged(read_parameter_set(params)), f"{found.origin}, {params.name}"
+    return replace(
+        found, params=found.params.merged(read_parameter_set(params)), origin=f"{found.origin}, {params.name}"
     )
 
 
@@ -140,8 +144,6 @@ def run_scenario(
     ConfigError
         What cannot be simulated together.
     """
-    from dataclasses import replace
-
     if duration_s is not None:
         scenario = replace(scenario, duration_s=duration_s)
     if simulation:

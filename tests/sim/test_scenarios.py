@@ -10,7 +10,6 @@ import pytest
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, TRUE_SIGNALS, drive_values, image_of, simulate
@@ -44,10 +43,10 @@ def drive():
 def test_every_scenario_runs_on_every_profile(profile, name):
     drive = find_drive(profile)
     trace = run_scenario(drive, find_scenario(name, drive))
-    if name == "field-weakening-sweep":  # beyond base speed without field weakening: the drive may trip, and says so
-        assert set(trace["trip"]) <= {0.0, float(0x2310)}
-    else:
-        assert not trace["trip"].any()
+    assert not trace["trip"].any()
+    if name == "field-weakening-sweep":  # the field is weakened to the end, and there is torque left there
+        assert trace["i_d_true_a"][-1] < trace["i_d_true_a"].min() + 0.1 * np.ptp(trace["i_d_true_a"])
+        assert trace["torque_true_nm"][-1] > 0.5 * trace["torque_true_nm"].max()
     assert trace.meta["event_overruns"] == 0
     assert all(np.all(np.isfinite(trace[signal])) for signal in trace.signals)
     current = np.hypot(trace["i_d_true_a"], trace["i_q_true_a"])
@@ -348,35 +347,3 @@ def test_built_in_needs_no_rated_values():
     scenario = built_in("field-weakening-sweep", bare, values)
     speeds = [n for _, n in scenario.schedule["driven_rpm"]]
     assert speeds[0] < speeds[-1]
-
-
-NOT_IN_THE_SETUP = {"compensation", "recorded_voltage", "serial"}
-"""Keys that reach the drive's parameters or its identity instead."""
-SAMPLES: dict[str, object] = {
-    "inverter_model": "switched", "deadtime_shape": "sign", "rotor": "locked", "phase_open": "c", "adc_bits": 14,
-    "drive_fault": "encoder_stuck", "encoder_reversed": True, "thermal_on": False, "pole_pairs": 5,
-    "encoder_bits": 15, "cogging_periods": 6, "seed": 99, "leg_mismatch_s": 1e-7, "sampling_shift_s": 2e-6,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "key", [key for key in SIMULATION_KEYS if key.name not in NOT_IN_THE_SETUP], ids=lambda k: k.name
-)
-def test_every_simulation_key_reaches_the_kernel(key):
-    """A key that is read and does nothing would be a lie; effects that come in pairs are switched on together."""
-    companions: dict[str, object] = {
-        "U_dc_ripple_hz": {"U_dc_ripple_v": 5.0},
-        "eddy_time_s": {"eddy_share": 0.1},
-        "coupling_stiffness_nm_per_rad": {},
-        "J_load_kgm2": {"coupling_stiffness_nm_per_rad": 500.0},
-        "driven_rpm": {"rotor": "driven"},
-    }
-    base = with_simulation(machine("interior-2k2"), companions.get(key.name, {}))  # type: ignore[arg-type]
-    before = base.simulation_settings().get(key.name)
-    value = SAMPLES.get(key.name)
-    if value is None:
-        old = float(before or 0.0)
-        value = min(max(old * 1.07 + (0.01 if old == 0.0 else 0.0), key.minimum), key.maximum)
-        value = key.maximum / 2.0 if value == old else value
-    changed = with_simulation(base, {key.name: value})
-    assert bytes(build_setup(base)[0]) != bytes(build_setup(changed)[0])

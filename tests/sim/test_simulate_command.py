@@ -11,6 +11,7 @@ import pytest
 
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.report.plots import POINTS_MAX, Panel, svg_text, thinned, trace_figure
+from pmsmtool.resources import data_folder
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 
@@ -70,7 +71,7 @@ def test_duration_and_scenario_file(tmp_path):
         (("--scenario", "q-step"), "nothing to write"),
         (("-o", "t.npz"), "which --scenario"),
         (("--scenario", "q-step", "-o", "t.xlsx"), "no trace format"),
-        (("--scenario", "q-step", "--plot", "t.gif"), "figure format"),
+        (("--scenario", "q-step", "-o", "t.npz", "--plot", "t.gif"), "figure format"),
         (("--scenario", "no-step", "-o", "t.npz"), "did you mean"),
         (("--scenario", "q-step", "--json", "--set", "seed"), "not KEY=VALUE"),
         (("--scenario", "q-step", "--json", "--set", "adc_bits=many"), "adc_bits"),
@@ -85,6 +86,23 @@ def test_bad_use_is_exit_2_with_one_clear_message(arguments, said, tmp_path, mon
     assert said in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_what_the_design_has_to_say_is_said(tmp_path):
+    machine = (data_folder("profiles") / "interior-2k2.toml").read_text(encoding="utf-8")
+    kept = [line for line in machine.splitlines() if not line.startswith("J_kgm2")]
+    (tmp_path / "machine.toml").write_text("\n".join(kept), encoding="utf-8")
+    done = pmsmtool(
+        "simulate", str(tmp_path / "machine.toml"), "--scenario", "q-step", "--json", "--set", "J_kgm2=0.01"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "speed control is off" in done.stderr
+
+
+def test_design_is_needed():
+    done = pmsmtool("simulate", "--scenario", "q-step", "--json")
+    assert done.returncode == 2
+    assert "missing argument DESIGN" in done.stderr
 
 
 def test_unknown_design_is_exit_2():
@@ -106,7 +124,7 @@ def test_trip_is_a_warning_with_its_time(tmp_path):
 
 
 def test_list_names_the_scenarios():
-    done = pmsmtool("simulate", "interior-2k2", "--list")
+    done = pmsmtool("simulate", "--list")
     assert done.returncode == 0
     assert "load-step" in done.stdout
 
