@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Flux = Callable[[Array, Array], tuple[Array, Array]]
 
-COLUMNS, ROWS = 241, 161
+COLUMNS, ROWS = 121, 97
 """Points of a search along i_d, and along i_q for each of them."""
 
 SHRINK = 0.06
 """Width of the next search around the best column, relative to this one."""
 
-ROUNDS = 11
-"""0.06^11 = 4e-14 of the first width."""
+ROUNDS = 9
+"""0.06^9 = 1e-11 of the first width."""
 
-BISECTIONS = 60
+BISECTIONS = 46
 
 
 @dataclass(frozen=True, slots=True)

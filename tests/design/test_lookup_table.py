@@ -214,7 +214,7 @@ def test_every_kind_of_cell_against_brute_force(name: str) -> None:
     bench = BENCHES[name]()
     machine = bench.machine
     T_top = float(torque_limits(machine, [0.0], [1e6], bench.I_max, bench.i_d_min).largest_nm[0, 0])
-    torque = T_top * np.array([-1.1, -0.7, -0.2, 0.0, 0.15, 0.5, 0.85, 1.2])
+    torque = T_top * np.array([-1.1, -0.6, -0.2, 0.0, 0.5, 0.9, 1.2])
     table = speed_table(
         machine, torque_nm=torque, speed_rpm=bench.rpm, V_max_v=[bench.V], I_max_apk=bench.I_max,
         i_d_min_a=bench.i_d_min,
