@@ -62,6 +62,18 @@ ARRIVAL_LIMIT_S = 1.0
 """A small current that has not come by then never comes: a phase is open, and the controller only winds up."""
 
 
+def calm_sequence(magnitudes: Sequence[float]) -> tuple[float, ...]:
+    """Return an order of levels (A) for a free rotor: plus, minus twice as long, plus, each from low to high and back.
+
+    The sign changes twice instead of at every level, and at the lowest current, so that the rotor turns over softly.
+    Both signs have the same mean time, and so have low and high levels: a drift stays orthogonal to the slope.
+    """
+    up = sorted(magnitudes)
+    odd, even = up[::2], up[1::2]
+    minus = [-level for level in (*up, *reversed(up))]
+    return (*odd, *reversed(even), *minus, *even, *reversed(odd))
+
+
 def record_zero_current(drive: Drive, samples: int = NOISE_SAMPLES) -> Trace:
     """Record both axis currents of a drive that is off, in a fixed frame."""
     return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "flags"), samples))

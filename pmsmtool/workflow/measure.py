@@ -18,7 +18,7 @@ from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import check_phases
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.estimators.resistance import ResistanceResult, level_sequence
+from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import resistance_of
@@ -184,7 +184,7 @@ class Measurement:
         ratio = (1.0 / LOWEST_LEVEL) ** (1.0 / (LEVELS - 1))
         magnitudes = [largest * max(LOWEST_LEVEL, (k + 1) / LEVELS) for k in range(LEVELS)]
         magnitudes[:2] = [largest * LOWEST_LEVEL, largest * LOWEST_LEVEL * ratio]
-        plan = standstill.LevelPlan(level_sequence(sorted(set(magnitudes))))
+        plan = standstill.LevelPlan(standstill.calm_sequence(sorted(set(magnitudes))))
         self.say(f"R and inverter: {len(plan.levels_a)} levels up to {largest:.3g} A")
         trace = standstill.hold_levels(self.drive, plan)
         self.keep("levels", trace)
