@@ -29,6 +29,13 @@ if TYPE_CHECKING:
 @click.argument("machine")
 @click.option("-o", "--output", "path", type=FILE, required=True, help="Design file to write.")
 @click.option("--params", "params_path", type=FILE, help="Parameter set to write.  [default: params.toml beside it]")
+@click.option("--controller", type=click.Choice(["pi", "polar"]), default="pi", help="Field-oriented PI, or polar.")
+@click.option(
+    "--polar-law",
+    type=click.Choice(["conventional", "proposed", "linear", "linear-printed", "regularised", "unified"]),
+    default="unified",
+    help="Law of --controller polar.",
+)
 @click.option(
     "--method",
     type=click.Choice(["imc", "modulus-optimum", "second-order"]),

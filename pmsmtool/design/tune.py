@@ -14,6 +14,7 @@ from pmsmtool.design.governor import design_governor
 from pmsmtool.design.lookup_design import LookupRequest, design_table
 from pmsmtool.design.lookup_file import lut_values
 from pmsmtool.design.lookup_table import RPM
+from pmsmtool.design.polar_values import polar_values
 from pmsmtool.design.ratings import Ratings, rating_values, ratings
 from pmsmtool.design.sampled_loop import LoopMargins, margins
 from pmsmtool.design.speed_loop import (
@@ -29,6 +30,7 @@ from pmsmtool.design.speed_loop import (
 )
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
+from pmsmtool.machine.flux_map_check import check_flux_map
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import CATALOGUE
 
@@ -87,6 +89,9 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
     if weakening.values["field_weakening.mode"].value == FIELD_WEAKENING["lookup"]:
         table, tables = _design_table(source, request, rated)
         parts.append(table)
+    if request.controller == "polar":
+        found, facts, notes = polar_values(source, rated, request.polar_law)
+        parts.append(_Part(found, {}, facts, notes))
     for part in parts:
         values |= part.values
     design = Design(
@@ -95,7 +100,7 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
         values,
         {name: loop for part in parts for name, loop in part.loops.items()},
         {name: fact for part in parts for name, fact in part.facts.items()},
-        tuple(note for part in parts for note in part.notes),
+        (*_map_complaints(source), *(note for part in parts for note in part.notes)),
         tables,
     )
     violations = design.parameter_set().violations()
@@ -106,6 +111,10 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
             hint="ask for another bandwidth, or correct the machine file",
         )
     return design
+
+
+def _map_complaints(source: MachineFile) -> tuple[str, ...]:
+    return () if source.flux_map is None else check_flux_map(source.flux_map).complaints
 
 
 @dataclass(frozen=True, slots=True)

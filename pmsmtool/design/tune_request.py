@@ -7,11 +7,13 @@ from dataclasses import dataclass, fields
 
 from pmsmtool.design.current_loop import Method
 from pmsmtool.design.design_file import Scalar
+from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING_MODES
+from pmsmtool.design.governor import MODES as GOVERNOR_MODES
+from pmsmtool.design.polar_values import LAWS as POLAR_LAWS
 from pmsmtool.design.speed_loop import SpeedMethod
 from pmsmtool.errors import ConfigError
 
-GOVERNOR_MODES = ("off", "paper", "line", "best", "linearised", "observe")
-FIELD_WEAKENING_MODES = ("auto", "off", "lookup", "gradient", "accelerated", "uncompensated")
+CONTROLLERS = ("pi", "polar")
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +22,10 @@ class TuneRequest:
 
     Attributes
     ----------
+    controller : str
+        ``pi`` (field-oriented) or ``polar`` (voltage amplitude and phase as inputs).
+    polar_law : str
+        Law of ``polar`` (``polar_values.LAWS``).
     method : str
         Rule of the current gains: ``imc``, ``modulus-optimum`` or ``second-order``.
     bandwidth_hz : float or None
@@ -56,6 +62,8 @@ class TuneRequest:
         the accelerated optimisation for a constant one.
     """
 
+    controller: str = "pi"
+    polar_law: str = "unified"
     method: str = "imc"
     bandwidth_hz: float | None = None
     damping: float = 1.0
@@ -80,10 +88,12 @@ class TuneRequest:
     def __post_init__(self) -> None:
         wrong = []
         choices = {
+            "controller": CONTROLLERS,
+            "polar_law": tuple(POLAR_LAWS),
             "method": tuple(str(one) for one in Method),
             "speed_method": tuple(str(one) for one in SpeedMethod),
-            "governor": GOVERNOR_MODES,
-            "field_weakening": FIELD_WEAKENING_MODES,
+            "governor": tuple(GOVERNOR_MODES),
+            "field_weakening": ("auto", *FIELD_WEAKENING_MODES),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:

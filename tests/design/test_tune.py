@@ -221,3 +221,16 @@ def test_command_exit_codes(tmp_path: Path) -> None:
     assert run(str(tmp_path / "missing.toml"), "-o", target)[0] == 2
     assert run(source, "-o", str(tmp_path / "no" / "design.toml"))[0] == 2
     assert not Path(target).exists()
+
+
+def test_choices_of_the_command_are_those_of_the_design() -> None:
+    from pmsmtool.cli.tune import tune_command
+    from pmsmtool.design import field_weakening, governor, polar_values
+
+    choices = {p.name: tuple(p.type.choices) for p in tune_command.params if hasattr(p.type, "choices")}
+    assert choices["governor"] == tuple(governor.MODES)
+    assert choices["field_weakening"] == ("auto", *field_weakening.MODES)
+    assert choices["polar_law"] == tuple(polar_values.LAWS)
+    for name, options in choices.items():
+        for option in options:
+            assert TuneRequest(**{name: option}).table()[name] == option

@@ -1,0 +1,102 @@
+"""Parameters of control in polar coordinates (``polar.py``): which law, its speeds, and what the true loop makes of it.
+
+The times are those of Miyajima et al. 2013 and of the laws built on it, in control periods: they were found at 0.1 ms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pmsmtool.design.design_file import DesignValue, Scalar
+from pmsmtool.design.lookup_table import RPM
+from pmsmtool.design.polar import (
+    AMPLITUDE_SIGMA_RAD_S,
+    CDM_GAMMA,
+    PHASE_SIGMA_RAD_S,
+    SurfaceMachine,
+    conditioning,
+    design_at,
+)
+from pmsmtool.design.ratings import Ratings
+from pmsmtool.errors import DesignInfeasible
+from pmsmtool.machine.machine_file import MachineFile
+
+LAWS: Mapping[str, int] = {
+    "conventional": 1,
+    "proposed": 2,
+    "linear": 3,
+    "linear-printed": 4,
+    "regularised": 5,
+    "unified": 6,
+}
+"""``polar.mode`` of the catalogue."""
+
+SURFACE_ONLY = ("conventional", "proposed", "linear", "linear-printed")
+"""Laws of the paper: they hold for L_d = L_q."""
+
+TAU_PERIODS = 10.0
+"""Equivalent time constant of the coefficient diagram method, in control periods."""
+
+OMEGA_C_PER_PERIOD, OMEGA_DOB_PER_PERIOD = 0.125, 0.04
+"""Bandwidths of the unified law and of its observer times T_s: 1250 and 400 rad/s at 0.1 ms."""
+
+V_REF_RATIO = 0.97
+"""Reference amplitude of the unified law over V_max: smoother torque on speed ramps than 1."""
+
+ON_MEASUREMENT, PREDICT = 1, 4
+"""Bits of ``polar.options``."""
+
+DESIGN_SPEED_SHARE = 0.8
+"""Speed at which the placed loops are looked at, over base speed: inside the linear range, voltage well above zero."""
+
+
+def polar_values(
+    source: MachineFile, rated: Ratings, law: str
+) -> tuple[dict[str, DesignValue], dict[str, Scalar], tuple[str, ...]]:
+    """Return catalogue values, facts and notes of a polar law.
+
+    Raises
+    ------
+    DesignInfeasible
+        A law of the paper on a machine with L_d != L_q.
+    """
+    machine, T_s = source.machine, source.inverter.T_s
+    surface: SurfaceMachine | None = None
+    try:
+        surface = SurfaceMachine.of(machine)
+    except DesignInfeasible:
+        if law in SURFACE_ONLY:
+            raise
+    options = (PREDICT if source.inverter.delay_periods >= 1.0 else 0) | ON_MEASUREMENT
+    values = {
+        "polar.mode": DesignValue(LAWS[law], f"{law}, as asked for"),
+        "polar.options": DesignValue(options, "P and D on the measurement, prediction over the delay"),
+        "polar.sigma_phase_rad_s": DesignValue(PHASE_SIGMA_RAD_S, "real part of the placed poles"),
+        "polar.sigma_amplitude_rad_s": DesignValue(AMPLITUDE_SIGMA_RAD_S, "real part of the placed poles"),
+        "polar.tau_s": DesignValue(TAU_PERIODS * T_s, f"{TAU_PERIODS:g} T_s"),
+        "polar.gamma": DesignValue(CDM_GAMMA, "coefficient diagram method"),
+        "polar.omega_c_rad_s": DesignValue(OMEGA_C_PER_PERIOD / T_s, f"{OMEGA_C_PER_PERIOD:g} / T_s"),
+        "polar.omega_dob_rad_s": DesignValue(OMEGA_DOB_PER_PERIOD / T_s, f"{OMEGA_DOB_PER_PERIOD:g} / T_s"),
+        "polar.V_ref_ratio": DesignValue(V_REF_RATIO, "smoother on ramps than full voltage"),
+        # the laws weaken the field by themselves, and a governed reference is not theirs
+        "governor.mode": DesignValue(0, "off: the polar law limits the voltage itself"),
+        "field_weakening.mode": DesignValue(0, "off: the polar law weakens the field itself"),
+    }
+    if surface is None:
+        return values, {}, ("polar: L_d and L_q differ; the placed loops of the paper do not apply, the law does",)
+    return values, _facts(surface, rated, source.inverter.V_max_v), ()
+
+
+def _facts(surface: SurfaceMachine, rated: Ratings, V_max: float) -> dict[str, Scalar]:
+    """The placed loops at the design point, both together on the coupled plant."""
+    omega = DESIGN_SPEED_SHARE * rated.base_speed_rpm / RPM * surface.pole_pairs
+    if omega <= 0.0:
+        return {}
+    found = design_at(surface, omega, rated.I_nom_apk, V_max)
+    torque = 1.5 * surface.pole_pairs * surface.psi_f_wb * rated.I_nom_apk
+    return {
+        "polar_design_speed_rpm": DESIGN_SPEED_SHARE * rated.base_speed_rpm,
+        "polar_two_input_stable": found.stable,
+        "polar_slowest_pole_rad_s": found.slowest_rad_s,
+        "polar_condition": conditioning(surface, omega, torque, V_max).condition,
+    }
