@@ -60,6 +60,7 @@ def lut_command(
     from pmsmtool.design.lookup_design import LookupRequest, design_table
     from pmsmtool.design.lookup_file import table_csv, table_facts, table_npz
     from pmsmtool.design.lookup_loci import loci
+    from pmsmtool.machine.flux_map_check import check_flux_map
     from pmsmtool.machine.profile import machine_path
 
     file = Path(source) / "design.toml"
@@ -81,7 +82,7 @@ def lut_command(
         save_figure(lookup_figure(made.table, lines), plot_path)
         written.append(plot_path)
     out.result("lut", {"files": written, "notes": made.notes, **facts, **_counts(made)}, lambda: _lines(made))
-    for note in made.notes:
+    for note in (*made.notes, *(check_flux_map(machine.flux_map).complaints if machine.flux_map else ())):
         out.note(note)
     out.note(f"wrote {', '.join(map(str, written))}")
 

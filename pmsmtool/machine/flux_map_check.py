@@ -91,6 +91,11 @@ class FluxMapReport:
         """Whether every number is inside its limit."""
         return all(finding.ok for finding in self.findings)
 
+    @property
+    def complaints(self) -> tuple[str, ...]:
+        """What is outside its limit, one sentence each, for whoever goes on with the map."""
+        return tuple(f"flux map, {finding.name}: {finding.text}" for finding in self.findings if not finding.ok)
+
 
 def check_flux_map(flux_map: FluxMap) -> FluxMapReport:
     """Measure a map against what a machine can be."""
