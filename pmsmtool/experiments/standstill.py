@@ -23,8 +23,10 @@ MEANS = ("u_d_v", "i_d_a", "u_q_v", "i_q_a", "T_winding_c")
 
 REST_RAD = 5e-4
 """Motion of the shaft (mechanical) between two looks that still counts as rest."""
-TRIES = 4
+TRIES = 6
 """Windows taken at one level until the shaft did not move in one; the last stands as it is."""
+DRIFTED = 5e-4
+"""Change of the voltage between the halves of a window, relative, that asks for another window."""
 LOOK_S = 0.03
 ARRIVED = 0.03
 """Distance of the mean current vector from its set-point, relative, that counts as arrived."""
@@ -139,12 +141,16 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
             times[len(rows) :] = [elapsed]
             elapsed += 2 * half * drive.period_s
             # a rotor that creeps out of an unstable position looks at rest just before it jumps
-            if abs(second["theta_m_rad"] - first["theta_m_rad"]) < REST_RAD:
+            turned = abs(second["theta_m_rad"] - first["theta_m_rad"])
+            drifted = abs(second["u_d_v"] - first["u_d_v"])
+            moved = turned >= REST_RAD or drifted > DRIFTED * abs(first["u_d_v"])
+            if not moved:
                 break
         row = {name: 0.5 * (first[name] + second[name]) for name in MEANS}
         for name, unit in (("u_d", "v"), ("i_d", "a")):
             row[f"{name}_first_{unit}"] = first[f"{name}_{unit}"]
             row[f"{name}_second_{unit}"] = second[f"{name}_{unit}"]
+        row["moved"] = float(moved)
         row["theta_M_rad"] = second["theta_m_rad"]
         row["flagged"] = float(first["flags"] + second["flags"] > 0.0)  # a mean of flag words: any bit counts
         rows.append(row)

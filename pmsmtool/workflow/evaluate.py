@@ -21,6 +21,8 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
+MOVED_SHARE = 0.25
+"""Largest share of levels that may be left out; with more the estimator sees them, and refuses what has not settled."""
 COPPER_ALPHA_PER_K = 0.00393
 """Temperature coefficient of copper at 20 degC (IEC 60028)."""
 MOSFET_LINK_V = 100.0
@@ -137,8 +139,23 @@ def evaluate(
 def resistance_of(
     levels: Trace, noise: Noise, T_ref_c: float = 20.0, tolerance: SensorTolerance | None = None
 ) -> ResistanceResult:
-    """Return the resistance at a reference temperature."""
-    return estimate_resistance(levels, noise, tolerance=tolerance, copper=Copper(T_ref_c, COPPER_ALPHA_PER_K))
+    """Return the resistance at a reference temperature; levels at which the shaft moved are left out, and counted.
+
+    A reluctance machine has currents at which its rotor leaves the vector so slowly that it never comes to rest.
+    """
+    moved = levels.signals.get("moved", np.zeros(len(levels))) > 0.0
+    left_out = int(np.sum(moved))
+    note = ""
+    if 0 < left_out <= MOVED_SHARE * len(levels):
+        signals = {name: values[~moved] for name, values in levels.signals.items()}
+        levels = Trace(levels.t_s[~moved], signals, levels.units, levels.meta)
+        note = f"{left_out} levels left out: shaft or voltage moved during them"
+    copper = Copper(T_ref_c, COPPER_ALPHA_PER_K)
+    result = estimate_resistance(levels, noise, tolerance=tolerance, copper=copper)
+    if not note:
+        return result
+    fallback = "; ".join(part for part in (result.R_s.fallback, note) if part)
+    return replace(result, R_s=replace(result.R_s, fallback=fallback))
 
 
 def pushes_of(traces: Mapping[str, Trace]) -> list[Trace]:

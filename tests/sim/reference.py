@@ -200,7 +200,8 @@ def start_flux(scenario: Scenario) -> np.ndarray:
 
 def reference_run(scenario: Scenario, periods: int, rtol: float = 1e-12) -> np.ndarray:
     """Return i_d, i_q at the sampling instants by DOP853 and the core of the library ``pmsm_core``."""
-    core = native.load("pmsm_core")
+    # a handle of its own: the structs here are laid out by hand, and other tests declare theirs on the shared one
+    core = ctypes.CDLL(str(native.LIBRARY_FOLDER / native.library_name("pmsm_core")))
     params = Params.from_buffer_copy(pack_image(scenario.values()))
     state = (ctypes.c_double * (STATE_BYTES // 8))()
     core.pmsm_init(ctypes.byref(state))
