@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import struct
 from dataclasses import replace
@@ -29,6 +30,7 @@ from pmsmtool.design.lookup_table import RPM, LookupTable, electrical_speed, flu
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.design.ratings import ratings
 from pmsmtool.errors import ConfigError, DesignInfeasible
+from pmsmtool.firmware.core_binding import core
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.npz_file import npz_bytes, read_npz
@@ -155,6 +157,39 @@ def test_words_fit_the_image_and_hold_the_stored_numbers(stored: StoredFormat) -
         read = np.where(raw == -32768, np.nan, raw * np.float64(np.float32(values["lut.lsb_a"])))
     assert np.allclose(read, table.i_d_a.ravel(), rtol=1e-7, atol=0.0, equal_nan=True)
     assert np.isnan(read).sum() == np.isnan(table.i_d_a).sum() > 0
+
+
+@pytest.mark.parametrize("stored", ["float32", "int16"])
+def test_what_the_drive_makes_of_the_table_keeps_the_bound(stored: StoredFormat) -> None:
+    """The core itself reads the words and asks for currents; the machine says what they are worth."""
+    design = made("mtpv-test", stored=stored, torque_bound=0.02, voltage_bound=0.02)
+    table, error = design.table, design.error
+    values, _ = lut_values(table, stored)
+    given = {"field_weakening.mode": 1.0, "motor.I_max_apk": 151.0, "field_weakening.i_d_min_a": -151.0}
+    binding = core()
+    words = lut_words(table, stored)
+    params = binding.params({**default_set().values, **given, **values}, words)
+    lut = (ctypes.c_uint32 * (len(words) // 4)).from_buffer_copy(words)
+    rng = np.random.default_rng(6)
+    torque = rng.uniform(table.torque_nm[0], table.torque_nm[-1], 3000).astype(np.float32).astype(float)
+    speed = rng.uniform(0.0, table.y[-1], 3000)
+    omega = electrical_speed(table.machine, speed).astype(np.float32).astype(float)
+    asked = np.empty((3000, 2))
+    for k in range(3000):
+        state = binding.state()
+        measurement = binding.make("pmsm_measurement", omega_e=omega[k], U_dc=173.2, T_winding=20.0)
+        request = binding.make("pmsm_reference", mode=3, tau_ref=torque[k])
+        output = binding.make("pmsm_output")
+        binding.library.pmsm_step(
+            *map(ctypes.byref, (state, params)), lut, *map(ctypes.byref, (measurement, request, output))
+        )
+        asked[k] = state.live.i_d_req, state.live.i_q_req
+    bounds = torque_limits(table.machine, omega, table.V_max_v, table.I_max_apk, table.i_d_min_a)
+    wanted = np.clip(torque, bounds.least_nm[:, 0], bounds.largest_nm[:, 0])
+    reached = table.machine.torque_nm(asked[:, 0], asked[:, 1])
+    assert np.abs(reached - wanted).max() <= error.torque_nm
+    assert (table.machine.voltage_v(asked[:, 0], asked[:, 1], omega) - table.V_max_v[0]).max() <= error.voltage_v
+    assert np.abs(reached - wanted).max() > 0.3 * error.torque_nm  # the table was really asked
 
 
 def test_a_voltage_axis_is_bounded_between_its_voltages_too() -> None:
