@@ -32,7 +32,7 @@ ROTATION_SHARES = (0.35, 0.18, 0.09)
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 BIAS_SHARE = 0.5
 BIAS_TRIES = 4
-BIAS_OFF_RAD = math.radians(12.0)
+BIAS_OFF_RAD = math.radians(6.0)
 """Angle between rotor and bias vector that a load or friction may make (electrical)."""
 BIAS_MOST = 0.8
 """Largest bias, of the test current: the ripple comes on top."""
@@ -244,7 +244,7 @@ class Measurement:
             theta_M = self.drive.average(("theta_m_rad",), periods)["theta_m_rad"]
             theta_e = encoder.direction * encoder.pole_pairs.value * theta_M - encoder.offset.value
             ahead = math.remainder(theta_e - plan.angle_rad, 2.0 * math.pi)
-            if abs(ahead) <= BIAS_OFF_RAD + 2.0 * abs(encoder.lag_rad):
+            if abs(ahead) <= BIAS_OFF_RAD + abs(encoder.lag_rad):
                 return plan
             bias = 0.5 * plan.bias_d_a
             plan = replace(plan, bias_d_a=bias, ripple_a=clear_ripple(0.5 * plan.ripple_a, bias, knee_a))
