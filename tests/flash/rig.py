@@ -15,7 +15,8 @@ from pmsmtool.flash.download import Download, Outcome
 from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.plan import Plan
 from pmsmtool.flash.restore import marks_of, old_marks, plan_download, plan_restore
-from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.sim.node.memory import RamStorage
 from tests.node.bench import Bench, open_bench
 
@@ -35,6 +36,16 @@ def with_tables(nodes: int = 9, kind: int = 1) -> ParameterSet:
         "lut.i_q_a": [0.02 * k for k in range(cells)],
     }
     return ParameterSet({**SMALL.values, **descriptor}, tables)
+
+
+def with_changed_defaults() -> ParameterSet:
+    """Return a full set with tables in which every REAL32 that can move has moved."""
+    moved = {
+        row.name: row.default * 1.01
+        for row in CATALOGUE
+        if not row.is_integer and row.default and row.minimum <= row.default * 1.01 <= row.maximum
+    }
+    return default_set().merged(ParameterSet(moved)).merged(with_tables())
 
 
 @dataclass
