@@ -187,7 +187,7 @@ class _Person:
 @contextmanager
 def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
     """Write the report whatever ends the chain; a run that was declined before anything moved leaves no trace."""
-    from pmsmtool.errors import Declined, PmsmtoolError
+    from pmsmtool.errors import Declined
     from pmsmtool.workflow.commission import write_report
 
     try:
@@ -199,8 +199,8 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
         try:
             write_report(run)
             out.note(f"report: {run.path / 'report.html'}; go on with: pmsmtool commission --resume {run.path}")
-        except PmsmtoolError as second:
-            out.warn(f"the report could not be written: {second.what}")
+        except Exception as second:  # whatever it is, what ended the chain outranks it
+            out.warn(f"the report could not be written: {type(second).__name__}: {second}")
         raise
     write_report(run)
     _show(run, out)

@@ -162,7 +162,7 @@ class Commissioning:
                 else:
                     self.progress.skip(name, number, len(STAGES))
         except KeyboardInterrupt:
-            raise Interrupted("interrupted; the machine is off") from None
+            raise Interrupted("the machine is off") from None
         finally:
             self._make_sure()
 
@@ -327,7 +327,7 @@ def commission(
     try:
         chain.carry_out()
     except BaseException:
-        with contextlib.suppress(PmsmtoolError):  # what ended the chain outranks a page that cannot be written
+        with contextlib.suppress(Exception):  # what ended the chain outranks a page that cannot be written
             write_report(run)
         raise
     write_report(run)

@@ -49,7 +49,7 @@ def report_page(path: Path) -> str:
     run = RunDirectory(path)
     record = run.read()
     drawn = [
-        *_identification_figures(run),
+        *_identification_figures(run, record),
         *_design_figures(run.path / "design.toml"),
         *_margin_figures(record),
         *_table_figures(run.path / "lut.npz"),
@@ -62,13 +62,13 @@ def verdict(path: Path) -> Verdict:
     return verdict_of([asdict(stage) for stage in RunDirectory(path).read().stages])
 
 
-def _identification_figures(run: RunDirectory) -> Iterator[Figure]:
+def _identification_figures(run: RunDirectory, record: RunRecord) -> Iterator[Figure]:
     """Draw what the traces of the run say, evaluated again; of a run that was refused, what can be evaluated."""
     traces = stored_traces(run)
     if "zero_current" not in traces:
         return
     period_s = traces["zero_current"].period_s
-    found = _evaluated(traces, period_s)
+    found = _evaluated(traces, period_s, complete=record.passed("identify"))
     if found is None:
         return
     resistance, inductance, flux = found.resistance, found.inductance, found.flux
@@ -83,14 +83,19 @@ def _identification_figures(run: RunDirectory) -> Iterator[Figure]:
         yield figures.flux_figure(traces["speeds"], flux, resistance.curve, waves, R_ohm=R_ohm, period_s=period_s)
 
 
-_EXPERIMENTS = ("phase_vectors", "levels", "rotation", "square", "speeds", "push")
-"""How the names of the traces begin, in the order the experiments were made."""
+_EXPERIMENTS = (("phase_vectors",), ("levels",), ("rotation",), ("square",), ("push",), ("wave", "speeds"))
+"""How the names of their traces begin, in the order the experiments are made."""
 
 
-def _evaluated(traces: Mapping[str, Trace], period_s: float) -> Evaluation | None:
-    """Evaluate the traces, leaving out the last experiments until nothing is refused; None when all is."""
-    for count in range(len(_EXPERIMENTS), -1, -1):
-        kept = ("zero_current", "wave", *_EXPERIMENTS[:count])
+def _evaluated(traces: Mapping[str, Trace], period_s: float, *, complete: bool) -> Evaluation | None:
+    """Evaluate the traces, leaving out the last experiments until nothing is refused; None when all is.
+
+    ``complete`` says that the run was not ended in the middle of its last experiment.
+    """
+    begun = [k for k, names in enumerate(_EXPERIMENTS) if any(trace.startswith(names) for trace in traces)]
+    count = max(begun, default=-1) + (1 if complete else 0)
+    for last in range(count, -1, -1):
+        kept = ("zero_current", *(name for names in _EXPERIMENTS[:last] for name in names))
         with contextlib.suppress(IdentificationError):
             return evaluate({name: trace for name, trace in traces.items() if name.startswith(kept)}, period_s)
     return None

@@ -13,7 +13,9 @@ import pytest
 from pmsmtool.cli.main import run as program
 from pmsmtool.design.lookup_design import LookupRequest
 from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.errors import IdentificationError
 from pmsmtool.resources import data_folder
+from pmsmtool.workflow import report_page
 from pmsmtool.workflow.design_stages import lut_stage, tune_stage
 from pmsmtool.workflow.report_page import open_loops
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage, new_record
@@ -127,3 +129,46 @@ def test_values_with_a_deviation_become_the_table(made: Path, tmp_path: Path) ->
     value = {"name": "R_s_ohm", "value": 0.13712, "std": 2e-4, "systematic": 1.4e-3, "unit": "ohm", "T_c": 20.0}
     run.write(replace(run.read(), stages=(Stage("identify", "pass", 9.0, values=[value]), *run.read().stages)))
     assert "0.1371 +- 0.0015 ohm" in page_of(run.path)
+
+
+@pytest.mark.parametrize(
+    ("present", "passed", "kept"),
+    [
+        (["zero_current"], False, {"zero_current"}),
+        (["zero_current", "phase_vectors", "levels", "rotation_forward"], False, {"phase_vectors", "levels"}),
+        (
+            ["phase_vectors", "levels", "rotation_forward", "rotation_backward", "square_d_6"],
+            False,
+            {"rotation_forward"},
+        ),
+        (["phase_vectors", "levels"], True, {"phase_vectors", "levels"}),
+        (["levels", "square_d_6", "square_q_6", "push_0", "wave_0"], False, {"push_0", "square_q_6"}),
+    ],
+)
+def test_an_experiment_that_was_cut_short_is_not_evaluated(
+    present: list[str], passed: bool, kept: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[set[str]] = []
+
+    def evaluate(traces: dict[str, object], period_s: float) -> str:
+        seen.append(set(traces))
+        return "done"
+
+    monkeypatch.setattr(report_page, "evaluate", evaluate)
+    traces = {name: object() for name in present}
+    assert report_page._evaluated(traces, 1e-4, complete=passed) == "done"  # type: ignore[arg-type, comparison-overlap]
+    assert kept <= seen[0]
+    if not passed:
+        assert present[-1] not in seen[0] or present[-1] == "zero_current"
+
+
+def test_what_is_refused_is_left_out_until_something_remains(monkeypatch: pytest.MonkeyPatch) -> None:
+    def evaluate(traces: dict[str, object], period_s: float) -> set[str]:
+        if "rotation_forward" in traces:
+            raise IdentificationError("E_TRACK_LOST", "lost")
+        return set(traces)
+
+    monkeypatch.setattr(report_page, "evaluate", evaluate)
+    traces = {name: object() for name in ("zero_current", "phase_vectors", "levels", "rotation_forward", "square_d_6")}
+    found = report_page._evaluated(traces, 1e-4, complete=True)  # type: ignore[arg-type]
+    assert found == {"zero_current", "phase_vectors", "levels"}  # type: ignore[comparison-overlap]
