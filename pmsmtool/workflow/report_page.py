@@ -93,7 +93,7 @@ def _evaluated(traces: Mapping[str, Trace], period_s: float, *, complete: bool) 
     ``complete`` says that the run was not ended in the middle of its last experiment.
     """
     begun = [k for k, names in enumerate(_EXPERIMENTS) if any(trace.startswith(names) for trace in traces)]
-    count = max(begun, default=-1) + (1 if complete else 0)
+    count = max(begun, default=0) + (1 if complete else 0)
     for last in range(count, -1, -1):
         kept = ("zero_current", *(name for names in _EXPERIMENTS[:last] for name in names))
         with contextlib.suppress(IdentificationError):
