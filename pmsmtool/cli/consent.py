@@ -115,7 +115,7 @@ def _ask(
         raise Declined(
             f"nobody can be asked for consent to {_NAMES[subject]}: nothing was done",
             likely="standard input or standard error is not a terminal",
-            hint=f"--yes {' '.join(f'{name} ...' for name in missing)}".rstrip() if missing else "--yes",
+            hint="--yes" if simulated or not missing else f"--yes {' '.join(f'{name} ...' for name in missing)}",
         )
     try:
         agreed = click.confirm(question, default=False, err=True)

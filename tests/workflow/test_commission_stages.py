@@ -22,9 +22,9 @@ from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow import commission
-from pmsmtool.workflow.commission import STAGES, Commissioning, drive_facts, due_stages
+from pmsmtool.workflow.commission import STAGES, Commissioning, begin_run, due_stages
 from pmsmtool.workflow.export import image_of
-from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage, new_record
+from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
 PROFILE = "interior-2k2"
 
@@ -88,9 +88,7 @@ def drive(tmp_path: Path) -> Iterator[CanopenDrive]:
 
 def identified(folder: Path, drive: CanopenDrive) -> RunDirectory:
     """A run whose identification has passed, as if the profile's own numbers had been measured."""
-    run = RunDirectory.create(
-        folder, drive.identity.serial, new_record(["commission"], drive=drive_facts(drive.identity), bus={}, versions={})
-    )
+    run = begin_run(drive, folder)
     shutil.copy(data_folder("profiles") / f"{PROFILE}.toml", run.path / "machine.toml")
     good = [Acceptance("measured", "yes", "yes", True)]
     run.add(Stage("identify", "pass", 9.0, acceptance=good, files={"machine.toml": ""}))

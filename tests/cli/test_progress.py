@@ -1,0 +1,83 @@
+"""Progress of a chain: one line per stage for a log, a live line for a person, nothing when quiet."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from pmsmtool.cli.output import Output
+from pmsmtool.cli.progress import StageProgress
+from pmsmtool.workflow.run_directory import Stage
+
+PASSED = Stage("tune", "pass", 0.0, summary="current loops 637 Hz")
+REFUSED = Stage("identify", "refused", 12.34, note="E_SNR: too little\nlikely: noise", summary="not shown")
+
+
+class Terminal(io.StringIO):
+    """Standard error as a person sees it."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def told(out: Output) -> None:
+    progress = StageProgress(out)
+    progress.skip("identify", 1, 6)
+    progress.begin("tune", 2, 6)
+    progress.say("choosing a bandwidth")
+    progress.pause()
+    progress.resume()
+    progress.say("again")
+    progress.end(PASSED, 2, 6)
+    progress.begin("identify", 1, 6)
+    progress.end(REFUSED, 1, 6)
+
+
+LINES = [
+    "[1/6] identify  PASS  as recorded, not run again",
+    "[2/6] tune      PASS  current loops 637 Hz",
+    "[1/6] identify  REFUSED  E_SNR: too little  (12.3 s)",
+]
+
+
+def test_one_line_per_stage_where_nobody_watches(capsys: pytest.CaptureFixture[str]) -> None:
+    told(Output())
+    printed = capsys.readouterr()
+    assert printed.err.splitlines() == LINES and printed.out == ""
+
+
+def test_every_step_with_v_and_nothing_when_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+    told(Output(verbosity=1))
+    assert [line.strip() for line in capsys.readouterr().err.splitlines()] == [
+        LINES[0], "choosing a bandwidth", "again", *LINES[1:],
+    ]  # fmt: skip
+    told(Output(verbosity=-1))
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("verbosity", [0, 1])
+def test_a_live_line_on_a_terminal_that_leaves_one_line_per_stage(
+    verbosity: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    told(Output(verbosity=verbosity))
+    shown = terminal.getvalue()
+    assert "choosing a bandwidth" in shown and "\x1b[2K" in shown, "the live line is drawn and erased"
+    for line in LINES:
+        assert line in shown
+    assert capsys.readouterr().out == ""
+
+
+def test_text_of_a_drive_is_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    progress = StageProgress(Output(verbosity=1))
+    progress.begin("flash", 5, 6)
+    progress.say("journal: [/tmp/x] [bold]y[/bold]")
+    progress.pause()
+    assert "[bold]y[/bold]" in terminal.getvalue()
