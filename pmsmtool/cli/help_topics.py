@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,6 +12,9 @@ from pmsmtool.cli.failure import READER_GONE
 from pmsmtool.cli.options import examples
 from pmsmtool.cli.output import table
 from pmsmtool.errors import ExitCode
+
+if TYPE_CHECKING:
+    from pmsmtool.machine.key import Key
 
 EXIT_CODES: dict[ExitCode, str] = {
     ExitCode.OK: "done, and good",
@@ -43,11 +47,13 @@ the hardware stop. Ctrl-C, SIGTERM and a closed terminal take that way too; a se
 A software stop is no safety function. Keep a hardware stop within reach."""
 
 FILES = """\
-machine file     profiles/*.toml, machine.toml  the machine and its inverter, SI with the unit in the key (R_s_ohm)
+machine file     profiles/*.toml, machine.toml  the machine and its inverter, SI with the unit in the key (R_s_ohm);
+                                                its keys: help machine-file, help simulation
 flux map         .npz .mat .csv                 grids of i_d, i_q (A peak) and psi_d, psi_q (Wb)
 design file      design.toml                    gains and limits with their margins; the machine is embedded
 parameter set    params.toml                    catalogue name and SI value; what is written to a drive
 look-up table    .npz .csv                      i_d, i_q over torque and speed; which limit binds, and by how much
+scenario         .toml                          what happens in a simulation (help scenario)
 trace            .npz .csv                      named signals over t_s; the second CSV row holds the units
 run directory    runs/<utc>-<serial>/           run.json, traces/, and the files above, as a commissioning leaves them
 drive memory     .pmsmsim/<profile>.nv          non-volatile memory of a simulated drive
@@ -101,6 +107,72 @@ def _refusals() -> str:
     return "\n".join(parts)
 
 
+def _default(key: Key) -> str:
+    if key.required:
+        return "required"
+    if key.falls_back:
+        return key.falls_back
+    if key.kind == "bool":
+        return str(key.default).lower()
+    return "" if key.default in (None, ()) else f"{key.default:.6g}" if key.kind == "float" else str(key.default)
+
+
+def _keys(keys: Iterable[Key]) -> list[str]:
+    rows = []
+    for key in keys:
+        rows.append((key.name, "" if key.unit == "1" else key.unit, _default(key), key.meaning))
+        if key.choices:
+            rows.append(("", "", "", f"  one of {', '.join(key.choices)}"))
+    return table(("key", "unit", "default", "meaning"), rows)
+
+
+def _machine_file() -> str:
+    from pmsmtool.machine.machine_keys import ENCODER_KEYS, ESTIMATE_KEYS, INVERTER_KEYS, LIMIT_KEYS, MACHINE_KEYS
+
+    parts = ['A machine file starts with schema = "pmsmtool.machine/1" and name = "..."; then come these tables.', ""]
+    for name, keys in (
+        ("machine", MACHINE_KEYS), ("inverter", INVERTER_KEYS), ("encoder", ENCODER_KEYS), ("limits", LIMIT_KEYS),
+        ("estimate.<key>", ESTIMATE_KEYS),
+    ):  # fmt: skip
+        parts += [f"[{name}]", *_keys(keys), ""]
+    parts += [
+        "[std], [systematic]: numeric keys of machine, inverter and encoder with one standard deviation, and with the",
+        "half width of the 95 % systematic part, in the key's own unit.",
+        "[conditions], [provenance]: free keys. [simulation]: help simulation. `pmsmtool machine new` writes a file.",
+    ]
+    return "\n".join(parts)
+
+
+def _simulation() -> str:
+    from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
+    from pmsmtool.sim.simulated_machine import DRIVE_FAULTS
+
+    return "\n".join(
+        [
+            "[simulation] of a machine file is what only the simulated drive knows; design commands look away.",
+            "Each key is a switch: `simulate --set KEY=VALUE` changes it for one run.",
+            "",
+            *_keys(SIMULATION_KEYS),
+            "",
+            *table(("drive_fault", "meaning"), DRIVE_FAULTS.items()),
+        ]
+    )
+
+
+def _scenario() -> str:
+    from pmsmtool.sim.scenarios import BUILT_IN, FILE_EXAMPLE, MODES, SCHEDULES
+
+    return "\n".join(
+        [
+            f"Built in: {', '.join(BUILT_IN)} (`pmsmtool simulate --list`). A scenario file:",
+            "",
+            FILE_EXAMPLE,
+            f"mode: {', '.join(MODES)}",
+            f"names of [schedule]: {', '.join(SCHEDULES)}",
+        ]
+    )
+
+
 def _environment() -> str:
     from pmsmtool.resources import user_folder
 
@@ -112,6 +184,9 @@ TOPICS: dict[str, tuple[str, Callable[[], str]]] = {
     "exit-codes": ("what a script can rely on", _exit_codes),
     "safety": ("consents, stops, and what --yes may answer", lambda: SAFETY),
     "files": ("the files that are read and written", lambda: FILES),
+    "machine-file": ("keys of a machine file", _machine_file),
+    "simulation": ("keys of [simulation]: what the simulated drive is like", _simulation),
+    "scenario": ("what can happen in a simulation", _scenario),
     "environment": ("environment variables and their order", _environment),
     "refusals": ("named reasons to give no number", _refusals),
 }
@@ -125,7 +200,8 @@ def help_command(ctx: click.Context, topic: tuple[str, ...]) -> None:
     """Explain a TOPIC, or a command; without one, list the topics."""
     if not topic:
         lines = [f"{name:<12}  {line}" for name, (line, _) in TOPICS.items()]
-        click.echo("\n".join([*lines, "", "or a command: " + " ".join(row.name for row in COMMANDS)]))
+        commands = click.wrap_text(" ".join(row.name for row in COMMANDS), 100, "or a command: ", " " * 14)
+        click.echo("\n".join([*lines, "", commands]))
         return
     if len(topic) == 1 and topic[0] in TOPICS:
         click.echo(TOPICS[topic[0]][1]())

@@ -1,22 +1,4 @@
-"""What happens in a simulation: built-in scenarios and TOML scenario files.
-
-A scenario file::
-
-    schema = "pmsmtool.scenario/1"
-    name = "reversal"
-    duration_s = 0.4
-    mode = "speed"            # current, torque, speed, voltage
-    rotor = "free"            # free, locked, driven; default: as the machine file says
-    start_rpm = 0.0
-    decimation = 1            # control periods per row of the trace
-
-    [schedule]                # nodes [time in s, value], straight lines between them, two nodes at one time are a step
-    speed_rpm = [[0.0, 0.0], [0.05, 1000.0], [0.2, 1000.0], [0.2, -1000.0]]
-    load_nm = [[0.0, 0.0]]
-
-    [simulation]              # other values of the machine file's [simulation], for this scenario only
-    sensor_noise_apk = 0.0
-"""
+"""What happens in a simulation: built-in scenarios and TOML scenario files (:data:`FILE_EXAMPLE`)."""
 
 from __future__ import annotations
 
@@ -35,6 +17,24 @@ from pmsmtool.sim.kernel import Target
 from pmsmtool.sim.simulated_machine import ROTORS, RPM
 
 SCHEMA = "pmsmtool.scenario/1"
+
+FILE_EXAMPLE = """\
+schema = "pmsmtool.scenario/1"
+name = "reversal"
+duration_s = 0.4
+mode = "speed"            # current, torque, speed, voltage
+rotor = "free"            # free, locked, driven; default: as the machine file says
+start_rpm = 0.0
+decimation = 1            # control periods per row of the trace
+
+[schedule]                # nodes [time in s, value], straight lines between them, two nodes at one time are a step
+speed_rpm = [[0.0, 0.0], [0.05, 1000.0], [0.2, 1000.0], [0.2, -1000.0]]
+load_nm = 0.5             # a number is a constant
+
+[simulation]              # other values of the machine file's [simulation], for this scenario only
+sensor_noise_apk = 0.0
+"""
+"""A scenario file with every key; what ``pmsmtool help scenario`` shows."""
 
 Profile = Sequence[tuple[float, float]]
 """Nodes (time in s, value), times not decreasing."""

@@ -34,6 +34,8 @@ from pmsmtool.errors import (
     StopNotConfirmed,
     VerifyMismatch,
 )
+from pmsmtool.machine.machine_keys import machine_file_keys
+from pmsmtool.sim.scenarios import BUILT_IN, SCHEDULES
 
 ROOT = Path(__file__).resolve().parents[2]
 SLOW = ("numpy", "scipy", "can", "canopen", "matplotlib", "rich", "jinja2", "tomlkit", "filterpy")
@@ -343,6 +345,13 @@ def test_help_topic(topic: str) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert len(done.stdout.splitlines()) > 5
     assert max(map(len, done.stdout.splitlines())) <= 130
+
+
+def test_help_names_every_key_of_a_machine_file_and_of_a_scenario() -> None:
+    text = TOPICS["machine-file"][1]() + TOPICS["simulation"][1]()
+    words = set(text.split())
+    assert {key.name for key in machine_file_keys()} <= words
+    assert set(SCHEDULES) | set(BUILT_IN) <= set(re.split(r"[\s,]+", TOPICS["scenario"][1]()))
 
 
 def test_help_names_every_variable_of_the_global_options() -> None:

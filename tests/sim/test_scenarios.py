@@ -15,7 +15,7 @@ from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, TRUE_SIGNALS, drive_values, image_of, simulate
 from pmsmtool.sim.kernel import Seen
 from pmsmtool.sim.node.drive_core import Signal
-from pmsmtool.sim.scenarios import BUILT_IN, Scenario, built_in, load_scenario
+from pmsmtool.sim.scenarios import BUILT_IN, FILE_EXAMPLE, Scenario, built_in, load_scenario
 from pmsmtool.sim.simulated_machine import (
     DRIVE_FAULTS,
     WRONG_COMPENSATION,
@@ -127,6 +127,13 @@ U_dc_v = [[0.0, 540], [0.03, 500]]
 [simulation]
 sensor_noise_apk = 0
 """
+
+
+def test_the_example_of_the_help_runs(tmp_path, drive):
+    trace = run_scenario(drive, load_scenario(write(tmp_path, FILE_EXAMPLE)))
+    assert trace.t_s[-1] == pytest.approx(0.4, abs=1e-3)
+    assert not trace["trip"].any()
+    assert trace["omega_m_rad_s"].max() > 50.0
 
 
 def test_file_says_what_happens(tmp_path, drive):
