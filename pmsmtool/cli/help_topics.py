@@ -111,7 +111,7 @@ def _default(key: Key) -> str:
     if key.required:
         return "required"
     if key.falls_back:
-        return key.falls_back
+        return f"as {key.falls_back.split()[0]}"
     if key.kind == "bool":
         return str(key.default).lower()
     return "" if key.default in (None, ()) else f"{key.default:.6g}" if key.kind == "float" else str(key.default)
