@@ -10,7 +10,6 @@ from typing import Any
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.flux_map import FluxMap, require_monotonic
-from pmsmtool.machine.flux_map_import import load_flux_map
 from pmsmtool.machine.flux_map_table import flux_map_from_table
 from pmsmtool.machine.key import Key, check_table, did_you_mean
 from pmsmtool.machine.machine_keys import (
@@ -179,6 +178,8 @@ class MachineReader:
 
 
 def _map_file(file: str, folder: Path | None) -> FluxMap:
+    from pmsmtool.machine.flux_map_import import load_flux_map  # start-up: most machine files name no map
+
     if folder is None:
         raise ConfigError("names a file, but these tables have no folder; embed the map")
     return load_flux_map(folder / file)
