@@ -36,6 +36,8 @@ MEASURED_MAP = Path(__file__).parents[2].parent / "shared" / "maps" / "baldor_40
 TOLERANCE = 0.01
 """Largest deviation of an identified value from the truth with ideal sensor gains; measured 0.2 % (benchmarks/
 commissioning.py)."""
+BUSY_RETRIES = 2
+"""The served drive runs in real time; a machine that is busy with other things may starve it."""
 QUANTITIES = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
 Result = tuple[int, str, str]
 Tool = Callable[..., Result]
@@ -169,6 +171,12 @@ def test_through_another_process_with_the_limits_a_real_drive_needs(
         assert not list(Path("runs").iterdir())
         limits = ("--i-max", "7.3Apk", "--speed-max", "3000rpm", "--shaft", "free", "--serial", "22001")
         code, out, err = tool("commission", "--yes", *limits)
+        for _ in range(BUSY_RETRIES):
+            if code != 3:
+                break
+            # This machine was too busy for a heartbeat of 0.2 s: the drive was stopped, the run goes on.
+            assert "heartbeat" in err, err
+            code, out, err = tool("commission", "--yes", *limits, "--resume", str(the_run()[0].path))
         assert code == 0, err
         directory, _ = the_run()
         assert_identified(drive, directory.path)
