@@ -267,6 +267,28 @@ def test_every_frame_doubled(bus: ScriptedBus, channel: SdoChannel, slave: Scrip
     assert channel.discarded > 0
 
 
+@pytest.mark.parametrize("with_crc", [True, False])
+def test_corrupted_segment_of_a_block_is_caught_by_the_crc(
+    channel: SdoChannel, bus: ScriptedBus, slave: ScriptedSlave, with_crc: bool
+) -> None:
+    slave.crc = with_crc
+    deliver, spoilt = bus.deliver, [1]
+
+    def spoil(cob_id: int, data: bytes) -> None:
+        if data[0] == 5 and spoilt[0]:
+            spoilt[0] -= 1
+            data = data[:3] + bytes((data[3] ^ 0x10,)) + data[4:]
+        deliver(cob_id, data)
+
+    bus.deliver = spoil  # type: ignore[method-assign]
+    result = channel.upload(*TABLE, size=2048)
+    if with_crc:
+        assert result.data == slave.objects[TABLE] and result.tries == 2 and "CRC" in result.notes[0]
+        assert any(data[:4] == b"\x80\x42\x20\x00" and data[4:] == b"\x04\x00\x04\x05" for _, data in bus.sent)
+    else:
+        assert result.data != slave.objects[TABLE], "without a CRC nobody can know; the read-back of a download does"
+
+
 def test_slow_object_gets_its_own_time(channel: SdoChannel, slave: ScriptedSlave) -> None:
     slave.delay = lambda data: 2.0
     channel.slow_objects[0x1010, 1] = 5.0

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 
 from pmsmtool.cli.main import run
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.firmware.drive_map import dump_drive_map, reference_map
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -226,6 +228,13 @@ def test_nobody_to_ask_writes_nothing(tool: Tool, wanted: str, tmp_path: Path) -
     assert code == 7 and "nothing was done" in err and "motor.R_s_ohm" in err
     assert not (tmp_path / "home").exists(), "not even a journal"
     assert tool("verify", wanted)[0] == 1
+
+
+def test_map_of_another_drive_is_refused_before_writing(tool: Tool, wanted: str, tmp_path: Path) -> None:
+    other = replace(reference_map(), name="other", vendor=0x1234)
+    (tmp_path / "other.toml").write_text(dump_drive_map(other))
+    code, _, err = tool("flash-params", wanted, "--map", "other.toml", "--yes")
+    assert code == 2 and "0x00001234" in err and "0x706d736d" in err and "nothing was written" in err
 
 
 def test_faults_on_purpose_leave_the_old_set(tool: Tool, wanted: str, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -240,6 +241,26 @@ def test_silent_rounding_is_caught(tmp_path: Path) -> None:
     with pytest.raises(VerifyMismatch, match="motor.L_d_h"):
         rig.download(SMALL)
     assert rig.image() == before
+
+
+def test_value_that_changes_over_the_reset_is_named_and_taken_back(rig: Rig) -> None:
+    before = rig.image()
+    session = rig.bench.node.session
+    assert session is not None
+    write = session.store.write
+
+    def write_something_else(content: dict[int, bytes], done: Callable[[], None]) -> None:
+        image = bytearray(content[0x2001 << 8])
+        image[8:12] = b"\x0a\xd7\x23\x3c"  # L_d_h becomes 0.01
+        write({**content, 0x2001 << 8: bytes(image)}, done)
+
+    session.store.write = write_something_else  # type: ignore[method-assign]
+    with pytest.raises(VerifyMismatch, match="after the reset") as caught:
+        rig.download(SMALL)
+    assert any(line.startswith("motor.L_d_h") for line in caught.value.differences)
+    assert "old set again" in str(caught.value) and rig.image() == before
+    image_crc, active, stored = rig.crcs()
+    assert image_crc == active == stored
 
 
 def test_ctrl_c_rolls_back_and_exits_130(rig: Rig) -> None:
