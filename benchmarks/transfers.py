@@ -74,12 +74,12 @@ class Rig:
 
 
 @contextmanager
-def rig(loss: float = 0.0, seed: int = 1) -> Iterator[Rig]:
-    """Yield a drive whose channel loses frames."""
+def rig(loss: float = 0.0, seed: int = 1, bitrate: int | None = None) -> Iterator[Rig]:
+    """Yield a drive whose channel loses frames, on a bus paced by a bit rate when one is given."""
     with tempfile.TemporaryDirectory() as folder:
         faults = Path(folder) / "faults.toml"
         faults.write_text(FAULTS.format(loss), encoding="utf-8")
-        line = build_line(Channel(nv=":memory:", seed=seed, faults=faults))
+        line = build_line(Channel(nv=":memory:", seed=seed, faults=faults, bitrate=bitrate))
     memory = bytearray()
     session = line.nodes[0].session
     if session is None:
