@@ -23,7 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
@@ -76,10 +76,11 @@ class Rig:
 @contextmanager
 def rig(loss: float = 0.0, seed: int = 1, bitrate: int | None = None) -> Iterator[Rig]:
     """Yield a drive whose channel loses frames, on a bus paced by a bit rate when one is given."""
+    channel = Channel(nv=":memory:", seed=seed, bitrate=bitrate)
     with tempfile.TemporaryDirectory() as folder:
         faults = Path(folder) / "faults.toml"
         faults.write_text(FAULTS.format(loss), encoding="utf-8")
-        line = build_line(Channel(nv=":memory:", seed=seed, faults=faults, bitrate=bitrate))
+        line = build_line(replace(channel, faults=faults) if loss else channel)
     memory = bytearray()
     session = line.nodes[0].session
     if session is None:
