@@ -142,20 +142,31 @@ def test_from_unknown_machine_to_verified_parameters(name: str, model: str, tool
 
 
 def test_a_failed_criterion_ends_the_chain_and_resume_goes_on_there(tool: Tool) -> None:
-    bus = ("-i", "pmsmsim", "-c", "interior-2k2?nv=drive.nv")
+    bus = ("-i", "pmsmsim", "-c", "interior-2k2?nv=drive.nv", "--yes")
     before = backup("interior-2k2?nv=drive.nv")
-    code, out, err = tool("commission", *bus, "--yes", "--gain-margin-db", "12", "--bandwidth-hz", "900")
+    directory = identified(Path("run"))
+    measured = (directory.path / "machine.toml").read_bytes()
+    code, out, err = tool("commission", *bus, "--resume", "run", "--gain-margin-db", "12", "--bandwidth-hz", "900")
     assert code == 1 and out == "" and "asked for: 45 degree, 12 dB" in err
-    directory, record = the_run()
-    assert [(stage.name, stage.status) for stage in record.stages] == [("identify", "pass"), ("tune", "fail")]
+    assert [(stage.name, stage.status) for stage in directory.read().stages] == [("identify", "pass"), ("tune", "fail")]
     assert ">FAIL</strong>" in (directory.path / "report.html").read_text()
     assert backup("interior-2k2?nv=drive.nv") == before
-    measured = (directory.path / "machine.toml").read_bytes()
-    code, out, err = tool("commission", "--resume", str(directory.path), "--yes")
+    code, out, err = tool("commission", *bus, "--resume", "run")
     assert code == 0, err
     assert "identify  PASS  as recorded, not run again" in err and out.startswith("PASS: 6 stages")
     assert (directory.path / "machine.toml").read_bytes() == measured
-    assert tool("verify", *bus, str(directory.path))[0] == 0
+    assert tool("verify", *bus[:-1], "run")[0] == 0
+
+
+def test_a_run_remembers_its_bus(tool: Tool) -> None:
+    directory = identified(Path("run"))
+    record = directory.read()
+    bus = {"interface": "pmsmsim", "channel": "interior-2k2?nv=drive.nv", "bitrate": None, "node": 1}
+    directory.write(replace(record, bus=bus))
+    code, out, err = tool("commission", "--resume", "run", "--yes")
+    assert code == 0, err
+    assert out.startswith("PASS: 6 stages")
+    assert tool("commission", "--resume", "run")[0] == 0, "nothing is left to do, so nobody is asked"
 
 
 def test_through_another_process_with_the_limits_a_real_drive_needs(
