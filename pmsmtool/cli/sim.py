@@ -18,9 +18,25 @@ _NODE_ID = WholeNumber("node", 1, 255)
 _COUNT = WholeNumber("count", 1, 127)
 
 
-@click.group("sim")
+_HELP = """Serve simulated drives to other programs; list the profiles; show faults.
+
+A simulated drive in this process needs no server: -i pmsmsim -c CHANNEL, or --sim CHANNEL, with a CHANNEL of
+NAME[?key=value&...], NAME a profile or a machine file:
+
+\b
+seed=N       seed of noise and faults
+nv=FILE      non-volatile memory; :memory: forgets; default .pmsmsim/NAME.nv
+faults=FILE  faults on purpose; `pmsmtool sim faults` prints an example
+bitrate=B    bit-exact frame times; default: nominal times at 1 Mbit/s
+node=ID      node id of the first drive; 255: unconfigured (LSS)
+nodes=N      number of drives on the line
+speed=X      idle time passes X times as fast as the wall clock; default: at once
+"""
+
+
+@click.group("sim", help=_HELP)
 def sim_command() -> None:
-    """Serve simulated drives to other programs; list the profiles."""
+    """Group of the commands below."""
 
 
 @sim_command.command(
@@ -40,7 +56,7 @@ def sim_command() -> None:
 @click.option("--nodes", type=_COUNT, metavar="N", help="Number of drives on the bus.")
 @click.option("--seed", type=_SEED, help="Seed of noise and faults.")
 @click.option("--nv", metavar="FILE", help="File of the non-volatile memory, or :memory:.")
-@click.option("--faults", type=FILE, help="File of faults on purpose.")
+@click.option("--faults", type=FILE, help="File of faults on purpose; `sim faults` prints an example.")
 @output_options
 def serve_command(out: Output, profile: str | None, host: str, port: int, speed: float, **given: Any) -> None:
     """Serve simulated drives on a socketcand server until Ctrl-C.
@@ -87,6 +103,16 @@ def _serve(server: SocketcandServer) -> None:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+@sim_command.command(
+    "faults", epilog=examples("pmsmtool sim faults > faults.toml", "pmsmtool sim serve --faults faults.toml")
+)
+def faults_command() -> None:
+    """Print an example of a faults file: every fault there is, with its keys."""
+    from pmsmtool.sim.faults import EXAMPLE
+
+    click.echo(EXAMPLE, nl=False)
 
 
 @sim_command.command("list", epilog=examples("pmsmtool sim list", "pmsmtool sim list --json | jq '.profiles[].name'"))

@@ -1,45 +1,7 @@
 """Faults on purpose: what a simulated bus and drive do wrong, from a TOML file, the same for the same seed.
 
-::
-
-    [[frame]]                  # rules for frames, tried in order; the first that strikes acts
-    action = "drop"            # drop | delay | duplicate | reorder | corrupt
-    probability = 0.001        # per matching frame; default 1
-    direction = "both"         # to-drive | from-drive | both
-    ids = ["0x581", "0x601-0x67F"]   # identifiers; default all
-    after = 100                # the first 100 matching frames pass untouched
-    count = 3                  # strikes at most three times
-    delay_s = 0.45             # delay: how late; reorder: the longest it waits for the next frame
-
-    [[drive]]                  # something happens to a drive
-    action = "power-cut"       # reset | unplug | power-cut
-    node = 1                   # node id; default: the first drive
-    at_frame = 120             # when that many frames have passed on the line, or
-    at_s = 1.5                 # at an instant of the bus clock, or
-    at_store_step = 3          # after that many write steps of its non-volatile memory
-    back_after_s = 0.5         # plugged in or powered again; default never
-
-    [[adapter]]                # the program's adapter is pulled: sending raises, nothing is received
-    at_frame = 200             # or at_s
-    recv_raises = false        # some adapters raise in recv too
-
-    [[refuse]]                 # writes that the drive refuses
-    object = "0x2010:02"
-    code = "0x06090030"
-    count = 1                  # default: always
-
-    [[lie]]                    # uploads whose announced size is wrong
-    object = "0x2062:00"
-    announce = 16              # bytes announced beyond those sent
-    cut = 0                    # bytes left out at the end
-
-    [[absent]]                 # an object this firmware does not have
-    object = "0x1016"          # all of an index, or one sub-object: "0x6007:00"
-
-    [store]
-    factor = 20.0              # a store takes that many times as long
-
-A frame is corrupted behind the CAN controller (a gateway, a driver): one bit of its data flips, no error is seen.
+:data:`EXAMPLE` shows every table and key. A frame is corrupted behind the CAN controller (a gateway, a driver): one bit
+of its data flips, no error is seen.
 """
 
 from __future__ import annotations
@@ -51,6 +13,58 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError
+
+EXAMPLE = """\
+# Faults on purpose, for pmsmtool sim serve --faults FILE, or -i pmsmsim -c 'NAME?faults=FILE'.
+# The same seed gives the same faults. Delete what you do not want; every table may appear several times.
+
+[[frame]]                           # rules for frames, tried in order; the first that strikes acts
+action = "drop"                     # drop | delay | duplicate | reorder | corrupt (one bit of the data flips)
+probability = 0.001                 # per matching frame; default 1
+direction = "both"                  # to-drive | from-drive | both
+ids = ["0x581", "0x601-0x67F"]      # identifiers; default all
+after = 100                         # the first 100 matching frames pass untouched
+count = 3                           # strikes at most three times
+
+[[frame]]
+action = "delay"
+delay_s = 0.45                      # delay: how late; reorder: the longest it waits for the next frame
+ids = "0x581"
+probability = 0.01
+
+[[drive]]                           # something happens to a drive
+action = "reset"                    # reset | unplug | power-cut
+node = 1                            # node id; default: the first drive
+at_frame = 5000                     # when that many frames have passed on the line; or:
+# at_s = 1.5                        # at this time of the bus; or:
+# at_store_step = 3                 # after that many write steps of its non-volatile memory
+
+[[drive]]
+action = "power-cut"
+at_s = 600.0
+back_after_s = 0.5                  # powered, or plugged in, again; default never
+
+[[adapter]]                         # the program's adapter is pulled: sending fails, nothing is received
+at_s = 900.0                        # or at_frame
+recv_raises = false                 # some adapters raise in recv, too
+
+[[refuse]]                          # writes that the drive refuses
+object = "0x2010:02"
+code = "0x06090030"
+count = 1                           # default: always
+
+[[lie]]                             # uploads whose announced size is wrong
+object = "0x2062:00"
+announce = 16                       # bytes announced beyond those sent
+cut = 0                             # bytes left out at the end
+
+[[absent]]                          # an object that this firmware does not have
+object = "0x60B2"                   # all of an index, or one sub-object: "0x2070:12"
+
+[store]
+factor = 2.0                        # storing takes that many times as long
+"""
+"""A faults file with every table, every key and what it means."""
 
 FRAME_ACTIONS = ("drop", "delay", "duplicate", "reorder", "corrupt")
 DRIVE_ACTIONS = ("reset", "unplug", "power-cut")

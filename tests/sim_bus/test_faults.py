@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import tomllib
 from pathlib import Path
 
 import can
@@ -215,12 +216,18 @@ def test_all_mistakes_of_a_file_are_listed_at_once(tmp_path: Path) -> None:
         load_faults(tmp_path / "missing.toml")
 
 
-def test_the_example_in_the_documentation_is_a_valid_file() -> None:
+def test_the_example_has_every_table_and_key_and_works(make_bench: BenchMaker) -> None:
     from pmsmtool.sim import faults
 
-    assert faults.__doc__ is not None
-    lines = faults.__doc__.split("::\n", 1)[1].split("\nA frame is")[0].splitlines()
-    text = "\n".join(line.removeprefix("    ") for line in lines)
-    with pytest.raises(ConfigError) as caught:
-        parse_faults(text)
-    assert caught.value.violations == ("[[drive]]: give exactly one of at_frame, at_s, at_store_step",)
+    tables = tomllib.loads(faults.EXAMPLE)
+    assert set(tables) == set(faults._TABLES)
+    for name, known in (
+        ("frame", faults._FRAME), ("drive", faults._DRIVE), ("adapter", faults._ADAPTER), ("refuse", faults._REFUSE),
+        ("lie", faults._LIE), ("absent", faults._ABSENT),
+    ):  # fmt: skip
+        shown = {key for row in tables[name] for key in row}
+        assert all(key in shown or f"# {key} =" in faults.EXAMPLE or f"or {key}" in faults.EXAMPLE for key in known)
+    for choice in (*faults.FRAME_ACTIONS, *faults.DRIVE_ACTIONS, *faults.DIRECTIONS):
+        assert choice in faults.EXAMPLE
+    bench = make_bench(faults=faults.EXAMPLE)
+    assert bench.client.number(0x1018, 4) == SERIAL
