@@ -1,4 +1,4 @@
-"""Programs as python-can and canopen ship them, each in a process of its own, with no line of pmsmtool on their side."""
+"""Programs as python-can and canopen ship them, each in its own process, with no line of pmsmtool on their side."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ import pytest
 
 from pmsmtool.resources import data_folder
 from tests.drive.served import ROOT, Server, serving
-
-pytest.importorskip("pmsmtool.sim.drive_kernel")
 
 CHANNEL = "interior-2k2?nv=:memory:"
 EDS = str(data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds")
