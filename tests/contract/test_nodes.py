@@ -13,8 +13,6 @@ from pmsmtool.sim.bus import PmsmSimBus
 from tests.contract.contract import NODE, DriveNodeContract, NodeContract, Peer
 from tests.drive.served import Server, serving
 
-pytest.importorskip("pmsmtool.sim.drive_kernel")
-
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Server]:

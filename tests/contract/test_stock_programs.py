@@ -45,11 +45,27 @@ def at(server: Server) -> list[str]:
     return ["-i", "socketcand", "-c", "vcan0", "--bus-kwargs", *kwargs]
 
 
+STARTED: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def nobody_is_left() -> Iterator[None]:
+    """Programs that a failing test left behind would spin on their closed connection for ever."""
+    yield
+    while STARTED:
+        with STARTED.pop() as process:
+            if process.poll() is None:
+                process.kill()
+
+
 def stock(module: str, arguments: Sequence[str], environment: dict[str, str]) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-u", "-m", module, *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+    STARTED.append(
+        subprocess.Popen(
+            [sys.executable, "-u", "-m", module, *arguments],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        )
     )  # fmt: skip
+    return STARTED[-1]
 
 
 def end(process: subprocess.Popen[str]) -> None:

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("pmsmtool.sim.drive_kernel")
-
 SCRIPT = Path(__file__).with_name("repeatable_run.py")
 MODULES = "import can, click, numpy, sys; print(sys.version_info[:2])"
 """What the run needs; an interpreter without them is not compared."""
