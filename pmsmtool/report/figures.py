@@ -75,6 +75,7 @@ def resistance_figure(levels: Trace, R_ohm: float, curve: InverterCurve) -> Figu
     left.legend()
     right.plot(curve.i_phase_a, curve.u_error_v, "o-", ms=3.5, color=_MEASURED)
     right.set(xlabel="phase current / A", ylabel="voltage error of one phase / V", xlim=(0.0, None))
+    right.set_ylim(min(0.0, float(np.min(curve.u_error_v))), None)
     peak = float(np.max(np.abs(i)))
     caption = (
         f"DC levels up to {peak:.4g} A and R = {R_ohm:.5g} ohm at the temperature of the measurement; what is left "
@@ -110,7 +111,7 @@ def inductance_figure(shots: Mapping[str, Trace], fits: Mapping[str, AxisFit], s
         axes.set_title(f"{axis} axis, half period {half} samples", loc="left", fontsize=9)
         rms = sigma_a * math.sqrt(float(np.mean(fit.residuals[0] ** 2)))
         texts.append(f"{axis}: rms residual {1e3 * rms:.3g} mA over {len(shot)} samples, chi2 {fit.chi2:.3g}")
-    panels[0].legend()
+    panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return Figure(svg(canvas), f"Square-wave injection, first periods; {'; '.join(texts)}.")
 
 
@@ -218,7 +219,11 @@ def bode_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMargin
 
 
 def envelope_figure(
-    speed_rpm: Vector, largest_nm: Vector, lines: Mapping[str, tuple[Vector, Vector]], binding: Sequence[str] = ()
+    speed_rpm: Vector,
+    largest_nm: Vector,
+    lines: Mapping[str, tuple[Vector, Vector]],
+    I_max_apk: float,
+    binding: Sequence[str] = (),
 ) -> Figure:
     """Draw the torque that can be reached over speed, and the current loci of the table.
 
@@ -227,7 +232,9 @@ def envelope_figure(
     speed_rpm, largest_nm : ndarray, shape (n,)
         Largest torque per speed; NaN where there is no admissible point.
     lines : mapping of str to (i_d, i_q)
-        Loci in the current plane (A).
+        Loci in the current plane (A); what lies beyond the current limit is not drawn.
+    I_max_apk : float
+        Current limit (A peak).
     binding : sequence of str
         Limits that bind somewhere in the table.
     """
@@ -235,10 +242,13 @@ def envelope_figure(
     left.plot(speed_rpm, largest_nm, color=_MEASURED)
     left.set(xlabel="speed / rpm", ylabel="largest torque / N m", ylim=(0.0, None))
     for (name, (i_d, i_q)), colour in zip(lines.items(), _colours(len(lines)), strict=True):
-        right.plot(i_d, i_q, color=colour, label=name)
-    right.set(xlabel="i_d / A", ylabel="i_q / A")
-    if lines:
-        right.legend()
+        if np.any(np.hypot(i_d, i_q) <= I_max_apk * (1.0 + 1e-6)):
+            right.plot(i_d, i_q, color=colour, label=name)
+    angle = np.linspace(0.5 * math.pi, math.pi, 91)
+    right.plot(I_max_apk * np.cos(angle), I_max_apk * np.sin(angle), color=_LIMIT, label="I_max")
+    edge = 1.08 * I_max_apk
+    right.set(xlabel="i_d / A", ylabel="i_q / A", aspect="equal", xlim=(-edge, 0.15 * edge), ylim=(0.0, edge))
+    right.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     limits = f" Limits that bind in the table: {', '.join(binding)}." if binding else ""
     return Figure(svg(canvas), f"Torque over speed and the current loci behind it.{limits}")
 

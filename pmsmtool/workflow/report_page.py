@@ -6,6 +6,7 @@ Nothing is measured, and no number is made that the run does not hold.
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -163,7 +164,8 @@ def _table_figures(path: Path) -> Iterator[Figure]:
         if f"{name}_i_d_a" in arrays and np.isfinite(arrays[f"{name}_i_d_a"]).any()
     }
     binding = [str(name) for name in np.unique(arrays["binding"])]
-    yield figures.envelope_figure(arrays["largest_speed_rpm"], arrays["largest_torque_nm"], lines, binding)
+    I_max = float(json.loads(str(arrays["meta"]))["I_max_apk"])
+    yield figures.envelope_figure(arrays["largest_speed_rpm"], arrays["largest_torque_nm"], lines, I_max, binding)
 
 
 def _changes(record: RunRecord) -> Sequence[Change]:

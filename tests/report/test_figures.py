@@ -115,7 +115,11 @@ def test_rows_are_drawn_from_quantile_to_quantile_against_their_limit(canvases: 
 
 
 def test_text_stays_text_and_no_date_is_written(canvases: list[Any]) -> None:
-    figure = figures.envelope_figure(np.linspace(0.0, 10.0, 5), np.ones(5), {}, ["current"])
+    inside, beyond = (np.array([-0.5, 0.0]), np.array([0.5, 0.0])), (np.array([-9.0, -8.0]), np.array([5.0, 4.0]))
+    figure = figures.envelope_figure(
+        np.linspace(0.0, 10.0, 5), np.ones(5), {"mtpa": inside, "mtpv": beyond}, 1.0, ["current"]
+    )
+    assert {"mtpa", "I_max"} <= set(lines(canvases[0])) and "mtpv" not in lines(canvases[0])
     assert "largest torque / N m" in figure.svg
     assert "dc:date" not in figure.svg and "matplotlib.org" not in figure.svg
     assert figure.caption.endswith("bind in the table: current.")
