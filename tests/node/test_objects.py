@@ -9,24 +9,36 @@ from pathlib import Path
 import canopen
 import pytest
 
+from pmsmtool.firmware.drive_map import parse_drive_map, reference_map
 from pmsmtool.params.catalogue import CATALOGUE, WIRE_SIZE, layout_signature
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.node.dictionary import Dictionary
-from pmsmtool.sim.node.eds import eds_text
+from pmsmtool.sim.node.eds import FILE_NAME, MAP_NAME, eds_text
 from pmsmtool.sim.node.objects import build_rows, object_rows
 from tests.node.bench import Bench
 
 FOLDER = data_folder("firmware-params") / "pmsmsim"
 
 
-def test_the_committed_data_sheet_is_the_generated_one() -> None:
+def test_the_committed_data_sheet_and_map_are_the_generated_ones() -> None:
     """Regenerate with ``python -m pmsmtool.sim.node.eds``."""
-    assert (FOLDER / "pmsmsim.eds").read_text(encoding="ascii") == eds_text()
+    assert (FOLDER / FILE_NAME).read_text(encoding="ascii") == eds_text()
+    assert parse_drive_map((FOLDER / MAP_NAME).read_text(encoding="ascii")) == reference_map()
+
+
+def test_the_map_names_objects_of_the_drive_in_their_types() -> None:
+    rows = {(row.index, row.sub): row for row in object_rows()}
+    drive_map = parse_drive_map((FOLDER / MAP_NAME).read_text(encoding="ascii"))
+    assert len(drive_map.cells) == len(CATALOGUE)
+    for cell in drive_map.cells.values():
+        assert rows[cell.index, cell.sub].key == cell.name
+        assert rows[cell.index, cell.sub].data_type.size == WIRE_SIZE[cell.wire]
+    assert {rows[address].type for address in drive_map.tables.values()} == {"DOMAIN"}
 
 
 @pytest.fixture(scope="module")
 def stock_dictionary() -> canopen.ObjectDictionary:
-    return canopen.import_od(str(FOLDER / "pmsmsim.eds"), node_id=5)
+    return canopen.import_od(str(FOLDER / FILE_NAME), node_id=5)
 
 
 def test_stock_canopen_reads_every_object_with_type_access_and_default(

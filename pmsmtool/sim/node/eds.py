@@ -1,7 +1,7 @@
 """The simulated drive's electronic data sheet (CiA 306-1), generated from its object table and the catalogue.
 
-``python -m pmsmtool.sim.node.eds`` rewrites ``firmware-params/pmsmsim/pmsmsim.eds``; the text carries no date, so the
-same rows always give the same bytes.
+``python -m pmsmtool.sim.node.eds`` rewrites ``firmware-params/pmsmsim/pmsmsim.eds`` and, beside it, ``map.toml``, the
+drive's map as any other drive would need one (``--map``); neither carries a date, the same rows give the same bytes.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 
+from pmsmtool.firmware.drive_map import dump_drive_map, reference_map
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.node.objects import ObjectRow, object_rows
 
 FILE_NAME = "pmsmsim.eds"
+MAP_NAME = "map.toml"
 _VAR, _DOMAIN, _ARRAY, _RECORD = 0x7, 0x2, 0x8, 0x9
 _MANDATORY = (0x1000, 0x1001, 0x1018)
 _BAUD_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
@@ -96,12 +98,14 @@ def _integer(row: ObjectRow, bound: int) -> str:
     return f"{bound}" if bound >= 0 else f"0x{bound & (1 << 8 * row.data_type.size) - 1:X}"
 
 
-def write_eds() -> str:
-    """Write the data sheet beside the object table and return its path."""
-    path = data_folder("firmware-params") / "pmsmsim" / FILE_NAME
-    path.write_text(eds_text(), encoding="ascii", newline="\n")
-    return str(path)
+def write_files() -> tuple[str, str]:
+    """Write data sheet and map beside the object table and return their paths."""
+    folder = data_folder("firmware-params") / "pmsmsim"
+    texts = {FILE_NAME: eds_text(), MAP_NAME: dump_drive_map(reference_map())}
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="ascii", newline="\n")
+    return str(folder / FILE_NAME), str(folder / MAP_NAME)
 
 
 if __name__ == "__main__":
-    sys.stdout.write(write_eds() + "\n")
+    sys.stdout.write("\n".join(write_files()) + "\n")
