@@ -245,7 +245,7 @@ def envelope_figure(
         if np.any(np.hypot(i_d, i_q) <= I_max_apk * (1.0 + 1e-6)):
             right.plot(i_d, i_q, color=colour, label=name)
     angle = np.linspace(0.5 * math.pi, math.pi, 91)
-    right.plot(I_max_apk * np.cos(angle), I_max_apk * np.sin(angle), color=_LIMIT, label="I_max")
+    right.plot(I_max_apk * np.cos(angle), I_max_apk * np.sin(angle), "--", color=_LIMIT, zorder=1.0, label="I_max")
     edge = 1.08 * I_max_apk
     right.set(xlabel="i_d / A", ylabel="i_q / A", aspect="equal", xlim=(-edge, 0.15 * edge), ylim=(0.0, edge))
     right.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
