@@ -249,7 +249,7 @@ def test_value_that_changes_over_the_reset_is_named_and_taken_back(rig: Rig) -> 
     assert session is not None
     write = session.store.write
 
-    def write_something_else(content: dict[int, bytes], done: Callable[[], None]) -> None:
+    def write_something_else(content: dict[int, bytes], done: Callable[[int | None], None]) -> None:
         image = bytearray(content[0x2001 << 8])
         image[8:12] = b"\x0a\xd7\x23\x3c"  # L_d_h becomes 0.01
         write({**content, 0x2001 << 8: bytes(image)}, done)
