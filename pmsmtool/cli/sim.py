@@ -50,7 +50,12 @@ def sim_command() -> None:
 @click.argument("profile", required=False)
 @click.option("--host", default="127.0.0.1", help="Address to listen on.")
 @click.option("--port", type=_PORT, default="29536", help="Port to listen on; 0 takes a free one.")
-@click.option("--speed", type=click.FloatRange(0, 1000, min_open=True), default=1.0, help="Multiple of the wall clock.")
+@click.option(
+    "--speed",
+    type=click.FloatRange(0, 1000, min_open=True),
+    default=1.0,
+    help="Multiple of the wall clock. Motion wants 0.8 to 2: a tool's heartbeat and time-outs are real time.",
+)
 @click.option("--bitrate", type=BITRATE, metavar="BIT/S", help="Pace the frames bit by bit; default: not paced.")
 @click.option("--node", type=_NODE_ID, metavar="ID", help="Node id of the first drive; 255: unconfigured (LSS).")
 @click.option("--nodes", type=_COUNT, metavar="N", help="Number of drives on the bus.")

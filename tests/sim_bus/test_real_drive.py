@@ -154,6 +154,29 @@ def test_speed_mode_turns_the_machine_and_quick_stop_brings_it_to_rest(client: R
     assert abs(client.number(0x606C, 0, "i")) < 10_000
 
 
+@pytest.mark.parametrize(("mode", "option", "seconds"), [(3, 2, 0.5), (4, 2, 0.5), (4, 3, 0.26)])
+def test_quick_stop_follows_its_ramp_or_the_current_limit(
+    client: RawClient, mode: int, option: int, seconds: float
+) -> None:
+    """From about 250 rpm with 500 rpm/s; at the limit, which ends like a viscous brake, in half of that."""
+    tune(client)
+    client.put(0x605A, 0, option, "h")
+    client.put(0x6085, 0, 500)
+    client.put(0x6060, 0, mode, "b")
+    client.put(0x60FF, 0, 250_000, "i")
+    client.put(0x6071, 0, 100, "h")
+    for word in (6, 7, 15):
+        client.put(0x6040, 0, word, "H")
+    while client.number(0x606C, 0, "i") < 249_000:
+        client.bus.clock.wait(0.002)
+    client.put(0x6040, 0, 2, "H")
+    started = client.bus.clock.now()
+    while int(client.number(0x6041, 0, "H")) & 0x6F == 0x07:
+        client.bus.clock.wait(0.001)
+    assert client.bus.clock.now() - started == pytest.approx(seconds, abs=0.08)
+    assert abs(client.number(0x606C, 0, "i")) < 10_000
+
+
 def test_a_lost_master_stops_the_turning_machine(client: RawClient) -> None:
     """The dead-man: heartbeat every 50 ms, watched for 100 ms; then it ends."""
     tune(client)
