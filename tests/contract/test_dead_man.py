@@ -62,13 +62,16 @@ def wait_for_current(connection: Connection) -> None:
 
 
 def test_a_killed_tool_leaves_a_stopped_machine() -> None:
-    """SIGKILL while 2 A flow: operation is left within the declared 350 ms (measured 194 to 246 ms)."""
+    """SIGKILL while 2 A flow: operation is left within the declared 350 ms (measured 194 to 246 ms from the kill)."""
     with serving("--nv", ":memory:") as server, server.connect() as connection:
         jog = tool(("jog", "--current", "2Apk", "--for", "60s", *CONSENT), server)
         try:
             wait_for_current(connection)
+            beats: list[float] = []
             lost: list[float] = []
-            connection.subscribe(0x081, lambda cob, data, stamp: lost.append(time.monotonic()))
+            connection.subscribe(0x700 + TOOL_NODE, lambda cob, data, stamp: beats.append(stamp))
+            connection.subscribe(0x081, lambda cob, data, stamp: lost.extend((stamp, time.monotonic())))
+            connection.wait(0.2)
             jog.kill()
             killed = time.monotonic()
             assert connection.wait_until(lambda: bool(lost), 3.0), "the drive did not notice"
@@ -77,7 +80,8 @@ def test_a_killed_tool_leaves_a_stopped_machine() -> None:
             jog.communicate()
         peer = Peer(connection)
         assert peer.number(0x1003, 1) == 0x8130
-        assert lost[0] - killed <= DECLARED_S + 0.1, "0.1 s for this process to be woken"
+        assert 1e-3 * CONSUMER_MS <= lost[0] - beats[-1] + 1e-3 <= DECLARED_S, "by the server's time stamps"
+        assert lost[1] - killed <= DECLARED_S + 1.0, "as seen from here; a busy computer wakes us late"
         assert State(peer.number(0x6041) & 0x6F) is not State.OPERATION_ENABLED
         connection.wait(0.2)
         assert peer.number(0x6041) & 0x4F == State.SWITCH_ON_DISABLED
@@ -107,7 +111,7 @@ def test_a_tool_busy_for_two_seconds_keeps_its_heartbeat() -> None:
         busy = subprocess.Popen([sys.executable, "-c", BUSY, str(server.port)], stdout=subprocess.PIPE, cwd=ROOT)
         wait_for_current(connection)
         beats: list[float] = []
-        connection.subscribe(0x700 + TOOL_NODE, lambda cob, data, stamp: beats.append(time.monotonic()))
+        connection.subscribe(0x700 + TOOL_NODE, lambda cob, data, stamp: beats.append(stamp))
         connection.wait(1.5)
         connection.unsubscribe(0x700 + TOOL_NODE)
         output, _ = busy.communicate(timeout=30)

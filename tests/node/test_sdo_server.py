@@ -188,12 +188,12 @@ def held_by(bench: Bench) -> bytes:
 def test_block_transfers_under_loss_are_right_or_reported(
     make_bench: BenchMaker, probability: float, needed: float
 ) -> None:
-    """60 transfers of 4 KiB each way, at most three tries each. Measured: 120 of 120 at 0.1 % and at 1 %."""
+    """30 transfers of 4 KiB each way, at most three tries each; of 120 all came through at 0.1 % and at 1 %."""
     bench = make_bench(faults=f'[[frame]]\naction="drop"\nids=["0x601", "0x581"]\nprobability={probability}', seed=9)
     client = bench.client
     succeeded = 0
     assert persist(client, 0x2000, lambda: stage(client))
-    for number in range(60):
+    for number in range(30):
         data = content(4096 + number)
         if persist(client, TABLE, partial(client.write_block, TABLE, 0, data)):
             succeeded += 1
@@ -203,7 +203,7 @@ def test_block_transfers_under_loss_are_right_or_reported(
         if persist(client, TABLE, partial(read_into, client, found)):
             succeeded += 1
             assert found == [held]
-    assert succeeded >= needed * 120
+    assert succeeded >= needed * 60
 
 
 # ---- refusals ------------------------------------------------------------------------------------
@@ -404,7 +404,7 @@ _FUZZED_IDS = [0x601, 0x000, 0x7E5, 0x080, 0x701, 0x201, 0x77F]
 
 
 @given(st.lists(st.tuples(st.sampled_from(_FUZZED_IDS), st.binary(max_size=8)), max_size=40))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_random_frames_never_break_the_node(frames: list[tuple[int, bytes]]) -> None:
     """After any frames at all, a reset node answers again."""
     bench = open_bench()
