@@ -1,0 +1,1 @@
+"""The figures and tables of the papers, recomputed: numbers beside the plot, each printed number checked."""
