@@ -1,13 +1,9 @@
-"""Commission simulated drives from factory memory, and interrupt them at many moments.
+"""Commission simulated drives from factory memory: four machines, averaged and switched inverter.
 
-    python -m benchmarks.commissioning machines                # four machines, averaged and switched inverter
-    python -m benchmarks.commissioning interrupts --command commission --moments 50
+    python -m benchmarks.commissioning
 
-``machines`` prints the verdict of each chain and how far the identified values lie from the simulated truth (of a
-saturated machine: the incremental inductances at the printed bias). ``interrupts`` counts how often the clock is
-waited on in one whole run, sends SIGINT to itself at that many moments spread evenly over it, each in a run of its
-own, and looks at the drive, which stays powered: exit code 130, statusword off, every parameter and limit as before
-(or, from the download on, exactly the new set). The measured map is read from ../shared/maps where it exists.
+Prints the verdict of each chain and how far the identified values lie from the simulated truth (of a saturated machine:
+the incremental inductances at the printed bias). The measured map is read from ../shared/maps where it exists.
 """
 
 from __future__ import annotations
@@ -15,33 +11,21 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
-import math
 import multiprocessing
 import os
-import signal
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import can
 
-from pmsmtool.bus.clock import VirtualClock
-from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import run
-from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.drive_node import is_safe
-from pmsmtool.firmware.image import crc32
-from pmsmtool.flash.restore import take_backup
 from pmsmtool.machine.flux_map_import import load_flux_map
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
-from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.workflow.export import image_of
 from pmsmtool.workflow.random_drives import true_loop_resistance
 from pmsmtool.workflow.run_directory import RunDirectory
 
@@ -104,7 +88,14 @@ def commanded(*arguments: str) -> tuple[int, str]:
     return code, told.getvalue()
 
 
-# ---- machines ---------------------------------------------------------------------------------------------
+@contextlib.contextmanager
+def powered(channel: str) -> Iterator[PmsmSimBus]:
+    """Stay on the line, so that the drive keeps its power when the tool leaves."""
+    bus = PmsmSimBus(channel)
+    try:
+        yield bus
+    finally:
+        bus.shutdown()
 
 
 def commission_one(job: tuple[str, str]) -> str:
@@ -136,94 +127,11 @@ def machines(processes: int) -> None:
             print(row, flush=True)
 
 
-# ---- interrupts -------------------------------------------------------------------------------------------
-
-
-def held(channel: str) -> tuple[Any, int, bool]:
-    """Return everything a drive holds, the CRC of its active set, and whether it is off."""
-    with Connection(PmsmSimBus(channel)) as connection:
-        drive = CanopenDrive(connection, 1)
-        entries = {entry.name: entry.old for entry in take_backup(drive.node, drive.identity).entries}
-        limits = [drive.node.sdo.read(*where) for where in LIMIT_OBJECTS]
-        found = (entries, limits), drive.parameters.crc_active, is_safe(drive.node.state())
-        drive.close()
-    return found
-
-
-def interrupted_at(command: str, profile: str, moment: int | None) -> tuple[int, int, str]:
-    """Run a command with SIGINT at the n-th wait; return the waits passed, the exit code and the verdict."""
-    channel = f"{profile}?nv=drive.nv"
-    count = 0
-    pass_time = VirtualClock.wait
-
-    def wait(self: VirtualClock, seconds: float) -> None:
-        nonlocal count
-        count += 1
-        if count == moment:
-            signal.raise_signal(signal.SIGINT)
-        pass_time(self, seconds)
-
-    with prepared(), _powered(channel):
-        before = held(channel)
-        setattr(VirtualClock, "wait", wait)  # noqa: B010 - a method is replaced on purpose
-        try:
-            code, _ = commanded(command, "-i", "pmsmsim", "-c", channel, "--yes")
-        finally:
-            setattr(VirtualClock, "wait", pass_time)  # noqa: B010
-        passed = count
-        state, crc, off = held(channel)
-        new = {crc32(image_of(read_parameter_set(path))) for path in Path(".").glob("runs/*/params.toml")}
-    if not off:
-        return passed, code, "NOT OFF"
-    if (state, crc) == before[:2]:
-        return passed, code, "off, everything as before"
-    return passed, code, "off, exactly the new set" if crc in new else "CHANGED"
-
-
-@contextlib.contextmanager
-def _powered(channel: str) -> Iterator[None]:
-    """Stay on the line, so that the drive keeps its power when the tool leaves."""
-    bus = PmsmSimBus(channel)
-    try:
-        yield
-    finally:
-        bus.shutdown()
-
-
-def interrupt_one(job: tuple[str, str, int]) -> tuple[int, int, str]:
-    """Interrupt one run; for a pool."""
-    command, profile, moment = job
-    _, code, verdict = interrupted_at(command, profile, moment)
-    return moment, code, verdict
-
-
-def interrupts(command: str, profile: str, moments: int, processes: int) -> None:
-    """Print what every interrupted run left, and a summary."""
-    waits, code, verdict = interrupted_at(command, profile, None)
-    print(f"{command} on {profile}: {waits} waits in a whole run, exit {code}, {verdict}")
-    places = [max(1, math.ceil((k + 0.5) * waits / moments)) for k in range(moments)]
-    outcomes: Counter[tuple[int, str]] = Counter()
-    with multiprocessing.Pool(processes, maxtasksperchild=1) as pool:
-        for moment, code, verdict in pool.imap(interrupt_one, [(command, profile, k) for k in places], chunksize=1):
-            outcomes[code, verdict] += 1
-            print(f"  wait {moment:6d}  exit {code:3d}  {verdict}", flush=True)
-    for (code, verdict), times in sorted(outcomes.items()):
-        print(f"exit {code}, {verdict}: {times} of {moments}")
-
-
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("what", choices=["machines", "interrupts"])
-    parser.add_argument("--command", choices=["identify", "commission"], default="commission")
-    parser.add_argument("--profile", default="interior-2k2")
-    parser.add_argument("--moments", type=int, default=50)
     parser.add_argument("--processes", type=int, default=2)
-    options = parser.parse_args()
-    if options.what == "machines":
-        machines(options.processes)
-    else:
-        interrupts(options.command, options.profile, options.moments, options.processes)
+    machines(parser.parse_args().processes)
 
 
 if __name__ == "__main__":

@@ -115,19 +115,27 @@ class GuardedDrive:
                 hint="without them nothing is moved",
             ) from abort
 
-    def stop(self) -> None:
+    def stop(self) -> bool:
         """Stop and confirm it; a Ctrl-C meanwhile removes the voltage at once.
+
+        Returns
+        -------
+        bool
+            Whether there was a Ctrl-C meanwhile.
 
         Raises
         ------
         StopNotConfirmed
             The drive does not confirm.
         """
+        interrupted = False
         while self._drive.may_be_energised:
             try:
                 self._drive.quick_stop()
             except KeyboardInterrupt:
+                interrupted = True
                 self._drive.disable_at_once()
+        return interrupted
 
     def restore(self) -> int:
         """Bring every changed object back to what it held, read it back, end the heartbeat.
@@ -385,10 +393,10 @@ def guarded(
             interrupted = True
             say("interrupted: stopping the machine (Ctrl-C again removes the voltage at once)")
         finally:
-            guard.stop()
+            interrupted = guard.stop() or interrupted
     finally:
         # Again: a signal in the wrong microsecond may have ended the first one. It does nothing when that succeeded.
-        guard.stop()
+        interrupted = guard.stop() or interrupted
         with interrupts_deferred() as noted:
             count = _restored(guard)
         say(f"voltage off, drive restored ({count} objects)")

@@ -85,12 +85,14 @@ def live_values(node: DriveNode, names: Sequence[str], period_s: float) -> Itera
             "the drive cannot send these as process data", where=abort.where, hint="leave --pdo out"
         ) from abort
     finally:
-        with interrupts_deferred():
+        with interrupts_deferred() as noted:
             for cob_id in cob_ids:
                 node.connection.unsubscribe(cob_id, live.take)
             if state is not NmtState.OPERATIONAL:
                 send_nmt(node.connection, NmtCommand.PRE_OPERATIONAL, node.node)
             _bring_back(node, before)
+        if noted:
+            raise KeyboardInterrupt
 
 
 def _groups(names: Sequence[str]) -> list[list[str]]:

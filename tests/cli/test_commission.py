@@ -211,7 +211,7 @@ def backup(channel: str) -> Any:
 
 @pytest.mark.parametrize(("command", "wait"), [("identify", 20), ("identify", 300), ("commission", 800)])
 def test_ctrl_c_while_the_machine_moves(command: str, wait: int, tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fifty moments each are tried by ``benchmarks/commissioning.py --interrupts 50``."""
+    """Fifty moments of every moving or writing command are tried by ``benchmarks/interrupted_commands.py``."""
     channel = "interior-2k2?nv=drive.nv"
     count = 0
     pass_time = VirtualClock.wait
