@@ -2,8 +2,8 @@
  * current control method with control inputs in polar coordinates for SPMSM based on linearized model).
  *
  * Laws 1 and 2 (polar_phase.c) and 3 and 4 are the paper's and belong to machines with L_d = L_q; they take the mean of
- * the two. Law 5 (regularised polar map with memory) and law 6 (equilibrium-scheduled with a disturbance observer)
- * hold for L_d != L_q as well.
+ * the two. Law 5 (regularised polar map with memory) and law 6 (polar_unified.c: equilibrium-scheduled with a
+ * disturbance observer) hold for L_d != L_q as well.
  */
 #include "polar.h"
 
@@ -12,7 +12,6 @@
 #define SMALLEST_SHARE PMSM_C(1e-3)   /* of V: amplitude of the schedule, sign kept */
 #define SLOW_SHARE PMSM_C(0.01)       /* of V: below it the d loop slows down, (37) */
 #define FOLD (PMSM_C(0.5) * PMSM_PI + PMSM_C(0.2))
-#define UNREACHABLE PMSM_C(0.97)      /* share of the largest torque at full voltage that is asked for */
 
 /* --- laws 3 and 4: linear range, section IV ------------------------------------------------------------------- */
 
@@ -92,7 +91,7 @@ static void linear_range(pmsm_period *period, const polar_plant *p)
 
 /* Nearest phase to the wish modulo pi, the slower the smaller the voltage; the amplitude is what the voltage has in
  * that direction. */
-static void polar_map(pmsm_period *period, pmsm_dq v, pmsm_real eps)
+void pmsm_polar_map(pmsm_period *period, pmsm_dq v, pmsm_real eps)
 {
     pmsm_real *memory = period->state->polar;
     pmsm_real delta = memory[POLAR_DELTA];
@@ -150,7 +149,7 @@ static void regularised(pmsm_period *period, const polar_plant *p)
     const axis_gains gains = regularised_gains(period);
     const pmsm_dq base = regularised_base(period, &gains);
     const pmsm_dq v = {base.d + memory[POLAR_X_D], base.q + memory[POLAR_X_Q]};
-    polar_map(period, v, (pmsm_real)period->params->polar_eps_ratio * p->V);
+    pmsm_polar_map(period, v, (pmsm_real)period->params->polar_eps_ratio * p->V);
 }
 
 /* Integrators of law 5: the error, and the voltage that was realised instead of the one the law asked for. */
@@ -166,75 +165,6 @@ static void regularised_settle(pmsm_period *period, pmsm_real T_s)
     const pmsm_real back_q = (gains.q.K_p > PMSM_C(0.0)) ? cut.q / gains.q.K_p : PMSM_C(0.0);
     memory[POLAR_X_D] += gains.d.K_i * T_s * (e.d + back_d);
     memory[POLAR_X_Q] += gains.q.K_i * T_s * (e.q + back_q);
-}
-
-/* --- law 6: unified ---------------------------------------------------------------------------------------------- */
-
-typedef struct {
-    pmsm_dq i, v;
-    uint32_t weakened; /* 1: the voltage limit moved i_d */
-} operating_point;
-
-static pmsm_dq steady_voltage(const pmsm_period *period, pmsm_dq i)
-{
-    pmsm_dq v = pmsm_model_voltage(period, i);
-    v.d += period->state->disturbance.d;
-    v.q += period->state->disturbance.q;
-    return v;
-}
-
-/* The equilibrium for the reference: at its own i_d inside the voltage circle, else on the circle, where i_d solves
- * |v(i_d, i_q)| = V; the root nearer to the reference is the stable branch. An i_q beyond reach is cut. */
-static operating_point find_point(const pmsm_period *period, pmsm_real V)
-{
-    const pmsm_params *params = period->params;
-    operating_point point = {period->reference, steady_voltage(period, period->reference), 0u};
-    if (pmsm_square(point.v) <= V * V) {
-        return point;
-    }
-    const pmsm_real R = period->R_s;
-    const pmsm_real X_d = period->omega_e * (pmsm_real)params->motor_L_d_app_h;
-    const pmsm_real X_q = period->omega_e * (pmsm_real)params->motor_L_q_app_h;
-    const pmsm_dq zero = {PMSM_C(0.0), PMSM_C(0.0)};
-    const pmsm_dq E = steady_voltage(period, zero);
-    const pmsm_real a = R * R + X_d * X_d;
-    const pmsm_real slope = R * R + X_d * X_q;
-    const pmsm_real offset = R * E.q - X_d * E.d;
-    const pmsm_real reach = PMSM_SQRT(a) * V;
-    const pmsm_real level = slope * period->reference.q + offset;
-    const pmsm_real cut = pmsm_clamp(level, -UNREACHABLE * reach, UNREACHABLE * reach);
-    point.i.q = (cut == level) ? period->reference.q : (cut - offset) / slope;
-    const pmsm_real b = R * (E.d - X_q * point.i.q) + X_d * (E.q + R * point.i.q);
-    point.i.d = (PMSM_SQRT(a * V * V - cut * cut) - b) / a;
-    point.v = steady_voltage(period, point.i);
-    point.weakened = 1u;
-    return point;
-}
-
-static void unified(pmsm_period *period, const polar_plant *p)
-{
-    const pmsm_params *params = period->params;
-    pmsm_observe_disturbance(period, pmsm_filter_weight((pmsm_real)params->polar_omega_dob_rad_s * p->T_s));
-    const pmsm_real V_ref = (pmsm_real)params->polar_V_ref_ratio * period->V_max;
-    const operating_point o = find_point(period, (V_ref < p->V) ? V_ref : p->V);
-    const pmsm_real L_d = (pmsm_real)params->motor_L_d_h;
-    const pmsm_real L_q = (pmsm_real)params->motor_L_q_h;
-    const pmsm_dq e = {o.i.d - period->i_model.d, o.i.q - period->i_model.q};
-    const pmsm_real omega_c = (pmsm_real)params->polar_omega_c_rad_s;
-    pmsm_dq v = {o.v.d + L_d * omega_c * e.d + period->omega_e * (pmsm_real)params->motor_L_q_app_h * e.q,
-                 o.v.q + L_q * omega_c * e.q - period->omega_e * (pmsm_real)params->motor_L_d_app_h * e.d};
-    pmsm_real size = PMSM_SQRT(pmsm_square(v));
-    if (size > p->V && o.weakened != 0u) { /* only the phase acts: full amplitude, state feedback 2 |omega| */
-        const pmsm_real omega_f = PMSM_C(2.0) * pmsm_abs(period->omega_e);
-        v.d = o.v.d + L_d * omega_f * e.d;
-        v.q = o.v.q + L_q * omega_f * e.q;
-        size = PMSM_SQRT(pmsm_square(v));
-        if (size > PMSM_C(0.0)) {
-            v.d *= p->V / size;
-            v.q *= p->V / size;
-        }
-    }
-    polar_map(period, v, (pmsm_real)params->polar_eps_ratio * p->V);
 }
 
 /* --- selection --------------------------------------------------------------------------------------------------- */
@@ -259,8 +189,8 @@ static uint32_t is_phase_law(uint32_t mode)
 }
 
 /* With the switch, the phase law takes over when the voltage of law 5 leaves the circle for a reference that cannot be
- * held inside it, and law 5 when the reference can be held again and the current is no longer weakened. Each starts from
- * the voltage of the other. */
+ * held inside it, and law 5 when the reference can be held again and the current is no longer weakened. Each starts
+ * from the voltage of the other. */
 static uint32_t use_linear_law(pmsm_period *period, const polar_plant *p)
 {
     pmsm_real *memory = period->state->polar;
@@ -316,7 +246,7 @@ void pmsm_polar_demand(pmsm_period *period)
         start(period, &p);
     }
     if (mode == PMSM_POLAR_UNIFIED) {
-        unified(period, &p);
+        pmsm_polar_unified(period, &p);
     } else if (mode == PMSM_POLAR_REGULARISED) {
         regularised(period, &p);
     } else if (is_phase_law(mode) == 0u) {
@@ -336,5 +266,7 @@ void pmsm_polar_settle(pmsm_period *period)
                                period->state->polar[POLAR_LINEAR] > PMSM_C(0.0)) ? 1u : 0u;
     if (params->polar_mode == PMSM_POLAR_REGULARISED || (is_phase_law(params->polar_mode) & switched) != 0u) {
         regularised_settle(period, period->state->derived.T_s);
+    } else if (params->polar_mode == PMSM_POLAR_UNIFIED) {
+        pmsm_polar_unified_settle(period);
     }
 }

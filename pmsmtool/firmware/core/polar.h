@@ -10,6 +10,8 @@ enum pmsm_polar_memory {
     POLAR_AMPLITUDE = 1,  /* V, signed amplitude of the last period */
     POLAR_I_PHASE = 2,    /* rad, integrator of the phase controller */
     POLAR_D_PHASE = 3,    /* A, low-passed input of its derivative part, and the last input */
+    POLAR_SHORT_D = 2,    /* V, what overmodulation keeps back, in the unified law */
+    POLAR_SHORT_Q = 3,    /* V */
     POLAR_I_AMPLITUDE = 4,/* V */
     POLAR_D_AMPLITUDE = 5,/* A */
     POLAR_X_D = 6,        /* V, integrators of the regularised law */
@@ -31,5 +33,12 @@ typedef struct {
 /* polar_phase.c: laws 1 and 2, PID on phase and amplitude */
 void pmsm_polar_phase_start(pmsm_period *period, const polar_plant *plant);
 void pmsm_polar_phase(pmsm_period *period, const polar_plant *plant);
+
+/* polar.c: demand v as amplitude and phase; the phase turns the slower the smaller v is against eps (V) */
+void pmsm_polar_map(pmsm_period *period, pmsm_dq v, pmsm_real eps);
+
+/* polar_unified.c: law 6, and what it remembers of the limits after the modulation */
+void pmsm_polar_unified(pmsm_period *period, const polar_plant *plant);
+void pmsm_polar_unified_settle(pmsm_period *period);
 
 #endif
