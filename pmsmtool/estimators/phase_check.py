@@ -47,14 +47,14 @@ def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
     ----------
     vectors : Trace
         Three rows: ``i_a_a i_b_a i_c_a`` phase currents and ``u_d_v i_d_a i_q_a`` along the vector (means);
-        ``meta["i_command_a"]``.
+        ``moved`` 1 where the rotor did not come to rest; ``meta["i_command_a"]``.
     noise : Noise
         From the zero-current trace.
 
     Raises
     ------
     IdentificationError
-        ``E_NOT_CONNECTED``, ``E_PHASE_OPEN``, ``E_UNBALANCED``.
+        ``E_NOT_CONNECTED``, ``E_PHASE_OPEN``, ``E_NOT_SETTLED``, ``E_UNBALANCED``.
     """
     phases = np.stack([vectors["i_a_a"], vectors["i_b_a"], vectors["i_c_a"]], axis=1)
     strongest = np.max(np.abs(phases), axis=0)
@@ -74,6 +74,8 @@ def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
             f"phase {'abc'[weakest]} carries {strongest[weakest]:.3g} A where the others carry {others:.3g} A",
             stage=STAGE,
         )
+    if "moved" in vectors.signals and float(np.max(vectors["moved"])) > 0.0:
+        raise refuse("E_NOT_SETTLED", "the rotor still swings under the test vectors", stage=STAGE)
     along = vectors["i_d_a"]
     impedance = vectors["u_d_v"] / along
     spread = max(_spread(along), _spread(impedance))

@@ -32,6 +32,10 @@ ARRIVED = 0.03
 """Distance of the mean current vector from its set-point, relative, that counts as arrived."""
 REST_LIMIT_S = 3.0
 """A rotor that has not come to rest by then stays as it is; the estimator sees it in the halves of the window."""
+NEAR_SHARE = 0.002
+"""The same distance of a small level, of the largest: noise and offsets of the converter."""
+TURN_STEP_RAD = math.radians(15.0)
+TURN_DWELL_S = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +46,10 @@ class LevelPlan:
     ----------
     levels_a : sequence of float
         Signed currents in the order they are held (A peak).
+    turn_a : float
+        Current that turns the rotor to the vector before the first level and at every change of sign (A peak).
+    start_rad : float
+        Electrical angle of the vector that was held last: the rotor is near it.
     settle_s : float
         Time between the set-point and the window (s).
     window_periods : int
@@ -51,6 +59,8 @@ class LevelPlan:
     """
 
     levels_a: Sequence[float]
+    turn_a: float
+    start_rad: float = 0.0
     settle_s: float = 0.1
     window_periods: int = 1600
     angle_rad: float = DC_ANGLE_RAD
@@ -64,16 +74,18 @@ ARRIVAL_LIMIT_S = 1.0
 """A small current that has not come by then never comes: a phase is open, and the controller only winds up."""
 
 
-def calm_sequence(magnitudes: Sequence[float]) -> tuple[float, ...]:
+def calm_sequence(magnitudes: Sequence[float], low: Sequence[float] = ()) -> tuple[float, ...]:
     """Return an order of levels (A) for a free rotor: plus, minus twice as long, plus, each from low to high and back.
 
-    The sign changes twice instead of at every level, and at the lowest current, so that the rotor turns over softly.
-    Both signs have the same mean time, and so have low and high levels: a drift stays orthogonal to the slope.
+    The sign changes twice instead of at every level, so that the rotor has to be turned over twice only. Both signs
+    have the same mean time, and so have low and high levels: a drift stays orthogonal to the slope. ``low`` are held
+    once with each sign, at the first change of sign: they serve the inverter curve only.
     """
-    up = sorted(magnitudes)
+    up, low = sorted(magnitudes), sorted(low)
     odd, even = up[::2], up[1::2]
+    turn = (*reversed(low), *(-level for level in low))
     minus = [-level for level in (*up, *reversed(up))]
-    return (*odd, *reversed(even), *minus, *even, *reversed(odd))
+    return (*odd, *reversed(even), *turn, *minus, *even, *reversed(odd))
 
 
 def record_zero_current(drive: Drive, samples: int = NOISE_SAMPLES) -> Trace:
@@ -87,7 +99,8 @@ def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace
     The drive is enabled on entry and holds zero current on return. It is off between two vectors: what its controller
     has wound up against an open phase must not meet the other two.
     """
-    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a")
+    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
+    half = max(1, periods // 2)
     rows: list[dict[str, float]] = []
     times = []
     elapsed = 0.0
@@ -96,15 +109,44 @@ def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace
             drive.disable()
             drive.enable()
         drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
-        elapsed += settle(drive, i_a, arrival_s=ARRIVAL_LIMIT_S)
+        for _ in range(TRIES):
+            elapsed += settle(drive, i_a, arrival_s=ARRIVAL_LIMIT_S)
+            first, second = (drive.average(names, half) for _ in range(2))
+            moved = abs(second["theta_m_rad"] - first["theta_m_rad"]) >= REST_RAD
+            if not moved:
+                break
         times.append(elapsed)
-        rows.append(dict(drive.average(names, periods)))
+        row = {name: 0.5 * (first[name] + second[name]) for name in names if name != "theta_m_rad"}
+        rows.append({**row, "moved": float(moved)})
     drive.command_current(0.0, 0.0, fixed_angle_rad=PHASE_ANGLES_RAD[-1])
     return table(rows, times, i_command_a=i_a, angles_rad=list(PHASE_ANGLES_RAD))
 
 
-def settle(drive: Drive, i_d_a: float, *, limit_s: float = REST_LIMIT_S, arrival_s: float = REST_LIMIT_S) -> float:
-    """Wait until the current has arrived and the shaft stands still, or a limit is over; return the time (s)."""
+def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float) -> float:
+    """Turn a current vector in small steps, so that the rotor follows instead of jumping; return the time (s).
+
+    A rotor left half an electrical turn off its vector stands on a top: friction holds it there until the current is
+    large, and then it falls over with all of it.
+    """
+    steps = max(1, math.ceil(abs(end_rad - start_rad) / TURN_STEP_RAD))
+    for k in range(1, steps + 1):
+        drive.command_current(i_a, 0.0, fixed_angle_rad=start_rad + (end_rad - start_rad) * k / steps)
+        drive.wait(TURN_DWELL_S)
+    return steps * TURN_DWELL_S
+
+
+def settle(
+    drive: Drive,
+    i_d_a: float,
+    *,
+    limit_s: float = REST_LIMIT_S,
+    arrival_s: float = REST_LIMIT_S,
+    near_a: float = 0.0,
+) -> float:
+    """Wait until the current has arrived and the shaft stands still, or a limit is over; return the time (s).
+
+    A current that has not arrived is waited for as long as the shaft moves, and ``arrival_s`` at least.
+    """
     periods = max(1, round(0.25 * LOOK_S / drive.period_s))
     waited = 0.0
     last = math.inf
@@ -112,9 +154,9 @@ def settle(drive: Drive, i_d_a: float, *, limit_s: float = REST_LIMIT_S, arrival
         drive.wait(LOOK_S)
         waited += LOOK_S
         now = drive.average(("theta_m_rad", "i_d_a", "i_q_a"), periods)
-        arrived = math.hypot(now["i_d_a"] - i_d_a, now["i_q_a"]) <= ARRIVED * abs(i_d_a)
+        arrived = math.hypot(now["i_d_a"] - i_d_a, now["i_q_a"]) <= max(ARRIVED * abs(i_d_a), near_a)
         at_rest = abs(now["theta_m_rad"] - last) < REST_RAD
-        if at_rest if arrived else waited >= arrival_s:
+        if at_rest and (arrived or waited >= arrival_s):
             break
         last = now["theta_m_rad"]
     return waited
@@ -123,20 +165,28 @@ def settle(drive: Drive, i_d_a: float, *, limit_s: float = REST_LIMIT_S, arrival
 def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
     """Hold DC levels and return one row per level: means of the window, of its halves, and the temperature.
 
-    The rotor may turn by half an electrical turn at each sign change; every window waits for it to come to rest. The
-    drive is enabled on entry and holds zero current on return.
+    At each change of sign the rotor is turned by half an electrical turn; every window waits for it to come to rest.
+    Values are along the plan's vector. The drive is enabled on entry and holds zero current on return.
     """
     names = (*MEANS, "theta_m_rad", "flags")
     half = max(1, plan.window_periods // 2)
+    near = NEAR_SHARE * max(map(abs, plan.levels_a))
     rows: list[dict[str, float]] = []
     times: list[float] = []
     elapsed = 0.0
+    angle = plan.start_rad
     for level in plan.levels_a:
-        drive.command_current(level, 0.0, fixed_angle_rad=plan.angle_rad)
+        sign = math.copysign(1.0, level)
+        target = plan.angle_rad if sign > 0.0 else plan.angle_rad + math.pi
+        if angle != target:
+            elapsed += turn_vector(drive, plan.turn_a, angle, target)
+            angle = target
+        # minus is the vector turned by half a turn, not a negative current: the controller does not notice
+        drive.command_current(abs(level), 0.0, fixed_angle_rad=angle)
         drive.wait(plan.settle_s)
         elapsed += plan.settle_s
         for _ in range(TRIES):
-            elapsed += settle(drive, level)
+            elapsed += settle(drive, abs(level), near_a=near)
             first, second = (drive.average(names, half) for _ in range(2))
             times[len(rows) :] = [elapsed]
             elapsed += 2 * half * drive.period_s
@@ -148,11 +198,13 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
                 break
         row = {name: 0.5 * (first[name] + second[name]) for name in MEANS}
         for name, unit in (("u_d", "v"), ("i_d", "a")):
-            row[f"{name}_first_{unit}"] = first[f"{name}_{unit}"]
-            row[f"{name}_second_{unit}"] = second[f"{name}_{unit}"]
+            row[f"{name}_first_{unit}"] = sign * first[f"{name}_{unit}"]
+            row[f"{name}_second_{unit}"] = sign * second[f"{name}_{unit}"]
+            for axis in (f"{name}_{unit}", f"{name[0]}_q_{unit}"):
+                row[axis] *= sign
         row["moved"] = float(moved)
         row["theta_M_rad"] = second["theta_m_rad"]
         row["flagged"] = float(first["flags"] + second["flags"] > 0.0)  # a mean of flag words: any bit counts
         rows.append(row)
-    drive.command_current(0.0, 0.0, fixed_angle_rad=plan.angle_rad)
+    drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
     return table(rows, times, samples=2 * half, fixed_angle_rad=plan.angle_rad, i_command_a=list(plan.levels_a))

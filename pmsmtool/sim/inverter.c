@@ -159,8 +159,9 @@ static void find_source(const pmsm_inverter *inverter, pmsm_leg_sources *sources
 
 static int floats(const pmsm_inverter *inverter, int x)
 {
-    return inverter->gates && inverter->setup.capacitance > 0.0 && inverter->leg[x].gate == PMSM_GATE_NONE
-           && !inverter->setup.open[x];
+    /* the averaged model has no commutations: its legs carry no gate states */
+    return inverter->setup.model == PMSM_INVERTER_SWITCHED && inverter->gates && inverter->setup.capacitance > 0.0
+           && inverter->leg[x].gate == PMSM_GATE_NONE && !inverter->setup.open[x];
 }
 
 /* The node moves by -i/C between the rails and its diodes; its mean over h is what the machine sees. */

@@ -26,7 +26,11 @@ from pmsmtool.workflow.evaluate import resistance_of
 PHASE_CHECK_SHARE = 0.05
 LEVELS = 12
 LOWEST_LEVEL = 0.08
-"""Lowest DC level, of the largest; the low ones serve the inverter curve."""
+"""Lowest repeated DC level, of the largest; the low ones serve the inverter curve."""
+CURVE_SHARES = (0.02, 0.04)
+"""Levels for the inverter curve alone: a speed run at small current lives there."""
+TURN_SHARE = 0.15
+"""Current that turns the rotor over, of the test current."""
 ROTATION_SHARES = (0.35, 0.18, 0.09)
 """Above psi/(L_q - L_d) a d current is no stable position: a reluctance machine follows a smaller vector only."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
@@ -184,7 +188,12 @@ class Measurement:
         ratio = (1.0 / LOWEST_LEVEL) ** (1.0 / (LEVELS - 1))
         magnitudes = [largest * max(LOWEST_LEVEL, (k + 1) / LEVELS) for k in range(LEVELS)]
         magnitudes[:2] = [largest * LOWEST_LEVEL, largest * LOWEST_LEVEL * ratio]
-        plan = standstill.LevelPlan(standstill.calm_sequence(sorted(set(magnitudes))))
+        low = [largest * share for share in CURVE_SHARES]
+        plan = standstill.LevelPlan(
+            standstill.calm_sequence(sorted(set(magnitudes)), low),
+            turn_a=TURN_SHARE * largest,
+            start_rad=standstill.PHASE_ANGLES_RAD[-1],
+        )
         self.say(f"R and inverter: {len(plan.levels_a)} levels up to {largest:.3g} A")
         trace = standstill.hold_levels(self.drive, plan)
         self.keep("levels", trace)
