@@ -18,7 +18,7 @@ import ctypes
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -90,6 +90,10 @@ class FluxMap:
         violations = _violations(self)
         if violations:
             raise ConfigError("the flux map is not usable", violations=violations)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the built tables behind when sent to another process: they hold addresses, and are built again."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
     @property
     def shape(self) -> tuple[int, int]:

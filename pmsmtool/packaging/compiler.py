@@ -176,7 +176,9 @@ def _arguments(
     arguments += [*WARNING_FLAGS, *tolerated] if strict else []
     arguments += [f"-D{define}" for define in (*COMMON_DEFINES, *kernel.defines)]
     arguments += [part for folder in INCLUDE_FOLDERS for part in ("-iquote", folder)]
-    return [*arguments, *(path.as_posix() for path in kernel.source_files(package)), "-lm", "-o", str(output)]
+    # pmsm_sim runs batches of drives on threads; Windows has its own.
+    libraries = ["-lm"] if platform == "win32" else ["-lm", "-lpthread"]
+    return [*arguments, *(path.as_posix() for path in kernel.source_files(package)), *libraries, "-o", str(output)]
 
 
 def _run(compiler: Compiler, arguments: list[str], folder: Path, what: str) -> None:

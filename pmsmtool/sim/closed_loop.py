@@ -125,21 +125,10 @@ def simulate(
     ConfigError
         The machine, the parameters or the scenario cannot be simulated together.
     """
-    changed = ({"rotor": scenario.rotor} if scenario.rotor else {}) | dict(scenario.simulation)
-    machine_file = with_simulation(machine_file, changed)
-    setup, keep = build_setup(machine_file, seed=seed, application=application, start_rad_s=RPM * scenario.start_rpm)
-    _check(machine_file, params, scenario, setup.machine.rotor)
-    simulation = Simulation(setup, image_of(machine_file, params), keep)
-    T_s = 1e-9 * simulation.params.inverter_T_s_ns
-    periods = max(1, round(scenario.duration_s / T_s))
+    machine_file, simulation, periods = open_simulation(machine_file, params, scenario, seed, application)
     rows = -(-periods // scenario.decimation)
     if rows > ROWS_MAX:
         raise ConfigError(f"{rows} rows are too many", where=scenario.name, hint="choose a larger decimation")
-    for name, profile in scenario.schedule.items():
-        target, factor = SCHEDULES[name]
-        simulation.schedule(target, [t for t, _ in profile], [factor * v for _, v in profile])
-    simulation.reference.mode = MODES[scenario.mode]
-    simulation.word(Part.ENABLED).value = 1
     columns: dict[str, tuple[Any, str]] = {**DRIVE_SIGNALS, **TRUE_SIGNALS}
     record = simulation.record([Truth.T, *(signal for signal, _ in columns.values())], rows, scenario.decimation)
     simulation.run(periods)
@@ -150,6 +139,31 @@ def simulate(
         units={name: unit for name, (_, unit) in columns.items()},
         meta=_meta(machine_file, params, scenario, simulation, seed),
     )
+
+
+def open_simulation(
+    machine_file: MachineFile,
+    params: ParameterSet,
+    scenario: Scenario,
+    seed: int | None = None,
+    application: Application = Application.DRIVE,
+) -> tuple[MachineFile, Simulation, int]:
+    """Return the machine as the scenario changes it, the enabled drive at time zero, and the periods to run.
+
+    Parameters and errors are those of :func:`simulate`.
+    """
+    changed = ({"rotor": scenario.rotor} if scenario.rotor else {}) | dict(scenario.simulation)
+    machine_file = with_simulation(machine_file, changed)
+    setup, keep = build_setup(machine_file, seed=seed, application=application, start_rad_s=RPM * scenario.start_rpm)
+    _check(machine_file, params, scenario, setup.machine.rotor)
+    simulation = Simulation(setup, image_of(machine_file, params), keep)
+    for name, profile in scenario.schedule.items():
+        target, factor = SCHEDULES[name]
+        simulation.schedule(target, [t for t, _ in profile], [factor * v for _, v in profile])
+    simulation.reference.mode = MODES[scenario.mode]
+    simulation.word(Part.ENABLED).value = 1
+    T_s = 1e-9 * simulation.params.inverter_T_s_ns
+    return machine_file, simulation, max(1, round(scenario.duration_s / T_s))
 
 
 def _check(machine_file: MachineFile, params: ParameterSet, scenario: Scenario, rotor: int) -> None:
@@ -189,4 +203,13 @@ def _meta(
     }
 
 
-__all__ = ["DRIVE_SIGNALS", "ROWS_MAX", "TRUE_SIGNALS", "Target", "drive_values", "image_of", "simulate"]
+__all__ = [
+    "DRIVE_SIGNALS",
+    "ROWS_MAX",
+    "TRUE_SIGNALS",
+    "Target",
+    "drive_values",
+    "image_of",
+    "open_simulation",
+    "simulate",
+]

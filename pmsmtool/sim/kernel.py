@@ -398,7 +398,7 @@ class Simulation:
     def __init__(self, setup: Setup, image: bytes, keep: object = None) -> None:
         self.library = library()
         self._keep = keep
-        self._setup = setup
+        self.setup = setup
         self._buffers: dict[object, object] = {}
         # 8-byte units: the structs hold doubles
         self._drive_memory = (_f64 * (self.library.pmsm_sim_layout(_LAYOUT_DRIVE) // 8 + 1))()

@@ -1,0 +1,242 @@
+"""Many drives at once: the same parameters and the same scenario on machines that differ, in one call over all cores.
+
+Every drive runs exactly as :func:`pmsmtool.sim.closed_loop.simulate` runs it alone (``monte_carlo.c``): the numbers
+depend neither on the number of threads nor on the other drives.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.machine.flux_map_scaled import FluxScale, scaled_struct
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.sim.closed_loop import open_simulation
+from pmsmtool.sim.kernel import Application, Setup, library
+from pmsmtool.sim.scenarios import Scenario
+
+Array = NDArray[np.float64]
+
+THREADS_MAX = 64
+"""``PMSM_MONTE_CARLO_THREADS_MAX``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """One machine among many.
+
+    Attributes
+    ----------
+    R, L_d, L_q, psi_f, J : float
+        Factors over the machine file; L_d and L_q of what the currents add to a flux map.
+    encoder_rad : float
+        Electrical angle that the encoder's offset is off (rad).
+    T_winding_c, T_magnet_c, U_dc_v : float or None
+        Temperatures (degC) and DC link (V); the machine file's where none is given.
+    seed : int
+        Of the sensors' noise.
+    """
+
+    R: float = 1.0
+    L_d: float = 1.0
+    L_q: float = 1.0
+    psi_f: float = 1.0
+    J: float = 1.0
+    encoder_rad: float = 0.0
+    T_winding_c: float | None = None
+    T_magnet_c: float | None = None
+    U_dc_v: float | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveRuns:
+    """What is kept of every drive, of its machine and not of what its sensors say; each shape (n,).
+
+    Attributes
+    ----------
+    i_peak_a, i_rms_a : ndarray
+        Largest current amplitude at the end of a control period, and its root mean square (A peak).
+    torque_nm : ndarray
+        Mean amount of the torque (N m).
+    omega_peak_rad_s : ndarray
+        Largest mechanical speed (rad/s).
+    u_peak : ndarray
+        Largest voltage demanded, behind the limiter, over the DC link.
+    T_winding_peak_c : ndarray
+        Hottest winding (degC).
+    limited, governed, infeasible : ndarray
+        Shares of the periods with the voltage at its limit, with a reference changed by the governor, and with no
+        admissible current at all.
+    trip : ndarray of int
+        Latched trip as CiA 402 error code, 0 without.
+    trip_s : ndarray
+        When it came (s); NaN without.
+    outside : ndarray of int
+        Evaluations outside the flux map.
+    record : ndarray, shape (n, rows, signals)
+        What was asked to be recorded; no rows otherwise.
+    """
+
+    i_peak_a: Array
+    i_rms_a: Array
+    torque_nm: Array
+    omega_peak_rad_s: Array
+    u_peak: Array
+    T_winding_peak_c: Array
+    limited: Array
+    governed: Array
+    infeasible: Array
+    trip: NDArray[np.int64]
+    trip_s: Array
+    outside: NDArray[np.int64]
+    record: Array
+
+
+class _Task(ctypes.Structure):
+    """``pmsm_monte_carlo``."""
+
+    _fields_ = (
+        ("model", ctypes.c_void_p),
+        ("setup", ctypes.POINTER(Setup)),
+        ("n", ctypes.c_uint32),
+        ("threads", ctypes.c_uint32),
+        ("periods", ctypes.c_uint64),
+        ("memory", ctypes.c_void_p),
+        ("record", ctypes.c_void_p),
+        ("record_rows", ctypes.c_uint64),
+        ("record_signals", ctypes.c_uint32),
+        ("record_decimation", ctypes.c_uint32),
+        ("record_signal", ctypes.c_void_p),
+        ("result", ctypes.c_void_p),
+    )
+
+
+_RESULT = np.dtype(
+    [
+        *((name, "f8") for name in ("i_peak", "i_square", "torque", "omega_peak", "u_peak", "T_winding_peak")),
+        *((name, "u8") for name in ("limited", "governed", "infeasible", "trip_period", "outside")),
+        ("trip", "u4"),
+        ("reserved", "u4"),
+    ]
+)
+"""``pmsm_drive_run``."""
+
+
+@cache
+def _library() -> Any:
+    lib = library()
+    lib.pmsm_monte_carlo_run.argtypes, lib.pmsm_monte_carlo_run.restype = (ctypes.POINTER(_Task),), ctypes.c_uint32
+    lib.pmsm_monte_carlo_memory.argtypes, lib.pmsm_monte_carlo_memory.restype = (), ctypes.c_uint64
+    lib.pmsm_monte_carlo_layout.argtypes, lib.pmsm_monte_carlo_layout.restype = (ctypes.c_uint32,), ctypes.c_uint32
+    if [lib.pmsm_monte_carlo_layout(k) for k in (0, 1)] != [ctypes.sizeof(_Task), _RESULT.itemsize]:
+        raise RuntimeError("the structs of monte_carlo.h have other sizes in the library pmsm_sim; rebuild it")
+    return lib
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def simulate_many(
+    machine_file: MachineFile,
+    params: ParameterSet,
+    scenario: Scenario,
+    variations: Sequence[Variation],
+    *,
+    threads: int | None = None,
+    signals: Sequence[int] = (),
+    application: Application = Application.DRIVE,
+) -> DriveRuns:
+    """Run a scenario on many drives, in one call of the kernel.
+
+    Parameters
+    ----------
+    machine_file, params, scenario
+        As for :func:`pmsmtool.sim.closed_loop.simulate`; every drive gets the same parameters.
+    variations : sequence of Variation
+        One per drive.
+    threads : int, optional
+        Threads; one per core when not given. The result does not depend on it.
+    signals : sequence of int
+        Signals (``kernel.Seen``, ``kernel.Truth``) recorded of every drive, every ``scenario.decimation`` periods.
+    application : Application
+        The whole drive, or the control core alone.
+
+    Raises
+    ------
+    ConfigError
+        What cannot be simulated together.
+    """
+    lib = _library()
+    machine_file, model, periods = open_simulation(machine_file, params, scenario, None, application)
+    n = len(variations)
+    setups = (Setup * n)()
+    keep = [_vary(setups[k], model.setup, machine_file, variation) for k, variation in enumerate(variations)]
+    workers = min(max(1, cores() if threads is None else threads), max(1, n), THREADS_MAX)
+    memory = np.zeros(workers * lib.pmsm_monte_carlo_memory() // 8)
+    names = np.ascontiguousarray(signals, dtype=np.uint32)
+    rows = -(-periods // scenario.decimation) if names.size else 0
+    record = np.zeros((n, rows, names.size))
+    result = np.zeros(n, dtype=_RESULT)
+    task = _Task(
+        model.sim, setups, n, workers, periods, memory.ctypes.data, record.ctypes.data if names.size else None,
+        rows, names.size, scenario.decimation, names.ctypes.data, result.ctypes.data,
+    )  # fmt: skip
+    lib.pmsm_monte_carlo_run(ctypes.byref(task))
+    del keep  # the flux maps of the machines had to live until here
+    return _runs(result, periods, 1e-9 * model.params.inverter_T_s_ns, record)
+
+
+def _runs(result: NDArray[Any], periods: int, T_s: float, record: Array) -> DriveRuns:
+    tripped = result["trip_period"] < periods
+    return DriveRuns(
+        i_peak_a=result["i_peak"].copy(),
+        i_rms_a=np.sqrt(result["i_square"]),
+        torque_nm=result["torque"].copy(),
+        omega_peak_rad_s=result["omega_peak"].copy(),
+        u_peak=result["u_peak"].copy(),
+        T_winding_peak_c=result["T_winding_peak"].copy(),
+        limited=result["limited"] / periods,
+        governed=result["governed"] / periods,
+        infeasible=result["infeasible"] / periods,
+        trip=result["trip"].astype(np.int64),
+        trip_s=np.where(tripped, T_s * result["trip_period"].astype(np.float64), math.nan),
+        outside=result["outside"].astype(np.int64),
+        record=record,
+    )
+
+
+def _vary(out: Setup, nominal: Setup, machine_file: MachineFile, by: Variation) -> object:
+    """Write one machine over the nominal one; returns what must live as long as the setup."""
+    ctypes.memmove(ctypes.byref(out), ctypes.byref(nominal), ctypes.sizeof(Setup))
+    machine = out.machine
+    machine.R_copper *= by.R
+    machine.R_fixed *= by.R
+    machine.L_d *= by.L_d
+    machine.L_q *= by.L_q
+    machine.psi_f *= by.psi_f
+    machine.J *= by.J
+    out.sensors.encoder_offset_e += by.encoder_rad
+    out.T_winding = out.T_winding if by.T_winding_c is None else by.T_winding_c
+    out.T_magnet = out.T_magnet if by.T_magnet_c is None else by.T_magnet_c
+    out.U_dc = out.U_dc if by.U_dc_v is None else by.U_dc_v
+    out.seed = by.seed
+    scale = FluxScale(by.L_d, by.L_q, by.psi_f)
+    if machine_file.flux_map is None or scale == FluxScale():
+        return None
+    struct = scaled_struct(machine_file.flux_map, scale, machine_file.machine.psi_f_wb)
+    machine.map = ctypes.pointer(struct)
+    return struct

@@ -1,0 +1,142 @@
+"""Many drives in one call: each as it would run alone, whatever the number of threads; machines that differ."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pmsmtool.machine.flux_map import FluxMap
+from pmsmtool.machine.flux_map_cells import library
+from pmsmtool.machine.flux_map_scaled import FluxScale, scaled_struct
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.sim.closed_loop import simulate
+from pmsmtool.sim.kernel import Seen, Truth
+from pmsmtool.sim.monte_carlo import DriveRuns, Variation, cores, simulate_many
+from pmsmtool.sim.scenarios import Scenario
+from tests.sim.bench import U_DC, values
+
+PROFILES = Path(__file__).resolve().parents[2] / "profiles"
+
+STEPS = Scenario(
+    "steps", 0.02, "current", {"i_q_a": ((0.0, 0.0), (0.002, 10.0), (0.01, -6.0)), "driven_rpm": ((0.0, 900.0),)},
+    rotor="driven", start_rpm=900.0,
+)  # fmt: skip
+
+SCALED = 1e-12
+"""Scaled cells against the fluxes they stand for, relative (measured 3e-15)."""
+
+
+def interior() -> tuple[MachineFile, ParameterSet]:
+    return load_machine_file(PROFILES / "interior-2k2.toml"), ParameterSet(values(inverter__U_dc_nom_v=540.0))
+
+
+def same(first: DriveRuns, second: DriveRuns) -> bool:
+    return all(
+        np.array_equal(getattr(first, field.name), getattr(second, field.name), equal_nan=True)
+        for field in fields(DriveRuns)
+    )
+
+
+def test_every_drive_runs_as_it_would_alone() -> None:
+    machine, params = interior()
+    noisy = replace(machine, simulation={**machine.simulation, "sensor_noise_apk": 0.05})
+    scenario = replace(STEPS, decimation=3)
+    runs = simulate_many(
+        noisy, params, scenario, [Variation(seed=7), Variation(seed=8)], signals=(Truth.I_D, Truth.I_Q, Seen.I_Q)
+    )
+    for k, seed in enumerate((7, 8)):
+        alone = simulate(noisy, params, scenario, seed=seed)
+        for column, name in enumerate(("i_d_true_a", "i_q_true_a", "i_q_a")):
+            assert np.array_equal(runs.record[k, :, column], alone.signals[name])
+    assert not np.array_equal(runs.record[0], runs.record[1])
+
+
+def test_what_is_kept_is_what_the_trace_shows() -> None:
+    machine, params = interior()
+    runs = simulate_many(machine, params, STEPS, [Variation(T_winding_c=50.0)], signals=(Truth.I_D, Truth.I_Q))
+    after = np.hypot(*runs.record[0, 1:].T)  # the kept numbers are of the period's end, the record of its start
+    assert runs.i_peak_a[0] == pytest.approx(after.max(), rel=1e-12)
+    assert runs.i_rms_a[0] == pytest.approx(math.sqrt(np.mean(after**2)), rel=0.01)
+    assert runs.omega_peak_rad_s[0] == pytest.approx(900.0 * math.pi / 30.0, rel=1e-9)
+    assert 50.0 < runs.T_winding_peak_c[0] < 50.1
+    assert 0.0 < runs.u_peak[0] <= 1.0 / math.sqrt(3.0) + 1e-6
+    assert runs.trip[0] == 0 and math.isnan(runs.trip_s[0])
+
+
+def test_a_trip_is_named_with_its_time() -> None:
+    machine, params = interior()
+    low = params.merged(ParameterSet({"protection.i_trip_apk": 8.0}))
+    runs = simulate_many(machine, low, STEPS, [Variation()])
+    assert runs.trip[0] == 0x2310
+    assert 0.002 < runs.trip_s[0] < 0.02
+
+
+@pytest.mark.parametrize("profile", ["interior-2k2", "saturated-pmsyrm"])
+def test_the_numbers_do_not_depend_on_threads_or_neighbours(profile: str) -> None:
+    machine, params = load_machine_file(PROFILES / f"{profile}.toml"), interior()[1]
+    rng = np.random.default_rng(2)
+    factors = rng.uniform(0.9, 1.1, (13, 5)).tolist()
+    many = [
+        Variation(R, L_d, L_q, psi_f, J, 0.01 * k, 80.0, 60.0, 500.0, k)
+        for k, (R, L_d, L_q, psi_f, J) in enumerate(factors)
+    ]
+    one = simulate_many(machine, params, STEPS, many, threads=1, signals=(Truth.I_Q,))
+    assert len(set(one.i_peak_a.tolist())) == len(many)
+    for threads in (2, 5, None):
+        assert same(simulate_many(machine, params, STEPS, many, threads=threads, signals=(Truth.I_Q,)), one)
+    few = simulate_many(machine, params, STEPS, many[4:6], signals=(Truth.I_Q,))
+    assert np.array_equal(few.record, one.record[4:6])
+    assert cores() >= 1
+
+
+def test_a_varied_machine_is_that_machine() -> None:
+    """The factors, against a machine file that says the same."""
+    machine, params = interior()
+    m = machine.machine
+    other = replace(
+        machine,
+        machine=replace(
+            m, R_s_ohm=1.1 * m.R_s_ohm, L_d_h=0.9 * m.L_d_h, L_q_h=1.05 * m.L_q_h, psi_f_wb=0.97 * m.psi_f_wb
+        ),
+        inverter=replace(machine.inverter, U_dc_v=500.0),
+        simulation={"T_winding_c": 90.0, "T_magnet_c": 70.0, "encoder_offset_rad": 0.03},
+    )
+    written = simulate_many(other, params, STEPS, [Variation()])
+    varied = simulate_many(
+        replace(machine, simulation={"encoder_offset_rad": 0.0}), params, STEPS,
+        [Variation(1.1, 0.9, 1.05, 0.97, 1.0, 0.03, 90.0, 70.0, 500.0)],
+    )  # fmt: skip
+    for name in ("i_peak_a", "i_rms_a", "torque_nm", "u_peak"):
+        assert getattr(varied, name)[0] == pytest.approx(getattr(written, name)[0], rel=1e-9)
+    assert U_DC != 500.0
+
+
+def test_a_scaled_flux_map_is_the_scaled_machine() -> None:
+    machine = load_machine_file(PROFILES / "saturated-pmsyrm.toml")
+    flux_map, psi_f = machine.flux_map, machine.machine.psi_f_wb
+    assert flux_map is not None
+    scale = FluxScale(L_d=1.1, L_q=0.93, psi_f=0.96)
+    struct = scaled_struct(flux_map, scale, psi_f)
+    rng = np.random.default_rng(5)
+    i_d, i_q = rng.uniform(-15.0, 5.0, 200), rng.uniform(-15.0, 15.0, 200)
+    psi = np.empty((2, 200))
+    library().pmsm_flux_map_flux_many(
+        struct, 200, i_d.ctypes.data, i_q.ctypes.data, psi[0].ctypes.data, psi[1].ctypes.data, None, None
+    )
+    psi_d, psi_q = flux_map.flux(i_d, i_q)
+    assert np.allclose(psi[0], 0.96 * psi_f + 1.1 * (psi_d - psi_f), rtol=SCALED, atol=SCALED)
+    assert np.allclose(psi[1], 0.93 * psi_q, rtol=SCALED, atol=SCALED)
+    back = np.empty((2, 200))
+    library().pmsm_flux_map_current_many(
+        struct, 200, psi[0].ctypes.data, psi[1].ctypes.data, back[0].ctypes.data, back[1].ctypes.data, None
+    )
+    assert np.allclose(back, flux_map.current(psi_d, psi_q), rtol=0.0, atol=1e-9)
+    # the same machine, fitted from the scaled grids
+    grids = (0.96 * psi_f + 1.1 * (flux_map.psi_d_wb - psi_f), 0.93 * flux_map.psi_q_wb)
+    fitted = FluxMap(flux_map.i_d_a, flux_map.i_q_a, *grids)
+    assert np.allclose(fitted.flux(i_d, i_q), psi, rtol=1e-10, atol=1e-12)
