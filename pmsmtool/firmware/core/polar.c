@@ -28,9 +28,12 @@ static cdm_gains cdm(pmsm_real gamma, pmsm_real tau, pmsm_real L, pmsm_real R)
     return gains;
 }
 
-/* (15); printed without omega_e on K_e, kept as an ablation. */
+/* (15); printed without omega_e on K_e, kept as an ablation. At standstill there is no rotation voltage to follow. */
 static pmsm_real decoupling_phase(const pmsm_period *period, const polar_plant *p, pmsm_dq i)
 {
+    if (p->omega <= PMSM_C(0.0) && p->omega >= PMSM_C(0.0)) {
+        return PMSM_C(0.0);
+    }
     if (period->params->polar_mode == PMSM_POLAR_LINEAR_PRINTED) {
         return pmsm_arctan(p->omega * p->L * i.q, p->omega * p->L * i.d + p->psi);
     }
