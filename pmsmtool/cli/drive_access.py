@@ -27,7 +27,8 @@ def map_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def read_map(path: Path | None) -> DriveMap:
     """Return the drive map of a file, the reference drive's without one."""
-    from pmsmtool.firmware.drive_map import parse_drive_map, reference_map
+    from pmsmtool.firmware.drive_map import reference_map
+    from pmsmtool.firmware.drive_map_file import parse_drive_map
 
     if path is None:
         return reference_map()

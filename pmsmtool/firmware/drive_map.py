@@ -9,22 +9,21 @@ from __future__ import annotations
 
 import math
 import struct
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.image import LUT_FORMAT_INT16, LUT_INT16_NO_POINT
-from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
+from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
-from pmsmtool.toml_text import toml_text
-
-SCHEMA = "pmsmtool.drive-map/1"
 
 Rounding = Literal["nearest", "down", "up"]
+Form = Literal["value", "time", "rate", "torque constant"]
+Recording = Literal["none", "element", "index", "domain"]
+Injecting = Literal["none", "current", "voltage"]
 
-_LETTERS: dict[str, str] = {
+LETTERS: dict[str, str] = {
     "UNSIGNED8": "B",
     "UNSIGNED16": "H",
     "UNSIGNED32": "I",
@@ -47,6 +46,10 @@ REFERENCE_TABLES = {
 """DOMAIN objects of the reference drive's look-up table."""
 
 
+TORQUE_FACTOR = 1.5
+"""Torque over p psi_f i_q with peak currents (amplitude-invariant dq)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Cell:
     """Where and how a drive keeps one value.
@@ -64,8 +67,15 @@ class Cell:
     rounding : str
         ``nearest``, or towards the safe side: ``down``, ``up`` (integers only).
     gain : str
-        Empty, or the catalogue name of a gain: the drive keeps gain / value instead of the value
-        (an integral time T_n = K_p / K_i).
+        Empty, or the catalogue name of the other value the form needs.
+    unit : str
+        What one count is worth (``firmware/wire_units.py``), as in the drive's manual.
+    form : str
+        ``value``; ``time``: the drive keeps gain / value (an integral time T_n = K_p / K_i); ``rate``: value / gain
+        (an integral rate K_i / K_p); ``torque constant``: 1.5 p psi_f instead of the flux linkage (``gain`` is the
+        number of pole pairs).
+    source : str
+        Key of ``DriveMap.sources`` that confirms the object.
     """
 
     name: str
@@ -76,11 +86,14 @@ class Cell:
     offset: float = 0.0
     rounding: Rounding = "nearest"
     gain: str = ""
+    unit: str = ""
+    form: Form = "value"
+    source: str = ""
 
     @property
     def size(self) -> int:
         """Bytes on the wire."""
-        return struct.calcsize("<" + _LETTERS[self.wire])
+        return struct.calcsize("<" + LETTERS[self.wire])
 
     def encode(self, value: float, values: Mapping[str, float]) -> bytes:
         """Return the bytes of an SI value.
@@ -96,7 +109,7 @@ class Cell:
             The value does not fit the type, or the gain is missing.
         """
         raw = (self._formed(value, values) - self.offset) / self.factor
-        letter = _LETTERS[self.wire]
+        letter = LETTERS[self.wire]
         if letter != "f":
             raw = self._rounded(raw)
         try:
@@ -113,19 +126,37 @@ class Cell:
             raise ConfigError(
                 f"{len(data)} bytes are no {self.wire}", where=f"{self.name} -> 0x{self.index:04X}:{self.sub:02X}"
             )
-        letter = _LETTERS[self.wire]
+        letter = LETTERS[self.wire]
         raw = struct.unpack("<" + letter, data)[0]
         if letter == "f":
             raw = shortest_binary32(raw)
-        return self._formed(raw * self.factor + self.offset, values)
+        return self._meant(raw * self.factor + self.offset, values)
 
     def _formed(self, value: float, values: Mapping[str, float]) -> float:
-        """Integral time from integral gain and back: both are the gain over the other."""
-        if not self.gain:
+        """What the drive keeps for a value."""
+        if self.form == "value":
             return value
+        other = self._other(values)
+        if self.form == "torque constant":
+            return TORQUE_FACTOR * other * value
+        divided = (value, other) if self.form == "rate" else (other, value)
+        return divided[0] / divided[1] if divided[1] else math.inf
+
+    def _meant(self, kept: float, values: Mapping[str, float]) -> float:
+        """What a kept number means; the inverse of :meth:`_formed`."""
+        if self.form == "value":
+            return kept
+        other = self._other(values)
+        if self.form == "rate":
+            return kept * other
+        if self.form == "torque constant":
+            return kept / (TORQUE_FACTOR * other) if other else math.inf
+        return other / kept if kept else math.inf
+
+    def _other(self, values: Mapping[str, float]) -> float:
         if self.gain not in values:
             raise ConfigError(f"needs {self.gain} in the same set", where=self.name)
-        return values[self.gain] / value if value else math.inf
+        return values[self.gain]
 
     def _rounded(self, raw: float) -> float:
         if not math.isfinite(raw):
@@ -133,6 +164,67 @@ class Cell:
         if self.rounding == "nearest":
             return round(raw)
         return math.floor(raw) if self.rounding == "down" else math.ceil(raw)
+
+
+@dataclass(frozen=True, slots=True)
+class SignalCell:
+    """Where a drive shows or takes a quantity of its running control.
+
+    Attributes
+    ----------
+    index, sub : int
+        The object.
+    wire : str
+        CiA 301 type.
+    unit : str
+        What one count is worth (``firmware/wire_units.py``).
+    source : str
+        Key of ``DriveMap.sources``.
+    """
+
+    index: int
+    sub: int
+    wire: str
+    unit: str
+    source: str = ""
+
+    @property
+    def size(self) -> int:
+        """Bytes on the wire."""
+        return struct.calcsize("<" + LETTERS[self.wire])
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What a family can do besides holding parameters; the drive itself must confirm it.
+
+    Attributes
+    ----------
+    torque_mode, velocity_mode : bool
+        CiA 402 modes 4 or 10, and 3 or 9.
+    commutation_angle : bool
+        Mode 11 with the commutation angle 0x60EA.
+    pdo : bool
+        Live quantities as process data.
+    recorder : str
+        ``none``; ``element`` (one object per sample), ``index`` (a sample register read again and again) or
+        ``domain`` (one upload).
+    injection : str
+        ``none``, ``current`` or ``voltage`` set-points for d and q.
+    averages : bool
+        Window averages inside the drive, and a voltage whose acting period is known.
+    auto_tuning : str
+        Empty, or how the vendor's own identification is started.
+    """
+
+    torque_mode: bool = False
+    velocity_mode: bool = False
+    commutation_angle: bool = False
+    pdo: bool = False
+    recorder: Recording = "none"
+    injection: Injecting = "none"
+    averages: bool = False
+    auto_tuning: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +243,16 @@ class DriveMap:
         DOMAIN objects of the look-up table; empty where the drive has none.
     staging : bool
         Whether the drive takes a whole set at once (objects 0x2000, 0x2001 of the reference drive).
+    more_products : tuple of int
+        Further product codes of the family.
+    capabilities : Capabilities
+        What it can do besides.
+    signals : mapping of str to SignalCell
+        Live quantities and references, by the names of :data:`SIGNALS`.
+    left_out : mapping of str to str
+        What is not mapped and why, by catalogue or signal name.
+    sources : mapping of str to str
+        Where the facts come from.
     """
 
     name: str
@@ -159,6 +261,15 @@ class DriveMap:
     cells: Mapping[str, Cell]
     tables: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     staging: bool = False
+    more_products: tuple[int, ...] = ()
+    capabilities: Capabilities = Capabilities()
+    signals: Mapping[str, SignalCell] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)
+
+    def is_for(self, vendor: int, product: int) -> bool:
+        """Whether a drive of this identity belongs to the family."""
+        return vendor == self.vendor and product in (self.product, *self.more_products)
 
     def encode(self, wanted: ParameterSet) -> dict[str, bytes]:
         """Return the bytes of every entry the drive has an object for, in the order they are written.
@@ -207,6 +318,36 @@ class DriveMap:
             return self.tables[name]
         cell = self.cells[name]
         return cell.index, cell.sub
+
+
+SIGNALS: dict[str, str] = {
+    "position_rad": "angle",
+    "omega_M_rad_s": "angular speed",
+    "torque_nm": "torque",
+    "i_q_a": "current",
+    "i_d_a": "current",
+    "u_q_v": "voltage",
+    "u_d_v": "voltage",
+    "U_dc_v": "voltage",
+    "target_torque_nm": "torque",
+    "target_omega_M_rad_s": "angular speed",
+}
+"""Live quantities and references a map may name, with their dimension; mechanical angles and speeds."""
+
+REFERENCE_CAPABILITIES = Capabilities(
+    torque_mode=True, velocity_mode=True, pdo=True, recorder="domain", injection="voltage", averages=True
+)
+REFERENCE_SIGNALS = {
+    "omega_M_rad_s": SignalCell(0x606C, 0, "INTEGER32", "mrpm"),
+    "torque_nm": SignalCell(0x6077, 0, "INTEGER16", "permille of 0x6076"),
+    "i_q_a": SignalCell(0x2070, 2, "REAL32", "A"),
+    "i_d_a": SignalCell(0x2070, 1, "REAL32", "A"),
+    "u_q_v": SignalCell(0x2070, 6, "REAL32", "V"),
+    "u_d_v": SignalCell(0x2070, 5, "REAL32", "V"),
+    "U_dc_v": SignalCell(0x2070, 8, "REAL32", "V"),
+    "target_torque_nm": SignalCell(0x6071, 0, "INTEGER16", "permille of 0x6076"),
+    "target_omega_M_rad_s": SignalCell(0x60FF, 0, "INTEGER32", "mrpm"),
+}
 
 
 def encode_table(name: str, numbers: Sequence[float], values: Mapping[str, float]) -> bytes:
@@ -258,88 +399,8 @@ def shortest_binary32(value: float) -> float:
 
 def reference_map() -> DriveMap:
     """Return the map of the reference drive, which is the parameter catalogue itself."""
-    cells = {row.name: Cell(row.name, row.index, row.sub, row.wire) for row in CATALOGUE}
-    return DriveMap("pmsmsim", REFERENCE_VENDOR, REFERENCE_PRODUCT, cells, REFERENCE_TABLES, staging=True)
-
-
-def dump_drive_map(drive_map: DriveMap) -> str:
-    """Return the text of a map file, which :func:`parse_drive_map` reads back."""
-    objects = {}
-    for cell in drive_map.cells.values():
-        row: dict[str, Any] = {"index": cell.index, "sub": cell.sub, "type": cell.wire}
-        row |= {"factor": cell.factor} if cell.factor != 1.0 else {}
-        row |= {"offset": cell.offset} if cell.offset else {}
-        row |= {"rounding": cell.rounding} if cell.rounding != "nearest" else {}
-        row |= {"gain": cell.gain} if cell.gain else {}
-        objects[cell.name] = row
-    tables = {name: {"index": index, "sub": sub} for name, (index, sub) in drive_map.tables.items()}
-    head = {"schema": SCHEMA, "name": drive_map.name, "vendor": drive_map.vendor, "product": drive_map.product}
-    return toml_text({**head, "staging": drive_map.staging, "objects": objects, "tables": tables})
-
-
-def parse_drive_map(text: str, where: str = "map.toml") -> DriveMap:
-    """Read a map file.
-
-    Raises
-    ------
-    ConfigError
-        Everything that is wrong with it, at once.
-    """
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"not a TOML file: {error}", where=where) from error
-    if document.get("schema") != SCHEMA:
-        raise ConfigError(f"schema is {document.get('schema')!r}, expected {SCHEMA!r}", where=where)
-    wrong: list[str] = []
-    for key in ("vendor", "product"):
-        if type(document.get(key)) is not int:
-            wrong.append(f"{key}: not a whole number")
-    objects, tables = document.get("objects", {}), document.get("tables", {})
-    cells = {name: _parse_cell(name, row, wrong) for name, row in objects.items()} if isinstance(objects, dict) else {}
-    found = {name: _parse_table(name, row, wrong) for name, row in tables.items()} if isinstance(tables, dict) else {}
-    if wrong:
-        raise ConfigError("the drive map cannot be used", where=where, violations=wrong)
-    ordered = {row.name: cells[row.name] for row in CATALOGUE if cells.get(row.name) is not None}
+    cells = {row.name: Cell(row.name, row.index, row.sub, row.wire, unit=row.unit) for row in CATALOGUE}
     return DriveMap(
-        str(document.get("name", "")), document["vendor"], document["product"],
-        {name: cell for name, cell in ordered.items() if cell is not None}, found, bool(document.get("staging", False)),
+        "pmsmsim", REFERENCE_VENDOR, REFERENCE_PRODUCT, cells, REFERENCE_TABLES, staging=True,
+        capabilities=REFERENCE_CAPABILITIES, signals=REFERENCE_SIGNALS,
     )  # fmt: skip
-
-
-def _parse_cell(name: str, row: Any, wrong: list[str]) -> Cell | None:
-    before = len(wrong)
-    if name not in BY_NAME:
-        wrong.append(f"{name}: not in the parameter catalogue")
-    if not isinstance(row, dict) or not _is_address(row):
-        wrong.append(f"{name}: needs index (0..0xFFFF) and sub (0..0xFF)")
-        return None
-    if row.get("type") not in _LETTERS:
-        wrong.append(f"{name}: type {row.get('type')!r} is none of {', '.join(_LETTERS)}")
-    numbers = [row.get("factor", 1.0), row.get("offset", 0.0)]
-    if not all(isinstance(x, (int, float)) and math.isfinite(x) for x in numbers) or numbers[0] == 0:
-        wrong.append(f"{name}: factor and offset must be finite numbers, factor not zero")
-    if row.get("rounding", "nearest") not in ("nearest", "down", "up"):
-        wrong.append(f"{name}: rounding {row['rounding']!r} is none of nearest, down, up")
-    if row.get("gain", "") not in ("", *BY_NAME):
-        wrong.append(f"{name}: gain {row['gain']!r} is not in the parameter catalogue")
-    unknown = set(row) - {"index", "sub", "type", "factor", "offset", "rounding", "gain"}
-    wrong.extend(f"{name}: unknown key {key}" for key in sorted(unknown))
-    if len(wrong) > before:
-        return None
-    factor, offset = map(float, numbers)
-    return Cell(
-        name, row["index"], row["sub"], row["type"], factor, offset, row.get("rounding", "nearest"), row.get("gain", "")
-    )
-
-
-def _parse_table(name: str, row: Any, wrong: list[str]) -> tuple[int, int]:
-    if name not in TABLE_NAMES or not isinstance(row, dict) or not _is_address(row):
-        wrong.append(f"tables.{name}: unknown table, or without index and sub")
-        return (0, 0)
-    return row["index"], row["sub"]
-
-
-def _is_address(row: Mapping[str, Any]) -> bool:
-    index, sub = row.get("index"), row.get("sub")
-    return type(index) is int and type(sub) is int and 0 <= index <= 0xFFFF and 0 <= sub <= 0xFF

@@ -21,7 +21,8 @@ from pmsmtool.cli import consent
 from pmsmtool.cli.main import run
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
-from pmsmtool.firmware.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, dump_drive_map, reference_map
+from pmsmtool.firmware.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, reference_map
+from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.flash.restore import take_backup
 from pmsmtool.machine.flux_map_import import load_flux_map
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file

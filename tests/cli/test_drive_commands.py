@@ -16,7 +16,8 @@ import pytest
 
 from pmsmtool.cli.main import run
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.firmware.drive_map import dump_drive_map, reference_map
+from pmsmtool.firmware.drive_map import reference_map
+from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
 
 ROOT = Path(__file__).resolve().parents[2]

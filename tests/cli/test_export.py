@@ -21,7 +21,8 @@ from pmsmtool.design.design_file import Design, DesignValue, design_text, load_d
 from pmsmtool.design.tune import tune
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.dcf import read_concise
-from pmsmtool.firmware.drive_map import Cell, DriveMap, dump_drive_map, reference_map
+from pmsmtool.firmware.drive_map import Cell, DriveMap, reference_map
+from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.firmware.export_c import FLAGS, image_of_json
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE

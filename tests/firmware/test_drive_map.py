@@ -15,13 +15,12 @@ from pmsmtool.firmware.drive_map import (
     Cell,
     DriveMap,
     decode_table,
-    dump_drive_map,
     encode_table,
     look_up_words,
-    parse_drive_map,
     reference_map,
     shortest_binary32,
 )
+from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.firmware.image import lut_size_words, pack_image
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import ParameterSet, default_set
@@ -31,12 +30,15 @@ SCALED = DriveMap(
     0x1234,
     1,
     {
-        "current.K_p_d_v_per_a": Cell("current.K_p_d_v_per_a", 0x30A0, 1, "UNSIGNED32", 1e-6),
+        "current.K_p_d_v_per_a": Cell("current.K_p_d_v_per_a", 0x30A0, 1, "UNSIGNED32", 1e-6, unit="uV/A"),
         "current.K_i_d_v_per_as": Cell(
-            "current.K_i_d_v_per_as", 0x320F, 2, "UNSIGNED16", 1e-6, gain="current.K_p_d_v_per_a"
+            "current.K_i_d_v_per_as", 0x320F, 2, "UNSIGNED16", 1e-6,
+            gain="current.K_p_d_v_per_a", unit="us", form="time",
+        ),  # fmt: skip
+        "motor.I_max_apk": Cell(
+            "motor.I_max_apk", 0x2031, 0, "UNSIGNED16", math.sqrt(2) / 1000, rounding="down", unit="mA rms"
         ),
-        "motor.I_max_apk": Cell("motor.I_max_apk", 0x2031, 0, "UNSIGNED16", math.sqrt(2) / 1000, rounding="down"),
-        "motor.T_ref_c": Cell("motor.T_ref_c", 0x3001, 9, "INTEGER16", 0.1, -273.15),
+        "motor.T_ref_c": Cell("motor.T_ref_c", 0x3001, 9, "INTEGER16", 0.1, -273.15, unit="0.1 degC"),
     },
 )
 
@@ -136,19 +138,3 @@ def test_table_that_does_not_fit_int16() -> None:
 def test_map_file_round_trip() -> None:
     for drive_map in (reference_map(), SCALED):
         assert parse_drive_map(dump_drive_map(drive_map)) == drive_map
-
-
-@pytest.mark.parametrize(
-    ("line", "complaint"),
-    [
-        ('[objects."motor.R_s"]\nindex = 1\nsub = 0\ntype = "REAL32"', "not in the parameter catalogue"),
-        ('[objects."motor.R_s_ohm"]\nindex = 70000\nsub = 0\ntype = "REAL32"', "needs index"),
-        ('[objects."motor.R_s_ohm"]\nindex = 1\nsub = 0\ntype = "REAL64"', "is none of"),
-        ('[objects."motor.R_s_ohm"]\nindex = 1\nsub = 0\ntype = "REAL32"\nfactor = 0', "not zero"),
-        ('[objects."motor.R_s_ohm"]\nindex = 1\nsub = 0\ntype = "REAL32"\nunit = "mohm"', "unknown key unit"),
-        ('[tables."lut.x"]\nindex = 1\nsub = 0', "unknown table"),
-    ],
-)
-def test_wrong_map_files_name_the_place(line: str, complaint: str) -> None:
-    with pytest.raises(ConfigError, match=complaint):
-        parse_drive_map(f'schema = "pmsmtool.drive-map/1"\nvendor = 1\nproduct = 1\n{line}\n')

@@ -1,0 +1,212 @@
+"""Map files: every shipped one can be used, every kind of mistake is refused with file and line."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, reference_map
+from pmsmtool.firmware.drive_map_file import dump_drive_map, line_of, map_hash, parse_drive_map
+from pmsmtool.firmware.wire_units import counted_in, wire_unit
+from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.resources import data_folder
+
+FOLDER = data_folder("firmware-params")
+FAMILIES = sorted(path.parent.name for path in FOLDER.glob("*/map.toml"))
+NAMED = {"epos4", "epos2", "copley", "nanotec", "synapticon", "faulhaber", "elmo", "ingenia", "pmsmsim"}
+
+GOOD = """\
+schema = "pmsmtool.drive-map/1"
+name = "mine"
+vendor = 0x123
+product = 7
+
+[objects]
+"motor.pole_pairs" = { index = 0x2001, sub = 1, type = "UNSIGNED8", unit = "1", source = "doc" }
+"current.K_p_q_v_per_a" = { index = 0x2001, sub = 2, type = "UNSIGNED16", unit = "mV/A", factor = 1e-3, source = "doc" }
+"current.K_i_q_v_per_as" = { index = 0x2001, sub = 3, type = "UNSIGNED16", unit = "us", gain = "current.K_p_q_v_per_a" }
+"encoder.offset_rad" = { index = 0x2001, sub = 4, type = "INTEGER32", unit = "deg" }
+
+[signals]
+omega_M_rad_s = { index = 0x606C, sub = 0, type = "INTEGER32", unit = "rpm" }
+
+[left_out]
+"motor.R_s_ohm" = "no object"
+
+[sources]
+doc = "manual, p. 3"
+"""
+
+MISTAKES = [
+    # (what is replaced, by what, part of the message, line)
+    ("index = 0x2001, sub = 1,", "sub = 1,", "needs index", 7),
+    ("index = 0x2001, sub = 1,", "index = 0x12001, sub = 1,", "needs index", 7),
+    ("index = 0x2001, sub = 1,", 'index = "0x2001", sub = 1,', "needs index", 7),
+    ("index = 0x2001, sub = 1,", "index = 0x2001, sub = 255,", "needs index", 7),
+    ("index = 0x2001, sub = 1,", "index = 0x1010, sub = 1,", "outside 0x2000", 7),
+    ("index = 0x2001, sub = 1,", "index = 0xA000, sub = 1,", "outside 0x2000", 7),
+    ("index = 0x2001, sub = 1,", "index = 0x6071, sub = 0,", "moves the machine", 7),
+    ("index = 0x2001, sub = 2,", "index = 0x2001, sub = 1,", "already motor.pole_pairs", 8),
+    ('"UNSIGNED8"', '"UNSIGNED7"', "is none of", 7),
+    ('"UNSIGNED8"', '"REAL64"', "is none of", 7),
+    ('type = "UNSIGNED8", ', "", "type None", 7),
+    ('"INTEGER32", unit = "deg"', '"UNSIGNED32", unit = "deg"', "cannot hold the negative", 10),
+    ("factor = 1e-3", "factor = -1e-3", "is negative", 8),
+    ("factor = 1e-3", "factor = 1e-6", "contradicts the unit", 8),
+    ("factor = 1e-3", "factor = 0", "not zero", 8),
+    ("factor = 1e-3", "factor = inf", "finite", 8),
+    ("factor = 1e-3", 'factor = "1e-3"', "finite", 8),
+    ('unit = "mV/A", ', "", "unit is missing", 8),
+    ('unit = "mV/A"', 'unit = ""', "unit is missing", 8),
+    ('unit = "mV/A"', 'unit = "mA"', "current, expected gain V/A", 8),
+    ('unit = "mV/A"', 'unit = "bananas"', "unknown unit", 8),
+    ('unit = "mV/A"', 'unit = "mV/A rms"', "no rms value", 8),
+    ('unit = "us"', 'unit = "V/(A s)"', "expected time", 9),
+    ('gain = "current.K_p_q_v_per_a"', 'gain = "current.K_p_d_v_per_a"', "does not hold", 9),
+    ('gain = "current.K_p_q_v_per_a"', 'gain = "K_p"', "not in the parameter catalogue", 9),
+    ('gain = "current.K_p_q_v_per_a"', 'form = "rate"', "needs the gain", 9),
+    ('gain = "current.K_p_q_v_per_a"', 'form = "sum"', "is none of value", 9),
+    ('unit = "deg" }', 'unit = "deg", rounding = "up or down" }', "rounding", 10),
+    ('unit = "deg" }', 'unit = "deg", offset = "1" }', "offset", 10),
+    ('unit = "deg" }', 'unit = "deg", scale = 2 }', "unknown key scale", 10),
+    ('source = "doc" }\n"current.K_p', 'source = "hearsay" }\n"current.K_p', "not in [sources]", 7),
+    ('"motor.pole_pairs"', '"motor.poles"', "not in the parameter catalogue", 7),
+    ('"INTEGER32", unit = "rpm"', '"INTEGER32", unit = "N m"', "torque, expected angular speed", 13),
+    ("omega_M_rad_s", "omega", "no signal of that name", 13),
+    ('"motor.R_s_ohm" = "no object"', '"motor.R_s_ohm" = ""', "say why", 16),
+    ('"motor.R_s_ohm"', '"motor.pole_pairs"', "mapped all the same", 16),
+    ("vendor = 0x123", 'vendor = "0x123"', "vendor: not a whole number", 3),
+    ("product = 7", "product = -7", "product: not a whole number", 4),
+    ("product = 7", "product = 7\nproducts = [8]", "products: unknown key", 5),
+    ('name = "mine"', "name = 3", "name is missing", 2),
+    ("[left_out]", "[capabilities]\ntorque_mode = 1\n[left_out]", "expected a bool", 16),
+    ("[left_out]", '[capabilities]\nrecorder = "paper"\n[left_out]', "expected none, element", 16),
+    ("[left_out]", "[capabilities]\nflight = true\n[left_out]", "unknown capability", 16),
+]
+
+
+def parse(text: str) -> DriveMap:
+    return parse_drive_map(text, "mine/map.toml")
+
+
+@pytest.mark.parametrize(("old", "new", "complaint", "line"), MISTAKES)
+def test_a_mistake_is_refused_with_file_and_line(old: str, new: str, complaint: str, line: int) -> None:
+    assert GOOD.count(old) == 1
+    with pytest.raises(ConfigError) as caught:
+        parse(GOOD.replace(old, new))
+    said = [text for text in caught.value.violations if complaint in text]
+    assert said, caught.value.violations
+    assert said[0].startswith(f"mine/map.toml:{line}: ")
+
+
+def test_all_mistakes_are_listed_at_once() -> None:
+    text = GOOD.replace("factor = 1e-3", "factor = -1e-3").replace('"UNSIGNED8"', '"REAL64"').replace('"deg"', '""')
+    with pytest.raises(ConfigError) as caught:
+        parse(text)
+    assert [int(re.match(r".*?:(\d+):", said).group(1)) for said in caught.value.violations] == [7, 8, 10]  # type: ignore[union-attr]
+
+
+def test_other_files_are_refused() -> None:
+    for text, complaint in (("a = ", "not a TOML file"), ("a = 1", "schema is None")):
+        with pytest.raises(ConfigError, match=complaint):
+            parse(text)
+
+
+def test_lines_are_found_in_both_ways_of_writing() -> None:
+    text = '[objects."a.b"]\nindex = 1\n\n[objects]\n"c.d" = { index = 2 }\n'
+    assert line_of(text, ("objects", "a.b", "index")) == 2
+    assert line_of(text, ("objects", "c.d", "index")) == 5
+    assert line_of(text, ("nothing",)) == 1
+
+
+def test_forms_of_an_integral_gain_and_of_a_torque_constant() -> None:
+    K_p = Cell("current.K_p_q_v_per_a", 0x2500, 0, "REAL32", unit="V/A")
+    rate = Cell("current.K_i_q_v_per_as", 0x2501, 0, "REAL32", 1.0, 0.0, "nearest", K_p.name, "1/s", "rate")
+    values = {K_p.name: 2.0, rate.name: 5000.0}
+    data = rate.encode(5000.0, values)
+    assert Cell("x", 0, 0, "REAL32").decode(data, {}) == 2500.0
+    assert rate.decode(data, values) == 5000.0
+    pairs = {"motor.pole_pairs": 3.0}
+    constant = Cell(
+        "motor.psi_f_wb", 0x6410, 12, "UNSIGNED32", 1e-5, 0.0, "nearest", "motor.pole_pairs", "0.01 N mm/A",
+        "torque constant",
+    )  # fmt: skip
+    data = constant.encode(0.1, pairs)  # K_t = 1.5 * 3 * 0.1 = 0.45 N m/A
+    assert int.from_bytes(data, "little") == 45_000
+    assert constant.decode(data, pairs) == pytest.approx(0.1, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("unit", "symbol", "value"),
+    [
+        ("uV/(A ms)", "V/(A s)", 1e-3),
+        ("10 mohm line-line", "ohm", 5e-3),
+        ("mA rms", "A", 1.4142135623730951e-3),
+        ("0.1 V", "V", 0.1),
+        ("us", "ns", 1000.0),
+        ("rpm", "rpm", 1.0),
+        ("rev", "rad", 6.283185307179586),
+        ("N m/(rev/s)", "N m s/rad", 0.15915494309189535),
+    ],
+)
+def test_what_a_count_is_worth(unit: str, symbol: str, value: float) -> None:
+    assert counted_in(unit, symbol) == pytest.approx(value, rel=1e-14)
+
+
+def test_relative_units_know_their_base() -> None:
+    assert wire_unit("permille of 0x6075").relative_to == 0x6075
+    with pytest.raises(ValueError, match="relative to 0x6076"):
+        counted_in("permille of 0x6076", "N m")
+
+
+def test_the_named_families_are_there() -> None:
+    assert set(FAMILIES) >= NAMED
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_shipped_maps_can_be_used_and_say_where_they_come_from(family: str) -> None:
+    path = FOLDER / family / "map.toml"
+    drive_map = parse_drive_map(path.read_text(encoding="utf-8"), str(path))
+    assert drive_map.name == family
+    assert parse_drive_map(dump_drive_map(drive_map)) == drive_map
+    if family == "pmsmsim":
+        return
+    rows = [*drive_map.cells.values(), *drive_map.signals.values()]
+    assert all(row.source in drive_map.sources for row in rows)
+    # the gains decide whether a design can be sent: mapped, or said why not
+    for name in ("current.K_p_q_v_per_a", "current.K_i_q_v_per_as"):
+        assert (name in drive_map.cells) != (name in drive_map.left_out)
+
+
+def test_hash_follows_content_not_layout() -> None:
+    again = parse(GOOD.replace("[left_out]", "# a remark\n\n[left_out]"))
+    assert map_hash(again) == map_hash(parse(GOOD))
+    assert map_hash(parse(GOOD.replace("sub = 4", "sub = 5"))) != map_hash(parse(GOOD))
+
+
+def test_identity() -> None:
+    mine = parse(GOOD.replace("product = 7", "product = 7\nmore_products = [9]"))
+    assert mine.is_for(0x123, 7) and mine.is_for(0x123, 9) and not mine.is_for(0x123, 8) and not mine.is_for(1, 7)
+    assert reference_map().is_for(REFERENCE_VENDOR, REFERENCE_PRODUCT)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_default_that_is_mapped_can_be_written(family: str) -> None:
+    path = FOLDER / family / "map.toml"
+    drive_map = parse_drive_map(path.read_text(encoding="utf-8"), str(path))
+    defaults = ParameterSet({name: BY_NAME[name].default for name in drive_map.cells})
+    held = drive_map.quantised(defaults).values
+    for name, cell in drive_map.cells.items():
+        if cell.form == "value" and cell.wire != "REAL32":
+            assert abs(held[name] - defaults.values[name]) <= cell.factor
+
+
+def test_the_guide_shows_a_map_that_is_accepted() -> None:
+    guide = (Path(FOLDER) / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```toml\n(.*?)```", guide, re.DOTALL)
+    assert blocks
+    assert parse(blocks[0]).cells
