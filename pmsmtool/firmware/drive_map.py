@@ -90,6 +90,10 @@ class Cell:
     form: Form = "value"
     source: str = ""
 
+    def __post_init__(self) -> None:
+        if self.gain and self.form == "value":
+            object.__setattr__(self, "form", "time")  # a gain alone has always meant an integral time
+
     @property
     def size(self) -> int:
         """Bytes on the wire."""

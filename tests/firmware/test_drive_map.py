@@ -34,7 +34,7 @@ SCALED = DriveMap(
         "current.K_i_d_v_per_as": Cell(
             "current.K_i_d_v_per_as", 0x320F, 2, "UNSIGNED16", 1e-6,
             gain="current.K_p_d_v_per_a", unit="us", form="time",
-        ),  # fmt: skip
+        ),
         "motor.I_max_apk": Cell(
             "motor.I_max_apk", 0x2031, 0, "UNSIGNED16", math.sqrt(2) / 1000, rounding="down", unit="mA rms"
         ),
