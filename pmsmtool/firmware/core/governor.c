@@ -15,6 +15,7 @@
 #define POLYGON_ROWS 16u
 #define POLYGON_INNER PMSM_C(0.92387953251128675613) /* cos(pi/8): the polygon lies inside the circle */
 #define LANDING_REST PMSM_C(0.26)          /* deadbeat would be 0; the rest is for an inductance that is off */
+#define EMPTY_MARGIN PMSM_C(1.00001)       /* on the square: rounding of a set that is just not empty */
 #define PRE_PROJECTION_MARGIN PMSM_C(0.99999)
 
 typedef struct {
@@ -22,6 +23,8 @@ typedef struct {
     uint32_t count;
     uint32_t steady;   /* index of the steady-state row; the current row follows it when it is there */
     pmsm_row pre;      /* steady-state row of the pre-projection */
+    pmsm_dq offset;    /* V, beside the nominal model in the steady state */
+    uint32_t may_start;/* 0: this period has no time to start a minimum-time transfer */
 } rows_of_period;
 
 static uint32_t has_option(const pmsm_period *period, uint32_t option)
@@ -31,8 +34,16 @@ static uint32_t has_option(const pmsm_period *period, uint32_t option)
 
 static uint32_t is_offset_free(const pmsm_params *params)
 {
-    return (params->governor_mode == PMSM_GOVERNOR_PAPER || params->governor_mode == PMSM_GOVERNOR_LINEARISED) ? 0u
-                                                                                                               : 1u;
+    const uint32_t mode = params->governor_mode;
+    return (mode == PMSM_GOVERNOR_PAPER || mode == PMSM_GOVERNOR_LINEARISED) ? 0u : 1u;
+}
+
+/* The line search takes the integrators' word: it is the law for little processing time. */
+static uint32_t uses_observer(const pmsm_params *params)
+{
+    const uint32_t mode = params->governor_mode;
+    const uint32_t able = (mode == PMSM_GOVERNOR_BEST || mode == PMSM_GOVERNOR_OBSERVE) ? 1u : 0u;
+    return (able != 0u && params->governor_observer_gain > 0.0F) ? 1u : 0u;
 }
 
 /* Voltage beside the nominal model that holds in the steady state. */
@@ -42,11 +53,11 @@ static pmsm_dq steady_offset(const pmsm_period *period, const pmsm_row *now)
     if (is_offset_free(period->params) == 0u) {
         return offset;
     }
-    if (period->params->governor_observer_gain > 0.0F) {
+    if (uses_observer(period->params) != 0u) {
         return period->state->disturbance;
     }
     /* the demand that would keep the current where it is, minus the model's: the integrators' share */
-    const pmsm_dq hold = pmsm_row_voltage(now, period->i_model);
+    const pmsm_dq hold = pmsm_voltage_of(now, period->i_model);
     const pmsm_dq model = pmsm_model_voltage(period, period->i_model);
     offset.d = hold.d - model.d;
     offset.q = hold.q - model.q;
@@ -131,15 +142,19 @@ static void build_rows(pmsm_period *period, rows_of_period *rows)
 {
     pmsm_row *now = &rows->row[0];
     pmsm_current_row(period, now);
-    now->V = pmsm_voltage_radius(period, pmsm_row_voltage(now, period->reference));
+    if (period->hexagon != 0u) {
+        now->V = pmsm_voltage_radius(period, pmsm_voltage_of(now, period->reference));
+    }
     rows->count = 1u;
+    rows->may_start = 1u;
     if (period->params->governor_mode == PMSM_GOVERNOR_PAPER) {
         add_prediction_rows(period, rows, PMSM_GOVERNOR_ROWS);
     } else if (period->params->governor_mode == PMSM_GOVERNOR_LINEARISED) {
         add_prediction_rows(period, rows, POLYGON_ROWS);
     }
     rows->steady = rows->count;
-    set_steady_row(period, steady_offset(period, now), &rows->row[rows->count]);
+    rows->offset = steady_offset(period, now);
+    set_steady_row(period, rows->offset, &rows->row[rows->count]);
     rows->count++;
     rows->pre = rows->row[rows->steady];
     rows->pre.V *= PRE_PROJECTION_MARGIN;
@@ -193,7 +208,7 @@ static uint32_t solve_linearised(const rows_of_period *rows, uint32_t count, pms
 /* Share of the way from p to r that a row allows; the root is clamped, so it can never extrapolate. */
 static pmsm_real row_share(const pmsm_row *row, pmsm_dq p, pmsm_dq way, pmsm_real slack)
 {
-    const pmsm_dq a = pmsm_row_voltage(row, p);
+    const pmsm_dq a = pmsm_voltage_of(row, p);
     const pmsm_dq e = {row->m_dd * way.d + row->m_dq * way.q, row->m_qd * way.d + row->m_qq * way.q};
     const pmsm_real aa = pmsm_square(e);
     const pmsm_real bb = a.d * e.d + a.q * e.q;
@@ -210,16 +225,28 @@ static pmsm_real row_share(const pmsm_row *row, pmsm_dq p, pmsm_dq way, pmsm_rea
     return (aa > PMSM_C(0.0)) ? (root - bb) / aa : PMSM_C(1.0);
 }
 
-/* Line search from the last governed reference. When that one became inadmissible (speed or U_dc moved), it is first
- * put back on the steady-state row and then on row 0. */
+/* A reference whose voltage is that of v in direction, and V in size. */
+static pmsm_dq scale_voltage(const pmsm_row *row, pmsm_dq v)
+{
+    const pmsm_dq w = pmsm_voltage_of(row, v);
+    const pmsm_real share = PMSM_C(1.0) - row->V / PMSM_SQRT(pmsm_square(w));
+    const pmsm_real inverse = share / (row->m_dd * row->m_qq - row->m_dq * row->m_qd);
+    const pmsm_dq x = {v.d - (row->m_qq * w.d - row->m_dq * w.q) * inverse,
+                       v.q - (row->m_dd * w.q - row->m_qd * w.d) * inverse};
+    return x;
+}
+
+/* Line search from the last governed reference. When that one became inadmissible (speed or U_dc moved), its
+ * steady-state voltage is scaled down; row 0 is met afterwards in any case. */
 static uint32_t solve_line(const pmsm_period *period, const rows_of_period *rows, pmsm_dq r, pmsm_dq *v,
                            uint32_t *active, uint32_t *steps)
 {
+    const pmsm_row *steady = &rows->row[rows->steady];
     const pmsm_dq p = period->state->reference_held;
     const pmsm_dq way = {r.d - p.d, r.q - p.q};
     const pmsm_real slack = (pmsm_real)period->params->governor_slack;
     pmsm_real kappa = PMSM_C(1.0);
-    for (uint32_t k = 0u; k < rows->count; k++) {
+    for (uint32_t k = 0u; k < rows->count && kappa >= PMSM_C(0.0); k++) {
         const pmsm_real share = row_share(&rows->row[k], p, way, slack);
         if (share < kappa) {
             kappa = share;
@@ -232,8 +259,8 @@ static uint32_t solve_line(const pmsm_period *period, const rows_of_period *rows
         v->q = p.q + kappa * way.q;
         return 1u;
     }
-    *v = pmsm_project_row(&rows->row[rows->steady], p, steps);
-    *v = pmsm_project_row(&rows->row[0], *v, steps);
+    const uint32_t outside = (pmsm_square(pmsm_voltage_of(steady, p)) > steady->V * steady->V) ? 1u : 0u;
+    *v = (outside != 0u) ? scale_voltage(steady, p) : p;
     return 1u;
 }
 
@@ -301,7 +328,7 @@ static void observe(pmsm_period *period, const rows_of_period *rows)
  * the direction of the request only): the demanded voltage ends inside its limit. */
 static pmsm_dq meet_row_zero(const pmsm_period *period, const pmsm_row *now, pmsm_dq v)
 {
-    const pmsm_dq w = pmsm_row_voltage(now, v);
+    const pmsm_dq w = pmsm_voltage_of(now, v);
     const pmsm_real square = pmsm_square(w);
     const pmsm_real V = pmsm_voltage_radius(period, w);
     if (square <= V * V) {
@@ -320,45 +347,89 @@ static pmsm_real land(pmsm_real i, pmsm_real r, pmsm_real L, pmsm_real K_p, pmsm
     return (gain > PMSM_C(1.0)) ? i + gain * (r - i) : r;
 }
 
-/* Minimum-time transfer to an inadmissible request, and its landing once the request is admissible. */
-static uint32_t steer(pmsm_period *period, const rows_of_period *rows, pmsm_dq r, uint32_t binding, pmsm_dq *v)
+/* An admissible request passes, but for the landing of a minimum-time transfer. */
+static pmsm_dq pass(pmsm_period *period, const rows_of_period *rows, pmsm_dq r, uint32_t *binding)
 {
     pmsm_state *state = period->state;
-    const pmsm_row *now = &rows->row[0];
-    if (binding == PMSM_BINDING_NONE) {
-        const uint32_t landing = state->landing;
-        state->time_to_go = PMSM_C(0.0);
-        state->landing = 0u;
-        if (landing != 0u) {
-            const pmsm_params *p = period->params;
-            const pmsm_real T_s = state->derived.T_s;
-            v->d = land(period->i_model.d, r.d, (pmsm_real)p->motor_L_d_h, now->m_dd, T_s);
-            v->q = land(period->i_model.q, r.q, (pmsm_real)p->motor_L_q_h, now->m_qq, T_s);
+    const pmsm_params *p = period->params;
+    const uint32_t landing = state->landing;
+    state->landing = 0u;
+    state->time_to_go = PMSM_C(0.0);
+    if (landing == 0u) {
+        return r;
+    }
+    const pmsm_dq v = {land(period->i_model.d, r.d, (pmsm_real)p->motor_L_d_h, rows->row[0].m_dd, state->derived.T_s),
+                       land(period->i_model.q, r.q, (pmsm_real)p->motor_L_q_h, rows->row[0].m_qq, state->derived.T_s)};
+    *binding = PMSM_BINDING_MINIMUM_TIME;
+    return v;
+}
+
+/* The line search says itself what is admissible, and the octagon is inside the circle. */
+static uint32_t asks_first(const pmsm_params *params)
+{
+    return (params->governor_mode == PMSM_GOVERNOR_PAPER || params->governor_mode == PMSM_GOVERNOR_BEST) ? 1u : 0u;
+}
+
+/* An inadmissible request: along the minimum-time direction where that is asked for and possible, else what the solver
+ * of the mode finds. Whether row 0 and the steady state can be met at once is settled first: an empty set changes what
+ * the direction may do to the current, and the smallest steady-state voltage is then the answer. */
+static pmsm_dq restrain(pmsm_period *period, const rows_of_period *rows, pmsm_dq r, uint32_t *binding, uint32_t *steps)
+{
+    pmsm_state *state = period->state;
+    const pmsm_row *steady = &rows->row[rows->steady];
+    if (has_option(period, PMSM_GOVERNOR_MINIMUM_TIME) == 0u || asks_first(period->params) == 0u) {
+        return solve(period, rows, r, binding, steps);
+    }
+    pmsm_dq v = pmsm_smallest_voltage(steady, &rows->row[0], steps);
+    const uint32_t empty = (pmsm_square(pmsm_voltage_of(steady, v)) > EMPTY_MARGIN * steady->V * steady->V) ? 1u : 0u;
+    *binding = PMSM_BINDING_EMPTY;
+    period->flags |= (empty != 0u) ? (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK : 0u;
+    if (pmsm_minimum_time(period, &rows->row[0], rows->offset, r, rows->may_start, &v) != 0u) {
+        state->landing = 1u;
+        *binding = PMSM_BINDING_MINIMUM_TIME;
+        return v;
+    }
+    state->time_to_go = PMSM_C(0.0);
+    return (empty != 0u) ? v : solve(period, rows, r, binding, steps);
+}
+
+static uint32_t is_admissible(const rows_of_period *rows, pmsm_dq r)
+{
+    for (uint32_t k = 0u; k < rows->count; k++) {
+        if (pmsm_square(pmsm_voltage_of(&rows->row[k], r)) > rows->row[k].V * rows->row[k].V) {
+            return 0u;
         }
-        return landing;
     }
-    if (pmsm_minimum_time(period, now, r, v) == 0u) {
-        state->time_to_go = PMSM_C(0.0);
-        return 0u;
-    }
-    state->landing = 1u;
     return 1u;
 }
 
-/* The reachable request: inside the steady-state row, and inside the current row where both can be met. */
-static pmsm_dq pre_project(const rows_of_period *rows, pmsm_dq r, uint32_t *steps)
+/* The reachable request: inside the steady-state row, and inside the current row where both can be met. The second is
+ * costly, so where a transfer has to be started as well the two share the work between two periods. */
+static pmsm_dq pre_project(pmsm_period *period, rows_of_period *rows, pmsm_dq r, uint32_t *steps)
 {
-    const uint32_t with_current = (rows->count > rows->steady + 1u) ? 1u : 0u;
-    const pmsm_row both[2] = {rows->pre, rows->row[rows->count - 1u]};
-    uint32_t active;
-    pmsm_dq v;
-    if (pmsm_project_rows(both, 1u + with_current, r, &v, &active, steps) != PMSM_PROJECTION_EMPTY) {
+    pmsm_state *state = period->state;
+    const pmsm_row *last = &rows->row[rows->count - 1u];
+    const uint32_t fresh = state->reachable_age;
+    pmsm_dq v = pmsm_project_row(&rows->pre, r, steps);
+    state->reachable_age = 0u;
+    if (rows->count <= rows->steady + 1u || pmsm_square(v) <= last->V * last->V) {
         return v;
     }
-    return pmsm_project_row(&rows->pre, r, steps);
+    const uint32_t same = (state->reachable_for.d == r.d && state->reachable_for.q == r.q) ? fresh : 0u;
+    if (same != 0u && state->time_to_go <= PMSM_C(0.0)) {
+        return state->reachable;
+    }
+    const pmsm_row both[2] = {rows->pre, *last};
+    uint32_t active;
+    (void)pmsm_project_rows(both, 2u, r, &v, &active, steps); /* v stays where there is no common point */
+    rows->may_start = 0u;
+    state->reachable_for = r;
+    state->reachable = v;
+    state->reachable_age = 1u;
+    return v;
 }
 
-static void choose(pmsm_period *period, const rows_of_period *rows)
+static void choose(pmsm_period *period, rows_of_period *rows)
 {
     pmsm_live *live = &period->state->live;
     const pmsm_dq request = period->reference;
@@ -366,12 +437,11 @@ static void choose(pmsm_period *period, const rows_of_period *rows)
     uint32_t steps = 0u;
     pmsm_dq r = request;
     if (has_option(period, PMSM_GOVERNOR_PRE_PROJECTION) != 0u) {
-        r = pre_project(rows, request, &steps);
+        r = pre_project(period, rows, request, &steps);
     }
-    pmsm_dq v = solve(period, rows, r, &binding, &steps);
-    if (has_option(period, PMSM_GOVERNOR_MINIMUM_TIME) != 0u && steer(period, rows, r, binding, &v) != 0u) {
-        binding = PMSM_BINDING_MINIMUM_TIME;
-    }
+    pmsm_dq v = (asks_first(period->params) != 0u && is_admissible(rows, r) != 0u)
+                    ? pass(period, rows, r, &binding)
+                    : restrain(period, rows, r, &binding, &steps);
     v = meet_row_zero(period, &rows->row[0], v);
     if (v.d != request.d || v.q != request.q) {
         period->flags |= (uint32_t)PMSM_FLAG_GOVERNOR_ACTIVE;
@@ -389,6 +459,9 @@ void pmsm_govern(pmsm_period *period)
     if (params->current_K_p_d_v_per_a <= 0.0F || params->current_K_p_q_v_per_a <= 0.0F || period->V_max <= 0 ||
         period->request->bias_bandwidth > PMSM_C(0.0)) {
         return; /* the reference does not act on the voltage at once, or by other gains than the rows' */
+    }
+    if (uses_observer(params) != 0u) {
+        pmsm_observe_disturbance(period, (pmsm_real)params->governor_observer_gain);
     }
     rows_of_period rows;
     build_rows(period, &rows);

@@ -112,6 +112,9 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_dq reference_realised; /* A, reference of the last period that its limited voltage stood for */
     pmsm_real tau_granted;   /* N m, torque of the reference that the limits left */
     pmsm_real time_to_go;    /* s, of the minimum-time transfer in progress, 0 when there is none */
+    pmsm_dq reachable_for;   /* A, request that reachable belongs to */
+    pmsm_dq reachable;       /* A, its projection on steady-state and current row */
+    uint32_t reachable_age;  /* 1: computed in the last period, 0: not valid */
     uint32_t landing;        /* 1: a minimum-time transfer has not reached its target yet */
     pmsm_real fw_tau;        /* N m, request of the last optimisation */
     uint32_t fw_empty;       /* 1: it found no current that satisfies both limits */

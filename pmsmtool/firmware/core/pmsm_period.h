@@ -64,7 +64,8 @@ pmsm_dq pmsm_predict_current(const pmsm_period *period);
 void pmsm_govern(pmsm_period *period);
 
 /* minimum_time.c: 1 and the reference that steers along the minimum-time direction, or 0 */
-uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq target, pmsm_dq *v);
+uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq offset, pmsm_dq target,
+                           uint32_t may_start, pmsm_dq *v);
 
 /* polar.c: the laws of polar.mode in place of the current controller */
 void pmsm_polar_demand(pmsm_period *period);

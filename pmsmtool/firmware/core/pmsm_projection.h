@@ -17,9 +17,19 @@ typedef struct {                  /* the row |M v + c| <= V */
 } pmsm_row;
 
 #define PMSM_PROJECTION_EMPTY 255u /* the rows have no common point */
+#define PMSM_PROJECTION_ROWS 72u   /* most rows of one call */
 #define PMSM_PROJECTION_ROUNDS 16u /* bound of the outer loop, and of every Newton iteration inside */
 
 /* M v + c. */
+static inline pmsm_dq pmsm_voltage_of(const pmsm_row *row, pmsm_dq v)
+{
+    pmsm_dq w;
+    w.d = (row->m_dd * v.d + row->m_dq * v.q) + row->c_d;
+    w.q = (row->m_qd * v.d + row->m_qq * v.q) + row->c_q;
+    return w;
+}
+
+/* The same for callers outside the core. */
 PMSM_EXPORT pmsm_dq pmsm_row_voltage(const pmsm_row *row, pmsm_dq v);
 
 /* Nearest point to r on one row; r itself when it satisfies the row. steps counts Newton steps. */

@@ -1,40 +1,68 @@
 /* Exact projection on intersections of ellipses in the plane.
  *
- * At the optimum at most two rows are active (an LP-type problem of dimension 2). One row: Newton's method on
- * 1/|w| = 1/V, monotone from multiplier 0. Two rows: Newton's method on the concave dual in the two multipliers.
+ * At the optimum at most two rows are active (an LP-type problem of dimension 2), so rows are exchanged one at a time.
+ * One active row: Newton's method on 1/|w| = 1/V for its multiplier, monotone from 0. Two active rows: Newton's method
+ * for the corner, after a test whether the two can be met at once; the sign of the multipliers tells the right corner.
  */
 #include "pmsm_projection.h"
 
 #include "pmsm_math.h"
 
 #ifdef PMSM_REAL_DOUBLE
-#define ROW_TOLERANCE 1e-11     /* | |w| - V | / V of a single-row projection */
-#define PAIR_TOLERANCE 1e-12    /* | |w|^2/V^2 - 1 | / 2 of a two-row projection */
-#define VIOLATION 1e-10         /* |w|^2/V^2 - 1 that counts as satisfied */
-#define STALL 1e-7              /* the same, when rounding keeps a row from coming closer */
-#define SINGULAR 1e-13          /* relative determinant below which two normals count as parallel */
-#define ROUNDING 1e-15          /* relative error of a dual value */
+#define ROW_TOLERANCE 1e-11  /* | |w| - V | / V of a single-row projection */
+#define PAIR_TOLERANCE 1e-12 /* | |w|^2/V^2 - 1 | / 2 at a corner */
+#define VIOLATION 1e-10      /* |w|^2/V^2 - 1 that counts as satisfied */
+#define STALL 1e-7           /* the same, when rounding keeps a row from coming closer */
+#define SINGULAR 1e-13       /* relative determinant below which two normals count as parallel */
 #else
 #define ROW_TOLERANCE 1e-6F
-#define PAIR_TOLERANCE 2e-6F
+#define PAIR_TOLERANCE 1e-6F
 #define VIOLATION 5e-6F
 #define STALL 2e-5F
 #define SINGULAR 1e-6F
-#define ROUNDING 3e-7F
 #endif
-#define PAIR_STEPS 16u          /* of the dual iteration */
+#ifdef PMSM_REAL_DOUBLE
+#define CORNER_STEPS 8u
+#else
+#define CORNER_STEPS 6u
+#endif
+#define ENTRY_TRIALS 4u
 #define NONE 255u
 
 typedef struct { /* symmetric 2x2 */
     pmsm_real a, b, c; /* [[a, b], [b, c]] */
 } symmetric;
 
-static pmsm_dq solve(symmetric s, pmsm_dq x)
+typedef struct { /* the same with the reciprocal of its determinant */
+    symmetric s;
+    pmsm_real inverse;
+} factor;
+
+static factor shifted_identity(symmetric K, pmsm_real lambda)
 {
-    const pmsm_real inverse = PMSM_C(1.0) / (s.a * s.c - s.b * s.b);
+    factor f;
+    f.s.a = PMSM_C(1.0) + lambda * K.a;
+    f.s.b = lambda * K.b;
+    f.s.c = PMSM_C(1.0) + lambda * K.c;
+    f.inverse = PMSM_C(1.0) / (f.s.a * f.s.c - f.s.b * f.s.b);
+    return f;
+}
+
+static factor shifted(symmetric G, pmsm_real mu)
+{
+    factor f;
+    f.s.a = G.a + mu;
+    f.s.b = G.b;
+    f.s.c = G.c + mu;
+    f.inverse = PMSM_C(1.0) / (f.s.a * f.s.c - f.s.b * f.s.b);
+    return f;
+}
+
+static pmsm_dq solve(const factor *f, pmsm_dq x)
+{
     pmsm_dq y;
-    y.d = (s.c * x.d - s.b * x.q) * inverse;
-    y.q = (s.a * x.q - s.b * x.d) * inverse;
+    y.d = (f->s.c * x.d - f->s.b * x.q) * f->inverse;
+    y.q = (f->s.a * x.q - f->s.b * x.d) * f->inverse;
     return y;
 }
 
@@ -61,211 +89,187 @@ static pmsm_dq transposed_times(const pmsm_row *row, pmsm_dq w)
 
 pmsm_dq pmsm_row_voltage(const pmsm_row *row, pmsm_dq v)
 {
-    pmsm_dq w;
-    w.d = (row->m_dd * v.d + row->m_dq * v.q) + row->c_d;
-    w.q = (row->m_qd * v.d + row->m_qq * v.q) + row->c_q;
-    return w;
+    return pmsm_voltage_of(row, v);
 }
 
-static pmsm_real excess(const pmsm_row *row, pmsm_dq v)
+/* |w|^2/V^2 - 1, the reciprocal of V^2 being at hand. */
+static pmsm_real excess(const pmsm_row *row, pmsm_real inverse, pmsm_dq v)
 {
-    return pmsm_square(pmsm_row_voltage(row, v)) / (row->V * row->V) - PMSM_C(1.0);
+    return pmsm_square(pmsm_voltage_of(row, v)) * inverse - PMSM_C(1.0);
 }
 
-/* (E + lambda K) w = a with |w| = V, K = M M^T: the multiplier of the row, for |a| > V. */
-static pmsm_dq shrink(symmetric K, pmsm_dq a, pmsm_real V, pmsm_real *lambda, uint32_t *steps)
-{
-    pmsm_dq w = a;
-    *lambda = PMSM_C(0.0);
-    for (uint32_t k = 0u; k < PMSM_PROJECTION_ROUNDS; k++) {
-        const pmsm_real square = pmsm_square(w);
-        const pmsm_real size = PMSM_SQRT(square);
-        if (size - V <= ROW_TOLERANCE * V) {
-            break;
-        }
-        symmetric S = {PMSM_C(1.0) + *lambda * K.a, *lambda * K.b, PMSM_C(1.0) + *lambda * K.c};
-        const pmsm_dq z = solve(S, times(K, w));
-        *lambda += ((size - V) / V) * square / dot(w, z);
-        S.a = PMSM_C(1.0) + *lambda * K.a;
-        S.b = *lambda * K.b;
-        S.c = PMSM_C(1.0) + *lambda * K.c;
-        w = solve(S, a);
-        (*steps)++;
-    }
-    return w;
-}
+/* --- one row active ---------------------------------------------------------------------------------------------- */
 
 pmsm_dq pmsm_project_row(const pmsm_row *row, pmsm_dq r, uint32_t *steps)
 {
-    const pmsm_dq a = pmsm_row_voltage(row, r);
-    if (pmsm_square(a) <= row->V * row->V) {
+    const pmsm_dq a = pmsm_voltage_of(row, r);
+    pmsm_real square = pmsm_square(a);
+    if (square <= row->V * row->V) {
         return r;
     }
+    /* (E + lambda K) w = a with |w| = V, K = M M^T; v = r - lambda M^T w */
     const symmetric K = {row->m_dd * row->m_dd + row->m_dq * row->m_dq, row->m_dd * row->m_qd + row->m_dq * row->m_qq,
                          row->m_qd * row->m_qd + row->m_qq * row->m_qq};
-    pmsm_real lambda;
-    const pmsm_dq w = shrink(K, a, row->V, &lambda, steps);
+    const pmsm_real enough = row->V * (PMSM_C(1.0) + ROW_TOLERANCE);
+    factor S = {{PMSM_C(1.0), PMSM_C(0.0), PMSM_C(1.0)}, PMSM_C(1.0)};
+    pmsm_real lambda = PMSM_C(0.0);
+    pmsm_dq w = a;
+    for (uint32_t k = 0u; k < PMSM_PROJECTION_ROUNDS; k++) {
+        const pmsm_real size = PMSM_SQRT(square);
+        if (size <= enough) {
+            break;
+        }
+        const pmsm_dq z = solve(&S, times(K, w));
+        lambda += (size - row->V) * square / (row->V * dot(w, z));
+        S = shifted_identity(K, lambda);
+        w = solve(&S, a);
+        square = pmsm_square(w);
+        (*steps)++;
+    }
     const pmsm_dq step = transposed_times(row, w);
-    pmsm_dq v;
-    v.d = r.d - lambda * step.d;
-    v.q = r.q - lambda * step.q;
+    const pmsm_dq v = {r.d - lambda * step.d, r.q - lambda * step.q};
     return v;
 }
 
-/* --- two rows active: concave dual in (l1, l2) >= 0, rows scaled to V = 1 ------------------------------------- */
+/* --- two rows active --------------------------------------------------------------------------------------------- */
 
-typedef struct {
-    symmetric G;  /* A^T A */
-    pmsm_dq h;    /* A^T d */
-    pmsm_real e;  /* |d|^2 - 1 */
-} quadratic;
-
-typedef struct {
-    pmsm_dq v;
-    pmsm_dq n[2]; /* gradients of g */
-    pmsm_real g[2];
-    symmetric H;
-    pmsm_real value; /* of the dual */
-} dual_point;
-
-static quadratic scaled(const pmsm_row *row)
+static pmsm_dq reference_of(const pmsm_row *row, pmsm_dq w)
 {
-    const pmsm_real s = PMSM_C(1.0) / row->V;
-    const pmsm_real dd = row->m_dd * s;
-    const pmsm_real dq = row->m_dq * s;
-    const pmsm_real qd = row->m_qd * s;
-    const pmsm_real qq = row->m_qq * s;
-    const pmsm_real c_d = row->c_d * s;
-    const pmsm_real c_q = row->c_q * s;
-    const quadratic q = {{dd * dd + qd * qd, dd * dq + qd * qq, dq * dq + qq * qq},
-                         {dd * c_d + qd * c_q, dq * c_d + qq * c_q},
-                         c_d * c_d + c_q * c_q - PMSM_C(1.0)};
-    return q;
+    const pmsm_real inverse = PMSM_C(1.0) / (row->m_dd * row->m_qq - row->m_dq * row->m_qd);
+    const pmsm_real d = w.d - row->c_d;
+    const pmsm_real q = w.q - row->c_q;
+    const pmsm_dq v = {(row->m_qq * d - row->m_dq * q) * inverse, (row->m_dd * q - row->m_qd * d) * inverse};
+    return v;
 }
 
-static void evaluate(const quadratic rows[2], pmsm_dq r, const pmsm_real l[2], dual_point *point)
+/* Newton's method for the corner where both rows are met with equality; 1 when it is the optimum, that is when r - v is
+ * a non-negative combination of the two outward normals. */
+static uint32_t find_corner(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq *v, uint32_t *steps)
 {
-    const symmetric H = {PMSM_C(1.0) + l[0] * rows[0].G.a + l[1] * rows[1].G.a,
-                         l[0] * rows[0].G.b + l[1] * rows[1].G.b,
-                         PMSM_C(1.0) + l[0] * rows[0].G.c + l[1] * rows[1].G.c};
-    const pmsm_dq right = {r.d - l[0] * rows[0].h.d - l[1] * rows[1].h.d,
-                           r.q - l[0] * rows[0].h.q - l[1] * rows[1].h.q};
-    point->H = H;
-    point->v = solve(H, right);
-    const pmsm_dq step = {point->v.d - r.d, point->v.q - r.q};
-    point->value = PMSM_C(0.5) * pmsm_square(step);
-    for (uint32_t k = 0u; k < 2u; k++) {
-        const pmsm_dq Gv = times(rows[k].G, point->v);
-        point->n[k].d = Gv.d + rows[k].h.d;
-        point->n[k].q = Gv.q + rows[k].h.q;
-        point->g[k] = PMSM_C(0.5) * ((dot(point->v, point->n[k]) + dot(point->v, rows[k].h)) + rows[k].e);
-        point->value += l[k] * point->g[k];
-    }
-}
-
-/* Newton step of the dual on the multipliers that are free. */
-static void newton_step(const dual_point *point, const pmsm_real l[2], pmsm_real step[2])
-{
-    const pmsm_dq y0 = solve(point->H, point->n[0]);
-    const pmsm_dq y1 = solve(point->H, point->n[1]);
-    const pmsm_real D[2] = {dot(point->n[0], y0), dot(point->n[1], y1)};
-    const pmsm_real across = dot(point->n[0], y1);
-    const pmsm_real *g = point->g;
-    const pmsm_real floor_det = SINGULAR * D[0] * D[1];
-    const uint32_t fixed0 = (l[0] <= PMSM_C(0.0) && g[0] < PMSM_C(0.0)) ? 1u : 0u;
-    const uint32_t fixed1 = (l[1] <= PMSM_C(0.0) && g[1] < PMSM_C(0.0)) ? 1u : 0u;
-    pmsm_real det = D[0] * D[1] - across * across;
-    det = (det > floor_det) ? det : floor_det;
-    step[0] = (fixed0 != 0u) ? PMSM_C(0.0) : (fixed1 != 0u) ? g[0] / D[0] : (g[0] * D[1] - g[1] * across) / det;
-    step[1] = (fixed1 != 0u) ? PMSM_C(0.0) : (fixed0 != 0u) ? g[1] / D[1] : (g[1] * D[0] - g[0] * across) / det;
-    for (uint32_t k = 0u; k < 2u; k++) {
-        const uint32_t other = 1u - k;
-        if (l[k] + step[k] < PMSM_C(0.0)) { /* this one goes to its bound, the other answers alone */
-            step[k] = -l[k];
-            step[other] = (g[other] - across * step[k]) / D[other];
-            step[other] = (l[other] + step[other] < PMSM_C(0.0)) ? -l[other] : step[other];
-            break;
+    const pmsm_real limit_1 = first->V * first->V;
+    const pmsm_real limit_2 = second->V * second->V;
+    for (uint32_t k = 0u; k < CORNER_STEPS; k++) {
+        const pmsm_dq w1 = pmsm_voltage_of(first, *v);
+        const pmsm_dq w2 = pmsm_voltage_of(second, *v);
+        const pmsm_real f1 = PMSM_C(0.5) * (pmsm_square(w1) - limit_1);
+        const pmsm_real f2 = PMSM_C(0.5) * (pmsm_square(w2) - limit_2);
+        const pmsm_dq n1 = transposed_times(first, w1);
+        const pmsm_dq n2 = transposed_times(second, w2);
+        const pmsm_real det = n1.d * n2.q - n1.q * n2.d;
+        if (det * det <= SINGULAR * (pmsm_square(n1) * pmsm_square(n2))) {
+            return 0u;
         }
+        const pmsm_real inverse = PMSM_C(1.0) / det;
+        if (pmsm_abs(f1) <= PAIR_TOLERANCE * limit_1 && pmsm_abs(f2) <= PAIR_TOLERANCE * limit_2) {
+            const pmsm_dq pull = {r.d - v->d, r.q - v->q};
+            const pmsm_real l1 = (pull.d * n2.q - pull.q * n2.d) * inverse;
+            const pmsm_real l2 = (pull.q * n1.d - pull.d * n1.q) * inverse;
+            return (l1 >= PMSM_C(0.0) && l2 >= PMSM_C(0.0)) ? 1u : 0u;
+        }
+        v->d -= (f1 * n2.q - f2 * n1.q) * inverse;
+        v->q -= (f2 * n1.d - f1 * n2.d) * inverse;
+        (*steps)++;
     }
+    return 0u;
 }
 
-static uint32_t is_solved(const dual_point *point, const pmsm_real l[2])
+/* The point of the first row's boundary above the point t of the chord from a to b (voltages of the row). */
+static pmsm_dq on_arc(const pmsm_row *first, pmsm_dq a, pmsm_dq b, pmsm_real t)
 {
-    uint32_t good = 1u;
-    for (uint32_t k = 0u; k < 2u; k++) {
-        const pmsm_real g = point->g[k];
-        const uint32_t touches = (pmsm_abs(g) <= PAIR_TOLERANCE) ? 1u : 0u;
-        const uint32_t idle = (l[k] <= PMSM_C(0.0) && g < PMSM_C(0.0)) ? 1u : 0u;
-        good &= touches | idle;
-    }
-    return good;
+    const pmsm_dq chord = {a.d + t * (b.d - a.d), a.q + t * (b.q - a.q)};
+    const pmsm_real scale = first->V / PMSM_SQRT(pmsm_square(chord));
+    const pmsm_dq w = {scale * chord.d, scale * chord.q};
+    return reference_of(first, w);
 }
 
-static pmsm_real start_multiplier(const pmsm_row *row, pmsm_dq r, uint32_t *steps)
+/* Both rows with equality, 0: there is no such optimum. outside is on the first row and violates the second, whose 
+ * voltage is smallest at some point of the first row's disc; if it is too large even there, the two cannot be met at
+ * once. On the boundary of the first row the excess of the second grows from that point like a parabola, which tells
+ * where to start Newton's method: also the short lens of two rows that hardly meet has its corners where the parabola
+ * says. Should it go astray, bisection leads it. */
+static uint32_t project_pair(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq outside, pmsm_dq *v,
+                             uint32_t *steps)
 {
-    const pmsm_dq a = pmsm_row_voltage(row, r);
-    if (pmsm_square(a) <= row->V * row->V) {
-        return PMSM_C(0.0);
-    }
-    const symmetric K = {row->m_dd * row->m_dd + row->m_dq * row->m_dq, row->m_dd * row->m_qd + row->m_dq * row->m_qq,
-                         row->m_qd * row->m_qd + row->m_qq * row->m_qq};
-    pmsm_real lambda;
-    (void)shrink(K, a, row->V, &lambda, steps);
-    return PMSM_C(0.5) * lambda * (row->V * row->V);
-}
-
-/* Can both rows be met at all? The smallest |w| of the one on the disc of the other tells, in few steps. */
-static uint32_t pair_is_feasible(const pmsm_row *first, const pmsm_row *second, uint32_t *steps)
-{
-    const pmsm_dq v = pmsm_smallest_voltage(second, first, steps);
-    return (excess(second, v) <= VIOLATION) ? 1u : 0u;
-}
-
-/* Returns 1 and the point when both rows can be met at once. */
-static uint32_t project_pair(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq *v, uint32_t *steps)
-{
-    if (pair_is_feasible(first, second, steps) == 0u) {
+    const pmsm_real inverse = PMSM_C(1.0) / (second->V * second->V);
+    const pmsm_dq best = pmsm_smallest_voltage(second, first, steps);
+    const pmsm_real depth = -excess(second, inverse, best);
+    if (depth < -VIOLATION) {
         return 0u;
     }
-    const quadratic rows[2] = {scaled(first), scaled(second)};
-    pmsm_real l[2] = {start_multiplier(first, r, steps), start_multiplier(second, r, steps)};
-    dual_point point;
-    evaluate(rows, r, l, &point);
-    for (uint32_t k = 0u; k < PAIR_STEPS; k++) {
-        if (is_solved(&point, l) != 0u) {
-            break;
+    const pmsm_dq a = pmsm_voltage_of(first, outside);
+    const pmsm_dq b = pmsm_voltage_of(first, best);
+    const pmsm_real within = (depth > PMSM_C(0.0)) ? depth : PMSM_C(0.0);
+    const pmsm_real share = PMSM_SQRT(within / (within + excess(second, inverse, outside)));
+    pmsm_real low = PMSM_C(0.0);
+    pmsm_real high = PMSM_C(1.0);
+    pmsm_real t = PMSM_C(1.0) - share;
+    for (uint32_t k = 0u; k < ENTRY_TRIALS; k++) {
+        const pmsm_dq start = on_arc(first, a, b, t);
+        *v = start;
+        if (find_corner(first, second, r, v, steps) != 0u) {
+            return 1u;
         }
-        pmsm_real step[2];
-        newton_step(&point, l, step);
-        dual_point next;
-        pmsm_real trial[2];
-        for (uint32_t cut = 0u; cut < 4u; cut++) { /* the dual must not decrease */
-            trial[0] = l[0] + step[0];
-            trial[1] = l[1] + step[1];
-            evaluate(rows, r, trial, &next);
-            (*steps)++;
-            if (next.value >= point.value - ROUNDING * pmsm_abs(point.value)) {
-                break;
-            }
-            step[0] *= PMSM_C(0.4);
-            step[1] *= PMSM_C(0.4);
+        if (excess(second, inverse, start) > PMSM_C(0.0)) {
+            low = t;
+        } else {
+            high = t;
         }
-        l[0] = trial[0];
-        l[1] = trial[1];
-        point = next;
+        t = PMSM_C(0.5) * (low + high);
     }
-    *v = point.v;
-    return (point.g[0] <= STALL && point.g[1] <= STALL) ? 1u : 0u;
+    return 0u;
 }
 
-/* --- active set ---------------------------------------------------------------------------------------------- */
+pmsm_dq pmsm_smallest_voltage(const pmsm_row *goal, const pmsm_row *limit, uint32_t *steps)
+{
+    /* coordinates y = M_l v + c_l: minimise |B y + f| over the disc |y| <= V_l */
+    const pmsm_real inverse = PMSM_C(1.0) / (limit->m_dd * limit->m_qq - limit->m_dq * limit->m_qd);
+    const pmsm_row back = {limit->m_qq * inverse, -limit->m_dq * inverse, -limit->m_qd * inverse,
+                           limit->m_dd * inverse, PMSM_C(0.0), PMSM_C(0.0), PMSM_C(1.0)};
+    const pmsm_dq centre = {-limit->c_d, -limit->c_q};
+    const pmsm_dq f = pmsm_voltage_of(goal, pmsm_voltage_of(&back, centre));
+    const pmsm_row B = {goal->m_dd * back.m_dd + goal->m_dq * back.m_qd,
+                        goal->m_dd * back.m_dq + goal->m_dq * back.m_qq,
+                        goal->m_qd * back.m_dd + goal->m_qq * back.m_qd,
+                        goal->m_qd * back.m_dq + goal->m_qq * back.m_qq,
+                        PMSM_C(0.0), PMSM_C(0.0), PMSM_C(1.0)};
+    const symmetric G = {B.m_dd * B.m_dd + B.m_qd * B.m_qd, B.m_dd * B.m_dq + B.m_qd * B.m_qq,
+                         B.m_dq * B.m_dq + B.m_qq * B.m_qq};
+    const pmsm_dq right = transposed_times(&B, f);
+    const pmsm_real enough = limit->V * (PMSM_C(1.0) + ROW_TOLERANCE);
+    pmsm_real mu = SINGULAR * (G.a + G.c); /* keeps a singular goal solvable */
+    pmsm_real size = PMSM_C(0.0);
+    pmsm_dq y = {PMSM_C(0.0), PMSM_C(0.0)};
+    for (uint32_t k = 0u; k < PMSM_PROJECTION_ROUNDS; k++) { /* Newton on 1/|y| = 1/V, monotone from below */
+        const factor S = shifted(G, mu);
+        y = solve(&S, right);
+        const pmsm_real square = pmsm_square(y);
+        size = PMSM_SQRT(square);
+        if (size <= enough) {
+            break;
+        }
+        mu += (size - limit->V) * square / (limit->V * dot(y, solve(&S, y)));
+        (*steps)++;
+    }
+    const pmsm_real scale = (size > limit->V) ? -limit->V / size : PMSM_C(-1.0);
+    const pmsm_dq point = {scale * y.d - limit->c_d, scale * y.q - limit->c_q};
+    return pmsm_voltage_of(&back, point);
+}
 
-static uint32_t most_violated(const pmsm_row *rows, uint32_t count, pmsm_dq v, pmsm_real *worst)
+/* --- active set -------------------------------------------------------------------------------------------------- */
+
+typedef struct {
+    const pmsm_row *row;
+    pmsm_real inverse[PMSM_PROJECTION_ROWS]; /* 1/V^2 */
+    uint32_t count;
+    uint32_t basis[2]; /* active rows, NONE when free */
+} active_set;
+
+static uint32_t most_violated(const active_set *set, pmsm_dq v, pmsm_real *worst)
 {
     uint32_t index = 0u;
-    *worst = excess(&rows[0], v);
-    for (uint32_t k = 1u; k < count; k++) {
-        const pmsm_real g = excess(&rows[k], v);
+    *worst = excess(&set->row[0], set->inverse[0], v);
+    for (uint32_t k = 1u; k < set->count; k++) {
+        const pmsm_real g = excess(&set->row[k], set->inverse[k], v);
         if (g > *worst) {
             *worst = g;
             index = k;
@@ -274,36 +278,36 @@ static uint32_t most_violated(const pmsm_row *rows, uint32_t count, pmsm_dq v, p
     return index;
 }
 
-typedef struct { /* indices of the active rows, NONE when free */
-    uint32_t row[2];
-} basis;
-
-static uint32_t satisfies(const pmsm_row *rows, const basis *b, uint32_t skip, pmsm_dq v)
+/* Does v satisfy the active rows? */
+static uint32_t satisfies(const active_set *set, uint32_t k, pmsm_dq v)
 {
-    for (uint32_t k = 0u; k < 2u; k++) {
-        if (b->row[k] != NONE && b->row[k] != skip && excess(&rows[b->row[k]], v) > VIOLATION) {
-            return 0u;
-        }
-    }
-    return 1u;
+    return (k == NONE || excess(&set->row[k], set->inverse[k], v) <= VIOLATION) ? 1u : 0u;
 }
 
-/* The new basis after row k turned out violated: k alone, or k with one of the old rows. 0: there is none. */
-static uint32_t exchange(const pmsm_row *rows, uint32_t k, pmsm_dq r, basis *b, pmsm_dq *v, uint32_t *steps)
+/* The new basis after row k turned out violated in v: k alone, or k with one of the old rows. 0: there is none. */
+static uint32_t exchange(active_set *set, uint32_t k, pmsm_dq r, pmsm_dq *v, uint32_t *steps)
 {
-    pmsm_dq x = pmsm_project_row(&rows[k], r, steps);
-    if (satisfies(rows, b, NONE, x) != 0u) {
-        b->row[0] = k;
-        b->row[1] = NONE;
-        *v = x;
+    const pmsm_dq alone = pmsm_project_row(&set->row[k], r, steps);
+    const uint32_t inside = (alone.d == r.d && alone.q == r.q) ? 1u : 0u; /* r itself is on neither boundary then */
+    const uint32_t met[2] = {satisfies(set, set->basis[0], alone), satisfies(set, set->basis[1], alone)};
+    if ((met[0] & met[1]) != 0u) {
+        set->basis[0] = k;
+        set->basis[1] = NONE;
+        *v = alone;
         return 1u;
     }
     for (uint32_t j = 0u; j < 2u; j++) {
-        const uint32_t other = b->row[j];
-        if (other != NONE && project_pair(&rows[k], &rows[other], r, &x, steps) != 0u &&
-            satisfies(rows, b, other, x) != 0u) {
-            b->row[0] = k;
-            b->row[1] = other;
+        const uint32_t other = set->basis[j];
+        if (met[j] != 0u) {
+            continue;
+        }
+        const pmsm_row *first = &set->row[(inside != 0u) ? other : k];
+        const pmsm_row *second = &set->row[(inside != 0u) ? k : other];
+        pmsm_dq x;
+        if (project_pair(first, second, r, (inside != 0u) ? *v : alone, &x, steps) != 0u &&
+            satisfies(set, set->basis[1u - j], x) != 0u) {
+            set->basis[0] = k;
+            set->basis[1] = other;
             *v = x;
             return 1u;
         }
@@ -314,64 +318,38 @@ static uint32_t exchange(const pmsm_row *rows, uint32_t k, pmsm_dq r, basis *b, 
 uint32_t pmsm_project_rows(const pmsm_row *rows, uint32_t count, pmsm_dq r, pmsm_dq *v, uint32_t *active,
                            uint32_t *steps)
 {
+    active_set set;
     pmsm_dq x = r;
-    basis b = {{NONE, NONE}};
+    set.row = rows;
+    set.count = count;
+    set.basis[0] = NONE;
+    set.basis[1] = NONE;
+    for (uint32_t k = 0u; k < count; k++) {
+        set.inverse[k] = PMSM_C(1.0) / (rows[k].V * rows[k].V);
+    }
     for (uint32_t round = 0u; round < PMSM_PROJECTION_ROUNDS; round++) {
         pmsm_real worst;
-        const uint32_t k = most_violated(rows, count, x, &worst);
-        const uint32_t again = (k == b.row[0] || k == b.row[1]) ? 1u : 0u;
+        const uint32_t k = most_violated(&set, x, &worst);
+        const uint32_t again = (k == set.basis[0] || k == set.basis[1]) ? 1u : 0u;
         if (worst <= VIOLATION || (again != 0u && worst <= STALL)) {
             *v = x;
-            *active = b.row[0];
-            return ((b.row[0] != NONE) ? 1u : 0u) + ((b.row[1] != NONE) ? 1u : 0u);
+            *active = set.basis[0];
+            return ((set.basis[0] != NONE) ? 1u : 0u) + ((set.basis[1] != NONE) ? 1u : 0u);
         }
-        if (again != 0u || exchange(rows, k, r, &b, &x, steps) == 0u) {
+        if (again != 0u || exchange(&set, k, r, &x, steps) == 0u) {
             return PMSM_PROJECTION_EMPTY;
         }
     }
     return PMSM_PROJECTION_EMPTY;
 }
 
-pmsm_dq pmsm_smallest_voltage(const pmsm_row *goal, const pmsm_row *limit, uint32_t *steps)
-{
-    /* coordinates y = M_l v + c_l: minimise |B y + f| over the disc |y| <= V_l */
-    const pmsm_real inverse = PMSM_C(1.0) / (limit->m_dd * limit->m_qq - limit->m_dq * limit->m_qd);
-    const pmsm_row back = {limit->m_qq * inverse, -limit->m_dq * inverse, -limit->m_qd * inverse,
-                           limit->m_dd * inverse, PMSM_C(0.0), PMSM_C(0.0), PMSM_C(1.0)};
-    const pmsm_dq centre = {-limit->c_d, -limit->c_q};
-    const pmsm_dq v_centre = pmsm_row_voltage(&back, centre);
-    const pmsm_dq f = pmsm_row_voltage(goal, v_centre);
-    const pmsm_row B = {goal->m_dd * back.m_dd + goal->m_dq * back.m_qd, goal->m_dd * back.m_dq + goal->m_dq * back.m_qq,
-                        goal->m_qd * back.m_dd + goal->m_qq * back.m_qd, goal->m_qd * back.m_dq + goal->m_qq * back.m_qq,
-                        PMSM_C(0.0), PMSM_C(0.0), PMSM_C(1.0)};
-    const symmetric G = {B.m_dd * B.m_dd + B.m_qd * B.m_qd, B.m_dd * B.m_dq + B.m_qd * B.m_qq,
-                         B.m_dq * B.m_dq + B.m_qq * B.m_qq};
-    const pmsm_dq right = transposed_times(&B, f);
-    pmsm_real mu = SINGULAR * (G.a + G.c); /* keeps a singular goal solvable */
-    pmsm_dq y = {PMSM_C(0.0), PMSM_C(0.0)};
-    for (uint32_t k = 0u; k < PMSM_PROJECTION_ROUNDS; k++) { /* Newton on 1/|y| = 1/V, monotone from below */
-        const symmetric S = {G.a + mu, G.b, G.c + mu};
-        y = solve(S, right);
-        const pmsm_real square = pmsm_square(y);
-        const pmsm_real size = PMSM_SQRT(square);
-        if (size <= limit->V * (PMSM_C(1.0) + ROW_TOLERANCE)) {
-            break;
-        }
-        mu += ((size - limit->V) / limit->V) * square / dot(y, solve(S, y));
-        (*steps)++;
-    }
-    const pmsm_real size = PMSM_SQRT(pmsm_square(y));
-    const pmsm_real scale = (size > limit->V) ? -limit->V / size : PMSM_C(-1.0);
-    const pmsm_dq point = {scale * y.d - limit->c_d, scale * y.q - limit->c_q};
-    return pmsm_row_voltage(&back, point);
-}
-
-/* --- half planes --------------------------------------------------------------------------------------------- */
+/* --- half planes ------------------------------------------------------------------------------------------------- */
 
 typedef struct {
     const pmsm_dq *a;
     const pmsm_real *b;
     pmsm_dq r;
+    uint32_t basis[2];
 } half_planes;
 
 /* a v - b, relative to the size of the terms. */
@@ -398,32 +376,32 @@ static uint32_t corner(const half_planes *h, uint32_t k, uint32_t other, pmsm_dq
     return (l1 >= PMSM_C(0.0) && l2 >= PMSM_C(0.0)) ? 1u : 0u;
 }
 
-static uint32_t respects(const half_planes *h, const basis *b, uint32_t skip, pmsm_dq v)
+static uint32_t respects(const half_planes *h, uint32_t skip, pmsm_dq v)
 {
     for (uint32_t k = 0u; k < 2u; k++) {
-        if (b->row[k] != NONE && b->row[k] != skip && beyond(h, b->row[k], v) > VIOLATION) {
+        if (h->basis[k] != NONE && h->basis[k] != skip && beyond(h, h->basis[k], v) > VIOLATION) {
             return 0u;
         }
     }
     return 1u;
 }
 
-static uint32_t exchange_line(const half_planes *h, uint32_t k, basis *b, pmsm_dq *v)
+static uint32_t exchange_line(half_planes *h, uint32_t k, pmsm_dq *v)
 {
     const pmsm_dq n = h->a[k];
     const pmsm_real lambda = (dot(n, h->r) - h->b[k]) / pmsm_square(n);
     pmsm_dq x = {h->r.d - lambda * n.d, h->r.q - lambda * n.q};
-    if (respects(h, b, NONE, x) != 0u) {
-        b->row[0] = k;
-        b->row[1] = NONE;
+    if (respects(h, NONE, x) != 0u) {
+        h->basis[0] = k;
+        h->basis[1] = NONE;
         *v = x;
         return 1u;
     }
     for (uint32_t j = 0u; j < 2u; j++) {
-        const uint32_t other = b->row[j];
-        if (other != NONE && corner(h, k, other, &x) != 0u && respects(h, b, other, x) != 0u) {
-            b->row[0] = k;
-            b->row[1] = other;
+        const uint32_t other = h->basis[j];
+        if (other != NONE && corner(h, k, other, &x) != 0u && respects(h, other, x) != 0u) {
+            h->basis[0] = k;
+            h->basis[1] = other;
             *v = x;
             return 1u;
         }
@@ -434,9 +412,8 @@ static uint32_t exchange_line(const half_planes *h, uint32_t k, basis *b, pmsm_d
 uint32_t pmsm_project_half_planes(const pmsm_dq *a, const pmsm_real *b, uint32_t count, pmsm_dq r, pmsm_dq *v,
                                   uint32_t *active, uint32_t *steps)
 {
-    const half_planes h = {a, b, r};
+    half_planes h = {a, b, r, {NONE, NONE}};
     pmsm_dq x = r;
-    basis set = {{NONE, NONE}};
     for (uint32_t round = 0u; round < 2u * PMSM_PROJECTION_ROUNDS; round++) {
         uint32_t k = 0u;
         pmsm_real worst = beyond(&h, 0u, x);
@@ -445,13 +422,13 @@ uint32_t pmsm_project_half_planes(const pmsm_dq *a, const pmsm_real *b, uint32_t
             k = (g > worst) ? j : k;
             worst = (g > worst) ? g : worst;
         }
-        const uint32_t again = (k == set.row[0] || k == set.row[1]) ? 1u : 0u;
+        const uint32_t again = (k == h.basis[0] || k == h.basis[1]) ? 1u : 0u;
         if (worst <= VIOLATION || (again != 0u && worst <= STALL)) {
             *v = x;
-            *active = set.row[0];
-            return ((set.row[0] != NONE) ? 1u : 0u) + ((set.row[1] != NONE) ? 1u : 0u);
+            *active = h.basis[0];
+            return ((h.basis[0] != NONE) ? 1u : 0u) + ((h.basis[1] != NONE) ? 1u : 0u);
         }
-        if (again != 0u || exchange_line(&h, k, &set, &x) == 0u) {
+        if (again != 0u || exchange_line(&h, k, &x) == 0u) {
             return PMSM_PROJECTION_EMPTY;
         }
         (*steps)++;

@@ -29,6 +29,7 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->fw_reference = zero;
     state->time_to_go = PMSM_C(0.0);
     state->landing = 0u;
+    state->reachable_age = 0u;
     state->speed_integrator = PMSM_C(0.0);
     state->notch_1 = PMSM_C(0.0);
     state->notch_2 = PMSM_C(0.0);
@@ -100,7 +101,6 @@ static void field_oriented(pmsm_period *period, pmsm_output *output)
         period->i_model = pmsm_predict_current(period);
     }
     if (period->params->governor_mode != PMSM_GOVERNOR_OFF) {
-        pmsm_observe_disturbance(period, (pmsm_real)period->params->governor_observer_gain);
         pmsm_govern(period);
     }
     pmsm_current_demand(period);
@@ -174,7 +174,8 @@ static void publish(pmsm_period *period, const pmsm_measurement *m)
 void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut, const pmsm_measurement *measurement,
                const pmsm_reference *reference, pmsm_output *output)
 {
-    pmsm_period period = {0};
+    const pmsm_dq zero = {PMSM_C(0.0), PMSM_C(0.0)};
+    pmsm_period period;
     if (state->prepared != 1u) {
         const uint32_t fresh = (state->prepared == 0u) ? 1u : 0u;
         pmsm_prepare(state, params);
@@ -193,6 +194,11 @@ void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut
     period.lut = lut;
     period.request = reference;
     period.state = state;
+    period.reference = zero;
+    period.u = zero;
+    period.u_realised = zero;
+    period.u_compensation = zero;
+    period.flags = 0u;
     state->live.kappa = PMSM_C(1.0);
     state->live.binding = PMSM_BINDING_NONE;
     state->live.iterations = 0u;

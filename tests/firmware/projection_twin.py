@@ -1,0 +1,198 @@
+"""A second hand at the projections of the core, in numpy binary32 and in the core's order of operations.
+
+Used by ``governor_twin`` to compare the governed core bit for bit. Test code only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.firmware.core_twin import Vector, f
+
+ROW_TOLERANCE, PAIR_TOLERANCE, VIOLATION, STALL, SINGULAR = f(1e-6), f(1e-6), f(5e-6), f(2e-5), f(1e-6)
+ROUNDS, CORNER_STEPS, ENTRY_TRIALS, NONE = 16, 6, 4, 255
+ZERO, ONE, TWO, HALF = f(0), f(1), f(2), f(0.5)
+Symmetric = tuple[np.float32, np.float32, np.float32]
+Factor = tuple[Symmetric, np.float32]
+
+
+@dataclass(frozen=True)
+class Row:
+    dd: np.float32
+    dq: np.float32
+    qd: np.float32
+    qq: np.float32
+    c: Vector
+    V: np.float32
+
+    def voltage(self, v: Vector) -> Vector:
+        return (self.dd * v[0] + self.dq * v[1]) + self.c[0], (self.qd * v[0] + self.qq * v[1]) + self.c[1]
+
+    def transposed(self, w: Vector) -> Vector:
+        return self.dd * w[0] + self.qd * w[1], self.dq * w[0] + self.qq * w[1]
+
+    def excess(self, v: Vector) -> np.float32:
+        return square(self.voltage(v)) * (ONE / (self.V * self.V)) - ONE
+
+    def gram(self) -> Symmetric:
+        """M M^T."""
+        return (self.dd * self.dd + self.dq * self.dq, self.dd * self.qd + self.dq * self.qq,
+                self.qd * self.qd + self.qq * self.qq)
+
+    def reference_of(self, w: Vector) -> Vector:
+        inverse = ONE / (self.dd * self.qq - self.dq * self.qd)
+        d, q = w[0] - self.c[0], w[1] - self.c[1]
+        return (self.qq * d - self.dq * q) * inverse, (self.dd * q - self.qd * d) * inverse
+
+
+def square(x: Vector) -> np.float32:
+    return x[0] * x[0] + x[1] * x[1]
+
+
+def dot(x: Vector, y: Vector) -> np.float32:
+    return x[0] * y[0] + x[1] * y[1]
+
+
+def factor(a: np.float32, b: np.float32, c: np.float32) -> Factor:
+    return (a, b, c), ONE / (a * c - b * b)
+
+
+def solve(S: Factor, x: Vector) -> Vector:
+    (a, b, c), inverse = S
+    return (c * x[0] - b * x[1]) * inverse, (a * x[1] - b * x[0]) * inverse
+
+
+def times(s: Symmetric, x: Vector) -> Vector:
+    return s[0] * x[0] + s[1] * x[1], s[1] * x[0] + s[2] * x[1]
+
+
+def project_row(row: Row, r: Vector) -> Vector:
+    a = row.voltage(r)
+    power = square(a)
+    if power <= row.V * row.V:
+        return r
+    K, enough = row.gram(), row.V * (ONE + ROW_TOLERANCE)
+    S, multiplier, w = factor(ONE, ZERO, ONE), ZERO, a
+    for _ in range(ROUNDS):
+        size = np.sqrt(power)
+        if size <= enough:
+            break
+        multiplier = multiplier + (size - row.V) * power / (row.V * dot(w, solve(S, times(K, w))))
+        S = factor(ONE + multiplier * K[0], multiplier * K[1], ONE + multiplier * K[2])
+        w = solve(S, a)
+        power = square(w)
+    step = row.transposed(w)
+    return r[0] - multiplier * step[0], r[1] - multiplier * step[1]
+
+
+def smallest_voltage(goal: Row, limit: Row) -> Vector:
+    inverse = ONE / (limit.dd * limit.qq - limit.dq * limit.qd)
+    back = Row(limit.qq * inverse, -limit.dq * inverse, -limit.qd * inverse, limit.dd * inverse, (ZERO, ZERO), ONE)
+    rest = goal.voltage(back.voltage((-limit.c[0], -limit.c[1])))
+    B = Row(goal.dd * back.dd + goal.dq * back.qd, goal.dd * back.dq + goal.dq * back.qq,
+            goal.qd * back.dd + goal.qq * back.qd, goal.qd * back.dq + goal.qq * back.qq, (ZERO, ZERO), ONE)
+    G = (B.dd * B.dd + B.qd * B.qd, B.dd * B.dq + B.qd * B.qq, B.dq * B.dq + B.qq * B.qq)
+    right, enough = B.transposed(rest), limit.V * (ONE + ROW_TOLERANCE)
+    mu, y, size = SINGULAR * (G[0] + G[2]), (ZERO, ZERO), ZERO
+    for _ in range(ROUNDS):
+        S = factor(G[0] + mu, G[1], G[2] + mu)
+        y = solve(S, right)
+        power = square(y)
+        size = np.sqrt(power)
+        if size <= enough:
+            break
+        mu = mu + (size - limit.V) * power / (limit.V * dot(y, solve(S, y)))
+    scale = -limit.V / size if size > limit.V else f(-1)
+    return back.voltage((scale * y[0] - limit.c[0], scale * y[1] - limit.c[1]))
+
+
+def find_corner(first: Row, second: Row, r: Vector, v: Vector) -> tuple[Vector, bool]:
+    """Last point of Newton's method, and whether it is the optimum."""
+    limits = first.V * first.V, second.V * second.V
+    for _ in range(CORNER_STEPS):
+        w1, w2 = first.voltage(v), second.voltage(v)
+        f1, f2 = HALF * (square(w1) - limits[0]), HALF * (square(w2) - limits[1])
+        n1, n2 = first.transposed(w1), second.transposed(w2)
+        det = n1[0] * n2[1] - n1[1] * n2[0]
+        if det * det <= SINGULAR * (square(n1) * square(n2)):
+            return v, False
+        inverse = ONE / det
+        if abs(f1) <= PAIR_TOLERANCE * limits[0] and abs(f2) <= PAIR_TOLERANCE * limits[1]:
+            pull = r[0] - v[0], r[1] - v[1]
+            l1 = (pull[0] * n2[1] - pull[1] * n2[0]) * inverse
+            l2 = (pull[1] * n1[0] - pull[0] * n1[1]) * inverse
+            return v, bool(l1 >= 0 and l2 >= 0)
+        v = v[0] - (f1 * n2[1] - f2 * n1[1]) * inverse, v[1] - (f2 * n1[0] - f1 * n2[0]) * inverse
+    return v, False
+
+
+def project_pair(first: Row, second: Row, r: Vector, outside: Vector) -> Vector | None:
+    best = smallest_voltage(second, first)
+    depth = -second.excess(best)
+    if depth < -VIOLATION:
+        return None
+    a, b, within = first.voltage(outside), first.voltage(best), max(depth, ZERO)
+    low, high, t = ZERO, ONE, ONE - np.sqrt(within / (within + second.excess(outside)))
+    for _ in range(ENTRY_TRIALS):
+        chord = a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])
+        scale = first.V / np.sqrt(square(chord))
+        start = first.reference_of((scale * chord[0], scale * chord[1]))
+        v, found = find_corner(first, second, r, start)
+        if found:
+            return v
+        low, high = (t, high) if second.excess(start) > 0 else (low, t)
+        t = HALF * (low + high)
+    return None
+
+
+def exchange(rows: list[Row], k: int, r: Vector, x: Vector, basis: list[int]) -> tuple[Vector, list[int]] | None:
+    alone = project_row(rows[k], r)
+    inside = alone == r
+    met = [b == NONE or bool(rows[b].excess(alone) <= VIOLATION) for b in basis]
+    if all(met):
+        return alone, [k, NONE]
+    for j, other in enumerate(basis):
+        if met[j]:
+            continue
+        first, second, start = (rows[other], rows[k], x) if inside else (rows[k], rows[other], alone)
+        both, rest = project_pair(first, second, r, start), basis[1 - j]
+        if both is not None and (rest == NONE or rows[rest].excess(both) <= VIOLATION):
+            return both, [k, other]
+    return None
+
+
+def project_rows(rows: list[Row], r: Vector) -> tuple[Vector, int] | None:
+    """Point and index of the row added last, None when the rows have no common point."""
+    x, basis = r, [NONE, NONE]
+    for _ in range(ROUNDS):
+        values = [row.excess(x) for row in rows]
+        k = int(np.argmax(values))
+        if values[k] <= VIOLATION or (k in basis and values[k] <= STALL):
+            return x, basis[0]
+        found = None if k in basis else exchange(rows, k, r, x, basis)
+        if found is None:
+            return None
+        x, basis = found
+    return None
+
+
+def row_share(row: Row, p: Vector, way: Vector, slack: np.float32) -> np.float32:
+    a = row.voltage(p)
+    e = row.dd * way[0] + row.dq * way[1], row.qd * way[0] + row.qq * way[1]
+    aa, bb, limit = square(e), a[0] * e[0] + a[1] * e[1], row.V * row.V
+    cc = square(a) - limit
+    if cc > slack * limit:
+        return f(-1)
+    cc = min(cc, ZERO)
+    root = np.sqrt(bb * bb - aa * cc)
+    if bb > 0:
+        return -cc / (bb + root)
+    return (root - bb) / aa if aa > 0 else ONE
+
+
+def scale_voltage(row: Row, v: Vector) -> Vector:
+    w = row.voltage(v)
+    inverse = (ONE - row.V / np.sqrt(square(w))) / (row.dd * row.qq - row.dq * row.qd)
+    return (v[0] - (row.qq * w[0] - row.dq * w[1]) * inverse, v[1] - (row.dd * w[1] - row.qd * w[0]) * inverse)
