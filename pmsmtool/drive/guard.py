@@ -212,6 +212,9 @@ class GuardedDrive:
     def write(self, values: Mapping[str, float]) -> None:
         """Write parameters; they are restored when the guard ends."""
         self._drive.write(values)
+        # speed and loss are judged with what the drive now takes for its motor
+        self._pole_pairs = values.get("motor.pole_pairs", self._pole_pairs)
+        self._R_s_ohm = values.get("motor.R_s_ohm", self._R_s_ohm)
 
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero reference.
