@@ -7,6 +7,7 @@
 #include "polar.h"
 
 #define SCHEDULE_SINE PMSM_C(0.98) /* largest argument of the equilibrium's arc sine: unreachable torque is cut here */
+#define REACH PMSM_C(0.97)         /* share of the largest sine that a reference may ask for */
 #define PHASE_LIMIT (PMSM_C(0.5) * PMSM_PI)
 /* Share of the set-point that P and D see in the form "on the measurement". None at all (I-PD) lets the integrator do
  * the whole step: 6 % overshoot of i_q and 3.7 A of positive i_d after the reference's step-down, 0.35 of it gives 1 %
@@ -32,6 +33,17 @@ static equilibrium find_equilibrium(const polar_plant *p, pmsm_real i_q, pmsm_re
     const pmsm_real c = PMSM_SQRT(PMSM_C(1.0) - s * s);
     const equilibrium e = {(s * X - c * p->R) / Z, (c * X + s * p->R) / Z}; /* minus atan2(R, X) */
     return e;
+}
+
+/* The i_q asked for, cut to what full amplitude can hold: beyond it the phase would run past the torque's maximum, where
+ * the loop's sign turns, and stay there. */
+static pmsm_real within_reach(const polar_plant *p, pmsm_real i_q)
+{
+    const pmsm_real X = p->omega * p->L;
+    const pmsm_real square = p->R * p->R + X * X;
+    const pmsm_real reach = REACH * p->V * PMSM_SQRT(square);
+    const pmsm_real back_emf = p->omega * p->R * p->psi;
+    return pmsm_clamp(i_q, (-reach - back_emf) / square, (reach - back_emf) / square);
 }
 
 /* Gains that place both pole pairs; (7), (8), (11). */
@@ -160,7 +172,7 @@ void pmsm_polar_phase(pmsm_period *period, const polar_plant *plant)
     pmsm_real *memory = period->state->polar;
     const pmsm_real mirror = (period->omega_e < PMSM_C(0.0)) ? PMSM_C(-1.0) : PMSM_C(1.0);
     const pmsm_dq i = {period->i_model.d, mirror * period->i_model.q};
-    const pmsm_dq target = {period->reference.d, mirror * period->reference.q};
+    const pmsm_dq target = {period->reference.d, within_reach(plant, mirror * period->reference.q)};
     pmsm_real V_a = plant->V;
     pmsm_real V_schedule = plant->V;
     if (period->params->polar_mode == PMSM_POLAR_PROPOSED) {
