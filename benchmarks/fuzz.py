@@ -1,30 +1,64 @@
-"""Random CAN frames and damaged files at the tool: no crash, no hang, no error that is not ours.
+"""Random CAN frames and damaged files, at the tool and at the drive: no crash, no hang, no error that is not ours.
 
-Run from the repository: ``python benchmarks/fuzz.py [N]`` (default 100 000 of each). Seeds are fixed, so that a failure
-comes again.
+Run from the repository: ``python benchmarks/fuzz.py [N] [NAME...]`` (default 100 000 of each). Seeds are fixed, so
+that a failure comes again. Files are damaged in their text, or, where they are binary, in their bytes.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import random
+import signal
 import sys
+import tempfile
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+from pmsmtool.design.design_file import design_text, parse_design
+from pmsmtool.design.tune import tune
 from pmsmtool.drive.port import Identity
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import PmsmtoolError
+from pmsmtool.firmware.dcf import Entry as Written
+from pmsmtool.firmware.dcf import read_concise, update_dcf, values_of, write_concise
 from pmsmtool.firmware.drive_map import dump_drive_map, parse_drive_map, reference_map
+from pmsmtool.firmware.eds import parse_eds
 from pmsmtool.flash.journal import Entry, Snapshot, check_sum, parse_snapshot
+from pmsmtool.machine.flux_map import FluxMap
+from pmsmtool.machine.flux_map_check import check_flux_map
+from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz, load_flux_map
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
 from pmsmtool.params.parameter_set import default_set, parse_parameter_set
+from pmsmtool.resources import data_folder
+from pmsmtool.sim.faults import EXAMPLE, parse_faults
+from pmsmtool.sim.scenarios import load_scenario
+from pmsmtool.trace_file import read_trace
 from tests.bus.frame_fuzz import transfers
 from tests.flash.rig import with_tables
+from tests.node.test_random_requests import FRAMES, test_after_any_requests_a_power_cycle_brings_a_healthy_node
 
 BATCH = 1000
+LONGEST_S = 20
+"""An input that takes longer hangs: SIGALRM ends the program."""
+SCENARIO = """\
+schema = "pmsmtool.scenario/1"
+name = "reversal"
+duration_s = 0.4
+mode = "speed"
+start_rpm = 10.0
+[schedule]
+speed_rpm = [[0.0, 0.0], [0.1, 400.0], [0.3, -400.0]]
+load_nm = 1.5
+[simulation]
+sensor_noise_apk = 0.01
+"""
 SNAPSHOT = Snapshot(
     "journal",
     "open",
@@ -54,15 +88,112 @@ def _use_snapshot(text: str) -> None:
     parse_snapshot(text, "fuzz")
 
 
+def _use_dcf(text: str) -> None:
+    sheet = parse_eds(text.encode("utf-8", "replace"), "fuzz", node_id=1)
+    values = values_of(sheet)
+    update_dcf(text.encode("utf-8", "replace"), dict(list(values.items())[:3]), "fuzz")
+
+
+def _use_scenario(text: str) -> None:
+    path = _SCRATCH / "scenario.toml"
+    path.write_text(text, encoding="utf-8", errors="replace")
+    load_scenario(path)
+
+
+def _use_map_csv(text: str) -> None:
+    path = _SCRATCH / "map.csv"
+    path.write_text(text, encoding="utf-8", errors="replace")
+    check_flux_map(load_flux_map(path))
+
+
+def _use_map_bytes(suffix: str) -> Callable[[bytes], None]:
+    def use(data: bytes) -> None:
+        path = _SCRATCH / f"map{suffix}"
+        path.write_bytes(data)
+        check_flux_map(load_flux_map(path))
+
+    return use
+
+
+def _use_trace_csv(text: str) -> None:
+    path = _SCRATCH / "trace.csv"
+    path.write_text(text, encoding="utf-8", errors="replace")
+    read_trace(path)
+
+
+def _small_map() -> FluxMap:
+    i_d, i_q = np.linspace(-8.0, 4.0, 5), np.linspace(-6.0, 6.0, 5)
+    psi_d = 0.1 + 4e-3 * i_d[:, None] - 1e-5 * i_q[None, :] ** 2
+    psi_q = 9e-3 * i_q[None, :] - 2e-5 * i_d[:, None] * i_q[None, :]
+    return FluxMap(i_d, i_q, psi_d, psi_q)
+
+
+def _mat() -> bytes:
+    from scipy.io import savemat
+
+    small = _small_map()
+    buffer = io.BytesIO()
+    savemat(buffer, {"i_d": small.i_d_a, "i_q": small.i_q_a, "psi_d": small.psi_d_wb, "psi_q": small.psi_q_wb})
+    return buffer.getvalue()
+
+
+_SCRATCH = Path(tempfile.mkdtemp(prefix="fuzz-"))
+_MACHINE = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
+_EDS = (data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds").read_bytes()
+_SHORT_EDS = _EDS[_EDS.index(b"[FileInfo") : 4000].decode() + "\n" + _EDS[_EDS.index(b"[2010]") :][:4000].decode()
+"""Enough of it for every kind of line; the whole takes ten times as long."""
 TEXTS: dict[str, tuple[str, Callable[[str], object]]] = {
-    "parameter sets": (default_set().merged(with_tables(3)).to_toml(), _use_set),
-    "drive maps": (dump_drive_map(reference_map()), parse_drive_map),
+    "parameter-sets": (default_set().merged(with_tables(3)).to_toml(), _use_set),
+    "drive-maps": (dump_drive_map(reference_map()), parse_drive_map),
     "snapshots": (SNAPSHOT.dumps(), _use_snapshot),
+    "eds": (_SHORT_EDS, lambda text: parse_eds(text.encode("utf-8", "replace"), "fuzz", node_id=1)),
+    "dcf": (_SHORT_EDS, _use_dcf),
+    "machine-files": (dump_machine_file(_MACHINE), parse_machine),
+    "design-files": (design_text(tune(_MACHINE)), parse_design),
+    "fault-files": (EXAMPLE, parse_faults),
+    "scenarios": (SCENARIO, _use_scenario),
+    "flux-maps-csv": (flux_map_csv(_small_map()), _use_map_csv),
+    "traces-csv": ("t_s,i_d_a\ns,A\n" + "".join(f"{k * 1e-4!r},{k * 0.1!r}\n" for k in range(20)), _use_trace_csv),
 }
+BINARIES: dict[str, tuple[Callable[[], bytes], Callable[[bytes], object]]] = {
+    "concise-dcf": (lambda: write_concise([Written(0x2010, 2, b"abcd"), Written(0x1017, 0, b"ab")]), read_concise),
+    "flux-maps-npz": (lambda: flux_map_npz(_small_map()), _use_map_bytes(".npz")),
+    "flux-maps-mat": (_mat, _use_map_bytes(".mat")),
+}
+
+
+VALUES = (
+    "nan",
+    "inf",
+    "-1",
+    "0",
+    "1e400",
+    "[]",
+    "{}",
+    '""',
+    "true",
+    "9" * 400,
+    "-1e-300",
+    "[1, [2]]",
+    "1979-05-27",
+    "'x'",
+)
+
+
+def with_other_values(text: str, rng: random.Random) -> str:
+    """Return a text with one or two values after ``=`` replaced by others: still TOML, or INI, or nearly."""
+    lines = text.split("\n")
+    places = [k for k, line in enumerate(lines) if "=" in line]
+    for _ in range(rng.randint(1, 2)):
+        k = rng.choice(places)
+        lines[k] = f"{lines[k].split('=')[0]}= {rng.choice(VALUES)}"
+    return "\n".join(lines)
 
 
 def damaged(text: str, rng: random.Random) -> str:
     """Return a text with a few characters, lines or numbers changed."""
+    if "=" in text and rng.random() < 0.5:
+        return with_other_values(text, rng)
     for _ in range(rng.randint(1, 4)):
         at = rng.randrange(len(text) or 1)
         kind = rng.random()
@@ -83,25 +214,78 @@ def damaged(text: str, rng: random.Random) -> str:
     return text
 
 
+def damaged_bytes(data: bytes, rng: random.Random) -> bytes:
+    """Return bytes with a few of them changed, removed or repeated."""
+    changed = bytearray(data)
+    for _ in range(rng.randint(1, 4)):
+        at = rng.randrange(len(changed) or 1)
+        kind = rng.random()
+        if kind < 0.6:
+            changed[at : at + 1] = rng.randbytes(1)
+        elif kind < 0.8:
+            del changed[at : at + rng.randrange(1, 40)]
+        elif kind < 0.9:
+            changed[at:at] = changed[at : at + rng.randrange(1, 40)]
+        else:
+            del changed[at:]
+    return bytes(changed)
+
+
+def run(name: str, count: int, attempt: Callable[[random.Random], None]) -> None:
+    """Try ``count`` inputs of one kind and print how they ended."""
+    rng, started = random.Random(name), time.perf_counter()
+    refused = 0
+    for number in range(count):
+        signal.alarm(LONGEST_S)
+        try:
+            attempt(rng)
+        except PmsmtoolError:
+            refused += 1
+        except BaseException:
+            print(f"{name}: input {number} of seed {name!r} was not handled", flush=True)
+            raise
+        finally:
+            signal.alarm(0)
+    seconds = time.perf_counter() - started
+    print(f"{count} damaged {name}: {refused} refused, {count - refused} usable, {seconds:.0f} s", flush=True)
+
+
+def _at_the_tool(count: int) -> None:
+    ended: Counter[str] = Counter()
+    started = time.perf_counter()
+    for seed in range(-(-count // BATCH)):
+        ended.update(transfers(1000 + seed, BATCH))
+    seconds = time.perf_counter() - started
+    print(f"{sum(ended.values())} transfers of random frames: {dict(ended)}, {seconds:.0f} s", flush=True)
+
+
+def _at_the_drive(count: int) -> None:
+    started = time.perf_counter()
+    seeds = -(-count // FRAMES)
+    for seed in range(seeds):
+        test_after_any_requests_a_power_cycle_brings_a_healthy_node(10_000 + seed)
+    seconds = time.perf_counter() - started
+    print(f"{seeds * FRAMES} random frames at the drive, healthy after each {FRAMES}: {seconds:.0f} s", flush=True)
+
+
 def main() -> None:
     """Print how the inputs ended."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
-    started = time.perf_counter()
-    ended: Counter[str] = Counter()
-    for seed in range(-(-count // BATCH)):
-        ended.update(transfers(1000 + seed, BATCH))
-    print(f"{sum(ended.values())} transfers of random frames: {dict(ended)}, {time.perf_counter() - started:.0f} s")
-    for name, (text, use) in TEXTS.items():
-        rng, started = random.Random(name), time.perf_counter()
-        refused = 0
-        for _ in range(count):
-            try:
-                use(damaged(text, rng))
-            except ConfigError:
-                refused += 1
-        seconds = time.perf_counter() - started
-        print(f"{count} damaged {name}: {refused} refused, {count - refused} usable, {seconds:.0f} s")
+    names = sys.argv[2:] or ["frames-at-the-tool", "frames-at-the-drive", *TEXTS, *BINARIES]
+    for name in names:
+        if name == "frames-at-the-tool":
+            _at_the_tool(count)
+        elif name == "frames-at-the-drive":
+            _at_the_drive(count)
+        elif name in TEXTS:
+            text, read = TEXTS[name]
+            run(name, count, lambda rng, text=text, read=read: read(damaged(text, rng)))  # type: ignore[misc]
+        else:
+            make, use = BINARIES[name]
+            data = make()
+            run(name, count, lambda rng, data=data, use=use: use(damaged_bytes(data, rng)))  # type: ignore[misc]
 
 
 if __name__ == "__main__":
+    warnings.simplefilter("ignore")
     main()

@@ -27,6 +27,7 @@ FLOORS: dict[str, int] = {
     "native": 2,
     "resources": 2,
     "npz_file": 2,
+    "toml_file": 2,
     "toml_text": 2,
     "machine": 3,
     "params": 3,

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from pmsmtool.machine.key import did_you_mean
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_from_tables, machine_tables
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
+from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
 
 SCHEMA = "pmsmtool.design/1"
@@ -177,10 +177,7 @@ def parse_design(text: str, *, where: str = "design.toml") -> Design:
     ConfigError
         Not TOML, another schema, unknown or missing values, or a machine that was changed after the design.
     """
-    try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}", where=where) from None
+    tables = parse_toml(text, where=where)
     schema = tables.get("schema")
     if schema != SCHEMA:
         hint = "give a design as `tune` writes it"
@@ -199,6 +196,7 @@ def parse_design(text: str, *, where: str = "design.toml") -> Design:
     values, wrong = _read_values(tables.get("value"))
     loops, wrong_loops = _read_loops(tables.get("loop", {}))
     wrong += wrong_loops
+    wrong += _odd_tables(tables)
     lost = {name: v.loop for name, v in values.items() if v.loop not in {"", *loops}}
     wrong += [f"{name}: names the loop {loop}, which is not there" for name, loop in lost.items()]
     if wrong:
@@ -235,6 +233,30 @@ def _read_values(table: Any) -> tuple[dict[str, DesignValue], list[str]]:
     return ordered, wrong
 
 
+def _all_numbers(values: Iterable[Any]) -> bool:
+    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+
+
+def _odd_tables(tables: Mapping[str, Any]) -> list[str]:
+    """Return what is wrong with the parts that are only carried along."""
+    wrong = [f"[{name}] is not a table" for name in ("request", "facts", "table") if not _is_table(tables, name)]
+    notes = tables.get("notes", [])
+    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+        wrong.append("notes is not a list of texts")
+    if not wrong:
+        arrays = tables.get("table", {})
+        wrong += [
+            f"table.{name} is not an array of numbers"
+            for name, array in arrays.items()
+            if not isinstance(array, list) or not _all_numbers(array)
+        ]
+    return wrong
+
+
+def _is_table(tables: Mapping[str, Any], name: str) -> bool:
+    return isinstance(tables.get(name, {}), dict)
+
+
 def _read_loops(table: Any) -> tuple[dict[str, LoopMargins], list[str]]:
     names = {item.name for item in fields(LoopMargins)}
     loops: dict[str, LoopMargins] = {}
@@ -242,7 +264,9 @@ def _read_loops(table: Any) -> tuple[dict[str, LoopMargins], list[str]]:
     for name, entry in (table if isinstance(table, dict) else {}).items():
         if not isinstance(entry, dict) or set(entry) != names:
             wrong.append(f"loop.{name}: holds other keys than {', '.join(sorted(names))}")
+        elif not isinstance(entry["stable"], bool) or not _all_numbers(v for k, v in entry.items() if k != "stable"):
+            wrong.append(f"loop.{name}: stable is not true or false, or another value not a number")
         else:
             numbers = {key: float(value) for key, value in entry.items() if key != "stable"}
-            loops[name] = LoopMargins(stable=bool(entry["stable"]), **numbers)
+            loops[name] = LoopMargins(stable=entry["stable"], **numbers)
     return loops, wrong

@@ -25,6 +25,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.machine.flux_map import INVERSE_NODES, FluxMap, meta_json
 from pmsmtool.machine.flux_map_cells import Kind
 from pmsmtool.machine.flux_map_repair import FluxGrid, fill_holes
+from pmsmtool.machine.mat_file import read_mat
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.units import parse_quantity
 
@@ -227,29 +228,18 @@ def _rising(
 
 
 def _read_mat(path: Path) -> dict[str, NDArray[Any]]:
-    from scipy.io import loadmat  # 0.3 s: only when a .mat file is read
-
-    if not path.is_file():
-        raise ConfigError("no such file", where=str(path), hint="check the path")
-    try:
-        content = loadmat(path, squeeze_me=True, struct_as_record=True)
-    except NotImplementedError:
-        raise ConfigError("is a MATLAB 7.3 file", where=str(path), hint="save it with -v7, or export .csv") from None
-    except Exception as error:  # scipy raises many kinds on damaged files
-        raise ConfigError(f"is not a readable .mat file ({error})", where=str(path), likely="truncated") from None
     arrays: dict[str, NDArray[Any]] = {}
-    _collect(arrays, {name: value for name, value in content.items() if not name.startswith("__")})
+    _collect(arrays, read_mat(path))
     return arrays
 
 
 def _collect(arrays: dict[str, NDArray[Any]], values: Mapping[str, Any]) -> None:
-    """Gather arrays, also out of MATLAB structs, by their last name."""
+    """Gather arrays, also out of MATLAB structures, by their last name."""
     for name, value in values.items():
-        array = np.asarray(value)
-        if array.dtype.names:
-            _collect(arrays, {field: array[field].item() for field in array.dtype.names if array.ndim == 0})
-        elif array.dtype.kind in "fiubc":
-            arrays.setdefault(name, array)
+        if isinstance(value, Mapping):
+            _collect(arrays, value)
+        else:
+            arrays.setdefault(name, value)
 
 
 def _read_csv(path: Path) -> dict[str, NDArray[Any]]:

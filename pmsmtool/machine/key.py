@@ -65,10 +65,12 @@ class Key:
             return None, f"is text; {self._number_hint(value)}"
         if isinstance(value, bool) or not isinstance(value, int | float):
             return None, f"is {_kind(value)}, not a number"
-        if self.kind == "int" and value != int(value):
-            return None, f"= {value!r} is not a whole number"
-        problem = self._bounds(float(value))
-        return (None, problem) if problem else (int(value) if self.kind == "int" else float(value), "")
+        problem = self._bounds(_as_float(value))
+        if problem:
+            return None, problem
+        if self.kind == "int":
+            return (int(value), "") if value == int(value) else (None, f"= {value!r} is not a whole number")
+        return float(value), ""
 
     def _check_text(self, value: Any) -> tuple[Value | None, str]:
         if not isinstance(value, str):
@@ -82,7 +84,7 @@ class Key:
             isinstance(item, bool) or not isinstance(item, int | float) for item in value
         ):
             return None, "is not an array of numbers"
-        problems = [problem for item in value if (problem := self._bounds(float(item)))]
+        problems = [problem for item in value if (problem := self._bounds(_as_float(item)))]
         return (None, problems[0]) if problems else (tuple(float(item) for item in value), "")
 
     def _bounds(self, value: float) -> str:
@@ -100,6 +102,14 @@ class Key:
             return f"write the number {parse_quantity(text, self.unit)!r} (in {self.unit})"
         except ConfigError:
             return f"write a number{f' in {self.unit}' if self.unit not in ('', '1') else ''}"
+
+
+def _as_float(value: float) -> float:
+    """Return a number as a float; a whole number of hundreds of digits is infinite."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
 
 
 def _kind(value: Any) -> str:

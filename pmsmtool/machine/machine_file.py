@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -28,6 +27,7 @@ from pmsmtool.machine.parameters import (
     MachineParameters,
 )
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS, resolved_simulation
+from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
 
 SCHEMA = "pmsmtool.machine/1"
@@ -123,10 +123,7 @@ def parse_machine(text: str, *, where: str = "machine file", folder: Path | None
     ConfigError
         Not TOML, another schema, or a list of all violations.
     """
-    try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}", where=where, likely="a missing quote or bracket") from None
+    tables = parse_toml(text, where=where)
     schema = tables.pop("schema", None)
     if schema != SCHEMA:
         found = "has no schema" if schema is None else f"has the schema {schema!r}"

@@ -11,7 +11,6 @@ import hashlib
 import itertools
 import math
 import struct
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, LUT_CAPACITY_WORDS
+from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_text
 
 SCHEMA = "pmsmtool.params/1"
@@ -104,10 +104,7 @@ def parse_parameter_set(text: str, where: str = "params.toml") -> ParameterSet:
         Not TOML, wrong schema, unknown names, values that are no numbers, or a content hash that
         does not fit the content; all violations at once.
     """
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"not a TOML file: {error}", where=where) from error
+    document = parse_toml(text, where=where)
     schema = document.pop("schema", None)
     if schema != SCHEMA:
         raise ConfigError(

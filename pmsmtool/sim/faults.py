@@ -6,13 +6,13 @@ of its data flips, no error is seen.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.toml_file import parse_toml
 
 EXAMPLE = """\
 # Faults on purpose, for pmsmtool sim serve --faults FILE, or -i pmsmsim -c 'NAME?faults=FILE'.
@@ -268,10 +268,7 @@ def parse_faults(text: str, where: str = "faults") -> FaultPlan:
     ConfigError
         Everything that is wrong with the text.
     """
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"not a TOML file: {error}", where=where) from error
+    document = parse_toml(text, where=where)
     reader = _Reader()
     for name in document:
         if name not in _TABLES:

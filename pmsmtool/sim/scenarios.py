@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -15,6 +14,7 @@ from pmsmtool.machine.key import Value, did_you_mean
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.sim.kernel import Target
 from pmsmtool.sim.simulated_machine import ROTORS, RPM
+from pmsmtool.toml_file import read_toml
 
 SCHEMA = "pmsmtool.scenario/1"
 
@@ -136,14 +136,7 @@ def load_scenario(path: Path) -> Scenario:
         It cannot be read, or everything that is wrong in it.
     """
     where = str(path)
-    try:
-        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=where, hint=f"or one of {', '.join(BUILT_IN)}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read as text: {error}", where=where) from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}", where=where) from None
+    tables = read_toml(Path(path), hint=f"or one of {', '.join(BUILT_IN)}")
     if tables.pop("schema", None) != SCHEMA:
         raise ConfigError("has another schema", where=where, hint=f'a scenario starts with schema = "{SCHEMA}"')
     return _from_tables(tables, where, Path(path).stem)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 from pmsmtool.design import design_file
@@ -13,6 +12,7 @@ from pmsmtool.firmware.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.eds import parse_eds
 from pmsmtool.params import parameter_set
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
+from pmsmtool.toml_file import parse_toml, read_text
 
 _IN_A_RUN = ("params.toml", "design.toml")
 _DCF_SUFFIXES = (".dcf", ".eds")
@@ -36,11 +36,8 @@ def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterS
     path = _file(path)
     if path.suffix.lower() in _DCF_SUFFIXES:
         return _from_dcf(path, drive_map or reference_map())
-    try:
-        text = path.read_text(encoding="utf-8")
-        schema = tomllib.loads(text).get("schema")
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"cannot be read: {error}", where=str(path)) from error
+    text = read_text(path)
+    schema = parse_toml(text, where=str(path)).get("schema")
     if schema == design_file.SCHEMA:
         return parse_design(text, where=str(path)).parameter_set()
     if schema == parameter_set.SCHEMA:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from pmsmtool.params.parameter_set import ParameterSet, read_parameter_set
 from pmsmtool.sim.closed_loop import drive_values, simulate
 from pmsmtool.sim.scenarios import Scenario, built_in, load_scenario
 from pmsmtool.sim.simulated_machine import with_simulation
+from pmsmtool.toml_file import read_toml
 from pmsmtool.trace import Trace
 
 DESIGN_SCHEMA = "pmsmtool.design/1"
@@ -94,14 +94,7 @@ def _path(source: str) -> Path:
 
 
 def _schema(path: Path) -> object:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8")).get("schema")
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=str(path), hint="`pmsmtool sim list` names the profiles") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read as text: {error}", where=str(path)) from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}", where=str(path)) from None
+    return read_toml(path, hint="`pmsmtool sim list` names the profiles").get("schema")
 
 
 def find_scenario(name: str, drive: SimulatedDrive) -> Scenario:

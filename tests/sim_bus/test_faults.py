@@ -197,7 +197,7 @@ def test_an_empty_file_is_no_fault() -> None:
         ('[[absent]]\nobject="here"', "object"),
         ("[store]\nfactor=0", "factor"),
         ("frame = 3", "array of tables"),
-        ("[[frame", "not a TOML file"),
+        ("[[frame", "is not TOML"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_said(text: str, named: str) -> None:

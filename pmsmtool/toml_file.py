@@ -1,0 +1,76 @@
+"""Reading TOML: the one reader behind every TOML file, so that each bad file ends in the same clear error."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pmsmtool.errors import ConfigError
+
+LARGEST_WHOLE = 1 << 63
+"""Whole numbers of TOML 1.0 have 64 bit; the standard library takes any, which no float holds."""
+
+
+def parse_toml(text: str, *, where: str) -> dict[str, Any]:
+    """Return the tables of a TOML text.
+
+    Parameters
+    ----------
+    text : str
+        The document.
+    where : str
+        Named in errors.
+
+    Raises
+    ------
+    ConfigError
+        Not TOML, or a whole number beyond 64 bit.
+    """
+    try:
+        tables = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # beside its own error: numbers of 5000 digits, brackets 1000 deep
+        raise ConfigError(f"is not TOML: {error}", where=where, likely="a missing quote or bracket") from None
+    for name, number in _whole_numbers(tables, ""):
+        if not -LARGEST_WHOLE <= number < LARGEST_WHOLE:
+            raise ConfigError("is a whole number beyond the 64 bit of TOML", where=f"{where}:{name}")
+    return tables
+
+
+def read_toml(path: Path, *, hint: str = "check the path") -> dict[str, Any]:
+    """Return the tables of a TOML file.
+
+    Raises
+    ------
+    ConfigError
+        Missing, unreadable, or as :func:`parse_toml`.
+    """
+    return parse_toml(read_text(path, hint=hint), where=str(path))
+
+
+def read_text(path: Path, *, hint: str = "check the path") -> str:
+    """Return the text of a file.
+
+    Raises
+    ------
+    ConfigError
+        Missing or unreadable.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError("no such file", where=str(path), hint=hint) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read as text: {error}", where=str(path)) from None
+
+
+def _whole_numbers(value: Any, name: str) -> Iterator[tuple[str, int]]:
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            yield from _whole_numbers(entry, f"{name}.{key}" if name else key)
+    elif isinstance(value, list):
+        for entry in value:
+            yield from _whole_numbers(entry, name)
+    elif isinstance(value, int) and not isinstance(value, bool):
+        yield name, value
