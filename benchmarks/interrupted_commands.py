@@ -188,6 +188,7 @@ def interrupted(how: str, command: str, moment: int | None) -> Outcome:
     with prepared(), powered(channel) as line:
         prepare(command, channel)
         before = held(channel)
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it
         with watch.on():
             code, told = commanded(*COMMANDS[command], "-i", "pmsmsim", "-c", channel, "--yes")
         if moment is None:
