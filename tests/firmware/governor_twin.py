@@ -27,7 +27,7 @@ from tests.firmware.projection_twin import (
 )
 
 EMPTY, STEERED = 254, 250
-EMPTY_MARGIN, HOLD_SHARE, LANDING_REST, ACCURACY = f(1.00001), f(0.99), f(0.26), f(1e-3)
+EMPTY_MARGIN, HOLD_SHARE, LANDING_REST, ACCURACY = f(1.00001), f(0.99), f(0.26), f(1e-2)
 FLAG_FALLBACK = 64
 
 
@@ -197,41 +197,34 @@ class GovernedTwin(Twin):
         return v
 
     def at_time(self, T: np.float32, a: Vector, b: Vector, drops: tuple[Vector, Vector]) -> tuple:
-        """Way, its size, gap and the slope of the gap after time T."""
+        """Way, its rate, gap and the slope of the gap after time T."""
         s, c = sincos(self.omega * T)
         turned = c * b[0] - s * b[1], s * b[0] + c * b[1]
         drop = (drops[0][0] + c * drops[1][0] - s * drops[1][1], drops[0][1] + s * drops[1][0] + c * drops[1][1])
         m = turned[0] - a[0] + drop[0] * T, turned[1] - a[1] + drop[1] * T
-        size = np.sqrt(square(m))
         rate = drop[0] - self.omega * turned[1], drop[1] + self.omega * turned[0]
-        return m, size, size - self.V_max * T, (m[0] * rate[0] + m[1] * rate[1]) / (size + f(1e-12)) - self.V_max
+        size = np.sqrt(square(m))
+        return m, rate, size - self.V_max * T, (m[0] * rate[0] + m[1] * rate[1]) / (size + f(1e-12)) - self.V_max
 
-    def refine(self, way: tuple, T: np.float32) -> tuple[np.float32, tuple] | None:
-        V, w = self.V_max, abs(self.omega)
-        for _ in range(4):
-            point = self.at_time(T, *way)
-            if point[3] >= 0:
-                return None
-            if abs(point[2]) <= ACCURACY * V * T:
-                return T, point
-            T = T - point[2] / point[3]
-            if T <= 0 or T * w > f(100):
-                return None
-        point = self.at_time(T, *way)
-        return (T, point) if abs(point[2]) <= f(10) * ACCURACY * V * T else None
-
-    def march(self, way: tuple, least: np.float32) -> tuple[np.float32, tuple] | None:
-        w, (a, b, drops) = abs(self.omega), way
-        bound = w * np.sqrt(square(b)) + np.sqrt(square(drops[0])) + np.sqrt(square(drops[1])) + self.V_max
-        low, gap = ZERO, np.sqrt(square((b[0] - a[0], b[1] - a[1])))
-        for _ in range(14):
-            T = max(low + gap / bound, f(1.4) * low)
+    def find_time(self, way: tuple, T: np.float32, least: np.float32, trials: int) -> tuple[np.float32, Vector] | None:
+        low, high, w = ZERO, ZERO, abs(self.omega)
+        for _ in range(trials):
             if T * w > f(100):
                 return None
-            point = self.at_time(T, *way)
-            if point[2] <= 0:
-                return None if T <= least else self.refine(way, low + (T - low) * gap / (gap - point[2]))
-            low, gap = T, point[2]
+            m, rate, gap, slope = self.at_time(T, *way)
+            if slope < 0 and abs(gap) <= ACCURACY * self.V_max * T:
+                last = -gap / slope
+                T = T + last
+                return (T, (m[0] + last * rate[0], m[1] + last * rate[1])) if T > least else None
+            low, high = (T, high) if gap > 0 else (low, T)
+            if gap <= 0 and high <= least:
+                return None
+            step = ONE * T
+            if slope < 0:
+                step = -gap / slope
+                step = ONE / w if step * w > ONE else step
+            following = T + step
+            T = HALF * (low + high) if following <= low or (high > 0 and following >= high) else following
         return None
 
     def minimum_time(self, now: Row, offset: Vector, target: Vector, may_start: bool) -> Vector | None:
@@ -239,16 +232,17 @@ class GovernedTwin(Twin):
         a, b = ((self["motor.psi_f_wb"] + self["motor.L_d_app_h"] * x[0], self["motor.L_q_app_h"] * x[1])
                 for x in (self.i, target))
         drops = tuple((HALF * (R * x[0] + offset[0]), HALF * (R * x[1] + offset[1])) for x in (self.i, target))
-        T = self.time_to_go - self.T_s
-        found = self.refine((a, b, drops), T) if T > 0 else None
-        if found is None and may_start:
-            found = self.march((a, b, drops), least)
-        if found is None or found[0] <= least:
+        T, found = self.time_to_go - self.T_s, None
+        if T > 0:
+            found = self.find_time((a, b, drops), T, least, 3)
+        elif may_start:
+            found = self.find_time((a, b, drops), least, least, 7)
+        if found is None:
             return None
-        T, (m, size, *_) = found
+        T, m = found
         s, c = sincos(HALF * self.T_s * self.omega)
-        w = park(m, s, c)
-        w = w[0] * (self.V_max / size), w[1] * (self.V_max / size)
+        w, scale = park(m, s, c), self.V_max / np.sqrt(square(m))
+        w = w[0] * scale, w[1] * scale
         kept = self.keep_current(offset, w)
         if kept is None:
             return None

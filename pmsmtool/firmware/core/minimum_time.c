@@ -8,11 +8,13 @@
 #include "pmsm_period.h"
 
 #define SHORTEST_PERIODS PMSM_C(3.0) /* a shorter transfer is left to the projection */
-#define MARCH_STEPS 14u
-#define MARCH_GROWTH PMSM_C(1.4)
-#define NEWTON_STEPS 4u
+#define TRIALS_START 7u /* 5 of 3830 random transfers are not found so, 1 of 3830 with any number of trials */
+#define TRIALS_FOLLOW 3u
+#define GROWTH PMSM_C(1.0)           /* of T, where the gap does not close yet */
+#define LONGEST_STEP PMSM_C(1.0)     /* rad */
+#define LONGEST_ANGLE PMSM_C(100.0)  /* rad */
 #define HOLD_SHARE PMSM_C(0.99)      /* of V_max: a current that needs more is not held at its limit */
-#define ACCURACY PMSM_C(1e-3)        /* of V T */
+#define ACCURACY PMSM_C(1e-2)        /* of V T, before the last step of Newton's method */
 
 typedef struct {
     pmsm_dq a, b;             /* Wb, now and at the target */
@@ -22,9 +24,9 @@ typedef struct {
 
 typedef struct {
     pmsm_dq m;
-    pmsm_real size;  /* |m| */
+    pmsm_dq rate;    /* dm / dT */
     pmsm_real gap;   /* |m| - V T */
-    pmsm_dq turned, drop; /* flux of the target and lost voltage, seen from the stator */
+    pmsm_real slope; /* d gap / dT */
 } transfer_point;
 
 static transfer_point at_time(const transfer *t, pmsm_real T)
@@ -32,73 +34,59 @@ static transfer_point at_time(const transfer *t, pmsm_real T)
     pmsm_real sine;
     pmsm_real cosine;
     pmsm_sincos(t->omega * T, &sine, &cosine);
-    transfer_point point;
-    point.turned.d = cosine * t->b.d - sine * t->b.q;
-    point.turned.q = sine * t->b.d + cosine * t->b.q;
+    const pmsm_dq turned = {cosine * t->b.d - sine * t->b.q, sine * t->b.d + cosine * t->b.q};
     const pmsm_dq drop = {t->drop_a.d + cosine * t->drop_b.d - sine * t->drop_b.q,
                           t->drop_a.q + sine * t->drop_b.d + cosine * t->drop_b.q};
-    point.drop = drop;
-    point.m.d = point.turned.d - t->a.d + drop.d * T;
-    point.m.q = point.turned.q - t->a.q + drop.q * T;
-    point.size = PMSM_SQRT(pmsm_square(point.m));
-    point.gap = point.size - t->V * T;
+    transfer_point point;
+    point.m.d = turned.d - t->a.d + drop.d * T;
+    point.m.q = turned.q - t->a.q + drop.q * T;
+    point.rate.d = drop.d - t->omega * turned.q;
+    point.rate.q = drop.q + t->omega * turned.d;
+    const pmsm_real size = PMSM_SQRT(pmsm_square(point.m));
+    point.gap = size - t->V * T;
+    point.slope = (point.m.d * point.rate.d + point.m.q * point.rate.q) / (size + PMSM_C(1e-12)) - t->V;
     return point;
 }
 
-/* d gap / d T */
-static pmsm_real slope_at(const transfer *t, const transfer_point *point)
+/* The next time to look at. Newton's method comes to the first root from the left, where the gap is hardly ever
+ * concave; a step is bounded in angle, and where the gap does not close the search goes on by a share of T. Left and
+ * right of the root once known (high > 0), the next time stays between them. */
+static pmsm_real next_time(const transfer *t, const transfer_point *point, pmsm_real T, pmsm_real low, pmsm_real high)
 {
-    const pmsm_real rate_d = point->drop.d - t->omega * point->turned.q;
-    const pmsm_real rate_q = point->drop.q + t->omega * point->turned.d;
-    return (point->m.d * rate_d + point->m.q * rate_q) / (point->size + PMSM_C(1e-12)) - t->V;
-}
-
-/* Newton from T; 1 when it settled on a root where the gap closes. */
-static uint32_t refine(const transfer *t, pmsm_real *T, transfer_point *point)
-{
-    for (uint32_t k = 0u; k < NEWTON_STEPS; k++) {
-        *point = at_time(t, *T);
-        const pmsm_real slope = slope_at(t, point);
-        if (slope >= PMSM_C(0.0)) {
-            return 0u;
-        }
-        if (pmsm_abs(point->gap) <= ACCURACY * t->V * *T) {
-            return 1u;
-        }
-        *T -= point->gap / slope;
-        if (*T <= PMSM_C(0.0) || *T * pmsm_abs(t->omega) > PMSM_C(100.0)) {
-            return 0u;
-        }
+    pmsm_real step = GROWTH * T;
+    if (point->slope < PMSM_C(0.0)) {
+        step = -point->gap / point->slope;
+        step = (step * pmsm_abs(t->omega) > LONGEST_STEP) ? LONGEST_STEP / pmsm_abs(t->omega) : step;
     }
-    *point = at_time(t, *T);
-    return (pmsm_abs(point->gap) <= PMSM_C(10.0) * ACCURACY * t->V * *T) ? 1u : 0u;
+    const pmsm_real next = T + step;
+    const uint32_t outside = (next <= low || (high > PMSM_C(0.0) && next >= high)) ? 1u : 0u;
+    return (outside != 0u) ? PMSM_C(0.5) * (low + high) : next;
 }
 
-/* Upwards from below the first root: the gap cannot close faster than its Lipschitz bound; the growth factor keeps the
- * number of steps bounded. A transfer shorter than least is not looked for. */
-static uint32_t march(const transfer *t, pmsm_real least, pmsm_real *T, transfer_point *point)
+/* The time T of the transfer and the way m, from a first guess; 0 when it is not found in so many trials, or shorter
+ * than least. */
+static uint32_t find_time(const transfer *t, pmsm_real least, uint32_t trials, pmsm_real *T, pmsm_dq *m)
 {
-    const pmsm_dq way = {t->b.d - t->a.d, t->b.q - t->a.q};
-    const pmsm_real bound = pmsm_abs(t->omega) * PMSM_SQRT(pmsm_square(t->b)) + PMSM_SQRT(pmsm_square(t->drop_a)) +
-                            PMSM_SQRT(pmsm_square(t->drop_b)) + t->V;
     pmsm_real low = PMSM_C(0.0);
-    pmsm_real gap_low = PMSM_SQRT(pmsm_square(way));
-    for (uint32_t k = 0u; k < MARCH_STEPS; k++) {
-        const pmsm_real safe = low + gap_low / bound;
-        *T = (safe > MARCH_GROWTH * low) ? safe : MARCH_GROWTH * low;
-        if (*T * pmsm_abs(t->omega) > PMSM_C(100.0)) {
-            return 0u;
+    pmsm_real high = PMSM_C(0.0);
+    for (uint32_t k = 0u; k < trials && *T * pmsm_abs(t->omega) <= LONGEST_ANGLE; k++) {
+        const transfer_point point = at_time(t, *T);
+        if (point.slope < PMSM_C(0.0) && pmsm_abs(point.gap) <= ACCURACY * t->V * *T) {
+            const pmsm_real last = -point.gap / point.slope;
+            m->d = point.m.d + last * point.rate.d;
+            m->q = point.m.q + last * point.rate.q;
+            *T += last;
+            return (*T > least) ? 1u : 0u;
         }
-        *point = at_time(t, *T);
-        if (point->gap <= PMSM_C(0.0)) {
-            if (*T <= least) {
+        if (point.gap > PMSM_C(0.0)) {
+            low = *T;
+        } else {
+            high = *T;
+            if (high <= least) {
                 return 0u;
             }
-            *T = low + (*T - low) * gap_low / (gap_low - point->gap); /* secant, then Newton */
-            return refine(t, T, point);
         }
-        low = *T;
-        gap_low = point->gap;
+        *T = next_time(t, &point, *T, low, high);
     }
     return 0u;
 }
@@ -168,24 +156,27 @@ uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq off
                         {half * (R * i.d + offset.d), half * (R * i.q + offset.q)},
                         {half * (R * target.d + offset.d), half * (R * target.q + offset.q)},
                         period->omega_e, period->V_max};
-    pmsm_real T = state->time_to_go - T_s;
-    transfer_point point;
     const pmsm_real least = SHORTEST_PERIODS * T_s;
-    if ((T <= PMSM_C(0.0) || refine(&t, &T, &point) == 0u) &&
-        (may_start == 0u || march(&t, least, &T, &point) == 0u)) {
-        return 0u;
+    pmsm_real T = state->time_to_go - T_s;
+    pmsm_dq m;
+    uint32_t found = 0u;
+    if (T > PMSM_C(0.0)) {
+        found = find_time(&t, least, TRIALS_FOLLOW, &T, &m);
+    } else if (may_start != 0u) {
+        T = least;
+        found = find_time(&t, least, TRIALS_START, &T, &m);
     }
-    if (T <= least) {
+    if (found == 0u) {
         return 0u;
     }
     pmsm_real sine;
     pmsm_real cosine;
     pmsm_sincos(PMSM_C(0.5) * T_s * period->omega_e, &sine, &cosine);
-    const pmsm_ab along = {point.m.d, point.m.q};
+    const pmsm_ab along = {m.d, m.q};
     pmsm_dq w = pmsm_park(along, sine, cosine); /* seen from the rotor in the middle of the period */
-    const pmsm_real radius = pmsm_voltage_radius(period, w);
-    w.d *= radius / point.size;
-    w.q *= radius / point.size;
+    const pmsm_real scale = pmsm_voltage_radius(period, w) / PMSM_SQRT(pmsm_square(m));
+    w.d *= scale;
+    w.q *= scale;
     if (keep_current(period, offset, &w) == 0u) {
         return 0u;
     }
