@@ -1,0 +1,224 @@
+"""Fill the current plane with voltage pulses that turn at a current: the traces a flux map is made from.
+
+The drive applies +-V on an axis of the rotor frame and turns it when the current leaves its band (Hinkkanen et al.
+2017, DOI 10.1109/TIA.2016.2644624). Pulses on both axes with different voltages drift against each other and fill the
+rectangle between the limits; several rectangles, the widest and the highest at last single axes, fill the disc.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
+from pmsmtool.errors import LimitExceeded
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.experiments.signals import readable
+from pmsmtool.trace import Trace
+
+Axis = Literal["d", "q"]
+
+STAGE = "flux map"
+SIGNALS = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "theta_m_rad", "omega_e_rad_s", "flags", "T_winding_c")
+SAMPLES = 2048
+"""64 kB of eight signals; with half of it the slow axis of a saturated machine does not complete its cycles."""
+RECTANGLES = (
+    (1.0, 0.0),
+    (0.0, 1.0),
+    (0.72, 0.69),
+    (0.45, 0.89),
+    (0.89, 0.45),
+    (0.5, 0.55),
+    (0.24, 0.97),
+    (0.97, 0.24),
+    (0.6, 0.8),
+    (0.8, 0.6),
+)
+"""Largest d and q current of each trace, of the largest vector."""
+VOLTAGE_RATIOS = (
+    (1.0, 0.0),
+    (0.0, 1.0),
+    (0.8, 1.0),
+    (1.0, 0.83),
+    (0.77, 1.0),
+    (1.0, 0.71),
+    (0.87, 1.0),
+    (1.0, 0.9),
+    (0.73, 1.0),
+    (1.0, 0.78),
+)
+"""Voltage of d and q of each trace, of the axis' own: unequal, so that the two cycles drift against each other."""
+HALF_PERIODS_HELD = 70
+HALF_PERIODS_FREE = 45
+"""Samples between two turns at full current: fewer move a free rotor less, more leave the inverter less to say."""
+U_SHARE = 0.9
+"""Largest voltage vector, of what the inverter gives."""
+FIRST_SHARE = 0.02
+"""First voltage of the search, of the largest."""
+SHARES = (0.25, 0.6, 1.0)
+"""Currents of the growing shots that size voltage and band, of the largest."""
+SEARCH_STEPS = 14
+OVERSHOOT_ALLOWANCE = 1.3
+"""Over the overshoot of the shot before: the plane saturates further out."""
+TURNS_LEAST = 3
+"""Turns of the voltage that a shot must show before it sizes anything."""
+REST_S = 0.08
+"""Pause at zero current between two traces: the current decays and the shaft slows down."""
+
+
+@dataclass(frozen=True, slots=True)
+class AxisPulse:
+    """Pulses on one axis: voltage (V), current at which they turn (A), and what the current reaches beyond it (A)."""
+
+    u_v: float
+    limit_a: float
+    overshoot_a: float
+    half_period: float
+
+
+@dataclass(frozen=True, slots=True)
+class ScanPlan:
+    """What a scan may use.
+
+    Attributes
+    ----------
+    i_max_a : float
+        Largest current vector that the machine is to see (A peak).
+    u_max_v : float
+        Largest voltage vector (V peak).
+    held : bool
+        Whether the rotor is held; a free one gets shorter and higher pulses.
+    rectangles : tuple
+        Shares of d and q current, one trace each.
+    """
+
+    i_max_a: float
+    u_max_v: float
+    held: bool
+    rectangles: tuple[tuple[float, float], ...] = RECTANGLES
+
+    @property
+    def half_periods(self) -> int:
+        """Samples between two turns that are aimed at."""
+        return HALF_PERIODS_HELD if self.held else HALF_PERIODS_FREE
+
+    def duration_s(self, period_s: float) -> float:
+        """Return the time under voltage (s)."""
+        return len(self.rectangles) * SAMPLES * period_s
+
+
+def pulse(
+    drive: Drive, u_dq_v: tuple[float, float], limit_dq_a: tuple[float, float], samples: int, abort_speed_rad_s: float
+) -> Trace:
+    """Record one train of pulses from rest; zero current is asked for before and after it.
+
+    Raises
+    ------
+    DriveFault
+        The drive aborted the pulses at its current or speed limit.
+    """
+    excitation = Excitation(
+        shape=Shape.HYSTERESIS,
+        point=Injection.U_D,
+        amplitude=u_dq_v[0],
+        amplitude_q=u_dq_v[1],
+        i_limit_d_a=limit_dq_a[0],
+        i_limit_q_a=limit_dq_a[1],
+        duration_s=samples * drive.period_s,
+        abort_speed_rad_s=abort_speed_rad_s,
+    )
+    drive.command_current(0.0, 0.0)
+    return readable(drive.record(SIGNALS, samples, excitation=excitation))
+
+
+def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float) -> AxisPulse:
+    """Find voltage and band of one axis by growing shots.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``: the largest voltage does not bring the current to its band within a shot.
+    """
+    u = FIRST_SHARE * plan.u_max_v
+    samples = round((2 * TURNS_LEAST + 1) * plan.half_periods)
+    found: AxisPulse | None = None
+    for share in SHARES:
+        limit = share * plan.i_max_a
+        if found is not None:
+            # a saturating axis needs less flux than in proportion: the half period comes out shorter, never longer
+            grown = limit / (found.limit_a + found.overshoot_a)
+            u = min(plan.u_max_v, found.u_v * grown * found.half_period / plan.half_periods)
+            limit = max(0.3 * limit, limit - OVERSHOOT_ALLOWANCE * found.overshoot_a * u / found.u_v)
+        found = _shot_that_turns(drive, plan, axis, u, limit, samples, abort_speed_rad_s)
+    assert found is not None
+    u = min(plan.u_max_v, found.u_v * found.half_period / plan.half_periods)
+    overshoot = found.overshoot_a * u / found.u_v
+    limit = plan.i_max_a - OVERSHOOT_ALLOWANCE * overshoot
+    if limit < 0.4 * plan.i_max_a:
+        raise refuse(
+            "E_EXCITATION",
+            f"the {axis} current overshoots its band by {overshoot:.3g} A of {plan.i_max_a:.3g} A",
+            stage=STAGE,
+            likely="a control period too long for this inductance",
+        )
+    return AxisPulse(u, limit, overshoot, float(plan.half_periods))
+
+
+def _shot_that_turns(
+    drive: Drive, plan: ScanPlan, axis: Axis, u: float, limit: float, samples: int, abort_speed_rad_s: float
+) -> AxisPulse:
+    for _ in range(SEARCH_STEPS):
+        on_d = axis == "d"
+        bands = (limit, 0.0) if on_d else (0.0, limit)  # without voltage a band does nothing
+        trace = pulse(drive, (u, 0.0) if on_d else (0.0, u), bands, samples, abort_speed_rad_s)
+        turns = np.flatnonzero(np.diff(np.sign(trace[f"u_{axis}_v"][1:]))) + 1
+        peak = float(np.max(np.abs(trace[f"i_{axis}_a"])))
+        if len(turns) >= TURNS_LEAST:
+            return AxisPulse(u, limit, max(0.0, peak - limit), float(np.median(np.diff(turns))))
+        if u >= plan.u_max_v:
+            break
+        reached = max(peak / limit, 0.2)
+        u = min(plan.u_max_v, u * (4.0 if reached < 1.0 else 2.0))
+    raise refuse(
+        "E_EXCITATION",
+        f"{u:.3g} V do not turn the {axis} current at {limit:.3g} A often enough, peak {peak:.3g} A",
+        stage=STAGE,
+        likely="too little DC-link voltage for this inductance",
+    )
+
+
+def scan(
+    drive: Drive, plan: ScanPlan, d: AxisPulse, q: AxisPulse, abort_speed_rad_s: float, keep: Callable[[Trace], None]
+) -> None:
+    """Record one trace per rectangle; each is handed over as soon as it is there.
+
+    The drive is enabled on entry with its frame on the rotor, and holds zero current on return.
+
+    Raises
+    ------
+    LimitExceeded
+        A trace went over the largest current by more than the allowance.
+    """
+    for rectangle, ratio in zip(plan.rectangles, VOLTAGE_RATIOS, strict=False):
+        u = (ratio[0] * d.u_v, ratio[1] * q.u_v)
+        too_much = math.hypot(*u) / plan.u_max_v
+        if too_much > 1.0:
+            u = (u[0] / too_much, u[1] / too_much)
+        bands = [
+            _band(share * plan.i_max_a, axis, volts) for share, axis, volts in zip(rectangle, (d, q), u, strict=True)
+        ]
+        trace = pulse(drive, u, (bands[0], bands[1]), SAMPLES, abort_speed_rad_s)
+        keep(replace(trace, meta={**trace.meta, "held": plan.held, "i_max_a": plan.i_max_a}))
+        drive.wait(REST_S)
+
+
+def _band(largest_a: float, axis: AxisPulse, u_v: float) -> float:
+    """Band of one axis: what it is to reach, less the overshoot at this voltage."""
+    return max(0.3 * largest_a, largest_a - axis.overshoot_a * u_v / axis.u_v)
+
+
+__all__ = ["AxisPulse", "LimitExceeded", "ScanPlan", "pulse", "scan", "size_axis"]
