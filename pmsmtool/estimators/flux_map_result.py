@@ -19,6 +19,7 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.machine.flux_map import FluxMap, require_monotonic
 from pmsmtool.machine.flux_map_reciprocity import reciprocal_change
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
 Array = NDArray[np.float64]
@@ -37,8 +38,9 @@ RADII = (1.0, 0.97, 0.94, 0.91, 0.88, 0.85, 0.8)
 """Discs that are tried, of the largest current; below the last the scan has not filled the plane."""
 MISFIT_LIMIT = 0.004
 """Largest flux misfit, of the flux range. Measured with switched and averaged inverters: below 0.001."""
-ASYMMETRY_NOTED = 0.005
-"""Asymmetry, of the flux range, above which the map is reported as not symmetric."""
+POINT_ANGLES = 181
+POINT_LEAST = 0.1
+"""Least d current, of the vector, at which an apparent L_d means anything."""
 RECIPROCITY_NOTED = 0.005
 """Distance to a reciprocal map, of the flux range, above which it is reported: a machine has none."""
 
@@ -87,6 +89,11 @@ class FluxMapResult:
     systematic_current: float
     notes: tuple[str, ...]
 
+    @property
+    def deviation(self) -> float:
+        """Rms standard deviation of the identified fluxes, of the flux range."""
+        return math.sqrt(float(np.mean(np.square(self.psi_std_wb[:, self.identified])))) / self.span_wb
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what the map's own file cannot say, for a ``.npz`` beside it."""
         names = ("L_dd", "L_dq", "L_qq")
@@ -99,6 +106,41 @@ class FluxMapResult:
             **{f"{name}_h": self.L_h[k] for k, name in enumerate(names)},
             **{f"{name}_std_h": self.L_std_h[k] for k, name in enumerate(names)},
         }
+
+
+    def at_rated_current(self, pole_pairs: int, I_apk: float) -> dict[str, Estimate]:
+        """Return incremental and apparent inductances (H) at the largest torque of a current, by machine-file key.
+
+        Parameters
+        ----------
+        pole_pairs : int
+            Pole pairs.
+        I_apk : float
+            Current (A peak); at most what the map knows.
+        """
+        current = min(I_apk, self.radius_a)
+        angle = np.linspace(0.5 * math.pi, math.pi, POINT_ANGLES)
+        torque = self.flux_map.torque_nm(pole_pairs, current * np.cos(angle), current * np.sin(angle))
+        best = float(angle[int(np.argmax(torque))])
+        i_d, i_q = np.array([current * math.cos(best)]), np.array([current * math.sin(best)])
+        L, L_std = self.fit.inductance(i_d, i_q)[:, 0], self.fit.inductance_std(i_d, i_q)[:, 0]
+        psi_std = self.fit.flux_std(i_d, i_q)[:, 0]
+        L_d_app, L_q_app = (float(x[0]) for x in self.flux_map.apparent_inductance(i_d, i_q))
+        rows = {
+            "L_d_h": (L[0], L_std[0]),
+            "L_q_h": (L[2], L_std[2]),
+            "L_q_app_h": (L_q_app, psi_std[1] / abs(i_q[0])),
+        }
+        if abs(i_d[0]) > POINT_LEAST * current:  # psi_d - psi_f over nothing is no inductance
+            rows["L_d_app_h"] = (L_d_app, math.sqrt(2.0) * psi_std[0] / abs(i_d[0]))
+        relative = math.hypot(self.systematic_flux, self.systematic_current)
+        return {
+            name: Estimate(
+                float(value), float(std), relative * abs(float(value)), "H", n=self.fit.n, chi2=self.fit.chi2,
+                method="co-energy spline of voltage pulses", i_d_apk=float(i_d[0]), i_q_apk=float(i_q[0]),
+            )
+            for name, (value, std) in rows.items()
+        }  # fmt: skip
 
 
 def estimate_flux_map(

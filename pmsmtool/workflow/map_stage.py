@@ -1,0 +1,191 @@
+"""The flux map's part of an identification: its pulses on the drive, its estimate from the traces, its files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pmsmtool.drive.port import Drive
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.flux_map_fit import MagnetFlux
+from pmsmtool.estimators.flux_map_result import FluxMapResult, estimate_flux_map
+from pmsmtool.estimators.flux_map_rows import Frame
+from pmsmtool.estimators.noise import Noise
+from pmsmtool.experiments import flux_map_scan
+from pmsmtool.experiments.speed_run import reach
+from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz
+from pmsmtool.machine.parameters import Estimate, MachineParameters
+from pmsmtool.npz_file import npz_bytes
+from pmsmtool.trace import Trace
+from pmsmtool.workflow.run_directory import Acceptance, RunDirectory
+
+if TYPE_CHECKING:
+    from pmsmtool.workflow.evaluate import Evaluation
+    from pmsmtool.workflow.measure import Limits
+
+MAP_FILE = "flux_map.npz"
+MAP_CSV = "flux_map.csv"
+MAP_INTERVALS = "flux_map_intervals.npz"
+
+REACH_SHARE = 0.97
+"""Current the pulses aim at, of the envelope's: they overshoot by up to 3 %."""
+TRIP_SHARE = 0.85
+"""The same, of the drive's overcurrent trip."""
+U_SHARE = 0.9
+"""Largest voltage vector, of the largest."""
+SPEED_SHARE = 0.9
+"""Speed at which the drive ends a pulse train by itself, of the envelope's."""
+COEFFICIENTS = 360
+"""Of the spline, for the deviation predicted before the pulses."""
+HELD_FALLBACK = "psi_f of the drive's parameter set: a held rotor shows increments of flux only"
+DEVIATION_LIMIT = 0.005
+"""Largest rms deviation of the identified fluxes, of their range. Measured: 0.0006."""
+
+PLAN_LINE = "voltage pulses of both axes up to the largest current: a free shaft jerks, by a turn or so"
+
+
+def measure_map(
+    drive: Drive,
+    limits: Limits,
+    noise: Noise,
+    held: bool,
+    keep: Callable[[str, Trace], None],
+    say: Callable[[str], None],
+) -> None:
+    """Size the pulses and record their trains as ``map_<k>``.
+
+    Parameters
+    ----------
+    drive : Drive
+        Enabled, with the frame of its encoder.
+    limits : Limits
+        What may be used.
+    noise : Noise
+        For the deviation that is predicted before the trains.
+    held : bool
+        Whether the rotor is held.
+    keep, say : callable
+        As for the other experiments.
+    """
+    pole_pairs = drive.read("motor.pole_pairs")
+    direction = -1.0 if drive.read("encoder.reversed") else 1.0
+    facts = {
+        "signed_pole_pairs": int(direction * pole_pairs),
+        "offset_rad": drive.read("encoder.offset_rad"),
+        "psi_f_wb": drive.read("motor.psi_f_wb"),
+        "I_nom_a": limits.I_nom_apk,
+    }
+    i_max = min(REACH_SHARE * limits.i_max_apk, TRIP_SHARE * drive.read("protection.i_trip_apk"))
+    plan = flux_map_scan.ScanPlan(i_max, U_SHARE * limits.V_max_v, held)
+    abort = SPEED_SHARE * pole_pairs * limits.omega_max_rad_s
+    say(f"flux map: growing pulses size voltage and band up to {i_max:.3g} A")
+    if not held:
+        reach(drive, 0.0, limit_s=1.0)
+    d, q = (flux_map_scan.size_axis(drive, plan, axis, abort) for axis in ("d", "q"))  # type: ignore[arg-type]
+    swings = [pulse.u_v * pulse.half_period * drive.period_s for pulse in (d, q)]
+    rows = 2 * len(plan.rectangles) * flux_map_scan.SAMPLES
+    predicted = noise.sigma_a * max(swings) / (2.0 * i_max) * math.sqrt(COEFFICIENTS / rows)
+    say(
+        f"flux map: {len(plan.rectangles)} trains, {d.u_v:.3g} V on d and {q.u_v:.3g} V on q, "
+        f"{plan.duration_s(drive.period_s):.2g} s under voltage; predicted deviation of a flux "
+        f"{1e3 * predicted:.2g} mWb of a swing of {1e3 * max(swings):.3g} mWb"
+    )
+    count = 0
+
+    def keep_train(trace: Trace) -> None:
+        nonlocal count
+        keep(f"map_{count}", replace(trace, meta={**trace.meta, **facts}))
+        count += 1
+
+    flux_map_scan.scan(drive, plan, d, q, abort, keep_train)
+
+
+def flux_map_of(
+    traces: Mapping[str, Trace], result: Evaluation, tolerance: SensorTolerance | None
+) -> FluxMapResult | None:
+    """Return the flux map of the pulse trains; None without them, or where the rotor turned and no flux is known.
+
+    Raises
+    ------
+    IdentificationError
+        As the estimator refuses.
+    """
+    trains = [traces[f"map_{k}"] for k in range(sum(name.startswith("map_") for name in traces))]
+    if not trains or result.resistance is None:
+        return None
+    facts = trains[0].meta
+    held = bool(facts["held"])
+    drive_offset = float(facts["offset_rad"])
+    pole_pairs = int(facts["signed_pole_pairs"])
+    magnet = MagnetFlux(float(facts["psi_f_wb"]), 0.0)
+    to_reference = 0.0
+    offset = drive_offset
+    if result.flux is not None and result.offset is not None:
+        measured = result.flux.psi_measured
+        magnet = MagnetFlux(measured.value, measured.std)
+        to_reference = result.flux.psi_f.value - measured.value
+        offset = result.offset.value
+    elif not held:
+        return None
+    return estimate_flux_map(
+        trains,
+        result.noise,
+        result.resistance,
+        Frame(pole_pairs, drive_offset, offset),
+        magnet,
+        to_reference_wb=to_reference,
+        align=held,
+        tolerance=tolerance,
+    )
+
+
+def map_estimates(result: FluxMapResult, trains: Mapping[str, Trace]) -> dict[str, Estimate]:
+    """Return the inductances at the largest torque of the rated current, by machine-file key."""
+    facts = trains["map_0"].meta
+    fallback = HELD_FALLBACK if facts["held"] else ""
+    found = result.at_rated_current(abs(int(facts["signed_pole_pairs"])), float(facts["I_nom_a"]))
+    return {name: replace(estimate, fallback=fallback) for name, estimate in found.items()}
+
+
+def with_map(machine: MachineParameters, estimates: Mapping[str, Estimate]) -> MachineParameters:
+    """Return the machine with the name of its map and its apparent inductances."""
+    apparent = {name: estimates[name].value for name in ("L_d_app_h", "L_q_app_h") if name in estimates}
+    return replace(machine, flux_map=MAP_FILE, **apparent)  # type: ignore[arg-type]
+
+
+def save_map(run: RunDirectory, result: FluxMapResult | None) -> dict[str, str]:
+    """Write the map's files into the run; returns their names as a stage lists them."""
+    if result is None:
+        return {}
+    run.save(MAP_FILE, flux_map_npz(result.flux_map))
+    run.save(MAP_CSV, flux_map_csv(result.flux_map))
+    run.save(MAP_INTERVALS, npz_bytes(result.arrays()))
+    return {MAP_FILE: "", MAP_CSV: "", MAP_INTERVALS: ""}
+
+
+def map_acceptance(result: FluxMapResult | None) -> list[Acceptance]:
+    """Return the criterion of a map: how well its fluxes are known."""
+    if result is None:
+        return []
+    deviation = result.deviation
+    return [
+        Acceptance(
+            "flux map: standard deviation of the identified fluxes, of their range",
+            f"{100.0 * deviation:.2g} %",
+            f"{100.0 * DEVIATION_LIMIT:.2g} %",
+            deviation <= DEVIATION_LIMIT,
+        )
+    ]
+
+
+def map_summary(result: FluxMapResult | None) -> str:
+    """Return what a person reads of the map behind the other values."""
+    if result is None:
+        return ""
+    kind = "symmetric in i_q" if result.fit.symmetric else "not symmetric in i_q"
+    return (
+        f"; flux map to {result.radius_a:.3g} A, deviation {100 * result.deviation:.2g} % of the flux range, {kind} "
+        f"({100 * result.asymmetry:.2g} %), reciprocal to {100 * result.skew:.2g} %, misfit {100 * result.misfit:.2g} %"
+    )
