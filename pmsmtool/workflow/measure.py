@@ -8,7 +8,7 @@ goes into its parameters, so that its own control fits the machine; the guard pu
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from pmsmtool.design.current_loop import imc
@@ -21,6 +21,7 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
 from pmsmtool.trace import Trace
+from pmsmtool.workflow import map_stage
 from pmsmtool.workflow.evaluate import resistance_of
 
 PHASE_CHECK_SHARE = 0.05
@@ -70,8 +71,17 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "L": ("levels", "rotation", "square"),
     "psi": ("levels", "rotation", "square", "speeds"),
     "mechanics": ("levels", "rotation", "square", "speeds"),
+    "map": ("levels", "rotation", "square", "speeds", "map"),
 }
 """Experiments behind each quantity."""
+HELD = ("levels", "map")
+"""Experiments that a held rotor allows."""
+
+
+def steps_of(quantities: Iterable[str], held: bool = False) -> set[str]:
+    """Return the experiments behind quantities; of a held rotor only those that it allows."""
+    steps = {step for quantity in quantities for step in NEEDS[quantity]}
+    return steps & set(HELD) if held else steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +152,8 @@ class Measurement:
         Told one line per experiment.
     ripple_share : float
         Ripple of the injection, peak to peak, of the rated current.
+    held : bool
+        Whether the shaft is locked.
     """
 
     drive: Drive
@@ -149,6 +161,7 @@ class Measurement:
     keep: Callable[[str, Trace], None]
     say: Callable[[str], None]
     ripple_share: float = RIPPLE_SHARE
+    held: bool = False
 
     def run(self, quantities: tuple[str, ...]) -> None:
         """Run what the quantities need.
@@ -158,16 +171,17 @@ class Measurement:
         IdentificationError
             A trap was seen; nothing more is moved.
         """
-        steps = {step for quantity in quantities for step in NEEDS[quantity]}
+        steps = steps_of(quantities, self.held)
         noise = self._zero_current()
         self._phase_check(noise)
         resistance = self._levels(noise) if "levels" in steps else None
         encoder = self._rotation() if "rotation" in steps else None
-        if resistance is None or encoder is None:
-            return
-        inductances = self._square(resistance, encoder) if "square" in steps else None
-        if inductances is not None and "speeds" in steps:
-            self._turn(resistance, encoder, inductances)
+        if resistance is not None and encoder is not None:
+            inductances = self._square(resistance, encoder) if "square" in steps else None
+            if inductances is not None and "speeds" in steps:
+                self._turn(resistance, encoder, inductances)
+        if "map" in steps:
+            map_stage.measure_map(self.drive, self.limits, noise, self.held, self.keep, self.say)
 
     def _zero_current(self) -> Noise:
         self.say("noise: currents of the drive at rest")
