@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
+from pmsmtool.estimators.flux_map_result import FluxMapResult
 from pmsmtool.estimators.inductance import InductanceResult, estimate_inductances
 from pmsmtool.estimators.inertia import InertiaResult, estimate_inertia
 from pmsmtool.estimators.noise import Noise, estimate_noise
@@ -20,6 +21,7 @@ from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_re
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
+from pmsmtool.workflow import map_stage
 
 MOVED_SHARE = 0.25
 """Largest share of levels that may be left out; with more the estimator sees them, and refuses what has not settled."""
@@ -40,6 +42,8 @@ class Evaluation:
     inductance: InductanceResult | None = None
     flux: FluxResult | None = None
     inertia: InertiaResult | None = None
+    flux_map: FluxMapResult | None = None
+    map_estimates: Mapping[str, Estimate] = field(default_factory=dict)
 
     @property
     def offset(self) -> Estimate | None:
@@ -53,7 +57,7 @@ class Evaluation:
 
     def estimates(self) -> dict[str, Estimate]:
         """Return every estimate by its machine-file key."""
-        found: dict[str, Estimate] = {}
+        found: dict[str, Estimate] = dict(self.map_estimates)
         if self.resistance is not None:
             found["R_s_ohm"] = self.resistance.R_s
         if self.inductance is not None:
@@ -95,7 +99,7 @@ def evaluate(
     traces : mapping of str to Trace
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``levels``, ``rotation_forward``,
         ``rotation_backward``, ``square_d_<half period>``, ``square_q_<half period>``, ``pushes_<k>``, ``speeds``,
-        ``wave_<k>``.
+        ``wave_<k>``, ``map_<k>``.
     period_s : float
         Control period (s).
     T_ref_c : float
@@ -133,6 +137,9 @@ def evaluate(
             pushes_of(traces), result.flux.psi_measured, round(result.encoder.pole_pairs.value), tolerance
         )
         result = replace(result, inertia=inertia)
+    flux_map = map_stage.flux_map_of(traces, result, tolerance)
+    if flux_map is not None:
+        result = replace(result, flux_map=flux_map, map_estimates=map_stage.map_estimates(flux_map, traces))
     return result
 
 
@@ -238,6 +245,9 @@ def machine_of(evaluation: Evaluation, nameplate: MachineFile, conditions: Mappi
     machine = replace(nameplate.machine, **values)  # type: ignore[arg-type]
     if evaluation.inertia is not None:
         machine = replace(machine, tau_c_nm=max(0.0, evaluation.inertia.tau_c.value), B_nms=None)
+    flux_map = nameplate.flux_map
+    if evaluation.flux_map is not None:
+        machine, flux_map = map_stage.with_map(machine, evaluation.map_estimates), evaluation.flux_map.flux_map
     inverter, encoder = nameplate.inverter, nameplate.encoder
     if evaluation.encoder is not None and evaluation.offset is not None:
         machine = replace(machine, pole_pairs=round(evaluation.encoder.pole_pairs.value))
@@ -263,4 +273,5 @@ def machine_of(evaluation: Evaluation, nameplate: MachineFile, conditions: Mappi
         estimates={**nameplate.estimates, **found},
         conditions=dict(conditions),
         simulation={},
+        flux_map=flux_map,
     )
