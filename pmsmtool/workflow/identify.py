@@ -30,7 +30,8 @@ from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
 from pmsmtool.units import format_estimate
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
-from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Limits, Measurement
+from pmsmtool.workflow import map_stage
+from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Limits, Measurement, steps_of
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
 MACHINE = "machine.toml"
@@ -51,7 +52,7 @@ class IdentifyRequest:
     Attributes
     ----------
     quantities : tuple of str
-        Out of ``R L psi encoder poles inverter mechanics``.
+        Out of ``R L psi encoder poles inverter mechanics map``.
     i_max_apk, speed_max_rad_s : float or None
         Envelope (A peak, rad/s mechanical).
     shaft, load, brake : str
@@ -83,11 +84,11 @@ class IdentifyRequest:
             raise ConfigError(
                 f"cannot identify {', '.join(unknown) or 'nothing'}", hint=f"choose from {', '.join(NEEDS)}, or all"
             )
-        turning = [name for name in self.quantities if set(NEEDS[name]) & {"rotation", "speeds"}]
+        turning = [name for name in self.quantities if name != "map" and set(NEEDS[name]) & {"rotation", "speeds"}]
         if turning and self.shaft == "locked":
             raise NotAvailable(
                 f"{', '.join(turning)} cannot be identified on a locked shaft: the rotor must turn",
-                hint="free the shaft, or identify R and inverter only",
+                hint="free the shaft, or identify R, inverter and map only",
             )
 
 
@@ -160,12 +161,14 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
 
 def plan_lines(envelope: Envelope, request: IdentifyRequest) -> list[str]:
     """Return what a person reads before consenting: the envelope and what will happen inside it."""
-    steps = {step for quantity in request.quantities for step in NEEDS[quantity]}
+    steps = steps_of(request.quantities, request.shaft == "locked")
     lines = [*envelope.lines(), "the rotor aligns with current vectors: it may jump by half an electrical turn"]
     if "rotation" in steps:
         lines.append("the shaft turns slowly through one turn each way")
     if "speeds" in steps:
         lines.append("the shaft is pushed both ways and runs at eight steady speeds, both directions")
+    if "map" in steps:
+        lines.append(map_stage.PLAN_LINE)
     lines.append("nothing is stored in the drive; every changed object is restored")
     return lines
 
@@ -208,7 +211,7 @@ def identify_stage(
     clock = drive.node.connection.clock
     start = clock.now()
     with guarded(drive, envelope, say=say) as guard:
-        Measurement(guard, limits, keep, say).run(request.quantities)
+        Measurement(guard, limits, keep, say, held=request.shaft == "locked").run(request.quantities)
     stage = evaluated_stage(run, nameplate, request)
     return replace(stage, seconds=clock.now() - start)
 
@@ -230,9 +233,11 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         tolerance=request.tolerance,
     )
     machine = machine_of(evaluation, nameplate, _conditions(evaluation, request))
+    map_files = map_stage.save_map(run, evaluation.flux_map)
     run.save(MACHINE, dump_machine_file(machine))
     found = evaluation.estimates()
     acceptance = [_accepted(name, estimate) for name, estimate in found.items() if _limit(name) is not None]
+    acceptance += map_stage.map_acceptance(evaluation.flux_map)
     return Stage(
         "identify",
         "pass" if all(line.ok for line in acceptance) else "fail",
@@ -240,13 +245,14 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         values=[_value(name, estimate) for name, estimate in found.items()],
         acceptance=acceptance,
         fallbacks=[f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback],
-        files={MACHINE: "", NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
+        files={MACHINE: "", **map_files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
         note="; ".join(warnings_of(evaluation)),
         summary=", ".join(
             f"{name} {format_estimate(found[name].value, total_half_width(found[name]), found[name].unit)}"
             for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
             if name in found
-        ),
+        )
+        + map_stage.map_summary(evaluation.flux_map),
     )
 
 
@@ -321,6 +327,8 @@ def warnings_of(evaluation: Evaluation) -> list[str]:
     if inductance is not None and inductance.verdict is Verdict.WARN:
         dependent = ", ".join(inductance.frequency_dependent)
         lines.append(f"L: {'depends on frequency on ' + dependent if dependent else 'chi-square above its limit'}")
+    if evaluation.flux_map is not None:
+        lines += evaluation.flux_map.notes
     return lines
 
 
