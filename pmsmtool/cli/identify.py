@@ -23,10 +23,11 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     epilog=examples(
         "pmsmtool --sim interior-2k2 --yes identify",
         "pmsmtool -i socketcan -c can0 -n 5 identify R L --i-max 6Apk",
+        "pmsmtool --sim saturated-pmsyrm --yes identify map --i-max 20Apk",
         "pmsmtool identify --replay runs/20260101T120000Z-000055f1",
     ),
 )
-@click.argument("quantities", nargs=-1, metavar="[R|L|psi|encoder|poles|inverter|mechanics|all]...")
+@click.argument("quantities", nargs=-1, metavar="[R|L|psi|encoder|poles|inverter|mechanics|map|all]...")
 @click.option("--method", type=click.Choice(["auto", "inject"]), default="auto", help="How: by injection and trace.")
 @click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="Recompute from the traces of a run; moves nothing.")
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
@@ -51,13 +52,16 @@ def identify_command(
 ) -> None:
     """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
 
+    "map" measures the flux linkages over the plane of currents with saturation and cross-saturation; a held rotor
+    (--shaft locked) allows R, inverter and map. Without a quantity all but the map are measured, with "all" all.
+
     The limits are printed and consent is asked before anything moves. Every number comes with its statistical and its
     systematic part; what cannot be trusted is refused by name. The run directory keeps raw traces and machine.toml;
     nothing is stored in the drive.
     """
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.workflow.identify import IdentifyRequest
-    from pmsmtool.workflow.measure import QUANTITIES
+    from pmsmtool.workflow.measure import NEEDS, QUANTITIES
 
     declared = None if sensor_tol is None else SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol)
     if replay is not None:
@@ -68,7 +72,7 @@ def identify_command(
         run.read()
         _show(run, recompute(run, declared), out)
         return
-    chosen = QUANTITIES if not quantities or "all" in quantities else quantities
+    chosen = tuple(NEEDS) if "all" in quantities else quantities or QUANTITIES
     request = IdentifyRequest(
         quantities=tuple(chosen),
         i_max_apk=motion.i_max_apk,
@@ -138,7 +142,10 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
     out.result("identify", data, table(heads, rows))
     for line in (*stage.fallbacks, *([stage.note] if stage.note else [])):
         out.warn(line)
-    out.note(f"-> {run.path / 'machine.toml'}")
+    out.note(stage.summary)
+    for name in stage.files:
+        if not name.startswith(("traces/", "nameplate", "request")):
+            out.note(f"-> {run.path / name}")
     if stage.status != "pass":
         broken = [f"{line.what}: {line.measured}, limit {line.limit}" for line in stage.acceptance if not line.ok]
         raise IdentificationError("E_NOT_ACCEPTED", "; ".join(broken), where=str(run.path))
