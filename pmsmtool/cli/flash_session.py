@@ -88,7 +88,7 @@ def checked_identity(node: DriveNode) -> Identity:
     from pmsmtool.flash.download import describe
 
     identity = node.identity()
-    if (identity.vendor, identity.product) != (node.map.vendor, node.map.product):
+    if not node.map.is_for(identity.vendor, identity.product):
         raise ConfigError(
             f"the map {node.map.name!r} is for vendor {node.map.vendor:#010x} product {node.map.product:#x}, "
             f"the drive is {describe(identity)}",

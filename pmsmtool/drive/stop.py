@@ -64,9 +64,12 @@ def disable_at_once(node: DriveNode) -> None:
 
 def zero_references(node: DriveNode) -> None:
     """End an excitation and bring all references to zero; a drive without these objects needs none."""
-    with contextlib.suppress(SdoAbort):
-        node.command(objects.EXCITATION_COMMAND, 0)
-    for reference in (objects.SET_POINT_D, objects.SET_POINT_Q, objects.TARGET_VELOCITY_MRPM):
+    references = [objects.TARGET_VELOCITY_MRPM]
+    if node.map.staging:  # 0x2050 and 0x2052 of another maker's drive are something else
+        with contextlib.suppress(SdoAbort):
+            node.command(objects.EXCITATION_COMMAND, 0)
+        references = [objects.SET_POINT_D, objects.SET_POINT_Q, *references]
+    for reference in references:
         with contextlib.suppress(SdoAbort):
             if node.get(reference) != 0.0:
                 node.put(reference, 0.0)

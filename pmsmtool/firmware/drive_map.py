@@ -112,7 +112,7 @@ class Cell:
         ConfigError
             The value does not fit the type, or the gain is missing.
         """
-        raw = (self._formed(value, values) - self.offset) / self.factor
+        raw = self.counts(value, values)
         letter = LETTERS[self.wire]
         if letter != "f":
             raw = self._rounded(raw)
@@ -123,6 +123,10 @@ class Cell:
                 f"{value:.9g} does not fit {self.wire} in steps of {self.factor:g}",
                 where=f"{self.name} -> 0x{self.index:04X}:{self.sub:02X}",
             ) from error
+
+    def counts(self, value: float, values: Mapping[str, float]) -> float:
+        """Return an SI value in counts of the object, not rounded yet."""
+        return (self._formed(value, values) - self.offset) / self.factor
 
     def decode(self, data: bytes, values: Mapping[str, float]) -> float:
         """Return the SI value of the object's bytes, with the fewest digits that give these bytes again."""

@@ -25,6 +25,7 @@ from pmsmtool.errors import (
     VerifyMismatch,
 )
 from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
+from pmsmtool.flash.map_gate import check_map, remember_map
 from pmsmtool.flash.plan import Change, Plan, differences
 from pmsmtool.params.catalogue import layout_signature
 
@@ -162,6 +163,7 @@ class Download:
 
     def _gate(self) -> None:
         check_identity(self.node, self.identity)
+        check_map(self.node.map, self.identity, self.folder)
         self._parameters.check_layout()
         refuse_while_enabled(self.node)
         if self._parameters.is_staged():
@@ -194,6 +196,7 @@ class Download:
             "journal", "open", self.identity, layout_signature() if self.node.map.staging else 0,
             self.plan.content, tuple(entries),
         )  # fmt: skip
+        remember_map(self.node.map, self.folder)
         journal = self.folder.begin(snapshot)
         self._say(f"journal: {self.folder.path}")
         return journal
@@ -201,6 +204,8 @@ class Download:
     def _read_marks(self) -> dict[str, bytes]:
         found = {}
         for name, index, sub in MARKS:
+            if name == "design_id" and not self.node.map.staging:
+                continue  # 0x2000 is another maker's own object
             try:
                 found[name] = self.node.sdo.read(index, sub)
             except SdoAbort:

@@ -75,6 +75,8 @@ def take_backup(node: DriveNode, identity: Identity, *, progress: Progress = lam
     found = parameters.read([*node.map.cells, *node.map.tables], progress=progress)
     entries = [Entry(name, *node.map.address(name), data) for name, data in found.items()]
     for name, index, sub in MARKS:
+        if name == "design_id" and not node.map.staging:
+            continue  # 0x2000 is another maker's own object
         try:
             entries.append(Entry(name, index, sub, node.sdo.upload(index, sub, mode=Mode.SEGMENTED).data))
         except SdoAbort:

@@ -9,6 +9,7 @@ NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
 ``bitrate`` bit rate (bit/s) for bit-exact frame times; default: nominal times at 1 Mbit/s
 ``node``   node id of the first drive, outranks one stored by LSS; default 1; 255: unconfigured
 ``nodes``  number of drives on the line, with consecutive node ids and serial numbers; default 1
+``drive``  family whose object dictionary the drive shows (``firmware-params``); default: the reference drive's own
 ``speed``  how fast idle time passes at most, as a multiple of the wall clock; default: at once
 ========== =============================================================================================
 """
@@ -23,10 +24,12 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.faults import load_faults
 from pmsmtool.sim.line import Line
 from pmsmtool.sim.node.factory import drive_settings
+from pmsmtool.sim.node.family import Face
 from pmsmtool.sim.node.lss import UNCONFIGURED
 from pmsmtool.sim.node.memory import FileStorage, Memory, RamStorage, Storage
 from pmsmtool.sim.node.node import Node
@@ -37,6 +40,8 @@ if TYPE_CHECKING:
 
 DEFAULT_PROFILE = "interior-2k2"
 """Profile of a channel without a name."""
+OWN_FAMILY = "pmsmsim"
+"""The reference drive by its family's name: no other face."""
 DEFAULT_NODE_ID = 1
 LARGEST_NODE_ID = 127
 MEMORY_FOLDER = Path(".pmsmsim")
@@ -56,6 +61,7 @@ class Channel:
     node: int | None = None
     nodes: int = 1
     speed: float | None = None
+    drive: str | None = None
 
 
 def _whole(low: int, high: int) -> Callable[[str], int]:
@@ -83,6 +89,7 @@ _KEYS: dict[str, Callable[[str], Any]] = {
     "node": _whole(1, 255),
     "nodes": _whole(1, 127),
     "speed": _positive,
+    "drive": str,
 }
 
 
@@ -162,14 +169,16 @@ def build_line(
         )
     path = machine_path(channel.name)
     machine_file = load_machine_file(path)
+    face = None if channel.drive in (None, OWN_FAMILY) else Face(load_family(channel.drive))
+    stem = path.stem if face is None else f"{path.stem}-{channel.drive}"
     plan = None if channel.faults is None else load_faults(channel.faults)
     seed = int(machine_file.simulation.get("seed", 0)) if channel.seed is None else channel.seed  # type: ignore[arg-type]
     line = Line(channel.bitrate or bitrate, plan, seed=seed, instant=instant)
     fixed = channel.node not in (None, UNCONFIGURED)
     for position in range(channel.nodes):
         node_id = first if first == UNCONFIGURED else first + position
-        settings = drive_settings(machine_file, path.stem, node_id, position, fixed_node_id=fixed)
-        memory = Memory(_storage(channel, path.stem, position))
+        settings = drive_settings(machine_file, path.stem, node_id, position, fixed_node_id=fixed, face=face)
+        memory = Memory(_storage(channel, stem, position))
         line.add_node(Node(line, make_core(machine_file, seed + position), memory, settings))
     line.arm_faults()
     return line

@@ -166,6 +166,11 @@ class Dictionary:
         self._hidden.add(index)
         self._indices = {key >> 8 for key in self._entries}
 
+    def show(self, entry: Entry) -> None:
+        """Answer with this entry at its object from now on; the application still finds its own by key."""
+        self._entries[entry.row.index << 8 | entry.row.sub] = entry
+        self._indices.add(entry.row.index)
+
     def readable(self, index: int, sub: int) -> Entry:
         """Return an entry that can be read, else refuse."""
         entry = self.find(index, sub)

@@ -10,6 +10,7 @@ import math
 from typing import TYPE_CHECKING
 
 from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.sim.node.family import Face
 from pmsmtool.sim.node.node import Settings
 from pmsmtool.sim.node.parameter_set import ParameterImage
 
@@ -59,7 +60,13 @@ def factory_values(machine_file: MachineFile) -> dict[str, float]:
 
 
 def drive_settings(
-    machine_file: MachineFile, name: str, node_id: int, position: int, *, fixed_node_id: bool = False
+    machine_file: MachineFile,
+    name: str,
+    node_id: int,
+    position: int,
+    *,
+    fixed_node_id: bool = False,
+    face: Face | None = None,
 ) -> Settings:
     """Return the settings of a drive made for a machine file.
 
@@ -73,6 +80,8 @@ def drive_settings(
         Number of the drive on its line, from 0; counts the serial number up.
     fixed_node_id : bool
         Whether the node id outranks a stored one.
+    face : Face, optional
+        The family whose dictionary the drive shows.
     """
     values = factory_values(machine_file)
     machine = machine_file.machine
@@ -82,9 +91,10 @@ def drive_settings(
     return Settings(
         node_id=node_id,
         serial=serial & 0xFFFFFFFF,
-        name=f"pmsmsim {name}",
+        name=f"pmsmsim {name}" if face is None else f"simulated {face.drive_map.name} {name}",
         factory=ParameterImage.of_values(values),
         rated_current_ma=max(1, round(1000.0 * i_nom / math.sqrt(2.0))),
         rated_torque_mnm=max(1, round(1000.0 * torque)),
         fixed_node_id=fixed_node_id,
+        face=face,
     )

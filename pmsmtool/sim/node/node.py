@@ -10,6 +10,7 @@ from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.sim.faults import Absence
 from pmsmtool.sim.node import store as storing
 from pmsmtool.sim.node.drive_core import DriveCore
+from pmsmtool.sim.node.family import Face
 from pmsmtool.sim.node.lss import UNCONFIGURED
 from pmsmtool.sim.node.memory import Memory
 from pmsmtool.sim.node.parameter_set import ParameterImage
@@ -57,6 +58,8 @@ class Settings:
         Factory values of 0x6075 (rms) and 0x6076.
     fixed_node_id : bool
         Whether ``node_id`` outranks one stored by LSS (a switch on the drive).
+    face : Face or None
+        The family whose dictionary it shows; None: the reference drive's own.
     """
 
     node_id: int
@@ -66,6 +69,7 @@ class Settings:
     rated_current_ma: int
     rated_torque_mnm: int
     fixed_node_id: bool = False
+    face: Face | None = None
 
 
 class Node:
@@ -86,7 +90,9 @@ class Node:
         self.core = core
         self.memory = memory
         self.factory = settings.factory
-        self.identity = (VENDOR, PRODUCT, REVISION, settings.serial)
+        self.face = settings.face
+        family = (VENDOR, PRODUCT) if self.face is None else (self.face.drive_map.vendor, self.face.drive_map.product)
+        self.identity = (*family, REVISION, settings.serial)
         self.name = settings.name
         self.rated_current_ma = settings.rated_current_ma
         self.rated_torque_mnm = settings.rated_torque_mnm

@@ -1,0 +1,215 @@
+"""The same simulated drive behind the object dictionary of another family: scaled integers, quantised gains.
+
+A face hides the reference drive's own objects and shows those a drive map names (``firmware-params/<family>``). What
+is written there is what counts: the bytes are kept, and the drive works with the SI value they mean. Modes the family
+does not have are refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.cia402 import Mode
+from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.drive_map import Cell, DriveMap, SignalCell
+from pmsmtool.firmware.wire_units import WireUnit, wire_unit
+from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+from pmsmtool.sim.node.objects import ObjectRow
+from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM
+
+OWN = range(0x2000, 0x6000)
+"""Indices of the reference drive's own objects."""
+DATA_SHEET = (0x1021, 0x1022)
+"""Stored data sheet: the reference drive's would describe another drive."""
+ONE_FOR_BOTH_AXES = {
+    "current.K_p_q_v_per_a": ("current.K_p_d_v_per_a",),
+    "current.K_i_q_v_per_as": ("current.K_i_d_v_per_as",),
+    "motor.L_q_h": ("motor.L_d_h", "motor.L_q_app_h", "motor.L_d_app_h"),
+}
+"""Where a family has one object only, its value acts on these as well."""
+MODE_BITS = {Mode.PROFILE_VELOCITY: 2, Mode.PROFILE_TORQUE: 3, Mode.CYCLIC_VELOCITY: 8, Mode.CYCLIC_TORQUE: 9}
+"""Bits of object 0x6502."""
+_TYPES = {
+    "UNSIGNED8": "U8", "UNSIGNED16": "U16", "UNSIGNED32": "U32", "INTEGER8": "I8", "INTEGER16": "I16",
+    "INTEGER32": "I32", "REAL32": "REAL32",
+}  # fmt: skip
+_LIVE = {
+    "position_rad": "live.theta_m_rad",
+    "i_q_a": "live.i_q_a",
+    "i_d_a": "live.i_d_a",
+    "u_q_v": "live.u_q_v",
+    "u_d_v": "live.u_d_v",
+    "U_dc_v": "live.U_dc_v",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Face:
+    """What a simulated drive shows instead of its own dictionary.
+
+    Attributes
+    ----------
+    drive_map : DriveMap
+        The family.
+    """
+
+    drive_map: DriveMap
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """Modes of operation the family has."""
+        has = self.drive_map.capabilities
+        torque = (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE) if has.torque_mode else ()
+        velocity = (Mode.PROFILE_VELOCITY, Mode.CYCLIC_VELOCITY) if has.velocity_mode else ()
+        return (*velocity, *torque)
+
+    def dress(self, dictionary: Dictionary) -> None:
+        """Put the family's objects into a dictionary whose application is not hooked up yet."""
+        hidden = {entry.row.index for entry in dictionary if entry.row.index in OWN or entry.row.index in DATA_SHEET}
+        if not self.drive_map.capabilities.torque_mode:
+            hidden |= {0x6071, 0x6074, 0x6087, 0x60B2}
+        if not self.drive_map.capabilities.velocity_mode:
+            hidden |= {0x60FF}
+        for index in hidden:
+            dictionary.hide(index)
+        for entry in (*self._modes(dictionary), *_Parameters(self.drive_map, dictionary).entries()):
+            dictionary.show(entry)
+        for name, signal in self.drive_map.signals.items():
+            dictionary.show(_signal_entry(name, signal, dictionary))
+
+    def _modes(self, dictionary: Dictionary) -> Iterator[Entry]:
+        inner = dictionary["cia402.mode"]
+        shown = Entry(inner.row, 0)
+
+        def sink(data: bytes) -> None:
+            if int.from_bytes(data, "little", signed=True) not in (Mode.NONE, *self.modes):
+                raise Refused(AbortCode.VALUE)
+            dictionary.write(inner, data)
+            shown.value = data
+
+        shown.source, shown.sink = inner.read, sink
+        yield shown
+        supported = dictionary["cia402.supported_modes"]
+        supported.put(sum(1 << MODE_BITS[mode] for mode in self.modes))
+
+
+class _Parameters:
+    """The mapped parameters of one session: bytes as the family keeps them, SI values for the drive behind."""
+
+    def __init__(self, drive_map: DriveMap, dictionary: Dictionary) -> None:
+        self._map = drive_map
+        self._dictionary = dictionary
+        self._shown: dict[str, Entry] = {}
+
+    def entries(self) -> Iterator[Entry]:
+        """Make the entries."""
+        for cell in self._map.cells.values():
+            parameter = BY_NAME[cell.name]
+            row = _row(cell.index, cell.sub, cell.wire, parameter.meaning, "rw", "R" if parameter.live else "0", True)
+            entry = Entry(row, 0)
+            entry.value = b""  # not taken from the factory's set yet
+            entry.source, entry.sink = self._source(cell), self._sink(cell)
+            self._shown[cell.name] = entry
+            yield entry
+
+    def _source(self, cell: Cell) -> Callable[[], bytes]:
+        def read() -> bytes:
+            shown = self._shown[cell.name]
+            if not shown.value:
+                shown.value = self._counted(cell, shown)
+            return shown.value
+
+        return read
+
+    def _counted(self, cell: Cell, shown: Entry) -> bytes:
+        """Return the factory's value as this family would keep it, cut to what its type holds."""
+        values = {name: self._dictionary[name].number() for name in (cell.name, cell.gain) if name}
+        counts = cell.counts(values[cell.name], values)
+        return shown.encode(counts if math.isfinite(counts) else math.copysign(1e30, counts))
+
+    def _sink(self, cell: Cell) -> Callable[[bytes], None]:
+        def write(data: bytes) -> None:
+            self._act(cell, data)
+            self._shown[cell.name].value = bytes(data)
+            for other in self._map.cells.values():
+                if other.gain == cell.name and self._shown[other.name].value:
+                    self._follow(other)
+
+        return write
+
+    def _follow(self, cell: Cell) -> None:
+        """An integral time stays what it is when its gain changes; the integral gain follows, as far as it may."""
+        try:
+            self._act(cell, self._shown[cell.name].value)
+        except Refused:
+            return
+
+    def _act(self, cell: Cell, data: bytes) -> None:
+        values = {cell.gain: self._dictionary[cell.gain].number()} if cell.gain else {}
+        try:
+            value = cell.decode(data, values)
+        except ConfigError as error:
+            raise Refused(AbortCode.VALUE) from error
+        if not math.isfinite(value):
+            raise Refused(AbortCode.VALUE)
+        others = [name for name in ONE_FOR_BOTH_AXES.get(cell.name, ()) if name not in self._map.cells]
+        for name in (cell.name, *others):
+            inner = self._dictionary[name]
+            self._dictionary.write(inner, inner.encode(value))
+
+
+def _signal_entry(name: str, signal: SignalCell, dictionary: Dictionary) -> Entry:
+    """Return the entry of a live quantity or a reference in the family's counts."""
+    unit = wire_unit(signal.unit)
+    target = name.startswith("target_")
+    row = _row(signal.index, signal.sub, signal.wire, name, "rw" if target else "ro", "R" if target else "T", False)
+    entry = Entry(row, 0)
+
+    def scale() -> float:
+        return _scale(unit, dictionary)
+
+    entry.source = lambda: entry.encode(_quantity(name, dictionary) / scale())
+    if target:
+
+        def sink(data: bytes) -> None:
+            inner, per_count = _target(name, dictionary)
+            value = entry.code.unpack(data)[0] if entry.code is not None else 0.0
+            dictionary.write(inner, inner.encode(value * scale() / per_count))
+
+        entry.sink = sink
+    return entry
+
+
+def _scale(unit: WireUnit, dictionary: Dictionary) -> float:
+    """Return one count in SI; relative ones by the rated current (mA rms, here as peak) or torque (mN m)."""
+    if unit.relative_to == 0x6075:
+        return unit.scale * 1e-3 * dictionary["cia402.rated_current"].number() * math.sqrt(2.0)
+    if unit.relative_to == 0x6076:
+        return unit.scale * 1e-3 * dictionary["cia402.rated_torque"].number()
+    return unit.scale
+
+
+def _quantity(name: str, dictionary: Dictionary) -> float:
+    if name in _LIVE:
+        return dictionary[_LIVE[name]].number()
+    if name in ("target_torque_nm", "target_omega_M_rad_s"):
+        inner, per_count = _target(name, dictionary)
+        return inner.number() * per_count
+    if name == "torque_nm":
+        return dictionary["cia402.torque"].number() * 1e-6 * dictionary["cia402.rated_torque"].number()
+    return dictionary["cia402.velocity"].number() * RAD_S_PER_MRPM
+
+
+def _target(name: str, dictionary: Dictionary) -> tuple[Entry, float]:
+    """Return the reference drive's object of a reference, and its SI value per count."""
+    if name == "target_torque_nm":
+        return dictionary["cia402.target_torque"], 1e-6 * dictionary["cia402.rated_torque"].number()
+    return dictionary["cia402.target_velocity"], RAD_S_PER_MRPM
+
+
+def _row(index: int, sub: int, wire: str, name: str, access: str, pdo: str, stored: bool) -> ObjectRow:
+    return ObjectRow(index, sub, "", name, _TYPES[wire], access, pdo, "", "0", None, None, stored)

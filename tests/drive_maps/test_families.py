@@ -1,0 +1,283 @@
+"""Simulated drives of every mapped family: what is shown before is what they hold; the gate before the first write."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pmsmtool.bus.connect import connect
+from pmsmtool.drive import objects
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.drive.port import Identity
+from pmsmtool.errors import ConfigError, DriveFault, SafetyRefusal, SdoAbort
+from pmsmtool.firmware.drive_map import REFERENCE_VENDOR, DriveMap
+from pmsmtool.firmware.drive_map_file import parse_drive_map
+from pmsmtool.firmware.shipped_maps import family_names, family_of, load_family
+from pmsmtool.flash.download import Download
+from pmsmtool.flash.journal import JournalFolder
+from pmsmtool.flash.map_gate import check_map, memory_of, remember_map
+from pmsmtool.flash.restore import plan_download, take_backup
+from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.params.parameter_set import ParameterSet
+
+FOREIGN = [name for name in family_names() if name != "pmsmsim"]
+HOLDING = [name for name in FOREIGN if load_family(name).cells]
+DESIGNS = 1000
+
+
+@contextmanager
+def opened(family: str, *, nv: str = ":memory:") -> Iterator[DriveNode]:
+    with connect("pmsmsim", f"interior-2k2?nv={nv}&drive={family}") as connection:
+        node = DriveNode(connection, 1, drive_map=load_family(family))
+        yield node
+        node.close()
+
+
+def random_design(rng: np.random.Generator) -> dict[str, float]:
+    """A machine from a few watts to many kilowatts, its ratings, and gains for a random bandwidth."""
+
+    def between(low: float, high: float) -> float:
+        return float(math.exp(rng.uniform(math.log(low), math.log(high))))
+
+    current, R_s, L_d = between(1.0, 100.0), between(0.01, 5.0), between(1e-4, 0.02)
+    L_q, alpha = L_d * float(rng.uniform(1.0, 2.2)), between(300.0, 5000.0)
+    return {
+        "motor.pole_pairs": float(rng.integers(1, 12)),
+        "motor.R_s_ohm": R_s,
+        "motor.L_q_h": L_q,
+        "motor.psi_f_wb": between(1e-3, 1.0),
+        "motor.I_nom_apk": current,
+        "motor.I_max_apk": 1.5 * current,
+        "motor.I_max_time_s": float(rng.uniform(0.1, 20.0)),
+        "motor.n_max_rpm": between(100.0, 20_000.0),
+        "protection.U_dc_min_v": float(rng.uniform(10.0, 400.0)),  # the simulated link has 560 V
+        "protection.U_dc_max_v": float(rng.uniform(650.0, 900.0)),
+        "current.K_p_d_v_per_a": alpha * L_d,
+        "current.K_i_d_v_per_as": alpha * R_s,
+        "current.K_p_q_v_per_a": alpha * L_q,
+        "current.K_i_q_v_per_as": alpha * R_s,
+        "speed.K_p_nms_per_rad": between(1e-4, 10.0),
+        "speed.K_i_nm_per_rad": between(1e-3, 100.0),
+        "speed.tau_max_nm": between(0.1, 500.0),
+    }
+
+
+@pytest.mark.parametrize("family", HOLDING)
+def test_what_is_shown_before_is_what_the_drive_holds(family: str) -> None:
+    """1000 random designs: bytes, and the SI values they mean, before writing and read back."""
+    rng = np.random.default_rng([7, len(family), ord(family[0])])
+    with opened(family) as node:
+        drive_map, parameters = node.map, DriveParameters(node)
+        rounded = 0
+        for _ in range(DESIGNS):
+            design = random_design(rng)
+            wanted = ParameterSet({name: design[name] for name in drive_map.cells})
+            encoded, shown = drive_map.encode(wanted), drive_map.quantised(wanted)
+            parameters.replace(encoded)
+            found = parameters.read(encoded)
+            assert found == encoded
+            assert drive_map.decode(found).values == shown.values
+            rounded += shown.values != wanted.values
+        assert rounded == DESIGNS  # every design is rounded by what the family can hold
+
+
+@pytest.mark.parametrize("family", HOLDING)
+def test_the_machine_behind_works_with_what_the_bytes_mean(family: str) -> None:
+    with opened(family) as node:
+        design = random_design(np.random.default_rng(3))
+        wanted = ParameterSet({name: design[name] for name in node.map.cells})
+        DriveParameters(node).replace(node.map.encode(wanted))
+        held = node.map.quantised(wanted).values
+        session = node.connection.bus.line.nodes[0].session  # type: ignore[attr-defined]
+        for name, value in held.items():
+            assert session.parameters.active.get(name) == pytest.approx(value, rel=2e-7)
+
+
+def test_one_pair_of_gains_acts_on_both_axes() -> None:
+    with opened("epos4") as node:
+        values = {"current.K_p_q_v_per_a": 1.2345678, "current.K_i_q_v_per_as": 99.9996}
+        DriveParameters(node).replace(node.map.encode(ParameterSet(values)))
+        active = node.connection.bus.line.nodes[0].session.parameters.active  # type: ignore[attr-defined]
+        assert active.get("current.K_p_d_v_per_a") == active.get("current.K_p_q_v_per_a") == pytest.approx(1.234568)
+        assert active.get("current.K_i_d_v_per_as") == pytest.approx(100.0)  # one count is 1 mV/(A s)
+
+
+def test_the_bytes_survive_a_store_and_a_reset() -> None:
+    """A count above 2^24 does not fit the binary32 behind it; the family's own bytes are kept all the same."""
+    with opened("epos4") as node:
+        encoded = node.map.encode(
+            ParameterSet({"current.K_p_q_v_per_a": 123.456789, "current.K_i_q_v_per_as": 54_321.987})
+        )
+        parameters = DriveParameters(node)
+        parameters.replace(encoded)
+        node.identity()
+        node.store()
+        node.reset()
+        assert parameters.read(encoded) == encoded
+
+
+@pytest.mark.parametrize("family", FOREIGN)
+def test_only_the_familys_objects_are_there(family: str) -> None:
+    with opened(family) as node:
+        identity, drive_map = node.identity(), node.map
+        assert (identity.vendor, identity.product) == (drive_map.vendor, drive_map.product)
+        shown = {(c.index, c.sub) for c in (*drive_map.cells.values(), *drive_map.signals.values())}
+        for index, sub in [(0x2000, 2), (0x2020, 1), (0x2050, 13), (0x2060, 1), (0x2070, 1), (0x1021, 0)]:
+            assert node.has(index, sub) == ((index, sub) in shown)
+        for cell in (*drive_map.cells.values(), *drive_map.signals.values()):
+            assert len(node.sdo.read(cell.index, cell.sub)) == cell.size
+        modes = node.whole(objects.SUPPORTED_MODES)
+        assert bool(modes & 0b1000) == drive_map.capabilities.torque_mode
+        for mode in (-1, 4, 3):
+            has = {4: drive_map.capabilities.torque_mode, 3: drive_map.capabilities.velocity_mode}.get(mode, False)
+            if has:
+                node.put(objects.MODE, mode)
+            else:
+                with pytest.raises(SdoAbort):
+                    node.put(objects.MODE, mode)
+
+
+def test_live_values_in_the_familys_counts() -> None:
+    with opened("ingenia") as node:
+        U_dc = np.frombuffer(node.sdo.read(0x2060, 0), "<f4")[0]
+        assert 500.0 < U_dc < 600.0  # interior-2k2: 560 V
+        node.sdo.download(0x2021, 0, np.float32(2.5).tobytes())  # rev/s
+        dictionary = node.connection.bus.line.nodes[0].session.dictionary  # type: ignore[attr-defined]
+        assert dictionary["cia402.target_velocity"].number() == pytest.approx(150_000, abs=1)
+    with opened("epos4") as node:
+        node.sdo.download(0x60FF, 0, (300).to_bytes(4, "little"))  # rpm
+        dictionary = node.connection.bus.line.nodes[0].session.dictionary  # type: ignore[attr-defined]
+        assert dictionary["cia402.target_velocity"].number() == 300_000
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    K_p=st.floats(1e-6, 4000.0), T_n=st.floats(1e-6, 0.06), step=st.sampled_from(["V/A", "mV/A", "0.1 V/A"])
+)
+def test_an_integral_time_is_read_back_as_shown(K_p: float, T_n: float, step: str) -> None:
+    text = f"""
+schema = "pmsmtool.drive-map/1"
+name = "tn"
+vendor = 1
+product = 1
+[objects]
+"current.K_p_q_v_per_a" = {{ index = 0x2002, sub = 1, type = "UNSIGNED32", unit = "{step}" }}
+[objects."current.K_i_q_v_per_as"]
+index = 0x2002
+sub = 2
+type = "UNSIGNED16"
+unit = "us"
+gain = "current.K_p_q_v_per_a"
+"""
+    drive_map = parse_drive_map(text)
+    wanted = ParameterSet({"current.K_p_q_v_per_a": K_p, "current.K_i_q_v_per_as": K_p / T_n})
+    encoded = drive_map.encode(wanted)
+    shown = drive_map.decode(encoded).values
+    counts = int.from_bytes(encoded["current.K_i_q_v_per_as"], "little")
+    assert abs(counts - 1e6 * T_n) <= 0.5 + 1e-6
+    if counts:  # the drive's integral gain is what its own K_p and T_n make of it
+        expected = shown["current.K_p_q_v_per_a"] / (1e-6 * counts)
+        assert shown["current.K_i_q_v_per_as"] == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_value_the_type_cannot_hold_is_refused_before_anything_is_written() -> None:
+    with opened("copley") as node:
+        before = DriveParameters(node).read(node.map.cells)
+        with pytest.raises(ConfigError, match="does not fit") as caught:
+            node.map.encode(ParameterSet({"motor.I_max_apk": 400.0, "motor.I_nom_apk": 3.0}))
+        assert "0x2110:00" in str(caught.value)
+        assert DriveParameters(node).read(node.map.cells) == before
+
+
+# ---- the gate -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> JournalFolder:
+    return JournalFolder(Identity(1, 0xFB, 0x61500000, 1, 7), tmp_path)
+
+
+def test_a_map_without_a_vendor_writes_nothing(folder: JournalFolder) -> None:
+    with pytest.raises(ConfigError, match="does not say whose drive"):
+        check_map(load_family("copley"), Identity(1, 0xAB, 1, 1, 7), folder)
+
+
+def test_another_identity_is_refused(folder: JournalFolder) -> None:
+    with pytest.raises(ConfigError, match="is for vendor 0x000000fb"):
+        check_map(load_family("epos4"), Identity(1, 0xFB, 0x63220000, 1, 7), folder)
+
+
+def test_another_map_for_the_same_drive_is_refused(folder: JournalFolder) -> None:
+    epos4 = load_family("epos4")
+    identity = Identity(1, 0xFB, 0x68500000, 1, 7)
+    check_map(epos4, identity, folder)
+    remember_map(epos4, folder)
+    check_map(epos4, identity, folder)
+    cell = epos4.cells["current.K_p_q_v_per_a"]
+    edited = replace(epos4, cells={**epos4.cells, cell.name: replace(cell, unit="mV/A", factor=1e-3)})
+    with pytest.raises(SafetyRefusal, match="last written through another map"):
+        check_map(edited, identity, folder)
+    memory_of(folder).unlink()
+    check_map(edited, identity, folder)
+    memory_of(folder).write_text("{}")
+    with pytest.raises(ConfigError, match="damaged"):
+        check_map(epos4, identity, folder)
+
+
+def flash(node: DriveNode, values: dict[str, float], root: Path) -> None:
+    identity = node.identity()
+    plan = plan_download(node, ParameterSet(values))
+    Download(node, identity, plan, {}, JournalFolder(identity, root)).run()
+
+
+def test_a_download_to_another_family_holds_stores_and_remembers(tmp_path: Path) -> None:
+    with opened("epos4") as node:
+        values = {"current.K_p_q_v_per_a": 3.3333333, "current.K_i_q_v_per_as": 1234.5678, "motor.R_s_ohm": 0.1}
+        flash(node, values, tmp_path)
+        assert DriveParameters(node).read_value("current.K_p_q_v_per_a") == pytest.approx(3.333333)
+        backup = take_backup(node, node.identity())
+        assert {entry.name for entry in backup.entries} >= set(node.map.cells)
+        cell = node.map.cells["current.K_p_q_v_per_a"]
+        changed = replace(cell, sub=2)
+        node.map = replace(node.map, cells={cell.name: changed})
+        with pytest.raises(SafetyRefusal, match="another map"):
+            flash(node, {cell.name: 1.0}, tmp_path)
+        assert int.from_bytes(node.sdo.read(0x30A0, 2), "little") == 1_234_568
+
+
+def test_a_map_whose_type_is_not_the_drives_is_found_before_the_first_write(tmp_path: Path) -> None:
+    with opened("epos4") as node:
+        cell = node.map.cells["current.K_p_q_v_per_a"]
+        for wrong in (replace(cell, wire="UNSIGNED16", factor=1e-3), replace(cell, index=0x30A9)):
+            node.map = replace(load_family("epos4"), cells={cell.name: wrong})
+            before = node.sdo.read(0x30A0, 1)
+            with pytest.raises((DriveFault, ConfigError)):
+                flash(node, {cell.name: 1.0}, tmp_path / wrong.wire / hex(wrong.index))
+            assert node.sdo.read(0x30A0, 1) == before
+
+
+def test_families_by_identity() -> None:
+    def name(drive_map: DriveMap | None) -> str:
+        return "" if drive_map is None else drive_map.name
+
+    assert name(family_of(0xFB, 0x68500000)) == "epos4"
+    assert name(family_of(0xFB, 0x63220000)) == "epos2"
+    assert name(family_of(REFERENCE_VENDOR, 1)) == "pmsmsim"
+    assert family_of(0, 0) is None and family_of(0xFB, 1) is None
+    with pytest.raises(ConfigError, match="did you mean epos4"):
+        load_family("epos5")
+
+
+def test_defaults_are_within_the_catalogue() -> None:
+    for family in HOLDING:
+        for cell in load_family(family).cells.values():
+            assert BY_NAME[cell.name].minimum <= BY_NAME[cell.name].default
