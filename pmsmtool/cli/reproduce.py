@@ -153,6 +153,7 @@ def _write(found: Reproduction, path: Path | None, figure_path: Path | None, out
         targets = [path / f"{found.name}{suffix}" for suffix in _SUFFIXES]
         if found.panels:
             save_figure(figure_of(found), path / f"{found.name}.svg")
+            out.note(f"wrote {path / found.name}.svg")
     for target in targets:
         write_file(target, _content(found, target.suffix.lower(), csv_text))
         out.note(f"wrote {target}")

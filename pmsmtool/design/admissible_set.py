@@ -161,8 +161,19 @@ class Horizon:
     bounds: StateBounds | None = None
 
     @property
+    def by_tolerance(self) -> bool:
+        """Whether only the tolerance ``REDUNDANT`` ended the search.
+
+        Without a tightened steady-state row later rows approach the limit for ever: what is found then is the row from
+        which on they gain less than the tolerance, not a horizon.
+        """
+        return not self.eps and self.k_max is not None and self.k_max > 0
+
+    @property
     def text(self) -> str:
         """The number, or that there is none."""
+        if self.by_tolerance:
+            return f"not finitely determined ({self.k_max} within {REDUNDANT:g})"
         return "not finitely determined" if self.k_max is None else str(self.k_max)
 
 

@@ -173,7 +173,7 @@ def design_governor(
 
 
 def _fact(found: Horizon) -> Scalar:
-    return found.text if found.k_max is None else found.k_max
+    return found.text if found.k_max is None or found.by_tolerance else found.k_max
 
 
 def _eps(error: float, asked: float | None) -> tuple[float, str]:
@@ -186,7 +186,7 @@ def _eps(error: float, asked: float | None) -> tuple[float, str]:
 def _k_max(found: Horizon | None) -> DesignValue:
     if found is None:
         return DesignValue(0, "no horizon: rows {0, infinity}")
-    if found.k_max is None:
+    if found.k_max is None or found.by_tolerance:
         return DesignValue(K_MAX_NOT_DETERMINED, "not finitely determined: the drive predicts as far as it can")
     return DesignValue(min(found.k_max, ROWS_IN_DRIVE - 1), f"redundancy test over all states, eps {found.eps:g}")
 
@@ -227,7 +227,7 @@ def _notes(mode: str, error: float, eps: float, found: Horizon | None, model: Pr
                 f"governor: Euler's prediction errs by {100.0 * error:.2g} % of V_max at the largest speed, more than "
                 f"the steady-state row is tightened ({100.0 * eps:.2g} %); the offset-free modes do not predict"
             )
-        if found.k_max is None:
+        if found.k_max is None or found.by_tolerance:
             notes.append("governor: the horizon is not finitely determined at this eps; the drive predicts 63 rows")
         elif found.k_max > SHORT_HORIZON:
             notes.append(

@@ -42,7 +42,20 @@ class Row:
     run_s: float
 
 
-FIGURES: tuple[Row, ...] = ()
+FIGURES: tuple[Row, ...] = (
+    Row("jercic-fig10", "current_step:q_steps", "step of i_q by seven laws, against minimum time", JERCIC, 5.0),
+    Row("jercic-fig11", "weakening:figure_11", "field weakening on perturbed plants, over time", JERCIC, 1.0),
+    Row("jercic-fig12", "weakening:figure_12", "field-weakening sweep; excess voltage on faster ramps", JERCIC, 1.0),
+    Row("jercic-table2", "weakening:table_2", "voltage and torque error on perturbed plants", JERCIC, 1.0),
+    Row("jercic-horizon", "horizon:horizons", "k_max over tuning, tightening, speed, bounds; matrices", JERCIC, 3.0),
+    Row("governor-random-steps", "random_steps:random_steps", "300 reachable steps over minimum time", JERCIC, 5.0),
+    Row("governor-unreachable", "random_steps:unreachable_references", "300 unreachable references", JERCIC, 8.0),
+    Row("governor-voltage-limit", "random_steps:voltage_limit", "demanded voltage over 1000 steps", JERCIC, 8.0),
+    Row("governor-delay", "delay:delay_and_predictor", "computation delay and predictor", JERCIC, 1.0),
+    Row("plant-mismatch", "random_steps:plant_mismatch", "300 steps on each of five other plants", JERCIC, 6.0),
+    Row("speed-ramp", "speed_rise:speed_ramp", "620 to 900 rpm in 20 ms without field weakening", JERCIC, 2.0),
+    Row("speed-steps", "speed_rise:speed_steps", "620 to 900 and 1200 rpm without field weakening", JERCIC, 2.0),
+)
 
 
 def find(name: str) -> Row:
