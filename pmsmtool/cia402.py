@@ -87,6 +87,8 @@ class Mode(IntEnum):
     PROFILE_TORQUE = 4
     CYCLIC_VELOCITY = 9
     CYCLIC_TORQUE = 10
+    CYCLIC_TORQUE_ANGLE = 11
+    """Torque with a commutation angle from the master (0x60EA)."""
 
 
 class AbortConnection(IntEnum):

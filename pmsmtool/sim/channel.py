@@ -10,6 +10,7 @@ NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
 ``node``   node id of the first drive, outranks one stored by LSS; default 1; 255: unconfigured
 ``nodes``  number of drives on the line, with consecutive node ids and serial numbers; default 1
 ``drive``  family whose object dictionary the drive shows (``firmware-params``); default: the reference drive's own
+``tier``   ``inject`` or ``recorder``: the reference drive without its averages, without its excitation too
 ``speed``  how fast idle time passes at most, as a multiple of the wall clock; default: at once
 ========== =============================================================================================
 """
@@ -29,7 +30,7 @@ from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.faults import load_faults
 from pmsmtool.sim.line import Line
 from pmsmtool.sim.node.factory import drive_settings
-from pmsmtool.sim.node.family import Face
+from pmsmtool.sim.node.family import TIER_HIDES, Face, Reduced
 from pmsmtool.sim.node.lss import UNCONFIGURED
 from pmsmtool.sim.node.memory import FileStorage, Memory, RamStorage, Storage
 from pmsmtool.sim.node.node import Node
@@ -62,6 +63,7 @@ class Channel:
     nodes: int = 1
     speed: float | None = None
     drive: str | None = None
+    tier: str | None = None
 
 
 def _whole(low: int, high: int) -> Callable[[str], int]:
@@ -81,6 +83,12 @@ def _positive(text: str) -> float:
     return value
 
 
+def _tier(text: str) -> str:
+    if text not in TIER_HIDES:
+        raise ValueError(f"must be one of {', '.join(TIER_HIDES)}")
+    return text
+
+
 _KEYS: dict[str, Callable[[str], Any]] = {
     "seed": _whole(0, 2**63 - 1),
     "nv": str,
@@ -90,6 +98,7 @@ _KEYS: dict[str, Callable[[str], Any]] = {
     "nodes": _whole(1, 127),
     "speed": _positive,
     "drive": str,
+    "tier": _tier,
 }
 
 
@@ -128,6 +137,21 @@ def _storage(channel: Channel, stem: str, position: int) -> Storage:
         return RamStorage()
     path = MEMORY_FOLDER / f"{stem}.nv" if channel.nv is None else Path(channel.nv)
     return FileStorage(path if position == 0 else path.with_name(f"{path.stem}-{position + 1}{path.suffix}"))
+
+
+def _face(channel: Channel) -> Face | Reduced | None:
+    """Return what the channel's drives show instead of the reference drive's whole dictionary.
+
+    Raises
+    ------
+    ConfigError
+        There is no such family, or a tier of a family that is not the reference drive.
+    """
+    if channel.drive in (None, OWN_FAMILY):
+        return None if channel.tier is None else Reduced(channel.tier)
+    if channel.tier is not None:
+        raise ConfigError("tier is of the reference drive, not of another family", where=f"channel {channel.name}")
+    return Face(load_family(channel.drive))
 
 
 CoreMaker = Callable[["MachineFile", int], "DriveCore"]
@@ -169,8 +193,8 @@ def build_line(
         )
     path = machine_path(channel.name)
     machine_file = load_machine_file(path)
-    face = None if channel.drive in (None, OWN_FAMILY) else Face(load_family(channel.drive))
-    stem = path.stem if face is None else f"{path.stem}-{channel.drive}"
+    face = _face(channel)
+    stem = f"{path.stem}-{channel.drive}" if isinstance(face, Face) else path.stem
     plan = None if channel.faults is None else load_faults(channel.faults)
     seed = int(machine_file.simulation.get("seed", 0)) if channel.seed is None else channel.seed  # type: ignore[arg-type]
     line = Line(channel.bitrate or bitrate, plan, seed=seed, instant=instant)

@@ -8,13 +8,13 @@ does not have are refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.cia402 import Mode
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.drive_map import Cell, DriveMap, SignalCell
+from pmsmtool.firmware.drive_map import Cell, DriveMap, SignalCell, reference_map
 from pmsmtool.firmware.wire_units import WireUnit, wire_unit
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
@@ -31,8 +31,18 @@ ONE_FOR_BOTH_AXES = {
     "motor.L_q_h": ("motor.L_d_h", "motor.L_q_app_h", "motor.L_d_app_h"),
 }
 """Where a family has one object only, its value acts on these as well."""
-MODE_BITS = {Mode.PROFILE_VELOCITY: 2, Mode.PROFILE_TORQUE: 3, Mode.CYCLIC_VELOCITY: 8, Mode.CYCLIC_TORQUE: 9}
+MODE_BITS = {
+    Mode.PROFILE_VELOCITY: 2,
+    Mode.PROFILE_TORQUE: 3,
+    Mode.CYCLIC_VELOCITY: 8,
+    Mode.CYCLIC_TORQUE: 9,
+    Mode.CYCLIC_TORQUE_ANGLE: 10,
+}
 """Bits of object 0x6502."""
+COMMUTATION_ANGLE = 0x60EA
+ANGLE_COUNT_RAD = 2.0 * math.pi / 65536.0
+TIER_HIDES = {"inject": (0x2063, 0x2064), "recorder": (0x2050, 0x2051, 0x2052, 0x2063, 0x2064)}
+"""What a reduced reference drive does not have: window averages; the excitation and current set-points too."""
 _TYPES = {
     "UNSIGNED8": "U8", "UNSIGNED16": "U16", "UNSIGNED32": "U32", "INTEGER8": "I8", "INTEGER16": "I16",
     "INTEGER32": "I32", "REAL32": "REAL32",
@@ -65,7 +75,7 @@ class Face:
         has = self.drive_map.capabilities
         torque = (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE) if has.torque_mode else ()
         velocity = (Mode.PROFILE_VELOCITY, Mode.CYCLIC_VELOCITY) if has.velocity_mode else ()
-        return (*velocity, *torque)
+        return (*velocity, *torque, *((Mode.CYCLIC_TORQUE_ANGLE,) if has.commutation_angle else ()))
 
     def dress(self, dictionary: Dictionary) -> None:
         """Put the family's objects into a dictionary whose application is not hooked up yet."""
@@ -76,25 +86,85 @@ class Face:
             hidden |= {0x60FF}
         for index in hidden:
             dictionary.hide(index)
-        for entry in (*self._modes(dictionary), *_Parameters(self.drive_map, dictionary).entries()):
-            dictionary.show(entry)
         for name, signal in self.drive_map.signals.items():
             dictionary.show(_signal_entry(name, signal, dictionary))
+        for entry in (*_modes(self.modes, dictionary), *_Parameters(self.drive_map, dictionary).entries()):
+            dictionary.show(entry)
 
-    def _modes(self, dictionary: Dictionary) -> Iterator[Entry]:
-        inner = dictionary["cia402.mode"]
-        shown = Entry(inner.row, 0)
 
-        def sink(data: bytes) -> None:
-            if int.from_bytes(data, "little", signed=True) not in (Mode.NONE, *self.modes):
-                raise Refused(AbortCode.VALUE)
-            dictionary.write(inner, data)
-            shown.value = data
+@dataclass(frozen=True, slots=True)
+class Reduced:
+    """The reference drive without a part of its own objects: what a lower tier leaves.
 
-        shown.source, shown.sink = inner.read, sink
-        yield shown
-        supported = dictionary["cia402.supported_modes"]
-        supported.put(sum(1 << MODE_BITS[mode] for mode in self.modes))
+    Attributes
+    ----------
+    tier : str
+        Key of :data:`TIER_HIDES`.
+    """
+
+    tier: str
+
+    @property
+    def drive_map(self) -> DriveMap:
+        """The reference drive's: its identity does not tell what it lacks."""
+        return reference_map()
+
+    def dress(self, dictionary: Dictionary) -> None:
+        """Hide what the tier does not have."""
+        for index in TIER_HIDES[self.tier]:
+            dictionary.hide(index)
+        if self.tier == "recorder":
+            modes = [mode for mode in MODE_BITS if mode is not Mode.CYCLIC_TORQUE_ANGLE]
+            for entry in _modes(modes, dictionary):
+                dictionary.show(entry)
+
+
+def _modes(modes: Sequence[Mode], dictionary: Dictionary) -> Iterator[Entry]:
+    """Yield the objects of the modes of operation, without those the drive does not have.
+
+    Torque with the master's commutation angle is the reference drive's current set-point at a fixed angle.
+    """
+    inner = dictionary["cia402.mode"]
+    shown = Entry(_row(0x6060, 0, "INTEGER8", "Modes of operation", "rw", "R", True), 0)
+    display = Entry(_row(0x6061, 0, "INTEGER8", "Modes of operation display", "ro", "T", False), 0)
+
+    def sink(data: bytes) -> None:
+        mode = int.from_bytes(data, "little", signed=True)
+        if mode not in (Mode.NONE, *modes):
+            raise Refused(AbortCode.VALUE)
+        behind = Mode.IDENTIFICATION if mode == Mode.CYCLIC_TORQUE_ANGLE else mode
+        dictionary.write(inner, inner.encode(behind))
+        shown.value = data
+
+    shown.sink = sink
+    display.source = lambda: shown.value
+    yield from (shown, display)
+    dictionary["cia402.supported_modes"].put(sum(1 << MODE_BITS[mode] for mode in modes))
+    if Mode.CYCLIC_TORQUE_ANGLE in modes:
+        yield from _commutation(shown, dictionary)
+
+
+def _commutation(mode: Entry, dictionary: Dictionary) -> Iterator[Entry]:
+    """Yield 0x60EA, and a target torque that is a current at that angle while mode 11 is chosen."""
+    angle = Entry(_row(COMMUTATION_ANGLE, 0, "UNSIGNED16", "Commutation angle", "rw", "R", False), 0)
+    torque = Entry(_row(0x6071, 0, "INTEGER16", "Target torque", "rw", "R", False), 0)
+    fixed, current = dictionary["set_point.fixed_angle_rad"], dictionary["set_point.i_q_a"]
+    own = dictionary["cia402.target_torque"]
+
+    def turn(data: bytes) -> None:
+        angle.value = data
+        dictionary.write(fixed, fixed.encode(angle.integer() * ANGLE_COUNT_RAD))
+
+    def push(data: bytes) -> None:
+        torque.value = data
+        if mode.integer() == Mode.CYCLIC_TORQUE_ANGLE:
+            rated_apk = 1e-3 * math.sqrt(2.0) * dictionary["cia402.rated_current"].number()
+            dictionary.write(current, current.encode(1e-3 * torque.integer() * rated_apk))
+        else:
+            dictionary.write(own, data)
+
+    angle.sink, torque.sink = turn, push
+    yield from (angle, torque)
 
 
 class _Parameters:

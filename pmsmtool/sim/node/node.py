@@ -10,7 +10,7 @@ from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.sim.faults import Absence
 from pmsmtool.sim.node import store as storing
 from pmsmtool.sim.node.drive_core import DriveCore
-from pmsmtool.sim.node.family import Face
+from pmsmtool.sim.node.family import Face, Reduced
 from pmsmtool.sim.node.lss import UNCONFIGURED
 from pmsmtool.sim.node.memory import Memory
 from pmsmtool.sim.node.parameter_set import ParameterImage
@@ -58,7 +58,7 @@ class Settings:
         Factory values of 0x6075 (rms) and 0x6076.
     fixed_node_id : bool
         Whether ``node_id`` outranks one stored by LSS (a switch on the drive).
-    face : Face or None
+    face : Face, Reduced or None
         The family whose dictionary it shows; None: the reference drive's own.
     """
 
@@ -69,7 +69,7 @@ class Settings:
     rated_current_ma: int
     rated_torque_mnm: int
     fixed_node_id: bool = False
-    face: Face | None = None
+    face: Face | Reduced | None = None
 
 
 class Node:

@@ -12,7 +12,7 @@ from pmsmtool.sim.node import store as storing
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.eds import eds_text
 from pmsmtool.sim.node.emergency import Emergency
-from pmsmtool.sim.node.family import Face
+from pmsmtool.sim.node.family import Face, Reduced
 from pmsmtool.sim.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from pmsmtool.sim.node.lss import LssSlave
 from pmsmtool.sim.node.measurement import Measurement
@@ -62,7 +62,7 @@ class Hardware(Plant, Protocol):
     name: str
     rated_current_ma: int
     rated_torque_mnm: int
-    face: Face | None
+    face: Face | Reduced | None
 
     def send(self, can_id: int, data: bytes) -> None:
         """Transmit a frame."""
