@@ -72,7 +72,7 @@ def lut_command(
     loss_map = None if iron_loss is None else load_iron_loss_map(iron_loss)
     made = design_table(machine, rated, LookupRequest(**asked), margin, loss_map)
     facts = table_facts(made.table, made.stored, made.error)
-    lines = loci(made.table) if made.table.axis_kind == "speed" else {}
+    lines = loci(made.table)
     write_file(path, table_npz(made.table, facts, lines))
     write_file(path.with_suffix(".csv"), table_csv(made.table))
     written = [path, path.with_suffix(".csv")]

@@ -23,6 +23,7 @@ from pmsmtool.design.lookup_loci import STANDSTILL_V
 from pmsmtool.design.lookup_table import (
     AxisKind,
     LookupTable,
+    TorqueLimits,
     electrical_speed,
     flux_table,
     speed_table,
@@ -230,8 +231,11 @@ class _Problem:
 
     def _reachable(self, speed_rpm: float) -> bool:
         omega = electrical_speed(self.machine, [np.float32(speed_rpm)])
-        bounds = torque_limits(self.machine, omega, [self.V_max.min()], self.rated.I_max_apk, self.rated.i_d_min_a)
+        bounds = self._limits_at(omega, float(self.V_max.min()))
         return not math.isnan(float(bounds.least_nm[0, 0]))
+
+    def _limits_at(self, omega_e: Array, V: float) -> TorqueLimits:
+        return torque_limits(self.machine, omega_e, [V], self.rated.I_max_apk, self.rated.i_d_min_a)
 
     def _largest_flux(self) -> float:
         """Flux beyond which no torque needs field weakening."""
@@ -245,10 +249,14 @@ class _Problem:
             return ()
         V = float(self.V_max.min())
         omega = V / table.y[None, :, None]
-        over = float(np.nanmax(self.machine.voltage_v(table.i_d_a, table.i_q_a, omega) - V))
+        over = max(float(np.nanmax(self.machine.voltage_v(table.i_d_a, table.i_q_a, omega) - V)), 0.0)
+        real, without = self._limits_at(omega.ravel(), V), table.torque_limits
+        unused = np.maximum(real.largest_nm - without.largest_nm, without.least_nm - real.least_nm)
+        lost = max(float(np.nanmax(unused, initial=0.0)), 0.0)
         return (
-            f"a flux table knows no resistance: at {V:.4g} V its points need up to {max(over, 0.0):.3g} V "
-            f"({100.0 * max(over, 0.0) / V:.2g} %) more than the limit; a table over speed does not",
+            f"a flux table knows no resistance: at {V:.4g} V its points need up to {over:.3g} V "
+            f"({100.0 * over / V:.2g} %) more than the limit and leave up to {lost:.3g} N m unused; "
+            "a table over speed does neither: prefer it",
         )
 
 

@@ -1,9 +1,10 @@
 """Look-up tables as files and as drive parameters.
 
 ``.npz``: axes ``torque_nm`` and ``speed_rpm`` (``flux_wb`` for a flux table), ``U_dc_v`` when there is more than one
-voltage; tables ``i_d_a i_q_a achieved_torque_nm binding margin_v margin_i`` over them; least and largest torque per
-speed; the loci; and the facts of the table as JSON text in ``meta``. ``.csv``: one row per cell, units in the second
-row. Both have the same bytes for the same table.
+voltage; tables ``i_d_a i_q_a achieved_torque_nm binding margin_v margin_i margin_torque_nm`` over them; least and
+largest torque per speed; the loci; and the facts of the table as JSON text in ``meta``. A cell that cannot have its
+torque holds the nearest feasible one (``achieved_torque_nm``), and ``margin_torque_nm`` says how far off that is
+(negative). ``.csv``: one row per cell, units in the second row. Both have the same bytes for the same table.
 """
 
 from __future__ import annotations
@@ -72,6 +73,7 @@ def table_npz(table: LookupTable, facts: Mapping[str, Any], lines: Mapping[str, 
     cells = {
         "i_d_a": table.i_d_a, "i_q_a": table.i_q_a, "achieved_torque_nm": table.achieved_torque_nm,
         "binding": table.binding, "margin_v": table.margin_v, "margin_i": table.margin_i,
+        "margin_torque_nm": table.margin_torque_nm,
     }  # fmt: skip
     bounds = {"least_torque_nm": table.torque_limits.least_nm, "largest_torque_nm": table.torque_limits.largest_nm}
     arrays: dict[str, NDArray[Any]] = {"torque_nm": table.torque_nm, _second(table): table.y}
@@ -103,6 +105,7 @@ def table_csv(table: LookupTable) -> str:
         "achieved_torque_nm": ("N m", table.achieved_torque_nm),
         "margin_v": (margin_unit, table.margin_v),
         "margin_i": ("A", table.margin_i),
+        "margin_torque_nm": ("N m", table.margin_torque_nm),
     }
     if table.U_dc_v.size == 1:
         del columns["U_dc_v"]

@@ -70,12 +70,18 @@ def mtpv_locus(machine: OperatingMachine, speed_rpm: Array, V_max_v: float, I_ma
 
 
 def loci(table: LookupTable, points: int = 101) -> dict[str, Locus]:
-    """Return ``mtpa``, ``mtpv``, ``largest``, ``least`` for the limits of a speed table at its lowest voltage."""
+    """Return ``mtpa``, ``mtpv``, ``largest``, ``least`` for the limits of a speed table at its lowest voltage.
+
+    A flux table knows no voltage: its locus is ``mtpa`` alone.
+    """
+    mtpa = mtpa_locus(table.machine, table.I_max_apk, table.i_d_min_a, points)
+    if table.axis_kind == "flux":
+        return {"mtpa": mtpa}
     speed = np.linspace(float(table.y[0]), float(table.y[-1]), points)
     V = float(table.V_max_v.min())
     largest, least = limit_locus(table.machine, speed, V, table.I_max_apk, table.i_d_min_a)
     return {
-        "mtpa": mtpa_locus(table.machine, table.I_max_apk, table.i_d_min_a, points),
+        "mtpa": mtpa,
         "mtpv": mtpv_locus(table.machine, speed, V, table.I_max_apk),
         "largest": largest,
         "least": least,

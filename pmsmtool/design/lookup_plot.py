@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 PLANE_POINTS = 161
 """Points along each axis of the current plane."""
 
-SPEEDS_SHOWN = 4
-"""Voltage limits drawn in the current plane."""
+LIMITS_SHOWN = 4
+"""Voltage (or flux) limits drawn in the current plane."""
 
 
 def lookup_figure(table: LookupTable, lines: Mapping[str, Locus]) -> Figure:
@@ -28,7 +28,7 @@ def lookup_figure(table: LookupTable, lines: Mapping[str, Locus]) -> Figure:
     figure = Figure(figsize=(13.0, 4.4), layout="constrained")
     plane, envelope, margin = figure.subplots(1, 3)
     _plane(plane, table, lines)
-    _envelope(envelope, lines)
+    _envelope(envelope, table, lines)
     _margin(figure, margin, table)
     return figure
 
@@ -41,25 +41,38 @@ def _plane(axes: Any, table: LookupTable, lines: Mapping[str, Locus]) -> None:
     i_d, i_q = np.meshgrid(i, i)
     torque = table.machine.torque_nm(i_d, i_q)
     axes.contour(i, i, torque, levels=10, colors="0.8", linewidths=0.6)
-    V = float(table.V_max_v.min())
-    speeds = np.linspace(0.0, float(table.y.max()), SPEEDS_SHOWN + 1)[1:]
-    for omega in electrical_speed(table.machine, speeds):
-        axes.contour(i, i, table.machine.voltage_v(i_d, i_q, omega), levels=[V], colors="tab:blue", linewidths=0.8)
+    if table.axis_kind == "speed":
+        V = float(table.V_max_v.min())
+        shown = np.linspace(0.0, float(table.y.max()), LIMITS_SHOWN + 1)[1:]
+        for omega in electrical_speed(table.machine, shown):
+            demand = table.machine.voltage_v(i_d, i_q, omega)
+            axes.contour(i, i, demand, levels=[V], colors="tab:blue", linewidths=0.8)
+        title = "voltage limits at " + ", ".join(f"{n:.0f}" for n in shown) + " rpm"
+    else:
+        shown = np.linspace(float(table.y.min()), float(table.y.max()), LIMITS_SHOWN)
+        demand = np.hypot(*table.machine.flux(i_d, i_q))
+        axes.contour(i, i, demand, levels=shown, colors="tab:blue", linewidths=0.8)
+        title = "flux limits " + ", ".join(f"{psi:.3g}" for psi in shown) + " Wb"
     for name, colour in (("mtpa", "tab:green"), ("largest", "tab:red"), ("mtpv", "tab:purple")):
-        if name in lines:
+        if name in lines and not np.isnan(lines[name].i_q_a).all():
             axes.plot(lines[name].i_d_a, lines[name].i_q_a, color=colour, label=name)
     axes.set(xlabel="i_d / A", ylabel="i_q / A", aspect="equal", xlim=(i[0], i[-1]), ylim=(i[0], i[-1]))
-    speeds_text = ", ".join(f"{n:.0f}" for n in speeds)
-    axes.set_title(f"voltage limits at {speeds_text} rpm", fontsize=9)
+    axes.set_title(title, fontsize=9)
     axes.legend(fontsize=8, loc="upper right")
 
 
-def _envelope(axes: Any, lines: Mapping[str, Locus]) -> None:
-    for name, colour in (("largest", "tab:red"), ("least", "tab:orange"), ("mtpv", "tab:purple")):
-        if name in lines:
-            axes.plot(lines[name].speed_rpm, lines[name].torque_nm, color=colour, label=name)
-    reach = [float(np.nanmax(np.abs(lines[name].torque_nm))) for name in ("largest", "least") if name in lines]
-    axes.set(xlabel="speed / rpm", ylabel="torque / N m", ylim=(-1.1 * max(reach), 1.3 * max(reach)))
+def _envelope(axes: Any, table: LookupTable, lines: Mapping[str, Locus]) -> None:
+    if table.axis_kind == "speed":
+        drawn = {name: (lines[name].speed_rpm, lines[name].torque_nm) for name in ("largest", "least") if name in lines}
+        if "mtpv" in lines and not np.isnan(lines["mtpv"].torque_nm).all():
+            axes.plot(lines["mtpv"].speed_rpm, lines["mtpv"].torque_nm, color="tab:purple", label="mtpv")
+    else:
+        bounds = table.torque_limits
+        drawn = {"largest": (table.y, bounds.largest_nm[:, 0]), "least": (table.y, bounds.least_nm[:, 0])}
+    for name, (x, torque) in drawn.items():
+        axes.plot(x, torque, color="tab:red" if name == "largest" else "tab:orange", label=name)
+    reach = max((float(np.nanmax(np.abs(torque))) for _, torque in drawn.values()), default=1.0)
+    axes.set(xlabel=_y_label(table), ylabel="torque / N m", ylim=(-1.1 * reach, 1.3 * reach))
     axes.set_title("torque that can be reached", fontsize=9)
     axes.grid(color="0.9")
     axes.legend(fontsize=8)
@@ -70,5 +83,9 @@ def _margin(figure: Any, axes: Any, table: LookupTable) -> None:
     share = np.minimum(table.margin_v / limit, table.margin_i / table.I_max_apk).min(axis=2)
     image = axes.pcolormesh(table.y, table.torque_nm, 100.0 * np.maximum(share, 0.0), shading="nearest", cmap="viridis")
     figure.colorbar(image, ax=axes, label="least margin / %")
-    axes.set(xlabel="speed / rpm" if table.axis_kind == "speed" else "flux / Wb", ylabel="torque / N m")
-    axes.set_title("least of voltage and current margin", fontsize=9)
+    axes.set(xlabel=_y_label(table), ylabel="torque / N m")
+    axes.set_title(f"least of {'voltage' if table.axis_kind == 'speed' else 'flux'} and current margin", fontsize=9)
+
+
+def _y_label(table: LookupTable) -> str:
+    return "speed / rpm" if table.axis_kind == "speed" else "flux / Wb"

@@ -115,6 +115,16 @@ class LookupTable:
     torque_limits: TorqueLimits
 
     @property
+    def margin_torque_nm(self) -> Array:
+        """Torque left to the limit of the cell's speed and voltage on the side of the demand, shape of the tables.
+
+        Negative: the demand lies that far beyond the nearest feasible torque, which the cell holds instead; NaN where
+        there is no admissible point.
+        """
+        T = self.torque_nm[:, None, None]
+        return np.where(T >= 0.0, self.torque_limits.largest_nm - T, T - self.torque_limits.least_nm)
+
+    @property
     def binding(self) -> NDArray[np.str_]:
         """Names of the binding limits, shape of the tables."""
         names = np.array([binding_name(k) for k in range(64)])
