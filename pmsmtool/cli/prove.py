@@ -1,0 +1,151 @@
+"""``pmsmtool prove``: the machine itself shows whether it does what the design promises."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmsmtool.cli.drive_access import map_option, open_drive, read_map
+from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
+from pmsmtool.cli.output import Output
+
+if TYPE_CHECKING:
+    from pmsmtool.workflow.run_directory import RunDirectory, Stage
+
+FOLDER = click.Path(file_okay=False, path_type=Path)
+
+
+@click.command(
+    "prove",
+    epilog=examples(
+        "pmsmtool prove --sim interior-2k2 runs/20260101T120000Z-000055f1 --yes",
+        "pmsmtool prove -i socketcan -c can0 -n 5 design.toml --i-max 12Apk --speed-max 3000rpm --shaft free",
+    ),
+)
+@click.argument("design", type=click.Path(exists=True, path_type=Path))
+@click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
+@click.option("--machines", type=click.IntRange(32, 2000), default=96, help="Machines drawn for the prediction.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the draw.")
+@map_option
+@bus_options
+@motion_options
+@output_options
+def prove_command(
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    design: Path,
+    runs: Path,
+    machines: int,
+    seed: int,
+    map_file: Path | None,
+) -> None:
+    """Predict the response of a flashed DESIGN, run it on the machine, compare; exit code 1 outside the 95 % band.
+
+    DESIGN is design.toml or a run directory; a proof of a run goes into that run. The drive must hold the design's
+    bytes. The band (from the intervals of the machine in the design) is printed, and its SHA-256, before the first step:
+    a speed step, current steps of two sizes and both signs, a governed unreachable reference, entry into field
+    weakening. The shaft must carry what the design was made for. Nothing is stored in the drive.
+    """
+    from dataclasses import asdict
+
+    from pmsmtool.cli.consent import Consent, ask_motion
+    from pmsmtool.cli.flash_session import checked_identity
+    from pmsmtool.design.design_file import design_text, load_design
+    from pmsmtool.workflow.commission import begin_run, write_report
+    from pmsmtool.workflow.prove.stage import ProofRequest, not_proven, prove_stage
+    from pmsmtool.workflow.run_directory import RunDirectory
+
+    path = design / "design.toml" if design.is_dir() else design
+    made = load_design(path)
+    asked = ProofRequest(
+        motion.i_max_apk, motion.speed_max_rad_s, motion.shaft or "free", motion.load, motion.brake, machines, seed
+    )
+    consents: list[Consent] = []
+    with open_drive(bus, read_map(map_file)) as drive:
+        checked_identity(drive.node)
+
+        def allow(lines: Any) -> None:
+            serial = drive.identity.serial
+            consents.append(ask_motion(lines, motion, simulated=bus.simulated(), serial=serial, out=out))
+
+        recorded = {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate}
+        if design.is_dir():
+            run = RunDirectory(design)
+            _same_drive(run, drive.identity.serial)
+        else:
+            run = begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=recorded)
+            run.save("design.toml", design_text(made))
+        stage = _proven(run, lambda: prove_stage(run, drive, made, asked, allow, out.note), fresh=not design.is_dir())
+    record = run.read()
+    run.write(_with_consents(record, [asdict(given) for given in consents]))
+    write_report(run)
+    _show(run, stage, out)
+    if stage.status != "pass":
+        raise not_proven(stage, run)
+
+
+def _same_drive(run: RunDirectory, serial: int) -> None:
+    from pmsmtool.errors import SafetyRefusal
+
+    expected = run.read().drive.get("serial")
+    if expected != serial:
+        raise SafetyRefusal(
+            f"the run is of the drive with serial number {expected}, {serial} answers",
+            where=str(run.path),
+            hint="give the design.toml itself when this drive is to be proven; nothing was moved",
+        )
+
+
+def _proven(run: RunDirectory, prove: Any, *, fresh: bool) -> Stage:
+    """Carry the proof out and record it; a run that was made for it and saw no prediction leaves no trace."""
+    import shutil
+    from dataclasses import replace
+
+    from pmsmtool.workflow.prove.stage import FOLDER as PROOFS
+    from pmsmtool.workflow.run_directory import Stage
+
+    try:
+        stage: Stage = prove()
+    except BaseException as error:
+        if fresh and not (run.path / PROOFS).exists():
+            shutil.rmtree(run.path, ignore_errors=True)
+        else:
+            run.add(Stage("prove", "fail", 0.0, note=str(error) or type(error).__name__))
+        raise
+    run.add(replace(stage))
+    return stage
+
+
+def _with_consents(record: Any, consents: list[dict[str, Any]]) -> Any:
+    from dataclasses import replace
+
+    return replace(record, consents=(*record.consents, *consents))
+
+
+def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
+    from pmsmtool.cli.output import table
+
+    facts = {str(value["name"]): value["value"] for value in stage.values if "where" not in value}
+    data = {
+        "run": run.path,
+        "verdict": "PASS" if stage.status == "pass" else "FAIL",
+        "prediction": facts["prediction"],
+        "cause": facts["cause"],
+        "event": facts["event"],
+        "left_out": list(stage.fallbacks),
+        "seen": [
+            {"what": value["name"], "share_of_band": value["value"], "inside": value["value"] <= 1.0}
+            for value in stage.values
+            if "where" in value
+        ],
+    }
+    rows = [("inside" if line.ok else "OUTSIDE", line.what, line.measured) for line in stage.acceptance]
+    out.result("prove", data, lambda: table(("", "response", "measured"), rows))
+    for line in stage.fallbacks:
+        out.warn(f"not run: {line}")
+    out.note(f"{data['verdict']}: {stage.summary if stage.status == 'pass' else stage.note}")
+    out.note(f"report: {run.path / 'report.html'}")

@@ -1,0 +1,450 @@
+"""The predicted band of a response, the verdict on a measured one, and what a deviation looks most like.
+
+A prediction is made of simulated runs of one design on machines drawn from their intervals. The band of an
+experiment is simultaneous: all its judged signals lie inside at all times. Its width comes from the largest of ``n``
+runs, so that it holds at least 95 % of the responses with the confidence 1 - 0.95^n (Wilks 1941,
+DOI 10.1214/aoms/1177731788): 99.3 % for 96 runs. Everything the verdict needs is in the prediction: what is committed
+before the first step is what is judged by.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.errors import ConfigError
+
+Array = NDArray[np.float64]
+Key = TypeVar("Key")
+
+SCHEMA = "pmsmtool.prediction/1"
+
+MODEL_ALLOWANCE = 1.3
+"""Half width over that of the simulated runs, for what the averaged model of the inverter leaves out."""
+FLOOR_SHARE = 0.005
+"""Standard deviation that every point has at least, of the scale of its signal: ripple, quantisation, cogging."""
+NORMALISING_QUANTILE = 0.9
+"""Quantile of the runs' largest deviations that makes signals comparable before the largest is taken."""
+NEARBY = 128
+"""The variance is the largest within this part of a response, either way."""
+EXPLAINED = 0.5
+"""A fault is named when it leaves at most this share of the squared deviation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """Predicted band of one signal of one experiment.
+
+    Attributes
+    ----------
+    mean, std : ndarray, shape (n,)
+        Of the simulated runs, the floor included.
+    factor : float
+        Half width over ``std``.
+    """
+
+    mean: Array
+    std: Array
+    factor: float
+
+    @property
+    def low(self) -> Array:
+        """Lower edge, shape (n,)."""
+        return self.mean - self.factor * self.std
+
+    @property
+    def high(self) -> Array:
+        """Upper edge, shape (n,)."""
+        return self.mean + self.factor * self.std
+
+    def largest(self, measured: Array) -> tuple[float, int]:
+        """Return the largest deviation over the half width, and its row; what is no number deviates infinitely."""
+        share = np.abs(measured - self.mean) / (self.factor * self.std)
+        share = np.where(np.isfinite(share), share, math.inf)
+        row = int(np.argmax(share))
+        return float(share[row]), row
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A derived quantity: the amplitude of a signature in the deviation, by weighted least squares.
+
+    Attributes
+    ----------
+    nominal : float
+        Value without deviation.
+    unit : str
+        Unit of the value.
+    low, high : float
+        Predicted band.
+    signature : mapping of (experiment, signal) to ndarray
+        Deviation per amplitude, already over the variance: the inner product with a deviation is the amplitude.
+    """
+
+    nominal: float
+    unit: str
+    low: float
+    high: float
+    signature: Mapping[tuple[str, str], Array]
+
+    def of(self, deviation: Mapping[tuple[str, str], Array]) -> float:
+        """Return the quantity that a deviation from the mean shows."""
+        return self.nominal + sum(float(np.vdot(weights, deviation[key])) for key, weights in self.signature.items())
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What the signals look like when something is wrong: mean and standard deviation by (experiment, signal)."""
+
+    text: str
+    mean: Mapping[tuple[str, str], Array]
+    std: Mapping[tuple[str, str], Array]
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What a drive will do, before it does it.
+
+    Attributes
+    ----------
+    t_s : mapping of str to ndarray
+        Time base of each experiment, in the order they are run.
+    bands : mapping of (experiment, signal) to Band
+        What is judged.
+    quantities : mapping of str to Quantity
+        Derived quantities with their bands.
+    faults : mapping of str to Fault
+        Signatures of what may be wrong.
+    facts : mapping
+        Design hash, conditions, seed, number of runs; JSON-serialisable.
+    """
+
+    t_s: Mapping[str, Array]
+    bands: Mapping[tuple[str, str], Band]
+    quantities: Mapping[str, Quantity] = field(default_factory=dict)
+    faults: Mapping[str, Fault] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def signals(self, experiment: str) -> tuple[str, ...]:
+        """Return the judged signals of an experiment."""
+        return tuple(signal for name, signal in self.bands if name == experiment)
+
+
+# ---- making it ------------------------------------------------------------------------------------------------
+
+Runs = Mapping[tuple[str, str], Array]
+"""Simulated responses by (experiment, signal), shape (runs, rows)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Direction:
+    """How a derived quantity is made: two sets of runs that differ in nothing but the quantity.
+
+    ``high`` and ``low`` are responses of the same machines at the values ``at_high`` and ``at_low``.
+    """
+
+    nominal: float
+    unit: str
+    high: Runs
+    low: Runs
+    at_high: float
+    at_low: float
+
+
+def predict(
+    t_s: Mapping[str, Array],
+    runs: Runs,
+    scales: Mapping[tuple[str, str], float],
+    *,
+    directions: Mapping[str, Direction] | None = None,
+    faults: Mapping[str, tuple[str, Runs]] | None = None,
+    facts: Mapping[str, Any] | None = None,
+) -> Prediction:
+    """Return the prediction that simulated runs make.
+
+    Parameters
+    ----------
+    t_s : mapping of str to ndarray
+        Time base of each experiment.
+    runs : mapping
+        Responses of the healthy drive on the drawn machines.
+    scales : mapping
+        Scale of each signal, for the floor of its standard deviation.
+    directions : mapping of str to Direction, optional
+        Derived quantities.
+    faults : mapping of str to (text, runs), optional
+        Responses of drives with something wrong.
+    facts : mapping, optional
+        Kept with it.
+    """
+    floors = {key: FLOOR_SHARE * scale for key, scale in scales.items()}
+    spread = {key: _spread(values, floors[key]) for key, values in runs.items()}
+    signatures = {name: _signature(direction, spread) for name, direction in (directions or {}).items()}
+    amplitudes = {
+        name: np.sum([(runs[key] - spread[key][0]) @ weights for key, weights in signature.items()], axis=0)
+        for name, signature in signatures.items()
+    }
+    largest = {key: _largest_left_out(values, floors[key]) for key, values in runs.items()}
+    factors: dict[tuple[str, str], float] = {}
+    for name in t_s:
+        factors |= _factors({key: v for key, v in largest.items() if key[0] == name})
+    quantity_factors = _factors({name: np.abs(a - np.median(a)) / _least_std(a) for name, a in amplitudes.items()})
+    return Prediction(
+        dict(t_s),
+        {key: Band(*spread[key], factors[key]) for key in runs},
+        {
+            name: _quantity(direction, signatures[name], amplitudes[name], quantity_factors[name])
+            for name, direction in (directions or {}).items()
+        },
+        {name: _fault(text, wrong, floors) for name, (text, wrong) in (faults or {}).items()},
+        dict(facts or {}),
+    )
+
+
+def _factors(deviations: Mapping[Key, Array]) -> dict[Key, float]:
+    """Return half widths over standard deviations such that the band of all signals together holds every run."""
+    normal = {key: float(np.quantile(v, NORMALISING_QUANTILE)) for key, v in deviations.items()}
+    common = max((float(np.max(v)) / normal[key] for key, v in deviations.items()), default=1.0)
+    return {key: MODEL_ALLOWANCE * common * q for key, q in normal.items()}
+
+
+def _spread(values: Array, floor: float) -> tuple[Array, Array]:
+    variance = _widest_nearby(np.var(values, axis=0, ddof=1))
+    return np.mean(values, axis=0), np.sqrt(variance + floor**2)
+
+
+def _widest_nearby(variance: Array) -> Array:
+    """Largest variance within a few rows: what comes a little earlier or later in one run is no deviation."""
+    reach = variance.shape[-1] // NEARBY
+    padded = np.pad(variance, [(0, 0)] * (variance.ndim - 1) + [(reach, reach)], mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=-1)
+    return np.asarray(windows.max(axis=-1))
+
+
+def _largest_left_out(values: Array, floor: float) -> Array:
+    """Largest deviation of each run over the standard deviation, both judged by the other runs, shape (runs,)."""
+    n = len(values)
+    centred = values - np.mean(values, axis=0)
+    out = centred * (n / (n - 1.0))
+    variance = np.maximum((np.sum(centred**2, axis=0) - centred * out) / (n - 2.0), 0.0)
+    return np.asarray(np.max(np.abs(out) / np.sqrt(_widest_nearby(variance) + floor**2), axis=1))
+
+
+def _signature(
+    direction: Direction, spread: Mapping[tuple[str, str], tuple[Array, Array]]
+) -> dict[tuple[str, str], Array]:
+    """Return the change per unit over the variance, normalised so that the change itself has amplitude one."""
+    change = direction.at_high - direction.at_low
+    slope = {key: np.mean(direction.high[key] - direction.low[key], axis=0) / change for key in direction.high}
+    power = sum(float(np.sum((s / spread[key][1]) ** 2)) for key, s in slope.items())
+    return {key: s / (spread[key][1] ** 2 * max(power, 1e-300)) for key, s in slope.items()}
+
+
+def _least_std(values: Array) -> float:
+    return max(float(np.std(values, ddof=1)), 1e-12)
+
+
+def _quantity(
+    direction: Direction, signature: Mapping[tuple[str, str], Array], amplitude: Array, factor: float
+) -> Quantity:
+    middle, half = direction.nominal + float(np.median(amplitude)), factor * _least_std(amplitude)
+    return Quantity(direction.nominal, direction.unit, middle - half, middle + half, signature)
+
+
+def _fault(text: str, runs: Runs, floors: Mapping[tuple[str, str], float]) -> Fault:
+    spread = {key: _spread(values, floors[key]) for key, values in runs.items()}
+    return Fault(text, {key: m for key, (m, _) in spread.items()}, {key: s for key, (_, s) in spread.items()})
+
+
+# ---- judging by it ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One judged signal or quantity.
+
+    Attributes
+    ----------
+    what : str
+        Experiment and signal, or the quantity.
+    share : float
+        Largest deviation over the half width of the band; at most one is inside.
+    where : str
+        Where the largest deviation is, or value and band of a quantity.
+    """
+
+    what: str
+    share: float
+    where: str
+
+    @property
+    def inside(self) -> bool:
+        """Whether all of it lies in the band."""
+        return self.share <= 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """The verdict on measured responses: every signal and quantity, and the likely cause when one is outside."""
+
+    seen: tuple[Seen, ...]
+    cause: str = ""
+
+    @property
+    def inside(self) -> bool:
+        """Whether everything lies in its band."""
+        return all(line.inside for line in self.seen)
+
+
+def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> Judgement:
+    """Compare measured responses with the prediction.
+
+    Parameters
+    ----------
+    prediction : Prediction
+        As committed.
+    measured : mapping
+        Response by (experiment, signal); experiments that were not run any more are left out.
+
+    Raises
+    ------
+    ConfigError
+        A response has another length than predicted.
+    """
+    seen = []
+    for (experiment, signal), band in prediction.bands.items():
+        if (experiment, signal) not in measured:
+            continue
+        values = measured[experiment, signal]
+        if values.shape != band.mean.shape:
+            raise ConfigError(f"{experiment}: {len(values)} rows of {signal}, {len(band.mean)} were predicted")
+        share, row = band.largest(values)
+        at = prediction.t_s[experiment][row]
+        seen.append(
+            Seen(
+                f"{experiment}: {signal}",
+                share,
+                f"{values[row]:.4g} at {at:.4g} s, {band.low[row]:.4g} to {band.high[row]:.4g} predicted",
+            )
+        )
+    deviation = {key: measured[key] - prediction.bands[key].mean for key in measured if key in prediction.bands}
+    for name, quantity in prediction.quantities.items():
+        if set(quantity.signature) <= set(deviation):
+            seen.append(_seen_quantity(name, quantity, quantity.of(deviation)))
+    found = Judgement(tuple(seen))
+    if found.inside:
+        return found
+    outside = {line.what for line in seen if not line.inside}
+    keys = {key for key in measured if f"{key[0]}: {key[1]}" in outside}
+    keys |= {key for name, q in prediction.quantities.items() if name in outside for key in q.signature}
+    return Judgement(found.seen, likely_cause(prediction, {key: measured[key] for key in sorted(keys)}))
+
+
+def _seen_quantity(name: str, quantity: Quantity, value: float) -> Seen:
+    middle, half = 0.5 * (quantity.low + quantity.high), 0.5 * (quantity.high - quantity.low)
+    share = abs(value - middle) / half if math.isfinite(value) else math.inf
+    unit = "" if quantity.unit == "1" else f" {quantity.unit}"
+    return Seen(name, share, f"{value:.3g}{unit}, {quantity.low:.3g} to {quantity.high:.3g} predicted")
+
+
+def likely_cause(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> str:
+    """Return the text of the fault whose signature is nearest; empty when none explains the deviation.
+
+    ``measured`` are the responses that deviate.
+    """
+    means = {key: prediction.bands[key].mean for key in measured}
+    stds = {key: prediction.bands[key].std for key in measured}
+    healthy = _distance(measured, means, stds)
+    nearest, best = "", math.inf
+    for name, fault in prediction.faults.items():
+        widest = {key: np.maximum(fault.std[key], stds[key]) for key in measured}
+        distance = _distance(measured, fault.mean, widest)
+        # minus twice the log-likelihood per point: what may look like anything is not near to everything
+        score = distance + 2.0 * float(np.mean([np.mean(np.log(widest[key] / stds[key])) for key in measured]))
+        if distance <= EXPLAINED * healthy and score < best:
+            nearest, best = name, score
+    return prediction.faults[nearest].text if nearest else ""
+
+
+def _distance(
+    measured: Mapping[tuple[str, str], Array],
+    mean: Mapping[tuple[str, str], Array],
+    std: Mapping[tuple[str, str], Array],
+) -> float:
+    """Mean squared deviation over the variance, each signal with the same weight."""
+    shares = [float(np.mean(((values - mean[key]) / std[key]) ** 2)) for key, values in measured.items()]
+    return float(np.mean(shares)) if np.all(np.isfinite(shares)) else math.inf
+
+
+# ---- as arrays, for the file that is committed -------------------------------------------------------------------
+
+
+def to_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
+    """Return the members of the ``.npz`` file; :func:`from_arrays` brings it back."""
+    arrays: dict[str, NDArray[Any]] = {f"time|{name}": t for name, t in prediction.t_s.items()}
+    for (experiment, signal), band in prediction.bands.items():
+        arrays[f"mean|{experiment}|{signal}"], arrays[f"std|{experiment}|{signal}"] = band.mean, band.std
+    for name, quantity in prediction.quantities.items():
+        arrays |= {f"signature|{name}|{e}|{s}": weights for (e, s), weights in quantity.signature.items()}
+    for name, fault in prediction.faults.items():
+        for experiment, signal in fault.mean:
+            key = f"{name}|{experiment}|{signal}"
+            arrays[f"fault_mean|{key}"] = fault.mean[experiment, signal]
+            arrays[f"fault_std|{key}"] = fault.std[experiment, signal]
+    facts = {
+        "schema": SCHEMA,
+        "factor": {f"{e}|{s}": band.factor for (e, s), band in prediction.bands.items()},
+        "quantity": {
+            name: {"nominal": q.nominal, "unit": q.unit, "low": q.low, "high": q.high}
+            for name, q in prediction.quantities.items()
+        },
+        "fault": {name: fault.text for name, fault in prediction.faults.items()},
+        "facts": dict(prediction.facts),
+    }
+    return {**arrays, "_meta": np.array(json.dumps(facts, sort_keys=True))}
+
+
+def from_arrays(arrays: Mapping[str, NDArray[Any]], *, where: str = "prediction") -> Prediction:
+    """Read what :func:`to_arrays` made.
+
+    Raises
+    ------
+    ConfigError
+        It is not a prediction.
+    """
+    try:
+        facts = json.loads(str(arrays["_meta"]))
+        if facts["schema"] != SCHEMA:
+            raise ConfigError(f"schema is {facts['schema']!r}, expected {SCHEMA!r}", where=where)
+        groups: dict[str, dict[tuple[str, ...], Array]] = {}
+        for name, values in arrays.items():
+            group, *key = name.split("|")
+            groups.setdefault(group, {})[tuple(key)] = np.asarray(values)
+        bands = {
+            (e, s): Band(mean, groups["std"][e, s], float(facts["factor"][f"{e}|{s}"]))
+            for (e, s), mean in groups["mean"].items()
+        }
+        quantities = {
+            name: Quantity(**entry, signature=_under(groups.get("signature", {}), name))
+            for name, entry in facts["quantity"].items()
+        }
+        faults = {
+            name: Fault(text, _under(groups.get("fault_mean", {}), name), _under(groups.get("fault_std", {}), name))
+            for name, text in facts["fault"].items()
+        }
+        times = {name: t for (name,), t in groups["time"].items()}
+        return Prediction(times, bands, quantities, faults, facts["facts"])
+    except (KeyError, ValueError, TypeError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"is no prediction: {error}", where=where) from error
+
+
+def _under(group: Mapping[tuple[str, ...], Array], name: str) -> dict[tuple[str, str], Array]:
+    return {(key[1], key[2]): values for key, values in group.items() if key[0] == name}

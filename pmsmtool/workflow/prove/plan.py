@@ -1,0 +1,333 @@
+"""Which experiments prove a design, and how large: sized from the design, the drive's conditions and the envelope."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from pmsmtool.design.design_file import Design
+from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
+from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.errors import ConfigError, NotAvailable
+
+RPM = math.pi / 30.0
+
+SIGNALS = ("i_d_a", "i_q_a", "omega_e_rad_s", "u_d_lim_v", "u_q_lim_v")
+"""What is recorded of every experiment."""
+STEPS = (0.5, 0.0, -0.5, 0.0, 1.0, 0.0, -1.0, 0.0)
+"""Current steps of one pattern, over the larger one: two sizes and both signs."""
+SETTLE = 8.0
+"""A current level lasts this many time constants 1/alpha of its loop."""
+LEVEL_ROWS = (24, 64)
+"""Least and most rows of a level."""
+PATTERN_ROWS = 2048
+"""Rows of the current steps: as many patterns as fit are averaged, against noise and the inverter's dead time."""
+STEP_SHARE = 0.5
+"""Larger current step, of the rated current."""
+STEP_VOLTAGE_SHARE = 0.7
+"""And its first voltage K_p i, of what the back-EMF leaves: the steps are to show the linear loop."""
+STEP_SPEED_SHARE = 0.4
+"""Speed of the current steps, of the base speed: fast enough to show the decoupling."""
+SCALE_SHARE = 0.25
+"""Least scale of the current steps, of the rated current: ripple and converter steps do not shrink with the steps."""
+SPEED_SHARE = 0.92
+"""Largest speed that is asked for, of the envelope's."""
+CURRENT_SHARE = 0.9
+"""Largest current that is asked for, of the envelope's."""
+SPEED_ROWS = 400
+SPEED_SETTLE = 8.0
+"""A speed step is recorded for its ramp and this many time constants of the speed loop after it."""
+LONGEST_S = 3.0
+WEAKENING_START = 0.8
+WEAKENING_END = 1.25
+WEAKENING_LEAST = 1.03
+"""Speeds of the entry into field weakening, of the speed at which the no-load voltage takes all there is."""
+WEAKENING_SLOPE = 0.25
+"""Slope of the ramp, of the design's: the full one takes most of the torque, whose currents would hide the entry."""
+WEAKENING_HOLD = 4
+"""Rows per level of the ramp's staircase."""
+WEAKENING_CURRENT = 0.35
+"""Most field-weakening current at its end without a load, of the current limit."""
+UNREACHABLE = 1.15
+UNREACHABLE_LEAST = 1.05
+"""Voltage that an unreachable current takes in steady state, of the largest: wanted, and least that counts."""
+UNREACHABLE_ROWS = (24, 96)
+UNREACHABLE_SPEED_RISE = 0.05
+"""Rise of the speed while it is asked for, relative."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What the drive says before anything moves, and what it may do.
+
+    Attributes
+    ----------
+    U_dc_v : float
+        DC link as measured (V).
+    T_winding_c, T_magnet_c : float
+        As measured; NaN without a sensor.
+    encoder_counts : int
+        Counts per turn, 0 when the drive does not tell.
+    i_max_apk, speed_max_rad_s : float
+        The envelope.
+    shaft : str
+        ``free``, ``locked`` or ``coupled``.
+    """
+
+    U_dc_v: float
+    T_winding_c: float
+    T_magnet_c: float
+    encoder_counts: int
+    i_max_apk: float
+    speed_max_rad_s: float
+    shaft: str = "free"
+
+    def facts(self) -> dict[str, Any]:
+        """Return them as JSON; what is not known is None."""
+        return {key: None if isinstance(v, float) and math.isnan(v) else v for key, v in asdict(self).items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """One record.
+
+    Attributes
+    ----------
+    name : str
+        ``speed_step``, ``q_steps``, ``d_steps``, ``unreachable``, ``weakening``.
+    text : str
+        What happens, one line.
+    base_rad_s : float
+        Mechanical speed held before (rad/s).
+    excitation : Excitation
+        What is asked on top of it.
+    rows, decimation : int
+        Size of the record.
+    repeats : int
+        The record is this often the same pattern; it is averaged over them.
+    judged : tuple of str
+        Signals that have a band.
+    scale_a, scale_rad_s : float
+        Scale of its currents (A) and of its electrical speed (rad/s).
+    settle_s : float
+        Time at the speed held before, after it is reached (s).
+    """
+
+    name: str
+    text: str
+    base_rad_s: float
+    excitation: Excitation
+    rows: int
+    decimation: int
+    repeats: int = 1
+    judged: tuple[str, ...] = ("i_d_a", "i_q_a")
+    scale_a: float = 1.0
+    scale_rad_s: float = 1.0
+    settle_s: float = 0.0
+
+    @property
+    def pattern_rows(self) -> int:
+        """Rows after averaging."""
+        return self.rows // self.repeats
+
+
+@dataclass(frozen=True, slots=True)
+class ProofPlan:
+    """The experiments in the order they are run, and what is left out, with the reason."""
+
+    experiments: tuple[Experiment, ...]
+    left_out: tuple[str, ...] = ()
+
+    def seconds(self, T_s: float) -> float:
+        """Return about how long the machine is energised (s)."""
+        return sum(e.rows * e.decimation * T_s + 0.5 for e in self.experiments)
+
+
+def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
+    """Return the experiments that fit a design within an envelope.
+
+    Raises
+    ------
+    NotAvailable
+        Not even current steps fit.
+    ConfigError
+        The design gives no rated current.
+    """
+    sizes = _Sizes.of(design, conditions)
+    experiments: list[Experiment] = []
+    left_out: list[str] = []
+    turning = sizes.turns
+    if turning:
+        experiments.append(_speed_step(sizes))
+    else:
+        why = "the shaft is locked" if conditions.shaft == "locked" else "the design has no speed controller"
+        left_out.append(f"speed step, field weakening, unreachable reference: {why}; current steps at standstill")
+    experiments += [_current_steps(sizes, "q"), _current_steps(sizes, "d")]
+    if turning:
+        for make in (_unreachable, _weakening):
+            found = make(sizes)
+            if isinstance(found, Experiment):
+                experiments.append(found)
+            else:
+                left_out.append(found)
+    return ProofPlan(tuple(experiments), tuple(left_out))
+
+
+@dataclass(frozen=True, slots=True)
+class _Sizes:
+    """What the experiments are sized with; speeds electrical unless they end in M."""
+
+    design: Design
+    T_s: float
+    p: int
+    psi: float
+    L_d: float
+    L_q: float
+    R: float
+    J: float
+    I_test: float
+    i_lim: float
+    V_linear: float
+    V_weakening: float
+    omega_max: float
+    omega_base: float
+    turns: bool
+    alpha: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, design: Design, conditions: Conditions) -> _Sizes:
+        machine, inverter = design.machine.machine, design.machine.inverter
+        I_nom = design["motor.I_nom_apk"]
+        if I_nom <= 0.0:
+            raise ConfigError("the design gives no rated current", where="motor.I_nom_apk")
+        i_lim = CURRENT_SHARE * min(conditions.i_max_apk, design["motor.I_max_apk"])
+        I_test = min(I_nom, i_lim)
+        V = inverter.voltage_utilisation * conditions.U_dc_v
+        psi, L_q = machine.psi_f_wb, machine.L_q_decoupling_h
+        p = machine.pole_pairs
+        omega_max = SPEED_SHARE * p * min(conditions.speed_max_rad_s, design["motor.n_max_rpm"] * RPM)
+        omega_base = V / math.hypot(psi, L_q * I_test)
+        turns = conditions.shaft != "locked" and design["speed.K_p_nms_per_rad"] > 0.0
+        return cls(
+            design, inverter.T_s, p, psi, machine.L_d_decoupling_h, L_q, machine.R_s_ohm, machine.J_kgm2 or 0.0,
+            I_test, i_lim, 0.85 * V, (1.0 - design["field_weakening.margin"]) * V, omega_max, omega_base, turns,
+            {a: design[f"current.K_p_{a}_v_per_a"] / L for a, L in (("d", machine.L_d_h), ("q", machine.L_q_h))},
+        )  # fmt: skip
+
+    @property
+    def omega_steps(self) -> float:
+        """Speed of the current steps."""
+        return min(STEP_SPEED_SHARE * self.omega_base, 0.7 * self.omega_max) if self.turns else 0.0
+
+    def torque(self, i_q_a: float) -> float:
+        """Torque at i_d = 0 (N m)."""
+        return 1.5 * self.p * self.psi * i_q_a
+
+
+def _speed_step(s: _Sizes) -> Experiment:
+    speed = s.omega_steps / s.p
+    rows, decimation = _speed_record(s, speed)
+    text = f"speed step from standstill to {speed / RPM:.4g} rpm"
+    return Experiment("speed_step", text, 0.0, _speed_excitation(s, speed, rows, decimation), rows, decimation,
+                      judged=("i_d_a", "i_q_a", "omega_e_rad_s"), scale_a=s.I_test,
+                      scale_rad_s=s.omega_steps)  # fmt: skip
+
+
+def _speed_record(s: _Sizes, step_rad_s: float) -> tuple[int, int]:
+    return _record_of(s, step_rad_s / (s.design["speed.acceleration_rpm_per_s"] * RPM))
+
+
+def _record_of(s: _Sizes, ramp_s: float) -> tuple[int, int]:
+    crossover = float(s.design.facts.get("speed_crossover_rad_s", 50.0))
+    seconds = min(LONGEST_S, ramp_s + SPEED_SETTLE / crossover)
+    decimation = max(1, math.ceil(seconds / (SPEED_ROWS * s.T_s)))
+    return SPEED_ROWS, decimation
+
+
+def _speed_excitation(s: _Sizes, step_rad_s: float, rows: int, decimation: int) -> Excitation:
+    # a little longer than the record: the reference falls back only after its last row
+    duration = (rows * decimation + 2 * decimation) * s.T_s
+    return Excitation(Shape.STEP, Injection.SPEED, step_rad_s, duration_s=duration)
+
+
+def _current_steps(s: _Sizes, axis: str) -> Experiment:
+    emf = s.omega_steps * s.psi
+    room = s.V_linear - emf if axis == "q" else math.sqrt(max(s.V_linear**2 - emf**2, 0.0))
+    K_p = s.design[f"current.K_p_{axis}_v_per_a"]
+    step = min(STEP_SHARE * s.I_test, STEP_VOLTAGE_SHARE * room / max(K_p, 1e-9))
+    if step <= 0.0:
+        raise NotAvailable("no current step fits the voltage", hint="check U_dc and the design's voltage")
+    periods = SETTLE / (s.alpha[axis] * s.T_s)
+    decimation = max(1, math.ceil(periods / LEVEL_ROWS[1]))
+    level = min(LEVEL_ROWS[1], max(LEVEL_ROWS[0], math.ceil(periods / decimation)))
+    pattern = tuple(step * share for share in STEPS for _ in range(level))
+    repeats = max(1, PATTERN_ROWS // len(pattern))
+    rows = repeats * len(pattern)
+    excitation = Excitation(
+        Shape.BUFFER, Injection.I_Q if axis == "q" else Injection.I_D, step, hold_periods=decimation,
+        duration_s=rows * decimation * s.T_s, buffer=pattern,
+    )  # fmt: skip
+    speed = s.omega_steps / s.p
+    text = f"i_{axis} steps of +-{0.5 * step:.4g} and +-{step:.4g} A at {speed / RPM:.4g} rpm, {repeats} times"
+    scale = max(step, SCALE_SHARE * s.I_test)
+    return Experiment(f"{axis}_steps", text, speed, excitation, rows, decimation, repeats, scale_a=scale)
+
+
+def _unreachable(s: _Sizes) -> Experiment | str:
+    if s.design["governor.mode"] == 0:
+        return "unreachable reference: the design has no governor"
+    V = s.V_linear / 0.85
+    fastest = min(0.9 * s.V_weakening / s.psi if s.psi > 0.0 else math.inf, 0.85 * s.omega_max)
+    K_p = s.design["current.K_p_q_v_per_a"]
+    for current in (s.I_test, s.i_lim):
+        omega = min(fastest, _speed_of_voltage(s, current, UNREACHABLE * V))
+        needed, when = math.hypot(omega * s.L_q * current, omega * s.psi + s.R * current), "for good"
+        if needed < UNREACHABLE_LEAST * V:
+            needed, when = K_p * current + omega * s.psi, "at once"
+        if needed >= UNREACHABLE_LEAST * V:
+            break
+    else:
+        return f"unreachable reference: the voltage suffices for {s.i_lim:.4g} A at every speed below field weakening"
+    rise = s.torque(current) / s.J * s.T_s  # mechanical, per period
+    periods = UNREACHABLE_SPEED_RISE * omega / s.p / max(rise, 1e-30)
+    rows = round(min(UNREACHABLE_ROWS[1], max(UNREACHABLE_ROWS[0], periods)))
+    excitation = Excitation(Shape.STEP, Injection.I_Q, current, duration_s=rows * s.T_s)
+    speed = omega / s.p / RPM
+    text = f"i_q step to {current:.4g} A at {speed:.4g} rpm, for which the voltage does not suffice {when}"
+    return Experiment("unreachable", text, omega / s.p, excitation, rows, 1, scale_a=current)
+
+
+def _speed_of_voltage(s: _Sizes, i_q: float, V: float) -> float:
+    """Electrical speed at which i_d = 0 and i_q take the voltage V."""
+    a, b, c = (s.L_q * i_q) ** 2 + s.psi**2, s.psi * s.R * i_q, (s.R * i_q) ** 2 - V**2
+    return (-b + math.sqrt(max(b * b - a * c, 0.0))) / a
+
+
+def _weakening(s: _Sizes) -> Experiment | str:
+    if s.design["field_weakening.mode"] == FIELD_WEAKENING["off"]:
+        return "entry into field weakening: it is off in the design"
+    if s.psi <= 0.0:
+        return "entry into field weakening: no magnet flux"
+    corner = s.V_weakening / s.psi
+    i_d = max(-WEAKENING_CURRENT * s.i_lim, 0.8 * s.design["field_weakening.i_d_min_a"])
+    psi_end = s.psi + s.L_d * i_d
+    end = min(WEAKENING_END * corner, s.omega_max, s.V_weakening / psi_end if psi_end > 0.0 else math.inf)
+    if end < WEAKENING_LEAST * corner:
+        return (
+            f"entry into field weakening: it begins at {corner / s.p / RPM:.4g} rpm, "
+            f"{end / s.p / RPM:.4g} rpm are within the limits"
+        )
+    start, step = WEAKENING_START * corner / s.p, (end - WEAKENING_START * corner) / s.p
+    slope = WEAKENING_SLOPE * s.design["speed.acceleration_rpm_per_s"] * RPM
+    rows, decimation = _record_of(s, step / slope)
+    settle = SPEED_SETTLE / float(s.design.facts.get("speed_crossover_rad_s", 50.0))
+    levels, hold = rows // WEAKENING_HOLD, WEAKENING_HOLD * decimation
+    rise = slope * hold * s.T_s
+    # one level more than the record has, so that the reference falls back only after its last row
+    ramp = tuple(min(step, rise * k) for k in range(1, levels + 2))
+    excitation = Excitation(Shape.BUFFER, Injection.SPEED, step, hold_periods=hold, buffer=ramp)
+    text = f"speed ramp from {start / RPM:.4g} to {end / s.p / RPM:.4g} rpm, into field weakening"
+    return Experiment("weakening", text, start, excitation, rows, decimation,
+                      judged=("i_d_a", "i_q_a", "omega_e_rad_s"), scale_a=s.I_test, scale_rad_s=end,
+                      settle_s=settle)  # fmt: skip
