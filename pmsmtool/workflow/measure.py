@@ -180,8 +180,8 @@ class Measurement:
             inductances = self._square(resistance, encoder) if "square" in steps else None
             if inductances is not None and "speeds" in steps:
                 self._turn(resistance, encoder, inductances)
-        if "map" in steps:
-            map_stage.measure_map(self.drive, self.limits, noise, self.held, self.keep, self.say)
+        if resistance is not None and "map" in steps:
+            map_stage.measure_map(self.drive, self.limits, noise, resistance, self.held, self.keep, self.say)
 
     def _zero_current(self) -> Noise:
         self.say("noise: currents of the drive at rest")
