@@ -55,8 +55,13 @@ VOLTAGE_RATIOS = (
 HALF_PERIODS_HELD = 70
 HALF_PERIODS_FREE = 45
 """Samples between two turns at full current: fewer move a free rotor less, more leave the inverter less to say."""
-U_SHARE = 0.9
-"""Largest voltage vector, of what the inverter gives."""
+DROPS_HELD, DROPS_FREE = 2.5, 4.0
+"""Smallest voltage over the resistive drop. Near the drop the current creeps towards its limit; on a free rotor the
+back-emf then makes it creep longer in one direction, which turns the rotor faster still."""
+BRAKE_LIMIT_S = 0.6
+BRAKE_LOOK_S = 0.03
+STANDSTILL_SHARE = 0.004
+"""Speed that counts as rest, of the largest."""
 FIRST_SHARE = 0.02
 """First voltage of the search, of the largest."""
 SHARES = (0.25, 0.6, 1.0)
@@ -91,7 +96,9 @@ class ScanPlan:
     u_max_v : float
         Largest voltage vector (V peak).
     held : bool
-        Whether the rotor is held; a free one gets shorter and higher pulses.
+        Whether the rotor is held; a free one gets shorter and higher pulses, and is braked before each train.
+    drop_v : float
+        Resistive drop at that current and the inverter's error (V): the pulses must be well above it.
     rectangles : tuple
         Shares of d and q current, one trace each.
     """
@@ -99,6 +106,7 @@ class ScanPlan:
     i_max_a: float
     u_max_v: float
     held: bool
+    drop_v: float = 0.0
     rectangles: tuple[tuple[float, float], ...] = RECTANGLES
 
     @property
@@ -106,15 +114,28 @@ class ScanPlan:
         """Samples between two turns that are aimed at."""
         return HALF_PERIODS_HELD if self.held else HALF_PERIODS_FREE
 
+    @property
+    def u_least_v(self) -> float:
+        """Smallest voltage of an axis (V)."""
+        return min(self.u_max_v, (DROPS_HELD if self.held else DROPS_FREE) * self.drop_v)
+
     def duration_s(self, period_s: float) -> float:
         """Return the time under voltage (s)."""
         return len(self.rectangles) * SAMPLES * period_s
 
 
 def pulse(
-    drive: Drive, u_dq_v: tuple[float, float], limit_dq_a: tuple[float, float], samples: int, abort_speed_rad_s: float
+    drive: Drive,
+    u_dq_v: tuple[float, float],
+    limit_dq_a: tuple[float, float],
+    samples: int,
+    abort_speed_rad_s: float,
+    *,
+    brake: bool = False,
 ) -> Trace:
     """Record one train of pulses from rest; zero current is asked for before and after it.
+
+    ``brake`` stops the shaft by the drive's own speed controller first.
 
     Raises
     ------
@@ -131,8 +152,22 @@ def pulse(
         duration_s=samples * drive.period_s,
         abort_speed_rad_s=abort_speed_rad_s,
     )
+    if brake:
+        _brake(drive, STANDSTILL_SHARE * abort_speed_rad_s)
     drive.command_current(0.0, 0.0)
     return readable(drive.record(SIGNALS, samples, excitation=excitation))
+
+
+def _brake(drive: Drive, omega_e_rad_s: float) -> None:
+    """Bring the shaft to rest, or as near as the limit of time allows."""
+    drive.command_speed(0.0)
+    periods = max(1, round(0.3 * BRAKE_LOOK_S / drive.period_s))
+    waited = 0.0
+    while waited < BRAKE_LIMIT_S:
+        drive.wait(BRAKE_LOOK_S)
+        waited += BRAKE_LOOK_S
+        if abs(drive.average(("omega_e_rad_s",), periods)["omega_e_rad_s"]) <= omega_e_rad_s:
+            return
 
 
 def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float) -> AxisPulse:
@@ -143,7 +178,7 @@ def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float
     IdentificationError
         ``E_EXCITATION``: the largest voltage does not bring the current to its band within a shot.
     """
-    u = FIRST_SHARE * plan.u_max_v
+    u = max(FIRST_SHARE * plan.u_max_v, SHARES[0] * plan.u_least_v)
     samples = round((2 * TURNS_LEAST + 1) * plan.half_periods)
     found: AxisPulse | None = None
     for share in SHARES:
@@ -151,11 +186,12 @@ def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float
         if found is not None:
             # a saturating axis needs less flux than in proportion: the half period comes out shorter, never longer
             grown = limit / (found.limit_a + found.overshoot_a)
-            u = min(plan.u_max_v, found.u_v * grown * found.half_period / plan.half_periods)
+            u = found.u_v * grown * found.half_period / plan.half_periods
+            u = min(plan.u_max_v, max(share * plan.u_least_v, u))
             limit = max(0.3 * limit, limit - OVERSHOOT_ALLOWANCE * found.overshoot_a * u / found.u_v)
         found = _shot_that_turns(drive, plan, axis, u, limit, samples, abort_speed_rad_s)
     assert found is not None
-    u = min(plan.u_max_v, found.u_v * found.half_period / plan.half_periods)
+    u = min(plan.u_max_v, max(plan.u_least_v, found.u_v * found.half_period / plan.half_periods))
     overshoot = found.overshoot_a * u / found.u_v
     limit = plan.i_max_a - OVERSHOOT_ALLOWANCE * overshoot
     if limit < 0.4 * plan.i_max_a:
@@ -165,7 +201,7 @@ def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float
             stage=STAGE,
             likely="a control period too long for this inductance",
         )
-    return AxisPulse(u, limit, overshoot, float(plan.half_periods))
+    return AxisPulse(u, limit, overshoot, found.half_period * found.u_v / u)
 
 
 def _shot_that_turns(
@@ -174,7 +210,8 @@ def _shot_that_turns(
     for _ in range(SEARCH_STEPS):
         on_d = axis == "d"
         bands = (limit, 0.0) if on_d else (0.0, limit)  # without voltage a band does nothing
-        trace = pulse(drive, (u, 0.0) if on_d else (0.0, u), bands, samples, abort_speed_rad_s)
+        volts = (u, 0.0) if on_d else (0.0, u)
+        trace = pulse(drive, volts, bands, samples, abort_speed_rad_s, brake=not plan.held)
         turns = np.flatnonzero(np.diff(np.sign(trace[f"u_{axis}_v"][1:]))) + 1
         peak = float(np.max(np.abs(trace[f"i_{axis}_a"])))
         if len(turns) >= TURNS_LEAST:
@@ -211,7 +248,7 @@ def scan(
         bands = [
             _band(share * plan.i_max_a, axis, volts) for share, axis, volts in zip(rectangle, (d, q), u, strict=True)
         ]
-        trace = pulse(drive, u, (bands[0], bands[1]), SAMPLES, abort_speed_rad_s)
+        trace = pulse(drive, u, (bands[0], bands[1]), SAMPLES, abort_speed_rad_s, brake=not plan.held)
         keep(replace(trace, meta={**trace.meta, "held": plan.held, "i_max_a": plan.i_max_a}))
         drive.wait(REST_S)
 

@@ -13,8 +13,8 @@ from pmsmtool.estimators.flux_map_fit import MagnetFlux
 from pmsmtool.estimators.flux_map_result import FluxMapResult, estimate_flux_map
 from pmsmtool.estimators.flux_map_rows import Frame
 from pmsmtool.estimators.noise import Noise
+from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import flux_map_scan
-from pmsmtool.experiments.speed_run import reach
 from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz
 from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.npz_file import npz_bytes
@@ -50,6 +50,7 @@ def measure_map(
     drive: Drive,
     limits: Limits,
     noise: Noise,
+    resistance: ResistanceResult,
     held: bool,
     keep: Callable[[str, Trace], None],
     say: Callable[[str], None],
@@ -64,6 +65,8 @@ def measure_map(
         What may be used.
     noise : Noise
         For the deviation that is predicted before the trains.
+    resistance : ResistanceResult
+        For the voltage that the pulses need at least.
     held : bool
         Whether the rotor is held.
     keep, say : callable
@@ -78,11 +81,10 @@ def measure_map(
         "I_nom_a": limits.I_nom_apk,
     }
     i_max = min(REACH_SHARE * limits.i_max_apk, TRIP_SHARE * drive.read("protection.i_trip_apk"))
-    plan = flux_map_scan.ScanPlan(i_max, U_SHARE * limits.V_max_v, held)
+    drop = resistance.R_measured.value * i_max + max(0.0, resistance.V_dead_v)
+    plan = flux_map_scan.ScanPlan(i_max, U_SHARE * limits.V_max_v, held, drop)
     abort = SPEED_SHARE * pole_pairs * limits.omega_max_rad_s
     say(f"flux map: growing pulses size voltage and band up to {i_max:.3g} A")
-    if not held:
-        reach(drive, 0.0, limit_s=1.0)
     d, q = (flux_map_scan.size_axis(drive, plan, axis, abort) for axis in ("d", "q"))  # type: ignore[arg-type]
     swings = [pulse.u_v * pulse.half_period * drive.period_s for pulse in (d, q)]
     rows = 2 * len(plan.rectangles) * flux_map_scan.SAMPLES
