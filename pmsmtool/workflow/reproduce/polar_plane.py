@@ -93,14 +93,26 @@ def equilibria(seed: int) -> Reproduction:
         near("i_q at the linear limit, 400 rpm", 54.0, _limit_i_q(400.0), "A", absolute=0.3, where=EXPECTED),
         *_identities(),
     )
+    table = Table("least-loss steady state; out of reach: the largest torque at full voltage", columns, rows)
     return Reproduction(
-        "polar-equilibria",
-        "equilibrium search and linear model",
-        SOURCE,
-        (Table("least-loss steady state; out of reach: the largest torque at full voltage", columns, rows),),
-        (),
-        checks,
-        ASSUMED,
+        "polar-equilibria", "equilibrium search and linear model", SOURCE, (table,), _loci(), checks, ASSUMED, columns=2
+    )
+
+
+def _loci() -> tuple[Panel, ...]:
+    """Phase and i_d of the steady state over the torque, to the end of what full voltage reaches."""
+    m = machine()
+    torques = np.linspace(-6.0, 12.0, 361)
+    phase, i_d = [], []
+    for rpm in (400.0, 800.0, 1000.0, 1200.0):
+        points = [equilibrium_without_i_d(m, _omega(rpm), m.current_a(float(torque)), V_PEAK) for torque in torques]
+        kept = [point for point in points if point.reachable]
+        reached = np.array([K_T * point.i_q / PEAK for point in kept])
+        phase.append(Series(f"{rpm:g} rpm", reached, np.array([point.delta for point in kept])))
+        i_d.append(Series(f"{rpm:g} rpm", reached, np.array([point.i_d / PEAK for point in kept])))
+    return (
+        Panel("phase of the steady state", "torque / N m", "delta_o / rad", tuple(phase)),
+        Panel("d-axis current of the steady state", "torque / N m", "i_d / A", tuple(i_d)),
     )
 
 

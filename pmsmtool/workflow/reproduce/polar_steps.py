@@ -115,7 +115,7 @@ def panels(r: Response, lead_s: float = LEAD_S, *, phase_limit: bool = True) -> 
         index.append(Series("", ends, -M_max, ":", -1))
     phase = [Series("delta", t, r.delta[kept])]
     if phase_limit:
-        phase += [Series("limit", ends, sign * np.pi / 2 * np.ones(2), ":", -1) for sign in (1.0, -1.0)]
+        phase += [Series(name, ends, x * np.ones(2), ":", -1) for name, x in (("limit", np.pi / 2), ("", -np.pi / 2))]
     return (
         Panel("(a) d-axis current", "time / ms", "i_d / A", (Series("i_d", t, r.i_d[kept]),)),
         Panel(
