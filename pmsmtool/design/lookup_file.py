@@ -13,16 +13,19 @@ import hashlib
 import io
 import json
 import struct
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.design.lookup_grid import InterpolationError, StoredFormat, lsb_a
+from pmsmtool.design.lookup_grid import InterpolationError, StoredFormat, int16_step_a
 from pmsmtool.design.lookup_loci import Locus
-from pmsmtool.design.lookup_table import LookupTable
+from pmsmtool.design.lookup_table import AxisKind, LookupTable
+from pmsmtool.errors import ConfigError
 from pmsmtool.npz_file import npz_bytes
+from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 
 SCHEMA = "pmsmtool.lut/1"
 
@@ -59,6 +62,8 @@ def table_facts(table: LookupTable, stored: StoredFormat | None, error: Interpol
         "objective": "copper loss" if machine.loss_map is None else "copper and iron loss",
         "stored": stored or "float64",
     }
+    if stored is not None:
+        facts["words_crc32"] = zlib.crc32(lut_words(table, stored))
     if error is not None:
         facts["interpolation_error"] = {
             "torque_nm": error.torque_nm, "voltage_v": error.voltage_v, "current_a": error.current_a,
@@ -120,30 +125,84 @@ def table_csv(table: LookupTable) -> str:
 
 def lut_values(table: LookupTable, stored: StoredFormat) -> tuple[dict[str, float], dict[str, tuple[float, ...]]]:
     """Return the ``lut.*`` values of the catalogue and the tables of a parameter set for a stored table."""
-    values = {
-        "lut.format": float(_FORMATS[stored]),
-        "lut.axis_kind": 0.0 if table.axis_kind == "speed" else 1.0,
-        "lut.n_x": float(table.torque_nm.size),
-        "lut.n_y": float(table.y.size),
-        "lut.n_z": float(table.U_dc_v.size),
-        "lut.lsb_a": lsb_a(table) if stored == "int16" else 0.0,
-    }
-    tables = {
-        "lut.axis_x": table.torque_nm, "lut.axis_y": table.y, "lut.axis_z": table.U_dc_v,
-        "lut.i_d_a": table.i_d_a.ravel(), "lut.i_q_a": table.i_q_a.ravel(),
-    }  # fmt: skip
-    return values, {name: tuple(array.tolist()) for name, array in tables.items()}
+    return _values(table.axis_kind, stored, _arrays(table))
 
 
 def lut_words(table: LookupTable, stored: StoredFormat) -> bytes:
     """Return the look-up words of the drive image: axes x, y, z as binary32, then both tables, padded to four bytes."""
-    axes = b"".join(np.ascontiguousarray(a, dtype="<f4").tobytes() for a in (table.torque_nm, table.y, table.U_dc_v))
+    return _words(stored, _arrays(table))
+
+
+def table_parameters(arrays: Mapping[str, NDArray[Any]], where: str) -> ParameterSet:
+    """Return what ``lut.npz`` gives a drive: the ``lut.*`` values, the axes and both tables.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        Content of the file.
+    where : str
+        Its name, for messages.
+
+    Raises
+    ------
+    ConfigError
+        It is no table, or its words are not those its ``meta`` has the CRC-32 of.
+    """
+    hint = "give lut.npz as `lut` writes it"
+    try:
+        facts = json.loads(str(arrays["meta"]))
+        kind, stored = facts["axis_kind"], facts["stored"]
+        second = "speed_rpm" if kind == "speed" else "flux_wb"
+        z = arrays["U_dc_v"] if "U_dc_v" in arrays else facts["U_dc_v"]
+        names = ("torque_nm", second, "i_d_a", "i_q_a")
+        x, y, i_d, i_q = (np.asarray(arrays[name], dtype=np.float64) for name in names)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"is no look-up table: {error}", where=where, hint=hint) from None
+    parts = (x, y, np.asarray(z, dtype=np.float64), i_d, i_q)
+    cells = parts[0].size * parts[1].size * parts[2].size
+    if facts.get("schema") != SCHEMA or kind not in _KINDS or stored not in _FORMATS or {i_d.size, i_q.size} != {cells}:
+        raise ConfigError("is no look-up table as a drive stores it", where=where, hint=hint)
+    if zlib.crc32(_words(stored, parts)) != facts.get("words_crc32"):
+        raise ConfigError(
+            "its numbers are not those its CRC-32 was made of", where=where, likely="the file was edited", hint=hint
+        )
+    values, tables = _values(kind, stored, parts)
+    return ParameterSet(values, tables, {"lut": str(facts.get("content", ""))}, "look-up table")
+
+
+_KINDS: tuple[AxisKind, ...] = ("speed", "flux")
+"""``lut.axis_kind`` of the catalogue."""
+
+_Parts = tuple[NDArray[np.float64], ...]
+"""Axes x, y, z and the tables i_d, i_q."""
+
+
+def _arrays(table: LookupTable) -> _Parts:
+    return table.torque_nm, table.y, table.U_dc_v, table.i_d_a, table.i_q_a
+
+
+def _values(
+    kind: AxisKind, stored: StoredFormat, parts: _Parts
+) -> tuple[dict[str, float], dict[str, tuple[float, ...]]]:
+    values = {
+        "lut.format": float(_FORMATS[stored]),
+        "lut.axis_kind": float(_KINDS.index(kind)),
+        "lut.n_x": float(parts[0].size),
+        "lut.n_y": float(parts[1].size),
+        "lut.n_z": float(parts[2].size),
+        "lut.lsb_a": int16_step_a(*parts[3:]) if stored == "int16" else 0.0,
+    }
+    return values, {name: tuple(array.ravel().tolist()) for name, array in zip(TABLE_NAMES, parts, strict=True)}
+
+
+def _words(stored: StoredFormat, parts: _Parts) -> bytes:
+    axes = b"".join(np.ascontiguousarray(a, dtype="<f4").tobytes() for a in parts[:3])
     tables = b""
-    for currents in (table.i_d_a, table.i_q_a):
+    for currents in parts[3:]:
         if stored == "float32":
             tables += np.ascontiguousarray(currents, dtype="<f4").tobytes()
         else:
-            whole = np.where(np.isnan(currents), -32768, np.rint(np.nan_to_num(currents) / lsb_a(table)))
-            tables += whole.astype("<i2").tobytes()
+            steps = np.rint(np.nan_to_num(currents) / int16_step_a(*parts[3:]))
+            tables += np.where(np.isnan(currents), -32768, steps).astype("<i2").tobytes()
             tables += struct.pack("<h", 0) * (currents.size % 2)
     return axes + tables

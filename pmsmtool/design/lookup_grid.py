@@ -68,7 +68,12 @@ def stored_axes(*axes: Array) -> tuple[Array, ...]:
 
 def lsb_a(table: LookupTable) -> float:
     """Return the int16 step (A) that spans the table's currents, a binary32 number."""
-    largest = max(float(np.nanmax(np.abs(t), initial=0.0)) for t in (table.i_d_a, table.i_q_a))
+    return int16_step_a(table.i_d_a, table.i_q_a)
+
+
+def int16_step_a(*currents: Array) -> float:
+    """Return the int16 step (A) that spans currents; the same for those it has rounded."""
+    largest = max(float(np.nanmax(np.abs(t), initial=0.0)) for t in currents)
     step = np.float32(max(largest, 1e-6) / INT16_LARGEST)
     return float(step if float(step) * INT16_LARGEST >= largest else np.nextafter(step, np.float32(np.inf)))
 

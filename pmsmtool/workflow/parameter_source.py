@@ -1,4 +1,4 @@
-"""Where parameters come from: a parameter set, a design, a run directory or a device configuration file."""
+"""Where parameters come from: a parameter set, a design, a run directory, a device configuration file or a table."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterS
     Parameters
     ----------
     path : Path
-        ``params.toml``, ``design.toml`` (told apart by their schema), a ``.dcf``, or a run directory.
+        ``params.toml``, ``design.toml`` (told apart by their schema), a ``.dcf``, a run directory, or a look-up table
+        as ``lut`` writes it (``.npz``): that gives the table alone.
     drive_map : DriveMap, optional
         What the objects of a DCF mean; the reference drive's when not given.
 
@@ -36,6 +37,11 @@ def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterS
     path = _file(path)
     if path.suffix.lower() in _DCF_SUFFIXES:
         return _from_dcf(path, drive_map or reference_map())
+    if path.suffix.lower() == ".npz":
+        from pmsmtool.design.lookup_file import table_parameters
+        from pmsmtool.npz_file import read_npz
+
+        return table_parameters(read_npz(path), str(path))
     text = read_text(path)
     schema = parse_toml(text, where=str(path)).get("schema")
     if schema == design_file.SCHEMA:
