@@ -97,18 +97,22 @@ static void root_on_piece(search *run, const pmsm_curve *curve, double s_a, doub
         cross(run, &at);
 }
 
-/* Three nodes with the voltage least in the middle, all above the limit: an admissible arc may hide between. */
-static void hidden_arc(search *run, const pmsm_curve *curve, double s_a, double s_c)
+/* Two neighbouring nodes on the same side of the limit with an extreme of the voltage between them that may lie on the
+ * other: an admissible arc, or a gap in one, hides there. */
+static void hidden_arc(search *run, const pmsm_curve *curve, double s_a, double s_b, int32_t ends_admissible)
 {
     double s;
     pmsm_point at;
-    if (!pmsm_curve_root_between(curve, PMSM_AT_VOLTAGE_EXTREME, s_a, s_c, &s, &at))
+    int32_t admissible;
+    if (!pmsm_curve_root_between(curve, PMSM_AT_VOLTAGE_EXTREME, s_a, s_b, &s, &at))
         return;
-    if (pmsm_curve_indicator(curve, PMSM_AT_VOLTAGE, &at) > 0.0)
+    admissible = pmsm_curve_indicator(curve, PMSM_AT_VOLTAGE, &at) <= 0.0;
+    if (admissible == ends_admissible)
         return;
-    consider(run, &at);
+    if (admissible)
+        consider(run, &at);
     root_on_piece(run, curve, s_a, s);
-    root_on_piece(run, curve, s, s_c);
+    root_on_piece(run, curve, s, s_b);
 }
 
 static void scan_piece(search *run, const pmsm_piece *piece)
@@ -116,21 +120,25 @@ static void scan_piece(search *run, const pmsm_piece *piece)
     pmsm_curve curve = piece->curve;
     const double *s = run->border->s + piece->first;
     const pmsm_point *node = run->border->node + piece->first;
-    double f[3] = {INFINITY, INFINITY, INFINITY};
+    double slope = 0.0;
+    int32_t admissible = 0;
     curve.omega = run->omega;
     curve.V2 = run->V2;
     for (int32_t k = 0; k < piece->count; k++) {
-        f[0] = f[1];
-        f[1] = f[2];
-        f[2] = pmsm_curve_indicator(&curve, PMSM_AT_VOLTAGE, &node[k]);
-        if (f[2] <= 0.0)
+        const int32_t before = admissible;
+        const double slope_before = slope;
+        admissible = pmsm_curve_indicator(&curve, PMSM_AT_VOLTAGE, &node[k]) <= 0.0;
+        slope = pmsm_curve_indicator(&curve, PMSM_AT_VOLTAGE_EXTREME, &node[k]);
+        if (admissible)
             consider(run, &node[k]);
         else
             run->outside++;
-        if (k > 0 && (f[1] <= 0.0) != (f[2] <= 0.0))
+        if (k == 0)
+            continue;
+        if (admissible != before)
             root_on_piece(run, &curve, s[k - 1], s[k]);
-        if (k > 1 && f[1] > 0.0 && f[1] < f[0] && f[1] <= f[2] && f[2] > 0.0)
-            hidden_arc(run, &curve, s[k - 2], s[k]);
+        else if (admissible ? slope_before > 0.0 && slope < 0.0 : slope_before < 0.0 && slope > 0.0)
+            hidden_arc(run, &curve, s[k - 1], s[k], admissible);
     }
 }
 
