@@ -156,6 +156,27 @@ def saturating() -> tuple[FluxMap, Flux]:
     return flux_map, spline(i_d, i_q, psi_d, psi_q)
 
 
+def seam() -> Bench:
+    """Voltage limit and current circle cross twice close to the negative d axis, both below it: R turns the limit."""
+    i_d, i_q = np.linspace(-30.0, 30.0, 25), np.linspace(-30.0, 30.0, 31)
+    d, q = np.meshgrid(i_d, i_q, indexing="ij")
+    psi_d = 0.0438 + 0.0957 * np.tanh(d / 32.6) + 1.15e-3 * d + 2.6e-5 * q**2 / (1.0 + (q / 20.0) ** 2)
+    psi_q = 0.238 * (q / 14.1) / np.sqrt(1.0 + (q / 14.1) ** 2) + 3.4e-4 * q
+    psi_q += 5.2e-5 * d * q / (1.0 + (q / 20.0) ** 2) ** 2
+    machine = OperatingMachine(3, 1.25, 1.0, 1.0, 0.0372, FluxMap(i_d, i_q, psi_d, psi_q), -0.0066)
+    flux = spline(i_d, i_q, psi_d - 0.0066, psi_q)
+    return Bench(machine, flux, 17.376, 74.56, (2900.0, 7800.0, 7832.0), edge=(-30.0, 30.0, 30.0))
+
+
+def warm() -> Bench:
+    """A constant machine with hot winding and magnet, its copper part given."""
+    parameters = MachineParameters(3, 0.3, 2e-3, 5e-3, 0.12, R_winding_ohm=0.25)
+    machine = at_temperature(parameters, T_winding_c=150.0, T_magnet_c=110.0)
+    R, psi = 0.3 + 0.25 * 0.00393 * 130.0, 0.12 * (1.0 - 0.0012 * 90.0)
+    assert (machine.R, machine.psi_f) == (pytest.approx(R), pytest.approx(psi))
+    return replace(linear(3, R, 2e-3, 5e-3, psi, 80.0, 150.0, 0.0, 2000.0, 4500.0, 12000.0), machine=machine)
+
+
 def spline(i_d: np.ndarray, i_q: np.ndarray, psi_d: np.ndarray, psi_q: np.ndarray) -> Flux:
     interpolate = pytest.importorskip("scipy.interpolate")
     parts = [interpolate.RectBivariateSpline(i_d, i_q, grid, s=0) for grid in (psi_d, psi_q)]
@@ -204,6 +225,9 @@ BENCHES = {
     "saturating": lambda: replace(map_cut(-math.inf), I_max=28.0),
     "edge of the map": lambda: map_cut(-math.inf),
     "map and demagnetisation": lambda: map_cut(-8.0),
+    "crossings at the d axis": seam,
+    "backwards": lambda: linear(4, 0.137, 2.3e-3, 2.1e-3, 0.41, 56.0, 121.24, -620.0, -900.0, -1100.0),
+    "hot": warm,
     "measured, cold": lambda: measured(False),
     "measured, hot": lambda: measured(True),
 }
