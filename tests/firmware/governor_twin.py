@@ -126,12 +126,13 @@ class GovernedTwin(Twin):
     def solve(self, rows: list[Row], steady: int, r: Vector) -> tuple[Vector, int]:
         if int(self.values["governor.mode"]) == LINE:
             return self.line_search(rows, steady, r)
-        found = project_rows(rows, r)
-        if found is not None:
-            return found
-        self.flags |= FLAG_FALLBACK
-        found = project_rows(rows[: steady + 1], r) if len(rows) > steady + 1 else None
-        return found if found is not None else (smallest_voltage(rows[steady], rows[0]), EMPTY)
+        found = project_rows(rows[: steady + 1], r)
+        more = None if found is None else project_rows(rows, r, found)
+        self.flags |= FLAG_FALLBACK if more is None else 0
+        if found is None:
+            return smallest_voltage(rows[steady], rows[0]), EMPTY
+        v, basis = found if more is None else more
+        return v, basis[0]
 
     def pre_project(self, rows: list[Row], steady: int, r: Vector) -> tuple[Vector, bool]:
         """The reachable request, and whether the period has time left to start a transfer."""
@@ -191,7 +192,6 @@ class GovernedTwin(Twin):
         if steered is not None:
             self.landing, self.binding = True, STEERED
             return steered
-        self.time_to_go = ZERO
         if not empty:
             v, self.binding = self.solve(rows, steady, r)
         return v
@@ -206,40 +206,43 @@ class GovernedTwin(Twin):
         size = np.sqrt(square(m))
         return m, rate, size - self.V_max * T, (m[0] * rate[0] + m[1] * rate[1]) / (size + f(1e-12)) - self.V_max
 
-    def find_time(self, way: tuple, T: np.float32, least: np.float32, trials: int) -> tuple[np.float32, Vector] | None:
+    def find_time(self, way: tuple, T: np.float32, least: np.float32, trials: int) -> tuple[np.float32, Vector | None]:
+        """Time and way of the transfer; without a way the time to go on from, 0 when there is no transfer."""
         low, high, w = ZERO, ZERO, abs(self.omega)
         for _ in range(trials):
             if T * w > f(100):
-                return None
+                break
             m, rate, gap, slope = self.at_time(T, *way)
             if slope < 0 and abs(gap) <= ACCURACY * self.V_max * T:
                 last = -gap / slope
                 T = T + last
-                return (T, (m[0] + last * rate[0], m[1] + last * rate[1])) if T > least else None
+                return (T, (m[0] + last * rate[0], m[1] + last * rate[1])) if T > least else (ZERO, None)
             low, high = (T, high) if gap > 0 else (low, T)
             if gap <= 0 and high <= least:
-                return None
+                return ZERO, None
             step = ONE * T
             if slope < 0:
                 step = -gap / slope
                 step = ONE / w if step * w > ONE else step
             following = T + step
             T = HALF * (low + high) if following <= low or (high > 0 and following >= high) else following
-        return None
+        return (T if T * w <= f(100) else ZERO), None
 
     def minimum_time(self, now: Row, offset: Vector, target: Vector, may_start: bool) -> Vector | None:
         R, least = self["motor.R_s_ohm"], f(3) * self.T_s
         a, b = ((self["motor.psi_f_wb"] + self["motor.L_d_app_h"] * x[0], self["motor.L_q_app_h"] * x[1])
                 for x in (self.i, target))
         drops = tuple((HALF * (R * x[0] + offset[0]), HALF * (R * x[1] + offset[1])) for x in (self.i, target))
-        T, found = self.time_to_go - self.T_s, None
+        T, m = self.time_to_go - self.T_s, None
         if T > 0:
-            found = self.find_time((a, b, drops), T, least, 3)
+            T, m = self.find_time((a, b, drops), T, least, 3)
         elif may_start:
-            found = self.find_time((a, b, drops), least, least, 7)
-        if found is None:
+            T, m = self.find_time((a, b, drops), least, least, 5)
+        else:
+            T = ZERO
+        self.time_to_go = T if m is None else ZERO
+        if m is None:
             return None
-        T, m = found
         s, c = sincos(HALF * self.T_s * self.omega)
         w, scale = park(m, s, c), self.V_max / np.sqrt(square(m))
         w = w[0] * scale, w[1] * scale

@@ -12,7 +12,7 @@ import numpy as np
 from tests.firmware.core_twin import Vector, f
 
 ROW_TOLERANCE, PAIR_TOLERANCE, VIOLATION, STALL, SINGULAR = f(1e-6), f(1e-6), f(5e-6), f(2e-5), f(1e-6)
-ROUNDS, CORNER_STEPS, ENTRY_TRIALS, NONE = 16, 6, 4, 255
+ROUNDS, CORNER_STEPS, NONE = 16, 6, 255
 ZERO, ONE, TWO, HALF = f(0), f(1), f(2), f(0.5)
 Symmetric = tuple[np.float32, np.float32, np.float32]
 Factor = tuple[Symmetric, np.float32]
@@ -134,20 +134,17 @@ def project_pair(first: Row, second: Row, r: Vector, outside: Vector) -> Vector 
     if depth < -VIOLATION:
         return None
     a, b, within = first.voltage(outside), first.voltage(best), max(depth, ZERO)
-    low, high, t = ZERO, ONE, ONE - np.sqrt(within / (within + second.excess(outside)))
-    for _ in range(ENTRY_TRIALS):
-        chord = a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])
-        scale = first.V / np.sqrt(square(chord))
-        start = first.reference_of((scale * chord[0], scale * chord[1]))
-        v, found = find_corner(first, second, r, start)
-        if found:
-            return v
-        low, high = (t, high) if second.excess(start) > 0 else (low, t)
-        t = HALF * (low + high)
-    return None
+    t = ONE - np.sqrt(within / (within + second.excess(outside)))
+    chord = a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])
+    scale = first.V / np.sqrt(square(chord))
+    v, found = find_corner(first, second, r, first.reference_of((scale * chord[0], scale * chord[1])))
+    return v if found else None
 
 
-def exchange(rows: list[Row], k: int, r: Vector, x: Vector, basis: list[int]) -> tuple[Vector, list[int]] | None:
+Solution = tuple[Vector, list[int]]
+
+
+def exchange(rows: list[Row], k: int, r: Vector, x: Vector, basis: list[int]) -> Solution | None:
     alone = project_row(rows[k], r)
     inside = alone == r
     met = [b == NONE or bool(rows[b].excess(alone) <= VIOLATION) for b in basis]
@@ -163,14 +160,14 @@ def exchange(rows: list[Row], k: int, r: Vector, x: Vector, basis: list[int]) ->
     return None
 
 
-def project_rows(rows: list[Row], r: Vector) -> tuple[Vector, int] | None:
-    """Point and index of the row added last, None when the rows have no common point."""
-    x, basis = r, [NONE, NONE]
+def project_rows(rows: list[Row], r: Vector, start: Solution | None = None) -> Solution | None:
+    """Point and active rows, the one added last first; None when the rows have no common point."""
+    x, basis = (r, [NONE, NONE]) if start is None else start
     for _ in range(ROUNDS):
         values = [row.excess(x) for row in rows]
         k = int(np.argmax(values))
         if values[k] <= VIOLATION or (k in basis and values[k] <= STALL):
-            return x, basis[0]
+            return x, basis
         found = None if k in basis else exchange(rows, k, r, x, basis)
         if found is None:
             return None

@@ -8,6 +8,7 @@
  *   between the two, so they are the whole admissible set.
  * Row 0 goes before the steady-state row, that before the current row, when not all can be met.
  */
+#include "active_set.h"
 #include "pmsm_period.h"
 
 #define ROWS_MAX (PMSM_GOVERNOR_ROWS + 2u) /* prediction, steady state, current */
@@ -25,6 +26,8 @@ typedef struct {
     pmsm_row pre;      /* steady-state row of the pre-projection */
     pmsm_dq offset;    /* V, beside the nominal model in the steady state */
     uint32_t may_start;/* 0: this period has no time to start a minimum-time transfer */
+    uint32_t smallest_known;
+    pmsm_dq smallest;  /* A, of the smallest steady-state voltage under row 0 */
 } rows_of_period;
 
 static uint32_t has_option(const pmsm_period *period, uint32_t option)
@@ -147,6 +150,7 @@ static void build_rows(pmsm_period *period, rows_of_period *rows)
     }
     rows->count = 1u;
     rows->may_start = 1u;
+    rows->smallest_known = 0u;
     if (period->params->governor_mode == PMSM_GOVERNOR_PAPER) {
         add_prediction_rows(period, rows, PMSM_GOVERNOR_ROWS);
     } else if (period->params->governor_mode == PMSM_GOVERNOR_LINEARISED) {
@@ -176,10 +180,31 @@ static uint32_t binding_of(const rows_of_period *rows, uint32_t active)
 
 /* --- solvers: 1 and v, or 0 when the rows have no common point ------------------------------------------------- */
 
-static uint32_t solve_exact(const rows_of_period *rows, uint32_t count, pmsm_dq r, pmsm_dq *v, uint32_t *active,
-                            uint32_t *steps)
+/* Voltage rows first, the current row only on top of their solution, which stands when all cannot be met at once.
+ * Returns 1, 0 when the current row had to be given up, PMSM_PROJECTION_EMPTY when the voltage rows have no common
+ * point. */
+static uint32_t solve_exact(const rows_of_period *rows, pmsm_dq r, pmsm_dq *v, uint32_t *active, uint32_t *steps)
 {
-    return (pmsm_project_rows(rows->row, count, r, v, active, steps) != PMSM_PROJECTION_EMPTY) ? 1u : 0u;
+    pmsm_active_set set;
+    pmsm_projection_begin(&set, rows->row, r);
+    if (rows->smallest_known != 0u) {
+        set.limit = 0u;
+        set.goal = rows->steady;
+        set.smallest = rows->smallest;
+    }
+    if (pmsm_projection_extend(&set, rows->steady + 1u, steps) == PMSM_PROJECTION_EMPTY) {
+        return PMSM_PROJECTION_EMPTY;
+    }
+    *v = set.v;
+    *active = set.basis[0];
+    if (rows->count > rows->steady + 1u) {
+        if (pmsm_projection_extend(&set, rows->count, steps) == PMSM_PROJECTION_EMPTY) {
+            return 0u;
+        }
+        *v = set.v;
+        *active = set.basis[0];
+    }
+    return 1u;
 }
 
 /* The circle of each row replaced by an inscribed octagon: [18] of the paper keeps its voltage rows linear. */
@@ -264,37 +289,29 @@ static uint32_t solve_line(const pmsm_period *period, const rows_of_period *rows
     return 1u;
 }
 
-/* The rows have no common point: first without the current row, then the smallest steady-state voltage that row 0
- * allows. Row 0 always can be met, so the inverter's limit holds in any case. */
-static pmsm_dq fall_back(pmsm_period *period, const rows_of_period *rows, pmsm_dq r, uint32_t *active, uint32_t *steps)
-{
-    pmsm_dq v;
-    period->flags |= (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK;
-    if (rows->count > rows->steady + 1u &&
-        solve_exact(rows, rows->steady + 1u, r, &v, active, steps) != 0u) {
-        return v;
-    }
-    *active = PMSM_BINDING_EMPTY;
-    return pmsm_smallest_voltage(&rows->row[rows->steady], &rows->row[0], steps);
-}
-
+/* Where not all rows can be met the current row is given up; where row 0 and the steady state exclude each other, the
+ * smallest steady-state voltage that row 0 allows is taken. Row 0 always can be met, so the inverter's limit holds in any
+ * case. */
 static pmsm_dq solve(pmsm_period *period, const rows_of_period *rows, pmsm_dq r, uint32_t *binding, uint32_t *steps)
 {
     const uint32_t mode = period->params->governor_mode;
     uint32_t active = PMSM_BINDING_NONE;
-    uint32_t found;
+    uint32_t found = 0u;
     pmsm_dq v = r;
     if (mode == PMSM_GOVERNOR_LINE) {
         found = solve_line(period, rows, r, &v, &active, steps);
     } else if (mode == PMSM_GOVERNOR_LINEARISED) {
         found = solve_linearised(rows, rows->count, r, &v, &active, steps);
-    } else {
-        found = solve_exact(rows, rows->count, r, &v, &active, steps);
+        period->flags |= (found == 0u) ? (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK : 0u;
     }
     if (found == 0u) {
-        v = fall_back(period, rows, r, &active, steps);
-        *binding = (active == PMSM_BINDING_EMPTY) ? active : binding_of(rows, active);
-        return v;
+        active = PMSM_BINDING_NONE;
+        found = solve_exact(rows, r, &v, &active, steps);
+    }
+    period->flags |= (found != 1u) ? (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK : 0u;
+    if (found == PMSM_PROJECTION_EMPTY) {
+        *binding = PMSM_BINDING_EMPTY;
+        return pmsm_smallest_voltage(&rows->row[rows->steady], &rows->row[0], steps);
     }
     *binding = binding_of(rows, active);
     return v;
@@ -318,9 +335,9 @@ static void observe(pmsm_period *period, const rows_of_period *rows)
     uint32_t active = PMSM_BINDING_NONE;
     uint32_t steps = 0u;
     pmsm_dq v = period->reference;
-    const uint32_t found = solve_exact(rows, rows->count, period->reference, &v, &active, &steps);
+    const uint32_t found = solve_exact(rows, period->reference, &v, &active, &steps);
     live->kappa = share_of_way(period->state->reference_held, period->reference, v);
-    live->binding = (found != 0u) ? binding_of(rows, active) : (uint32_t)PMSM_BINDING_EMPTY;
+    live->binding = (found == 1u) ? binding_of(rows, active) : (uint32_t)PMSM_BINDING_EMPTY;
     live->iterations += steps;
 }
 
@@ -373,7 +390,7 @@ static uint32_t asks_first(const pmsm_params *params)
 /* An inadmissible request: along the minimum-time direction where that is asked for and possible, else what the solver
  * of the mode finds. Whether row 0 and the steady state can be met at once is settled first: an empty set changes what
  * the direction may do to the current, and the smallest steady-state voltage is then the answer. */
-static pmsm_dq restrain(pmsm_period *period, const rows_of_period *rows, pmsm_dq r, uint32_t *binding, uint32_t *steps)
+static pmsm_dq restrain(pmsm_period *period, rows_of_period *rows, pmsm_dq r, uint32_t *binding, uint32_t *steps)
 {
     pmsm_state *state = period->state;
     const pmsm_row *steady = &rows->row[rows->steady];
@@ -382,6 +399,8 @@ static pmsm_dq restrain(pmsm_period *period, const rows_of_period *rows, pmsm_dq
     }
     pmsm_dq v = pmsm_smallest_voltage(steady, &rows->row[0], steps);
     const uint32_t empty = (pmsm_square(pmsm_voltage_of(steady, v)) > EMPTY_MARGIN * steady->V * steady->V) ? 1u : 0u;
+    rows->smallest_known = 1u;
+    rows->smallest = v;
     *binding = PMSM_BINDING_EMPTY;
     period->flags |= (empty != 0u) ? (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK : 0u;
     if (pmsm_minimum_time(period, &rows->row[0], rows->offset, r, rows->may_start, &v) != 0u) {
@@ -389,7 +408,6 @@ static pmsm_dq restrain(pmsm_period *period, const rows_of_period *rows, pmsm_dq
         *binding = PMSM_BINDING_MINIMUM_TIME;
         return v;
     }
-    state->time_to_go = PMSM_C(0.0);
     return (empty != 0u) ? v : solve(period, rows, r, binding, steps);
 }
 

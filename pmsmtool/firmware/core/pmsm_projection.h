@@ -17,6 +17,7 @@ typedef struct {                  /* the row |M v + c| <= V */
 } pmsm_row;
 
 #define PMSM_PROJECTION_EMPTY 255u /* the rows have no common point */
+#define PMSM_PROJECTION_NONE 255u  /* no row */
 #define PMSM_PROJECTION_ROWS 72u   /* most rows of one call */
 #define PMSM_PROJECTION_ROUNDS 16u /* bound of the outer loop, and of every Newton iteration inside */
 

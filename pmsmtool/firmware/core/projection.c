@@ -4,7 +4,7 @@
  * One active row: Newton's method on 1/|w| = 1/V for its multiplier, monotone from 0. Two active rows: Newton's method
  * for the corner, after a test whether the two can be met at once; the sign of the multipliers tells the right corner.
  */
-#include "pmsm_projection.h"
+#include "active_set.h"
 
 #include "pmsm_math.h"
 
@@ -26,8 +26,7 @@
 #else
 #define CORNER_STEPS 6u
 #endif
-#define ENTRY_TRIALS 4u
-#define NONE 255u
+#define NONE PMSM_PROJECTION_NONE
 
 typedef struct { /* symmetric 2x2 */
     pmsm_real a, b, c; /* [[a, b], [b, c]] */
@@ -182,16 +181,15 @@ static pmsm_dq on_arc(const pmsm_row *first, pmsm_dq a, pmsm_dq b, pmsm_real t)
     return reference_of(first, w);
 }
 
-/* Both rows with equality, 0: there is no such optimum. outside is on the first row and violates the second, whose 
- * voltage is smallest at some point of the first row's disc; if it is too large even there, the two cannot be met at
- * once. On the boundary of the first row the excess of the second grows from that point like a parabola, which tells
+/* Both rows with equality, 0: there is no such optimum. outside is on the first row and violates the second, whose
+ * voltage is smallest at best of all points of the first row's disc; if it is too large even there, the two cannot be met
+ * at once. On the boundary of the first row the excess of the second grows from that point like a parabola, which tells
  * where to start Newton's method: also the short lens of two rows that hardly meet has its corners where the parabola
- * says. Should it go astray, bisection leads it. */
-static uint32_t project_pair(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq outside, pmsm_dq *v,
-                             uint32_t *steps)
+ * says. */
+static uint32_t project_pair(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq outside, pmsm_dq best,
+                             pmsm_dq *v, uint32_t *steps)
 {
     const pmsm_real inverse = PMSM_C(1.0) / (second->V * second->V);
-    const pmsm_dq best = pmsm_smallest_voltage(second, first, steps);
     const pmsm_real depth = -excess(second, inverse, best);
     if (depth < -VIOLATION) {
         return 0u;
@@ -200,23 +198,8 @@ static uint32_t project_pair(const pmsm_row *first, const pmsm_row *second, pmsm
     const pmsm_dq b = pmsm_voltage_of(first, best);
     const pmsm_real within = (depth > PMSM_C(0.0)) ? depth : PMSM_C(0.0);
     const pmsm_real share = PMSM_SQRT(within / (within + excess(second, inverse, outside)));
-    pmsm_real low = PMSM_C(0.0);
-    pmsm_real high = PMSM_C(1.0);
-    pmsm_real t = PMSM_C(1.0) - share;
-    for (uint32_t k = 0u; k < ENTRY_TRIALS; k++) {
-        const pmsm_dq start = on_arc(first, a, b, t);
-        *v = start;
-        if (find_corner(first, second, r, v, steps) != 0u) {
-            return 1u;
-        }
-        if (excess(second, inverse, start) > PMSM_C(0.0)) {
-            low = t;
-        } else {
-            high = t;
-        }
-        t = PMSM_C(0.5) * (low + high);
-    }
-    return 0u;
+    *v = on_arc(first, a, b, PMSM_C(1.0) - share);
+    return find_corner(first, second, r, v, steps);
 }
 
 pmsm_dq pmsm_smallest_voltage(const pmsm_row *goal, const pmsm_row *limit, uint32_t *steps)
@@ -257,14 +240,7 @@ pmsm_dq pmsm_smallest_voltage(const pmsm_row *goal, const pmsm_row *limit, uint3
 
 /* --- active set -------------------------------------------------------------------------------------------------- */
 
-typedef struct {
-    const pmsm_row *row;
-    pmsm_real inverse[PMSM_PROJECTION_ROWS]; /* 1/V^2 */
-    uint32_t count;
-    uint32_t basis[2]; /* active rows, NONE when free */
-} active_set;
-
-static uint32_t most_violated(const active_set *set, pmsm_dq v, pmsm_real *worst)
+static uint32_t most_violated(const pmsm_active_set *set, pmsm_dq v, pmsm_real *worst)
 {
     uint32_t index = 0u;
     *worst = excess(&set->row[0], set->inverse[0], v);
@@ -279,21 +255,22 @@ static uint32_t most_violated(const active_set *set, pmsm_dq v, pmsm_real *worst
 }
 
 /* Does v satisfy the active rows? */
-static uint32_t satisfies(const active_set *set, uint32_t k, pmsm_dq v)
+static uint32_t satisfies(const pmsm_active_set *set, uint32_t k, pmsm_dq v)
 {
     return (k == NONE || excess(&set->row[k], set->inverse[k], v) <= VIOLATION) ? 1u : 0u;
 }
 
 /* The new basis after row k turned out violated in v: k alone, or k with one of the old rows. 0: there is none. */
-static uint32_t exchange(active_set *set, uint32_t k, pmsm_dq r, pmsm_dq *v, uint32_t *steps)
+static uint32_t exchange(pmsm_active_set *set, uint32_t k, uint32_t *steps)
 {
+    const pmsm_dq r = set->r;
     const pmsm_dq alone = pmsm_project_row(&set->row[k], r, steps);
     const uint32_t inside = (alone.d == r.d && alone.q == r.q) ? 1u : 0u; /* r itself is on neither boundary then */
     const uint32_t met[2] = {satisfies(set, set->basis[0], alone), satisfies(set, set->basis[1], alone)};
     if ((met[0] & met[1]) != 0u) {
         set->basis[0] = k;
         set->basis[1] = NONE;
-        *v = alone;
+        set->v = alone;
         return 1u;
     }
     for (uint32_t j = 0u; j < 2u; j++) {
@@ -301,46 +278,68 @@ static uint32_t exchange(active_set *set, uint32_t k, pmsm_dq r, pmsm_dq *v, uin
         if (met[j] != 0u) {
             continue;
         }
-        const pmsm_row *first = &set->row[(inside != 0u) ? other : k];
-        const pmsm_row *second = &set->row[(inside != 0u) ? k : other];
+        const uint32_t first = (inside != 0u) ? other : k;
+        const uint32_t second = (inside != 0u) ? k : other;
+        const uint32_t known = (first == set->limit && second == set->goal) ? 1u : 0u;
+        const pmsm_dq best =
+            (known != 0u) ? set->smallest : pmsm_smallest_voltage(&set->row[second], &set->row[first], steps);
         pmsm_dq x;
-        if (project_pair(first, second, r, (inside != 0u) ? *v : alone, &x, steps) != 0u &&
+        if (project_pair(&set->row[first], &set->row[second], r, (inside != 0u) ? set->v : alone, best, &x,
+                         steps) != 0u &&
             satisfies(set, set->basis[1u - j], x) != 0u) {
             set->basis[0] = k;
             set->basis[1] = other;
-            *v = x;
+            set->v = x;
             return 1u;
         }
     }
     return 0u;
 }
 
-uint32_t pmsm_project_rows(const pmsm_row *rows, uint32_t count, pmsm_dq r, pmsm_dq *v, uint32_t *active,
-                           uint32_t *steps)
+void pmsm_projection_begin(pmsm_active_set *set, const pmsm_row *rows, pmsm_dq r)
 {
-    active_set set;
-    pmsm_dq x = r;
-    set.row = rows;
-    set.count = count;
-    set.basis[0] = NONE;
-    set.basis[1] = NONE;
-    for (uint32_t k = 0u; k < count; k++) {
-        set.inverse[k] = PMSM_C(1.0) / (rows[k].V * rows[k].V);
+    set->row = rows;
+    set->count = 0u;
+    set->basis[0] = NONE;
+    set->basis[1] = NONE;
+    set->limit = NONE;
+    set->goal = NONE;
+    set->smallest = r;
+    set->r = r;
+    set->v = r;
+}
+
+uint32_t pmsm_projection_extend(pmsm_active_set *set, uint32_t count, uint32_t *steps)
+{
+    for (uint32_t k = set->count; k < count; k++) {
+        set->inverse[k] = PMSM_C(1.0) / (set->row[k].V * set->row[k].V);
     }
+    set->count = count;
     for (uint32_t round = 0u; round < PMSM_PROJECTION_ROUNDS; round++) {
         pmsm_real worst;
-        const uint32_t k = most_violated(&set, x, &worst);
-        const uint32_t again = (k == set.basis[0] || k == set.basis[1]) ? 1u : 0u;
+        const uint32_t k = most_violated(set, set->v, &worst);
+        const uint32_t again = (k == set->basis[0] || k == set->basis[1]) ? 1u : 0u;
         if (worst <= VIOLATION || (again != 0u && worst <= STALL)) {
-            *v = x;
-            *active = set.basis[0];
-            return ((set.basis[0] != NONE) ? 1u : 0u) + ((set.basis[1] != NONE) ? 1u : 0u);
+            return ((set->basis[0] != NONE) ? 1u : 0u) + ((set->basis[1] != NONE) ? 1u : 0u);
         }
-        if (again != 0u || exchange(&set, k, r, &x, steps) == 0u) {
+        if (again != 0u || exchange(set, k, steps) == 0u) {
             return PMSM_PROJECTION_EMPTY;
         }
     }
     return PMSM_PROJECTION_EMPTY;
+}
+
+uint32_t pmsm_project_rows(const pmsm_row *rows, uint32_t count, pmsm_dq r, pmsm_dq *v, uint32_t *active,
+                           uint32_t *steps)
+{
+    pmsm_active_set set;
+    pmsm_projection_begin(&set, rows, r);
+    const uint32_t status = pmsm_projection_extend(&set, count, steps);
+    if (status != PMSM_PROJECTION_EMPTY) {
+        *v = set.v;
+        *active = set.basis[0];
+    }
+    return status;
 }
 
 /* --- half planes ------------------------------------------------------------------------------------------------- */
