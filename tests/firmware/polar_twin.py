@@ -121,6 +121,8 @@ class PolarTwin(Twin):
         det = k0 * n0 + w0 * n1 * n1
         b2, b1 = (c2 * n0 - n1 * c1) / det, (k0 * c1 + w0 * n1 * c2) / det
         a = c3 - n1 * b2
+        if not a > 0:
+            return ZERO, ZERO, ZERO, sigma
         K_i = b0 / a
         K_p = (b1 - K_i) / a
         return K_p, K_i, (b2 - K_p) / a, a
@@ -146,13 +148,14 @@ class PolarTwin(Twin):
         self.phase_memory = Pid(self.delta, last, last)
         self.amplitude_memory = Pid(self.amplitude, ZERO, ZERO)
 
-    def plant(self, w: np.float32, i_q: np.float32, V_a: np.float32) -> tuple[np.float32, np.float32, np.float32]:
+    def plant(self, w: np.float32, i_q: np.float32, V_a: np.float32) -> tuple[np.float32, np.float32]:
+        """Sine of the equilibrium's phase, and w cos - alpha sin."""
         X = w * self.L
         Z = np.sqrt(self.R * self.R + X * X)
         s = clamp((Z * Z * i_q + w * self.R * self.psi) / (V_a * Z), f(-0.98), f(0.98))
         c = np.sqrt(ONE - s * s)
         sine, cosine = (s * X - c * self.R) / Z, (c * X + s * self.R) / Z
-        return sine, cosine, w * cosine - self.alpha * sine
+        return sine, w * cosine - self.alpha * sine
 
     def phase_law(self) -> None:
         w, mirror = abs(self.omega), f(-1) if self.omega < 0 else ONE
@@ -162,18 +165,18 @@ class PolarTwin(Twin):
         i = self.i_model[0], mirror * self.i_model[1]
         q = clamp(mirror * self.reference[1], (-reach - emf) / power, (reach - emf) / power)
         free = bool(self.options & NO_ANTI_WINDUP)
-        V_a, schedule = self.V, self.V
+        V_a, schedule, w_s = self.V, self.V, max(w, self.alpha)
         if self.mode == PROPOSED:
             schedule = max(self.amplitude, f(1e-3) * self.V)
-            sine, _, lever = self.plant(w, q, schedule)
-            gains = self.place(w, self["polar.sigma_amplitude_rad_s"], -sine / self.L, lever / self.L)
+            sine, lever = self.plant(w_s, q, schedule)
+            gains = self.place(w_s, self["polar.sigma_amplitude_rad_s"], -sine / self.L, lever / self.L)
             e = self.reference[0] - i[0]
             output, kept = self.advance(gains, self.amplitude_memory, e, e)
             V_a = clamp(output, ZERO, self.V)
             self.amplitude_memory = kept if V_a == output or free else self.amplitude_memory
-        sine, _, lever = self.plant(w, q, schedule)
+        sine, lever = self.plant(w_s, q, schedule)
         scale = schedule / self.L
-        gains = self.place(w, self["polar.sigma_phase_rad_s"], -scale * sine, scale * lever)
+        gains = self.place(w_s, self["polar.sigma_phase_rad_s"], -scale * sine, scale * lever)
         output, kept = self.advance(gains, self.phase_memory, q - i[1], self.share() * q - i[1])
         delta = clamp(output, -QUARTER, QUARTER)
         self.phase_memory = kept if delta == output or free else self.phase_memory

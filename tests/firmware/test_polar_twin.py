@@ -46,6 +46,7 @@ CASES = {
     "proposed without anti-windup": (values(PROPOSED, NO_ANTI_WINDUP | ON_MEASUREMENT), -800.0, 14.0),
     "proposed, torque out of reach": (values(PROPOSED, ON_MEASUREMENT), 1000.0, 39.0),
     "proposed, switched": (values(PROPOSED, SWITCH), 800.0, 14.0),
+    "proposed near standstill": (values(PROPOSED, ON_MEASUREMENT), 60.0, 3.0),
     "linear": (values(LINEAR), 300.0, 6.0),
     "linear at standstill": (values(LINEAR), 0.0, 6.0),
     "printed": (values(PRINTED), 300.0, 3.0),

@@ -242,6 +242,9 @@ void pmsm_polar_demand(pmsm_period *period)
 {
     const uint32_t mode = period->params->polar_mode;
     const polar_plant p = plant_of(period, is_phase_law(mode));
+    if (!(p.V > PMSM_C(0.0))) {
+        return; /* no link voltage: no phase to speak of */
+    }
     if ((period->params->polar_options & PMSM_POLAR_PREDICT) != 0u && period->params->inverter_delay_periods >= 1.0F) {
         period->i_model = pmsm_predict_current(period);
     }

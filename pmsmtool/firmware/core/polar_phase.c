@@ -35,8 +35,8 @@ static equilibrium find_equilibrium(const polar_plant *p, pmsm_real i_q, pmsm_re
     return e;
 }
 
-/* The i_q asked for, cut to what full amplitude can hold: beyond it the phase would run past the torque's maximum, where
- * the loop's sign turns, and stay there. */
+/* The i_q asked for, cut to what full amplitude can hold: beyond it the phase would run past the torque's maximum,
+ * where the loop's sign turns, and stay there. */
 static pmsm_real within_reach(const polar_plant *p, pmsm_real i_q)
 {
     const pmsm_real X = p->omega * p->L;
@@ -46,7 +46,16 @@ static pmsm_real within_reach(const polar_plant *p, pmsm_real i_q)
     return pmsm_clamp(i_q, (-reach - back_emf) / square, (reach - back_emf) / square);
 }
 
-/* Gains that place both pole pairs; (7), (8), (11). */
+/* The placement is singular at standstill (its determinant is omega^2): the gains are those of omega = R/L at least,
+ * below which the phase is not the input for i_q any more. */
+static polar_plant schedule_plant(const polar_plant *plant)
+{
+    polar_plant p = *plant;
+    p.omega = (p.omega > p.alpha) ? p.omega : p.alpha;
+    return p;
+}
+
+/* Gains that place both pole pairs; (7), (8), (11). No gain at all where they cannot be placed: the input is held. */
 static pid place(const polar_plant *p, pmsm_real sigma, pmsm_real n1, pmsm_real n0)
 {
     const pmsm_real w0 = p->alpha * p->alpha + p->omega * p->omega;
@@ -61,6 +70,10 @@ static pid place(const polar_plant *p, pmsm_real sigma, pmsm_real n1, pmsm_real 
     const pmsm_real b1 = (k0 * c1 + w0 * n1 * c2) / det;
     pid C;
     C.a = c3 - n1 * b2;
+    if (!(C.a > PMSM_C(0.0))) {
+        const pid none = {PMSM_C(0.0), PMSM_C(0.0), PMSM_C(0.0), sigma};
+        return none;
+    }
     C.K_i = b0 / C.a;
     C.K_p = (b1 - C.K_i) / C.a;
     C.K_d = (b2 - C.K_p) / C.a;
@@ -173,14 +186,15 @@ void pmsm_polar_phase(pmsm_period *period, const polar_plant *plant)
     const pmsm_real mirror = (period->omega_e < PMSM_C(0.0)) ? PMSM_C(-1.0) : PMSM_C(1.0);
     const pmsm_dq i = {period->i_model.d, mirror * period->i_model.q};
     const pmsm_dq target = {period->reference.d, within_reach(plant, mirror * period->reference.q)};
+    const polar_plant scheduled = schedule_plant(plant);
     pmsm_real V_a = plant->V;
     pmsm_real V_schedule = plant->V;
     if (period->params->polar_mode == PMSM_POLAR_PROPOSED) {
         const pmsm_real floor_V = SMALLEST_SHARE * plant->V;
         V_schedule = (memory[POLAR_AMPLITUDE] > floor_V) ? memory[POLAR_AMPLITUDE] : floor_V;
-        V_a = amplitude_step(period, plant, i, target, V_schedule);
+        V_a = amplitude_step(period, &scheduled, i, target, V_schedule);
     }
-    const pmsm_real delta = phase_step(period, plant, i, target, V_schedule);
+    const pmsm_real delta = phase_step(period, &scheduled, i, target, V_schedule);
     pmsm_real sine;
     pmsm_real cosine;
     pmsm_sincos(delta, &sine, &cosine);
