@@ -103,7 +103,9 @@ def declared(drive: MachineFile) -> MachineFile:
     step = 2.0 * float(settings["adc_full_scale_apk"]) / 2**12
     noise = math.sqrt(2.0 / 3.0) * math.hypot(float(settings["sensor_noise_apk"]), step / math.sqrt(12.0))
     dead, U_dc, T_s = drive.inverter.dead_time_s, drive.inverter.U_dc_v, drive.inverter.T_s
-    plateau = U_dc * dead / T_s + 0.5 * (float(settings["device_drop_v"]) + float(settings["diode_drop_v"]))
+    plateau = U_dc * dead / T_s
+    if float(settings["device_drop_v"]) > 0.0:  # of a MOSFET bridge the diodes conduct in the dead time only
+        plateau += 0.5 * (float(settings["device_drop_v"]) + float(settings["diode_drop_v"]))
     knee = 2.0 * float(settings["output_capacitance_f"]) * U_dc / dead  # charges a leg's output within the dead time
     offset = float(settings["encoder_offset_rad"]) + OFFSET_STD_RAD * float(rng.standard_normal())
     return replace(

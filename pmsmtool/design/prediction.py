@@ -29,6 +29,8 @@ MODEL_ALLOWANCE = 1.3
 """Half width over that of the simulated runs, for what the averaged model of the inverter leaves out."""
 FLOOR_SHARE = 0.005
 """Standard deviation that every point has at least, of the scale of its signal: ripple, quantisation, cogging."""
+LEAST_FACTOR = 2.0
+"""Half width over the standard deviation is never less: a signal that no drawn parameter moves keeps its floor."""
 NORMALISING_QUANTILE = 0.9
 """Quantile of the runs' largest deviations that makes signals comparable before the largest is taken."""
 NEARBY = 128
@@ -211,7 +213,7 @@ def _factors(deviations: Mapping[Key, Array]) -> dict[Key, float]:
     """Return half widths over standard deviations such that the band of all signals together holds every run."""
     normal = {key: float(np.quantile(v, NORMALISING_QUANTILE)) for key, v in deviations.items()}
     common = max((float(np.max(v)) / normal[key] for key, v in deviations.items()), default=1.0)
-    return {key: MODEL_ALLOWANCE * common * q for key, q in normal.items()}
+    return {key: max(LEAST_FACTOR, MODEL_ALLOWANCE * common * q) for key, q in normal.items()}
 
 
 def _spread(values: Array, floor: float) -> tuple[Array, Array]:

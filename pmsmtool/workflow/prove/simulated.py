@@ -111,6 +111,15 @@ def _inertia(factor: float) -> Change:
     return change
 
 
+def _saturated(setup: Setup, params: Params) -> None:
+    setup.machine.L_d *= 0.7
+    setup.machine.L_q *= 0.7
+
+
+def _compensation(setup: Setup, params: Params) -> None:
+    params.inverter_V_dead_v *= 2.0
+
+
 DEFECTS: Mapping[str, Defect] = {
     "gain_low": Defect("the gain of the current loops is lower than designed", _gain(0.8)),
     "gain_high": Defect("the gain of the current loops is higher than designed", _gain(1.25)),
@@ -119,6 +128,8 @@ DEFECTS: Mapping[str, Defect] = {
     "pole_pairs_high": Defect("wrong pole pairs: the drive counts too many", _pole_pairs(1)),
     "pole_pairs_low": Defect("wrong pole pairs: the drive counts too few", _pole_pairs(-1)),
     "voltage": Defect("the voltage is too low: the DC link falls below what it shows at rest", _link(0.85)),
+    "inductance": Defect("less inductance than designed for, as when the machine saturates", _saturated),
+    "compensation": Defect("the dead-time compensation does not fit the inverter", _compensation),
     "inertia_high": Defect("more inertia than designed for", _inertia(1.4)),
     "inertia_low": Defect("less inertia than designed for", _inertia(0.7)),
 }
@@ -243,7 +254,7 @@ def predict_proof(
     wrong = {
         name: {e.name: drives.respond(e, defect, min(FAULT_RUNS, runs)) for e in plan.experiments}
         for name, defect in DEFECTS.items()
-        if not (name == "pole_pairs_low" and design["motor.pole_pairs"] < 2)
+        if _possible(name, design)
     }
     T_s = design.machine.inverter.T_s
     facts = {
@@ -269,6 +280,12 @@ def predict_proof(
         faults={name: (DEFECTS[name].text, _judged(plan.experiments, values)) for name, values in wrong.items()},
         facts=facts,
     )  # fmt: skip
+
+
+def _possible(defect: str, design: Design) -> bool:
+    if defect == "pole_pairs_low":
+        return design["motor.pole_pairs"] >= 2
+    return defect != "compensation" or design["inverter.deadtime_compensation"] != 0.0
 
 
 def _judged(experiments: Sequence[Experiment], responses: Mapping[str, Array]) -> Runs:
