@@ -1,4 +1,4 @@
-"""``pmsmtool commission``: from an unknown machine to flashed and checked parameters, in one command."""
+"""``pmsmtool commission``: from an unknown machine to flashed and proven parameters, in one command."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ def commission_command(
     sensor_tol: float,
     **design: Any,
 ) -> None:
-    """Identify the machine, design its control, make the look-up table, judge the margins, flash, verify, report.
+    """Identify the machine, design its control, make the table, judge the margins, flash, verify, prove, report.
 
     MACHINE is a machine file with what is known (ratings, limits); without it the drive's own ratings are the start.
-    Two consents are asked: the motion envelope before anything moves, the list of differences before anything is
-    written. The chain ends at the first criterion that is not met, with the drive off and as it was; --resume goes on
+    Consents are asked one by one: the motion envelope before anything moves, the list of differences before anything
+    is written, and the envelope of the proof, which runs the flashed drive up to its designed limits. The chain ends at the first criterion that is not met, with the drive off and as it was; --resume goes on
     there. A simulated drive starts from factory memory unless its channel names a memory file (nv=).
     """
     from pmsmtool.cli.flash_session import checked_identity

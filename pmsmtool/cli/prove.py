@@ -46,7 +46,7 @@ def prove_command(
     """Predict the response of a flashed DESIGN, run it on the machine, compare; exit code 1 outside the 95 % band.
 
     DESIGN is design.toml or a run directory; a proof of a run goes into that run. The drive must hold the design's
-    bytes. The band (from the intervals of the machine in the design) is printed, and its SHA-256, before the first step:
+    bytes. The band (from the intervals of the machine in the design) and its SHA-256 are printed before the first step:
     a speed step, current steps of two sizes and both signs, a governed unreachable reference, entry into field
     weakening. The shaft must carry what the design was made for. Nothing is stored in the drive.
     """

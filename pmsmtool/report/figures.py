@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.design.prediction import Prediction
 from pmsmtool.design.sampled_loop import LoopMargins, SampledLoop
 from pmsmtool.estimators.axis_fit import SKIP_SAMPLES, AxisFit
 from pmsmtool.estimators.flux_linkage import I_D_SPREAD, FluxResult, mean_inverter_error
@@ -271,6 +272,38 @@ def band_figure(rows: Mapping[str, tuple[float, float, float, float]], unit: str
             axes.plot([limit, limit], [y - 0.35, y + 0.35], color=_MODEL)
     axes.set_yticks(range(len(rows)), list(rows))
     axes.set(xlabel=unit, ylim=(len(rows) - 0.5, -0.5))
+    return Figure(svg(canvas), caption)
+
+
+_SIGNAL_LABELS = {"i_d_a": "i_d / A", "i_q_a": "i_q / A", "omega_e_rad_s": "speed / rad/s (el)"}
+
+
+def proof_figure(prediction: Prediction, experiment: str, measured: Mapping[str, Vector], caption: str) -> Figure:
+    """Draw the measured response of one experiment over its predicted band.
+
+    Parameters
+    ----------
+    prediction : Prediction
+        As committed before the first step.
+    experiment : str
+        One of its experiments.
+    measured : mapping of str to ndarray, shape (n,)
+        Response by signal; without one only the band is drawn.
+    """
+    signals = prediction.signals(experiment)
+    canvas, panels = _canvas(len(signals), 1, height=0.3 + 0.45 * len(signals), sharex=True)
+    t_ms = 1e3 * prediction.t_s[experiment]
+    for axes, signal in zip(panels, signals, strict=True):
+        band = prediction.bands[experiment, signal]
+        axes.fill_between(t_ms, band.low, band.high, color=_LIMIT, alpha=0.4, lw=0.0, label="predicted 95 % band")
+        if signal in measured:
+            outside = (measured[signal] < band.low) | (measured[signal] > band.high)
+            axes.plot(t_ms, measured[signal], color=_MEASURED, label="measured")
+            if np.any(outside):
+                axes.plot(t_ms[outside], measured[signal][outside], "x", ms=4, color=_MODEL, label="outside")
+        axes.set_ylabel(_SIGNAL_LABELS.get(signal, signal))
+    panels[0].legend(loc="best")
+    panels[-1].set_xlabel("time / ms")
     return Figure(svg(canvas), caption)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from pmsmtool.units import format_estimate, format_quantity
 
-COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify")
+COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
 """Stages of a full commissioning; one that is missing keeps the verdict open."""
 
 

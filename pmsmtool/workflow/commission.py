@@ -1,4 +1,4 @@
-"""The whole chain: identify, tune, lut, margins, flash, verify; one run directory, resumable at every stage.
+"""The whole chain: identify, tune, lut, margins, flash, verify, prove; one run directory, resumable at every stage.
 
 A stage that is recorded as passed is not run again. The chain ends at the first stage that does not pass, whatever
 it had done is recorded, and the drive is off: experiments run inside the guard, a download rolls back by itself, and
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from pmsmtool import __version__
+from pmsmtool.design.design_file import load_design
 from pmsmtool.design.lookup_design import LookupRequest
 from pmsmtool.design.margins import MarginRequest
 from pmsmtool.design.tune_request import TuneRequest
@@ -36,12 +37,13 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
 from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplate_of
+from pmsmtool.workflow.prove.stage import ProofRequest, not_proven, prove_stage
 from pmsmtool.workflow.report_page import report_page
 from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, Status, new_record
 
 FROM_TABLE = TuneRequest(field_weakening="lookup")
 """The chain's default design: the drive takes its current references from the table the chain makes and checks."""
-STAGES = ("identify", "tune", "lut", "margins", "flash", "verify")
+STAGES = ("identify", "tune", "lut", "margins", "flash", "verify", "prove")
 
 
 class Person(Protocol):
@@ -68,6 +70,11 @@ class Progress(Protocol):
 
     def end(self, stage: Stage, number: int, count: int) -> None:
         """Tell how the stage ended."""
+
+
+def proof_within(asked: IdentifyRequest) -> ProofRequest:
+    """Return the proof that keeps within what identification was allowed."""
+    return ProofRequest(asked.i_max_apk, asked.speed_max_rad_s, asked.shaft, asked.load, asked.brake)
 
 
 def due_stages(run: RunDirectory, record: RunRecord) -> tuple[str, ...]:
@@ -128,7 +135,7 @@ class Commissioning:
         Is told.
     nameplate : MachineFile, optional
         What is known of the machine; the drive's own ratings and set when not given.
-    identify, tune, lookup, margins
+    identify, tune, lookup, margins, prove
         What is asked.
     """
 
@@ -141,6 +148,7 @@ class Commissioning:
     tune: TuneRequest = FROM_TABLE
     lookup: LookupRequest = field(default_factory=LookupRequest)
     margins: MarginRequest = field(default_factory=MarginRequest)
+    prove: ProofRequest | None = None
 
     def carry_out(self) -> None:
         """Run what is due.
@@ -206,12 +214,18 @@ class Commissioning:
             "margins": lambda: margins_stage(self.run, self.margins),
             "flash": lambda: flash_stage(self.run, self.drive, self.person.allow_writing, say),
             "verify": lambda: verify_stage(self.run, self.drive),
+            "prove": self._prove,
         }
 
     def _identify(self) -> Stage:
         identity = self.drive.identity
         known = self.nameplate or nameplate_of(self.drive, identity.name or f"drive {identity.serial:#010x}")
         return identify_stage(self.run, self.drive, known, self.identify, self.person.allow_motion, self.progress.say)
+
+    def _prove(self) -> Stage:
+        design = load_design(self.run.path / "design.toml")
+        asked = self.prove or proof_within(self.identify)
+        return prove_stage(self.run, self.drive, design, asked, self.person.allow_motion, self.progress.say)
 
     def _make_sure(self) -> None:
         """Leave the machine off, confirmed, where this program may have energised it."""
@@ -242,6 +256,8 @@ def _not_good(stage: Stage, run: RunDirectory) -> PmsmtoolError:
         return IdentificationError("E_NOT_ACCEPTED", what, where=where)
     if stage.name == "verify":
         return VerifyMismatch(what, where=where, hint="flash again: commission --resume " + where)
+    if stage.name == "prove":
+        return not_proven(stage, run)
     return CheckFailed(what, where=where, hint=f"pmsmtool report {where}")
 
 
@@ -298,7 +314,7 @@ def commission(
     identify: IdentifyRequest | None = None,
     tune: TuneRequest | None = None,
 ) -> RunDirectory:
-    """Take a drive from unknown machine to verified parameters, in a new run directory with its report.
+    """Take a drive from unknown machine to proven parameters, in a new run directory with its report.
 
     Parameters
     ----------
@@ -307,7 +323,7 @@ def commission(
     runs : Path
         Folder of the run directories.
     person : Person
-        Gives the two consents.
+        Consents to every motion and to the differences.
     progress : Progress, optional
         Is told.
     nameplate : MachineFile, optional

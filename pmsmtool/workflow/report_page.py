@@ -17,6 +17,7 @@ import numpy as np
 
 from pmsmtool.design.current_loop import AxisPlant, CurrentGains, Method, axis_loop
 from pmsmtool.design.design_file import Design, load_design
+from pmsmtool.design.prediction import judge
 from pmsmtool.design.sampled_loop import SampledLoop
 from pmsmtool.design.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, speed_loop
 from pmsmtool.errors import IdentificationError
@@ -26,6 +27,7 @@ from pmsmtool.report.report import Change, Figure, Verdict, render, verdict_of
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, shots_of
 from pmsmtool.workflow.identify import stored_traces
+from pmsmtool.workflow.prove.stage import read_proof, responses
 from pmsmtool.workflow.run_directory import RunDirectory, RunRecord
 
 NOT_CHECKED = (
@@ -54,8 +56,10 @@ def report_page(path: Path) -> str:
         *_design_figures(run.path / "design.toml"),
         *_margin_figures(record),
         *_table_figures(run.path / "lut.npz"),
+        *_proof_figures(run, record),
     ]
-    return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=NOT_CHECKED)
+    not_checked = NOT_CHECKED[1:] if record.passed("prove") else NOT_CHECKED
+    return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=not_checked)
 
 
 def verdict(path: Path) -> Verdict:
@@ -166,6 +170,23 @@ def _table_figures(path: Path) -> Iterator[Figure]:
     binding = [str(name) for name in np.unique(arrays["binding"])]
     I_max = float(json.loads(str(arrays["meta"]))["I_max_apk"])
     yield figures.envelope_figure(arrays["largest_speed_rpm"], arrays["largest_torque_nm"], lines, I_max, binding)
+
+
+def _proof_figures(run: RunDirectory, record: RunRecord) -> Iterator[Figure]:
+    """Draw the latest proof: what was committed before the first step, and what was measured, verdict first."""
+    stage = record.stage("prove")
+    names = [name for name in (stage.files if stage else {}) if name.endswith("/prediction.npz")]
+    if not names or not (run.path / names[0]).is_file():
+        return
+    prediction, traces = read_proof((run.path / names[0]).parent)
+    found = responses(traces, prediction)
+    judgement = judge(prediction, found)
+    for number, (experiment, text) in enumerate(zip(prediction.t_s, prediction.facts["experiments"], strict=True), 1):
+        measured = {signal: values for (name, signal), values in found.items() if name == experiment}
+        shares = [line.share for line in judgement.seen if line.what.startswith(f"{experiment}: ")]
+        verdict = "not run" if not shares else "inside its band" if max(shares) <= 1.0 else "OUTSIDE its band"
+        caption = f"Proof {number}, {verdict}: {text}. Grey: the band predicted and committed before the first step."
+        yield figures.proof_figure(prediction, experiment, measured, caption)
 
 
 def _changes(record: RunRecord) -> Sequence[Change]:
