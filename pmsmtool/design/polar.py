@@ -110,12 +110,18 @@ def equilibrium_at_amplitude(machine: SurfaceMachine, omega_e: float, i_q: float
     return Equilibrium(omega_e, V_a, delta, current.real, current.imag, reachable)
 
 
+def largest_i_q(machine: SurfaceMachine, omega_e: float, V_a: float) -> float:
+    """Return the largest i_q (A peak) that amplitude ``V_a`` holds, at delta = atan2(omega_e L, R)."""
+    size = abs(machine.impedance(omega_e))
+    return V_a / size - omega_e * machine.R_s_ohm * machine.psi_f_wb / size**2
+
+
 def equilibrium_without_i_d(machine: SurfaceMachine, omega_e: float, i_q: float, V_max: float) -> Equilibrium:
     """Return the steady state of least loss: i_d = 0 while the voltage suffices, else amplitude ``V_max``."""
     v = machine.impedance(omega_e) * 1j * i_q + 1j * omega_e * machine.psi_f_wb
     if abs(v) > V_max:
         return equilibrium_at_amplitude(machine, omega_e, i_q, V_max)
-    return Equilibrium(omega_e, abs(v), cmath.phase(v / 1j) if v else 0.0, 0.0, i_q, True)
+    return Equilibrium(omega_e, abs(v), math.atan2(-v.real, v.imag) if v else 0.0, 0.0, i_q, True)
 
 
 def linearised(machine: SurfaceMachine, point: Equilibrium) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from pmsmtool.design.design_file import DesignValue, Scalar
 from pmsmtool.design.lookup_table import RPM
 from pmsmtool.design.polar import (
@@ -16,7 +18,9 @@ from pmsmtool.design.polar import (
     SurfaceMachine,
     conditioning,
     design_at,
+    largest_i_q,
 )
+from pmsmtool.design.polar_map import stability_map
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
@@ -43,8 +47,24 @@ OMEGA_C_PER_PERIOD, OMEGA_DOB_PER_PERIOD = 0.125, 0.04
 V_REF_RATIO = 0.97
 """Reference amplitude of the unified law over V_max: smoother torque on speed ramps than 1."""
 
-ON_MEASUREMENT, PREDICT = 1, 4
-"""Bits of ``polar.options``."""
+ON_MEASUREMENT, NO_ANTI_WINDUP, PREDICT, LINEAR_RANGE = 1, 2, 4, 8
+"""Bits of ``polar.options``: P and D on the measurement, (ablation), prediction, switch to the regularised law."""
+
+PHASE_LAWS = ("conventional", "proposed")
+"""Laws of section III: the phase is the input for i_q, which needs speed."""
+
+NEEDS_SWITCH = (
+    "polar: the phase is no input for i_q at standstill; inside the voltage limit the drive switches to the"
+    " regularised law (polar.options, bit 3), whose transition shows in the torque where the current is noisy"
+)
+LINEAR_ONLY = (
+    "polar: a law of the linear range; where the voltage limit is reached it loses torque, above base speed down to the"
+    " wrong sign. The unified law covers both ranges"
+)
+
+MAP_SPEED_SHARES = (0.25, 0.5, 0.75, 1.0)
+MAP_CURRENT_SHARES = (-1.0, -0.5, 0.1, 0.5, 1.0)
+"""Grid over base speed and rated current on which the true loops are judged."""
 
 DESIGN_SPEED_SHARE = 0.8
 """Speed at which the placed loops are looked at, over base speed: inside the linear range, voltage well above zero."""
@@ -67,10 +87,10 @@ def polar_values(
     except DesignInfeasible:
         if law in SURFACE_ONLY:
             raise
-    options = (PREDICT if source.inverter.delay_periods >= 1.0 else 0) | ON_MEASUREMENT
+    options, how = _options(source.inverter.delay_periods, law)
     values = {
         "polar.mode": DesignValue(LAWS[law], f"{law}, as asked for"),
-        "polar.options": DesignValue(options, "P and D on the measurement, prediction over the delay"),
+        "polar.options": DesignValue(options, how),
         "polar.sigma_phase_rad_s": DesignValue(PHASE_SIGMA_RAD_S, "real part of the placed poles"),
         "polar.sigma_amplitude_rad_s": DesignValue(AMPLITUDE_SIGMA_RAD_S, "real part of the placed poles"),
         "polar.tau_s": DesignValue(TAU_PERIODS * T_s, f"{TAU_PERIODS:g} T_s"),
@@ -82,9 +102,20 @@ def polar_values(
         "governor.mode": DesignValue(0, "off: the polar law limits the voltage itself"),
         "field_weakening.mode": DesignValue(0, "off: the polar law weakens the field itself"),
     }
+    notes = (NEEDS_SWITCH,) if law in PHASE_LAWS else (LINEAR_ONLY,) if law != "unified" else ()
     if surface is None:
-        return values, {}, ("polar: L_d and L_q differ; the placed loops of the paper do not apply, the law does",)
-    return values, _facts(surface, rated, source.inverter.V_max_v), ()
+        differ = "polar: L_d and L_q differ; the placed loops of the paper do not apply, the law does"
+        return values, {}, (differ, *notes)
+    return values, _facts(surface, rated, source.inverter.V_max_v), notes
+
+
+def _options(delay_periods: float, law: str) -> tuple[int, str]:
+    options, parts = ON_MEASUREMENT, ["P and D on the measurement"]
+    if delay_periods >= 1.0:
+        options, parts = options | PREDICT, [*parts, "prediction over the delay"]
+    if law in PHASE_LAWS:
+        options, parts = options | LINEAR_RANGE, [*parts, "regularised law inside the voltage limit"]
+    return options, ", ".join(parts)
 
 
 def _facts(surface: SurfaceMachine, rated: Ratings, V_max: float) -> dict[str, Scalar]:
@@ -93,8 +124,17 @@ def _facts(surface: SurfaceMachine, rated: Ratings, V_max: float) -> dict[str, S
     if omega <= 0.0:
         return {}
     found = design_at(surface, omega, rated.I_nom_apk, V_max)
-    torque = 1.5 * surface.pole_pairs * surface.psi_f_wb * rated.I_nom_apk
+    per_ampere = 1.5 * surface.pole_pairs * surface.psi_f_wb
+    torque = per_ampere * rated.I_nom_apk
+    speeds = [share * rated.base_speed_rpm for share in MAP_SPEED_SHARES]
+    torques = [share * torque for share in MAP_CURRENT_SHARES]
+    slowest = stability_map(surface, V_max, speeds, torques)
+    linear_range = slowest[~np.isnan(slowest)]
+    anywhere = {"polar_slowest_pole_anywhere_rad_s": float(linear_range.max())} if len(linear_range) else {}
     return {
+        "polar_V_a_max_v": V_max,
+        "polar_largest_torque_nm": per_ampere * largest_i_q(surface, omega, V_max),
+        **anywhere,
         "polar_design_speed_rpm": DESIGN_SPEED_SHARE * rated.base_speed_rpm,
         "polar_two_input_stable": found.stable,
         "polar_slowest_pole_rad_s": found.slowest_rad_s,

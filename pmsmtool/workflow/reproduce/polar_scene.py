@@ -14,7 +14,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.design.polar_values import LAWS, ON_MEASUREMENT, PREDICT
+from pmsmtool.design.polar_values import LAWS, LINEAR_RANGE, NO_ANTI_WINDUP, ON_MEASUREMENT, PREDICT
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.machine.key import Value
@@ -32,9 +32,6 @@ SOURCE = "Miyajima, Fujimoto, Fujitsuna 2013; expected numbers re-derived, Table
 
 PEAK = math.sqrt(2.0 / 3.0)
 """Peak over power-invariant value of a current or voltage."""
-
-NO_ANTI_WINDUP, LINEAR_RANGE = 2, 8
-"""Bits of ``polar.options`` beside those ``tune`` sets."""
 
 CDM_A1_TAU, CDM_A0_TAU2 = 2.5, 2.5
 """a1 tau and a0 tau^2 of the coefficient diagram method, (32)-(35); tau is 10 T_u."""
