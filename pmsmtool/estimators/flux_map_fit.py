@@ -51,8 +51,9 @@ INVERTER_STD = 0.1
 """Standard deviation of the factor on the measured inverter curve."""
 DELAY_STD_SHARE = 0.1
 """Standard deviation of the delay of the current sample, of the control period."""
-MAGNET_STD = 1e-4
-"""Least relative standard deviation of the flux at zero current."""
+ANCHOR = 1e4
+"""Weight of the flux at zero current, of the mean diagonal: the run over speeds knows it, the motion under pulses hardly
+does; its deviation is added to the result's."""
 SYMMETRIC_SHARE = 0.001
 """Asymmetry (rms, of the flux range) that counts as none whatever its standard deviation: what the fit leaves."""
 SYMMETRIC_SIGMA = 3.0
@@ -98,6 +99,8 @@ class CoenergyFit:
         Flux that has no co-energy.
     frame : Frame
         The angles used.
+    magnet_std_wb : float
+        Standard deviation of the flux at zero current (Wb).
     """
 
     spline: CoenergySpline
@@ -116,6 +119,7 @@ class CoenergyFit:
     axis_std_rad: float
     skew: FittedSkew
     frame: Frame
+    magnet_std_wb: float
 
     def flux(self, i_d_a: Array, i_q_a: Array) -> Array:
         """Return psi_d, psi_q (Wb), shape (2, n)."""
@@ -134,7 +138,8 @@ class CoenergyFit:
         """Return the standard deviations of psi_d, psi_q (Wb), shape (2, n): of the fit, and its misfit as flux."""
         fitted = np.stack([self._std(i_d_a, i_q_a, 1, 0), self._std(i_d_a, i_q_a, 0, 1)])
         L_dd, L_dq, L_qq = self.inductance(i_d_a, i_q_a)
-        return np.hypot(fitted, self.misfit_a * np.stack([np.hypot(L_dd, L_dq), np.hypot(L_dq, L_qq)]))
+        misfit = self.misfit_a * np.stack([np.hypot(L_dd, L_dq), np.hypot(L_dq, L_qq)])
+        return np.sqrt(fitted**2 + misfit**2 + np.array([[self.magnet_std_wb], [0.0]]) ** 2)
 
     def inductance_std(self, i_d_a: Array, i_q_a: Array) -> Array:
         """Return the standard deviations of L_dd, L_dq, L_qq (H), shape (3, n).
@@ -217,7 +222,7 @@ def fit_coenergy(
     T_s = float(traces[0].meta["control_period_s"])
     priors = Priors((R_ohm, 1.0, 0.0), (R_STD * R_ohm, INVERTER_STD, DELAY_STD_SHARE * T_s))
     for _ in range(ALIGNMENTS if align else 1):
-        pulses = [integrate_pulses(trace, frame, curve) for trace in traces]
+        pulses = [integrate_pulses(trace, frame, curve, R_ohm) for trace in traces]
         i = np.concatenate([p.i for p in pulses], axis=1)
         coarse = CoenergySpline.over(i[0], i[1], COARSE_PIECES)
         sums = normal_equations(pulses, coarse, _flat(pulses))
@@ -252,7 +257,7 @@ def _fine_fit(
     return CoenergyFit(
         spline, x[:k], covariance[:k, :k], float(x[k]), float(x[k + 1]), float(x[k + 2]), sigma_a,
         sums.squares(x) / (sigma_a**2 * (sums.n - len(x))), sums.n, symmetric, asymmetry, asymmetry_std, axis, axis_std,
-        FittedSkew(free[:k], skew, free[own:]), frame,
+        FittedSkew(free[:k], skew, free[own:]), frame, magnet.std_wb,
     )  # fmt: skip
 
 
@@ -302,13 +307,13 @@ def _solve(
         A[column, column] += weight
         b[column] += weight * mean
     zero = np.zeros(1)
-    std = max(magnet.std_wb, MAGNET_STD * abs(magnet.psi_wb), 1e-12)
+    mean_diagonal = float(np.trace(sums.A[:k, :k])) / k
     for order, value in (((1, 0), magnet.psi_wb), ((0, 1), 0.0)):
         row = np.zeros(size)
         row[:k] = spline.derivative(zero, zero, *order)[0]
-        A += (unit / std) ** 2 * np.outer(row, row)
-        b += (unit / std) ** 2 * value * row
-    mean_diagonal = float(np.trace(sums.A[:k, :k])) / k
+        weight = ANCHOR * mean_diagonal / float(row @ row)
+        A += weight * np.outer(row, row)
+        b += weight * value * row
     A[:k, :k] += mean_diagonal * (ROUGHNESS * spline.roughness() + RIDGE * np.eye(k))
     behind = np.arange(k + len(NUISANCES), size)
     A[behind, behind] += ROUGHNESS * mean_diagonal * max(1.0, float(np.max(np.diag(sums.A)[behind], initial=0.0)))

@@ -58,6 +58,8 @@ HALF_PERIODS_FREE = 45
 DROPS_HELD, DROPS_FREE = 2.5, 4.0
 """Smallest voltage over the resistive drop. Near the drop the current creeps towards its limit; on a free rotor the
 back-emf then makes it creep longer in one direction, which turns the rotor faster still."""
+HALF_PERIODS_LEAST = 14
+"""Samples between two turns that a higher voltage for the drop must leave: fewer, and the overshoot is the current."""
 BRAKE_LIMIT_S = 0.6
 BRAKE_LOOK_S = 0.03
 STANDSTILL_SHARE = 0.004
@@ -186,12 +188,11 @@ def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float
         if found is not None:
             # a saturating axis needs less flux than in proportion: the half period comes out shorter, never longer
             grown = limit / (found.limit_a + found.overshoot_a)
-            u = found.u_v * grown * found.half_period / plan.half_periods
-            u = min(plan.u_max_v, max(share * plan.u_least_v, u))
+            u = _voltage(plan, share, found.u_v * grown * found.half_period)
             limit = max(0.3 * limit, limit - OVERSHOOT_ALLOWANCE * found.overshoot_a * u / found.u_v)
         found = _shot_that_turns(drive, plan, axis, u, limit, samples, abort_speed_rad_s)
     assert found is not None
-    u = min(plan.u_max_v, max(plan.u_least_v, found.u_v * found.half_period / plan.half_periods))
+    u = _voltage(plan, 1.0, found.u_v * found.half_period)
     overshoot = found.overshoot_a * u / found.u_v
     limit = plan.i_max_a - OVERSHOOT_ALLOWANCE * overshoot
     if limit < 0.4 * plan.i_max_a:
@@ -202,6 +203,12 @@ def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float
             likely="a control period too long for this inductance",
         )
     return AxisPulse(u, limit, overshoot, found.half_period * found.u_v / u)
+
+
+def _voltage(plan: ScanPlan, share: float, volt_samples: float) -> float:
+    """Return the voltage for a swing of that many volt-samples: the wanted half period, but above the drop."""
+    least = min(share * plan.u_least_v, volt_samples / HALF_PERIODS_LEAST)
+    return min(plan.u_max_v, max(least, volt_samples / plan.half_periods))
 
 
 def _shot_that_turns(
