@@ -237,7 +237,8 @@ class GovernedTwin(Twin):
         if T > 0:
             T, m = self.find_time((a, b, drops), T, least, 3)
         elif may_start:
-            T, m = self.find_time((a, b, drops), least, least, 5)
+            direct = f(0.7) * np.sqrt(square((b[0] - a[0], b[1] - a[1]))) / self.V_max
+            T, m = self.find_time((a, b, drops), max(direct, least), least, 4)
         else:
             T = ZERO
         self.time_to_go = T if m is None else ZERO

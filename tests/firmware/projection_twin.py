@@ -30,6 +30,9 @@ class Row:
     def voltage(self, v: Vector) -> Vector:
         return (self.dd * v[0] + self.dq * v[1]) + self.c[0], (self.qd * v[0] + self.qq * v[1]) + self.c[1]
 
+    def change(self, step: Vector) -> Vector:
+        return self.dd * step[0] + self.dq * step[1], self.qd * step[0] + self.qq * step[1]
+
     def transposed(self, w: Vector) -> Vector:
         return self.dd * w[0] + self.qd * w[1], self.dq * w[0] + self.qq * w[1]
 
@@ -119,12 +122,14 @@ def find_corner(first: Row, second: Row, r: Vector, v: Vector) -> tuple[Vector, 
         if det * det <= SINGULAR * (square(n1) * square(n2)):
             return v, False
         inverse = ONE / det
-        if abs(f1) <= PAIR_TOLERANCE * limits[0] and abs(f2) <= PAIR_TOLERANCE * limits[1]:
+        step = (f1 * n2[1] - f2 * n1[1]) * inverse, (f2 * n1[0] - f1 * n2[0]) * inverse
+        v = v[0] - step[0], v[1] - step[1]
+        if all(square(row.change(step)) <= PAIR_TOLERANCE * limit
+               for row, limit in zip((first, second), limits, strict=True)):
             pull = r[0] - v[0], r[1] - v[1]
             l1 = (pull[0] * n2[1] - pull[1] * n2[0]) * inverse
             l2 = (pull[1] * n1[0] - pull[0] * n1[1]) * inverse
             return v, bool(l1 >= 0 and l2 >= 0)
-        v = v[0] - (f1 * n2[1] - f2 * n1[1]) * inverse, v[1] - (f2 * n1[0] - f1 * n2[0]) * inverse
     return v, False
 
 

@@ -10,7 +10,7 @@
 
 #ifdef PMSM_REAL_DOUBLE
 #define ROW_TOLERANCE 1e-11  /* | |w| - V | / V of a single-row projection */
-#define PAIR_TOLERANCE 1e-12 /* | |w|^2/V^2 - 1 | / 2 at a corner */
+#define PAIR_TOLERANCE 1e-12 /* | |w|^2/V^2 - 1 | at a corner */
 #define VIOLATION 1e-10      /* |w|^2/V^2 - 1 that counts as satisfied */
 #define STALL 1e-7           /* the same, when rounding keeps a row from coming closer */
 #define SINGULAR 1e-13       /* relative determinant below which two normals count as parallel */
@@ -141,8 +141,15 @@ static pmsm_dq reference_of(const pmsm_row *row, pmsm_dq w)
     return v;
 }
 
+static pmsm_real square_of_change(const pmsm_row *row, pmsm_dq step)
+{
+    const pmsm_dq change = {row->m_dd * step.d + row->m_dq * step.q, row->m_qd * step.d + row->m_qq * step.q};
+    return pmsm_square(change);
+}
+
 /* Newton's method for the corner where both rows are met with equality; 1 when it is the optimum, that is when r - v is
- * a non-negative combination of the two outward normals. */
+ * a non-negative combination of the two outward normals. The rows are quadratic, so what a step leaves of |w|^2 - V^2 is
+ * the square of the change of w: known without looking again. */
 static uint32_t find_corner(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq *v, uint32_t *steps)
 {
     const pmsm_real limit_1 = first->V * first->V;
@@ -159,15 +166,17 @@ static uint32_t find_corner(const pmsm_row *first, const pmsm_row *second, pmsm_
             return 0u;
         }
         const pmsm_real inverse = PMSM_C(1.0) / det;
-        if (pmsm_abs(f1) <= PAIR_TOLERANCE * limit_1 && pmsm_abs(f2) <= PAIR_TOLERANCE * limit_2) {
+        const pmsm_dq step = {(f1 * n2.q - f2 * n1.q) * inverse, (f2 * n1.d - f1 * n2.d) * inverse};
+        v->d -= step.d;
+        v->q -= step.q;
+        (*steps)++;
+        if (square_of_change(first, step) <= PAIR_TOLERANCE * limit_1 &&
+            square_of_change(second, step) <= PAIR_TOLERANCE * limit_2) {
             const pmsm_dq pull = {r.d - v->d, r.q - v->q};
             const pmsm_real l1 = (pull.d * n2.q - pull.q * n2.d) * inverse;
             const pmsm_real l2 = (pull.q * n1.d - pull.d * n1.q) * inverse;
             return (l1 >= PMSM_C(0.0) && l2 >= PMSM_C(0.0)) ? 1u : 0u;
         }
-        v->d -= (f1 * n2.q - f2 * n1.q) * inverse;
-        v->q -= (f2 * n1.d - f1 * n2.d) * inverse;
-        (*steps)++;
     }
     return 0u;
 }
