@@ -52,8 +52,8 @@ INVERTER_STD = 0.1
 DELAY_STD_SHARE = 0.1
 """Standard deviation of the delay of the current sample, of the control period."""
 ANCHOR = 1e4
-"""Weight of the flux at zero current, of the mean diagonal: the run over speeds knows it, the motion under pulses hardly
-does; its deviation is added to the result's."""
+"""Weight of the flux at zero current, of the mean diagonal: the run over speeds knows it, the motion under pulses
+hardly does; its deviation is added to the result's."""
 SYMMETRIC_SHARE = 0.001
 """Asymmetry (rms, of the flux range) that counts as none whatever its standard deviation: what the fit leaves."""
 SYMMETRIC_SIGMA = 3.0
