@@ -50,9 +50,10 @@ def truth_of(drive: MachineFile, evaluation: Evaluation) -> dict[str, float]:
     truth["R_at_T_ohm"] = devices + copper * (1.0 + drive.machine.alpha_R_per_k * rise)
     truth["offset_rad"] = values.number("encoder_offset_rad")
     if drive.flux_map is not None and evaluation.inductance is not None:
-        bias = evaluation.inductance.L_d
-        incremental = drive.flux_map.incremental_inductance(bias.i_d_apk, 0.0)
-        truth["L_d_h"], truth["L_q_h"] = float(incremental[0, 0]), float(incremental[1, 1])
+        for k, (name, found) in enumerate(
+            (("L_d_h", evaluation.inductance.L_d), ("L_q_h", evaluation.inductance.L_q))
+        ):
+            truth[name] = float(drive.flux_map.incremental_inductance(found.i_d_apk, found.i_q_apk)[k, k])
         truth["psi_f_wb"] = float(drive.flux_map.flux(0.0, 0.0)[0])
     return truth
 

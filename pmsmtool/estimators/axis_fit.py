@@ -49,6 +49,8 @@ MOTION_PRIOR_STD = 10.0
 """Prior of the motional term, in hundredths of L over the square of a half period."""
 RATIO_PRIOR_STD = 0.3
 """Prior of the relative difference of L and R between injection frequencies."""
+DISPERSION_SHARE = 0.5
+"""Standard deviation of L, of its difference between the injection frequencies where the fit found one."""
 DELAY_STARTS = (0.05, 0.45, 0.95, 1.45, 1.95)
 LAG_STARTS = (0.02, 0.1, 0.4, 0.8)
 """Delays and lags tried before the fit (T_s)."""
@@ -441,7 +443,7 @@ def fit_axis(shots: Sequence[Shot], sigma_a: float, R_guess: float, *, allow_mot
             if richer not in tried:
                 new_layout, start = layout.changed(fit.x, richer)
                 tried[richer] = (_Problem(shots, slow, sigma_a, new_layout).fit(start), new_layout)
-        best = min(tried, key=lambda effects: _criterion(tried[effects][0]))
+        best = min(tried, key=lambda effects: _criterion(effects, tried[effects][0]))
         if not set(best.names) > set(current.names):
             break
         current = best
@@ -451,8 +453,9 @@ def fit_axis(shots: Sequence[Shot], sigma_a: float, R_guess: float, *, allow_mot
     return _average(shots, slow, sigma_a, tried)
 
 
-def _criterion(fit: Fit) -> float:
-    return fit.cost + PENALTY * len(fit.x)
+def _criterion(effects: Effects, fit: Fit) -> float:
+    """Information criterion; a rotor that follows is free of charge: it is there, whether it can be seen or not."""
+    return fit.cost + PENALTY * (len(fit.x) - effects.motion)
 
 
 def _average(
@@ -466,13 +469,16 @@ def _average(
     rows = [row for row in rows if row[2].responses(row[1].x)[0].motion >= 0.0]  # a rotor cannot push back
     if not rows:
         raise refuse("E_NOT_CONVERGED", "no model of the axis could be fitted", stage="inductance")
-    weights = information_weights([_criterion(fit) for _, fit, _, _ in rows])
+    weights = information_weights([_criterion(effects, fit) for effects, fit, _, _ in rows])
     L = float(sum(w * row[2].L_scale * math.exp(row[1].x[0]) for w, row in zip(weights, rows, strict=True)))
     variance = 0.0
     for w, (_, fit, layout, covariance) in zip(weights, rows, strict=True):
         if w > NEGLIGIBLE_WEIGHT:
             L_m = layout.L_scale * math.exp(float(fit.x[0]))
-            variance += float(w) * (L_m**2 * float(covariance[0, 0]) + (L_m - L) ** 2)
+            sizes = [response.model.L_h for response in layout.responses(fit.x)]
+            # an inductance that depends on the frequency is not known better than by half that difference
+            spread = DISPERSION_SHARE * (max(sizes) - min(sizes))
+            variance += float(w) * (L_m**2 * float(covariance[0, 0]) + (L_m - L) ** 2 + spread**2)
     effects, fit, layout, _ = rows[int(np.argmax(weights))]
     covariance, condition = scaled_covariance(fit.jacobian)
     responses = layout.responses(fit.x)

@@ -25,6 +25,7 @@ from pmsmtool.estimators.estimate import SensorTolerance, condition_gate
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.switching_ripple import Modulation, rippled_error_dq_v
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
@@ -87,7 +88,8 @@ def estimate_flux_linkage(
     period_s: float,
     inverter: InverterCurve | None = None,
     waves: Sequence[Trace] = (),
-    L_d_h: float = 0.0,
+    modulation: Modulation | None = None,
+    cross_h_per_a: float = 0.0,
     tolerance: SensorTolerance | None = None,
     T_ref_c: float = 20.0,
     alpha_psi_per_k: float = -0.0012,
@@ -109,8 +111,10 @@ def estimate_flux_linkage(
     waves : sequence of Trace
         ``i_d_a i_q_a theta_e_rad`` over about the window of each speed: the mean error of a current with ripple near
         its zero crossing is not the error of the mean current. Empty: the mean currents are used.
-    L_d_h : float
-        Incremental L_d where known, to refer psi to i_d = 0 (H).
+    modulation : Modulation or None
+        With waves: what ripple at the switching edges may do to the inverter's error counts as a standard deviation.
+    cross_h_per_a : float
+        Standard deviation of dL_q/di_d (H/A), which by reciprocity bends psi_d by half of it times i_q^2.
     tolerance : SensorTolerance
         Declared sensor tolerances.
     T_ref_c, alpha_psi_per_k : float
@@ -129,7 +133,7 @@ def estimate_flux_linkage(
     correction = x / np.sin(x)
     e_d, e_q = _inverter_error(inverter, i_d, i_q, waves)
     u_d = (speeds["u_d_v"] - e_d - R_ohm * i_d) * correction
-    u_q = (speeds["u_q_v"] - e_q - R_ohm * i_q) * correction - w * L_d_h * i_d
+    u_q = (speeds["u_q_v"] - e_q - R_ohm * i_q) * correction
     one = np.ones_like(w)
     q_columns = [w, np.sign(w), w * i_q]
     d_columns = [-w * i_q, w, -w * w]
@@ -137,7 +141,8 @@ def estimate_flux_linkage(
         # the flux of i_d and its share on the q axis of a frame that is off are unknowns of the same run
         q_columns.append(w * i_d)
         d_columns.append(-w * i_d)
-    q_fit, q_cov, q_residual, q_condition = linear_solve(np.stack(q_columns, axis=1), u_q, one)
+    q_matrix = np.stack(q_columns, axis=1)
+    q_fit, q_cov, q_residual, q_condition = linear_solve(q_matrix, u_q, one)
     d_fit, d_cov, d_residual, d_condition = linear_solve(np.stack(d_columns, axis=1), u_d, one)
     condition_gate(q_condition, "psi and the dead-time voltage", STAGE)
     condition_gate(d_condition, "L_q, the offset and the angle delay", STAGE)
@@ -157,8 +162,18 @@ def estimate_flux_linkage(
             hint="identify poles and encoder first",
         )
     std_1, std_2 = s_q * math.sqrt(float(q_cov[0, 0])), s_d * math.sqrt(float(d_cov[1, 1]))
+    # what two effects outside the model would do to psi: the same regression of their voltages
+    crossed = 0.5 * cross_h_per_a * w * i_q**2
+    rippled = np.zeros_like(w)
+    if inverter is not None and modulation is not None and waves:
+        rippled = (_rippled_error(inverter, speeds, waves, modulation) - e_q) * correction
+    model = [float(linear_solve(q_matrix, voltage, one)[0][0]) for voltage in (crossed, rippled)]
     std = math.hypot(
-        math.cos(eps) * std_1, math.sin(eps) * std_2, RELATIVE_FLOOR * psi, tolerance.voltage_scale_std * psi
+        math.cos(eps) * std_1,
+        math.sin(eps) * std_2,
+        RELATIVE_FLOOR * psi,
+        tolerance.voltage_scale_std * psi,
+        *model,
     )
     T = float(np.mean(speeds["T_magnet_c"]))
     measured = Estimate(
@@ -205,6 +220,18 @@ def _inverter_error(
         return mean_inverter_error(curve, i_d, i_q)
     errors = [curve.error_dq_v(wave["i_d_a"], wave["i_q_a"], wave["theta_e_rad"]) for wave in waves]
     return np.array([float(np.mean(e[0])) for e in errors]), np.array([float(np.mean(e[1])) for e in errors])
+
+
+def _rippled_error(
+    curve: InverterCurve, speeds: Trace, waves: Sequence[Trace], modulation: Modulation
+) -> Vector:
+    """Mean q error of each speed with the ripple at the switching edges (V)."""
+    errors = []
+    for wave, u_d, u_q in zip(waves, speeds["u_d_v"], speeds["u_q_v"], strict=True):
+        voltage = (np.full(len(wave), u_d), np.full(len(wave), u_q))
+        current = (wave["i_d_a"], wave["i_q_a"])
+        errors.append(float(np.mean(rippled_error_dq_v(curve, current, voltage, wave["theta_e_rad"], modulation)[1])))
+    return np.array(errors)
 
 
 def mean_inverter_error(curve: InverterCurve, i_d: Vector, i_q: Vector) -> tuple[Vector, Vector]:

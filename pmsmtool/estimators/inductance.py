@@ -3,7 +3,9 @@
 Two half periods per axis separate the delay, the sensor lag and the motion of the rotor from L; the frame's offset from
 the d axis, known from the flux run, mixes the axes and is undone with the measured inverse inductances
 
-    1/L_d' = cos^2 eps / L_d + sin^2 eps / L_q.
+    1/L_d' = cos^2 eps / L_d + sin^2 eps / L_q,    1/L_q' = sin^2 eps / L_d + cos^2 eps / L_q,
+
+each with the angle at which the rotor stood during its own shots.
 """
 
 from __future__ import annotations
@@ -36,6 +38,23 @@ MINIMUM_PERIODS = 20
 CURVE_POINTS = 256
 ANISOTROPY_LIMIT = 0.03
 """(1/L_d - 1/L_q) over the mean below which the axis angle cannot be told from the inductances."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAhead:
+    """Angle of the frozen frame ahead of the rotor's d axis during the shots of each axis (rad electrical).
+
+    Attributes
+    ----------
+    d_rad, q_rad : float
+        During the shots on d and on q: an injection may shake the rotor loose from its friction.
+    std_rad : float
+        Standard deviation of both (they share the encoder offset).
+    """
+
+    d_rad: float
+    q_rad: float
+    std_rad: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +102,7 @@ def estimate_inductances(
     noise: Noise,
     R_ohm: float,
     *,
-    frame_offset: tuple[float, float] | None = None,
+    frame: FrameAhead | None = None,
     inverter: InverterCurve | None = None,
     tolerance: SensorTolerance | None = None,
 ) -> InductanceResult:
@@ -98,9 +117,9 @@ def estimate_inductances(
         From the zero-current trace.
     R_ohm : float
         Loop resistance (ohm).
-    frame_offset : (float, float) or None
-        Angle of the frame ahead of the d axis and its standard deviation (rad), from the flux run. None: taken from the
-        cross responses where the machine is salient enough, and said so in ``fallback``.
+    frame : FrameAhead or None
+        Where the rotor stood, with the encoder offset of the flux run. None: taken from the cross responses where the
+        machine is salient enough, and said so in ``fallback``.
     inverter : InverterCurve or None
         Voltage error from the DC levels.
     tolerance : SensorTolerance
@@ -125,16 +144,13 @@ def estimate_inductances(
     widen = {axis: chi2_gate(fit.chi2, f"inductance, {axis} axis") for axis, fit in fits.items()}
     angle, angle_std = _axis_angle(fits, cross)
     fallback = ""
-    if frame_offset is None:
+    if frame is None:
         if math.isfinite(angle):
-            frame_offset, fallback = (angle, angle_std), "frame offset from the cross responses"
+            frame, fallback = FrameAhead(angle, angle, angle_std), "frame offset from the cross responses"
         else:
-            frame_offset, fallback = (0.0, 0.0), "frame offset unknown, machine nearly round: axes taken as they are"
-    values, stds = _unmix(fits, {axis: factor for axis, (_, factor) in widen.items()}, frame_offset)
-    bias = (
-        float(np.mean([np.mean(trace["i_d_a"]) for trace in (*d_shots, *q_shots)])),
-        float(np.mean([np.mean(trace["i_q_a"]) for trace in (*d_shots, *q_shots)])),
-    )
+            frame, fallback = FrameAhead(0.0, 0.0, 0.0), "frame offset unknown, machine nearly round: axes as they are"
+    values, stds = _unmix(fits, {axis: factor for axis, (_, factor) in widen.items()}, frame)
+    biases = {"d": _bias(d_shots, frame.d_rad), "q": _bias(q_shots, frame.q_rad)}
     by_frequency = {
         axis: tuple(
             (1.0 / (2 * shot.half_period * shot.period_s), L)
@@ -162,8 +178,8 @@ def estimate_inductances(
             chi2=fits[axis].chi2,
             T_c=_temperature(traces[axis]),
             method="square wave on d bias, output error, incremental",
-            i_d_apk=bias[0],
-            i_q_apk=bias[1],
+            i_d_apk=biases[axis][0],
+            i_q_apk=biases[axis][1],
             fallback=fallback,
         )
         for axis in fits
@@ -184,6 +200,13 @@ def estimate_inductances(
     )
 
 
+def _bias(traces: Sequence[Trace], ahead_rad: float) -> tuple[float, float]:
+    """Mean current in the rotor's own frame (A)."""
+    i_d, i_q = (float(np.mean([np.mean(trace[name]) for trace in traces])) for name in ("i_d_a", "i_q_a"))
+    c, s = math.cos(ahead_rad), math.sin(ahead_rad)
+    return c * i_d - s * i_q, s * i_d + c * i_q
+
+
 def _commutation_std(shots: Sequence[Shot]) -> float:
     """What an inverter error that depends on the current adds to L (H).
 
@@ -198,6 +221,13 @@ def _commutation_std(shots: Sequence[Shot]) -> float:
             slope = abs(float(rise[1] - rise[0])) / (high - low)
             worst = max(worst, slope * shot.period_s / 2.0 / math.sqrt(3.0))
     return worst
+
+
+def bare_shot(trace: Trace, axis: str) -> Shot:
+    """Return a record as a shot, unchecked and without an inverter's error."""
+    other = "q" if axis == "d" else "d"
+    signals = trace[f"u_{axis}_v"], trace[f"i_{axis}_a"], trace[f"i_{other}_a"]
+    return Shot(*signals, int(trace.meta["half_period"]), trace.period_s)
 
 
 def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, stage: str) -> Shot:
@@ -261,16 +291,17 @@ def _axis_angle(fits: Mapping[str, AxisFit], cross: Mapping[str, tuple[float, fl
 
 
 def _unmix(
-    fits: Mapping[str, AxisFit], widen: Mapping[str, float], frame_offset: tuple[float, float]
+    fits: Mapping[str, AxisFit], widen: Mapping[str, float], frame: FrameAhead
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Undo the frame offset; standard deviations by first-order propagation."""
 
-    def unmixed(L_d: float, L_q: float, eps: float) -> tuple[float, float]:
-        mean = 0.5 * (1.0 / L_d + 1.0 / L_q)
-        half = 0.5 * (1.0 / L_d - 1.0 / L_q) / math.cos(2.0 * eps)
-        return 1.0 / (mean + half), 1.0 / (mean - half)
+    def unmixed(L_d: float, L_q: float, shift: float) -> tuple[float, float]:
+        s_d, s_q = math.sin(frame.d_rad + shift) ** 2, math.sin(frame.q_rad + shift) ** 2
+        g_d, g_q = 1.0 / L_d, 1.0 / L_q
+        determinant = 1.0 - s_d - s_q
+        return determinant / ((1.0 - s_q) * g_d - s_d * g_q), determinant / ((1.0 - s_d) * g_q - s_q * g_d)
 
-    eps, eps_std = frame_offset
+    eps = max(frame.d_rad, frame.q_rad, key=abs)
     if abs(eps) > math.radians(30.0):
         raise refuse(
             "E_NOT_IDENTIFIABLE",
@@ -281,11 +312,11 @@ def _unmix(
         )
     L = {axis: fit.L_h for axis, fit in fits.items()}
     std = {axis: fit.std_h * widen[axis] for axis, fit in fits.items()}
-    values = unmixed(L["d"], L["q"], eps)
+    values = unmixed(L["d"], L["q"], 0.0)
     shifted = [
-        unmixed(L["d"] + std["d"], L["q"], eps),
-        unmixed(L["d"], L["q"] + std["q"], eps),
-        unmixed(L["d"], L["q"], eps + eps_std),
+        unmixed(L["d"] + std["d"], L["q"], 0.0),
+        unmixed(L["d"], L["q"] + std["q"], 0.0),
+        unmixed(L["d"], L["q"], frame.std_rad),
     ]
     spread = [math.sqrt(sum((row[k] - values[k]) ** 2 for row in shifted)) for k in (0, 1)]
     return {"d": values[0], "q": values[1]}, {"d": spread[0], "q": spread[1]}

@@ -9,15 +9,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.estimators.axis_fit import initial_inductance
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.flux_map_result import FluxMapResult
-from pmsmtool.estimators.inductance import InductanceResult, estimate_inductances
+from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
 from pmsmtool.estimators.inertia import InertiaResult, estimate_inertia
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PhaseCheck, check_phases
 from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance
+from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
@@ -25,6 +27,8 @@ from pmsmtool.workflow import map_stage
 
 MOVED_SHARE = 0.25
 """Largest share of levels that may be left out; with more the estimator sees them, and refuses what has not settled."""
+CROSS_SATURATION = 0.25
+"""Standard deviation of dL_q/di_d, of (L_q - L_d)/I: the reluctance machine of the profiles has 0.24."""
 COPPER_ALPHA_PER_K = 0.00393
 """Temperature coefficient of copper at 20 degC (IEC 60028)."""
 MOSFET_LINK_V = 100.0
@@ -128,7 +132,7 @@ def evaluate(
         encoder = estimate_encoder(traces["rotation_forward"], traces["rotation_backward"])
         result = replace(result, encoder=encoder)
     if "speeds" in traces and result.resistance is not None:
-        flux = flux_of(traces, result.resistance, period_s, T_ref_c, tolerance)
+        flux = flux_of(traces, result.resistance, period_s, T_ref_c, tolerance, U_dc_v)
         result = replace(result, flux=flux)
     if result.resistance is not None and result.encoder is not None and any(k.startswith("square_d") for k in traces):
         result = replace(result, inductance=inductance_of(traces, result, tolerance))
@@ -176,6 +180,7 @@ def flux_of(
     period_s: float,
     T_ref_c: float,
     tolerance: SensorTolerance | None,
+    U_dc_v: float = math.inf,
 ) -> FluxResult:
     """Return the flux linkage, with the resistance at the temperature of the speed run."""
     speeds = traces["speeds"]
@@ -183,15 +188,30 @@ def flux_of(
     R = resistance.R_measured
     T = float(np.mean(speeds["T_winding_c"]))
     warmer = COPPER_ALPHA_PER_K * (T - R.T_c) if math.isfinite(T) and math.isfinite(R.T_c) else 0.0
+    modulation, cross = None, 0.0
+    rough = [_rough_inductance(traces, axis) for axis in "dq"]
+    if all(L > 0.0 for L in rough):
+        cross = CROSS_SATURATION * abs(rough[1] - rough[0]) / R.i_d_apk
+        if math.isfinite(U_dc_v):
+            dead_time = max(0.0, resistance.V_dead_v) * period_s / U_dc_v
+            modulation = Modulation(U_dc_v, 2.0 / (1.0 / rough[0] + 1.0 / rough[1]), period_s, dead_time)
     return estimate_flux_linkage(
         speeds,
         R.value * (1.0 + warmer),
         period_s=period_s,
         inverter=resistance.curve,
         waves=waves,
+        modulation=modulation,
+        cross_h_per_a=cross,
         tolerance=tolerance,
         T_ref_c=T_ref_c,
     )
+
+
+def _rough_inductance(traces: Mapping[str, Trace], axis: str) -> float:
+    """Inductance from the ripple of the first shot of an axis, without its delay and resistance; 0 without one (H)."""
+    shots = shots_of(traces, axis, 1)
+    return initial_inductance(bare_shot(shots[0], axis)) if shots else 0.0
 
 
 def inductance_of(
@@ -204,13 +224,14 @@ def inductance_of(
     offset = result.offset
     frame = None
     if offset is not None and result.flux is not None:
-        frame = (_frame_ahead(shots["d"] + shots["q"], result.encoder, offset.value), max(offset.std, 1e-6))
+        ahead = {axis: _frame_ahead(shots[axis], result.encoder, offset.value) for axis in "dq"}
+        frame = FrameAhead(ahead["d"], ahead["q"], max(offset.std, 1e-6))
     return estimate_inductances(
         shots["d"],
         shots["q"],
         result.noise,
         result.resistance.R_measured.value,
-        frame_offset=frame,
+        frame=frame,
         inverter=result.resistance.curve,
         tolerance=tolerance,
     )

@@ -39,6 +39,8 @@ BIAS_SHARE = 0.5
 BIAS_TRIES = 4
 BIAS_OFF_RAD = math.radians(6.0)
 """Angle between rotor and bias vector that a load or friction may make (electrical)."""
+BIAS_ON_RAD = math.radians(2.0)
+"""The same, of a vector that was put on the rotor's axis: more is motion."""
 BIAS_MOST = 0.8
 """Largest bias, of the test current: the ripple comes on top."""
 RIPPLE_SHARE = 0.25
@@ -111,9 +113,13 @@ class Limits:
         return min(self.I_nom_apk, self.i_max_apk / 1.1)
 
 
-def clear_ripple(wanted_a: float, bias_a: float, knee_a: float) -> float:
-    """Return the ripple (A peak to peak) that keeps every phase current above the knee, or the least useful one."""
-    return max(RIPPLE_LEAST * wanted_a, min(wanted_a, (0.5 * bias_a - knee_a) / CROSSING))
+def clear_ripple(wanted_a: float, bias_a: float, knee_a: float, angle_rad: float = 0.0) -> float:
+    """Return the ripple (A peak to peak) that keeps every phase current above the knee, or the least useful one.
+
+    The smallest phase current of a bias at a (small) stator angle is its share cos(60 deg + |angle|).
+    """
+    smallest = bias_a * math.cos(math.pi / 3.0 + abs(angle_rad))
+    return max(RIPPLE_LEAST * wanted_a, min(wanted_a, (smallest - knee_a) / CROSSING))
 
 
 def bias_and_ripple(I_test_apk: float, ripple_share: float, knee_a: float) -> tuple[float, float]:
@@ -260,23 +266,35 @@ class Measurement:
         self, plan: square_injection.SquarePlan, encoder: EncoderResult, knee_a: float
     ) -> square_injection.SquarePlan:
         """Hold the bias, or as much of it as leaves the rotor's d axis on the vector; returns the plan with it."""
+        wanted = plan.ripple_a
         for _ in range(BIAS_TRIES):
             self.say(f"L_d, L_q: square wave on {plan.bias_d_a:.3g} A, {plan.ripple_a:.3g} A peak to peak")
             square_injection.hold_bias(self.drive, plan)
-            periods = max(1, round(0.02 / self.drive.period_s))
-            theta_M = self.drive.average(("theta_m_rad",), periods)["theta_m_rad"]
-            theta_e = encoder.direction * encoder.pole_pairs.value * theta_M - encoder.offset.value
-            ahead = math.remainder(theta_e - plan.angle_rad, 2.0 * math.pi)
+            stands = self._rotor_angle(encoder)
+            ahead = math.remainder(stands - plan.angle_rad, 2.0 * math.pi)
             if abs(ahead) <= BIAS_OFF_RAD + abs(encoder.lag_rad):
-                return plan
-            bias = 0.5 * plan.bias_d_a
-            plan = replace(plan, bias_d_a=bias, ripple_a=clear_ripple(0.5 * plan.ripple_a, bias, knee_a))
+                # the frame goes to the rotor: a d bias off its axis would pull, and mix the axes
+                angle = plan.angle_rad + ahead
+                clear = clear_ripple(plan.ripple_a, plan.bias_d_a, knee_a, angle)
+                aligned = replace(plan, angle_rad=angle, ripple_a=clear)
+                square_injection.hold_bias(self.drive, aligned)
+                ahead = math.remainder(self._rotor_angle(encoder) - angle, 2.0 * math.pi)
+                if abs(ahead) <= BIAS_ON_RAD:
+                    return aligned
+            wanted, bias = 0.5 * wanted, 0.5 * plan.bias_d_a
+            plan = replace(plan, bias_d_a=bias, ripple_a=clear_ripple(wanted, bias, knee_a))
         raise refuse(
             "E_ROTOR_MOVED",
             f"the rotor stands {math.degrees(ahead):.3g} deg (electrical) off the bias vector",
             stage="inductance",
             likely="a load on the shaft, or a machine with much more reluctance than magnet torque",
         )
+
+    def _rotor_angle(self, encoder: EncoderResult) -> float:
+        """Electrical angle of the rotor with the coarse offset (rad)."""
+        periods = max(1, round(0.02 / self.drive.period_s))
+        theta_M = self.drive.average(("theta_m_rad",), periods)["theta_m_rad"]
+        return encoder.direction * encoder.pole_pairs.value * theta_M - encoder.offset.value
 
     # ---- what turns the shaft ---------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance
-from pmsmtool.estimators.inductance import InductanceResult, estimate_inductances
+from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, estimate_inductances
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.trace import Trace
@@ -66,12 +66,16 @@ class Shots:
             [self.trace(k, "q", half) for half in HALF_PERIODS],
             Noise(d.sigma_dq[k], 0.0, 0.0, 2048),
             d.R[k],
-            frame_offset=(d.offset[k], 1e-4) if offset else None,
+            frame=_ahead(d, k) if offset else None,
             inverter=InverterCurve(*curve_points(d, k), 0.0) if compensate else None,
         )
 
     def mean_i_d(self, k: int) -> float:
         return float(np.mean([np.mean(self.trace(k, axis, half)["i_d_a"]) for axis in "dq" for half in HALF_PERIODS]))
+
+
+def _ahead(d: Drives, k: int) -> FrameAhead:
+    return FrameAhead(d.offset[k], d.offset[k], 1e-4)
 
 
 def errors_of(shots: Shots) -> tuple[np.ndarray, np.ndarray, list[InductanceResult]]:
@@ -91,7 +95,7 @@ def errors_of(shots: Shots) -> tuple[np.ndarray, np.ndarray, list[InductanceResu
 @pytest.fixture(scope="module")
 def plain() -> Shots:
     rng = np.random.default_rng(21)
-    return Shots(draw(14, rng), rng)
+    return Shots(draw(9, rng), rng)
 
 
 def test_ideal_sensors(plain: Shots) -> None:
@@ -105,7 +109,7 @@ def test_ideal_sensors(plain: Shots) -> None:
 
 def test_unknown_sensor_lag_and_late_sampling() -> None:
     rng = np.random.default_rng(22)
-    drives = draw(10, rng, lag_max=20e-6, late_max=0.1)
+    drives = draw(7, rng, lag_max=20e-6, late_max=0.1)
     errors, widths, results = errors_of(Shots(drives, rng))
     assert np.quantile(errors, 0.9) < 5e-3  # measured 1.4e-3
     assert np.max(errors) < 2e-2  # measured 2.0e-3
@@ -117,7 +121,7 @@ def test_unknown_sensor_lag_and_late_sampling() -> None:
 
 def test_a_bend_is_not_taken_for_an_inductance() -> None:
     rng = np.random.default_rng(23)
-    drives = draw(6, rng)
+    drives = draw(4, rng)
     drives.bend[:] = 0.4 / drives.I_r
     errors, _, results = errors_of(Shots(drives, rng))
     assert np.quantile(errors[::2], 0.9) < 2.5e-3  # the d axis, measured 1.6e-3
@@ -126,7 +130,7 @@ def test_a_bend_is_not_taken_for_an_inductance() -> None:
 
 def test_a_free_rotor_follows_the_injection() -> None:
     rng = np.random.default_rng(24)
-    drives = draw(6, rng)
+    drives = draw(5, rng)
     drives.offset[:] = 0.0
     errors, _, _ = errors_of(Shots(drives, rng, free=True))
     assert np.quantile(errors, 0.9) < 2.5e-3  # measured 1.3e-3
@@ -146,8 +150,8 @@ def test_the_offset_of_the_frame_is_undone(plain: Shots) -> None:
 def test_a_salient_machine_shows_its_axis_without_turning(plain: Shots) -> None:
     d = plain.drives
     salient = [k for k in range(d.n) if d.L_q[k] > 1.3 * d.L_d[k]]
-    assert len(salient) >= 4
-    for k in salient[:4]:
+    assert len(salient) >= 2
+    for k in salient[:2]:
         result = plain.estimate(k, offset=False)
         assert result.axis_angle_rad == pytest.approx(d.offset[k], abs=0.01)
         assert result.L_d.fallback
@@ -163,7 +167,7 @@ def test_one_shot_of_an_unknown_delay_is_not_biased_by_it(plain: Shots) -> None:
     ]
     d = plain.drives
     result = estimate_inductances(
-        shifted[:2], shifted[2:], Noise(d.sigma_dq[k], 0, 0, 2048), d.R[k], frame_offset=(d.offset[k], 1e-4)
+        shifted[:2], shifted[2:], Noise(d.sigma_dq[k], 0, 0, 2048), d.R[k], frame=_ahead(d, k)
     )
     assert result.delay == pytest.approx(0.0, abs=0.03)
     assert result.L_d.value == pytest.approx(d.L_d[k], rel=3e-3)
@@ -187,7 +191,7 @@ def test_two_frequencies_that_disagree_are_both_reported(plain: Shots) -> None:
         [plain.trace(k, "q", half) for half in HALF_PERIODS],
         Noise(d.sigma_dq[k], 0, 0, 2048),
         d.R[k],
-        frame_offset=(d.offset[k], 1e-4),
+        frame=_ahead(d, k),
     )
     assert result.frequency_dependent == ("d",)
     assert result.verdict == "warn"
@@ -202,7 +206,7 @@ def test_efficiency_against_the_bound() -> None:
     one.dV[:] = 0.0
     one.drop[:] = 0.0
     one.offset[:] = 0.0
-    count = 16
+    count = 12
     shots = Shots(repeat(one, count), rng)
     results = [shots.estimate(k, compensate=False) for k in range(count)]
     ratios = []
@@ -239,7 +243,7 @@ def test_refusals(plain: Shots, change: Change, reason: str) -> None:
     d = plain.drives
     with pytest.raises(IdentificationError) as caught:
         estimate_inductances(
-            traces, [plain.trace(k, "q", 6)], Noise(d.sigma_dq[k], 0, 0, 2048), d.R[k], frame_offset=(0.0, 1e-4)
+            traces, [plain.trace(k, "q", 6)], Noise(d.sigma_dq[k], 0, 0, 2048), d.R[k], frame=FrameAhead(0.0, 0.0, 1e-4)
         )
     assert caught.value.reason == reason
 
@@ -259,7 +263,7 @@ def test_a_bridge_of_unequal_thresholds_is_a_voltage_scale_of_unknown_size(plain
     noise = Noise(d.sigma_dq[k], 0, 0, 2048)
     mosfet, igbt = (
         estimate_inductances(
-            shots["d"], shots["q"], noise, d.R[k], frame_offset=(d.offset[k], 1e-4), tolerance=tolerance
+            shots["d"], shots["q"], noise, d.R[k], frame=_ahead(d, k), tolerance=tolerance
         ).L_d
         for tolerance in (SensorTolerance(), SensorTolerance(U_dc_v=100.0))
     )
@@ -279,7 +283,7 @@ def test_commutation_near_the_knee_widens_the_interval(plain: Shots) -> None:
     inverters = (None, InverterCurve(i, slope * i, 0.0))
     stds = [
         estimate_inductances(
-            shots["d"], shots["q"], noise, d.R[k], frame_offset=(d.offset[k], 1e-4), inverter=inverter
+            shots["d"], shots["q"], noise, d.R[k], frame=_ahead(d, k), inverter=inverter
         ).L_q.std
         for inverter in inverters
     ]
