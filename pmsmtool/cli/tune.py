@@ -116,12 +116,18 @@ _SHOWN = (
     "current.K_p_d_v_per_a", "current.K_i_d_v_per_as", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as",
     "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad", "speed.tau_max_nm",
 )  # fmt: skip
+_SHOWN_POLAR = (
+    "polar.mode", "polar.options", "polar.sigma_phase_rad_s", "polar.sigma_amplitude_rad_s", "polar.tau_s",
+    "polar.omega_c_rad_s", "polar.omega_dob_rad_s", "polar.V_ref_ratio", *_SHOWN[4:],
+)  # fmt: skip
 
 
 def _lines(design: Design) -> Iterator[str]:
     from pmsmtool.params.catalogue import BY_NAME
 
-    rows = [(name, f"{design[name]:.6g}", BY_NAME[name].unit, design.values[name].method) for name in _SHOWN]
+    polar = design["polar.mode"] != 0.0
+    shown = _SHOWN_POLAR if polar else _SHOWN
+    rows = [(name, f"{design[name]:.6g}", BY_NAME[name].unit, design.values[name].method) for name in shown]
     yield from table(("parameter", "value", "unit", "method"), rows)
     yield ""
     yield from table(
@@ -135,5 +141,16 @@ def _lines(design: Design) -> Iterator[str]:
                 f"{loop.bandwidth_rad_s / (2.0 * math.pi):.4g}",
             )
             for name, loop in design.loops.items()
+            if not (polar and name.startswith("current"))
         ],
     )
+    facts = {name: value for name, value in design.facts.items() if name.startswith("polar_")}
+    if facts:
+        yield ""
+        yield from table(("polar loops", "value"), [(name, _fact(value)) for name, value in facts.items()])
+
+
+def _fact(value: bool | float | str) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
