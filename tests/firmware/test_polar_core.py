@@ -1,310 +1,340 @@
-"""Polar-coordinate laws in closed loop against the numbers of the polar-control reference.
+"""The polar-coordinate laws in the compiled closed loop against the numbers of the polar-control reference.
 
-Machine of the reference (assumed there: the paper's table is missing), peak quantities; amperes below are
-power-invariant as in the paper, that is peak times sqrt(3/2).
+Machine of the reference (assumed there: the paper's table is missing). Amperes are power-invariant as in the paper.
+Each target stands beside the value measured with ``pmsmtool reproduce polar-steps`` (``-linear``, ``-noise``,
+``-ramps``, ``-sweep``, ``-limit``, ``-salient``).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import pytest
 
 from pmsmtool.firmware.core_binding import core
-from tests.firmware.closed_loop import DEFAULTS, MODE_CURRENT, Loop
+from pmsmtool.workflow.reproduce import (
+    polar_limit,
+    polar_linear,
+    polar_ramps,
+    polar_salient,
+    polar_steps,
+    polar_sweep,
+)
+from pmsmtool.workflow.reproduce.polar_measures import TorqueStep
+from pmsmtool.workflow.reproduce.polar_scene import (
+    CONVENTIONAL,
+    CONVENTIONAL_ON_MEASUREMENT,
+    K_T,
+    LINEAR,
+    NOISY,
+    PRINTED,
+    PROPOSED,
+    PROPOSED_ON_MEASUREMENT,
+    REGULARISED,
+    SIMULATION,
+    SWITCHED,
+    UNIFIED,
+    UNIFIED_TUNED,
+    WOUND_UP,
+    Bench,
+    Controller,
+    run,
+    steps,
+)
+from tests.firmware.closed_loop import MODE_CURRENT, MODE_TORQUE, Loop
+from tests.firmware.test_polar_twin import RPM, U_DC, values
 
-(CONVENTIONAL, PROPOSED, LINEAR, PRINTED, REGULARISED, UNIFIED) = range(1, 7)
-ON_MEASUREMENT, NO_ANTI_WINDUP, PREDICT, SWITCH = 1, 2, 4, 8
-S = math.sqrt(2 / 3)  # peak / power-invariant
-P, U_DC = 8, 36.0
-K_T = P * 0.033  # N m per power-invariant ampere
-V_MAX = U_DC / math.sqrt(3)
-RPM = P * math.pi / 30
-
-
-def values(mode: int, *, delayed: bool = False, **changes: float) -> dict[str, float]:
-    machine = {"motor.pole_pairs": P, "motor.R_s_ohm": 0.157, "motor.psi_f_wb": 0.033 * S, "motor.I_max_apk": 200.0,
-               "protection.I_cont_apk": 150.0, "inverter.T_s_ns": 100_000, "polar.mode": mode,
-               "inverter.voltage_utilisation": 1 / math.sqrt(3), "inverter.delay_periods": 1.5 if delayed else 0.5}
-    machine |= {f"motor.L_{axis}_h": 0.0009 for axis in ("d", "q", "d_app", "q_app")}
-    return DEFAULTS | machine | {name.replace("__", "."): value for name, value in changes.items()}
-
-
-@dataclass(frozen=True)
-class Run:
-    """Power-invariant currents (A), phase (rad), demanded voltage (V peak)."""
-
-    i: np.ndarray
-    delta: np.ndarray
-    u: np.ndarray
-
-
-def run(settings: dict[str, float], i_q: np.ndarray, rpm: float | np.ndarray, start: tuple[float, float], *,
-        noise: float = 0.0, seed: int = 1, plant: tuple[float, float, float, float] = (1, 1, 1, 1),
-        double: bool = False) -> Run:
-    loop = Loop(core(double=double), settings, omega=0.0, U_dc=U_DC)
-    m = loop.plant
-    m.R, m.L_d, m.L_q, m.psi = m.R * plant[0], m.L_d * plant[1], m.L_q * plant[2], m.psi * plant[3]
-    speed = np.broadcast_to(rpm, len(i_q))
-    m.omega = float(speed[0]) * RPM
-    loop.settle_at(start[0] * S, start[1] * S)
-    rng = np.random.default_rng(seed)
-    currents, phases, voltages = [], [], []
-    for k, target in enumerate(i_q):
-        m.omega = float(speed[k]) * RPM
-        true = m.i
-        currents.append(true / S)
-        m.i = true + noise * S * rng.normal(size=2)
-        seen = m.phases()
-        m.i = true
-        live = loop.step_with(seen, mode=MODE_CURRENT, i_q_ref=float(target) * S)
-        phases.append(loop.state.polar[0])
-        voltages.append((live.u_d, live.u_q))
-    return Run(np.array(currents), np.array(phases), np.array(voltages))
+RPM_800 = 800.0
 
 
-@dataclass(frozen=True)
-class StepResult:
-    """Settling (ms, 5 %), overshoot (%) up and down; peak and area of positive i_d after the step down."""
-
-    up: float
-    down: float
-    over_up: float
-    over_down: float
-    peak: float
-    area: float
-    i_d_end: float
+def measured(law: Controller, bench: Bench = SIMULATION) -> TorqueStep:
+    return polar_steps.measured(polar_steps.response(law, bench))
 
 
-TORQUE_STEP = np.where((np.arange(1600) >= 300) & (np.arange(1600) < 900), 4.5, 1.0) / K_T
+# ---- 800 rpm, 1 -> 4.5 -> 1 N m ------------------------------------------------------------------------------
 
-
-def evaluate(seen: Run, sign: float = 1.0) -> StepResult:
-    low, high = 1.0 / K_T, 4.5 / K_T
-    i_d, i_q = seen.i[:, 0], sign * seen.i[:, 1]
-
-    def settled(part: np.ndarray, target: float) -> float:
-        outside = np.flatnonzero(np.abs(part - target) > 0.05 * (high - low))
-        return 0.0 if len(outside) == 0 else float(outside[-1] + 1) * 0.1
-
-    up, down = i_q[300:900], i_q[900:]
-    return StepResult(settled(up, high), settled(down, low), 100 * max(0.0, up.max() - high) / (high - low),
-                      100 * max(0.0, low - down.min()) / (high - low), float(i_d[900:].max()),
-                      float(np.maximum(i_d[900:1200], 0).sum() * 0.1), float(i_d[-1]))
-
-
-@cache
-def torque_step(mode: int, options: int = 0, delayed: bool = False, noise: float = 0.0) -> StepResult:
-    """800 rpm, 1 -> 4.5 -> 1 Nm, from the controller's own steady state."""
-    start = (4.476, 1.0 / K_T) if mode == CONVENTIONAL and not options & SWITCH else (0.0, 1.0 / K_T)
-    settings = values(mode, delayed=delayed, polar__options=options)
-    return evaluate(run(settings, TORQUE_STEP, 800.0, start, noise=noise))
+CONVENTIONAL_I_D, CONVENTIONAL_I_D_ROOM = 4.47, 0.01  # A; 4.477: the inverter holds the voltage in the stator frame
+CONVENTIONAL_PEAK = (5.0, 6.5)  # A; 5.76
+CONVENTIONAL_SETTLING = (8.0, 13.0)  # ms; 11.0 up, 10.7 down
+PROPOSED_I_D = 0.02  # A; 1e-5
+PROPOSED_AREA = 0.15  # of conventional; 0.105, with P and D on the measurement 0.089
+PROPOSED_PEAK, ON_MEASUREMENT_PEAK = 0.92, 0.5  # of conventional; 0.863 and 0.380
+PROPOSED_SETTLING = (0.65, 1.15)  # of conventional; 0.82 and 0.83, on the measurement 0.92 and 0.72
+WITHOUT_ANTI_WINDUP = 3.0  # times slower; 4.9
+ON_MEASUREMENT_OVER = 2.0  # %; 0.1 and 1.1
 
 
 def test_conventional_law_strengthens_the_flux() -> None:
-    held = run(values(CONVENTIONAL), np.full(1500, 1.0 / K_T), 800.0, (0.0, 1.0 / K_T))
-    assert held.i[-1] == pytest.approx([4.47, 1.0 / K_T], abs=0.01)
-    assert held.delta[-1] == pytest.approx(0.062, abs=0.001)
-    step = torque_step(CONVENTIONAL)
-    assert 5.0 <= step.peak <= 6.5
-    assert 8.0 <= step.up <= 13.0
-    assert 8.0 <= step.down <= 13.0
+    step = measured(CONVENTIONAL)
+    assert step.end_a == pytest.approx(CONVENTIONAL_I_D, abs=CONVENTIONAL_I_D_ROOM)
+    assert CONVENTIONAL_PEAK[0] <= step.peak_a <= CONVENTIONAL_PEAK[1]
+    for settling in (step.up_ms, step.down_ms):
+        assert CONVENTIONAL_SETTLING[0] <= settling <= CONVENTIONAL_SETTLING[1]
 
 
 def test_proposed_law_removes_the_sustained_flux_strengthening() -> None:
-    step, conventional = torque_step(PROPOSED), torque_step(CONVENTIONAL)
-    assert abs(step.i_d_end) <= 0.02
-    assert step.area <= 0.15 * conventional.area
-    assert step.peak <= 0.92 * conventional.peak
-    for new, old in ((step.up, conventional.up), (step.down, conventional.down)):
-        assert 0.65 * old <= new <= 1.15 * old
-    wound_up = torque_step(PROPOSED, NO_ANTI_WINDUP)
-    assert wound_up.down >= 3 * step.down
+    step, conventional, wound_up = measured(PROPOSED), measured(CONVENTIONAL), measured(WOUND_UP)
+    assert abs(step.end_a) <= PROPOSED_I_D
+    assert step.area_mas <= PROPOSED_AREA * conventional.area_mas
+    assert step.peak_a <= PROPOSED_PEAK * conventional.peak_a
+    for new, old in ((step.up_ms, conventional.up_ms), (step.down_ms, conventional.down_ms)):
+        assert PROPOSED_SETTLING[0] * old <= new <= PROPOSED_SETTLING[1] * old
+    assert wound_up.down_ms >= WITHOUT_ANTI_WINDUP * step.down_ms
 
 
 def test_p_and_d_on_the_measurement_halve_the_peak() -> None:
-    step, conventional = torque_step(PROPOSED, ON_MEASUREMENT), torque_step(CONVENTIONAL)
-    assert step.peak <= 0.5 * conventional.peak
-    assert step.area <= 0.15 * conventional.area
-    for new, old in ((step.up, conventional.up), (step.down, conventional.down)):
-        assert 0.65 * old <= new <= 1.15 * old
-    assert max(step.over_up, step.over_down) <= 2.0
+    step, conventional = measured(PROPOSED_ON_MEASUREMENT), measured(CONVENTIONAL)
+    assert abs(step.end_a) <= PROPOSED_I_D
+    assert step.peak_a <= ON_MEASUREMENT_PEAK * conventional.peak_a
+    assert step.area_mas <= PROPOSED_AREA * conventional.area_mas
+    for new, old in ((step.up_ms, conventional.up_ms), (step.down_ms, conventional.down_ms)):
+        assert PROPOSED_SETTLING[0] * old <= new <= PROPOSED_SETTLING[1] * old
+    assert max(step.over_up, step.over_down) <= ON_MEASUREMENT_OVER
 
 
 def test_always_in_field_weakening_proposed_is_conventional_bit_for_bit() -> None:
-    i_q = np.where((np.arange(1600) >= 300) & (np.arange(1600) < 900), 3.0, 0.5) / K_T
-    seen = [run(values(mode), i_q, 1000.0, (-3.0, 0.5 / K_T)) for mode in (CONVENTIONAL, PROPOSED)]
-    assert (seen[0].i == seen[1].i).all()
-    assert (seen[0].u == seen[1].u).all()
+    torque = steps([(0.0, 0.5), (0.03, 3.0), (0.09, 0.5)])
+    # the amplitude is at its limit as soon as i_d has become negative; both start from no current
+    seen = [run(law, SIMULATION, torque, [(0.0, 1000.0)], 0.16) for law in (CONVENTIONAL, PROPOSED)]
+    start = seen[0].index(0.02)
+    assert seen[1].i_d[start:].max() < 0.0
+    assert np.array_equal(seen[0].i_q[start:], seen[1].i_q[start:])
+    assert np.array_equal(seen[0].u_q[start:], seen[1].u_q[start:])
 
 
-def test_unified_law_in_field_weakening() -> None:
-    step = torque_step(UNIFIED)
-    assert step.up <= 6.0
-    assert step.down <= 3.0
-    assert max(step.over_up, step.over_down) <= 1.0
-    assert step.peak <= 0.1
-    noisy = torque_step(UNIFIED, PREDICT, delayed=True, noise=0.05)
-    assert noisy.peak <= 0.3
-    assert (noisy.up, noisy.down) <= (6.0, 3.0)
+def test_small_signal_response_decays_as_placed() -> None:
+    at, small = 0.06, 0.0264  # 0.1 A
+    r = run(CONVENTIONAL, SIMULATION, steps([(0.0, 1.0), (at, 1.0 + small)]), [(0.0, RPM_800)], 0.1)
+    response = (r.i_q[r.index(at) :] - 1.0 / K_T) / (small / K_T)
+    rate = np.polyfit(1e-4 * np.arange(140), np.log(np.abs(response[60:200] - 1.0) + 1e-6), 1)[0]
+    assert -900.0 < rate < -250.0  # 1/s; double poles at -600 +- j346
+    assert response.max() < 1.1
 
 
-@pytest.mark.parametrize("mode", [CONVENTIONAL, PROPOSED, LINEAR, REGULARISED, UNIFIED])
-def test_backwards_is_the_mirror_image(mode: int) -> None:
-    rpm, start = (800.0, (0.0, 1.0 / K_T)) if mode in (CONVENTIONAL, PROPOSED, UNIFIED) else (400.0, (0.0, 1.0 / K_T))
-    forward = run(values(mode), TORQUE_STEP / (1 if rpm > 500 else 3), rpm, start)
-    backward = run(values(mode), -TORQUE_STEP / (1 if rpm > 500 else 3), -rpm, (start[0], -start[1]))
-    assert np.abs(forward.i[:, 0] - backward.i[:, 0]).max() <= 5e-4  # A; measured 1e-5: the sine of a negative angle
-    assert np.abs(forward.i[:, 1] + backward.i[:, 1]).max() <= 5e-4
+# ---- unified law in field weakening --------------------------------------------------------------------------
+
+UNIFIED_UP, UNIFIED_DOWN = 6.0, 3.0  # ms; 4.9 and 2.0 (V_ref 0.97 V_max: 3.7 and 2.0), with delay and noise 5.0 and 2.1
+UNIFIED_OVER = 1.0  # %; 0.002, with delay and noise 0.4
+UNIFIED_PEAK, UNIFIED_NOISY_PEAK = 0.1, 0.3  # A; 1e-4 and 0.055
+MIRROR_A = 5e-4  # A; 2e-5: binary32 rounds the phases b and c in another order
+MIRROR_DOUBLE_A = 1e-11  # A; 3e-13 in binary64
+RAMP_BUMP = 0.025  # N m; 0.0224 and 0.0058 on the torque ramp, 0.0090 and 0.0003 on the speed ramp
 
 
-def linear_range(mode: int, rpm: float) -> tuple[float, float, float]:
-    """0 -> 1 -> 0 -> -1 -> 0 Nm every 20 ms: worst overshoot (%), settling (ms), i_d peak (A)."""
-    levels = np.array([0.0, 1.0, 0.0, -1.0, 0.0]) / K_T
-    seen = run(values(mode), np.repeat(levels, 200), rpm, (0.0, 0.0))
-    step = 1.0 / K_T
-    overshoot, settling = 0.0, 0.0
-    for k in range(1, 5):
-        part = seen.i[200 * k : 200 * (k + 1), 1] - levels[k]
-        overshoot = max(overshoot, 100 * float((part * np.sign(levels[k] - levels[k - 1])).max()) / step)
-        outside = np.flatnonzero(np.abs(part) > 0.05 * step)
-        settling = max(settling, float(outside[-1] + 1) * 0.1)
-    return overshoot, settling, float(np.abs(seen.i[:, 0]).max())
+BENCHES = ((SIMULATION, UNIFIED_PEAK), (NOISY, UNIFIED_NOISY_PEAK))
+
+
+@pytest.mark.parametrize("law", [UNIFIED, UNIFIED_TUNED], ids=["V_max", "0.97 V_max"])
+@pytest.mark.parametrize(("bench", "peak"), BENCHES, ids=["ideal", "noisy"])
+def test_unified_law_in_field_weakening(law: Controller, bench: Bench, peak: float) -> None:
+    step = measured(law, bench)
+    assert step.up_ms <= UNIFIED_UP
+    assert step.down_ms <= UNIFIED_DOWN
+    assert max(step.over_up, step.over_down) <= UNIFIED_OVER
+    assert step.peak_a <= peak
+
+
+@pytest.mark.parametrize("law", [CONVENTIONAL, PROPOSED, SWITCHED, UNIFIED], ids=lambda law: law.name)
+def test_backwards_is_the_mirror_image(law: Controller) -> None:
+    forward, backward = (polar_steps.response(law, mirrored=mirrored) for mirrored in (False, True))
+    assert np.abs(forward.i_d - backward.i_d).max() <= MIRROR_A
+    assert np.abs(forward.i_q + backward.i_q).max() <= MIRROR_A
+
+
+def test_the_mirror_is_exact_but_for_rounding() -> None:
+    found = []
+    for sign in (1.0, -1.0):
+        loop = Loop(core(double=True), values(6, polar__V_ref_ratio=0.97), omega=sign * 900 * RPM, U_dc=U_DC)
+        rows = []
+        for k in range(200):
+            loop.step(mode=MODE_CURRENT, i_q_ref=sign * (12.0 if k > 50 else 2.0))
+            rows.append(loop.plant.i * (1.0, sign))
+        found.append(np.array(rows))
+    assert np.abs(found[0] - found[1]).max() <= MIRROR_DOUBLE_A
+
+
+@pytest.mark.parametrize("ramp", [polar_ramps.TORQUE, polar_ramps.SPEED], ids=["torque", "speed"])
+def test_torque_bump_on_ramps(ramp: polar_ramps.Ramp) -> None:
+    bump = {
+        law.name: polar_ramps.measured(polar_ramps.response(law, ramp), ramp)[0]
+        for law in (PROPOSED, UNIFIED, UNIFIED_TUNED)
+    }
+    assert bump[UNIFIED.name] <= RAMP_BUMP
+    assert bump[UNIFIED_TUNED.name] <= 0.3 * bump[UNIFIED.name]  # 0.26 and 0.04
+    assert bump[PROPOSED.name] > bump[UNIFIED.name]
+
+
+# ---- linear range --------------------------------------------------------------------------------------------
+
+STANDSTILL_OVER, STANDSTILL_OVER_ROOM = 18.5, 1.5  # %; 18.5
+TURNING_OVER, TURNING_I_D = 20.5, (0.1, 0.45)  # %, A; 19.0 and 0.176
+SETTLING_ROOM = 0.3  # ms between 0 and 400 rpm; 0.0
+IMPROVED_SAME, IMPROVED_OVER, IMPROVED_I_D = 0.5, 3.5, 1.0  # points, %, % of the step; 0.003, 2.8, 0.66
+PHASE_RATIO = 1.0 / 15.0  # of the paper's law; 1/18 regularised, 1/66 unified
+SPIKE = 0.12  # A; 0.081 and 0.058
+
+
+def stairs(law: Controller, rpm: float) -> polar_linear.Staircase:
+    return polar_linear.measured(polar_linear.response(law, rpm))
 
 
 def test_linear_range_as_in_the_paper() -> None:
-    standstill, turning = linear_range(LINEAR, 0.0), linear_range(LINEAR, 400.0)
-    assert standstill[0] == pytest.approx(18.5, abs=1.5)
-    assert turning[0] <= 20.5
-    assert 0.1 <= turning[2] <= 0.45
-    assert turning[1] == pytest.approx(standstill[1], abs=0.3)
+    standstill, turning = stairs(LINEAR, 0.0), stairs(LINEAR, 400.0)
+    assert standstill.over == pytest.approx(STANDSTILL_OVER, abs=STANDSTILL_OVER_ROOM)
+    assert standstill.i_d_a <= 1e-3  # 2e-6
+    assert turning.over <= TURNING_OVER
+    assert TURNING_I_D[0] <= turning.i_d_a <= TURNING_I_D[1]
+    assert turning.settle_ms == pytest.approx(standstill.settle_ms, abs=SETTLING_ROOM)
 
 
 def test_printed_decoupling_fails_to_settle() -> None:
-    printed = linear_range(PRINTED, 400.0)
-    assert printed[1] >= 19.9
-    assert printed[2] > 3.0
-    assert linear_range(PRINTED, 0.0)[0] == pytest.approx(18.5, abs=1.5)  # blind at standstill
+    printed = stairs(PRINTED, 400.0)
+    assert math.isinf(printed.settle_ms)
+    assert printed.i_d_a > 3.0  # 8.7
+    assert stairs(PRINTED, 0.0).over == pytest.approx(STANDSTILL_OVER, abs=STANDSTILL_OVER_ROOM)  # blind at standstill
 
 
-@pytest.mark.parametrize("mode", [REGULARISED, UNIFIED])
-def test_improved_linear_laws(mode: int) -> None:
-    standstill, turning = linear_range(mode, 0.0), linear_range(mode, 400.0)
-    assert abs(turning[0] - standstill[0]) <= 0.5
-    assert turning[0] <= 3.5
-    assert turning[2] <= 0.01 / K_T
+@pytest.mark.parametrize("law", [REGULARISED, UNIFIED_TUNED], ids=lambda law: law.name)
+def test_improved_linear_laws(law: Controller) -> None:
+    standstill, turning = stairs(law, 0.0), stairs(law, 400.0)
+    assert abs(turning.over - standstill.over) <= IMPROVED_SAME
+    assert turning.over <= IMPROVED_OVER
+    assert turning.i_d_percent <= IMPROVED_I_D
 
 
-def standstill_noise(mode: int, torque: float = 0.0) -> tuple[float, float, float]:
-    """Rms phase step (rad, modulo pi), standard deviations of i_d and i_q (A) with 0.05 A of noise per axis."""
-    rows = []
-    for seed in range(3):
-        seen = run(values(mode), np.full(2500, torque / K_T), 0.0, (0.0, 0.0), noise=0.05, seed=seed + 1)
-        jump = np.mod(np.diff(seen.delta[800:]) + np.pi / 2, np.pi) - np.pi / 2
-        rows.append((np.sqrt(np.mean(jump**2)), seen.i[800:, 0].std(), seen.i[800:, 1].std()))
-    means = np.mean(rows, axis=0)
-    return float(means[0]), float(means[1]), float(means[2])
+@pytest.mark.parametrize("law", [REGULARISED, UNIFIED_TUNED], ids=lambda law: law.name)
+def test_phase_is_quiet_at_zero_voltage(law: Controller) -> None:
+    papers, improved = (polar_linear.at_rest(one, 0.0, 4, 8, 0) for one in (LINEAR, law))
+    assert improved.phase_rad <= PHASE_RATIO * papers.phase_rad
+    assert improved.i_d_a <= papers.i_d_a
+    assert improved.i_q_a <= papers.i_q_a
+    assert max(improved.spikes_a) <= SPIKE < max(papers.spikes_a)  # the paper's 1.2
 
 
-@pytest.mark.parametrize("mode", [REGULARISED, UNIFIED])
-def test_phase_is_quiet_at_zero_voltage(mode: int) -> None:
-    papers, improved = standstill_noise(LINEAR), standstill_noise(mode)
-    assert improved[0] <= papers[0] / 15
-    assert improved[1] <= papers[1]
-    assert improved[2] <= papers[2]
-    spikes = []
-    for seed in range(12):
-        i_q = np.where(np.arange(500) < 300, 0.0, 1.0 / K_T)
-        seen = run(values(mode), i_q, 0.0, (0.0, 0.0), noise=0.05, seed=40 + seed)
-        spikes.append(np.abs(seen.i[300:400, 0]).max())
-    assert max(spikes) <= 0.12
+@pytest.mark.parametrize("law", [SWITCHED, polar_ramps.CONVENTIONAL_SWITCHED], ids=lambda law: law.name)
+def test_switching_to_the_linear_law_is_bumpless(law: Controller) -> None:
+    step = measured(law)
+    assert step.up_ms <= 11.0  # 7.9 and 9.0
+    assert step.down_ms <= 3.5  # 2.2
+    assert step.over_down <= 4.0  # 2.7
+    assert step.peak_a <= 1.2  # 0.98
+    assert abs(step.end_a) <= PROPOSED_I_D
 
 
-def test_torque_bump_on_a_ramp() -> None:
-    time = np.arange(5000) * 1e-4
-    torque = np.interp(time, [0, 0.03, 0.23, 0.27, 0.47, 0.5], [1, 1, 4.5, 4.5, 1, 1])
-    bumps = []
-    for mode, ratio in ((PROPOSED, 1.0), (UNIFIED, 1.0), (UNIFIED, 0.97)):
-        seen = run(values(mode, polar__V_ref_ratio=ratio), torque / K_T, 800.0, (0.0, 1.0 / K_T))
-        error = seen.i[:, 1] * K_T - torque
-        bumps.append(np.abs(error - np.convolve(error, np.ones(200) / 200, "same"))[300:-300].max())
-    assert bumps[1] <= 0.025
-    assert bumps[2] <= 0.3 * bumps[1]
-    assert bumps[0] > bumps[1]
+@pytest.mark.parametrize("law", [SWITCHED, polar_ramps.CONVENTIONAL_SWITCHED], ids=lambda law: law.name)
+def test_the_switch_makes_the_phase_laws_work_at_standstill(law: Controller) -> None:
+    r = run(law, SIMULATION, steps([(0.0, 0.0), (0.01, 1.0)]), [(0.0, 0.0)], 0.06)
+    assert r.torque[-1] == pytest.approx(1.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("mode", [CONVENTIONAL, PROPOSED])
-def test_switching_to_the_linear_law_is_bumpless(mode: int) -> None:
-    step = torque_step(mode, SWITCH)
-    assert step.up <= 11.0
-    assert step.down <= 3.5
-    assert step.over_down <= 4.0
-    assert step.peak <= 1.2
-    assert abs(step.i_d_end) <= 0.02
+# ---- everywhere ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rpm", [0.0, 200.0, 600.0, 900.0, 1200.0, -1500.0])
-@pytest.mark.parametrize("torque", [-4.0, -1.0, 1.0, 4.0])
-def test_unified_law_from_standstill_to_deep_field_weakening(rpm: float, torque: float) -> None:
-    i_q = np.where(np.arange(900) < 50, 0.0, torque / K_T)
-    seen = run(values(UNIFIED), i_q, rpm, (0.0, 0.0))
-    assert seen.i[-1, 1] == pytest.approx(torque / K_T, abs=0.02)
-    assert np.ptp(seen.i[-200:], axis=0).max() <= 1e-2
-    assert np.hypot(*seen.u[-1]) <= V_MAX * (1 + 1e-4)
-    assert seen.i[60:, 0].max() <= 0.5  # A; 0.32 where the step itself clips the voltage
+def test_unified_law_over_six_speeds_and_four_loads() -> None:
+    cells = polar_sweep.grid(UNIFIED_TUNED, SIMULATION, polar_sweep.SPEEDS_RPM, polar_sweep.LOADS_NM, 0)
+    failures = {cell for cell, one in cells.items() if one.fails(polar_sweep.ERROR_A, polar_sweep.RIPPLE_A)}
+    assert len(cells) == 24
+    assert failures == set()
+    assert max(one.i_d_a for one in cells.values()) <= 0.5  # A; 0.31 where the step itself clips the voltage
 
 
-def test_unified_law_under_random_parameters() -> None:
-    rng = np.random.default_rng(0)
-    for k in range(100):
-        plant = tuple(float(x) for x in rng.uniform([0.5, 0.6, 0.6, 0.75], [2.0, 1.6, 1.6, 1.2]))
-        rpm, torque, delayed = float(rng.uniform(-1500, 1500)), float(rng.uniform(-3, 3)), bool(rng.integers(2))
-        i_q = np.where(np.arange(500) < 30, 0.0, torque / K_T)
-        settings = values(UNIFIED, delayed=delayed, polar__options=PREDICT if delayed else 0)
-        seen = run(settings, i_q, rpm, (0.0, 0.0), plant=(plant[0], plant[1], plant[2], plant[3]))
-        assert np.isfinite(seen.i).all()
-        assert np.ptp(seen.i[-100:], axis=0).max() <= 0.1, k  # settled, no limit cycle
-        assert abs(seen.i[-1, 1] - torque / K_T) <= 0.5, k
+def test_unified_law_on_the_whole_drive() -> None:
+    cells = polar_sweep.grid(UNIFIED_TUNED, polar_sweep.EXPERIMENT, (0.0, 900.0, -1400.0), (-4.0, 1.0), 0)
+    assert not any(one.fails(polar_sweep.NOISY_ERROR_A, polar_sweep.NOISY_RIPPLE_A) for one in cells.values())
 
 
-def test_unified_law_cuts_an_unreachable_torque_and_comes_back() -> None:
-    i_q = np.where((np.arange(1200) > 100) & (np.arange(1200) < 600), 12.0, 1.0) / K_T
-    seen = run(values(UNIFIED), i_q, 800.0, (0.0, 1.0 / K_T))
-    assert seen.i[550, 1] == pytest.approx(0.97 * 31.9, rel=0.03)  # largest i_q at 800 rpm is 31.9 A
-    assert seen.i[-1] == pytest.approx([0, 1.0 / K_T], abs=0.02)
+def test_unified_law_on_random_machines() -> None:
+    found = polar_sweep.random_outcomes(UNIFIED_TUNED, 100, 0)
+    failed = [k for k, one in enumerate(found) if one.fails(polar_sweep.RANDOM_ERROR_A, polar_sweep.RANDOM_RIPPLE_A)]
+    assert failed == []
 
 
-@pytest.mark.parametrize("mode", [REGULARISED, UNIFIED])
-def test_laws_for_salient_machines_hold_there(mode: int) -> None:
-    salient = {"motor.L_d_h": 0.0006, "motor.L_q_h": 0.0014, "motor.L_d_app_h": 0.0006, "motor.L_q_app_h": 0.0014}
-    rpm = 400.0 if mode == REGULARISED else 1000.0
-    i_q = np.where(np.arange(900) < 100, 2.0, 9.0)
-    loop_values = values(mode) | salient
-    loop = Loop(core(), loop_values, omega=rpm * RPM, U_dc=U_DC)
-    loop.settle_at(0.0, 0.0)
-    peak = 0.0
-    for target in i_q:
-        loop.step(mode=MODE_CURRENT, i_q_ref=float(target) * S)
-        peak = max(peak, float(loop.plant.i[1]) / S)
-    assert loop.plant.i[1] / S == pytest.approx(9.0, abs=0.02)
-    assert peak <= 9.0 + 0.05 * 7.0
-    if mode == REGULARISED:
-        assert loop.plant.i[0] == pytest.approx(0, abs=0.02)
-    else:
-        u = math.hypot(loop.state.live.u_d, loop.state.live.u_q)
-        assert u == pytest.approx(V_MAX, rel=1e-3)
-        assert loop.plant.i[0] < -1.0
+REACHED = (
+    (CONVENTIONAL, 8.099),
+    (CONVENTIONAL_ON_MEASUREMENT, 8.099),
+    (PROPOSED_ON_MEASUREMENT, 8.099),
+    (UNIFIED, 8.101),
+    (UNIFIED_TUNED, 7.787),
+)
+"""Torque held at 800 rpm where 12 N m are asked for and 8.42 N m are the most: 0.97 of the reach."""
+REACH_ROOM_NM = 0.02
 
 
-def test_phase_laws_place_the_poles_they_promise() -> None:
-    """Small-signal response of the conventional law equals the placed polynomial's, to the sampling's accuracy."""
-    i_q = np.where(np.arange(400) < 100, 3.788, 3.888)
-    seen = run(values(CONVENTIONAL), i_q, 800.0, (4.476, 3.788), double=True)
-    response = (seen.i[100:, 1] - 3.788) / 0.1
-    tail = np.abs(response[60:200] - 1)
-    rate = np.polyfit(np.arange(140) * 1e-4, np.log(tail + 1e-6), 1)[0]
-    assert -900 < rate < -250  # double poles at -600 +- j346
-    assert response.max() < 1.1
+@pytest.mark.parametrize(("law", "torque"), REACHED, ids=[law.name for law, _ in REACHED])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_torque_out_of_reach_is_cut_and_comes_back(law: Controller, torque: float, sign: float) -> None:
+    held, r = polar_limit.unreachable(law, sign=sign)
+    assert sign * held.torque == pytest.approx(torque, abs=REACH_ROOM_NM)
+    assert held.ripple <= 0.01  # N m; 1e-5
+    assert sign * r.torque[-1] == pytest.approx(1.0, abs=0.01)
+
+
+def test_unified_law_keeps_the_current_limit_out_of_reach() -> None:
+    _, r = polar_limit.unreachable(UNIFIED_TUNED)
+    assert np.hypot(r.i_d, r.i_q).max() <= 40.0 * math.sqrt(1.5)  # I_max of the profile; 31.4 A peak
+
+
+OVERMODULATED_NM = 0.01  # 0.001
+
+
+@pytest.mark.parametrize("ratio", [1.05, 1.08])
+def test_unified_law_holds_torque_in_overmodulation(ratio: float) -> None:
+    law = Controller("unified", "unified", 0, (("polar.V_ref_ratio", 0.97 * ratio),))
+    held = polar_limit.at_ratio(law, ratio, 4.5)
+    assert held.torque == pytest.approx(4.5, abs=OVERMODULATED_NM)
+    assert held.fundamental > 1.0
+
+
+# ---- L_d != L_q ----------------------------------------------------------------------------------------------
+
+
+def test_the_papers_laws_are_refused_on_an_interior_machine() -> None:
+    refused = polar_salient.refusals()
+    assert {law for law, why in refused.items() if why} == {"conventional", "proposed", "linear", "linear-printed"}
+    assert all("L_d = L_q" in why for why in refused.values() if why)
+
+
+@pytest.mark.parametrize("rpm", [500.0, 2000.0, -2500.0])
+@pytest.mark.parametrize("torque", [4.0, 14.0, -14.0])
+def test_unified_law_holds_torque_on_an_interior_machine(rpm: float, torque: float) -> None:
+    point = polar_salient.point(polar_salient.response(UNIFIED_TUNED, rpm, torque))
+    assert point.torque == pytest.approx(torque, rel=polar_salient.TORQUE_SHARE)
+    assert point.voltage <= 1.0 + 1e-4
+
+
+def test_regularised_law_holds_torque_on_an_interior_machine() -> None:
+    r = polar_salient.response(REGULARISED, 500.0, 14.0)
+    assert polar_salient.point(r).torque == pytest.approx(14.0, rel=polar_salient.TORQUE_SHARE)
+    assert r.torque.max() <= 1.06 * 14.0  # 1.033
+
+
+@pytest.mark.parametrize(("rpm", "torque"), [(2500.0, 20.0), (3000.0, 14.0), (-3000.0, -20.0)])
+def test_unified_law_keeps_the_demagnetisation_limit(rpm: float, torque: float) -> None:
+    point = polar_salient.point(polar_salient.response(UNIFIED_TUNED, rpm, torque))
+    assert point.i_d == pytest.approx(-10.0, abs=0.01)
+    assert 0.5 * abs(torque) < abs(point.torque) < abs(torque)
+    assert point.peak <= 12.0
+
+
+# ---- nothing but finite duties -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", range(1, 7))
+@pytest.mark.parametrize("options", [0, 1, 2, 5, 9])
+def test_every_law_stays_finite_on_states_no_loop_visits(mode: int, options: int) -> None:
+    rng = np.random.default_rng(mode)
+    loop = Loop(core(), values(mode, options, inverter__delay_periods=1.5), omega=0.0, U_dc=U_DC)
+    for _ in range(60):
+        m = loop.measurement
+        m.theta_e = float(rng.uniform(-3, 3))
+        m.omega_e = float(rng.choice([0.0, 1e-3, 1.0, -1.0]) * rng.uniform(0, 3000))
+        m.U_dc = float(rng.choice([0.0, 1.0, 36.0, 60.0]))
+        phases = rng.normal(0, 30, 3)
+        loop.measurement.i_a, loop.measurement.i_b, loop.measurement.i_c = (float(x) for x in phases - phases.mean())
+        loop.reference.mode = int(rng.choice([MODE_CURRENT, MODE_TORQUE]))
+        loop.reference.i_q_ref, loop.reference.tau_ref = float(rng.normal(0, 40)), float(rng.normal(0, 12))
+        loop.binding.library.pmsm_step(loop.state, loop.params, loop.lut, m, loop.reference, loop.output)
+        duties = np.array([loop.output.duty_a, loop.output.duty_b, loop.output.duty_c])
+        assert np.isfinite(duties).all()
+        assert ((duties >= 0.0) & (duties <= 1.0)).all()

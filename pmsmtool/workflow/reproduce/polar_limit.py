@@ -93,7 +93,7 @@ def held(r: Response, from_s: float, to_s: float) -> Held:
 
 def at_ratio(law: Controller, ratio: float, torque_nm: float) -> Held:
     """Return what a polar law holds at 800 rpm with V_a,max at a share of the linear limit."""
-    values = {**law.values, "polar.V_a_max_ratio": ratio}
+    values = (*law.values, ("polar.V_a_max_ratio", ratio))
     changed = replace(law, name=f"{law.name}, {ratio:g}", values=values)
     torque = steps([(0.0, BACK_NM), (0.02, torque_nm)])
     return held(run(changed, SIMULATION, torque, [(0.0, RPM)], 0.25), SETTLED_S, 0.25)

@@ -49,10 +49,10 @@ STEP_A = 1.0 / K_T
 STAIRS = (0.0, 1.0, 0.0, -1.0, 0.0)
 REVERSAL = (0.0, 1.0, -1.0, 1.0)
 
-REGULARISED_HALF = replace(REGULARISED, name="regularised polar map, b = 0.5", values={"polar.b": 0.5})
-REGULARISED_ONE = replace(REGULARISED, name="regularised polar map, b = 1", values={"polar.b": 1.0})
+REGULARISED_HALF = replace(REGULARISED, name="regularised polar map, b = 0.5", values=(("polar.b", 0.5),))
+REGULARISED_ONE = replace(REGULARISED, name="regularised polar map, b = 1", values=(("polar.b", 1.0),))
 REGULARISED_WIDE = replace(
-    REGULARISED, name="regularised polar map, eps = 0.05 V_max", values={"polar.eps_ratio": 0.05}
+    REGULARISED, name="regularised polar map, eps = 0.05 V_max", values=(("polar.eps_ratio", 0.05),)
 )
 DELAYED = Bench("one period of delay", 1.5, SIMULATION.simulation)
 

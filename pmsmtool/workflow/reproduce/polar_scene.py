@@ -113,7 +113,7 @@ class Controller:
         Law of ``tune --controller polar``; empty: field-oriented.
     options : int
         ``polar.options`` in place of what ``tune`` chooses; -1: as tuned.
-    values : mapping
+    values : tuple of (str, float)
         Further values of the catalogue.
     request : TuneRequest
         What is asked of ``tune`` besides.
@@ -125,7 +125,7 @@ class Controller:
     name: str
     law: str = ""
     options: int = -1
-    values: Mapping[str, float] = field(default_factory=dict)
+    values: tuple[tuple[str, float], ...] = ()
     request: TuneRequest = field(default_factory=TuneRequest)
     cdm: bool = False
 
@@ -139,7 +139,7 @@ SWITCHED = Controller("proposed, switched to the regularised law", "proposed", L
 LINEAR = Controller("linear range, (15) corrected", "linear", 0)
 PRINTED = Controller("linear range, (15) as printed", "linear-printed", 0)
 REGULARISED = Controller("regularised polar map", "regularised", 0)
-UNIFIED = Controller("unified, V_ref = V_max", "unified", 0, {"polar.V_ref_ratio": 1.0})
+UNIFIED = Controller("unified, V_ref = V_max", "unified", 0, (("polar.V_ref_ratio", 1.0),))
 UNIFIED_TUNED = Controller("unified, V_ref = 0.97 V_max (tune)", "unified", 0)
 
 
@@ -164,9 +164,6 @@ def machine_file(delay_periods: float = 1.5) -> MachineFile:
     return replace(source, inverter=replace(source.inverter, delay_periods=delay_periods))
 
 
-_SETS: dict[tuple[str, str, float], ParameterSet] = {}
-
-
 def parameter_set(controller: Controller, source: MachineFile) -> ParameterSet:
     """Return the drive parameters of a controller on a machine: as ``tune`` makes them, then its own changes.
 
@@ -186,7 +183,7 @@ def parameter_set(controller: Controller, source: MachineFile) -> ParameterSet:
         values["polar.options"] = float(controller.options | predict)
     if controller.cdm:
         values |= _cdm_gains(source)
-    values |= controller.values
+    values |= dict(controller.values)
     return ParameterSet(values=values, tables=tuned.tables)
 
 
@@ -300,8 +297,11 @@ def run(
     )
 
 
+_SETS: dict[tuple[Controller, str], ParameterSet] = {}
+
+
 def _cached_set(controller: Controller, source: MachineFile) -> ParameterSet:
-    key = (controller.name, source.content_hash(), source.inverter.delay_periods)
+    key = (controller, source.content_hash())
     if key not in _SETS:
         _SETS[key] = parameter_set(controller, source)
     return _SETS[key]
