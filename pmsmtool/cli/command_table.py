@@ -45,6 +45,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("doctor", "pmsmtool.cli.doctor:doctor_command", Section.LOOK, "Examine adapters, wiring and bit rate."),
     Row("scan", "pmsmtool.cli.scan:scan_command", Section.LOOK, "List the nodes on a bus."),
     Row("info", "pmsmtool.cli.info:info_command", Section.LOOK, "Show identity, state and parameter set."),
+    Row("caps", "pmsmtool.cli.caps:caps_command", Section.LOOK, "Show what a drive can give, and what is missing."),
     Row("monitor", "pmsmtool.cli.monitor:monitor_command", Section.LOOK, "Show live values."),
     Row("fault", "pmsmtool.cli.fault:fault_command", Section.LOOK, "Show or reset faults."),
     Row("commission", "pmsmtool.cli.commission:commission_command", Section.MOVE, "Identify, design, flash, prove."),

@@ -21,17 +21,20 @@ if TYPE_CHECKING:
 
 def map_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add ``--map`` to a command, which receives ``map_file: Path | None``."""
-    text = "Map of the drive's objects (TOML); default: the reference drive's."
+    text = "Map of the drive's objects: TOML file, or family (`firmware-params`)."
     return click.option("--map", "map_file", type=FILE, metavar="FILE", help=text)(function)
 
 
 def read_map(path: Path | None) -> DriveMap:
-    """Return the drive map of a file, the reference drive's without one."""
+    """Return the drive map of a file or a shipped family, the reference drive's without one."""
     from pmsmtool.firmware.drive_map import reference_map
     from pmsmtool.firmware.drive_map_file import parse_drive_map
+    from pmsmtool.firmware.shipped_maps import family_names, load_family
 
     if path is None:
         return reference_map()
+    if str(path) in family_names() and not path.is_file():
+        return load_family(str(path))
     try:
         return parse_drive_map(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:

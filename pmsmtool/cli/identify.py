@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pmsmtool.cli.drive_access import map_option
 from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
+    from pmsmtool.workflow.capabilities import Capabilities
     from pmsmtool.workflow.identify import IdentifyRequest
     from pmsmtool.workflow.run_directory import RunDirectory, Stage
 
@@ -28,7 +30,12 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     ),
 )
 @click.argument("quantities", nargs=-1, metavar="[R|L|psi|encoder|poles|inverter|mechanics|map|all]...")
-@click.option("--method", type=click.Choice(["auto", "inject"]), default="auto", help="How: by injection and trace.")
+@click.option(
+    "--method",
+    type=click.Choice(["auto", "inject", "recorder", "standard", "vendor", "manual"]),
+    default="auto",
+    help="How; auto: the best this drive can (`pmsmtool caps`).",
+)
 @click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="Recompute from the traces of a run; moves nothing.")
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
 @click.option(
@@ -37,6 +44,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     metavar="SHARE",
     help="95 % tolerance of sensor gains; default 0.01, with --replay what the run was made with.",
 )
+@map_option
 @bus_options
 @motion_options
 @output_options
@@ -49,6 +57,7 @@ def identify_command(
     replay: Path | None,
     runs: Path,
     sensor_tol: float | None,
+    map_file: Path | None,
 ) -> None:
     """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
 
@@ -83,8 +92,70 @@ def identify_command(
         tolerance=declared or SensorTolerance(),
     )
     request.check()
-    run, stage = _measure(bus, motion, out, request, runs)
+    found, how, request = _choose(bus, map_file, method, request, everything=not quantities)
+    if how == "inject":
+        run, stage = _measure(bus, motion, out, request, runs)
+    else:
+        run, stage = _measure_without_injection(bus, motion, out, request, runs, found)
     _show(run, stage, out)
+
+
+def _choose(
+    bus: BusOptions, map_file: Path | None, method: str, request: IdentifyRequest, *, everything: bool
+) -> tuple[Capabilities, str, IdentifyRequest]:
+    """Ask the drive what it can; return the method, and without a choice of quantities those it gives."""
+    from dataclasses import replace
+
+    from pmsmtool.cli.drive_access import open_node, read_map
+    from pmsmtool.workflow.capabilities import Method, examine
+
+    with open_node(bus) as node:
+        found = examine(node, None if map_file is None else read_map(map_file))
+    wanted = None if method == "auto" else Method(method)
+    if everything:
+        for candidate in (Method.INJECT, Method.RECORDER, Method.STANDARD) if wanted is None else (wanted,):
+            given = tuple(name for name in request.quantities if found.row(name, candidate).available)
+            if given and candidate is not Method.MANUAL:
+                return found, candidate.value, replace(request, quantities=given)
+    return found, found.require(request.quantities, wanted).value, request
+
+
+def _measure_without_injection(
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    request: IdentifyRequest,
+    runs: Path,
+    found: Capabilities,
+) -> tuple[RunDirectory, Stage]:
+    from dataclasses import asdict
+
+    from pmsmtool import __version__
+    from pmsmtool.cli.consent import ask_motion
+    from pmsmtool.cli.drive_access import choose_node
+    from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
+    from pmsmtool.workflow.run_directory import RunDirectory, new_record
+    from pmsmtool.workflow.tier_identify import tier_stage
+
+    identity = found.identity
+    kind = RecorderDrive if "recorder" in found.features else StandardDrive
+    with bus.connect() as connection:
+        drive = kind(connection, choose_node(connection, bus.node), drive_map=found.drive_map)
+        record = new_record(
+            ["pmsmtool", *sys.argv[1:]],
+            drive=asdict(identity),
+            bus={"interface": bus.interface, "channel": bus.channel, "node": identity.node},
+            versions={"pmsmtool": __version__},
+        )
+        run = RunDirectory.create(runs, identity.serial, record)
+
+        def allow(lines: Any) -> None:
+            ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
+
+        stage = tier_stage(run, drive, request, allow, out.note)
+        drive.close()
+    run.add(stage)
+    return run, stage
 
 
 def _measure(

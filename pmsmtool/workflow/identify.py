@@ -242,7 +242,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         "identify",
         "pass" if all(line.ok for line in acceptance) else "fail",
         0.0,
-        values=[_value(name, estimate) for name, estimate in found.items()],
+        values=[value_facts(name, estimate) for name, estimate in found.items()],
         acceptance=acceptance,
         fallbacks=[f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback],
         files={MACHINE: "", **map_files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
@@ -344,7 +344,8 @@ def _conditions(evaluation: Evaluation, request: IdentifyRequest) -> dict[str, A
     return conditions
 
 
-def _value(name: str, estimate: Estimate) -> dict[str, Any]:
+def value_facts(name: str, estimate: Estimate) -> dict[str, Any]:
+    """Return an estimate as a stage records it; numbers that are not finite as None."""
     facts = {key: getattr(estimate, key) for key in ("value", "std", "systematic", "unit", "n", "method", "source")}
     for key in ("chi2", "T_c", "i_d_apk", "i_q_apk"):
         number = getattr(estimate, key)

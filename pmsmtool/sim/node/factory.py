@@ -25,6 +25,8 @@ TRIP_SHARE = 1.3
 DC_HIGH_SHARE = 1.35
 DC_LOW_SHARE = 0.5
 OVERSPEED_SHARE = 1.5
+SET_UP_BANDWIDTH = 0.05
+"""Current bandwidth (rad/s) times control period of a drive that its maker's tool has set up."""
 
 
 def factory_values(machine_file: MachineFile) -> dict[str, float]:
@@ -59,6 +61,33 @@ def factory_values(machine_file: MachineFile) -> dict[str, float]:
     return {name: min(max(value, BY_NAME[name].minimum), BY_NAME[name].maximum) for name, value in values.items()}
 
 
+def set_up_values(machine_file: MachineFile) -> dict[str, float]:
+    """Return what the maker's own set-up tool would have left in a closed drive: it commutates and controls currents.
+
+    From the simulated machine itself: a drive of another family, or without current set-points, cannot be given this
+    through its own dictionary.
+    """
+    truth = machine_file.simulation_settings()
+
+    def number(key: str) -> float:
+        return float(truth[key])  # type: ignore[arg-type]
+
+    alpha = SET_UP_BANDWIDTH / machine_file.inverter.T_s
+    values = {
+        "motor.pole_pairs": number("pole_pairs"),
+        "motor.R_s_ohm": number("R_s_ohm"),
+        "motor.psi_f_wb": number("psi_f_wb"),
+        "encoder.offset_rad": number("encoder_offset_rad"),
+        "encoder.reversed": float(bool(truth["encoder_reversed"])),
+    }
+    for axis in "dq":
+        inductance = number(f"L_{axis}_h")
+        values |= {f"motor.L_{axis}_h": inductance, f"motor.L_{axis}_app_h": inductance}
+        values |= {f"current.K_p_{axis}_v_per_a": alpha * inductance}
+        values |= {f"current.K_i_{axis}_v_per_as": alpha * number("R_s_ohm")}
+    return values
+
+
 def drive_settings(
     machine_file: MachineFile,
     name: str,
@@ -84,6 +113,8 @@ def drive_settings(
         The family whose dictionary the drive shows.
     """
     values = factory_values(machine_file)
+    if face is not None:
+        values |= set_up_values(machine_file)
     machine = machine_file.machine
     i_nom = values["motor.I_nom_apk"]
     torque = abs(machine.torque_nm(0.0, i_nom)) or 1.0

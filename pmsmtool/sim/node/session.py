@@ -139,6 +139,8 @@ class Session:
         entries["device.name"].value = hardware.name.encode("ascii", "replace")
         entries["cia402.rated_current"].put(hardware.rated_current_ma)
         entries["cia402.rated_torque"].put(hardware.rated_torque_mnm)
+        if hardware.face is not None:  # set up by its maker's tool
+            entries["cia402.max_speed"].put(hardware.factory.get("motor.n_max_rpm"))
 
     def _recall(self, indices: range) -> None:
         """Take stored values over; a value the present firmware would refuse is left at its default."""

@@ -1,0 +1,187 @@
+"""Drives without the reference drive's objects behind the same port: CiA 402 modes and what their map shows.
+
+:class:`StandardDrive` needs mode 11 with the commutation angle 0x60EA; it turns a current vector and reads the encoder.
+:class:`RecorderDrive` has a recorder of currents and voltages at loop rate and a torque mode that commutates already.
+Both give the guard what it watches; everything else ends in ``NotAvailable``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from pmsmtool.bus.connection import Connection
+from pmsmtool.cia402 import Mode
+from pmsmtool.drive import objects
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.drive.port import Excitation
+from pmsmtool.drive.recorder import Recorder
+from pmsmtool.errors import NotAvailable, SdoAbort
+from pmsmtool.firmware.drive_map import DriveMap
+
+COMMUTATION_ANGLE = DriveObject(0x60EA, 0, "H")
+TARGET_TORQUE = DriveObject(0x6071, 0, "h")
+POSITION = DriveObject(0x6064, 0, "i")
+ENCODER_COUNTS = DriveObject(0x608F, 1, "I")
+MOTOR_TURNS = DriveObject(0x608F, 2, "I")
+ANGLE_COUNTS = 1 << 16
+"""Counts of 0x60EA per electrical turn."""
+POLL_PERIOD_S = 1e-3
+"""Live values are polled about this often: process data of a CAN bus do not come faster."""
+QUARTER_TURN = 0.5 * math.pi
+"""Torque current flows a quarter turn ahead of the commutation angle; the rotor's d axis settles there."""
+
+
+class StandardDrive(CanopenDrive):
+    """A drive of which only CiA 402 is known; implements ``drive.port.Drive`` as far as that goes.
+
+    Its own pole pairs are unknown: electrical speed is counted per mechanical turn.
+
+    Attributes
+    ----------
+    counts_per_turn : float
+        Encoder increments per motor turn (0x608F).
+    """
+
+    def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
+        self.node = DriveNode(connection, node_id, drive_map=drive_map)
+        self.parameters = DriveParameters(self.node)
+        self.may_be_energised = False
+        self.identity = self.node.identity()
+        self.period_s = POLL_PERIOD_S
+        self.recorder: Recorder = PolledMeans(self.node, self.live)
+        self._last_counts: float | None = None
+        self._last_s = 0.0
+        self._speed_rad_s = 0.0
+        try:
+            self.counts_per_turn = self.node.get(ENCODER_COUNTS) / max(1.0, self.node.get(MOTOR_TURNS))
+            self._rated_apk = 1e-3 * math.sqrt(2.0) * self.node.get(objects.RATED_CURRENT_MA)
+        except SdoAbort as abort:
+            raise NotAvailable(
+                "the drive does not say how many increments its encoder has (0x608F) or what its rated current is "
+                "(0x6075)",
+                where=abort.where,
+                hint="`pmsmtool caps` lists what this drive can give",
+            ) from abort
+
+    def read(self, name: str) -> float:
+        """Return one parameter; of those the guard scales with, neutral values where the drive has none."""
+        if name in self.node.map.cells:
+            return super().read(name)
+        if name == "motor.pole_pairs":
+            return 1.0
+        if name == "motor.R_s_ohm":
+            return 0.0
+        raise NotAvailable(f"the drive has no object for {name}", where=f"node {self.node.node}")
+
+    def live(self, name: str) -> float:
+        """Return position, speed per mechanical turn, or the current as if all of it were torque current (A peak)."""
+        if name == "theta_m_rad":
+            return self._position_rad()
+        if name == "omega_e_rad_s":
+            self._position_rad()
+            return self._speed_rad_s
+        if name == "i_q_a":
+            # Permille of the rated current: taken as rms, the larger of the two readings, for safety.
+            return 1e-3 * self.node.get(objects.CURRENT_PERMILLE) * self._rated_apk
+        if name == "i_d_a":
+            return 0.0
+        raise NotAvailable(f"the drive does not show {name}", where=f"node {self.node.node}")
+
+    def _position_rad(self) -> float:
+        """Return the unwrapped mechanical angle; its change since the last look is the speed."""
+        counts, now = self.node.get(POSITION), self.node.connection.clock.now()
+        if self._last_counts is not None:
+            step = counts - self._last_counts
+            step -= round(step / 2.0**32) * 2.0**32
+            counts = self._last_counts + step
+            if now > self._last_s:
+                self._speed_rad_s = 2.0 * math.pi * step / self.counts_per_turn / (now - self._last_s)
+        self._last_counts, self._last_s = counts, now
+        return 2.0 * math.pi * counts / self.counts_per_turn
+
+    def enable(self) -> None:
+        """Bring the drive to operation enabled at zero torque with the master's commutation angle."""
+        self.node.put(TARGET_TORQUE, 0)
+        self._set_mode(Mode.CYCLIC_TORQUE_ANGLE)
+        self.may_be_energised = True
+        self.node.enable()
+
+    def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
+        """Hold a current vector at a fixed electrical angle: torque current behind a commutation angle."""
+        if fixed_angle_rad is None and (i_d_a or i_q_a):
+            raise NotAvailable("the drive takes no current in the rotor's frame", where=f"node {self.node.node}")
+        length = math.hypot(i_d_a, i_q_a)
+        if fixed_angle_rad is not None:
+            angle = fixed_angle_rad + math.atan2(i_q_a, i_d_a) - QUARTER_TURN
+            self.node.put(COMMUTATION_ANGLE, round(angle / (2.0 * math.pi) * ANGLE_COUNTS) % ANGLE_COUNTS)
+        self.node.put(TARGET_TORQUE, round(1000.0 * length / self._rated_apk))
+
+    def command_speed(self, omega_m_rad_s: float) -> None:
+        """Refuse: the unit of the target velocity is not known."""
+        raise NotAvailable("the drive's unit of speed is not known", where=f"node {self.node.node}, 0x60FF:00")
+
+    def prepare(self, excitation: Excitation) -> None:
+        """Refuse: there is no excitation."""
+        raise NotAvailable("the drive has no excitation", where=f"node {self.node.node}")
+
+
+class PolledMeans(Recorder):
+    """Means over a window, from live values polled one after the other.
+
+    Parameters
+    ----------
+    node : DriveNode
+        The drive.
+    live : callable
+        Returns a live value by name.
+    """
+
+    SAMPLES = 4
+
+    def __init__(self, node: DriveNode, live: Callable[[str], float]) -> None:
+        super().__init__(node, POLL_PERIOD_S)
+        self._live = live
+
+    def start_average(self, signals: Sequence[str], periods: int) -> None:
+        """Nothing to start: the values are polled at the end."""
+
+    def finish_average(self, signals: Sequence[str]) -> dict[str, float]:
+        """Return means of a few polled values."""
+        sums = dict.fromkeys(signals, 0.0)
+        for _ in range(self.SAMPLES):
+            for name in signals:
+                sums[name] += self._live(name)
+        return {name: total / self.SAMPLES for name, total in sums.items()}
+
+
+class RecorderDrive(CanopenDrive):
+    """A drive with a recorder and a torque mode, without excitation; the part of ``drive.port.Drive`` that this gives.
+
+    A q current is asked for as torque, in permille of rated: current and torque are taken as proportional, which a
+    recorded current then corrects.
+    """
+
+    def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
+        super().__init__(connection, node_id, drive_map=drive_map)
+        self._rated_apk = 1e-3 * math.sqrt(2.0) * self.node.get(objects.RATED_CURRENT_MA)
+
+    def enable(self) -> None:
+        """Bring the drive to operation enabled at zero torque."""
+        self.node.put(TARGET_TORQUE, 0)
+        self._set_mode(Mode.PROFILE_TORQUE)
+        self.may_be_energised = True
+        self.node.enable()
+
+    def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
+        """Ask for the torque of a q current."""
+        if i_d_a or fixed_angle_rad is not None:
+            raise NotAvailable("the drive takes no current set-point, only torque", where=f"node {self.node.node}")
+        self.node.put(TARGET_TORQUE, round(1000.0 * i_q_a / self._rated_apk))
+
+    def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
+        """Return the live values: the drive has no averages."""
+        return {name: self.live(name) for name in signals}

@@ -1,0 +1,120 @@
+"""Torque pushes both ways, recorded at loop rate: what a drive without injection can still be asked for.
+
+The shaft swings between two speeds under constant torque currents of several sizes and both signs, so that the
+recorded voltages contain every current at every speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pmsmtool.drive.port import Drive
+from pmsmtool.errors import IdentificationError
+from pmsmtool.experiments.signals import readable
+from pmsmtool.trace import Trace
+
+SIGNALS = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "omega_e_rad_s", "theta_m_rad", "flags")
+FIRST_SHARE = 0.08
+FIRST_S = 0.02
+ANSWER_SHARE = 0.04
+"""Speed change, of the wanted one, that counts as an answer of the shaft."""
+MOST_TRIES = 10
+LEAST_RAMP_S = 0.05
+STOP_SLICES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class PushPlan:
+    """How the shaft is swung.
+
+    Attributes
+    ----------
+    i_test_a : float
+        Largest torque current (A peak).
+    omega_m_rad_s : float
+        Mechanical speed the swing goes to, both ways (rad/s).
+    shares : tuple of float
+        Torque currents, of the largest.
+    samples : int
+        Samples of one record.
+    """
+
+    i_test_a: float
+    omega_m_rad_s: float
+    shares: tuple[float, ...] = (0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
+    samples: int = 1024
+
+
+def swing(drive: Drive, plan: PushPlan, keep: Callable[[str, Trace], None]) -> None:
+    """Swing the shaft and keep a record of every push as ``push_<k>``; the shaft is nearly at rest on return.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``: the shaft does not answer.
+    """
+    rate = _rate(drive, plan)
+    count = 0
+    for share in plan.shares:
+        current = share * plan.i_test_a
+        ramp_s = max(LEAST_RAMP_S, plan.omega_m_rad_s / (rate * current))
+        drive.command_current(0.0, -current)
+        drive.wait(ramp_s)
+        for sign in (1.0, -1.0, 1.0, -1.0):
+            trace = _recorded(drive, plan, sign * current, 2.0 * ramp_s)
+            keep(f"push_{count}", trace)
+            count += 1
+        _stop(drive, current, ramp_s)
+
+
+def _recorded(drive: Drive, plan: PushPlan, i_q_a: float, seconds: float) -> Trace:
+    """Command a torque current and record the push; the record starts right behind the command."""
+    drive.command_current(0.0, i_q_a)
+    decimation = max(1, round(0.97 * seconds / (plan.samples * drive.period_s)))
+    trace = drive.record(SIGNALS, plan.samples, decimation=decimation)
+    return readable(trace, i_command_a=i_q_a, decimation=decimation)
+
+
+def _rate(drive: Drive, plan: PushPlan) -> float:
+    """Return the acceleration per ampere (rad/s2/A) from short pushes that grow until the shaft answers."""
+    current, seconds = FIRST_SHARE * plan.i_test_a, FIRST_S
+    for _ in range(MOST_TRIES):
+        before = _turned(drive)
+        drive.command_current(0.0, current)
+        drive.wait(seconds)
+        middle = _turned(drive)
+        drive.command_current(0.0, -current)
+        drive.wait(seconds)
+        drive.command_current(0.0, 0.0)
+        way = abs(middle - before)
+        speed = 2.0 * way / seconds
+        if speed > ANSWER_SHARE * plan.omega_m_rad_s:
+            return speed / (seconds * current)
+        if current < 0.5 * plan.i_test_a:
+            current *= 2.0
+        else:
+            seconds *= 1.6
+    raise IdentificationError(
+        "E_EXCITATION",
+        "the shaft does not answer a torque push",
+        where="recorded push",
+        likely="a locked shaft or a closed brake, or a drive whose commutation is not set up",
+        hint="free the shaft; run the maker's own set-up first",
+    )
+
+
+def _turned(drive: Drive) -> float:
+    return drive.live("theta_m_rad")
+
+
+def _stop(drive: Drive, current: float, ramp_s: float) -> None:
+    """Bring the shaft to about rest against its own sense of turning."""
+    for _ in range(STOP_SLICES):
+        omega = drive.live("omega_e_rad_s")
+        drive.command_current(0.0, -math.copysign(current, omega))
+        drive.wait(ramp_s / STOP_SLICES)
+        if omega * drive.live("omega_e_rad_s") <= 0.0:
+            break
+    drive.command_current(0.0, 0.0)

@@ -1,0 +1,328 @@
+"""What a drive can give: quantity x method x expected interval x what is missing, decided from map and drive.
+
+The map says what a family can do, the drive itself must confirm it: supported modes (0x6502) and objects that answer.
+Expected intervals are those measured on simulated nodes of the tier (:data:`EXPECTED`); where nothing was measured,
+nothing is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from pmsmtool.cia402 import Mode
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.objects import SUPPORTED_MODES
+from pmsmtool.drive.port import Identity
+from pmsmtool.errors import NotAvailable, SdoAbort
+from pmsmtool.firmware.drive_map import DriveMap, reference_map
+from pmsmtool.firmware.shipped_maps import UNKNOWN_VENDOR, family_of, load_family
+
+GENERIC = "cia402"
+"""Family of a drive that no map is known for."""
+
+
+class Tier(StrEnum):
+    """How much a drive gives, from most to least."""
+
+    FULL = "full"
+    INJECT = "inject"
+    RECORDER = "recorder"
+    STANDARD = "standard"
+    VENDOR = "vendor"
+    MANUAL = "manual"
+
+
+class Method(StrEnum):
+    """Ways to a quantity, as ``identify --method`` names them."""
+
+    INJECT = "inject"
+    RECORDER = "recorder"
+    STANDARD = "standard"
+    VENDOR = "vendor"
+    MANUAL = "manual"
+
+
+QUANTITIES = ("R", "L", "psi", "map", "inverter", "encoder", "poles", "mechanics", "frf")
+
+FEATURES: Mapping[str, str] = {
+    "heartbeat": "consumer heartbeat (0x1016)",
+    "abort option": "abort connection option (0x6007)",
+    "quick stop": "quick stop option (0x605A)",
+    "limits": "its own current and speed limit (0x6073, 0x6075, 0x6080)",
+    "set-points": "current set-points for d and q",
+    "excitation": "voltage or current injection",
+    "averages": "averages inside the drive",
+    "recorder": "a recorder of currents and voltages that this program reads",
+    "torque mode": "torque mode (0x6502 bit 3 or 9)",
+    "position": "position in increments of a known number per turn (0x6064, 0x608F)",
+    "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
+    "vendor result": "the maker's identification in the drive map",
+    "frf": "a frequency-response experiment, which this program does not have",
+    "line voltage": "the undriven machine's voltage, or a recorder of voltages",
+}
+"""What methods need, as a person reads it."""
+
+_SAFE = ("heartbeat", "abort option", "quick stop", "limits")
+_INJECT = (*_SAFE, "set-points", "excitation", "averages", "recorder")
+_RECORD = (*_SAFE, "recorder", "torque mode")
+_STANDARD = (*_SAFE, "position", "commutation angle")
+
+NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
+    "R": {Method.INJECT: _INJECT, Method.RECORDER: _RECORD, Method.VENDOR: ("vendor result",), Method.MANUAL: ()},
+    "L": {Method.INJECT: _INJECT, Method.RECORDER: _RECORD, Method.VENDOR: ("vendor result",), Method.MANUAL: ()},
+    "psi": {
+        Method.INJECT: _INJECT,
+        Method.RECORDER: _RECORD,
+        Method.STANDARD: ("line voltage",),
+        Method.VENDOR: ("vendor result",),
+        Method.MANUAL: (),
+    },
+    "map": {Method.INJECT: _INJECT},
+    "inverter": {Method.INJECT: _INJECT},
+    "encoder": {Method.INJECT: _INJECT, Method.STANDARD: _STANDARD, Method.VENDOR: ("vendor result",)},
+    "poles": {
+        Method.INJECT: _INJECT,
+        Method.STANDARD: _STANDARD,
+        Method.VENDOR: ("vendor result",),
+        Method.MANUAL: (),
+    },
+    "mechanics": {Method.INJECT: _INJECT, Method.MANUAL: ()},
+    "frf": {Method.INJECT: ("frf",)},
+}
+"""Methods of each quantity and what they need."""
+
+NOTES: Mapping[tuple[str, Method], str] = {
+    ("L", Method.RECORDER): "L_q at running currents only",
+    ("R", Method.RECORDER): "rarely: where the inverter's error does not hide it",
+    ("psi", Method.RECORDER): "the drive must commutate already",
+    ("mechanics", Method.INJECT): "inertia, roughly",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """An interval measured on simulated drives.
+
+    Attributes
+    ----------
+    name : str
+        Key of the estimate.
+    half_width, unit : float, str
+        90 % of the drives had a total 95 % half width up to this (% of the value, or deg).
+    drives : int
+        Accepted drives behind it.
+    program : str
+        Command that measured it.
+    """
+
+    name: str
+    half_width: float
+    unit: str
+    drives: int
+    program: str
+
+    def __str__(self) -> str:
+        return f"{self.name} +-{self.half_width:.2g} {self.unit}"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One way to one quantity.
+
+    Attributes
+    ----------
+    quantity, method : str
+        What and how.
+    missing : tuple of str
+        What the drive lacks, in words; empty: available.
+    expected : tuple of Expected
+        What to expect; empty: not measured.
+    note : str
+        What limits it.
+    """
+
+    quantity: str
+    method: Method
+    missing: tuple[str, ...]
+    expected: tuple[Expected, ...] = ()
+    note: str = ""
+
+    @property
+    def available(self) -> bool:
+        """Whether the drive gives it."""
+        return not self.missing
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What one drive gives.
+
+    Attributes
+    ----------
+    identity : Identity
+        Of the drive.
+    drive_map : DriveMap
+        The map used.
+    map_is_drives : bool
+        Whether that map names this identity; without, nothing is written through it.
+    features : frozenset of str
+        Keys of :data:`FEATURES` it has.
+    """
+
+    identity: Identity
+    drive_map: DriveMap
+    map_is_drives: bool
+    features: frozenset[str]
+
+    @property
+    def tier(self) -> Tier:
+        """The highest tier whose needs are met."""
+        for tier, needs in _TIERS:
+            if self.features >= set(needs):
+                return tier
+        return Tier.VENDOR if self.drive_map.capabilities.auto_tuning else Tier.MANUAL
+
+    def rows(self) -> tuple[Row, ...]:
+        """Return every quantity by every method."""
+        return tuple(self.row(quantity, method) for quantity in QUANTITIES for method in NEEDS[quantity])
+
+    def row(self, quantity: str, method: Method) -> Row:
+        """Return one way to one quantity."""
+        if method not in NEEDS[quantity]:
+            return Row(quantity, method, (f"another method: {quantity} has no {method} method",))
+        missing = tuple(FEATURES[need] for need in NEEDS[quantity][method] if need not in self.features)
+        return Row(
+            quantity, method, missing, EXPECTED.get((quantity, method), ()), NOTES.get((quantity, method), "")
+        )
+
+    def best(self, quantity: str) -> Row | None:
+        """Return the first measuring method of a quantity that is available."""
+        rows = (self.row(quantity, method) for method in NEEDS[quantity] if method in _MEASURING)
+        return next((row for row in rows if row.available), None)
+
+    def require(self, quantities: Sequence[str], method: Method | None) -> Method:
+        """Return the method that gives all the quantities: the one asked for, else the first that does.
+
+        Raises
+        ------
+        NotAvailable
+            None does; for every quantity the message names what is missing.
+        """
+        for candidate in _MEASURING if method is None else (method,):
+            if candidate in _MEASURING and all(self.row(name, candidate).available for name in quantities):
+                return candidate
+        raise NotAvailable(
+            "\n  - ".join(["this drive cannot give what was asked", *self._reasons(quantities, method)]),
+            where=f"node {self.identity.node}",
+            hint="`pmsmtool caps` lists what it can; `pmsmtool machine new` takes numbers of a datasheet or a meter",
+        )
+
+    def _reasons(self, quantities: Sequence[str], method: Method | None) -> list[str]:
+        lines = []
+        for quantity in quantities:
+            rows = [self.row(quantity, m) for m in (NEEDS[quantity] if method is None else (method,))]
+            if any(row.available and row.method in _MEASURING for row in rows):
+                lines.append(f"{quantity}: by itself yes ({self._how(quantity, method)}), together with the others no")
+                continue
+            for row in rows:
+                if row.method in _MEASURING or method is not None:
+                    needs = f"not available: needs {', '.join(row.missing)}" if row.missing else "a number you bring"
+                    lines.append(f"{quantity} by {row.method}: {needs}")
+        return lines
+
+    def _how(self, quantity: str, method: Method | None) -> str:
+        best = self.best(quantity)
+        return str(method or (best.method if best else ""))
+
+
+_MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD)
+_TIERS = (
+    (Tier.FULL, _INJECT),
+    (Tier.INJECT, (*_SAFE, "set-points", "excitation", "recorder")),
+    (Tier.RECORDER, _RECORD),
+    (Tier.STANDARD, (*_SAFE, "torque mode")),
+)
+
+
+def choose_map(identity: Identity, given: DriveMap | None) -> DriveMap:
+    """Return the map for a drive: the one given, the shipped one for its identity, else what CiA 402 says."""
+    return given or family_of(identity.vendor, identity.product) or load_family(GENERIC)
+
+
+def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
+    """Ask a drive what it has; only reads.
+
+    Parameters
+    ----------
+    node : DriveNode
+        The drive; its map is replaced by the chosen one.
+    given : DriveMap, optional
+        The map to use; default: by the drive's identity.
+    """
+    identity = node.identity()
+    drive_map = choose_map(identity, given)
+    node.map = drive_map
+    modes = _modes(node)
+    has = {
+        "heartbeat": node.has(0x1016, 1),
+        "abort option": node.has(0x6007, 0),
+        "quick stop": node.has(0x605A, 0),
+        "limits": all(node.has(index, 0) for index in (0x6073, 0x6075, 0x6080)),
+        "position": node.has(0x6064, 0) and node.has(0x608F, 1),
+        "torque mode": drive_map.capabilities.torque_mode
+        and bool(modes & (_bit(Mode.PROFILE_TORQUE) | _bit(Mode.CYCLIC_TORQUE)))
+        and node.has(0x6071, 0),
+        "commutation angle": drive_map.capabilities.commutation_angle
+        and bool(modes & _bit(Mode.CYCLIC_TORQUE_ANGLE))
+        and node.has(0x60EA, 0),
+    }
+    if drive_map.staging:  # only then these objects are what the reference drive has there
+        has |= {
+            "set-points": node.has(0x2052, 1),
+            "excitation": node.has(0x2050, 0x0E),
+            "averages": node.has(0x2063, 3),
+            "recorder": node.has(0x2060, 8),
+        }
+    found = frozenset(name for name, there in has.items() if there)
+    named = identity.vendor != UNKNOWN_VENDOR and drive_map.is_for(identity.vendor, identity.product)
+    return Capabilities(identity, drive_map, named, found)
+
+
+def _bit(mode: Mode) -> int:
+    """Return the bit of a mode in object 0x6502."""
+    return 1 << (mode - 1)
+
+
+def _modes(node: DriveNode) -> int:
+    try:
+        return node.whole(SUPPORTED_MODES)
+    except SdoAbort:
+        return 0
+
+
+def reference_capabilities(identity: Identity) -> Capabilities:
+    """Return what the reference drive with everything gives, for tests and documentation."""
+    every = frozenset(_INJECT) | frozenset(_RECORD) | {"position"}
+    return Capabilities(identity, reference_map(), True, every)
+
+
+_FULL = "benchmarks.identification_coverage --drives 12 --first 9000"
+_STANDARD_RUN = "benchmarks.tier_intervals standard --drives 40 --first 100"
+
+
+def _expected(program: str, drives: int, *rows: tuple[str, float, str]) -> tuple[Expected, ...]:
+    return tuple(Expected(name, half, unit, drives, program) for name, half, unit in rows)
+
+
+EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
+    ("R", Method.INJECT): _expected(_FULL, 12, ("R_s_ohm", 4.7, "%")),
+    ("L", Method.INJECT): _expected(_FULL, 12, ("L_d_h", 1.4, "%"), ("L_q_h", 1.4, "%")),
+    ("psi", Method.INJECT): _expected(_FULL, 12, ("psi_f_wb", 1.1, "%")),
+    ("encoder", Method.INJECT): _expected(_FULL, 12, ("offset_rad", 0.11, "deg")),
+    ("mechanics", Method.INJECT): _expected(_FULL, 12, ("J_kgm2", 3.0, "%")),
+    ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 40, ("offset_rad", 12.4, "deg")),
+    ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 40, ("pole_pairs", 0.2, "%")),
+}
+"""Total 95 % half widths that 90 % of random simulated drives of the tier kept to, with sensors of 1 %."""
