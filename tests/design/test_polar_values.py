@@ -6,16 +6,18 @@ from pathlib import Path
 
 import pytest
 
+from pmsmtool.design.polar_values import LINEAR_RANGE
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.machine_file import load_machine_file
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
+ASSUMED = PROFILES / "miyajima-2013-assumed.toml"
 
 
 def test_times_follow_the_control_period() -> None:
-    design = tune(load_machine_file(PROFILES / "miyajima-2013-assumed.toml"), TuneRequest(controller="polar"))
+    design = tune(load_machine_file(ASSUMED), TuneRequest(controller="polar"))
     T_s = design.machine.inverter.T_s
     assert T_s == pytest.approx(1e-4)
     assert design["polar.mode"] == 6.0
@@ -25,6 +27,28 @@ def test_times_follow_the_control_period() -> None:
     assert design["governor.mode"] == design["field_weakening.mode"] == 0.0
     assert design.facts["polar_two_input_stable"] is True
     assert design.parameter_set().violations() == ()
+
+
+@pytest.mark.parametrize("law", ["conventional", "proposed"])
+def test_phase_laws_get_the_switch_they_need_at_standstill(law: str) -> None:
+    design = tune(load_machine_file(ASSUMED), TuneRequest(controller="polar", polar_law=law))
+    assert int(design["polar.options"]) & LINEAR_RANGE
+    assert any("standstill" in note for note in design.notes)
+
+
+@pytest.mark.parametrize("law", ["linear", "regularised"])
+def test_laws_of_the_linear_range_say_so(law: str) -> None:
+    design = tune(load_machine_file(ASSUMED), TuneRequest(controller="polar", polar_law=law))
+    assert not int(design["polar.options"]) & LINEAR_RANGE
+    assert any("linear range" in note for note in design.notes)
+
+
+def test_facts_state_the_voltage_limit_the_reach_and_the_slowest_true_pole() -> None:
+    facts = tune(load_machine_file(ASSUMED), TuneRequest(controller="polar")).facts
+    assert facts["polar_V_a_max_v"] == pytest.approx(36.0 / 3**0.5)
+    assert facts["polar_largest_torque_nm"] > 8.42  # that is the most at 800 rpm; the design speed is lower
+    assert float(facts["polar_slowest_pole_anywhere_rad_s"]) < -100.0
+    assert float(facts["polar_slowest_pole_anywhere_rad_s"]) >= float(facts["polar_slowest_pole_rad_s"]) - 1.0
 
 
 @pytest.mark.parametrize("law", ["conventional", "proposed", "linear", "linear-printed"])
@@ -42,6 +66,6 @@ def test_the_improved_laws_take_it_and_say_so(law: str, mode: float) -> None:
 
 
 def test_pi_leaves_polar_control_off() -> None:
-    assert tune(load_machine_file(PROFILES / "miyajima-2013-assumed.toml"))["polar.mode"] == 0.0
+    assert tune(load_machine_file(ASSUMED))["polar.mode"] == 0.0
     with pytest.raises(ConfigError, match="request"):
         TuneRequest(controller="fuzzy")
