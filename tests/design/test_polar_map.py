@@ -10,8 +10,8 @@ import pytest
 from pmsmtool.design import polar, polar_map
 from tests.design.test_polar import POWER_TO_PEAK, SET_A, V_MAX, W_800
 
-SHARE_ABOVE_10, SHARE_ABOVE_100 = 0.066, 0.003  # measured 0.062 and 0.0024 on 281 x 201 points, here on fewer
-SHARE_ROOM = (0.012, 0.003)
+SHARE_ABOVE_10, SHARE_ABOVE_100 = 0.066, 0.003  # measured 0.0658 and 0.0033; on 281 x 201 points 0.0623 and 0.0024
+SHARE_ROOM = (0.001, 0.0005)
 
 
 def test_share_of_the_badly_conditioned_area() -> None:
@@ -50,7 +50,7 @@ def test_the_true_loop_is_stable_all_over_the_linear_range() -> None:
     speeds, torques = np.linspace(100, 900, 9), np.linspace(-5, 5, 11)
     slowest = polar_map.stability_map(SET_A, V_MAX, speeds, torques)
     assert np.isfinite(slowest).sum() > 60
-    assert np.nanmax(slowest) < -100.0  # measured -121; designed for -300
+    assert np.nanmax(slowest) < -100.0  # measured -126; designed for -300
     assert np.isnan(slowest[-1, -1])  # field weakening: the amplitude loop rests
     at_800 = polar_map.stability_map(SET_A, V_MAX, [800.0], [0.5 * 0.264, 13.0 * 0.264])
     assert at_800[0] == pytest.approx([-181.0, -153.0], abs=1.0)
