@@ -45,7 +45,7 @@ def page_of(folder: Path) -> str:
 def test_the_page_needs_nothing_else_and_puts_the_verdict_first(made: Path) -> None:
     page = page_of(made)
     assert page.index("NOT COMPLETE") < page.index("<h2")
-    assert "not run yet: identify, margins, verify" in page
+    assert "not run yet: identify, margins, verify, prove" in page
     assert not re.search(r"<(script|link|iframe|img)\b|@import|url\((?!#)", page)
     assert not re.search(r'(?:src|href)="(?!#)', page)
     assert page.count("<svg") == 2

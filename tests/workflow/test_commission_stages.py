@@ -1,4 +1,4 @@
-"""The chain without its experiments: from an identified machine to a drive that holds the design, and every way out."""
+"""The chain without identification: from an identified machine to a drive that is proven, and every way out."""
 
 from __future__ import annotations
 
@@ -24,9 +24,12 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow import commission
 from pmsmtool.workflow.commission import STAGES, Commissioning, begin_run, due_stages
 from pmsmtool.workflow.export import image_of
+from pmsmtool.workflow.prove.stage import ProofRequest
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
 PROFILE = "interior-2k2"
+FEW_MACHINES = ProofRequest(runs=32)
+"""The proof's own tests draw as many as the tool; here it is one of the stages."""
 
 
 class Told:
@@ -35,9 +38,10 @@ class Told:
     def __init__(self, *, writes: bool = True) -> None:
         self.writes = writes
         self.shown: list[Sequence[str]] = []
+        self.moved: list[Sequence[str]] = []
 
     def allow_motion(self, lines: Sequence[str]) -> None:
-        raise AssertionError("nothing moves here")
+        self.moved.append(lines)
 
     def allow_writing(self, lines: Sequence[str]) -> None:
         self.shown.append(lines)
@@ -97,6 +101,7 @@ def identified(folder: Path, drive: CanopenDrive) -> RunDirectory:
 
 def finish(run: RunDirectory, drive: CanopenDrive, person: Told | None = None, **asked: object) -> Noted:
     progress = Noted()
+    asked = {"prove": FEW_MACHINES, **asked}
     Commissioning(run, drive, person or Told(), progress, **asked).carry_out()  # type: ignore[arg-type]
     return progress
 
@@ -118,7 +123,10 @@ def test_the_drive_holds_the_design_and_the_record_says_so(tmp_path: Path, drive
     assert all(line.ok for stage in record.stages for line in stage.acceptance)
     recorded = {name: digest for stage in record.stages for name, digest in stage.files.items()}
     assert {name: run.sha256(name) for name in recorded} == recorded
-    assert set(recorded) == {"machine.toml", "design.toml", "lut.npz", "lut.csv", "params.toml"}
+    proof = {name for name in recorded if name.startswith("prove/")}
+    assert {name.rsplit("/", 1)[1] for name in proof} >= {"prediction.npz", "speed_step.npz", "q_steps.npz"}
+    assert set(recorded) - proof == {"machine.toml", "design.toml", "lut.npz", "lut.csv", "params.toml"}
+    assert len(person.moved) == 1 and any("speed step" in line for line in person.moved[0])
     assert is_safe(drive.node.state())
     assert due_stages(run, record) == ()
     assert finish(run, drive, Told(writes=False)).skipped == list(STAGES)
@@ -184,7 +192,7 @@ def test_declined_writing_changes_nothing_and_can_be_taken_back(tmp_path: Path, 
         finish(run, drive, Told(writes=False))
     assert active_crc(drive) == crc
     assert (run.read().stages[-1].name, run.read().stages[-1].status) == ("flash", "refused")
-    assert finish(run, drive).ended == [("flash", "pass"), ("verify", "pass")]
+    assert finish(run, drive).ended == [("flash", "pass"), ("verify", "pass"), ("prove", "pass")]
 
 
 def test_the_chain_ends_at_the_first_criterion_that_is_not_met(tmp_path: Path, drive: CanopenDrive) -> None:

@@ -13,7 +13,10 @@ from pmsmtool.workflow.prove.plan import SIGNALS, Experiment, ProofPlan
 
 REACH_S = 4.0
 """A speed that is not reached by then is not waited for any longer: the record shows it."""
-STANDSTILL_S = 1.0
+STANDSTILL_S = 2.0
+STANDSTILL_RAD_S = 1.0
+"""Longest wait for the shaft, and electrical speed that counts as standstill (the noise of a 12-bit encoder)."""
+LOOK_S = 0.05
 
 Keep = Callable[[Experiment, Trace], bool]
 """Told every record as soon as it is there; returns whether to go on."""
@@ -41,6 +44,8 @@ def run_experiments(drive: Drive, plan: ProofPlan, pole_pairs: int, keep: Keep, 
         say(experiment.text)
         if experiment.base_rad_s or experiment.excitation.point is Injection.SPEED:
             drive.command_speed(experiment.base_rad_s)
+            if not experiment.base_rad_s:
+                _come_to_rest(drive)  # the shaft may still turn from what was done before
         if experiment.base_rad_s:
             reach(drive, pole_pairs * experiment.base_rad_s, limit_s=REACH_S)
             drive.wait(experiment.settle_s)
@@ -57,12 +62,12 @@ def _come_to_rest(drive: Drive) -> None:
     """Wait for the shaft as long as it gets slower; the guard's stop brakes what is left."""
     waited, last = 0.0, math.inf
     while waited < STANDSTILL_S:
-        drive.wait(0.05)
-        waited += 0.05
         speed = abs(drive.live("omega_e_rad_s"))
-        if speed > 0.98 * last or speed < 1.0:
+        if speed > 0.98 * last or speed < STANDSTILL_RAD_S:
             return
         last = speed
+        drive.wait(LOOK_S)
+        waited += LOOK_S
 
 
 def _facts(experiment: Experiment) -> dict[str, object]:

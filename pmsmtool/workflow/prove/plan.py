@@ -21,7 +21,7 @@ SETTLE = 8.0
 """A current level lasts this many time constants 1/alpha of its loop."""
 LEVEL_ROWS = (24, 64)
 """Least and most rows of a level."""
-PATTERN_ROWS = 2048
+PATTERN_ROWS = 1536
 """Rows of the current steps: as many patterns as fit are averaged, against noise and the inverter's dead time."""
 STEP_SHARE = 0.5
 """Larger current step, of the rated current."""

@@ -31,8 +31,8 @@ from pmsmtool.workflow.prove.plan import SIGNALS, Conditions, Experiment, ProofP
 
 RUNS = 96
 """Drawn machines: the largest of 96 holds 95 % of all with a confidence of 99.3 %."""
-FAULT_RUNS = 6
-"""Drawn machines behind each fault's signature; the first of the healthy ones, with their random numbers."""
+FAULT_RUNS = 4
+"""Drawn machines behind each fault's signature, for :data:`RUNS`; the first of the healthy ones, with their numbers."""
 
 T_SPREAD_K = 5.0
 """Half range of the winding's temperature about its sensor, and of the magnets' about theirs."""
@@ -250,9 +250,10 @@ def predict_proof(
         Seed of everything random.
     """
     drives = SimulatedDrives(design, conditions, plan, runs, seed)
+    few_runs = max(2, runs * FAULT_RUNS // RUNS)
     healthy = {e.name: drives.respond(e) for e in plan.experiments}
     wrong = {
-        name: {e.name: drives.respond(e, defect, min(FAULT_RUNS, runs)) for e in plan.experiments}
+        name: {e.name: drives.respond(e, defect, few_runs) for e in plan.experiments}
         for name, defect in DEFECTS.items()
         if _possible(name, design)
     }
@@ -266,7 +267,7 @@ def predict_proof(
         "runs": runs,
         "seed": seed,
     }
-    few: dict[str, Array] = {name: values[: min(FAULT_RUNS, runs)] for name, values in healthy.items()}
+    few: dict[str, Array] = {name: values[:few_runs] for name, values in healthy.items()}
     steps = [e for e in plan.experiments if e.repeats > 1 or e.name.endswith("_steps")]
     directions = {}
     for name, (high, at_high, low, at_low, nominal, unit) in QUANTITIES.items():
