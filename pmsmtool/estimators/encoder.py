@@ -24,6 +24,10 @@ INTEGER_LIMIT = 0.1
 """Largest distance of the count from an integer (identification reference, 3.6)."""
 LINEARITY_LIMIT_RAD = math.radians(30.0)
 """Largest deviation of p theta_M from the imposed angle (electrical): beyond it the rotor slips or sticks."""
+COUNTS_SHARE = 0.25
+"""Part of the imposed angle that friction leaves a rotor; less is none."""
+MAX_POLE_PAIRS = 64
+"""Pole pairs up to which a turning rotor is told from a standing one."""
 MINIMUM_TURNS = 0.98
 """Mechanical turns the vector must have gone through in each direction."""
 
@@ -48,6 +52,30 @@ class EncoderResult:
     direction: int
     offset: Estimate
     lag_rad: float
+
+
+def check_encoder_counts(turned: Trace) -> None:
+    """Refuse an encoder whose reading did not change while the vector turned.
+
+    Parameters
+    ----------
+    turned : Trace
+        Two rows, before and after: ``theta_imposed_rad`` (electrical), ``theta_M_rad`` (mechanical).
+
+    Raises
+    ------
+    IdentificationError
+        ``E_ENCODER``.
+    """
+    imposed, measured = (abs(float(np.ptp(turned[name]))) for name in ("theta_imposed_rad", "theta_M_rad"))
+    least = COUNTS_SHARE * imposed / MAX_POLE_PAIRS
+    if measured < least:
+        raise refuse(
+            "E_ENCODER",
+            f"the vector turned by {math.degrees(imposed):.4g} deg (electrical) and the encoder by "
+            f"{math.degrees(measured):.2g} deg (mechanical), {math.degrees(least):.2g} at least are due",
+            stage=STAGE,
+        )
 
 
 def estimate_encoder(forward: Trace, backward: Trace) -> EncoderResult:

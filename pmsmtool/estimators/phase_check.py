@@ -1,4 +1,9 @@
-"""Is the motor there, and are its phases alike? Three small vectors before any larger current."""
+"""Is the motor there, are its phases and sensors alike? Three small vectors before any larger current; then pairs.
+
+At five percent of the rated current dead time hides an unbalance of the winding: the small vectors find what is not
+connected, and the slope of the voltage through each pair of phases at half and full current finds what is unequal. What
+three sensors measure adds up to nothing unless they differ.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +13,30 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "phase check"
 CONNECTED_SIGMA = 10.0
-"""Multiples of the noise of one sample that a current must exceed."""
+"""Multiples of the noise of a mean that a current must exceed."""
+MEAN_SAMPLES = 512
+"""Samples of a mean."""
 OPEN_FRACTION = 0.2
-"""Fraction of the other phases' current below which a phase counts as open."""
+"""Fraction of the other phases' current below which a phase counts as open, and of the command all of them."""
 BALANCE_LIMIT = 0.10
 """Largest relative spread of currents or resistances between the phases."""
+SMALL_LIMIT = 0.30
+"""The same, of u/i at the small vectors: legs whose dead times differ by 5 % already make 0.11 of it."""
+SENSOR_LIMIT = 0.01
+"""Largest sum of the three phase currents, of the vector's; a gain that is 2 % off makes 1.7 %."""
+OFFSET_LIMIT = 0.2
+"""Largest offset of the current sensors, of the small test current: 1 % of the rated one."""
+SLOPE_SIGMA = 6.0
+"""Standard deviations that a difference must exceed besides."""
+PAIRS = ("b-c", "c-a", "a-b")
+"""Phases that carry the current when a, b or c is idle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,16 +72,24 @@ def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
     Raises
     ------
     IdentificationError
-        ``E_NOT_CONNECTED``, ``E_PHASE_OPEN``, ``E_NOT_SETTLED``, ``E_UNBALANCED``.
+        ``E_SNR``, ``E_NOT_CONNECTED``, ``E_PHASE_OPEN``, ``E_CURRENT_SENSOR``, ``E_NOT_SETTLED``, ``E_UNBALANCED``.
     """
     phases = np.stack([vectors["i_a_a"], vectors["i_b_a"], vectors["i_c_a"]], axis=1)
     strongest = np.max(np.abs(phases), axis=0)
     # an open phase still leaves 0.87 of the current in the other two for the vectors off its axis
-    floor = CONNECTED_SIGMA * noise.sigma_a
+    floor = CONNECTED_SIGMA * noise.sigma_a / math.sqrt(MEAN_SAMPLES)
+    command = float(vectors.meta.get("i_command_a", 0.0))
+    if 0.0 < command < 2.0 * floor:
+        raise refuse(
+            "E_SNR",
+            f"ten times the noise of a mean current is {floor:.3g} A, above half of the {command:.3g} A of the test",
+            stage=STAGE,
+        )
+    floor = max(floor, OPEN_FRACTION * command)
     if float(np.max(strongest)) < floor:
         raise refuse(
             "E_NOT_CONNECTED",
-            f"largest phase current {float(np.max(strongest)):.3g} A, below ten times the noise, {floor:.3g} A",
+            f"largest phase current {float(np.max(strongest)):.3g} A, limit {floor:.3g} A",
             stage=STAGE,
         )
     weakest = int(np.argmin(strongest))
@@ -74,17 +100,26 @@ def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
             f"phase {'abc'[weakest]} carries {strongest[weakest]:.3g} A where the others carry {others:.3g} A",
             stage=STAGE,
         )
+    offset = math.hypot(noise.offset_d_a, noise.offset_q_a)
+    if 0.0 < OFFSET_LIMIT * command < offset:
+        raise refuse(
+            "E_CURRENT_SENSOR",
+            f"at rest the sensors show a current of {offset:.3g} A, limit {OFFSET_LIMIT * command:.3g} A",
+            stage=STAGE,
+            likely="offset of a phase current sensor",
+        )
     if "moved" in vectors.signals and float(np.max(vectors["moved"])) > 0.0:
         raise refuse("E_NOT_SETTLED", "the rotor still swings under the test vectors", stage=STAGE)
     along = vectors["i_d_a"]
     impedance = vectors["u_d_v"] / along
     spread = max(_spread(along), _spread(impedance))
     across = float(np.max(np.abs(vectors["i_q_a"] / along)))
-    if max(spread, across) > BALANCE_LIMIT or not math.isfinite(spread):
+    unequal = max(_spread(along), across) > BALANCE_LIMIT or _spread(impedance) > SMALL_LIMIT
+    if unequal or not math.isfinite(spread):
         raise refuse(
             "E_UNBALANCED",
-            f"currents differ by {100 * _spread(along):.2g} %, u/i by {100 * _spread(impedance):.2g} %, "
-            f"{100 * across:.2g} % of the current is off its axis; limit {100 * BALANCE_LIMIT:g} %",
+            f"currents differ by {100 * _spread(along):.2g} %, {100 * across:.2g} % of the current is off its axis, "
+            f"limit {100 * BALANCE_LIMIT:g} %; u/i by {100 * _spread(impedance):.2g} %, limit {100 * SMALL_LIMIT:g} %",
             stage=STAGE,
         )
     return PhaseCheck(
@@ -92,6 +127,72 @@ def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
         (float(impedance[0]), float(impedance[1]), float(impedance[2])),
         max(spread, across),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class PairCheck:
+    """Result of the three pairs.
+
+    Attributes
+    ----------
+    resistance_ohm : tuple of float
+        Slope of the voltage with phase a, b and c idle (ohm).
+    spread : float
+        Largest difference between them, relative.
+    sensor_sum : float
+        Largest sum of the phase currents that grows with the current, relative.
+    """
+
+    resistance_ohm: tuple[float, float, float]
+    spread: float
+    sensor_sum: float
+
+
+def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
+    """Judge the slopes of the three pairs of phases.
+
+    Parameters
+    ----------
+    pairs : Trace
+        Six rows, two currents with phase a, b and c idle in turn: ``i_a_a i_b_a i_c_a u_d_v i_d_a`` (means);
+        ``meta["i_command_a"]``.
+    noise : Noise
+        From the zero-current trace.
+    curve : InverterCurve
+        Voltage error from the DC levels.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_CURRENT_SENSOR``, ``E_UNBALANCED``.
+    """
+    i = pairs["i_d_a"]
+    steps = np.diff(i)[::2]
+    total = pairs["i_a_a"] + pairs["i_b_a"] + pairs["i_c_a"]
+    sums = np.abs(np.diff(total)[::2] / steps)
+    worst = int(np.argmax(sums))
+    if float(sums[worst]) > SENSOR_LIMIT:
+        raise refuse(
+            "E_CURRENT_SENSOR",
+            f"through {PAIRS[worst]} the three phase currents add up to {100 * sums[worst]:.2g} % of the current, "
+            f"limit {100 * SENSOR_LIMIT:g} %",
+            stage=STAGE,
+            likely="the gains of the phase current sensors differ",
+        )
+    u = pairs["u_d_v"] - curve.error_v(math.sqrt(3.0) / 2.0 * i) * 2.0 / math.sqrt(3.0)
+    slopes = np.diff(u)[::2] / steps
+    spread = _spread(slopes)
+    # noise of a mean, seen through R at both ends of a slope
+    sigma = noise.sigma_a * math.sqrt(2.0 / MEAN_SAMPLES) / float(np.min(np.abs(steps)))
+    if spread > max(BALANCE_LIMIT, SLOPE_SIGMA * sigma) or not float(np.min(slopes)) > 0.0:
+        named = ", ".join(f"{name} {slope:.4g}" for name, slope in zip(PAIRS, slopes, strict=True))
+        raise refuse(
+            "E_UNBALANCED",
+            f"the resistances of the phase pairs differ by {100 * spread:.2g} %, limit {100 * BALANCE_LIMIT:g} % "
+            f"({named} ohm)",
+            stage=STAGE,
+        )
+    return PairCheck((float(slopes[0]), float(slopes[1]), float(slopes[2])), spread, float(sums[worst]))
 
 
 def _spread(values: NDArray[np.float64]) -> float:

@@ -85,8 +85,8 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
     ),
     (
         "E_CURRENT_SENSOR",
-        "the voltage has a line at once or twice the electrical frequency",
-        "offset or gain of the phase current sensors differ",
+        "offsets or gains of the phase current sensors differ",
+        "a drifted or damaged sensor, or a wrong scale of one phase",
         "calibrate the current sensors",
     ),
     (
@@ -100,6 +100,12 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
         "two injection frequencies give different inductances",
         "eddy currents in the core or the magnets",
         "use the value of the frequency that the current loop will see; both are in the record",
+    ),
+    (
+        "E_ENCODER",
+        "the encoder does not count while the current vector turns the rotor",
+        "an encoder that is stuck or not coupled, or a shaft that is locked without --shaft locked",
+        "turn the shaft by hand and watch theta_m in `pmsmtool monitor`",
     ),
     (
         "E_POLE_PAIRS",

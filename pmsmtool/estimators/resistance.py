@@ -164,6 +164,8 @@ def estimate_resistance(
     """
     tolerance = tolerance or SensorTolerance()
     copper = copper or Copper()
+    if "flagged" in levels.signals and float(np.max(levels["flagged"])) > 0.0:
+        raise refuse("E_CLIPPED", f"{int(np.sum(levels['flagged'] > 0))} levels with limited samples", stage=STAGE)
     i, v = levels["i_d_a"], levels["u_d_v"]
     samples = int(levels.meta["samples"])
     peak = float(np.max(np.abs(i)))
@@ -254,8 +256,6 @@ def _check_levels(levels: Trace, i: Vector, peak: float, R_0: float, noise: Nois
                 f"{count} different levels of one sign above {FIT_FROM:g} of the largest, {TAIL_TERMS + 3} needed",
                 stage=STAGE,
             )
-    if "flagged" in levels.signals and float(np.max(levels["flagged"])) > 0.0:
-        raise refuse("E_CLIPPED", f"{int(np.sum(levels['flagged'] > 0))} levels with limited samples", stage=STAGE)
     change = (levels["u_d_second_v"] - levels["u_d_first_v"]) - R_0 * (levels["i_d_second_a"] - levels["i_d_first_a"])
     sigma = 2.0 * R_0 * noise.sigma_a / math.sqrt(samples)  # difference of two halves
     fit_limit = max(SETTLE_SIGMA * sigma, SETTLE_FLOOR * R_0 * peak)

@@ -122,6 +122,59 @@ def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace
     return table(rows, times, i_command_a=i_a, angles_rad=list(PHASE_ANGLES_RAD))
 
 
+PAIR_SHARES = (0.5, 1.0)
+"""Currents of the three pairs of phases, of the largest: above the knee of any inverter."""
+PAIR_PERIODS = 512
+
+
+def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float) -> Trace:
+    """Hold two currents through each pair of phases, the third phase idle; return one row of means for each.
+
+    Parameters
+    ----------
+    drive : Drive
+        Enabled; it holds zero current on return.
+    i_a : float
+        Larger current (A peak).
+    turn_a, start_rad : float
+        Current that turns the rotor from pair to pair (A peak), and the vector that was held last (rad electrical).
+    """
+    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a")
+    rows: list[dict[str, float]] = []
+    times: list[float] = []
+    elapsed = 0.0
+    angle = start_rad
+    for k in range(3):
+        target = DC_ANGLE_RAD + PHASE_ANGLES_RAD[k]
+        if target != angle:
+            elapsed += turn_vector(drive, turn_a, angle, target)
+            angle = target
+        for share in PAIR_SHARES:
+            drive.command_current(share * i_a, 0.0, fixed_angle_rad=angle)
+            elapsed += settle(drive, share * i_a)
+            times.append(elapsed)
+            rows.append(dict(drive.average(names, PAIR_PERIODS)))
+            elapsed += PAIR_PERIODS * drive.period_s
+    drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
+    return table(rows, times, i_command_a=i_a, idle=["a", "a", "b", "b", "c", "c"])
+
+
+def turn_and_look(drive: Drive, i_a: float, start_rad: float, end_rad: float) -> Trace:
+    """Turn a current vector in small steps and return where the encoder stood before and after."""
+    drive.command_current(i_a, 0.0, fixed_angle_rad=start_rad)
+    settle(drive, i_a)
+    periods = max(1, round(0.01 / drive.period_s))
+    before = drive.average(("theta_m_rad",), periods)
+    seconds = turn_vector(drive, i_a, start_rad, end_rad)
+    settle(drive, i_a)
+    after = drive.average(("theta_m_rad",), periods)
+    rows = [
+        {"theta_imposed_rad": angle, "theta_M_rad": row["theta_m_rad"]}
+        for angle, row in ((start_rad, before), (end_rad, after))
+    ]
+    return table(rows, [0.0, seconds], i_command_a=i_a)
+
+
 def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float) -> float:
     """Turn a current vector in small steps, so that the rotor follows instead of jumping; return the time (s).
 
@@ -145,7 +198,8 @@ def settle(
 ) -> float:
     """Wait until the current has arrived and the shaft stands still, or a limit is over; return the time (s).
 
-    A current that has not arrived is waited for as long as the shaft moves, and ``arrival_s`` at least.
+    A current that has not arrived is waited for as long as the shaft moves, and ``arrival_s`` at least. A flag ends it:
+    what is limited or at full scale does not settle, it winds up.
     """
     periods = max(1, round(0.25 * LOOK_S / drive.period_s))
     waited = 0.0
@@ -153,10 +207,10 @@ def settle(
     while waited < limit_s:
         drive.wait(LOOK_S)
         waited += LOOK_S
-        now = drive.average(("theta_m_rad", "i_d_a", "i_q_a"), periods)
+        now = drive.average(("theta_m_rad", "i_d_a", "i_q_a", "flags"), periods)
         arrived = math.hypot(now["i_d_a"] - i_d_a, now["i_q_a"]) <= max(ARRIVED * abs(i_d_a), near_a)
         at_rest = abs(now["theta_m_rad"] - last) < REST_RAD
-        if at_rest and (arrived or waited >= arrival_s):
+        if (at_rest and (arrived or waited >= arrival_s)) or (now["flags"] > 0.0 and not arrived):
             break
         last = now["theta_m_rad"]
     return waited
@@ -206,5 +260,7 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
         row["theta_M_rad"] = second["theta_m_rad"]
         row["flagged"] = float(first["flags"] + second["flags"] > 0.0)  # a mean of flag words: any bit counts
         rows.append(row)
+        if row["flagged"]:
+            break  # the estimator refuses it; nothing larger is held
     drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
     return table(rows, times, samples=2 * half, fixed_angle_rad=plan.angle_rad, i_command_a=list(plan.levels_a))

@@ -10,14 +10,14 @@ import numpy as np
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.axis_fit import initial_inductance
-from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
+from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.flux_map_result import FluxMapResult
 from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
 from pmsmtool.estimators.inertia import InertiaResult, estimate_inertia
 from pmsmtool.estimators.noise import Noise, estimate_noise
-from pmsmtool.estimators.phase_check import PhaseCheck, check_phases
+from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases
 from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance
 from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.machine_file import MachineFile
@@ -41,6 +41,7 @@ class Evaluation:
 
     noise: Noise
     phases: PhaseCheck | None = None
+    pairs: PairCheck | None = None
     resistance: ResistanceResult | None = None
     encoder: EncoderResult | None = None
     inductance: InductanceResult | None = None
@@ -101,9 +102,9 @@ def evaluate(
     Parameters
     ----------
     traces : mapping of str to Trace
-        As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``levels``, ``rotation_forward``,
-        ``rotation_backward``, ``square_d_<half period>``, ``square_q_<half period>``, ``pushes_<k>``, ``speeds``,
-        ``wave_<k>``, ``map_<k>``.
+        As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
+        ``phase_pairs``, ``rotation_forward``, ``rotation_backward``, ``square_d_<half period>``,
+        ``square_q_<half period>``, ``push_<k>``, ``speeds``, ``wave_<k>``, ``map_<k>``.
     period_s : float
         Control period (s).
     T_ref_c : float
@@ -126,8 +127,12 @@ def evaluate(
     result = Evaluation(estimate_noise(traces["zero_current"]))
     if "phase_vectors" in traces:
         result = replace(result, phases=check_phases(traces["phase_vectors"], result.noise))
+    if "first_turn" in traces:
+        check_encoder_counts(traces["first_turn"])
     if "levels" in traces:
         result = replace(result, resistance=resistance_of(traces["levels"], result.noise, T_ref_c, tolerance))
+    if "phase_pairs" in traces and result.resistance is not None:
+        result = replace(result, pairs=check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve))
     if "rotation_forward" in traces:
         encoder = estimate_encoder(traces["rotation_forward"], traces["rotation_backward"])
         result = replace(result, encoder=encoder)
@@ -155,6 +160,7 @@ def resistance_of(
     A reluctance machine has currents at which its rotor leaves the vector so slowly that it never comes to rest.
     """
     moved = levels.signals.get("moved", np.zeros(len(levels))) > 0.0
+    moved &= levels.signals.get("flagged", np.zeros(len(levels))) == 0.0  # a limit is no motion: the estimator names it
     left_out = int(np.sum(moved))
     note = ""
     if 0 < left_out <= MOVED_SHARE * len(levels):

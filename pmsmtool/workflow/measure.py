@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from pmsmtool.design.current_loop import imc
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError, LimitExceeded
-from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
+from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.noise import Noise, estimate_noise
-from pmsmtool.estimators.phase_check import check_phases
+from pmsmtool.estimators.phase_check import check_pairs, check_phases
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
@@ -180,7 +180,11 @@ class Measurement:
         steps = steps_of(quantities, self.held)
         noise = self._zero_current()
         self._phase_check(noise)
-        resistance = self._levels(noise) if "levels" in steps else None
+        start = standstill.PHASE_ANGLES_RAD[-1]
+        if "rotation" in steps:
+            self._encoder_counts(start, standstill.DC_ANGLE_RAD)
+            start = standstill.DC_ANGLE_RAD
+        resistance = self._levels(noise, start) if "levels" in steps else None
         encoder = self._rotation() if "rotation" in steps else None
         if resistance is not None and encoder is not None:
             inductances = self._square(resistance, encoder) if "square" in steps else None
@@ -203,7 +207,12 @@ class Measurement:
         self.keep("phase_vectors", trace)
         check_phases(trace, noise)
 
-    def _levels(self, noise: Noise) -> ResistanceResult:
+    def _encoder_counts(self, start_rad: float, end_rad: float) -> None:
+        trace = standstill.turn_and_look(self.drive, TURN_SHARE * self.limits.I_test_apk, start_rad, end_rad)
+        self.keep("first_turn", trace)
+        check_encoder_counts(trace)
+
+    def _levels(self, noise: Noise, start_rad: float) -> ResistanceResult:
         largest = self.limits.I_test_apk
         ratio = (1.0 / LOWEST_LEVEL) ** (1.0 / (LEVELS - 1))
         magnitudes = [largest * max(LOWEST_LEVEL, (k + 1) / LEVELS) for k in range(LEVELS)]
@@ -212,12 +221,17 @@ class Measurement:
         plan = standstill.LevelPlan(
             standstill.calm_sequence(sorted(set(magnitudes)), low),
             turn_a=TURN_SHARE * largest,
-            start_rad=standstill.PHASE_ANGLES_RAD[-1],
+            start_rad=start_rad,
         )
         self.say(f"R and inverter: {len(plan.levels_a)} levels up to {largest:.3g} A")
         trace = standstill.hold_levels(self.drive, plan)
         self.keep("levels", trace)
-        return resistance_of(trace, noise)
+        resistance = resistance_of(trace, noise)
+        self.say(f"pairs of phases: two currents up to {largest:.3g} A through each")
+        pairs = standstill.hold_pairs(self.drive, largest, TURN_SHARE * largest, standstill.DC_ANGLE_RAD)
+        self.keep("phase_pairs", pairs)
+        check_pairs(pairs, noise, resistance.curve)
+        return resistance
 
     def _rotation(self) -> EncoderResult:
         """Turn the vector; with less current again when the rotor did not stay on it."""
