@@ -41,7 +41,7 @@ class GovernedTwin(Twin):
     disturbance: Vector = (ZERO, ZERO)
     time_to_go: np.float32 = ZERO
     landing: bool = False
-    reachable: tuple[Vector, Vector] | None = None
+    reachable: Vector | None = None
     omega: np.float32 = ZERO
     T_s: np.float32 = ZERO
     V_max: np.float32 = ZERO
@@ -142,11 +142,11 @@ class GovernedTwin(Twin):
         self.reachable = None
         if len(rows) <= steady + 1 or square(v) <= rows[-1].V * rows[-1].V:
             return v, True
-        if kept is not None and kept[0] == r and self.time_to_go <= 0:
-            return kept[1], True
+        if kept is not None and self.time_to_go <= 0:
+            return kept, True
         both = project_rows([pre, rows[-1]], r)
         v = v if both is None else both[0]
-        self.reachable = r, v
+        self.reachable = v
         return v, False
 
     def govern(self, request: Vector) -> Vector:
@@ -188,12 +188,16 @@ class GovernedTwin(Twin):
         empty = bool(square(last.voltage(v)) > EMPTY_MARGIN * last.V * last.V)
         self.binding = EMPTY
         self.flags |= FLAG_FALLBACK if empty else 0
-        steered = self.minimum_time(rows[0], offset, r, may_start)
+        steered, barred = self.minimum_time(rows[0], offset, r, may_start)
         if steered is not None:
             self.landing, self.binding = True, STEERED
             return steered
-        if not empty:
-            v, self.binding = self.solve(rows, steady, r)
+        if empty or barred:
+            return v
+        if (self.time_to_go > 0 or not may_start):
+            self.binding = 0
+            return project_row(rows[0], r)
+        v, self.binding = self.solve(rows, steady, r)
         return v
 
     def at_time(self, T: np.float32, a: Vector, b: Vector, drops: tuple[Vector, Vector]) -> tuple:
@@ -228,7 +232,8 @@ class GovernedTwin(Twin):
             T = HALF * (low + high) if following <= low or (high > 0 and following >= high) else following
         return (T if T * w <= f(100) else ZERO), None
 
-    def minimum_time(self, now: Row, offset: Vector, target: Vector, may_start: bool) -> Vector | None:
+    def minimum_time(self, now: Row, offset: Vector, target: Vector, may_start: bool) -> tuple[Vector | None, bool]:
+        """The steering reference, and whether a transfer was found that the transient current limit bars."""
         R, least = self["motor.R_s_ohm"], f(3) * self.T_s
         a, b = ((self["motor.psi_f_wb"] + self["motor.L_d_app_h"] * x[0], self["motor.L_q_app_h"] * x[1])
                 for x in (self.i, target))
@@ -243,15 +248,15 @@ class GovernedTwin(Twin):
             T = ZERO
         self.time_to_go = T if m is None else ZERO
         if m is None:
-            return None
+            return None, False
         s, c = sincos(HALF * self.T_s * self.omega)
         w, scale = park(m, s, c), self.V_max / np.sqrt(square(m))
         w = w[0] * scale, w[1] * scale
         kept = self.keep_current(offset, w)
         if kept is None:
-            return None
+            return None, True
         self.time_to_go = T
-        return (kept[0] - now.c[0]) / now.dd, (kept[1] - now.c[1]) / now.qq
+        return ((kept[0] - now.c[0]) / now.dd, (kept[1] - now.c[1]) / now.qq), False
 
     def keep_current(self, offset: Vector, w: Vector) -> Vector | None:
         model, i = self.model_voltage(self.i), self.i

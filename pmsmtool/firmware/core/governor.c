@@ -25,7 +25,7 @@ typedef struct {
     uint32_t steady;   /* index of the steady-state row; the current row follows it when it is there */
     pmsm_row pre;      /* steady-state row of the pre-projection */
     pmsm_dq offset;    /* V, beside the nominal model in the steady state */
-    uint32_t may_start;/* 0: this period has no time to start a minimum-time transfer */
+    uint32_t may_start;/* 0: this period has no time left to start a minimum-time transfer, or for more than row 0 */
     uint32_t smallest_known;
     pmsm_dq smallest;  /* A, of the smallest steady-state voltage under row 0 */
 } rows_of_period;
@@ -403,12 +403,20 @@ static pmsm_dq restrain(pmsm_period *period, rows_of_period *rows, pmsm_dq r, ui
     rows->smallest = v;
     *binding = PMSM_BINDING_EMPTY;
     period->flags |= (empty != 0u) ? (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK : 0u;
-    if (pmsm_minimum_time(period, &rows->row[0], rows->offset, r, rows->may_start, &v) != 0u) {
+    const enum pmsm_transfer transfer = pmsm_minimum_time(period, &rows->row[0], rows->offset, r, rows->may_start, &v);
+    if (transfer == PMSM_TRANSFER_FOUND) {
         state->landing = 1u;
         *binding = PMSM_BINDING_MINIMUM_TIME;
         return v;
     }
-    return (empty != 0u) ? v : solve(period, rows, r, binding, steps);
+    if (empty != 0u || transfer == PMSM_TRANSFER_BARRED) { /* out of the reach of the voltage: back into it first */
+        return v;
+    }
+    if (transfer == PMSM_TRANSFER_SOUGHT || rows->may_start == 0u) { /* little time is left: row 0 only */
+        *binding = 0u;
+        return pmsm_project_row(&rows->row[0], r, steps);
+    }
+    return solve(period, rows, r, binding, steps);
 }
 
 static uint32_t is_admissible(const rows_of_period *rows, pmsm_dq r)
@@ -422,7 +430,8 @@ static uint32_t is_admissible(const rows_of_period *rows, pmsm_dq r)
 }
 
 /* The reachable request: inside the steady-state row, and inside the current row where both can be met. The second is
- * costly, so where a transfer has to be started as well the two share the work between two periods. */
+ * costly, so unless a transfer is under way it is done in every other period, and what it was done for stands meanwhile;
+ * the period between is for the rows, or to start a transfer. */
 static pmsm_dq pre_project(pmsm_period *period, rows_of_period *rows, pmsm_dq r, uint32_t *steps)
 {
     pmsm_state *state = period->state;
@@ -433,15 +442,13 @@ static pmsm_dq pre_project(pmsm_period *period, rows_of_period *rows, pmsm_dq r,
     if (rows->count <= rows->steady + 1u || pmsm_square(v) <= last->V * last->V) {
         return v;
     }
-    const uint32_t same = (state->reachable_for.d == r.d && state->reachable_for.q == r.q) ? fresh : 0u;
-    if (same != 0u && state->time_to_go <= PMSM_C(0.0)) {
+    if (fresh != 0u && state->time_to_go <= PMSM_C(0.0)) {
         return state->reachable;
     }
     const pmsm_row both[2] = {rows->pre, *last};
     uint32_t active;
     (void)pmsm_project_rows(both, 2u, r, &v, &active, steps); /* v stays where there is no common point */
     rows->may_start = 0u;
-    state->reachable_for = r;
     state->reachable = v;
     state->reachable_age = 1u;
     return v;

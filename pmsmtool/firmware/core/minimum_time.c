@@ -64,10 +64,8 @@ static pmsm_real next_time(const transfer *t, const transfer_point *point, pmsm_
     return (outside != 0u) ? PMSM_C(0.5) * (low + high) : next;
 }
 
-enum search { NO_TRANSFER, FOUND, GOES_ON };
-
 /* The time T of the transfer and the way m, from a first guess. Not when it is shorter than least. */
-static enum search find_time(const transfer *t, pmsm_real least, uint32_t trials, pmsm_real *T, pmsm_dq *m)
+static enum pmsm_transfer find_time(const transfer *t, pmsm_real least, uint32_t trials, pmsm_real *T, pmsm_dq *m)
 {
     pmsm_real low = PMSM_C(0.0);
     pmsm_real high = PMSM_C(0.0);
@@ -78,19 +76,19 @@ static enum search find_time(const transfer *t, pmsm_real least, uint32_t trials
             m->d = point.m.d + last * point.rate.d;
             m->q = point.m.q + last * point.rate.q;
             *T += last;
-            return (*T > least) ? FOUND : NO_TRANSFER;
+            return (*T > least) ? PMSM_TRANSFER_FOUND : PMSM_TRANSFER_NONE;
         }
         if (point.gap > PMSM_C(0.0)) {
             low = *T;
         } else {
             high = *T;
             if (high <= least) {
-                return NO_TRANSFER;
+                return PMSM_TRANSFER_NONE;
             }
         }
         *T = next_time(t, &point, *T, low, high);
     }
-    return (*T * pmsm_abs(t->omega) <= LONGEST_ANGLE) ? GOES_ON : NO_TRANSFER;
+    return (*T * pmsm_abs(t->omega) <= LONGEST_ANGLE) ? PMSM_TRANSFER_SOUGHT : PMSM_TRANSFER_NONE;
 }
 
 static pmsm_dq flux(const pmsm_params *params, pmsm_dq i)
@@ -146,8 +144,8 @@ static uint32_t keep_current(const pmsm_period *period, pmsm_dq offset, pmsm_dq 
 
 /* offset: voltage beside the model's, which turns with the rotor as the resistance drop does. may_start: 0 only follows
  * a transfer that is under way, which takes little time. */
-uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq offset, pmsm_dq target,
-                           uint32_t may_start, pmsm_dq *v)
+enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq offset, pmsm_dq target,
+                                     uint32_t may_start, pmsm_dq *v)
 {
     pmsm_state *state = period->state;
     const pmsm_real T_s = state->derived.T_s;
@@ -161,7 +159,7 @@ uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq off
     const pmsm_real least = SHORTEST_PERIODS * T_s;
     pmsm_real T = state->time_to_go - T_s;
     pmsm_dq m;
-    enum search found = NO_TRANSFER;
+    enum pmsm_transfer found = PMSM_TRANSFER_NONE;
     if (T > PMSM_C(0.0)) {
         found = find_time(&t, least, TRIALS_FOLLOW, &T, &m);
     } else if (may_start != 0u) {
@@ -170,9 +168,9 @@ uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq off
         T = (T > least) ? T : least;
         found = find_time(&t, least, TRIALS_START, &T, &m);
     }
-    state->time_to_go = (found == GOES_ON) ? T : PMSM_C(0.0);
-    if (found != FOUND) {
-        return 0u;
+    state->time_to_go = (found == PMSM_TRANSFER_SOUGHT) ? T : PMSM_C(0.0);
+    if (found != PMSM_TRANSFER_FOUND) {
+        return found;
     }
     pmsm_real sine;
     pmsm_real cosine;
@@ -183,10 +181,10 @@ uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq off
     w.d *= scale;
     w.q *= scale;
     if (keep_current(period, offset, &w) == 0u) {
-        return 0u;
+        return PMSM_TRANSFER_BARRED;
     }
     state->time_to_go = T;
     v->d = (w.d - row->c_d) / row->m_dd;
     v->q = (w.q - row->c_q) / row->m_qq;
-    return 1u;
+    return PMSM_TRANSFER_FOUND;
 }

@@ -65,7 +65,8 @@ typedef struct {             /* what a trace or a TPDO can show of this period *
     pmsm_real i_d_req, i_q_req;      /* A, before the governor */
     pmsm_real i_d_ref, i_q_ref;      /* A, after the governor */
     pmsm_real u_d, u_q;              /* V, demanded, before the limiter */
-    pmsm_real u_d_lim, u_q_lim;      /* V, after limiter and duty clip, in the frame of u; dead-time compensation excluded unless current.options bit 5 */
+    pmsm_real u_d_lim, u_q_lim;      /* V, after limiter and duty clip, in the frame of u; without dead-time
+                                        compensation unless current.options bit 5 */
     pmsm_real theta_e, omega_e;      /* rad in [-pi, pi), rad/s */
     pmsm_real tau;                   /* N m, from currents and parameters */
     pmsm_real kappa;                 /* governor: share of the way to the request, 1 = passed unchanged */
@@ -112,8 +113,7 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_dq reference_realised; /* A, reference of the last period that its limited voltage stood for */
     pmsm_real tau_granted;   /* N m, torque of the reference that the limits left */
     pmsm_real time_to_go;    /* s, of the minimum-time transfer in progress, 0 when there is none */
-    pmsm_dq reachable_for;   /* A, request that reachable belongs to */
-    pmsm_dq reachable;       /* A, its projection on steady-state and current row */
+    pmsm_dq reachable;       /* A, a request's projection on steady-state and current row */
     uint32_t reachable_age;  /* 1: computed in the last period, 0: not valid */
     uint32_t landing;        /* 1: a minimum-time transfer has not reached its target yet */
     pmsm_real fw_tau;        /* N m, request of the last optimisation */

@@ -63,9 +63,11 @@ pmsm_dq pmsm_predict_current(const pmsm_period *period);
 /* governor.c: period->reference becomes the governed one */
 void pmsm_govern(pmsm_period *period);
 
-/* minimum_time.c: 1 and the reference that steers along the minimum-time direction, or 0 */
-uint32_t pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq offset, pmsm_dq target,
-                           uint32_t may_start, pmsm_dq *v);
+/* minimum_time.c: when found, v is the reference that steers along the minimum-time direction; sought: the search takes
+ * another period; barred: it would break the transient current limit */
+enum pmsm_transfer { PMSM_TRANSFER_NONE, PMSM_TRANSFER_FOUND, PMSM_TRANSFER_SOUGHT, PMSM_TRANSFER_BARRED };
+enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq offset, pmsm_dq target,
+                                     uint32_t may_start, pmsm_dq *v);
 
 /* polar.c: the laws of polar.mode in place of the current controller */
 void pmsm_polar_demand(pmsm_period *period);
