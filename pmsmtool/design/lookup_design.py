@@ -157,7 +157,7 @@ def design_table(
     if request.torque_points is not None and request.y_points is not None:
         x = np.linspace(-torque, torque, request.torque_points)
         stored = _fitting(request, x.size, y[1].size, problem.V_max.size)
-        table = as_stored(problem.solve(*stored_axes(x, y[1])), stored)
+        table = as_stored(problem.solve(*stored_axes(x, y[1], problem.U_dc)), stored)
         return LookupDesign(table, stored, interpolation_error(table), (*notes, *problem.flux_note(table)))
     x = np.linspace(-torque, torque, FIRST_TORQUES)
     failed: DesignInfeasible | None = None
@@ -168,7 +168,7 @@ def design_table(
         limit = float(problem.V_max.min()) if request.axis == "speed" else float(y[1][-1])
         bounds = GridBounds(request.torque_bound * torque, request.voltage_bound * limit, stored)
         try:
-            table, error = refined_table(problem.solve, x, y[0], bounds)
+            table, error = refined_table(problem.solve, x, y[0], problem.U_dc, bounds)
         except DesignInfeasible as refused:
             failed = refused
             continue
@@ -200,19 +200,22 @@ class _Problem:
 
     @property
     def V_max(self) -> Array:
-        return (1.0 - self.voltage_margin) * self.source.inverter.voltage_utilisation * self.U_dc
+        return self._limit(self.U_dc)
+
+    def _limit(self, U_dc_v: Array) -> Array:
+        return (1.0 - self.voltage_margin) * self.source.inverter.voltage_utilisation * U_dc_v
 
     def largest_torque(self) -> float:
         bounds = torque_limits(self.machine, [0.0], [STANDSTILL_V], self.rated.I_max_apk, self.rated.i_d_min_a)
         return float(max(bounds.largest_nm[0, 0], -bounds.least_nm[0, 0]))
 
-    def solve(self, torque_nm: Array, y: Array) -> LookupTable:
+    def solve(self, torque_nm: Array, y: Array, U_dc_v: Array) -> LookupTable:
         I_max, i_d_min = self.rated.I_max_apk, self.rated.i_d_min_a
         if self.request.axis == "flux":
             return flux_table(self.machine, torque_nm=torque_nm, flux_limit_wb=y, I_max_apk=I_max, i_d_min_a=i_d_min)
         return speed_table(
-            self.machine, torque_nm=torque_nm, speed_rpm=y, V_max_v=self.V_max, I_max_apk=I_max,
-            i_d_min_a=i_d_min, U_dc_v=stored_axes(self.U_dc)[0],
+            self.machine, torque_nm=torque_nm, speed_rpm=y, V_max_v=self._limit(U_dc_v), I_max_apk=I_max,
+            i_d_min_a=i_d_min, U_dc_v=U_dc_v,
         )  # fmt: skip
 
     def second_axis(self) -> tuple[tuple[Array, Array], tuple[str, ...]]:

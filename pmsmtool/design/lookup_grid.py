@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -32,8 +32,11 @@ BOUND_SAFETY = 1.1
 INT16_LARGEST = 32767
 """Full scale of a stored current; -32768 says that a cell has no point."""
 
-AXIS_NODES_MAX = 255
-"""Nodes of an axis in the drive (``lut.n_x`` is one byte)."""
+AXIS_NODES_MAX, VOLTAGES_MAX = 255, 16
+"""Nodes of an axis in the drive (``lut.n_x`` is one byte), and of its DC-link voltages (``lut.n_z``)."""
+
+Axes = tuple[Array, Array, Array]
+"""Torque (N m), speed (rpm) or flux (Wb), DC-link voltage (V)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,8 +130,6 @@ def _fine_limits(table: LookupTable, points: int) -> Array:
     """Least and largest torque at the fine nodes of y and z, shape (f_y, f_z, 2)."""
     y = _fine(table.y, points)
     if table.axis_kind == "flux":
-        from dataclasses import replace
-
         bounds = torque_limits(replace(table.machine, R=0.0), [1.0], y, table.I_max_apk, table.i_d_min_a)
         return np.ascontiguousarray(np.stack((bounds.least_nm.T, bounds.largest_nm.T), axis=-1))
     omega = y * table.machine.pole_pairs / RPM
@@ -180,21 +181,21 @@ def table_words(n_x: int, n_y: int, n_z: int, stored: StoredFormat) -> int:
     return n_x + n_y + n_z + 2 * (cells if stored == "float32" else (cells + 1) // 2)
 
 
-Solver = Callable[[Array, Array], LookupTable]
-"""Solve a table over a torque and a second axis."""
+Solver = Callable[[Array, Array, Array], LookupTable]
+"""Solve a table over torque, a second axis and DC-link voltages."""
 
 
 def refined_table(
-    solve: Solver, torque_nm: Array, y: Array, bounds: GridBounds
+    solve: Solver, torque_nm: Array, y: Array, U_dc_v: Array, bounds: GridBounds
 ) -> tuple[LookupTable, InterpolationError]:
     """Refine the axes until the stored table keeps its bounds.
 
     Parameters
     ----------
     solve : callable
-        Solves a table over both axes.
-    torque_nm, y : ndarray
-        First axes; their nodes are kept.
+        Solves a table over all axes.
+    torque_nm, y, U_dc_v : ndarray
+        First axes; their nodes are kept. A single voltage stays single.
     bounds : GridBounds
         What is asked.
 
@@ -203,25 +204,63 @@ def refined_table(
     DesignInfeasible
         The drive's memory is full before the bounds hold; the message names what was reached.
     """
-    x, y = stored_axes(np.asarray(torque_nm, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    axes = stored_axes(*(np.asarray(axis, dtype=np.float64) for axis in (torque_nm, y, U_dc_v)))
     for turn in range(_TURNS_MAX):
-        table = as_stored(solve(x, y), bounds.stored)
+        table = as_stored(solve(*axes), bounds.stored)
         worst = cell_errors(table)
         error = _bounds(table, worst)
         if error.torque_nm <= bounds.torque_nm and error.voltage_v <= bounds.voltage_v:
             return table, error
-        finer = _split(x, y, worst, bounds, table.U_dc_v.size) if turn < _TURNS_MAX - 1 else None
+        finer = None
+        if turn < _TURNS_MAX - 1:
+            finer = _split_voltages(table, axes, bounds) or _split(*axes, worst, bounds)
         if finer is None:
             break
-        x, y = finer
+        axes = finer
     raise DesignInfeasible(
-        f"{x.size} x {y.size} nodes keep the torque within {error.torque_nm:.3g} N m and the voltage within "
-        f"{error.voltage_v:.3g} V; asked for: {bounds.torque_nm:.3g} N m, {bounds.voltage_v:.3g} V",
+        f"{' x '.join(str(axis.size) for axis in axes)} nodes keep the torque within {error.torque_nm:.3g} N m and the "
+        f"voltage within {error.voltage_v:.3g} V; asked for: {bounds.torque_nm:.3g} N m, {bounds.voltage_v:.3g} V",
         where=f"look-up table ({bounds.stored}, {bounds.capacity_words} words)",
         likely="the drive's memory for tables is full",
-        hint="ask for larger bounds, take int16, or reduce the range of torque or speed"
-        + ("; closer DC-link voltages may be missing too" if table.U_dc_v.size > 1 else ""),
+        hint="ask for larger bounds, take int16, or reduce the range of torque, speed or DC-link voltage",
     )
+
+
+VOLTAGE_SHARE = 0.6
+"""An interval of the voltages is split when its own error, at nodes of torque and speed, is this much of the bound."""
+
+_BETWEEN = np.array([0.25, 0.5, 0.75])
+"""Shares of an interval of the voltages at which that error is taken."""
+
+
+def _split_voltages(table: LookupTable, axes: Axes, bounds: GridBounds) -> Axes | None:
+    """Halve the intervals of the voltages that no other node of torque or speed could cure, where memory allows."""
+    z = _halved(axes[2], np.array([e > VOLTAGE_SHARE for e in _voltage_excess(table, bounds)], dtype=np.bool_))
+    words = table_words(axes[0].size, axes[1].size, z.size, bounds.stored)
+    fits = axes[2].size < z.size <= VOLTAGES_MAX and words <= bounds.capacity_words
+    return (axes[0], axes[1], z) if fits else None
+
+
+def _voltage_excess(table: LookupTable, bounds: GridBounds) -> list[float]:
+    """Largest error inside each interval of the voltages at the nodes of torque and speed, over what is asked."""
+    found = []
+    omega = table.y * table.machine.pole_pairs / RPM
+    for k in range(table.U_dc_v.size - 1):
+        i_d, i_q = (
+            currents[..., k, None] * (1.0 - _BETWEEN) + currents[..., k + 1, None] * _BETWEEN
+            for currents in (table.i_d_a, table.i_q_a)
+        )
+        V = table.V_max_v[k] * (1.0 - _BETWEEN) + table.V_max_v[k + 1] * _BETWEEN
+        reach = torque_limits(table.machine, omega, V, table.I_max_apk, table.i_d_min_a)
+        torque = np.abs(table.machine.torque_nm(i_d, i_q) - reach.nearest(table.torque_nm[:, None, None]))
+        over = table.machine.voltage_v(i_d, i_q, omega[None, :, None]) - V
+        excess = np.maximum(torque / bounds.torque_nm, over / bounds.voltage_v)
+        found.append(float(np.nanmax(excess, initial=0.0)))
+    return found
+
+
+def _excess(worst: Array, bounds: GridBounds) -> Array:
+    return np.asarray(np.maximum(worst[..., 0] / bounds.torque_nm, worst[..., 1] / bounds.voltage_v))
 
 
 _TURNS_MAX = 24
@@ -231,18 +270,18 @@ _SPLIT_SHARES = (0.5, 0.7, 0.85, 0.95, 1.0)
 """Intervals whose error is at least this share of the largest are split together; fewer where memory ends."""
 
 
-def _split(x: Array, y: Array, worst: Array, bounds: GridBounds, n_z: int) -> tuple[Array, Array] | None:
+def _split(x: Array, y: Array, z: Array, worst: Array, bounds: GridBounds) -> Axes | None:
     """Halve the intervals that matter, each along the axis whose interpolation alone is the worse one."""
-    excess = np.maximum(worst[..., 0] / bounds.torque_nm, worst[..., 1] / bounds.voltage_v)
+    excess = _excess(worst, bounds)
     total = excess.max(axis=2)
     for share in _SPLIT_SHARES:
         cells = total >= max(1.0 / BOUND_SAFETY, share * float(total.max()))
         along_x = cells & (excess[..., 0] >= excess[..., 1])
         finer = _halved(x, along_x.any(axis=1)), _halved(y, (cells & ~along_x).any(axis=0))
         n_x, n_y = finer[0].size, finer[1].size
-        fits = table_words(n_x, n_y, n_z, bounds.stored) <= bounds.capacity_words and max(n_x, n_y) <= AXIS_NODES_MAX
+        fits = table_words(n_x, n_y, z.size, bounds.stored) <= bounds.capacity_words and max(n_x, n_y) <= AXIS_NODES_MAX
         if fits and n_x + n_y > x.size + y.size:
-            return finer
+            return (*finer, z)
     return None
 
 

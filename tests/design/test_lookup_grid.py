@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import math
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from pmsmtool.design.lookup_grid import (
     table_words,
 )
 from pmsmtool.design.lookup_loci import loci
-from pmsmtool.design.lookup_table import RPM, LookupTable, electrical_speed, flux_table, speed_table, torque_limits
+from pmsmtool.design.lookup_table import CUT, RPM, LookupTable, electrical_speed, flux_table, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.design.ratings import ratings
 from pmsmtool.errors import ConfigError, DesignInfeasible
@@ -192,21 +193,48 @@ def test_what_the_drive_makes_of_the_table_keeps_the_bound(stored: StoredFormat)
     assert np.abs(reached - wanted).max() > 0.3 * error.torque_nm  # the table was really asked
 
 
-def test_a_voltage_axis_is_bounded_between_its_voltages_too() -> None:
-    asked = {"U_dc_v": (150.0, 160.0, 173.0), "torque_bound": 0.05, "voltage_bound": 0.05}
+@pytest.mark.parametrize("stored", ["float32", "int16"])
+def test_a_voltage_axis_is_refined_and_bounded_between_its_voltages_too(stored: str) -> None:
+    asked = {"U_dc_v": (130.0, 190.0), "torque_bound": 0.05, "voltage_bound": 0.03, "stored": stored}
     design = made("mtpv-test", **asked)
-    table = design.table
-    assert table.i_d_a.shape[2] == 3
+    table, error = design.table, design.error
+    assert table.U_dc_v.size > 2 and {130.0, 190.0} <= set(table.U_dc_v.tolist())
+    assert error.torque_nm <= 0.05 * table.torque_nm[-1] and error.voltage_v <= 0.03 * table.V_max_v[0]
+    # a grid ten times finer along every axis, taken in random planes of it
+    torque, speed, voltage = (finer(axis, 10) for axis in (table.torque_nm, table.y, table.U_dc_v))
     rng = np.random.default_rng(1)
-    torque, speed = rng.uniform(-150.0, 150.0, 4000), rng.uniform(0.0, 5000.0, 4000)
-    k, c = corners(table.U_dc_v, rng.uniform(150.0, 173.0, 4000))
-    layers = [replace(table, i_d_a=table.i_d_a[..., z : z + 1], i_q_a=table.i_q_a[..., z : z + 1]) for z in range(3)]
-    stack = np.array([bilinear(layer, torque, speed) for layer in layers])
-    at = np.arange(4000)
-    i_d, i_q = (1 - c) * stack[k, :, at].T + c * stack[k + 1, :, at].T
-    V = (1 - c) * table.V_max_v[k] + c * table.V_max_v[k + 1]
-    over = table.machine.voltage_v(i_d, i_q, electrical_speed(table.machine, speed)) - V
-    assert over.max() <= design.error.voltage_v
+    worst_torque = 0.0
+    for U_dc in rng.choice(voltage, 9, replace=False):
+        k, c = (float(v[0]) for v in corners(table.U_dc_v, np.array([U_dc])))
+        low, high = int(k), int(k) + 1
+        plane = replace(
+            table,
+            i_d_a=(1 - c) * table.i_d_a[..., low : low + 1] + c * table.i_d_a[..., high : high + 1],
+            i_q_a=(1 - c) * table.i_q_a[..., low : low + 1] + c * table.i_q_a[..., high : high + 1],
+            V_max_v=(1 - c) * table.V_max_v[low : low + 1] + c * table.V_max_v[high : high + 1],
+        )
+        found = errors_at(plane, torque, speed)
+        for value, bound in zip(found, (error.torque_nm, error.voltage_v, error.current_a), strict=True):
+            assert value <= bound
+        worst_torque = max(worst_torque, found[0])
+    assert worst_torque >= 0.5 * error.torque_nm
+
+
+@pytest.mark.parametrize("stored", ["float32", "int16"])
+def test_the_bound_of_a_flux_table_is_true_on_a_ten_times_finer_grid(stored: str) -> None:
+    design = made("mtpv-test", axis="flux", stored=stored, torque_bound=0.02, voltage_bound=0.02)
+    table, error = design.table, design.error
+    torque, flux = finer(table.torque_nm, 10), finer(table.y, 10)
+    lossless = replace(table.machine, R=0.0)
+    bounds = torque_limits(lossless, [1.0], flux, table.I_max_apk, table.i_d_min_a)
+    x, y = (grid.ravel() for grid in np.meshgrid(torque, flux, indexing="ij"))
+    i_d, i_q = bilinear(table, x, y)
+    shape = (torque.size, flux.size)
+    least, largest = (np.broadcast_to(b[0], shape).ravel() for b in (bounds.least_nm, bounds.largest_nm))
+    reached = np.abs(lossless.torque_nm(i_d, i_q) - np.clip(x, least, largest)).max()
+    assert 0.8 * error.torque_nm <= reached <= error.torque_nm
+    assert (np.hypot(*lossless.flux(i_d, i_q)) - y).max() <= error.voltage_v
+    assert (np.hypot(i_d, i_q) - table.I_max_apk).max() <= error.current_a
 
 
 def test_flux_table_is_exact_without_resistance_and_says_how_far_off_it_is_with() -> None:
@@ -220,9 +248,42 @@ def test_flux_table_is_exact_without_resistance_and_says_how_far_off_it_is_with(
         assert np.allclose(over_flux.i_d_a[:, k, 0], over_speed.i_d_a[:, 0, 0], atol=1e-6)
         assert np.allclose(over_flux.i_q_a[:, k, 0], over_speed.i_q_a[:, 0, 0], atol=1e-6)
     design = made("mtpv-test", axis="flux", torque_bound=0.03)
-    assert "knows no resistance" in " ".join(design.notes)
+    note = " ".join(design.notes)
+    assert "prefer" in note
+    V = 0.92 * 173.2 / math.sqrt(3.0)
+    over = over_the_limit(design.table, V)
+    assert f"need up to {over:.3g} V" in note
+    # braking: resistance helps, the flux table does not know it
+    omega = V / design.table.y
+    reach = torque_limits(design.table.machine, omega, [V], 150.0, design.table.i_d_min_a).least_nm[:, 0]
+    unused = design.table.torque_limits.least_nm[:, 0] - reach
+    assert f"leave up to {np.nanmax(unused):.3g} N m unused" in note
     assert design.table.margin_v.min() >= -1e-6
     assert lut_values(design.table, design.stored)[0]["lut.axis_kind"] == 1.0
+
+
+def over_the_limit(table: LookupTable, V: float) -> float:
+    """Largest voltage that the points of a flux table need beyond V at the speeds where it sends them, cell by cell."""
+    worst = 0.0
+    for k, flux in enumerate(table.y):
+        voltage = table.machine.voltage_v(table.i_d_a[:, k, 0], table.i_q_a[:, k, 0], V / flux)
+        worst = max(worst, float(voltage.max()) - V)
+    return worst
+
+
+def test_every_cell_says_how_much_torque_is_left_or_missing() -> None:
+    table = speed_table(
+        M, torque_nm=[-500.0, -20.0, 0.0, 60.0, 500.0], speed_rpm=[0.0, 3000.0, 9000.0], V_max_v=[100.0, 15.0],
+        I_max_apk=80.0,
+    )  # fmt: skip
+    cut = (table.limits & CUT) != 0
+    none = np.isnan(table.i_d_a)
+    assert cut.any() and none.any() and (~cut & ~none).any()
+    assert np.array_equal(np.isnan(table.margin_torque_nm), none)
+    demand = np.broadcast_to(table.torque_nm[:, None, None], cut.shape)
+    missing = np.abs(demand - table.achieved_torque_nm)[cut]
+    assert np.allclose(table.margin_torque_nm[cut], -missing, rtol=1e-12)
+    assert (table.margin_torque_nm[~cut & ~none] >= 0.0).all()
 
 
 def test_hot_and_cold_tables_differ_as_the_machine_does() -> None:
@@ -311,7 +372,7 @@ def test_files_hold_every_cell_and_the_same_bytes(tmp_path: Path) -> None:
     arrays = read_npz(tmp_path / "lut.npz")
     assert arrays["torque_nm"].ndim == arrays["speed_rpm"].ndim == 1
     shape = (arrays["torque_nm"].size, arrays["speed_rpm"].size)
-    for name in ("i_d_a", "i_q_a", "achieved_torque_nm", "binding", "margin_v", "margin_i"):
+    for name in ("i_d_a", "i_q_a", "achieved_torque_nm", "binding", "margin_v", "margin_i", "margin_torque_nm"):
         assert arrays[name].shape == shape
     assert json.loads(str(arrays["meta"]))["content"].startswith("sha256:")
     lines = table_csv(design.table).splitlines()
@@ -340,6 +401,8 @@ def test_command(tmp_path: Path) -> None:
     assert run(source, "-o", str(target), "--torque-bound", "1e-4")[0] == 1
     assert run(source, "-o", str(target), "--torque-points", "12")[0] == 2
     assert run(source, "-o", str(target), *points, "--plot", str(tmp_path / "lut.xyz"))[0] == 2
+    flux = run(source, "-o", str(target), *points, "--axis", "flux", "--plot", str(tmp_path / "flux.svg"))
+    assert flux[0] == 0 and b"flux / Wb" in (tmp_path / "flux.svg").read_bytes()
     code, text = run(source, "-o", str(target), *points, "--json")
     assert json.loads(text)["schema"] == "pmsmtool.lut/1"
 
