@@ -54,11 +54,26 @@ def open_node(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[Dr
 
 @contextmanager
 def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[CanopenDrive]:
-    """Open the bus and the drive on it, ready for experiments."""
+    """Open the bus and the drive on it, ready for experiments.
+
+    Raises
+    ------
+    NotAvailable
+        The drive lacks the reference drive's objects.
+    """
     from pmsmtool.drive.canopen_drive import CanopenDrive
+    from pmsmtool.errors import NotAvailable, SdoAbort
 
     with bus.connect() as connection:
-        drive = CanopenDrive(connection, choose_node(connection, bus.node), drive_map=drive_map)
+        try:
+            drive = CanopenDrive(connection, choose_node(connection, bus.node), drive_map=drive_map)
+        except SdoAbort as abort:
+            raise NotAvailable(
+                "this drive does not have the objects that experiments and commissioning need",
+                where=abort.where,
+                likely="a drive of another family",
+                hint="`pmsmtool caps` lists what it can give and what is missing",
+            ) from abort
         yield drive
         drive.close()
 

@@ -30,6 +30,8 @@ faults=FILE  faults on purpose; `pmsmtool sim faults` prints an example
 bitrate=B    bit-exact frame times; default: nominal times at 1 Mbit/s
 node=ID      node id of the first drive; 255: unconfigured (LSS)
 nodes=N      number of drives on the line
+drive=FAMILY the drive behind another family's objects (epos4, ingenia, cia402, ...; `firmware-params`)
+tier=TIER    inject or recorder: without averages, without its own excitation too
 speed=X      idle time passes X times as fast as the wall clock; default: at once
 """
 

@@ -65,7 +65,7 @@ def disable_at_once(node: DriveNode) -> None:
 def zero_references(node: DriveNode) -> None:
     """End an excitation and bring all references to zero; a drive without these objects needs none."""
     references = [objects.TARGET_VELOCITY_MRPM]
-    if node.map.staging:  # 0x2050 and 0x2052 of another maker's drive are something else
+    if node.map.staging and _is_maps_drive(node):  # 0x2050 and 0x2052 of another maker's drive are something else
         with contextlib.suppress(SdoAbort):
             node.command(objects.EXCITATION_COMMAND, 0)
         references = [objects.SET_POINT_D, objects.SET_POINT_Q, *references]
@@ -73,6 +73,14 @@ def zero_references(node: DriveNode) -> None:
         with contextlib.suppress(SdoAbort):
             if node.get(reference) != 0.0:
                 node.put(reference, 0.0)
+
+
+def _is_maps_drive(node: DriveNode) -> bool:
+    """Whether the drive is of the maker its map is for; a map may be a mere default."""
+    try:
+        return int.from_bytes(node.sdo.read(objects.IDENTITY, 1, size=4), "little") == node.map.vendor
+    except SdoAbort:
+        return False
 
 
 def not_confirmed(node: DriveNode, why: str) -> StopNotConfirmed:

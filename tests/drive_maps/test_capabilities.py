@@ -163,6 +163,12 @@ def test_identify_ends_in_exit_9_and_names_what_is_missing(
     assert not (tmp_path / "runs").exists()  # nothing was begun
 
 
+def test_commission_of_another_family_is_exit_9(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = run("--sim", CHANNEL + "&drive=epos4", "--yes", "commission")
+    assert isinstance(outcome.exception, NotAvailable) and "pmsmtool caps" in outcome.exception.hint
+
+
 def test_identify_by_cia402_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     outcome = run("--sim", CHANNEL + "&drive=cia402", "--yes", "identify", "--json")

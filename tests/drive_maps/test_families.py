@@ -18,8 +18,9 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive.stop import quick_stop
 from pmsmtool.errors import ConfigError, DriveFault, SafetyRefusal, SdoAbort
-from pmsmtool.firmware.drive_map import REFERENCE_VENDOR, DriveMap
+from pmsmtool.firmware.drive_map import REFERENCE_VENDOR, DriveMap, reference_map
 from pmsmtool.firmware.drive_map_file import parse_drive_map
 from pmsmtool.firmware.shipped_maps import family_names, family_of, load_family
 from pmsmtool.flash.download import Download
@@ -281,3 +282,22 @@ def test_defaults_are_within_the_catalogue() -> None:
     for family in HOLDING:
         for cell in load_family(family).cells.values():
             assert BY_NAME[cell.name].minimum <= BY_NAME[cell.name].default
+
+
+def test_nothing_of_the_reference_drive_is_written_to_another(tmp_path: Path) -> None:
+    """A stop and a flash without a map that fits: 0x2000, 0x2050 and 0x2052 of another maker stay untouched."""
+    with opened("epos4") as node:
+        node.map = reference_map()  # what commands without --map take
+        sent: list[tuple[int, int]] = []
+        download = node.sdo.download
+
+        def noted(index: int, sub: int, *rest: object, **more: object) -> object:
+            sent.append((index, sub))
+            return download(index, sub, *rest, **more)  # type: ignore[arg-type]
+
+        node.sdo.download = noted  # type: ignore[method-assign, assignment]
+        quick_stop(node)
+        assert sent and not [where for where in sent if 0x2000 <= where[0] < 0x6000]
+        node.map = load_family("epos4")
+        flash(node, {"current.K_p_q_v_per_a": 2.0}, tmp_path)
+        assert {where for where in sent if 0x2000 <= where[0] < 0x6000} == {(0x30A0, 1)}
