@@ -55,7 +55,7 @@ PHASE_LAWS = ("conventional", "proposed")
 
 NEEDS_SWITCH = (
     "polar: the phase is no input for i_q at standstill; inside the voltage limit the drive switches to the"
-    " regularised law (polar.options, bit 3), whose transition shows in the torque where the current is noisy"
+    " regularised law (polar.options, bit 3), whose transition shows in the torque; the unified law has none"
 )
 LINEAR_ONLY = (
     "polar: a law of the linear range; where the voltage limit is reached it loses torque, above base speed down to the"

@@ -139,8 +139,7 @@ class PolarTwin(Twin):
     def share(self) -> np.float32:
         return f(0.35) if self.options & ON_MEASUREMENT else ONE
 
-    def phase_start(self) -> None:
-        v = self.model_voltage(self.i)
+    def phase_start(self, v: Vector) -> None:
         mirror = f(-1) if self.omega < 0 else ONE
         size = np.sqrt(square(v))
         self.delta, self.amplitude = arctan(-v[0], mirror * v[1]), min(size, self.V)
@@ -252,23 +251,29 @@ class PolarTwin(Twin):
             x[k] = x[k] + K_i * self.T_s * ((self.reference[k] - self.i[k]) + cut / K_p)
         self.charge = x[0], x[1]
 
-    def charge_from_model(self) -> None:
-        base, v = self.regularised_base(), self.model_voltage(self.i_model)
+    def holding(self, i: Vector) -> Vector:
+        v = self.model_voltage(i)
+        return v[0] + self.disturbance[0], v[1] + self.disturbance[1]
+
+    def charge_from(self, v: Vector) -> None:
+        base = self.regularised_base()
         self.charge = v[0] - base[0], v[1] - base[1]
 
-    def takes_linear(self) -> bool:
-        fits = square(self.model_voltage(self.reference)) <= self.V * self.V
+    def takes_linear(self, s: np.float32, c: np.float32) -> bool:
+        self.observe(s, c, weight(self["polar.omega_dob_rad_s"] * self.T_s))
+        fits = square(self.holding(self.reference)) <= self.V * self.V
         base = self.regularised_base()
         if self.linear_on:
             if fits or square((base[0] + self.charge[0], base[1] + self.charge[1])) <= self.V * self.V:
                 return True
-            self.phase_start()
+            self.phase_start(self.holding(self.i_model))
             self.linear_on = False
             return False
         if not fits or self.i_model[0] < self.reference[0]:
             return False
-        self.charge_from_model()
-        self.linear_on = True
+        v = self.holding(self.i_model)
+        self.charge_from(v)
+        self.delta, self.linear_on = arctan(-v[0], v[1]), True
         return True
 
     # -- law 6 -----------------------------------------------------------------------------------------------
@@ -367,11 +372,11 @@ class PolarTwin(Twin):
 
     def start(self) -> None:
         self.started = self.linear_on = True
+        v = self.model_voltage(self.i_model)
         if self.mode in (CONVENTIONAL, PROPOSED):
-            self.phase_start()
+            self.phase_start(v)
         if self.mode == REGULARISED or self.options & SWITCH:
-            v = self.model_voltage(self.i_model)
-            self.charge_from_model()
+            self.charge_from(v)
             self.delta = arctan(-v[0], v[1])
 
     def demand_polar(self, s: np.float32, c: np.float32) -> bool:
@@ -384,7 +389,7 @@ class PolarTwin(Twin):
             self.regularised()
         elif self.mode in (LINEAR, PRINTED):
             self.linear()
-        elif self.options & SWITCH and self.takes_linear():
+        elif self.options & SWITCH and self.takes_linear(s, c):
             self.regularised()
             return True
         else:

@@ -191,30 +191,41 @@ static uint32_t is_phase_law(uint32_t mode)
     return (mode == PMSM_POLAR_CONVENTIONAL || mode == PMSM_POLAR_PROPOSED) ? 1u : 0u;
 }
 
+/* Steady-state voltage of a current, the voltage the model lacks included. */
+static pmsm_dq holding_voltage(const pmsm_period *period, pmsm_dq i)
+{
+    pmsm_dq v = pmsm_model_voltage(period, i);
+    v.d += period->state->disturbance.d;
+    v.q += period->state->disturbance.q;
+    return v;
+}
+
 /* With the switch, the phase law takes over when the voltage of law 5 leaves the circle for a reference that cannot be
  * held inside it, and law 5 when the reference can be held again and the current is no longer weakened. Each starts
- * from the voltage of the other. */
+ * from the voltage that holds the present current. */
 static uint32_t use_linear_law(pmsm_period *period, const polar_plant *p)
 {
     pmsm_real *memory = period->state->polar;
     const axis_gains gains = regularised_gains(period);
     const pmsm_dq base = regularised_base(period, &gains);
-    const uint32_t fits = (pmsm_square(pmsm_model_voltage(period, period->reference)) <= p->V * p->V) ? 1u : 0u;
+    pmsm_observe_disturbance(period, pmsm_filter_weight((pmsm_real)period->params->polar_omega_dob_rad_s * p->T_s));
+    const uint32_t fits = (pmsm_square(holding_voltage(period, period->reference)) <= p->V * p->V) ? 1u : 0u;
     if (memory[POLAR_LINEAR] > PMSM_C(0.0)) {
         const pmsm_dq v = {base.d + memory[POLAR_X_D], base.q + memory[POLAR_X_Q]};
         if (fits != 0u || pmsm_square(v) <= p->V * p->V) {
             return 1u;
         }
-        pmsm_polar_phase_start(period, p);
+        pmsm_polar_phase_start(period, p, holding_voltage(period, period->i_model));
         memory[POLAR_LINEAR] = PMSM_C(0.0);
         return 0u;
     }
     if (fits == 0u || period->i_model.d < period->reference.d) {
         return 0u;
     }
-    const pmsm_dq v = pmsm_model_voltage(period, period->i_model);
+    const pmsm_dq v = holding_voltage(period, period->i_model);
     memory[POLAR_X_D] = v.d - base.d;
     memory[POLAR_X_Q] = v.q - base.q;
+    memory[POLAR_DELTA] = pmsm_arctan(-v.d, v.q);
     memory[POLAR_LINEAR] = PMSM_C(1.0);
     return 1u;
 }
@@ -229,7 +240,7 @@ static void start(pmsm_period *period, const polar_plant *p)
     memory[POLAR_STARTED] = PMSM_C(1.0);
     memory[POLAR_LINEAR] = PMSM_C(1.0);
     if (is_phase_law(mode) != 0u) {
-        pmsm_polar_phase_start(period, p);
+        pmsm_polar_phase_start(period, p, v);
     }
     if (mode == PMSM_POLAR_REGULARISED || (period->params->polar_options & PMSM_POLAR_LINEAR_RANGE) != 0u) {
         memory[POLAR_X_D] = v.d - base.d;

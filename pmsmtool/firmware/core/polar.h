@@ -31,7 +31,7 @@ typedef struct {
 } polar_plant;
 
 /* polar_phase.c: laws 1 and 2, PID on phase and amplitude */
-void pmsm_polar_phase_start(pmsm_period *period, const polar_plant *plant);
+void pmsm_polar_phase_start(pmsm_period *period, const polar_plant *plant, pmsm_dq v);
 void pmsm_polar_phase(pmsm_period *period, const polar_plant *plant);
 
 /* polar.c: demand v as amplitude and phase; the phase turns the slower the smaller v is against eps (V) */

@@ -163,12 +163,11 @@ static pmsm_real amplitude_step(pmsm_period *period, const polar_plant *p, pmsm_
     return limited;
 }
 
-/* Memory for a start without a jump from the voltage that holds the present current. */
-void pmsm_polar_phase_start(pmsm_period *period, const polar_plant *plant)
+/* Memory for a start without a jump from a voltage. */
+void pmsm_polar_phase_start(pmsm_period *period, const polar_plant *plant, pmsm_dq v)
 {
     pmsm_real *memory = period->state->polar;
     const pmsm_real mirror = (period->omega_e < PMSM_C(0.0)) ? PMSM_C(-1.0) : PMSM_C(1.0);
-    const pmsm_dq v = pmsm_model_voltage(period, period->i);
     const pmsm_real size = PMSM_SQRT(pmsm_square(v));
     memory[POLAR_DELTA] = pmsm_arctan(-v.d, mirror * v.q);
     memory[POLAR_AMPLITUDE] = (size < plant->V) ? size : plant->V;
