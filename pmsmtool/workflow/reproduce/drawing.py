@@ -15,7 +15,7 @@ from pmsmtool.workflow.reproduce.figure import Panel, Reproduction, Table, check
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLOURS = ("#1f5fa8", "#c2410c", "#15803d", "#7e22ce", "#b45309", "#0e7490", "#be185d", "#4b5563")
+COLOURS = ("#1f5fa8", "#c2410c", "#15803d", "#7e22ce", "#111827", "#0891b2", "#db2777", "#65a30d")
 GREY = "#9ca3af"
 _WIDTH, _HEIGHT = 7.5, 2.6
 

@@ -64,8 +64,8 @@ CURRENT_BACK_CALCULATION, CURRENT_HEXAGON, CURRENT_PREDICTOR = 1 << 2, 1 << 3, 1
 
 BOOST_V = 700.0
 """DC link while the drive is brought to its initial current, which its own voltage may hold but not reach."""
-BOOST_S, REST_S = 0.12, 0.002
-"""How long: the integrators settle with L/R = 17 ms; and the rest at the true DC link before the step (s)."""
+BOOST_S, REST_S = 0.03, 0.15
+"""How long, and the rest at the true DC link before the step, in which the integrators settle with L/R = 17 ms (s)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,6 +92,12 @@ def paired(a: Array, b: Array, statistic: str, rng: np.random.Generator) -> Diff
     return Difference(value, float(low), float(high))
 
 
+def lower_end(values: Array, statistic: str, rng: np.random.Generator) -> float:
+    """Return the lower end of the bootstrap interval of a statistic."""
+    drawn = rng.integers(0, len(values), (RESAMPLES, len(values)))
+    return float(np.percentile(STATISTICS[statistic](values[drawn]), 50.0 * (1.0 - CONFIDENCE)))
+
+
 def difference_table(
     title: str, rows: Sequence[tuple[str, str, Array, Array]], rng: np.random.Generator, unit: str = ""
 ) -> Table:
