@@ -53,7 +53,7 @@ LINE_LIMIT, EXACT_LIMIT = 600, 4500
 """Instructions: line search; exact projection on 12 rows (k_max 10 and the steady state)."""
 BEST_TYPICAL, BEST_WORST, UNIFIED_WORST = 0.25, 0.50, 0.25
 """Shares of the period: best mode over 12 kHz, unified polar law over 10 kHz."""
-NOMINAL_STEPS, RANDOM_STATES, CLIMBS, CHANGES = 180, 600, 6, 60
+NOMINAL_STEPS, RANDOM_STATES, CLIMBS, CHANGES = 180, 2000, 12, 120
 V_DC = 210.0
 STATE_SIZE = 22
 """Numbers that describe an adversarial state."""

@@ -2,16 +2,18 @@
  *
  *   minimise h1 (T* - T(x))^2 + h2 (i_d - i_dLM)^2   subject to |v(x)| <= V_m, |x| <= I_m               (43), (44)
  *
- * The voltage row uses what the integrators hold, v = (K_i I_ed - w L_q i_q, K_i I_eq + w (psi + L_d i_d)) (42), so errors
- * of R_s, L and psi do not matter in the steady state; the uncompensated variant takes the nominal ellipse (33). Solved
- * by projected gradient steps with Armijo's rule (45)-(48), or by FISTA with restart. One call per N_fw periods. The
- * accelerated variant also puts R_s into the row: (41) takes R_s i for constant from call to call, which lets i_q swing
- * where the ellipse is flat.
+ * The voltage row uses what the integrators hold, v = (K_i I_ed - w L_q i_q, K_i I_eq + w (psi + L_d i_d)) (42), so
+ * errors of R_s, L and psi do not matter in the steady state; the uncompensated variant takes the nominal ellipse (33).
+ * Solved by projected gradient steps with Armijo's rule (45)-(48), or by FISTA with restart. One call per N_fw periods;
+ * an accelerated call that has used up its time goes on in the next period from where it is. The accelerated variant
+ * also puts R_s into the row: (41) takes R_s i for constant from call to call, which lets i_q swing where the ellipse
+ * is flat.
  * The search is kept to i_d <= max(0, i_dLM), where the cost is well behaved for salient machines, and to
  * i_d >= i_d_min.
  */
 #include "pmsm_period.h"
 
+#define STEPS_PER_PERIOD 8u          /* Newton steps and iterations of an accelerated call */
 #define STEP_END PMSM_C(2e-5)        /* A: a smaller change ends the iteration */
 #define HALVINGS 8u                  /* of an Armijo step */
 #define TORQUE_EVENT PMSM_C(0.02)    /* of rated torque: a larger change of the request is answered at once */
@@ -25,6 +27,7 @@ typedef struct {
     pmsm_real k_t, k_s;    /* T = (k_t + k_s i_d) i_q */
     uint32_t empty;        /* 1: no current satisfied both rows */
     uint32_t steps;
+    uint32_t unfinished;   /* 1: the time of this period ended the iteration */
 } problem;
 
 static pmsm_row voltage_row(const pmsm_period *period)
@@ -61,6 +64,7 @@ static problem state_problem(const pmsm_period *period, pmsm_real tau)
         tau,
         period->state->derived.torque_per_flux * (pmsm_real)p->motor_psi_f_wb,
         period->state->derived.torque_per_flux * ((pmsm_real)p->motor_L_d_app_h - (pmsm_real)p->motor_L_q_app_h),
+        0u,
         0u,
         0u};
     return q;
@@ -201,11 +205,16 @@ static pmsm_dq accelerated_steps(problem *q, const pmsm_params *params, pmsm_dq 
         const pmsm_real t_next = PMSM_C(0.5) * (PMSM_C(1.0) + PMSM_SQRT(PMSM_C(1.0) + PMSM_C(4.0) * t * t));
         const pmsm_real ahead = (t - PMSM_C(1.0)) / t_next;
         const pmsm_real change = distance(z, x);
+        q->unfinished = (q->steps >= STEPS_PER_PERIOD) ? 1u : 0u;
         y.d = z.d + ahead * (z.d - x.d);
         y.q = z.q + ahead * (z.q - x.q);
         x = z;
         t = t_next;
         if (change < STEP_END) {
+            q->unfinished = 0u;
+            break;
+        }
+        if (q->unfinished != 0u) {
             break;
         }
     }
@@ -236,7 +245,7 @@ pmsm_dq pmsm_field_weakening(pmsm_period *period, pmsm_real tau)
                                   : gradient_steps(&q, params, state->fw_reference);
         state->fw_tau = tau;
         state->fw_empty = q.empty;
-        state->fw_count = params->field_weakening_N_fw;
+        state->fw_count = (q.unfinished != 0u) ? 1u : params->field_weakening_N_fw;
         state->live.iterations += q.steps;
     }
     state->fw_count--;
