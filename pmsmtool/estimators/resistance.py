@@ -187,6 +187,9 @@ def estimate_resistance(
         fits = [_fit_tail(levels.t_s, i, v_w, peak, sigma_v, powers) for powers in tail_models()]
         weights = information_weights([_criterion(fit, len(i)) for fit in fits])
         R_w = float(sum(w * fit.x[0] for w, fit in zip(weights, fits, strict=True)))
+    V_vector, v_0, drift = (float(sum(w * fit.x[k] for w, fit in zip(weights, fits, strict=True))) for k in (1, 2, 3))
+    drift /= R_w
+    _check_drift(drift)  # before the fit is judged: heating that is no straight line in time is no model mismatch
     best = min(fits, key=lambda fit: fit.chi2 / fit.dof)
     chi2 = best.chi2 / best.dof
     verdict, widen = chi2_gate(chi2, STAGE)
@@ -194,13 +197,11 @@ def estimate_resistance(
     variance = sum(
         w * (fit.covariance[0, 0] * widen**2 + (fit.x[0] - R_w) ** 2) for w, fit in zip(weights, fits, strict=True)
     )
-    V_vector, v_0, drift = (float(sum(w * fit.x[k] for w, fit in zip(weights, fits, strict=True))) for k in (1, 2, 3))
-    drift /= R_w
     V_dead = V_vector * math.sqrt(3.0) / 2.0
     hardness = abs(V_dead) / (R_w * peak)
     std = math.sqrt(float(variance)) * (HARD_FACTOR if hardness > HARD_RATIO else 1.0)
     std = math.hypot(std, DRIFT_SECOND_ORDER * abs(drift) * R_w, tolerance.voltage_scale_std * R_w)
-    _check_result(R_w, std, drift, half_width_limit)
+    _check_result(R_w, std, half_width_limit)
     R_measured = Estimate(
         value=R_w,
         std=std,
@@ -293,13 +294,16 @@ def _criterion(fit: _TailFit, levels: int) -> float:
     return fit.chi2 + len(fit.x) * math.log(levels)
 
 
-def _check_result(R: float, std: float, drift: float, half_width_limit: float) -> None:
+def _check_drift(drift: float) -> None:
     if abs(drift) > DRIFT_LIMIT:
         raise refuse(
             "E_THERMAL_DRIFT",
             f"R changed by {100 * drift:+.2g} % over the sweep, limit {100 * DRIFT_LIMIT:g} %",
             stage=STAGE,
         )
+
+
+def _check_result(R: float, std: float, half_width_limit: float) -> None:
     if not R > 0.0 or COVERAGE_FACTOR * std > half_width_limit * R:
         raise refuse(
             "E_NOT_IDENTIFIABLE",

@@ -1,0 +1,133 @@
+"""What the drive cannot be made to do: one healthy run, its traces spoilt in one way each, and replayed.
+
+Every trap ends with its name and exit code 6, and gives no number.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pmsmtool.cli.main import run
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import read_trace, trace_npz
+
+Signals = dict[str, NDArray[np.float64]]
+Spoil = Callable[[Trace], Signals]
+
+
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A run directory of a healthy drive."""
+    folder = tmp_path_factory.mktemp("healthy")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("PMSMTOOL_HOME", str(folder / "home"))
+        patch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
+        patch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+        assert run(("identify", "-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:", "--yes", "R", "L", "psi")) == 0
+        (made,) = (folder / "runs").iterdir()
+        yield made
+
+
+def ramp(t: Trace, name: str, size: float) -> Signals:
+    return {name: t[name] + np.linspace(0.0, size, len(t))}
+
+
+def warmer(t: Trace) -> Signals:
+    """A winding that heats by a fifth of its resistance while nobody measures its temperature."""
+    slope = float(np.median(t["u_d_v"] / t["i_d_a"]))
+    growth = 0.2 * slope * t.t_s / t.t_s[-1] * t["i_d_a"]
+    halves = {name: t[name] + growth for name in ("u_d_v", "u_d_first_v", "u_d_second_v")}
+    return {**halves, "T_winding_c": np.full(len(t), np.nan)}
+
+
+def turned(t: Trace) -> Signals:
+    """The voltage of a rotor whose encoder offset is off by 60 degrees."""
+    c, s = 0.5, 0.5 * np.sqrt(3.0)
+    return {"u_d_v": c * t["u_d_v"] - s * t["u_q_v"], "u_q_v": s * t["u_d_v"] + c * t["u_q_v"]}
+
+
+def one_way(t: Trace) -> Signals:
+    return {"omega_e_rad_s": np.abs(t["omega_e_rad_s"])}
+
+
+TRAPS: dict[str, tuple[str, Spoil, str]] = {
+    "noise below the converter's step": (
+        "zero_current",
+        lambda t: {name: np.full(len(t), 0.01) for name in ("i_d_a", "i_q_a")},
+        "E_SNR",
+    ),
+    "rotor swings under the first vectors": ("phase_vectors", lambda t: {"moved": np.ones(len(t))}, "E_NOT_SETTLED"),
+    "encoder stands still": ("first_turn", lambda t: {"theta_M_rad": np.zeros(len(t))}, "E_ENCODER"),
+    "voltage limited at a level": ("levels", lambda t: {"flagged": np.eye(len(t))[-1]}, "E_CLIPPED"),
+    "voltage drifts in a window": ("levels", lambda t: {"u_d_second_v": 1.1 * t["u_d_second_v"]}, "E_NOT_SETTLED"),
+    "winding heats unseen": ("levels", warmer, "E_THERMAL_DRIFT"),
+    "levels of one size": ("levels", lambda t: {"i_d_a": np.sign(t["i_d_a"])}, "E_EXCITATION"),
+    "no model explains the levels": (
+        "levels",
+        lambda t: {"u_d_v": t["u_d_v"] * (1.0 + 0.01 * (-1.0) ** np.arange(len(t)))},
+        "E_MODEL_MISMATCH",
+    ),
+    "one pair of phases has more resistance": (
+        "phase_pairs",
+        lambda t: {"u_d_v": t["u_d_v"] * np.array([1.0, 1.3, 1.0, 1.0, 1.0, 1.0])},
+        "E_UNBALANCED",
+    ),
+    "gains of the sensors differ": ("phase_pairs", lambda t: {"i_a_a": 1.03 * t["i_a_a"]}, "E_CURRENT_SENSOR"),
+    "a gear before the encoder": (
+        "rotation_forward",
+        lambda t: {"theta_M_rad": 1.25 * t["theta_M_rad"]},
+        "E_POLE_PAIRS",
+    ),
+    "rotor leaves the turning vector": (
+        "rotation_forward",
+        lambda t: {"theta_M_rad": t["theta_M_rad"] + 0.4 * np.sin(6.0 * t["theta_imposed_rad"])},
+        "E_ROTOR_MOVED",
+    ),
+    "one direction only": ("speeds", one_way, "E_EXCITATION"),
+    "speed still moves": ("speeds", lambda t: {"omega_second_rad_s": 1.1 * t["omega_second_rad_s"]}, "E_NOT_SETTLED"),
+    "voltage limited at a speed": ("speeds", lambda t: {"flagged": np.ones(len(t))}, "E_CLIPPED"),
+    "encoder offset far off": ("speeds", turned, "E_NOT_IDENTIFIABLE"),
+    "rotor moves in the injection": ("square_q_6", lambda t: ramp(t, "theta_M_rad", 0.1), "E_ROTOR_MOVED"),
+    "current clipped in the injection": (
+        "square_d_6",
+        lambda t: {"i_d_a": np.minimum(t["i_d_a"], np.mean(t["i_d_a"]))},
+        "E_MODEL_MISMATCH",
+    ),
+    "samples limited in the injection": ("square_d_9", lambda t: {"flagged": np.eye(len(t))[0]}, "E_CLIPPED"),
+    "no current follows the injection": (
+        "square_q_6",
+        lambda t: {"i_q_a": np.full(len(t), np.mean(t["i_q_a"]))},
+        "E_EXCITATION",
+    ),
+}
+"""Trace, what happens to it, and the name."""
+
+
+@pytest.mark.parametrize("case", TRAPS)
+def test_a_trap_is_named_and_no_number_is_given(
+    case: str, healthy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, spoil, reason = TRAPS[case]
+    folder = tmp_path / "run"
+    shutil.copytree(healthy, folder)
+    (folder / "machine.toml").unlink()
+    path = folder / "traces" / f"{name}.npz"
+    trace = read_trace(path)
+    signals = {**trace.signals, **spoil(trace)}
+    path.write_bytes(trace_npz(replace(trace, signals=signals, units=dict.fromkeys(signals, "1"))))
+    capsys.readouterr()
+    code = run(("identify", "--replay", str(folder)))
+    printed = capsys.readouterr()
+    assert (code, printed.out) == (6, ""), printed.err
+    assert f"{reason}: " in printed.err
+    assert "likely:" in printed.err and "try:" in printed.err
+    assert not (folder / "machine.toml").exists()
