@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from pmsmtool.firmware.drive_map import DriveMap
 
 
+OWN_FAMILY = "pmsmsim"
+"""The reference drive's map, which commands take without ``--map``."""
+
+
 def map_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add ``--map`` to a command, which receives ``map_file: Path | None``."""
     text = "Map of the drive's objects: TOML file, or family (`firmware-params`)."
@@ -43,13 +47,42 @@ def read_map(path: Path | None) -> DriveMap:
 
 @contextmanager
 def open_node(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[DriveNode]:
-    """Open the bus and the node on it; without ``-n`` the only drive there is."""
+    """Open the bus and the node on it; without ``-n`` the only drive there is.
+
+    Raises
+    ------
+    ConfigError
+        The map is the default one, and the drive is of another family that is known.
+    """
     from pmsmtool.drive.drive_node import DriveNode
 
     with bus.connect() as connection:
         node = DriveNode(connection, choose_node(connection, bus.node), drive_map=drive_map)
+        if drive_map is not None and drive_map.name == OWN_FAMILY:
+            _refuse_another_family(node)
         yield node
         node.close()
+
+
+def _refuse_another_family(node: DriveNode) -> None:
+    """Say which map a known drive needs, instead of failing at its first object."""
+    from pmsmtool.drive import objects
+    from pmsmtool.errors import SdoAbort
+    from pmsmtool.firmware.shipped_maps import family_of
+
+    try:
+        vendor, product = (
+            int.from_bytes(node.sdo.read(objects.IDENTITY, sub, size=4), "little") for sub in (1, 2)
+        )
+    except SdoAbort:
+        return
+    family = None if node.map.is_for(vendor, product) else family_of(vendor, product)
+    if family is not None:
+        raise ConfigError(
+            f"this drive is of family {family.name!r}, the map is {node.map.name!r}",
+            where=f"node {node.node}, 0x1018",
+            hint=f"add --map {family.name}",
+        )
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
-from pmsmtool.errors import IdentificationError, NotAvailable
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
@@ -181,6 +181,15 @@ def test_identify_by_cia402_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
         "rotation_backward.npz",
         "rotation_forward.npz",
     ]
+
+
+def test_a_known_drive_is_told_its_map() -> None:
+    outcome = run("--sim", CHANNEL + "&drive=epos4", "param", "get", "current.*")
+    assert isinstance(outcome.exception, ConfigError) and outcome.exception.hint == "add --map epos4"
+    outcome = run("--sim", CHANNEL + "&drive=epos4", "param", "get", "current.*", "--map", "epos4")
+    assert outcome.exit_code == 0 and "0x30A0:01" in outcome.stdout
+    outcome = run("--sim", CHANNEL + "&drive=epos4", "param", "get", "current.*", "--map", "epos5")
+    assert isinstance(outcome.exception, ConfigError)
 
 
 # ---- the experiments of the lower tiers ------------------------------------------------------------
