@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.estimators.coenergy_spline import CoenergySpline
 from pmsmtool.estimators.flux_map_rows import (
+    KNEES,
     NUISANCES,
     Frame,
     NormalEquations,
@@ -49,6 +50,8 @@ R_STD = 0.01
 """Relative standard deviation of R in the fit: it follows the winding's temperature."""
 INVERTER_STD = 0.1
 """Standard deviation of the factor on the measured inverter curve."""
+RAMP_STD = 0.3
+"""Standard deviation of each further shape of the error, of the measured plateau."""
 DELAY_STD_SHARE = 0.1
 """Standard deviation of the delay of the current sample, of the control period."""
 ANCHOR = 1e4
@@ -220,7 +223,12 @@ def fit_coenergy(
         Turn the frame onto the axis of symmetry: where the offset of the encoder is not known better.
     """
     T_s = float(traces[0].meta["control_period_s"])
-    priors = Priors((R_ohm, 1.0, 0.0), (R_STD * R_ohm, INVERTER_STD, DELAY_STD_SHARE * T_s))
+    ramps = np.zeros(len(KNEES))
+    plateau = float(np.max(np.abs(curve.u_error_v)))
+    priors = Priors(
+        (R_ohm, 1.0, *ramps, 0.0),
+        (R_STD * R_ohm, INVERTER_STD, *(ramps + RAMP_STD * plateau + 1e-9), DELAY_STD_SHARE * T_s),
+    )
     for _ in range(ALIGNMENTS if align else 1):
         pulses = [integrate_pulses(trace, frame, curve, R_ohm) for trace in traces]
         i = np.concatenate([p.i for p in pulses], axis=1)
@@ -255,7 +263,7 @@ def _fine_fit(
     if symmetric:
         x, covariance = _solve(sums, spline, priors, magnet, unit, even=True)
     return CoenergyFit(
-        spline, x[:k], covariance[:k, :k], float(x[k]), float(x[k + 1]), float(x[k + 2]), sigma_a,
+        spline, x[:k], covariance[:k, :k], float(x[k]), float(x[k + 1]), float(x[own - 1]), sigma_a,
         sums.squares(x) / (sigma_a**2 * (sums.n - len(x))), sums.n, symmetric, asymmetry, asymmetry_std, axis, axis_std,
         FittedSkew(free[:k], skew, free[own:]), frame, magnet.std_wb,
     )  # fmt: skip

@@ -29,7 +29,12 @@ GAUSS = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
 """Points of an interval at which the inverter's error is averaged."""
 STEPS_LEFT = 0.6
 """Largest rms between measured and smooth angle, in steps of the encoder; steps alone leave 0.29."""
-NUISANCES = ("R_ohm", "inverter", "delay_s")
+ROUNDING = 1e-6
+"""Of an angle recorded in binary32, as a second difference of the electrical angle."""
+KNEES = (0.5, 1.0, 2.0)
+"""Further shapes of the inverter's error, a ramp to a plateau each: knees in steps of the current from sample to sample.
+A fast current, with the ripple of a high duty ratio, rounds the curve that was measured at rest."""
+NUISANCES = ("R_ohm", "inverter", *(f"ramp_{knee:g}_v" for knee in KNEES), "delay_s")
 """Columns behind the spline coefficients."""
 
 
@@ -62,8 +67,10 @@ class PulseIntegrals:
         Currents in the rotor frame (A).
     theta : ndarray, shape (n,)
         Electrical angle of the d axis (rad).
-    volt_seconds, current_seconds, error_seconds : ndarray
-        Integrals of voltage, current and inverter error up to each sample, stator frame (V s, A s, V s).
+    volt_seconds, current_seconds : ndarray
+        Integrals of voltage and current up to each sample, stator frame (V s, A s).
+    error_seconds : tuple of ndarray
+        Integrals of the inverter's measured error and of one volt of each further shape, stator frame (V s).
     volts_before : ndarray
         Voltage of the interval before each sample, stator frame (V).
     first : int
@@ -74,7 +81,7 @@ class PulseIntegrals:
     theta: Array
     volt_seconds: Array
     current_seconds: Array
-    error_seconds: Array
+    error_seconds: tuple[Array, ...]
     volts_before: Array
     first: int
 
@@ -105,13 +112,11 @@ def integrate_pulses(trace: Trace, frame: Frame, curve: InverterCurve, R_ohm: fl
     before = np.zeros_like(u_s)
     before[:, 1:] = acting
     mean_current = 0.5 * (i_s[:, :-1] + i_s[:, 1:])
-    error = np.zeros_like(acting)
-    still = np.zeros(acting.shape[1])
-    for share in GAUSS:
-        at = (1.0 - share) * i_s[:, :-1] + share * i_s[:, 1:]
-        error += 0.5 * np.stack(curve.error_dq_v(at[0], at[1], still))
-    volt_seconds, current_seconds, error_seconds = (_cumulated(T_s * x) for x in (acting, mean_current, error))
-    flux = volt_seconds - R_ohm * current_seconds - error_seconds
+    step = float(np.median(np.max(np.abs(np.diff(i_s)), axis=0)))
+    shapes = (curve, *(ramp(knee * step) for knee in KNEES))
+    error_seconds = tuple(_cumulated(T_s * mean_error(shape, i_s)) for shape in shapes)
+    volt_seconds, current_seconds = _cumulated(T_s * acting), _cumulated(T_s * mean_current)
+    flux = volt_seconds - R_ohm * current_seconds - error_seconds[0]
     theta = smooth_angle(turned, i_s, flux, T_s) + frame.drive_offset_rad - frame.offset_rad
     return PulseIntegrals(
         i=turn(-theta, i_s),
@@ -122,6 +127,21 @@ def integrate_pulses(trace: Trace, frame: Frame, curve: InverterCurve, R_ohm: fl
         volts_before=before,
         first=lag + 2,
     )
+
+
+def ramp(knee_a: float) -> InverterCurve:
+    """Return an error curve that rises to one volt at a current and stays there."""
+    return InverterCurve(np.array([knee_a, 2.0 * knee_a]), np.ones(2), 0.0)
+
+
+def mean_error(curve: InverterCurve, i: Array) -> Array:
+    """Return the error of each interval in the stator frame (V), shape (2, n - 1), of the interpolated current."""
+    still = np.zeros(i.shape[1] - 1)
+    error = np.zeros((2, i.shape[1] - 1))
+    for share in GAUSS:
+        at = (1.0 - share) * i[:, :-1] + share * i[:, 1:]
+        error += 0.5 * np.stack(curve.error_dq_v(at[0], at[1], still))
+    return error
 
 
 def smooth_angle(theta: Array, i: Array, flux: Array, T_s: float) -> Array:
@@ -141,8 +161,9 @@ def smooth_angle(theta: Array, i: Array, flux: Array, T_s: float) -> Array:
     T_s : float
         Sampling period (s).
     """
-    steps = np.abs(np.diff(theta))
-    steps = steps[steps > 0.0]
+    # second differences: of a turning rotor every first one is many steps; what binary32 rounds is none
+    steps = np.abs(np.diff(theta, 2))
+    steps = steps[steps > ROUNDING * max(1.0, float(np.max(np.abs(theta))))]
     if len(steps) == 0:
         return theta
     one_step = float(np.min(steps))
@@ -256,7 +277,7 @@ def _rows(
     parts = [
         np.stack([spline.derivative(*trace.i, 1, 0), spline.derivative(*trace.i, 0, 1)], axis=1),
         seen(trace.current_seconds)[:, :, None],
-        seen(trace.error_seconds)[:, :, None],
+        *(seen(error)[:, :, None] for error in trace.error_seconds),
         seen(trace.volts_before)[:, :, None],
     ]
     if skew is not None:
