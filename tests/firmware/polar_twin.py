@@ -285,12 +285,12 @@ class PolarTwin(Twin):
     def on_circle(self, i_q: np.float32, V: np.float32) -> tuple[Vector, np.float32]:
         R, X_d, X_q, E = self.R, *self.X, self.E
         a, slope, offset = R * R + X_d * X_d, R * R + X_d * X_q, R * E[1] - X_d * E[0]
-        reach, level = REACH * np.sqrt(a) * V, slope * i_q + offset
+        inverse, power = ONE / a, a * V * V
+        reach, level = REACH * np.sqrt(power), slope * i_q + offset
         cut = clamp(level, -reach, reach)
         q = i_q if cut == level else (cut - offset) / slope
-        b = R * (E[0] - X_q * q) + X_d * (E[1] + R * q)
-        root = np.sqrt(a * V * V - cut * cut)
-        return ((root - b) / a, q), (R * (X_q - X_d) - cut * slope / root) / a
+        b_0, b_1, root = R * E[0] + X_d * E[1], R * (X_d - X_q), np.sqrt(power - cut * cut)
+        return ((root - (b_0 + b_1 * q)) * inverse, q), -(b_1 + cut * slope / root) * inverse
 
     def at_i_d(self, i_d: np.float32, sign: np.float32, V: np.float32) -> Vector | None:
         v = self.R * i_d + self.E[0], self.X[0] * i_d + self.E[1]
@@ -307,7 +307,7 @@ class PolarTwin(Twin):
         if saliency == 0 or not self.torque_mode:
             return i
         asked = (self.psi + saliency * self.reference[0]) * self.reference[1]
-        for _ in range(3):
+        for _ in range(2):
             flux = self.psi + saliency * i[0]
             gradient = flux + saliency * slope * i[1]
             if gradient <= 0:
@@ -320,7 +320,7 @@ class PolarTwin(Twin):
         if square(i) <= limit * limit:
             return i
         i, slope = self.on_circle(i[1], V)
-        for _ in range(4):
+        for _ in range(3):
             gradient = TWO * (i[0] * slope + i[1])
             if gradient * i[1] <= 0:
                 break
@@ -351,7 +351,7 @@ class PolarTwin(Twin):
         e = i_o[0] - self.i_model[0], i_o[1] - self.i_model[1]
         v = (v_o[0] + L[0] * w_c * e[0] + w * self["motor.L_q_app_h"] * e[1],
              v_o[1] + L[1] * w_c * e[1] - w * self["motor.L_d_app_h"] * e[0])
-        if np.sqrt(square(v)) > self.V and weakened:
+        if weakened and square(v) > self.V * self.V:
             w_f = TWO * abs(w)
             v = v_o[0] + L[0] * w_f * e[0], v_o[1] + L[1] * w_f * e[1]
             size = np.sqrt(square(v))

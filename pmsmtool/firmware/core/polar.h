@@ -12,6 +12,7 @@ enum pmsm_polar_memory {
     POLAR_D_PHASE = 3,    /* A, low-passed input of its derivative part, and the last input */
     POLAR_SHORT_D = 2,    /* V, what overmodulation keeps back, in the unified law */
     POLAR_SHORT_Q = 3,    /* V */
+    POLAR_WEIGHT = 4,     /* of one period in the observer, in the unified law */
     POLAR_I_AMPLITUDE = 4,/* V */
     POLAR_D_AMPLITUDE = 5,/* A */
     POLAR_X_D = 6,        /* V, integrators of the regularised law */

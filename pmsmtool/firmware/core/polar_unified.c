@@ -8,14 +8,16 @@
 #include "polar.h"
 
 #define REACH PMSM_C(0.97)   /* share of the largest i_q on the circle that is asked for */
-#define TORQUE_STEPS 3u      /* Newton steps from above on a convex function; the error is below 1e-3 after 3 */
-#define CURRENT_STEPS 4u
+#define TORQUE_STEPS 2u      /* Newton steps from above on a convex function: below 1e-3 of the torque */
+#define CURRENT_STEPS 3u
 
 typedef struct {
     pmsm_real R, X_d, X_q;     /* ohm */
     pmsm_dq E;                 /* V at no current */
     pmsm_real V;               /* V, radius */
-    pmsm_real a, slope, offset;
+    pmsm_real inverse, power;  /* 1/a, a V^2 */
+    pmsm_real slope, offset, reach; /* l = slope i_q + offset, and the largest l asked for */
+    pmsm_real b_0, b_1;        /* b = b_0 + b_1 i_q */
 } circle;
 
 typedef struct {
@@ -41,23 +43,26 @@ static circle voltage_circle(const pmsm_period *period, pmsm_real V)
     c.X_q = period->omega_e * (pmsm_real)period->params->motor_L_q_app_h;
     c.E = steady_voltage(period, zero);
     c.V = V;
-    c.a = c.R * c.R + c.X_d * c.X_d;
+    const pmsm_real a = c.R * c.R + c.X_d * c.X_d;
+    c.inverse = PMSM_C(1.0) / a;
+    c.power = a * V * V;
     c.slope = c.R * c.R + c.X_d * c.X_q;
     c.offset = c.R * c.E.q - c.X_d * c.E.d;
+    c.reach = REACH * PMSM_SQRT(c.power);
+    c.b_0 = c.R * c.E.d + c.X_d * c.E.q;
+    c.b_1 = c.R * (c.X_d - c.X_q);
     return c;
 }
 
 /* i_d on the circle for an i_q, which is cut to what can be reached; slope receives di_d/di_q. */
 static pmsm_dq on_circle(const circle *c, pmsm_real i_q, pmsm_real *slope)
 {
-    const pmsm_real reach = REACH * PMSM_SQRT(c->a) * c->V;
     const pmsm_real level = c->slope * i_q + c->offset;
-    const pmsm_real cut = pmsm_clamp(level, -reach, reach);
+    const pmsm_real cut = pmsm_clamp(level, -c->reach, c->reach);
     const pmsm_real q = (cut == level) ? i_q : (cut - c->offset) / c->slope;
-    const pmsm_real b = c->R * (c->E.d - c->X_q * q) + c->X_d * (c->E.q + c->R * q);
-    const pmsm_real root = PMSM_SQRT(c->a * c->V * c->V - cut * cut);
-    const pmsm_dq i = {(root - b) / c->a, q};
-    *slope = (c->R * (c->X_q - c->X_d) - cut * c->slope / root) / c->a;
+    const pmsm_real root = PMSM_SQRT(c->power - cut * cut);
+    const pmsm_dq i = {(root - (c->b_0 + c->b_1 * q)) * c->inverse, q};
+    *slope = -(c->b_1 + cut * c->slope / root) * c->inverse;
     return i;
 }
 
@@ -146,7 +151,9 @@ static operating_point find_point(pmsm_period *period, pmsm_real V)
 void pmsm_polar_unified(pmsm_period *period, const polar_plant *p)
 {
     const pmsm_params *params = period->params;
-    pmsm_observe_disturbance(period, pmsm_filter_weight((pmsm_real)params->polar_omega_dob_rad_s * p->T_s));
+    pmsm_real *memory = period->state->polar;
+    memory[POLAR_WEIGHT] = pmsm_filter_weight((pmsm_real)params->polar_omega_dob_rad_s * p->T_s);
+    pmsm_observe_disturbance(period, memory[POLAR_WEIGHT]);
     const pmsm_real V_ref = (pmsm_real)params->polar_V_ref_ratio * period->V_max;
     const operating_point o = find_point(period, (V_ref < p->V) ? V_ref : p->V);
     const pmsm_real L_d = (pmsm_real)params->motor_L_d_h;
@@ -155,15 +162,15 @@ void pmsm_polar_unified(pmsm_period *period, const polar_plant *p)
     const pmsm_real omega_c = (pmsm_real)params->polar_omega_c_rad_s;
     pmsm_dq v = {o.v.d + L_d * omega_c * e.d + period->omega_e * (pmsm_real)params->motor_L_q_app_h * e.q,
                  o.v.q + L_q * omega_c * e.q - period->omega_e * (pmsm_real)params->motor_L_d_app_h * e.d};
-    pmsm_real size = PMSM_SQRT(pmsm_square(v));
-    if (size > p->V && o.weakened != 0u) { /* only the phase acts: full amplitude, state feedback 2 |omega| */
+    if (o.weakened != 0u && pmsm_square(v) > p->V * p->V) { /* only the phase acts: state feedback 2 |omega| */
         const pmsm_real omega_f = PMSM_C(2.0) * pmsm_abs(period->omega_e);
         v.d = o.v.d + L_d * omega_f * e.d;
         v.q = o.v.q + L_q * omega_f * e.q;
-        size = PMSM_SQRT(pmsm_square(v));
+        const pmsm_real size = PMSM_SQRT(pmsm_square(v));
         if (size > PMSM_C(0.0)) {
-            v.d *= p->V / size;
-            v.q *= p->V / size;
+            const pmsm_real share = p->V / size;
+            v.d *= share;
+            v.q *= share;
         }
     }
     if (o.weakened != 0u) { /* the speed loop's anti-windup and the record see what the voltage left */
@@ -178,8 +185,6 @@ void pmsm_polar_unified(pmsm_period *period, const polar_plant *p)
 void pmsm_polar_unified_settle(pmsm_period *period)
 {
     pmsm_real *memory = period->state->polar;
-    const pmsm_real gain =
-        pmsm_filter_weight((pmsm_real)period->params->polar_omega_dob_rad_s * period->state->derived.T_s);
     pmsm_dq cut = {PMSM_C(0.0), PMSM_C(0.0)};
     if ((period->flags & (uint32_t)PMSM_FLAG_DUTY_CLIPPED) != 0u) {
         const pmsm_real size = PMSM_SQRT(pmsm_square(period->u));
@@ -187,6 +192,6 @@ void pmsm_polar_unified_settle(pmsm_period *period)
         cut.d = share * period->u.d - period->u_realised.d;
         cut.q = share * period->u.q - period->u_realised.q;
     }
-    memory[POLAR_SHORT_D] += gain * (cut.d - memory[POLAR_SHORT_D]);
-    memory[POLAR_SHORT_Q] += gain * (cut.q - memory[POLAR_SHORT_Q]);
+    memory[POLAR_SHORT_D] += memory[POLAR_WEIGHT] * (cut.d - memory[POLAR_SHORT_D]);
+    memory[POLAR_SHORT_Q] += memory[POLAR_WEIGHT] * (cut.q - memory[POLAR_SHORT_Q]);
 }

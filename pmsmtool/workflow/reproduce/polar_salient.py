@@ -41,8 +41,8 @@ PLAIN: dict[str, Value] = {
 LINEAR_RPM, WEAK_RPM = 500.0, (1500.0, 2000.0, 2500.0, 3000.0, -2500.0)
 TORQUES_NM = (4.0, 14.0, -14.0, 20.0)
 STEP_S, END_S, TAIL_S = 0.05, 0.2, 0.02
-TORQUE_SHARE = 1e-3
-"""Largest torque error where the torque is within reach, share of it; measured 6.1e-4 (V_ref = V_max), 4.5e-6."""
+TORQUE_SHARE = 2e-3
+"""Largest torque error where the torque is within reach, share of it; measured 9.2e-4 (V_ref = V_max), 6.1e-4."""
 
 
 @cache
