@@ -31,6 +31,7 @@ typedef struct {             /* least current per torque, one sign of torque */
 typedef struct {             /* one side of a torque contour, from its start */
     int32_t n;
     int32_t traced;
+    int32_t rising;          /* 1: the current falls nowhere along it, as on every machine but the oddly saturated */
     pmsm_point at[CONTOUR_NODES];
 } branch;
 
@@ -45,6 +46,7 @@ typedef struct {
     pmsm_curve curve;
     pmsm_point start;
     double first_length;     /* signed step of side 0 */
+    int32_t whole;           /* 1: traced to the edge of the domain, whatever current and flux do */
     branch side[2];
 } contour;
 
@@ -188,6 +190,7 @@ static void trace(contour *c, int32_t which, double length)
 {
     branch *to = &c->side[which];
     to->traced = 1;
+    to->rising = 1;
     to->n = 1;
     to->at[0] = c->start;
     while (to->n < CONTOUR_NODES) {
@@ -203,8 +206,9 @@ static void trace(contour *c, int32_t which, double length)
                 }
             return;
         }
+        to->rising &= next->h >= from->h;
         to->n++;
-        if (!still_useful(c, next, length))
+        if (!c->whole && !still_useful(c, next, length))
             return;
     }
 }
@@ -215,11 +219,13 @@ static int32_t start_contour(const tables *all, double T, contour *c)
     double tangent[2];
     c->curve = (pmsm_curve){all->plane, &all->border.rectangle, PMSM_CURVE_TORQUE, T, 0.0, 0.0, T};
     c->side[0].traced = c->side[1].traced = 0;
+    c->whole = 0;
     if (!least_current(all, &c->curve, &c->start))
         return 0;
     if (!(c->start.t_d * c->start.t_d + c->start.t_q * c->start.t_q > 0.0)) {
         c->side[0].traced = c->side[1].traced = 1; /* no torque slope: a machine without magnet at rest */
         c->side[0].n = c->side[1].n = 1;
+        c->side[0].rising = c->side[1].rising = 1;
         c->side[0].at[0] = c->side[1].at[0] = c->start;
         return 1;
     }
@@ -329,6 +335,36 @@ static void least_loss(const demand *want, const pmsm_curve *curve, const branch
     }
 }
 
+/* The least current of all admissible points of a side: minima and ends of its admissible parts. *at is admissible and
+ * to be beaten when have is 1; returns whether there is one. */
+static int32_t least_of_all(const demand *want, const pmsm_curve *curve, const branch *on, int32_t from, int32_t have,
+                            pmsm_point *at)
+{
+    const double slack = FULL_VOLTAGE * want->V2;
+    pmsm_point a = have ? *at : on->at[from - 1], best = a, found;
+    if (!have)
+        have = excess(want, &a) <= slack;
+    for (int32_t k = from; k < on->n; k++) {
+        const pmsm_point *b = &on->at[k];
+        const double f_a = excess(want, &a), f_b = excess(want, b);
+        const int32_t a_in = f_a <= slack, b_in = f_b <= slack;
+        if (a_in != b_in ? voltage_point(curve, &a, b, f_a, f_b, &found)
+                         : a_in && pmsm_curve_root(curve, PMSM_AT_CURRENT_EXTREME, &a, b, &found))
+            if ((!have || found.h < best.h) && excess(want, &found) <= slack) {
+                best = found;
+                have = 1;
+            }
+        if (b_in && (!have || b->h < best.h)) {
+            best = *b;
+            have = 1;
+        }
+        a = *b;
+    }
+    if (have)
+        *at = best;
+    return have;
+}
+
 /* Least loss on one side of the contour; 0 when no point of it is admissible. */
 static int32_t solve_side(const demand *want, pmsm_curve *curve, const branch *on, pmsm_point *at)
 {
@@ -351,6 +387,8 @@ static int32_t solve_side(const demand *want, pmsm_curve *curve, const branch *o
     }
     if (want->plane->loss)
         least_loss(want, curve, on, k, at);
+    else if (!on->rising)
+        (void)least_of_all(want, curve, on, k, 1, at);
     return 1;
 }
 
@@ -367,6 +405,40 @@ static int32_t solve_cell(contour *c, const pmsm_plane *plane, double omega, dou
             return 1;
     }
     return 0;
+}
+
+/* On an oddly saturated machine the contour may leave the domain and come back, or flux and current may rise and fall
+ * again. Torque has no extreme inside, so every part of a contour ends on the border: all of them, from there. */
+static int32_t solve_everywhere(const tables *all, double T, double omega, double V, pmsm_point *at)
+{
+    contour c;
+    demand want = {all->plane, omega, V * V, all->plane->R * all->plane->R, omega * omega, 0.0};
+    int32_t have = 0;
+    want.room = want.V2 - 2.0 * all->plane->R * omega * T;
+    c.curve = (pmsm_curve){all->plane, &all->border.rectangle, PMSM_CURVE_TORQUE, T, omega, V * V, T};
+    c.whole = 1;
+    for (int32_t p = 0; p < all->border.n_pieces; p++) {
+        const pmsm_piece *piece = &all->border.piece[p];
+        pmsm_curve along = piece->curve;
+        along.T = T;
+        for (int32_t k = piece->first + 1; k < piece->first + piece->count; k++) {
+            const pmsm_point *a = &all->border.node[k - 1], *b = &all->border.node[k];
+            double s;
+            if ((a->t > T) == (b->t > T)
+                || !pmsm_curve_root_between(&along, PMSM_AT_TORQUE, all->border.s[k - 1], all->border.s[k], &s, &c.start))
+                continue;
+            for (int32_t side = 0; side < 2; side++) {
+                pmsm_point found;
+                trace(&c, side, (side ? -CONTOUR_STEP : CONTOUR_STEP) * all->plane->I_max);
+                if (least_of_all(&want, &c.curve, &c.side[side], 1, 0, &found) && pmsm_on_branch(all->plane, &found)
+                    && (!have || found.h < at->h)) {
+                    *at = found;
+                    have = 1;
+                }
+            }
+        }
+    }
+    return have;
 }
 
 static uint8_t touched(const tables *all, const pmsm_point *at, double omega, double V)
@@ -441,7 +513,7 @@ static void solve_row(const tables *all, double torque, ptrdiff_t row, contour *
                     started = start_contour(all, T, c) ? 1 : -1;
                 if (started > 0 && solve_cell(c, all->plane, out->omega[w], out->V[v], &at))
                     store(all, out, cell, &at, out->omega[w], out->V[v], 0);
-                else if (at_the_limit(all, torque, e, &at))
+                else if (at_the_limit(all, torque, e, &at) || solve_everywhere(all, T, out->omega[w], out->V[v], &at))
                     store(all, out, cell, &at, out->omega[w], out->V[v], 0);
                 else
                     store_nothing(out, cell, UNSOLVED);

@@ -135,8 +135,14 @@ def extreme_torque(case: Case, sign: float) -> tuple[float, float, float]:
         reach = case.i_q_reach(i_d)
         columns, i_q = crossings(case, i_d, lambda d, q: case.voltage(d, q) - case.V)
         inside = np.linspace(-1.0, 1.0, 41)[:, None] * reach
-        columns = np.concatenate((columns, np.broadcast_to(i_d, inside.shape).ravel()))
-        i_q = np.concatenate((i_q, inside.ravel()))
+        # along the edge of the data the torque may have an extreme of its own
+        step = 1e-5 * case.I_max
+        at_edge = i_d[[0, -1]]
+        turning, i_q_turning = crossings(
+            case, at_edge, lambda d, q: case.torque(d, q + step) - case.torque(d, q - step)
+        )
+        columns = np.concatenate((columns, np.broadcast_to(i_d, inside.shape).ravel(), turning))
+        i_q = np.concatenate((i_q, inside.ravel(), i_q_turning))
         allowed = (case.voltage(columns, i_q) <= case.V * (1.0 + 1e-12)) & case.on_branch(columns, i_q)
         return columns, i_q, np.where(allowed, -sign * case.torque(columns, i_q), np.inf)
 

@@ -168,6 +168,18 @@ def seam() -> Bench:
     return Bench(machine, flux, 17.376, 74.56, (2900.0, 7800.0, 7832.0), edge=(-30.0, 30.0, 30.0))
 
 
+def falling_again() -> Bench:
+    """A d axis saturated so early that |i| along a torque contour has two minima, the admissible one the higher."""
+    i_d, i_q = np.linspace(-30.0, 30.0, 25), np.linspace(-30.0, 30.0, 31)
+    d, q = np.meshgrid(i_d, i_q, indexing="ij")
+    psi_d = 0.148 + 0.139 * np.tanh(d / 10.8) + 2e-3 * d + 1.2e-5 * q**2 / (1.0 + (q / 20.0) ** 2)
+    psi_q = 0.21 * (q / 18.9) / np.sqrt(1.0 + (q / 18.9) ** 2) + 2.2e-3 * q
+    psi_q += 2.4e-5 * d * q / (1.0 + (q / 20.0) ** 2) ** 2
+    flux_map = FluxMap(i_d, i_q, psi_d, psi_q)
+    machine, flux = OperatingMachine(3, 1.74, 1.0, 1.0, 0.148, flux_map), spline(i_d, i_q, psi_d, psi_q)
+    return Bench(machine, flux, 35.2, 364.3, (6365.0,), edge=(-30.0, 30.0, 30.0))
+
+
 def warm() -> Bench:
     """A constant machine with hot winding and magnet, its copper part given."""
     parameters = MachineParameters(3, 0.3, 2e-3, 5e-3, 0.12, R_winding_ohm=0.25)
@@ -226,6 +238,7 @@ BENCHES = {
     "edge of the map": lambda: map_cut(-math.inf),
     "map and demagnetisation": lambda: map_cut(-8.0),
     "crossings at the d axis": seam,
+    "current falls again": falling_again,
     "backwards": lambda: linear(4, 0.137, 2.3e-3, 2.1e-3, 0.41, 56.0, 121.24, -620.0, -900.0, -1100.0),
     "hot": warm,
     "measured, cold": lambda: measured(False),
@@ -238,7 +251,7 @@ def test_every_kind_of_cell_against_brute_force(name: str) -> None:
     bench = BENCHES[name]()
     machine = bench.machine
     T_top = float(torque_limits(machine, [0.0], [1e6], bench.I_max, bench.i_d_min).largest_nm[0, 0])
-    torque = T_top * np.array([-1.1, -0.6, -0.2, 0.0, 0.5, 0.9, 1.2])
+    torque = T_top * np.array([-1.1, -0.6, -0.34, -0.2, 0.0, 0.5, 0.9, 1.2])
     table = speed_table(
         machine, torque_nm=torque, speed_rpm=bench.rpm, V_max_v=[bench.V], I_max_apk=bench.I_max,
         i_d_min_a=bench.i_d_min,
