@@ -44,6 +44,12 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     metavar="SHARE",
     help="95 % tolerance of sensor gains; default 0.01, with --replay what the run was made with.",
 )
+@click.option(
+    "--cal",
+    multiple=True,
+    metavar="V_dc|I=SHOWN:TRUE:TOL",
+    help="What an instrument read while the drive showed SHOWN, and its 95 % tolerance; takes that scale out.",
+)
 @map_option
 @bus_options
 @motion_options
@@ -57,6 +63,7 @@ def identify_command(
     replay: Path | None,
     runs: Path,
     sensor_tol: float | None,
+    cal: tuple[str, ...],
     map_file: Path | None,
 ) -> None:
     """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
@@ -69,6 +76,7 @@ def identify_command(
     nothing is stored in the drive.
     """
     from pmsmtool.estimators.estimate import SensorTolerance
+    from pmsmtool.workflow.calibration import calibrated_tolerance
     from pmsmtool.workflow.identify import IdentifyRequest
     from pmsmtool.workflow.measure import NEEDS, QUANTITIES
 
@@ -79,7 +87,7 @@ def identify_command(
 
         run = RunDirectory(replay)
         run.read()
-        _show(run, recompute(run, declared), out)
+        _show(run, recompute(run, declared, cal), out)
         return
     chosen = tuple(NEEDS) if "all" in quantities else quantities or QUANTITIES
     request = IdentifyRequest(
@@ -89,7 +97,7 @@ def identify_command(
         shaft=motion.shaft or "free",
         load=motion.load,
         brake=motion.brake,
-        tolerance=declared or SensorTolerance(),
+        tolerance=calibrated_tolerance(declared or SensorTolerance(), cal),
     )
     request.check()
     found, how, request = _choose(bus, map_file, method, request, everything=not quantities)

@@ -57,6 +57,8 @@ class SensorTolerance:
         Standard deviation of diode minus switch threshold (V; 0 for a bridge of MOSFETs) and the DC link it acts on: a
         conducting leg swings by U_dc + V_diode - V_switch, which no experiment tells from a voltage gain. It is a model
         error that differs from drive to drive, so it belongs to the statistical part. Infinite link: not counted.
+    current_scale, voltage_scale : float
+        True over shown, where an instrument said so; the gains are then the instrument's tolerances.
     """
 
     current_gain: float = SENSOR_GAIN_TOLERANCE
@@ -65,6 +67,8 @@ class SensorTolerance:
     device_share_max: float = 0.3
     bridge_threshold_v: float = BRIDGE_THRESHOLD_V
     U_dc_v: float = math.inf
+    current_scale: float = 1.0
+    voltage_scale: float = 1.0
 
     @property
     def voltage_scale_std(self) -> float:

@@ -24,6 +24,7 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 from pmsmtool.workflow import map_stage
+from pmsmtool.workflow.calibration import calibrated_traces
 
 MOVED_SHARE = 0.25
 """Largest share of levels that may be left out; with more the estimator sees them, and refuses what has not settled."""
@@ -124,6 +125,7 @@ def evaluate(
     if "zero_current" not in traces:
         raise ConfigError("the run has no zero-current trace", hint="run identify again")
     tolerance = tolerance_on(tolerance or SensorTolerance(), U_dc_v)
+    traces = calibrated_traces(traces, tolerance)
     result = Evaluation(estimate_noise(traces["zero_current"]))
     if "phase_vectors" in traces:
         result = replace(result, phases=check_phases(traces["phase_vectors"], result.noise))

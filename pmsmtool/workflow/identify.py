@@ -30,6 +30,7 @@ from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
 from pmsmtool.units import format_estimate
 from pmsmtool.workflow import map_stage
+from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
 from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Limits, Measurement, steps_of
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
@@ -256,7 +257,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     )
 
 
-def replay(run: RunDirectory, tolerance: SensorTolerance | None = None) -> Stage:
+def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibration: Sequence[str] = ()) -> Stage:
     """Recompute every estimate of a run from its traces.
 
     Parameters
@@ -265,6 +266,8 @@ def replay(run: RunDirectory, tolerance: SensorTolerance | None = None) -> Stage
         Of ``identify`` or ``commission``. When the machine file becomes another one, the stage is recorded anew.
     tolerance : SensorTolerance, optional
         Replaces the sensor tolerances that the run was made with.
+    calibration : sequence of str
+        Scales against an instrument (``workflow/calibration.py``).
 
     Raises
     ------
@@ -279,6 +282,7 @@ def replay(run: RunDirectory, tolerance: SensorTolerance | None = None) -> Stage
     request = parse_request((run.path / REQUEST).read_text(encoding="utf-8"), where=str(run.path / REQUEST))
     if tolerance is not None:
         request = replace(request, tolerance=tolerance)
+    request = replace(request, tolerance=calibrated_tolerance(request.tolerance, calibration))
     recorded = run.read().stage("identify")
     stage = evaluated_stage(run, load_machine_file(run.path / NAMEPLATE), request)
     if recorded is not None and recorded.files.get(MACHINE) != run.sha256(MACHINE):
@@ -337,6 +341,8 @@ def _conditions(evaluation: Evaluation, request: IdentifyRequest) -> dict[str, A
         "shaft": request.shaft,
         "current_gain_tolerance": request.tolerance.current_gain,
         "voltage_gain_tolerance": request.tolerance.voltage_gain,
+        "current_scale": request.tolerance.current_scale,
+        "voltage_scale": request.tolerance.voltage_scale,
         "noise_apk": evaluation.noise.sigma_a,
     }
     if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):

@@ -1,0 +1,71 @@
+"""``--cal``: a scale against an instrument leaves the instrument's tolerance; three kinds of interval stay apart."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import can
+import pytest
+
+from pmsmtool.cli.main import run
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.resources import data_folder
+from pmsmtool.workflow.random_drives import true_loop_resistance
+
+GAIN = 1.01
+"""Of the simulated drive's DC-link measurement: commands come out smaller than the drive believes."""
+
+
+def answer(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, float]:
+    capsys.readouterr()
+    code = run(("identify", *arguments, "--json"))
+    printed = capsys.readouterr()
+    assert code == 0, printed.err
+    (value,) = json.loads(printed.out)["values"]
+    return dict(value)
+
+
+def test_a_scale_is_taken_out_and_its_tolerance_takes_the_sensors_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
+    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+    base = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
+    changed = {"rotor": "locked", "U_dc_gain": GAIN, "T_winding_c": 20.0, "thermal_on": False}
+    drive = replace(base, simulation={**base.simulation, **changed})
+    Path("drive.toml").write_text(dump_machine_file(drive), encoding="utf-8")
+    R = true_loop_resistance(drive)
+    channel = "drive.toml?nv=:memory:"
+    shown = answer(capsys, "-i", "pmsmsim", "-c", channel, "--yes", "--shaft", "locked", "R")
+    assert shown["systematic"] / shown["value"] == pytest.approx(math.hypot(0.01, 0.01), rel=0.2)
+    assert shown["value"] == pytest.approx(R * GAIN, rel=3e-3)  # measured 0.1 %
+
+    (folder,) = Path("runs").iterdir()
+    true = answer(capsys, "--replay", str(folder), "--cal", "V_dc=565.6:560:0.56", "--cal", "I=5:5:0.005")
+    assert true["value"] == pytest.approx(shown["value"] / GAIN, rel=1e-6)
+    assert true["value"] == pytest.approx(R, rel=3e-3)
+    assert true["std"] == pytest.approx(shown["std"] / GAIN, rel=1e-3)
+    # what is left: two instruments of 0.1 % and the 2 K of the temperature sensor
+    assert true["systematic"] / true["value"] == pytest.approx(math.hypot(1e-3, 1e-3, 2.0 * 0.00393), rel=0.01)
+
+    kept = tomllib.loads((folder / "machine.toml").read_text(encoding="utf-8"))
+    assert kept["std"]["R_s_ohm"] == pytest.approx(true["std"])
+    assert kept["systematic"]["R_s_ohm"] == pytest.approx(true["systematic"])
+    assert kept["conditions"]["voltage_scale"] == pytest.approx(1.0 / GAIN)
+    again = answer(capsys, "--replay", str(folder))
+    assert again == true  # the run keeps its calibration
+
+
+@pytest.mark.parametrize(
+    "text", ["U=1:1:0.1", "V_dc=48", "V_dc=48:0:0.1", "V_dc=0:48:0.1", "V_dc=48:48:0", "V_dc=48:480:1", "V_dc=a:b:c"]
+)
+def test_what_is_no_calibration_is_a_usage_error(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(("identify", "-i", "virtual", "-c", "nothing", "--yes", "--cal", text)) == 2
+    err = capsys.readouterr().err
+    assert "instrument" in err or "cannot be calibrated" in err
