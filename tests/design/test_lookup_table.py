@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -185,7 +186,7 @@ def warm() -> Bench:
     parameters = MachineParameters(3, 0.3, 2e-3, 5e-3, 0.12, R_winding_ohm=0.25)
     machine = at_temperature(parameters, T_winding_c=150.0, T_magnet_c=110.0)
     R, psi = 0.3 + 0.25 * 0.00393 * 130.0, 0.12 * (1.0 - 0.0012 * 90.0)
-    assert (machine.R, machine.psi_f) == (pytest.approx(R), pytest.approx(psi))
+    assert machine.R == pytest.approx(R) and machine.psi_f == pytest.approx(psi)
     return replace(linear(3, R, 2e-3, 5e-3, psi, 80.0, 150.0, 0.0, 2000.0, 4500.0, 12000.0), machine=machine)
 
 
@@ -225,7 +226,7 @@ def map_cut(i_d_min: float) -> Bench:
     return Bench(machine, flux, 36.0, 120.0, (0.0, 1500.0, 4000.0), i_d_min, (-30.0, 30.0, 30.0))
 
 
-BENCHES = {
+BENCHES: dict[str, Callable[[], Bench]] = {
     "interior": lambda: linear(4, 0.05, 1e-3, 2.5e-3, 0.1, 150.0, 100.0, 0.0, 1500.0, 2400.0, 4000.0, 9000.0),
     "surface": lambda: linear(4, 0.137, 2.1e-3, 2.1e-3, 0.41, 56.0, 121.24, 0.0, 620.0, 850.0, 1000.0),
     "L_d > L_q": lambda: linear(4, 0.137, 4.0e-3, 2.1e-3, 0.2, 90.0, 111.0, 0.0, 620.0, 1200.0, 2000.0),
