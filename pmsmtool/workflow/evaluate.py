@@ -63,19 +63,20 @@ class Evaluation:
 
     def estimates(self) -> dict[str, Estimate]:
         """Return every estimate by its machine-file key."""
-        found: dict[str, Estimate] = dict(self.map_estimates)
+        found: dict[str, Estimate] = {}
         if self.resistance is not None:
             found["R_s_ohm"] = self.resistance.R_s
         if self.inductance is not None:
             found["L_d_h"], found["L_q_h"] = self.inductance.L_d, self.inductance.L_q
         if self.flux is not None:
-            found["psi_f_wb"] = self.flux.psi_f
+            found["psi_f_wb"] = self.map_estimates.get("psi_f_wb", self.flux.psi_f)
         if self.encoder is not None:
             found["pole_pairs"] = self.encoder.pole_pairs
         if self.offset is not None:
             found["offset_rad"] = self.offset
         if self.inertia is not None:
             found["J_kgm2"], found["tau_c_nm"] = self.inertia.J, self.inertia.tau_c
+        found.update((name, estimate) for name, estimate in self.map_estimates.items() if name not in found)
         return found
 
 
@@ -150,7 +151,7 @@ def evaluate(
         result = replace(result, inertia=inertia)
     flux_map = map_stage.flux_map_of(traces, result, tolerance)
     if flux_map is not None:
-        result = replace(result, flux_map=flux_map, map_estimates=map_stage.map_estimates(flux_map, traces))
+        result = replace(result, flux_map=flux_map, map_estimates=map_stage.map_estimates(result, flux_map, traces))
     return result
 
 
