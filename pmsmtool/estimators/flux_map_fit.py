@@ -66,10 +66,23 @@ DISC_POINTS = 25
 
 @dataclass(frozen=True, slots=True)
 class MagnetFlux:
-    """Flux linkage at zero current and temperature of the pulses (Wb), and its standard deviation."""
+    """psi_d where another experiment measured it, at the temperature of the pulses.
+
+    Attributes
+    ----------
+    psi_wb, std_wb : float
+        Mean of psi_d over the points (Wb), and its standard deviation.
+    i_d_a, i_q_a : tuple of float
+        The points (A); a run with i_d of both signs means the mean of psi_d there, not psi_d at zero current.
+    weight : tuple of float
+        Their weights, of sum one.
+    """
 
     psi_wb: float
     std_wb: float
+    i_d_a: tuple[float, ...] = (0.0,)
+    i_q_a: tuple[float, ...] = (0.0,)
+    weight: tuple[float, ...] = (1.0,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -316,9 +329,10 @@ def _solve(
         b[column] += weight * mean
     zero = np.zeros(1)
     mean_diagonal = float(np.trace(sums.A[:k, :k])) / k
-    for order, value in (((1, 0), magnet.psi_wb), ((0, 1), 0.0)):
+    there = np.array(magnet.weight) @ spline.derivative(np.array(magnet.i_d_a), np.array(magnet.i_q_a), 1, 0)
+    for known, value in ((there, magnet.psi_wb), (spline.derivative(zero, zero, 0, 1)[0], 0.0)):
         row = np.zeros(size)
-        row[:k] = spline.derivative(zero, zero, *order)[0]
+        row[:k] = known
         weight = ANCHOR * mean_diagonal / float(row @ row)
         A += weight * np.outer(row, row)
         b += weight * value * row

@@ -22,6 +22,7 @@ from pmsmtool.trace import Trace
 
 Axis = Literal["d", "q"]
 
+AXES: tuple[Axis, Axis] = ("d", "q")
 STAGE = "flux map"
 SIGNALS = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "theta_m_rad", "omega_e_rad_s", "flags", "T_winding_c")
 SAMPLES = 2048

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_map_fit import MagnetFlux
@@ -85,7 +87,7 @@ def measure_map(
     plan = flux_map_scan.ScanPlan(i_max, U_SHARE * limits.V_max_v, held, drop)
     abort = SPEED_SHARE * pole_pairs * limits.omega_max_rad_s
     say(f"flux map: growing pulses size voltage and band up to {i_max:.3g} A")
-    d, q = (flux_map_scan.size_axis(drive, plan, axis, abort) for axis in ("d", "q"))  # type: ignore[arg-type]
+    d, q = (flux_map_scan.size_axis(drive, plan, axis, abort) for axis in flux_map_scan.AXES)
     swings = [pulse.u_v * pulse.half_period * drive.period_s for pulse in (d, q)]
     rows = 2 * len(plan.rectangles) * flux_map_scan.SAMPLES
     predicted = noise.sigma_a * max(swings) / (2.0 * i_max) * math.sqrt(COEFFICIENTS / rows)
@@ -126,7 +128,7 @@ def flux_map_of(
     offset = drive_offset
     if result.flux is not None and result.offset is not None:
         measured = result.flux.psi_measured
-        magnet = MagnetFlux(measured.value, measured.std)
+        magnet = _magnet_of(traces["speeds"], measured)
         to_reference = result.flux.psi_f.value - measured.value
         offset = result.offset.value
     elif not held:
@@ -143,12 +145,30 @@ def flux_map_of(
     )
 
 
-def map_estimates(result: FluxMapResult, trains: Mapping[str, Trace]) -> dict[str, Estimate]:
-    """Return the inductances at the largest torque of the rated current, by machine-file key."""
-    facts = trains["map_0"].meta
+def _magnet_of(speeds: Trace, psi: Estimate) -> MagnetFlux:
+    """Return the flux linkage with the currents it was measured at; fast rows decide the regression over speeds."""
+    weight = np.square(speeds["omega_e_rad_s"])
+    weight = weight / np.sum(weight)
+    points = (tuple(map(float, speeds[name])) for name in ("i_d_a", "i_q_a"))
+    return MagnetFlux(psi.value, psi.std, *points, tuple(map(float, weight)))
+
+
+def map_estimates(result: Evaluation, flux_map: FluxMapResult, traces: Mapping[str, Trace]) -> dict[str, Estimate]:
+    """Return what the map says of the machine, by machine-file key.
+
+    Inductances at the largest torque of the rated current; and psi_f, which the run over speeds knows at its currents
+    only, at none.
+    """
+    facts = traces["map_0"].meta
     fallback = HELD_FALLBACK if facts["held"] else ""
-    found = result.at_rated_current(abs(int(facts["signed_pole_pairs"])), float(facts["I_nom_a"]))
-    return {name: replace(estimate, fallback=fallback) for name, estimate in found.items()}
+    found = flux_map.at_rated_current(abs(int(facts["signed_pole_pairs"])), float(facts["I_nom_a"]))
+    found = {name: replace(estimate, fallback=fallback) for name, estimate in found.items()}
+    if result.flux is not None:
+        psi_f = float(flux_map.flux_map.flux(0.0, 0.0)[0])
+        std = float(flux_map.fit.flux_std(np.zeros(1), np.zeros(1))[0, 0])
+        method = f"{result.flux.psi_f.method}, at zero current by the flux map"
+        found["psi_f_wb"] = replace(result.flux.psi_f, value=psi_f, std=std, method=method)
+    return found
 
 
 def with_map(machine: MachineParameters, estimates: Mapping[str, Estimate]) -> MachineParameters:
