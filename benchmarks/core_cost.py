@@ -1,12 +1,12 @@
 """Instructions of the control core on Cortex-M3, M4F and M7, counted under emulation, against the budgets.
 
-Run from the repository with ``pip install ziglang==0.14.1 unicorn``: ``python benchmarks/core_cost.py [--markdown FILE]``;
-about half a minute of one core. How it is compiled, emulated and weighted stands in ``tests/firmware/cortex_m.py``.
+Run from the repository with ``pip install ziglang==0.14.1 unicorn``: ``python benchmarks/core_cost.py``
+``[--markdown FILE]``; about two minutes of one core. How it is compiled, emulated and weighted stands in ``tests/firmware/cortex_m.py``.
 Instructions are exact; cycles are a model of the M4F, not silicon.
 
 Two sets of inputs: *nominal*, a closed loop at 620 rpm with steps of the request; *adversarial*, a search over states that
-no closed loop visits (current, integrators, observer, held reference, transfer under way, speed, DC voltage, request):
-600 random ones, then a climb from the worst of them by random changes. Budgets belong to the adversarial worst case.
+no closed loop visits (current, integrators, observer, held reference, voltages, transfer under way, speed, DC voltage,
+request): 2000 random ones, then climbs from the worst of them by random changes. Budgets belong to the adversarial worst case.
 The governor's cost is that of the period with it less that of the same period without.
 
 Exit code 0: every budget met; 1: one is missed; 77: skipped, a tool is absent (the line says which).
@@ -115,10 +115,12 @@ def laws() -> dict[str, Law]:
         "exact, 12 rows": Law(reference_case(4000.0, governor__mode=PAPER, governor__k_max=10), without="PI"),
         "best, rows only": Law(reference_case(4000.0, **best, governor__options=CURRENT_ROW), without="PI"),
         "best": Law(reference_case(7540.0, **best, governor__options=options), without="PI"),
-        "best, delay": Law(reference_case(7540.0, **best, **delay, governor__options=options | PREDICTOR),
-                           without="PI, predictor"),
-        "best + accelerated FW": Law(reference_case(7540.0, **best, governor__options=options,
-                                                    field_weakening__mode=3), MODE_TORQUE),
+        "best, delay": Law(
+            reference_case(7540.0, **best, **delay, governor__options=options | PREDICTOR), without="PI, predictor"
+        ),
+        "best + accelerated FW": Law(
+            reference_case(7540.0, **best, governor__options=options, field_weakening__mode=3), MODE_TORQUE
+        ),
         "polar, proposed": Law(reference_case(4000.0, polar__mode=2)),
         "polar, regularised": Law(reference_case(4000.0, polar__mode=5)),
         "polar, unified": Law(reference_case(4000.0, polar__mode=6, polar__options=4, **delay)),
@@ -145,9 +147,15 @@ def summary(costs: list[tuple[int, int]], worst_input: np.ndarray | None = None)
 def nominal(target: Target, law: Law) -> Cost:
     """Closed loop at 620 rpm with a step of the request every 60 periods."""
     values = law.values
-    plant = LinearPlant(R=values["motor.R_s_ohm"], L_d=values["motor.L_d_h"], L_q=values["motor.L_q_h"],
-                        psi=values["motor.psi_f_wb"], T_s=1e-9 * values["inverter.T_s_ns"], omega=620 * RPM,
-                        delayed=values["inverter.delay_periods"] >= 1)
+    plant = LinearPlant(
+        R=values["motor.R_s_ohm"],
+        L_d=values["motor.L_d_h"],
+        L_q=values["motor.L_q_h"],
+        psi=values["motor.psi_f_wb"],
+        T_s=1e-9 * values["inverter.T_s_ns"],
+        omega=620 * RPM,
+        delayed=values["inverter.delay_periods"] >= 1,
+    )
     m, r = target.measurement, target.reference
     costs = []
     target.state = type(target.state).from_buffer_copy(target.prepared)
@@ -240,20 +248,32 @@ def verdicts(table: Table) -> list[tuple[str, float, float]]:
     """What is promised, the measured number, the limit."""
 
     def governor(name: str, kind: str, what: str) -> float:
-        without = laws()[name].without
-        return float(getattr(table[name][kind], what) - getattr(table[without]["nominal"], what.replace("worst", "mean")))
+        plain = table[laws()[name].without]["nominal"]
+        return float(getattr(table[name][kind], what) - getattr(plain, what.replace("worst", "mean")))
 
     return [
         ("line search, worst instructions", governor("line search", "adversarial", "worst"), LINE_LIMIT),
         ("exact 12 rows, worst instructions", governor("exact, 12 rows", "adversarial", "worst"), EXACT_LIMIT),
-        ("best with delay, typical share of 12 kHz",
-         governor("best, delay", "nominal", "mean_cycles") / BUDGET_12_KHZ, BEST_TYPICAL),
-        ("best with delay, worst share of 12 kHz",
-         governor("best, delay", "adversarial", "worst_cycles") / BUDGET_12_KHZ, BEST_WORST),
-        ("whole period of best with delay, worst share of 12 kHz",
-         table["best, delay"]["adversarial"].worst_cycles / BUDGET_12_KHZ, BEST_WORST),
-        ("whole period of the unified polar law, worst share of 10 kHz",
-         table["polar, unified"]["adversarial"].worst_cycles / BUDGET_10_KHZ, UNIFIED_WORST),
+        (
+            "best with delay, typical share of 12 kHz",
+            governor("best, delay", "nominal", "mean_cycles") / BUDGET_12_KHZ,
+            BEST_TYPICAL,
+        ),
+        (
+            "best with delay, worst share of 12 kHz",
+            governor("best, delay", "adversarial", "worst_cycles") / BUDGET_12_KHZ,
+            BEST_WORST,
+        ),
+        (
+            "whole period of best with delay, worst share of 12 kHz",
+            table["best, delay"]["adversarial"].worst_cycles / BUDGET_12_KHZ,
+            BEST_WORST,
+        ),
+        (
+            "whole period of the unified polar law, worst share of 10 kHz",
+            table["polar, unified"]["adversarial"].worst_cycles / BUDGET_10_KHZ,
+            UNIFIED_WORST,
+        ),
     ]
 
 
@@ -262,13 +282,18 @@ def table_lines(table: Table, elsewhere: dict[str, tuple[dict[str, Cost], dict[s
     names = list(elsewhere)
     lines = [
         "| law, one whole period | nominal mean | nominal worst | adversarial mean | adversarial worst | "
-        + " | ".join(f"{name} nominal mean | {name} on that worst input" for name in names) + " |",
+        + " | ".join(f"{name} nominal mean | {name} on that worst input" for name in names)
+        + " |",
         "|---|" + "---|" * (4 + 2 * len(names)),
     ]
     for law, row in table.items():
         n, a = row["nominal"], row["adversarial"]
-        cells = [f"{n.mean:.0f} ({n.mean_cycles:.0f})", f"{n.worst} ({n.worst_cycles})",
-                 f"{a.mean:.0f} ({a.mean_cycles:.0f})", f"{a.worst} ({a.worst_cycles})"]
+        cells = [
+            f"{n.mean:.0f} ({n.mean_cycles:.0f})",
+            f"{n.worst} ({n.worst_cycles})",
+            f"{a.mean:.0f} ({a.mean_cycles:.0f})",
+            f"{a.worst} ({a.worst_cycles})",
+        ]
         for loop, worst in elsewhere.values():
             cells += [f"{loop[law].mean:.0f}", f"{worst[law]}"]
         lines.append(f"| {law} | " + " | ".join(cells) + " |")
@@ -295,9 +320,13 @@ def main() -> int:
         for name in () if options.m4f_only else ("Cortex-M3", "Cortex-M7"):
             other, _ = cortex_m.emulator(name, sources, "pmsm_step", Path(folder))
             elsewhere[name] = (measure(other, nominal), replay(other, found["adversarial"]))
-    lines = [f"Compiled by {compiler}, {' '.join(('-O2', *cortex_m.FLAGS))}.",
-             "Cortex-M4F: instructions (model cycles). Others: instructions.", "",
-             *table_lines(table, elsewhere), ""]
+    lines = [
+        f"Compiled by {compiler}, {' '.join(('-O2', *cortex_m.FLAGS))}.",
+        "Cortex-M4F: instructions (model cycles). Others: instructions.",
+        "",
+        *table_lines(table, elsewhere),
+        "",
+    ]
     missed = 0
     for text, value, limit in verdicts(table):
         good = value <= limit
@@ -305,8 +334,13 @@ def main() -> int:
         lines.append(f"- {'ok' if good else 'MISS'}: {text}: {value:.4g} (limit {limit:g})")
     print("\n".join(lines))
     if options.markdown:
-        head = ["# Cost of the control core", "", "Written by `python benchmarks/core_cost.py --markdown "
-                "benchmarks/core_cost.md`; what is counted and how stands in that program.", ""]
+        head = [
+            "# Cost of the control core",
+            "",
+            "Written by `python benchmarks/core_cost.py --markdown "
+            "benchmarks/core_cost.md`; what is counted and how stands in that program.",
+            "",
+        ]
         options.markdown.write_text("\n".join([*head, *lines]) + "\n")
     return 1 if missed else 0
 

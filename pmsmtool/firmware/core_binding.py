@@ -55,9 +55,7 @@ def _fields(body: str, types: Mapping[str, CType], sizes: Mapping[str, int]) -> 
     return fields
 
 
-def parse_structs(
-    text: str, known: Mapping[str, CType] | None = None, *, double: bool = False
-) -> dict[str, CType]:
+def parse_structs(text: str, known: Mapping[str, CType] | None = None, *, double: bool = False) -> dict[str, CType]:
     """Return a ctypes Structure for every ``typedef struct {...} name;`` of C header text.
 
     Parameters
@@ -158,6 +156,14 @@ def _declare(library: ctypes.CDLL, types: Mapping[str, CType]) -> None:
         function.argtypes = arguments
 
 
+def bind(library: ctypes.CDLL, *, double: bool = False) -> CoreBinding:
+    """Return a binding of a loaded library that contains the core, for instance one compiled from an export."""
+    text = "\n".join((HEADER_FOLDER / name).read_text(encoding="ascii") for name in CORE_HEADERS)
+    types = parse_structs(text, double=double)
+    _declare(library, types)
+    return CoreBinding(library, types)
+
+
 def core(*, double: bool = False) -> CoreBinding:
     """Load the core, as flashed (float) or in double.
 
@@ -171,8 +177,4 @@ def core(*, double: bool = False) -> CoreBinding:
 
 @functools.cache
 def _bind(double: bool) -> CoreBinding:
-    text = "\n".join((HEADER_FOLDER / name).read_text(encoding="ascii") for name in CORE_HEADERS)
-    types = parse_structs(text, double=double)
-    library = load("pmsm_core_f64" if double else "pmsm_core")
-    _declare(library, types)
-    return CoreBinding(library, types)
+    return bind(load("pmsm_core_f64" if double else "pmsm_core"), double=double)

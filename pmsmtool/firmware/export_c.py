@@ -1,8 +1,9 @@
 """A parameter set as C: a const instance of ``pmsm_params`` with its look-up words, and the core that runs it.
 
 The generated files are the ones the simulated drive runs (``firmware/core``, copied byte for byte) plus
-``<prefix>_cfg.h``, ``<prefix>_cfg.c`` and ``<prefix>_cfg.json`` with the same content. Two motors in one program
-use two prefixes. The text depends on the set only: no date, no path.
+``<prefix>_cfg.h``, ``<prefix>_cfg.c`` and ``<prefix>_cfg.json`` with the same content, and ``<prefix>_main.c``, an
+example that is compiled only on request. Two motors in one program use two prefixes. The text depends on the set only:
+no date, no path.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from importlib import resources
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.export_example import example_source
 from pmsmtool.firmware.image import LUT_FORMAT_BINARY32, crc32, pack_image, unpack_image
 from pmsmtool.firmware.params_header import c_float
 from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, layout_signature
@@ -50,6 +52,7 @@ def c_files(image: bytes, *, prefix: str = "pmsm", design_id: str = "") -> dict[
         f"{prefix}_cfg.h": _header(prefix, image, lut, design_id),
         f"{prefix}_cfg.c": _source(prefix, values, lut),
         f"{prefix}_cfg.json": _json(values, image, design_id),
+        f"{prefix}_main.c": example_source(prefix),
         **dict(core_files()),
     }
 

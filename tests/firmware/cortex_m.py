@@ -1,8 +1,8 @@
 """Cortex-M processors for tests and benchmarks: compile C for thumb, run it in an emulator, count instructions.
 
 The compiler is ``arm-none-eabi-gcc`` where it is installed, else the ziglang package; the emulator is the unicorn
-package. ``missing()`` names what is absent. Instruction counts are exact and repeat bit for bit. Cycles are a model, not
-silicon: the weights of the Cortex-M4 technical reference manual as in the firmware reference (division and square root
+package. ``missing()`` names what is absent. Instruction counts are exact and repeat bit for bit. Cycles are a model,
+not silicon: the weights of the Cortex-M4 technical reference manual as in the firmware reference (division and square root
 14, single load or store 2, multiple 1 + N, taken branch 3, everything else 1, one more where a floating-point result is
 used by the next instruction); no flash wait states, no interrupt entry, no stacking of registers. Test code only.
 """
@@ -21,8 +21,17 @@ from typing import Any
 
 import numpy as np
 
-FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wdouble-promotion", "-Wfloat-conversion", "-Wshadow", "-Werror",
-         "-ffp-contract=off", "-fno-math-errno")
+FLAGS = (
+    "-std=c99",
+    "-Wall",
+    "-Wextra",
+    "-Wdouble-promotion",
+    "-Wfloat-conversion",
+    "-Wshadow",
+    "-Werror",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+)
 STACK_TOP, DATA, RETURN = 0x2010_0000, 0x2000_0000, 0x0800_0000
 ARGUMENTS = 0x100
 """Room for arguments behind the top of the stack."""
@@ -88,10 +97,16 @@ PROCESSORS = {
     processor.name: processor
     for processor in (
         Processor("Cortex-M3", ("thumb-freestanding-eabi", "cortex_m3"), ("-mcpu=cortex-m3", "-mfloat-abi=soft")),
-        Processor("Cortex-M4F", ("thumb-freestanding-eabihf", "cortex_m4+vfp4d16sp"),
-                  ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard")),
-        Processor("Cortex-M7", ("thumb-freestanding-eabihf", "cortex_m7+fp_armv8d16sp"),
-                  ("-mcpu=cortex-m7", "-mfpu=fpv5-sp-d16", "-mfloat-abi=hard")),
+        Processor(
+            "Cortex-M4F",
+            ("thumb-freestanding-eabihf", "cortex_m4+vfp4d16sp"),
+            ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"),
+        ),
+        Processor(
+            "Cortex-M7",
+            ("thumb-freestanding-eabihf", "cortex_m7+fp_armv8d16sp"),
+            ("-mcpu=cortex-m7", "-mfpu=fpv5-sp-d16", "-mfloat-abi=hard"),
+        ),
     )
 }
 
@@ -111,7 +126,17 @@ def build(processor: Processor, sources: Sequence[Path], entry: str, folder: Pat
     elf, root = folder / "core.elf", folder / "root.c"
     root.write_text(ROOT if processor.name == "Cortex-M3" else "typedef int nothing;\n")
     files = [str(path) for path in (*sources, root)]
-    common = ("-O2", *FLAGS, "-ffreestanding", "-static", "-nostdlib", f"-Wl,-e,{entry}", "-o", str(elf))
+    common = (
+        "-O2",
+        *FLAGS,
+        "-ffreestanding",
+        "-static",
+        "-nostdlib",
+        "-Wl,--no-gc-sections",
+        f"-Wl,-e,{entry}",
+        "-o",
+        str(elf),
+    )
     gcc = shutil.which("arm-none-eabi-gcc")
     if gcc:
         version = subprocess.run([gcc, "-dumpversion"], capture_output=True, text=True, check=True).stdout.strip()
@@ -120,8 +145,9 @@ def build(processor: Processor, sources: Sequence[Path], entry: str, folder: Pat
     else:
         target, cpu = processor.zig
         command = [sys.executable, "-m", "ziglang", "cc", "-target", target, f"-mcpu={cpu}", *common, *files]
-        version = subprocess.run([sys.executable, "-m", "ziglang", "version"], capture_output=True, text=True,
-                                 check=True).stdout.strip()
+        version = subprocess.run(
+            [sys.executable, "-m", "ziglang", "version"], capture_output=True, text=True, check=True
+        ).stdout.strip()
         name = f"ziglang {version} (clang)"
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode:
