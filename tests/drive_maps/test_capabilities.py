@@ -228,7 +228,7 @@ def test_flux_linkage_by_a_recorder(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert outcome.exit_code == 0, outcome.exception
     found = {value["name"]: value for value in json.loads(outcome.stdout)["values"]}
     truth = load_machine_file(data_folder("profiles") / "interior-2k2.toml").machine
-    # measured: psi within 0.3 %, L_q within 2 %
+    # random drives are judged by benchmarks.tier_intervals; the issue asks for 1.5 and 5 %
     assert found["psi_f_wb"]["value"] == pytest.approx(truth.psi_f_wb, rel=0.015)
     assert found["L_q_app_h"]["value"] == pytest.approx(truth.L_q_h, rel=0.05)
 
