@@ -116,6 +116,12 @@ _SHOWN = (
     "current.K_p_d_v_per_a", "current.K_i_d_v_per_as", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as",
     "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad", "speed.tau_max_nm",
 )  # fmt: skip
+_SHOWN_LIMITS = (
+    "governor.mode", "governor.k_max", "governor.eps", "governor.options", "governor.I_transient_apk",
+    "governor.observer_gain", "field_weakening.mode", "field_weakening.N_fw", "field_weakening.margin",
+    "field_weakening.h1", "field_weakening.h2", "field_weakening.beta", "field_weakening.sigma",
+    "field_weakening.iterations", "field_weakening.i_d_min_a", "field_weakening.i_d_lm_a",
+)  # fmt: skip
 _SHOWN_POLAR = (
     "polar.mode", "polar.options", "polar.sigma_phase_rad_s", "polar.sigma_amplitude_rad_s", "polar.tau_s",
     "polar.omega_c_rad_s", "polar.omega_dob_rad_s", "polar.V_ref_ratio", *_SHOWN[4:],
@@ -126,7 +132,7 @@ def _lines(design: Design) -> Iterator[str]:
     from pmsmtool.params.catalogue import BY_NAME
 
     polar = design["polar.mode"] != 0.0
-    shown = _SHOWN_POLAR if polar else _SHOWN
+    shown = _SHOWN_POLAR if polar else (*_SHOWN, *_SHOWN_LIMITS)
     rows = [(name, f"{design[name]:.6g}", BY_NAME[name].unit, design.values[name].method) for name in shown]
     yield from table(("parameter", "value", "unit", "method"), rows)
     yield ""
@@ -144,10 +150,11 @@ def _lines(design: Design) -> Iterator[str]:
             if not (polar and name.startswith("current"))
         ],
     )
-    facts = {name: value for name, value in design.facts.items() if name.startswith("polar_")}
+    facts = {name: value for name, value in design.facts.items() if name.startswith("polar_") == polar}
     if facts:
         yield ""
-        yield from table(("polar loops", "value"), [(name, _fact(value)) for name, value in facts.items()])
+        head = "polar loops" if polar else "governor, field weakening, loops"
+        yield from table((head, "value"), [(name, _fact(value)) for name, value in facts.items()])
 
 
 def _fact(value: bool | float | str) -> str:

@@ -7,11 +7,14 @@ at (-psi/L_d, 0).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pmsmtool.design.design_file import DesignValue, Scalar
-from pmsmtool.design.lookup_table import torque_limits
+from pmsmtool.design.lookup_table import RPM, torque_limits
 from pmsmtool.design.operating_machine import at_temperature, magnet_flux_at
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import ConfigError
@@ -95,10 +98,11 @@ def design_field_weakening(source: MachineFile, rated: Ratings, mode: str, margi
         "field_weakening.i_d_min_a": DesignValue(rated.i_d_min_a, rated.methods["i_d_min"]),
         "field_weakening.i_d_lm_a": DesignValue(i_d_lm, "least current at rated torque"),
     }
+    facts = limit_facts(source, rated, (1.0 - margin) * source.inverter.V_max_v)
     if mode in ("off", "lookup") or rated.base_speed_rpm <= 0.0:
-        return FieldWeakeningDesign(values, {}, math.inf)
+        return FieldWeakeningDesign(values, facts, math.inf)
     limit = ramp_limit_rpm_per_s(rated.base_speed_rpm, every, margin)
-    facts: dict[str, Scalar] = {
+    facts |= {
         "field_weakening_period_s": every,
         "field_weakening_entry_rpm": rated.base_speed_rpm,
         "voltage_overshoot_per_rpm_per_s": overshoot_per_slope(rated.base_speed_rpm, every),
@@ -129,6 +133,91 @@ def torque_constant(machine: MachineParameters, i_d_a: float) -> float:
     saliency = machine.L_d_decoupling_h - machine.L_q_decoupling_h
     return 1.5 * machine.pole_pairs * (machine.psi_f_wb + saliency * i_d_a)
 
+
+# -- where the machine ends ----------------------------------------------------------------------------------------
+
+
+def limit_facts(source: MachineFile, rated: Ratings, V_m: float) -> dict[str, Scalar]:
+    """Return where a constant machine's field weakening ends: MTPVA at n_max, MTPV, the empty set, the hot magnet.
+
+    Nothing of the currents for a machine with a flux map: its look-up table holds these limits cell by cell.
+    """
+    machine = source.machine
+    facts: dict[str, Scalar] = {}
+    hot = source.limits.T_magnet_max_c
+    if hot is not None:
+        facts["psi_f_at_T_magnet_max_wb"] = flux_at_temperature(machine, hot)
+    if source.flux_map is not None or machine.psi_f_wb <= 0.0:
+        return facts
+    facts["characteristic_current_apk"] = machine.psi_f_wb / machine.L_d_decoupling_h
+    entry = mtpv_entry_rpm(machine, V_m, rated.I_max_apk)
+    facts["mtpv_from_rpm"] = "unreachable: psi/L_d exceeds I_max" if math.isinf(entry) else entry
+    empty = empty_above_rpm(machine, V_m, rated.I_max_apk)
+    facts["field_weakening_empty_above_rpm"] = "never" if math.isinf(empty) else empty
+    top = min(rated.n_max_rpm, MTPVA_SHARE * empty)
+    corner = mtpva(machine, top / RPM * machine.pole_pairs, V_m, rated.I_max_apk)
+    if corner is not None and top > rated.base_speed_rpm:
+        facts |= {"mtpva_speed_rpm": top, "mtpva_i_d_a": corner[0], "mtpva_i_q_a": corner[1]}
+    return facts
+
+
+def mtpv_entry_rpm(machine: MachineParameters, V_m: float, I_max: float) -> float:
+    """Return the speed (rpm) from which on the largest torque needs less than I_max; infinite where it never does.
+
+    The MTPV point moves towards (-psi/L_d, 0) as the speed rises: with psi/L_d >= I_max it stays outside the circle.
+    """
+    if machine.psi_f_wb / machine.L_d_decoupling_h >= I_max:
+        return math.inf
+    low, high = 0.0, 1.0
+    while math.hypot(*mtpv(machine, high, V_m)) > I_max:
+        low, high = high, 2.0 * high
+    return RPM / machine.pole_pairs * _bisected(lambda w: math.hypot(*mtpv(machine, w, V_m)) > I_max, low, high)
+
+
+def empty_above_rpm(machine: MachineParameters, V_m: float, I_max: float) -> float:
+    """Return the speed (rpm) above which no current within I_max needs as little as V_m, R included; infinite for none.
+
+    The set (44) is empty there: field weakening can only hold the current of the smallest voltage.
+    """
+    if machine.psi_f_wb / machine.L_d_decoupling_h <= I_max:
+        return math.inf
+    high = 1.0
+    while _least_voltage(machine, high, I_max) <= V_m:
+        high *= 2.0
+    found = _bisected(lambda w: _least_voltage(machine, w, I_max) <= V_m, 0.5 * high, high)
+    return RPM / machine.pole_pairs * found
+
+
+def _bisected(below: Callable[[float], bool], low: float, high: float) -> float:
+    """Return where a condition that holds at ``low`` ends."""
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if below(middle) else (low, middle)
+    return high
+
+
+def _least_voltage(machine: MachineParameters, omega_e: float, I_max: float) -> float:
+    """Return the smallest steady-state voltage (V) over |i| <= I_max; the minimum lies on the circle or is zero."""
+    R, psi = machine.R_s_ohm, machine.psi_f_wb
+    X_d, X_q = omega_e * machine.L_d_decoupling_h, omega_e * machine.L_q_decoupling_h
+    M = np.array([[R, -X_q], [X_d, R]])
+    c = np.array([0.0, omega_e * psi])
+    gram, pull = M.T @ M, M.T @ c
+
+    def point(ridge: float) -> NDArray[np.float64]:
+        return np.asarray(-np.linalg.solve(gram + ridge * np.eye(2), pull))
+
+    if float(np.hypot(*point(0.0))) <= I_max:
+        return 0.0
+    largest = float(np.hypot(*pull)) / I_max
+    ridge = _bisected(lambda mu: float(np.hypot(*point(mu))) > I_max, 0.0, largest)
+    return float(np.hypot(*(M @ point(ridge) + c)))
+
+
+MTPVA_SHARE = 0.95
+"""The MTPVA point is listed at n_max, or at this share of the speed at which nothing is feasible any more."""
+
+_BISECTIONS = 60
 
 # -- limits of the linear machine without resistance -----------------------------------------------------------
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.design.admissible_set import Horizon, PredictionModel, horizon
+from pmsmtool.design.admissible_set import Horizon, PredictionModel, StateBounds, horizon
 from pmsmtool.design.current_loop import CurrentGains
 from pmsmtool.design.design_file import DesignValue, Scalar
 from pmsmtool.design.lookup_table import RPM
@@ -168,8 +168,31 @@ def design_governor(
     facts: dict[str, Scalar] = {"governor_euler_error_at_n_max": error}
     if found is not None:
         facts |= {"k_max_chosen": _fact(found), "k_max_speed_rpm": rated.n_max_rpm, **listed}
+        facts |= {"k_max_without_steady_state_row": "not finitely determined"}
+        facts |= _bounded_facts(model, source, rated, chosen)
     facts["straight_segment"] = model.has_straight_segment()
     return GovernorDesign(values, facts, _notes(mode, error, chosen, found, model))
+
+
+def _bounded_facts(model: PredictionModel, source: MachineFile, rated: Ratings, eps: float) -> dict[str, Scalar]:
+    """Horizon over the states that occur, |i|, |v| <= I_max and a small zeta, at and above the base speed."""
+    bounds = StateBounds(rated.I_max_apk, ZETA_SHARE * source.inverter.V_max_v)
+    facts: dict[str, Scalar] = {}
+    for share in BOUNDED_SPEEDS:
+        rpm = share * rated.base_speed_rpm
+        if 0.0 < rpm <= rated.n_max_rpm:
+            omega = rpm / RPM * source.machine.pole_pairs
+            facts[f"k_max_bounded_states_at_{rpm:.0f}_rpm"] = _fact(
+                horizon(model, omega, source.inverter.V_max_v, eps, bounds, ROWS_IN_DRIVE)
+            )
+    return facts
+
+
+ZETA_SHARE = 1.0 / 60.0
+"""Bound of |K_i I_e - R i| over V_max in that test: 2 V for the machine of the paper."""
+
+BOUNDED_SPEEDS = (1.0, 1.25)
+"""Speeds of that test over the base speed."""
 
 
 def _fact(found: Horizon) -> Scalar:

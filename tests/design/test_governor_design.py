@@ -6,13 +6,16 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pmsmtool.design.admissible_set import PredictionModel
 from pmsmtool.design.current_loop import imc
 from pmsmtool.design.field_weakening import (
+    empty_above_rpm,
     flux_at_temperature,
     mtpv,
+    mtpv_entry_rpm,
     mtpva,
     overshoot_per_slope,
     ramp_limit_rpm_per_s,
@@ -153,3 +156,61 @@ def test_other_modes_on_request(mode: str) -> None:
     assert bool(design.tables) == (mode == "lookup")
     assert design["governor.mode"] == 2.0
     assert design["governor.eps"] == 0.03
+
+
+TABLE_1 = MachineParameters(P, R, L_D, L_Q, PSI)
+
+
+@pytest.mark.parametrize(
+    ("I_a", "share", "rpm"), [(28.0, 0.92, 770.0), (28.0, 1.0, 837.0), (56.0, 0.92, 945.0), (56.0, 1.0, 1027.0)]
+)
+def test_speed_above_which_no_current_holds_the_voltage(I_a: float, share: float, rpm: float) -> None:
+    """Reference numbers hold for i_q = 0; a little negative i_q needs still less voltage, up to 0.8 % of the speed."""
+    found = empty_above_rpm(TABLE_1, share * V_MAX, I_a)
+    assert rpm - 1.0 <= found <= 1.009 * rpm
+    angle = np.linspace(0.0, 2.0 * math.pi, 20001)
+    i_d, i_q = I_a * np.cos(angle), I_a * np.sin(angle)
+
+    def least(speed: float) -> float:
+        w = speed * P * math.pi / 30.0
+        return float(np.hypot(R * i_d - w * L_Q * i_q, R * i_q + w * (L_D * i_d + PSI)).min())
+
+    assert least(0.9999 * found) <= share * V_MAX <= least(1.0001 * found)
+
+
+def test_a_machine_that_can_cancel_its_magnet_has_no_such_speed_but_an_mtpv_entry() -> None:
+    assert empty_above_rpm(MTPV_MACHINE, 100.0, 150.0) == math.inf
+    entry = mtpv_entry_rpm(MTPV_MACHINE, 100.0, 150.0)
+    assert math.hypot(*mtpv(MTPV_MACHINE, entry * P * math.pi / 30.0, 100.0)) == pytest.approx(150.0, rel=1e-9)
+    assert mtpv_entry_rpm(TABLE_1, 0.92 * V_MAX, 56.0) == math.inf
+
+
+def test_tune_says_where_the_machine_ends_and_how_hot_magnets_are() -> None:
+    facts = tune(load_machine_file(PROFILES / "jercic-2017.toml")).facts
+    assert facts["mtpv_from_rpm"] == "unreachable: psi/L_d exceeds I_max"
+    assert facts["characteristic_current_apk"] == pytest.approx(178.0, abs=0.5)
+    assert facts["field_weakening_empty_above_rpm"] == pytest.approx(951.8, abs=0.1)
+    assert math.hypot(float(facts["mtpva_i_d_a"]), float(facts["mtpva_i_q_a"])) == pytest.approx(56.0)
+    assert facts["mtpva_speed_rpm"] == pytest.approx(0.95 * 951.8, abs=0.1)
+    assert facts["psi_f_at_T_magnet_max_wb"] == pytest.approx(PSI * (1.0 - 0.0012 * 100.0))
+    other = tune(load_machine_file(PROFILES / "mtpv-test.toml")).facts
+    assert other["field_weakening_empty_above_rpm"] == "never"
+    assert float(other["mtpv_from_rpm"]) > 0.0
+
+
+def test_the_paper_mode_reports_its_horizon_over_speed_eps_and_bounds() -> None:
+    source = load_machine_file(PROFILES / "jercic-2017.toml")
+    facts = tune(source, TuneRequest(governor="paper", bandwidth_hz=4000.0 / (2.0 * math.pi), eps=1e-3)).facts
+    assert [facts[f"k_max_eps_{eps}"] for eps in ("0.1", "0.01", "0.001")] == [18, 24, 34]
+    assert facts["k_max_without_steady_state_row"] == "not finitely determined"
+    assert facts["k_max_bounded_states_at_620_rpm"] == pytest.approx(14, abs=2)
+    assert 14 < int(facts["k_max_bounded_states_at_775_rpm"]) <= 34
+
+
+def test_no_tightening_is_not_finitely_determined_whatever_the_tolerance_says() -> None:
+    source = load_machine_file(PROFILES / "jercic-2017.toml")
+    request = TuneRequest(governor="paper", method="second-order", bandwidth_hz=2000.0 / (2.0 * math.pi), eps=0.0)
+    design = tune(source, request)
+    assert str(design.facts["k_max_chosen"]).startswith("not finitely determined")
+    assert design["governor.k_max"] == 255.0
+    assert any("not finitely determined" in note for note in design.notes)
