@@ -107,7 +107,6 @@ class FluxMapResult:
             **{f"{name}_std_h": self.L_std_h[k] for k, name in enumerate(names)},
         }
 
-
     def at_rated_current(self, pole_pairs: int, I_apk: float) -> dict[str, Estimate]:
         """Return incremental and apparent inductances (H) at the largest torque of a current, by machine-file key.
 

@@ -32,8 +32,8 @@ STEPS_LEFT = 0.6
 ROUNDING = 1e-6
 """Of an angle recorded in binary32, as a second difference of the electrical angle."""
 KNEES = (0.5, 1.0, 2.0)
-"""Further shapes of the inverter's error, a ramp to a plateau each: knees in steps of the current between two samples. A
-fast current, with the ripple of a high duty ratio, rounds the curve that was measured at rest."""
+"""Further shapes of the inverter's error, a ramp to a plateau each: knees in steps of the current between two samples.
+A fast current, with the ripple of a high duty ratio, rounds the curve that was measured at rest."""
 NUISANCES = ("R_ohm", "inverter", *(f"ramp_{knee:g}_v" for knee in KNEES), "delay_s")
 """Columns behind the spline coefficients."""
 

@@ -42,6 +42,8 @@ SPEED_SHARE = 0.9
 COEFFICIENTS = 360
 """Of the spline, for the deviation predicted before the pulses."""
 HELD_FALLBACK = "psi_f of the drive's parameter set: a held rotor shows increments of flux only"
+CORRECTION_STD = 0.2
+"""Standard deviation of what the map takes psi_f back to zero current by, of that correction: its curvature there."""
 DEVIATION_LIMIT = 0.005
 """Largest rms deviation of the identified fluxes, of their range. Measured: 0.0006."""
 
@@ -165,7 +167,7 @@ def map_estimates(result: Evaluation, flux_map: FluxMapResult, traces: Mapping[s
     found = {name: replace(estimate, fallback=fallback) for name, estimate in found.items()}
     if result.flux is not None:
         psi_f = float(flux_map.flux_map.flux(0.0, 0.0)[0])
-        std = float(flux_map.fit.flux_std(np.zeros(1), np.zeros(1))[0, 0])
+        std = math.hypot(result.flux.psi_f.std, CORRECTION_STD * (psi_f - result.flux.psi_f.value))
         method = f"{result.flux.psi_f.method}, at zero current by the flux map"
         found["psi_f_wb"] = replace(result.flux.psi_f, value=psi_f, std=std, method=method)
     return found
