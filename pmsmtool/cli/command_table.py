@@ -53,6 +53,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("lss", "pmsmtool.cli.lss:lss_command", Section.WRITE, "Give node ids to nodes without one."),
     Row("stop", "pmsmtool.cli.stop:stop_command", Section.MOVE, "Stop a drive, confirmed."),
     Row("identify", "pmsmtool.cli.identify:identify_command", Section.MOVE, "Measure the machine on its drive."),
+    Row("track", "pmsmtool.cli.track:track_command", Section.LOOK, "Follow R and psi while the machine runs."),
     Row("jog", "pmsmtool.cli.jog:jog_command", Section.MOVE, "Move shortly, within limits."),
     Row("prove", "pmsmtool.cli.prove:prove_command", Section.MOVE, "Show that the machine does what was designed."),
     Row("param", "pmsmtool.cli.param:param_command", Section.WRITE, "Read, write, compare parameters."),

@@ -1,0 +1,151 @@
+"""``pmsmtool track``: resistance and flux linkage of a machine in operation, followed over time."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pmsmtool.cli.options import FREQUENCY, TIME, BusOptions, bus_options, examples, output_options
+from pmsmtool.cli.output import Output
+
+if TYPE_CHECKING:
+    from pmsmtool.estimators.tracking_model import Known
+    from pmsmtool.machine.machine_file import MachineFile
+    from pmsmtool.workflow.run_directory import RunDirectory
+    from pmsmtool.workflow.track import Tracked
+
+FOLDER = click.Path(file_okay=False, path_type=Path)
+QUANTITIES = {"R": "R_s_ohm", "psi": "psi_f_wb"}
+
+
+@click.command(
+    "track",
+    epilog=examples(
+        "pmsmtool -n 5 track --machine runs/last/machine.toml --for 60s",
+        "pmsmtool -n 5 track psi --by trace --for 20s --json",
+        "pmsmtool track --replay runs/20260101T120000Z-000055f1",
+    ),
+)
+@click.argument("quantities", nargs=-1, metavar="[R|psi]...", type=click.Choice(list(QUANTITIES)))
+@click.option("--machine", type=click.Path(exists=True, path_type=Path), help="Machine file, design or run directory; "
+              "default: what the drive holds.")  # fmt: skip
+@click.option("--for", "seconds", type=TIME, default="10s", help="How long.")
+@click.option("--by", type=click.Choice(["pdo", "trace"]), default="pdo", help="Process data, or recordings.")
+@click.option("--rate", "rate_hz", type=FREQUENCY, default="100Hz", help="Process data per second.")
+@click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="From the traces of a run; asks no drive.")
+@click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
+@bus_options
+@output_options
+def track_command(
+    bus: BusOptions,
+    out: Output,
+    quantities: tuple[str, ...],
+    machine: Path | None,
+    seconds: float,
+    by: str,
+    rate_hz: float,
+    replay: Path | None,
+    runs: Path,
+) -> None:
+    """Follow R(T) and psi(T) while somebody else runs the machine; nothing is commanded.
+
+    The values, their statistical and systematic intervals and the temperatures they mean are printed. What the
+    operating points do not show is refused by name (exit code 6): R needs current, psi needs speed, both need change.
+    """
+    from pmsmtool.workflow.track import follow, track_stage
+
+    wanted = tuple(QUANTITIES[name] for name in dict.fromkeys(quantities or QUANTITIES))
+    if replay is not None:
+        observations, known, described, run = _stored(replay, machine)
+        found = follow(observations, known, described, wanted)
+    else:
+        observations, known, described, run = _observed(bus, out, machine, seconds, by, rate_hz, runs)
+        found = follow(observations, known, described, wanted)
+        run.add(track_stage(found, wanted, described))
+    _show(run, found, wanted, out)
+
+
+def _stored(replay: Path, machine: Path | None) -> tuple[Any, Known, MachineFile, RunDirectory]:
+    from pmsmtool.design.design_file import load_machine_or_design
+    from pmsmtool.workflow.run_directory import RunDirectory
+    from pmsmtool.workflow.track import KNOWN, known_of, load_known, replay_observations
+
+    run = RunDirectory(replay)
+    run.read()
+    described, _ = load_machine_or_design(machine or replay / "machine.toml")
+    kept = replay / KNOWN
+    known = load_known(kept) if kept.is_file() and machine is None else known_of(described, compensated=False)
+    return replay_observations(run), known, described, run
+
+
+def _observed(
+    bus: BusOptions, out: Output, machine: Path | None, seconds: float, by: str, rate_hz: float, runs: Path
+) -> tuple[Any, Known, MachineFile, RunDirectory]:
+    from pmsmtool.cli.drive_access import open_drive
+    from pmsmtool.machine.machine_file import dump_machine_file
+    from pmsmtool.workflow.commission import begin_run
+    from pmsmtool.workflow.identify import nameplate_of
+    from pmsmtool.workflow.track import keep, known_of, observe_process_data, observe_recordings
+
+    with open_drive(bus) as drive:
+        described = _described(machine) if machine else nameplate_of(drive, drive.identity.name or "drive")
+        known = known_of(described, compensated=drive.read("inverter.deadtime_compensation") != 0.0)
+        if by == "pdo":
+            observations = observe_process_data(drive.node, seconds, rate_hz, out.detail)
+        else:
+            observations = observe_recordings(drive, seconds, out.detail)
+        recorded = {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate}
+        run = begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=recorded)
+    run.save("machine.toml", dump_machine_file(described))
+    keep(run, observations, known)
+    return observations, known, described, run
+
+
+def _described(path: Path) -> MachineFile:
+    from pmsmtool.design.design_file import load_machine_or_design
+
+    return load_machine_or_design(path / "machine.toml" if path.is_dir() else path)[0]
+
+
+def _show(run: RunDirectory, found: Tracked, wanted: tuple[str, ...], out: Output) -> None:
+    from pmsmtool.cli.output import table
+    from pmsmtool.report.report import total_interval
+    from pmsmtool.units import format_estimate, format_quantity
+
+    units = {"R_s_ohm": "ohm", "psi_f_wb": "Wb"}
+    path = found.track
+    rows = []
+    for name in wanted:
+        value, std = float(path.value[name][-1]), float(path.std[name][-1])
+        systematic = found.systematic[name]
+        first, least = float(path.value[name][len(path.t_s) // 4]), format_quantity(1.96 * std, units[name], 2)
+        rows.append(
+            (
+                name,
+                format_estimate(value, total_interval(std, systematic), units[name]),
+                least,
+                format_quantity(systematic, units[name], 2),
+                f"{100.0 * (value / first - 1.0):+.2f} %",
+            )
+        )
+    for name, (value, std) in found.temperatures.items():
+        rows.append((name, f"{value:.1f} +- {1.96 * std:.1f} degC", "", "", ""))
+    data = {
+        "run": run.path,
+        "t_s": path.t_s,
+        "values": {
+            name: {"value": path.value[name], "std": path.std[name], "systematic": found.systematic[name]}
+            for name in wanted
+        },
+        "temperatures": {name: {"value": v, "std": s} for name, (v, s) in found.temperatures.items()},
+        "innovation": {"nis": path.nis, "inflation": path.inflation, "restarts": path.restarts},
+        "notes": list(path.notes),
+    }
+    heads = ("quantity", "at the end, total 95 %", "statistical", "systematic", "since a quarter")
+    out.result("track", data, lambda: table(heads, rows))
+    for line in path.notes:
+        out.warn(line)
+    out.note(f"-> {run.path}")

@@ -1,0 +1,160 @@
+"""The machine in steady operation as the tracking filter sees it: observations, and the voltages they should show.
+
+Observation k is a window in which the machine ran steadily (s = sinc(omega T_s / 2), the exact sampled-data factor of
+a drive that advances its voltage, identification reference 3.4):
+
+    u_d = R i_d - s omega L_q i_q + k e_d + L_d di_d/dt
+    u_q = R i_q + s omega (psi + L_d i_d) + k e_q + L_q di_q/dt
+
+e is the inverter's mean error of the identified curve, of which the recorded voltage contains the share k.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.flux_linkage import mean_inverter_error
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.trace import Trace
+
+Array = NDArray[np.float64]
+
+SIGNALS = ("u_d_v", "u_q_v", "i_d_a", "i_q_a", "omega_e_rad_s")
+"""What an observation is made of; ``T_winding_c`` is kept beside it where it is recorded."""
+STATES = ("R_s_ohm", "psi_f_wb", "inverter error", "L_d_h", "L_q_h")
+TRACKED = ("R_s_ohm", "psi_f_wb")
+
+PRIOR = {"R_s_ohm": 0.30, "psi_f_wb": 0.10}
+"""Relative standard deviation at the start: what the temperature may have done since identification."""
+INDUCTANCE_STD = 0.02
+"""Least relative standard deviation of an inductance away from its bias point."""
+STEADY = 0.05
+"""Largest change of a current or the speed within a window, of the largest there is: transients are left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What is known of the machine before.
+
+    Attributes
+    ----------
+    R_s_ohm, psi_f_wb, L_d_h, L_q_h : float
+        Values to start from; inductances are apparent ones.
+    L_std : tuple of float
+        Relative standard deviations of the inductances.
+    T_s : float
+        Control period (s).
+    curve : InverterCurve or None
+        Error of one phase.
+    error_share : tuple of float
+        Mean and standard deviation of the part of the curve that the recorded voltage contains: (1, 0.1) without
+        a compensation, (0, 0.2) when the drive compensates it.
+    """
+
+    R_s_ohm: float
+    psi_f_wb: float
+    L_d_h: float
+    L_q_h: float
+    T_s: float
+    L_std: tuple[float, float] = (INDUCTANCE_STD, INDUCTANCE_STD)
+    curve: InverterCurve | None = None
+    error_share: tuple[float, float] = (1.0, 0.1)
+
+    @property
+    def scale(self) -> Array:
+        """Unit of each state."""
+        return np.array([self.R_s_ohm, self.psi_f_wb, 1.0, self.L_d_h, self.L_q_h])
+
+    @property
+    def start(self) -> Array:
+        """States at the start, in their units."""
+        return np.array([1.0, 1.0, self.error_share[0], 1.0, 1.0])
+
+    @property
+    def start_std(self) -> Array:
+        """Their standard deviations."""
+        return np.array([PRIOR["R_s_ohm"], PRIOR["psi_f_wb"], max(self.error_share[1], 1e-6), *self.L_std])
+
+
+# ---- observations ---------------------------------------------------------------------------------------------
+
+
+def condense(trace: Trace, rows: int) -> Trace:
+    """Return means over windows of ``rows``, of the windows in which nothing was limited and the machine ran steadily.
+
+    Raises
+    ------
+    ValueError
+        The trace lacks a signal of :data:`SIGNALS`.
+    """
+    missing = [name for name in SIGNALS if name not in trace.signals]
+    if missing:
+        raise ValueError(f"the trace has no {', '.join(missing)}")
+    count = len(trace) // rows
+    names = [*SIGNALS, *(["T_winding_c"] if "T_winding_c" in trace.signals else [])]
+    blocks = {name: trace[name][: count * rows].reshape(count, rows) for name in names}
+    keep = np.ones(count, dtype=bool)
+    if "flags" in trace.signals:
+        keep &= ~np.any(trace["flags"][: count * rows].reshape(count, rows) != 0.0, axis=1)
+    keep &= _steady(blocks)
+    means = {name: block.mean(axis=1)[keep] for name, block in blocks.items()}
+    means |= {f"{axis}_rise_a": _rise(blocks[f"i_{axis}_a"])[keep] for axis in "dq"}
+    times = trace.t_s[: count * rows].reshape(count, rows).mean(axis=1)[keep]
+    units = {name: trace.units[name] for name in names} | {"d_rise_a": "A", "q_rise_a": "A"}
+    return Trace(times, means, units, {**trace.meta, "window_s": rows * trace.period_s})
+
+
+def _steady(blocks: Mapping[str, Array]) -> NDArray[np.bool_]:
+    """Whether currents and speed changed little within each window, and from the window before."""
+    largest = float(np.max(np.abs(np.hypot(blocks["i_d_a"].mean(axis=1), blocks["i_q_a"].mean(axis=1))), initial=0.0))
+    fastest = float(np.max(np.abs(blocks["omega_e_rad_s"].mean(axis=1)), initial=0.0))
+    calm = np.ones(len(blocks["i_d_a"]), dtype=bool)
+    for name, scale in (("i_d_a", largest), ("i_q_a", largest), ("omega_e_rad_s", fastest)):
+        change = np.abs(_rise(blocks[name]))
+        calm &= change <= STEADY * scale
+        calm[1:] &= change[:-1] <= STEADY * scale
+    return calm
+
+
+def _rise(block: Array) -> Array:
+    """Rise of a current over its window (A), from the means of its halves."""
+    half = max(1, block.shape[1] // 2)
+    return np.asarray(2.0 * (block[:, -half:].mean(axis=1) - block[:, :half].mean(axis=1)))
+
+
+def inputs(observations: Trace, known: Known) -> Array:
+    """Columns i_d, i_q, s omega, e_d, e_q and the inductive voltages per henry, shape (n, 7)."""
+    i_d, i_q, omega = (observations[name] for name in ("i_d_a", "i_q_a", "omega_e_rad_s"))
+    e_d = e_q = np.zeros_like(i_d)
+    if known.curve is not None:
+        e_d, e_q = mean_inverter_error(known.curve, i_d, i_q)
+    window = float(observations.meta.get("window_s", 0.0))
+    rises = [
+        observations[f"{axis}_rise_a"] / window if window and f"{axis}_rise_a" in observations.signals else 0.0 * i_d
+        for axis in "dq"
+    ]
+    return np.column_stack([i_d, i_q, omega * np.sinc(omega * known.T_s / (2.0 * np.pi)), e_d, e_q, *rises])
+
+
+def model_voltage(x: Array, given: Array, scale: Array) -> Array:
+    """Voltages of the model (V), shape (2,)."""
+    R, psi, k, L_d, L_q = x * scale
+    i_d, i_q, omega, e_d, e_q, rise_d, rise_q = given
+    return np.array(
+        [
+            R * i_d - omega * L_q * i_q + k * e_d + L_d * rise_d,
+            R * i_q + omega * (psi + L_d * i_d) + k * e_q + L_q * rise_q,
+        ]
+    )
+
+
+def model_slopes(given: Array, scale: Array) -> Array:
+    """Derivative of the voltages with respect to the states, shape (2, 5); the model is linear in them."""
+    i_d, i_q, omega, e_d, e_q, rise_d, rise_q = given
+    d = np.array([i_d, 0.0, e_d, rise_d, -omega * i_q])
+    q = np.array([i_q, omega, e_q, omega * i_d, rise_q])
+    return np.asarray(np.stack([d, q]) * scale)

@@ -1,0 +1,321 @@
+"""Follow R(T) and psi(T) of a machine in operation: observations from the drive or from stored traces, then the filter.
+
+Tracking commands nothing. By process data it borrows transmit PDOs, by trace it uses the drive's recorder; what either
+of them was is brought back. A run keeps the observations and what was known, so that a replay gives the same numbers.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pmsmtool.drive import objects
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.interruption import interrupts_deferred
+from pmsmtool.drive.objects import signal_unit
+from pmsmtool.drive.process_data import live_values
+from pmsmtool.errors import ConfigError
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.tracking import Track, track
+from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, SIGNALS, TRACKED, Known, condense
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import trace_npz
+from pmsmtool.workflow.identify import stored_traces
+from pmsmtool.workflow.run_directory import RunDirectory, Stage
+
+NAMES = (*SIGNALS, "T_winding_c")
+"""What is asked of the drive: as much as three process data objects hold."""
+OBSERVATIONS, KNOWN = "track", "track.json"
+SAMPLES_PER_WINDOW = 4
+"""Process data that make one observation."""
+RECORD_ROWS, RECORD_WINDOWS = 1024, 4
+"""Rows of one recording, and observations that it makes."""
+RECORD_S = 0.2
+"""Time of one recording (s)."""
+REPLAY_ROWS = 16
+"""Rows of a stored fast trace that make one observation."""
+SAY_S = 1.0
+KNEE_POINTS = 64
+
+Say = Callable[[str], None]
+
+
+def known_of(machine: MachineFile, *, compensated: bool) -> Known:
+    """Return what a machine file knows before tracking.
+
+    Parameters
+    ----------
+    machine : MachineFile
+        As identified.
+    compensated : bool
+        Whether the drive compensates the inverter's error, so that the recorded voltage does not contain it.
+    """
+    values, inverter = machine.machine, machine.inverter
+    L = {"L_d_h": values.L_d_decoupling_h, "L_q_h": values.L_q_decoupling_h}
+    std = [max(INDUCTANCE_STD, _total_std(machine, name) / value) for name, value in L.items()]
+    curve, doubt = _curve(machine)
+    return Known(
+        values.R_s_ohm, values.psi_f_wb, L["L_d_h"], L["L_q_h"], inverter.T_s, (std[0], std[1]), curve,
+        (0.0, 2.0 * doubt) if compensated else (1.0, doubt),
+    )  # fmt: skip
+
+
+def _total_std(machine: MachineFile, name: str) -> float:
+    """Standard deviation with the systematic part, which is a 95 % half width."""
+    return math.hypot(machine.std.get(name, 0.0), machine.systematic.get(name, 0.0) / 1.96)
+
+
+def _curve(machine: MachineFile) -> tuple[InverterCurve | None, float]:
+    """Return the inverter's error and the relative doubt of its size."""
+    inverter = machine.inverter
+    if inverter.voltage_error_i_apk:
+        i, u = np.array(inverter.voltage_error_i_apk), np.array(inverter.voltage_error_v)
+        positive = i > 0.0
+        return InverterCurve(i[positive], u[positive], 0.0), 0.1
+    plateau, doubt = inverter.V_dead_v, 0.2
+    if plateau is None:
+        plateau, doubt = inverter.U_dc_v * inverter.dead_time_s / inverter.T_s, 0.5
+    if plateau <= 0.0:
+        return None, 0.1
+    largest = machine.machine.I_max_apk or machine.machine.I_nom_apk or 1.0
+    knee = inverter.i_knee_apk or 0.02 * largest
+    i = np.linspace(0.0, largest, KNEE_POINTS + 1)[1:]
+    return InverterCurve(i, plateau * np.tanh(i / knee), 0.0), doubt
+
+
+# ---- observations from the drive -----------------------------------------------------------------------------
+
+
+def observe_process_data(node: DriveNode, seconds: float, rate_hz: float, say: Say = lambda text: None) -> Trace:
+    """Collect what the drive sends by itself, ``rate_hz`` times a second.
+
+    Raises
+    ------
+    NotAvailable
+        The drive cannot send these quantities.
+    ConfigError
+        Nothing arrived.
+    """
+    clock = node.connection.clock
+    rows: list[tuple[float, ...]] = []
+    with live_values(node, NAMES, 1.0 / rate_hz) as live:
+        start, told = clock.now(), 0.0
+        while (t := clock.now() - start) < seconds:
+            node.connection.wait(1.0 / rate_hz)
+            node.supervision.check()
+            if len(live.values) == len(NAMES):
+                rows.append((clock.now() - start, *(live.values[name] for name in NAMES)))
+            if t - told >= SAY_S:
+                told = t
+                say(f"{t:.0f} s, {len(rows)} samples")
+    if not rows:
+        raise ConfigError("no process data arrived", hint="a lower --rate, or --by trace")
+    table = np.array(rows).T
+    _, first = np.unique(table[0], return_index=True)
+    columns = {name: table[k][first] for k, name in enumerate(NAMES, 1)}
+    sampled = Trace(table[0][first], columns, {name: signal_unit(name) for name in NAMES}, {})
+    return condense(sampled, SAMPLES_PER_WINDOW)
+
+
+def observe_recordings(drive: CanopenDrive, seconds: float, say: Say = lambda text: None) -> Trace:
+    """Collect recordings of the drive's trace recorder, one after the other; its set-up is brought back.
+
+    Raises
+    ------
+    NotAvailable
+        The drive has no recorder, or not these signals.
+    """
+    clock = drive.node.connection.clock
+    decimation = max(1, round(RECORD_S / (RECORD_ROWS * drive.period_s)))
+    parts: list[Trace] = []
+    with _recorder_kept(drive):
+        start, told = clock.now(), 0.0
+        while (t := clock.now() - start) < seconds:
+            record = drive.record((*NAMES, "flags"), RECORD_ROWS, decimation=decimation)
+            shifted = Trace(record.t_s - record.t_s[0] + t, record.signals, record.units, record.meta)
+            parts.append(condense(shifted, RECORD_ROWS // RECORD_WINDOWS))
+            if t - told >= SAY_S:
+                told = t
+                say(f"{t:.0f} s, {sum(map(len, parts))} observations")
+    return joined(parts)
+
+
+@contextmanager
+def _recorder_kept(drive: CanopenDrive) -> Iterator[None]:
+    """Note the recorder's set-up and bring it back."""
+    kept = (
+        *objects.TRACE_CHANNELS,
+        objects.TRACE_DECIMATION,
+        objects.TRACE_PRETRIGGER,
+        objects.TRACE_DEPTH,
+        objects.TRACE_TRIGGER,
+    )
+    drive.recorder.forget()
+    before = [(item, drive.node.whole(item)) for item in kept]
+    try:
+        yield
+    finally:
+        with interrupts_deferred() as noted:
+            drive.node.put(objects.TRACE_PRETRIGGER, 0)
+            for item, value in sorted(before, key=lambda pair: pair[0] is objects.TRACE_PRETRIGGER):
+                drive.node.put(item, value)
+            drive.recorder.forget()
+        if noted:
+            raise KeyboardInterrupt
+
+
+# ---- observations from stored traces ----------------------------------------------------------------------------
+
+
+def replay_observations(run: RunDirectory) -> Trace:
+    """Return the observations that a run's traces hold: its own, or those of identification's pushes and speeds.
+
+    Raises
+    ------
+    ConfigError
+        The run holds no trace with voltages, currents and speed in the rotor's frame.
+    """
+    traces = stored_traces(run)
+    if OBSERVATIONS in traces:
+        return traces[OBSERVATIONS]
+    parts = []
+    for name, trace in sorted(traces.items()):
+        if all(signal in trace.signals for signal in SIGNALS) and "fixed_angle_rad" not in trace.meta:
+            parts.append(condense(trace, REPLAY_ROWS) if name != "speeds" else trace)
+    if not parts:
+        raise ConfigError(
+            "no trace of the run has voltages, currents and speed while the machine turned",
+            where=str(run.path),
+            hint="give a run of track, identify or commission",
+        )
+    return joined(parts)
+
+
+def joined(parts: Sequence[Trace]) -> Trace:
+    """Return observations one after the other, each part from where the last one ended, unless it starts later."""
+    times, last = [], -math.inf
+    for part in parts:
+        if not len(part):
+            continue
+        step = part.period_s if len(part) > 1 else 1.0
+        start = max(float(part.t_s[0]), last + step) if math.isfinite(last) else float(part.t_s[0])
+        times.append(part.t_s - part.t_s[0] + start)
+        last = float(times[-1][-1])
+    filled = [part for part in parts if len(part)]
+    names = [name for name in (*NAMES, "d_rise_a", "q_rise_a") if all(name in part.signals for part in filled)]
+    if not filled:
+        return Trace(np.zeros(0), {name: np.zeros(0) for name in SIGNALS}, {n: signal_unit(n) for n in SIGNALS}, {})
+    windows = {float(part.meta.get("window_s", 0.0)) for part in filled}
+    if len(windows) > 1:  # rises over windows of different lengths are no common column
+        names = [name for name in names if not name.endswith("_rise_a")]
+    return Trace(
+        np.concatenate(times),
+        {name: np.concatenate([part[name] for part in filled]) for name in names},
+        {name: filled[0].units[name] for name in names},
+        {"window_s": windows.pop()} if len(windows) == 1 else {},
+    )
+
+
+# ---- the result ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """A track with what it says of the temperatures.
+
+    Attributes
+    ----------
+    track : Track
+        R and psi over time.
+    temperatures : mapping of str to (value, std)
+        ``T_winding_c`` from R and ``T_magnet_c`` from psi at the end (degC), with the doubt of the identified values.
+    systematic : mapping of str to float
+        95 % half widths that the sensors' scales leave, as identification states them.
+    sensor_c : float
+        Mean reading of the winding's sensor (degC); NaN without one.
+    """
+
+    track: Track
+    temperatures: dict[str, tuple[float, float]]
+    systematic: dict[str, float]
+    sensor_c: float
+
+
+def follow(observations: Trace, known: Known, machine: MachineFile, wanted: Sequence[str] = TRACKED) -> Tracked:
+    """Run the filter and add the temperatures.
+
+    Raises
+    ------
+    IdentificationError
+        As :func:`pmsmtool.estimators.tracking.track`.
+    """
+    found = track(observations, known, wanted)
+    values = machine.machine
+    share = 1.0 if values.R_winding_ohm is None else min(1.0, values.R_winding_ohm / values.R_s_ohm)
+    temperatures = {}
+    for name, quantity, alpha in (
+        ("T_winding_c", "R_s_ohm", values.alpha_R_per_k * share),
+        ("T_magnet_c", "psi_f_wb", values.alpha_psi_per_k),
+    ):
+        reference = {"R_s_ohm": values.R_s_ohm, "psi_f_wb": values.psi_f_wb}[quantity]
+        if quantity in wanted and alpha != 0.0:
+            relative = float(found.value[quantity][-1]) / reference - 1.0
+            std = math.hypot(float(found.std[quantity][-1]), machine.std.get(quantity, 0.0)) / reference
+            temperatures[name] = (values.T_ref_c + relative / alpha, abs(std / alpha))
+    sensor = float(np.mean(observations["T_winding_c"])) if "T_winding_c" in observations.signals else math.nan
+    systematic = {name: machine.systematic.get(name, 0.0) for name in wanted}
+    return Tracked(found, temperatures, systematic, sensor)
+
+
+def keep(run: RunDirectory, observations: Trace, known: Known) -> None:
+    """Store what a replay needs."""
+    run.save(f"traces/{OBSERVATIONS}.npz", trace_npz(observations))
+    run.save(KNOWN, dump_known(known))
+
+
+def dump_known(known: Known) -> str:
+    """Return what was known as JSON."""
+    facts = asdict(known)
+    if known.curve is not None:
+        facts["curve"] = {"i_phase_a": known.curve.i_phase_a.tolist(), "u_error_v": known.curve.u_error_v.tolist()}
+    return json.dumps(facts, indent=1) + "\n"
+
+
+def load_known(path: Path) -> Known:
+    """Read what :func:`dump_known` wrote; raises ``ConfigError`` when it is damaged."""
+    try:
+        facts: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        curve = facts.pop("curve")
+        if curve is not None:
+            curve = InverterCurve(np.array(curve["i_phase_a"]), np.array(curve["u_error_v"]), 0.0)
+        (L_std_d, L_std_q), (share, share_std) = facts.pop("L_std"), facts.pop("error_share")
+        numbers = {name: float(value) for name, value in facts.items()}
+        return Known(**numbers, curve=curve, L_std=(L_std_d, L_std_q), error_share=(share, share_std))
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ConfigError(f"cannot be read: {error}", where=str(path)) from error
+
+
+def track_stage(found: Tracked, wanted: Sequence[str], machine: MachineFile) -> Stage:
+    """Return the record of a track: the values at its end."""
+    track_ = found.track
+    values = [
+        {
+            "name": name, "value": float(track_.value[name][-1]), "std": float(track_.std[name][-1]),
+            "systematic": found.systematic[name], "unit": {"R_s_ohm": "ohm", "psi_f_wb": "Wb"}[name],
+            "n": len(track_.t_s), "T_c": found.sensor_c if math.isfinite(found.sensor_c) else None,
+            "method": "unscented Kalman filter", "source": "pmsmtool",
+        }
+        for name in wanted
+    ]  # fmt: skip
+    text = f"{len(track_.t_s)} observations over {track_.t_s[-1] - track_.t_s[0]:.3g} s, innovations {track_.nis:.2g}"
+    files = {f"traces/{OBSERVATIONS}.npz": "", KNOWN: ""}
+    return Stage("track", "pass", 0.0, values=values, fallbacks=track_.notes, files=files, summary=text)
