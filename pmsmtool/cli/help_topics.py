@@ -50,9 +50,12 @@ FILES = """\
 machine file     profiles/*.toml, machine.toml  the machine and its inverter, SI with the unit in the key (R_s_ohm);
                                                 its keys: help machine-file, help simulation
 flux map         .npz .mat .csv                 grids of i_d, i_q (A peak) and psi_d, psi_q (Wb)
+iron-loss map    .npz                           axes i_d_a, i_q_a and grids c_h_w_per_hz, c_e_w_per_hz2 over them:
+                                                P_fe = c_h f + c_e f^2, f the electrical frequency (Hz)
 design file      design.toml                    gains and limits with their margins; the machine is embedded
 parameter set    params.toml                    catalogue name and SI value; what is written to a drive
-look-up table    .npz .csv                      i_d, i_q over torque and speed; which limit binds, and by how much
+look-up table    .npz .csv                      i_d, i_q over torque and speed; which limit binds, and by how much;
+                                                flash-params and export take the .npz
 scenario         .toml                          what happens in a simulation (help scenario)
 trace            .npz .csv                      named signals over t_s; the second CSV row holds the units
 run directory    runs/<utc>-<serial>/           run.json, traces/, and the files above, as a commissioning leaves them

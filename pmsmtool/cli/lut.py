@@ -23,6 +23,7 @@ _TEMPERATURE = Quantity("temperature")
     epilog=examples(
         "pmsmtool lut design.toml -o lut.npz",
         "pmsmtool lut machine.toml -o lut.npz --torque-points 100 --speed-points 100 --plot lut.svg",
+        "pmsmtool lut machine.toml -o lut.npz && pmsmtool -n 5 flash-params lut.npz",
         "pmsmtool lut machine.toml -o hot.npz --winding 140degC --magnet 110degC --u-dc 480V --u-dc 540V",
     ),
 )
@@ -34,7 +35,9 @@ _TEMPERATURE = Quantity("temperature")
 @click.option("--torque-bound", type=float, default=0.01, metavar="RATIO", help="Torque error between nodes / T_max.")
 @click.option("--voltage-bound", type=float, default=0.01, metavar="RATIO", help="Voltage excess there / limit.")
 @click.option("--stored", type=click.Choice(["auto", "float32", "int16"]), default="auto", help="Format in the drive.")
-@click.option("--u-dc", "U_dc_v", type=Quantity("voltage"), multiple=True, help="DC-link voltage; several: an axis.")
+@click.option(
+    "--u-dc", "U_dc_v", type=Quantity("voltage"), multiple=True, help="DC-link voltage; several: an axis, refined."
+)
 @click.option("--winding", "T_winding_c", type=_TEMPERATURE, help="Winding temperature, e.g. 140degC.")
 @click.option("--magnet", "T_magnet_c", type=_TEMPERATURE, help="Magnet temperature.")
 @click.option("--n-max", "n_max_rpm", type=Quantity("rpm"), help="Largest speed, e.g. 3000rpm.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,6 @@ IN_PROCESS = 20_000
 @click.command(
     "margins",
     epilog=examples(
-        "pmsmtool margins design.toml",
         "pmsmtool margins design.toml --monte-carlo 100000 --phase-margin-deg 40",
         "pmsmtool margins design.toml --monte-carlo 1000000 --scheduler tcp://10.0.0.5:8786",
         "pmsmtool margins design.toml --simulate 256 --scenario load-step --current-headroom -0.05",
@@ -138,13 +137,15 @@ def _failed(simulated: SimulatedMargins | None) -> list[str]:
 def _lines(report: MarginReport, simulated: SimulatedMargins | None) -> Iterator[str]:
     yield f"loop margins over {report.corners} corners" + (f" and {report.samples} samples" if report.samples else "")
     yield from _table(report.loops)
+    phase = min((s for s in report.loops if s.name.endswith("_phase")), key=lambda s: s.worst)
+    yield f"worst {phase.name}: {_sample(phase.worst_sample)}"
     yield ""
     yield "limit headroom of the references for the nominal machine (1: nothing needed, 0: at the limit)"
     yield from _table(report.headroom)
     for name in ("headroom_voltage", "headroom_current"):
         spread = next(s for s in report.headroom if s.name == name)
         if spread.worst < 0.0:
-            yield f"worst {name}: {spread.worst_cell}"
+            yield f"worst {name}: {spread.worst_cell}, {_sample(spread.worst_sample)}"
     if report.cells:
         yield ""
         yield from table(
@@ -165,12 +166,16 @@ def _simulated_lines(simulated: SimulatedMargins) -> Iterator[str]:
     yield f"{simulated.drives} drives in closed loop, scenario {simulated.scenario}, {simulated.duration_s:g} s each"
     yield from _table(simulated.quantities, "worst drive")
     worst = next(q for q in simulated.quantities if q.name == "simulated_current")
-    sample = ", ".join(f"{name} {value:.4g}" for name, value in worst.worst_sample.items() if name != "operating_point")
-    yield f"worst simulated_current: {sample}"
+    yield f"worst simulated_current: {_sample(worst.worst_sample)}"
     trips = ", ".join(f"{count} {name}" for name, count in simulated.trips.items())
     yield f"tripped: {trips or 'none'}"
     if simulated.outside_flux_map:
         yield f"left the flux map, not to be relied on: {simulated.outside_flux_map} drives"
+
+
+def _sample(sample: Mapping[str, float]) -> str:
+    """Return a machine of the box: factors over nominal, then absolutes."""
+    return ", ".join(f"{name} {value:.4g}" for name, value in sample.items())
 
 
 def _table(spreads: Sequence[Spread] | Sequence[Observed], worst: str = "worst corner") -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pmsmtool.design.operating_machine import OperatingMachine, design_library
-from pmsmtool.errors import DesignInfeasible
+from pmsmtool.errors import ConfigError, DesignInfeasible
 
 Array = NDArray[np.float64]
 AxisKind = Literal["speed", "flux"]
@@ -192,6 +192,8 @@ def speed_table(
     ------
     DesignInfeasible
         A folded flux map, or limits that leave out zero current.
+    ConfigError
+        References outside the iron-loss map.
     """
     V_max = np.atleast_1d(np.asarray(V_max_v, dtype=np.float64))
     U_dc = math.sqrt(3.0) * V_max if U_dc_v is None else np.atleast_1d(np.asarray(U_dc_v, dtype=np.float64))
@@ -249,6 +251,7 @@ def _solve(
 ) -> LookupTable:
     torque = np.atleast_1d(np.asarray(torque_nm, dtype=np.float64))
     (i_d, i_q, achieved, limits), bounds = _kernel(machine, torque, omega, V_max, I_max, i_d_min)
+    _require_loss_data(machine, i_d, i_q)
     voltage = machine.voltage_v(i_d, i_q, omega[None, :, None])
     return LookupTable(
         machine, axis_kind, torque, y, U_dc, V_max, I_max, i_d_min, i_d, i_q, achieved, limits,
@@ -279,6 +282,22 @@ def _kernel(
         )
     sides = (extreme[:, :, side, k].copy() for side in range(2) for k in range(3))
     return (i_d, i_q, achieved, limits), TorqueLimits(*sides)
+
+
+def _require_loss_data(machine: OperatingMachine, i_d: Array, i_q: Array) -> None:
+    """Refuse references whose iron loss was extrapolated: least loss means nothing there."""
+    if machine.loss_map is None:
+        return
+    axes = machine.loss_map.i_d_a, machine.loss_map.i_q_a
+    outside = [(i < axis[0]) | (i > axis[-1]) for i, axis in zip((i_d, i_q), axes, strict=True)]
+    worst = int(np.count_nonzero(outside[0] | outside[1]))
+    if worst:
+        ends = ", ".join(f"{n} {a[0]:g} to {a[-1]:g} A" for n, a in zip(("i_d", "i_q"), axes, strict=True))
+        raise ConfigError(
+            f"the map covers {ends}, and {worst} of {i_d.size} references lie outside",
+            where="iron-loss map",
+            hint="measure or compute the loss over the whole current range, or lower I_max",
+        )
 
 
 def _check(machine: OperatingMachine, torque: Array, omega: Array, V: Array, I_max: float, i_d_min: float) -> None:

@@ -33,6 +33,7 @@ from pmsmtool.design.ratings import ratings
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.firmware.core_binding import core
 from pmsmtool.firmware.image import pack_image
+from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS
@@ -358,6 +359,16 @@ def test_a_bad_iron_loss_map_is_refused(tmp_path: Path) -> None:
     path.write_bytes(npz_bytes({"i_d_a": axis, "i_q_a": axis, **grids}))
     with pytest.raises(ConfigError, match="negative"):
         load_iron_loss_map(path)
+
+
+def test_references_beyond_the_iron_loss_map_are_refused() -> None:
+    axis = np.linspace(-40.0, 40.0, 9)
+    flux = np.hypot(*M.flux(axis[:, None], axis[None, :])) ** 2
+    machine = replace(M, loss_map=FluxMap(axis, axis, 60.0 * flux, 0.4 * flux))
+    inside = speed_table(machine, torque_nm=[20.0], speed_rpm=[1500.0], V_max_v=[100.0], I_max_apk=150.0)
+    assert np.hypot(inside.i_d_a, inside.i_q_a).max() < 40.0
+    with pytest.raises(ConfigError, match="1 of 1 references lie outside"):
+        speed_table(machine, torque_nm=[90.0], speed_rpm=[1500.0], V_max_v=[100.0], I_max_apk=150.0)
 
 
 # -- files and command ---------------------------------------------------------------------------------------
