@@ -141,21 +141,24 @@ class PairCheck:
         Largest difference between them, relative.
     sensor_sum : float
         Largest sum of the phase currents that grows with the current, relative.
+    judged : bool
+        Whether the rotor was at rest, so that the spread means something.
     """
 
     resistance_ohm: tuple[float, float, float]
     spread: float
     sensor_sum: float
+    judged: bool = True
 
 
 def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
-    """Judge the slopes of the three pairs of phases.
+    """Judge the slopes of the three pairs of phases; while the rotor moves they say nothing, and are not judged.
 
     Parameters
     ----------
     pairs : Trace
-        Six rows, two currents with phase a, b and c idle in turn: ``i_a_a i_b_a i_c_a u_d_v i_d_a`` (means);
-        ``meta["i_command_a"]``.
+        Six rows, two currents with phase a, b and c idle in turn: ``i_a_a i_b_a i_c_a u_d_v i_d_a`` (means),
+        ``moved`` 1 where the rotor did not come to rest.
     noise : Noise
         From the zero-current trace.
     curve : InverterCurve
@@ -184,7 +187,8 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
     spread = _spread(slopes)
     # noise of a mean, seen through R at both ends of a slope
     sigma = noise.sigma_a * math.sqrt(2.0 / MEAN_SAMPLES) / float(np.min(np.abs(steps)))
-    if spread > max(BALANCE_LIMIT, SLOPE_SIGMA * sigma) or not float(np.min(slopes)) > 0.0:
+    moved = "moved" in pairs.signals and float(np.max(pairs["moved"])) > 0.0
+    if not moved and (spread > max(BALANCE_LIMIT, SLOPE_SIGMA * sigma) or not float(np.min(slopes)) > 0.0):
         named = ", ".join(f"{name} {slope:.4g}" for name, slope in zip(PAIRS, slopes, strict=True))
         raise refuse(
             "E_UNBALANCED",
@@ -192,7 +196,8 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
             f"({named} ohm)",
             stage=STAGE,
         )
-    return PairCheck((float(slopes[0]), float(slopes[1]), float(slopes[2])), spread, float(sums[worst]))
+    resistances = (float(slopes[0]), float(slopes[1]), float(slopes[2]))
+    return PairCheck(resistances, spread, float(sums[worst]), not moved)
 
 
 def _spread(values: NDArray[np.float64]) -> float:

@@ -16,6 +16,7 @@ from pmsmtool.trace import Trace
 Axis = Literal["d", "q"]
 
 SIGNALS = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "theta_m_rad", "flags", "T_winding_c")
+SHOT_SAMPLES = 2048
 SEARCH_SAMPLES = 360
 BUS_ALLOWANCE_S = 2.0
 """The injection goes on this much longer than lead and record need: slow adapters arm the recorder late."""
@@ -54,7 +55,7 @@ class SquarePlan:
     ripple_a: float
     u_max_v: float
     half_periods: tuple[int, ...] = (6, 9)
-    samples: int = 2048
+    samples: int = SHOT_SAMPLES
     bias_bandwidth_rad_s: float = 2.0 * math.pi * 15.0
     lead_s: float = 0.3
     angle_rad: float = 0.0

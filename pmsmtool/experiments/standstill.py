@@ -21,6 +21,8 @@ DC_ANGLE_RAD = math.pi / 2.0
 MEANS = ("u_d_v", "i_d_a", "u_q_v", "i_q_a", "T_winding_c")
 """What is averaged over a whole window at each level."""
 
+LEVEL_WINDOW = 1600
+"""Control periods averaged at each level (identification reference, 3.1)."""
 REST_RAD = 5e-4
 """Motion of the shaft (mechanical) between two looks that still counts as rest."""
 TRIES = 6
@@ -62,7 +64,7 @@ class LevelPlan:
     turn_a: float
     start_rad: float = 0.0
     settle_s: float = 0.1
-    window_periods: int = 1600
+    window_periods: int = LEVEL_WINDOW
     angle_rad: float = DC_ANGLE_RAD
 
     def duration_s(self, period_s: float) -> float:
@@ -122,8 +124,8 @@ def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace
     return table(rows, times, i_command_a=i_a, angles_rad=list(PHASE_ANGLES_RAD))
 
 
-PAIR_SHARES = (0.5, 1.0)
-"""Currents of the three pairs of phases, of the largest: above the knee of any inverter."""
+PAIR_SHARES = (0.15, 0.30)
+"""Currents of the three pairs of phases, of the largest: more is no stable position for a reluctance machine."""
 PAIR_PERIODS = 512
 
 
@@ -139,7 +141,8 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float) -> Tra
     turn_a, start_rad : float
         Current that turns the rotor from pair to pair (A peak), and the vector that was held last (rad electrical).
     """
-    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a")
+    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
+    half = PAIR_PERIODS // 2
     rows: list[dict[str, float]] = []
     times: list[float] = []
     elapsed = 0.0
@@ -151,9 +154,15 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float) -> Tra
             angle = target
         for share in PAIR_SHARES:
             drive.command_current(share * i_a, 0.0, fixed_angle_rad=angle)
-            elapsed += settle(drive, share * i_a)
-            times.append(elapsed)
-            rows.append(dict(drive.average(names, PAIR_PERIODS)))
+            for _ in range(TRIES):
+                elapsed += settle(drive, share * i_a)
+                first, second = (drive.average(names, half) for _ in range(2))
+                moved = abs(second["theta_m_rad"] - first["theta_m_rad"]) >= REST_RAD
+                if not moved:
+                    break
+            times[len(rows) :] = [elapsed]
+            row = {name: 0.5 * (first[name] + second[name]) for name in names if name != "theta_m_rad"}
+            rows.append({**row, "moved": float(moved)})
             elapsed += PAIR_PERIODS * drive.period_s
     drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
     return table(rows, times, i_command_a=i_a, idle=["a", "a", "b", "b", "c", "c"])

@@ -212,7 +212,9 @@ def identify_stage(
     clock = drive.node.connection.clock
     start = clock.now()
     with guarded(drive, envelope, say=say) as guard:
-        Measurement(guard, limits, keep, say, held=request.shaft == "locked").run(request.quantities)
+        measurement = Measurement(guard, limits, keep, say, held=request.shaft == "locked")
+        measurement.spent = lambda: (guard.energised_s, guard.energy_j)
+        measurement.run(request.quantities)
     stage = evaluated_stage(run, nameplate, request)
     return replace(stage, seconds=clock.now() - start)
 
@@ -327,6 +329,8 @@ def warnings_of(evaluation: Evaluation) -> list[str]:
     lines = []
     if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
         lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
+    if evaluation.pairs is not None and not evaluation.pairs.judged:
+        lines.append("the phases were not compared: the rotor did not come to rest on the three pairs")
     inductance = evaluation.inductance
     if inductance is not None and inductance.verdict is Verdict.WARN:
         dependent = ", ".join(inductance.frequency_dependent)

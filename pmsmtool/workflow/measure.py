@@ -15,14 +15,16 @@ from pmsmtool.design.current_loop import imc
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError, LimitExceeded
 from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.noise import Noise, estimate_noise
-from pmsmtool.estimators.phase_check import check_pairs, check_phases
+from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phases
+from pmsmtool.estimators.prediction import check_prediction, predict
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
 from pmsmtool.trace import Trace
 from pmsmtool.workflow import map_stage
-from pmsmtool.workflow.evaluate import resistance_of
+from pmsmtool.workflow.evaluate import resistance_of, tolerance_on
 
 PHASE_CHECK_SHARE = 0.05
 LEVELS = 12
@@ -39,6 +41,10 @@ BIAS_SHARE = 0.5
 BIAS_TRIES = 4
 BIAS_OFF_RAD = math.radians(6.0)
 """Angle between rotor and bias vector that a load or friction may make (electrical)."""
+ALIGN_TRIES = 3
+"""Times the frame follows a rotor that was moved by the change of the frame itself."""
+NOISE_RIPPLE = 25.0
+"""Smallest ripple, peak to peak, in noise of one sample: an inverter's knee biases less than a ripple that drowns."""
 BIAS_ON_RAD = math.radians(2.0)
 """The same, of a vector that was put on the rotor's axis: more is motion."""
 BIAS_MOST = 0.8
@@ -160,6 +166,8 @@ class Measurement:
         Ripple of the injection, peak to peak, of the rated current.
     held : bool
         Whether the shaft is locked.
+    spent : callable or None
+        Seconds energised and copper loss so far (s, J), told after every stage.
     """
 
     drive: Drive
@@ -168,6 +176,7 @@ class Measurement:
     say: Callable[[str], None]
     ripple_share: float = RIPPLE_SHARE
     held: bool = False
+    spent: Callable[[], tuple[float, float]] | None = None
 
     def run(self, quantities: tuple[str, ...]) -> None:
         """Run what the quantities need.
@@ -179,17 +188,23 @@ class Measurement:
         """
         steps = steps_of(quantities, self.held)
         noise = self._zero_current()
-        self._phase_check(noise)
+        phases = self._phase_check(noise)
+        self._predict(noise, phases, steps)
+        self._tell_spent()
         start = standstill.PHASE_ANGLES_RAD[-1]
         if "rotation" in steps:
             self._encoder_counts(start, standstill.DC_ANGLE_RAD)
             start = standstill.DC_ANGLE_RAD
         resistance = self._levels(noise, start) if "levels" in steps else None
+        self._tell_spent()
         encoder = self._rotation() if "rotation" in steps else None
+        self._tell_spent()
         if resistance is not None and encoder is not None:
-            inductances = self._square(resistance, encoder) if "square" in steps else None
+            inductances = self._square(noise, resistance, encoder) if "square" in steps else None
+            self._tell_spent()
             if inductances is not None and "speeds" in steps:
                 self._turn(resistance, encoder, inductances)
+                self._tell_spent()
         if resistance is not None and "map" in steps:
             map_stage.measure_map(self.drive, self.limits, noise, resistance, self.held, self.keep, self.say)
 
@@ -199,13 +214,44 @@ class Measurement:
         self.keep("zero_current", trace)
         return estimate_noise(trace)
 
-    def _phase_check(self, noise: Noise) -> None:
+    def _tell_spent(self) -> None:
+        if self.spent is not None:
+            seconds, energy = self.spent()
+            self.say(f"  so far energised for {seconds:.1f} s, {energy:.3g} J in the winding")
+
+    def _predict(self, noise: Noise, phases: PhaseCheck, steps: set[str]) -> None:
+        """Say how good the numbers will be, and stop here where they cannot be good enough."""
+        limits = self.limits
+        if "levels" not in steps:
+            return
+        prediction = predict(
+            noise,
+            standstill.calm_sequence(self._magnitudes()),
+            standstill.LEVEL_WINDOW,
+            self.ripple_share * limits.I_test_apk,
+            2 * square_injection.SHOT_SAMPLES,
+            max(abs(z * i) for z, i in zip(phases.impedance_ohm, phases.currents_a, strict=True)),
+            EMF_SHARE * limits.V_max_v * speed_run.SHARES[1],
+            tolerance_on(SensorTolerance(), math.sqrt(3.0) * limits.V_max_v),
+        )
+        self.say(prediction.line())
+        check_prediction(prediction)
+
+    def _magnitudes(self) -> list[float]:
+        """DC levels that are held with both signs, several times (A)."""
+        largest = self.limits.I_test_apk
+        ratio = (1.0 / LOWEST_LEVEL) ** (1.0 / (LEVELS - 1))
+        magnitudes = [largest * max(LOWEST_LEVEL, (k + 1) / LEVELS) for k in range(LEVELS)]
+        magnitudes[:2] = [largest * LOWEST_LEVEL, largest * LOWEST_LEVEL * ratio]
+        return sorted(set(magnitudes))
+
+    def _phase_check(self, noise: Noise) -> PhaseCheck:
         i_a = PHASE_CHECK_SHARE * self.limits.I_test_apk
         self.say(f"phases: three vectors of {i_a:.3g} A")
         self.drive.enable()
         trace = standstill.hold_phase_vectors(self.drive, i_a)
         self.keep("phase_vectors", trace)
-        check_phases(trace, noise)
+        return check_phases(trace, noise)
 
     def _encoder_counts(self, start_rad: float, end_rad: float) -> None:
         trace = standstill.turn_and_look(self.drive, TURN_SHARE * self.limits.I_test_apk, start_rad, end_rad)
@@ -214,12 +260,9 @@ class Measurement:
 
     def _levels(self, noise: Noise, start_rad: float) -> ResistanceResult:
         largest = self.limits.I_test_apk
-        ratio = (1.0 / LOWEST_LEVEL) ** (1.0 / (LEVELS - 1))
-        magnitudes = [largest * max(LOWEST_LEVEL, (k + 1) / LEVELS) for k in range(LEVELS)]
-        magnitudes[:2] = [largest * LOWEST_LEVEL, largest * LOWEST_LEVEL * ratio]
         low = [largest * share for share in CURVE_SHARES]
         plan = standstill.LevelPlan(
-            standstill.calm_sequence(sorted(set(magnitudes)), low),
+            standstill.calm_sequence(self._magnitudes(), low),
             turn_a=TURN_SHARE * largest,
             start_rad=start_rad,
         )
@@ -227,7 +270,8 @@ class Measurement:
         trace = standstill.hold_levels(self.drive, plan)
         self.keep("levels", trace)
         resistance = resistance_of(trace, noise)
-        self.say(f"pairs of phases: two currents up to {largest:.3g} A through each")
+        strongest = max(standstill.PAIR_SHARES) * largest
+        self.say(f"pairs of phases: two currents up to {strongest:.3g} A through each")
         pairs = standstill.hold_pairs(self.drive, largest, TURN_SHARE * largest, standstill.DC_ANGLE_RAD)
         self.keep("phase_pairs", pairs)
         check_pairs(pairs, noise, resistance.curve)
@@ -248,7 +292,7 @@ class Measurement:
                     raise
         raise AssertionError("the last share returns or raises")
 
-    def _square(self, resistance: ResistanceResult, encoder: EncoderResult) -> tuple[float, float]:
+    def _square(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult) -> tuple[float, float]:
         """Record the shots; return rough inductances (H) from ripple and voltage, enough for a current controller."""
         limits = self.limits
         self.drive.disable()
@@ -264,7 +308,7 @@ class Measurement:
         knee = resistance.curve.knee_a(max(0.0, resistance.V_dead_v))
         bias, ripple = bias_and_ripple(limits.I_test_apk, self.ripple_share, knee)
         plan = square_injection.SquarePlan(bias_d_a=bias, ripple_a=ripple, u_max_v=U_SHARE * limits.V_max_v)
-        plan = self._hold_stable_bias(plan, encoder, knee)
+        plan = self._hold_stable_bias(plan, encoder, knee, noise)
         rough = []
         for axis in ("d", "q"):
             amplitude = square_injection.find_amplitude(self.drive, plan, axis)
@@ -277,26 +321,29 @@ class Measurement:
         return rough[0], rough[1]
 
     def _hold_stable_bias(
-        self, plan: square_injection.SquarePlan, encoder: EncoderResult, knee_a: float
+        self, plan: square_injection.SquarePlan, encoder: EncoderResult, knee_a: float, noise: Noise
     ) -> square_injection.SquarePlan:
         """Hold the bias, or as much of it as leaves the rotor's d axis on the vector; returns the plan with it."""
         wanted = plan.ripple_a
+        floor = NOISE_RIPPLE * noise.sigma_a
         for _ in range(BIAS_TRIES):
             self.say(f"L_d, L_q: square wave on {plan.bias_d_a:.3g} A, {plan.ripple_a:.3g} A peak to peak")
             square_injection.hold_bias(self.drive, plan)
-            stands = self._rotor_angle(encoder)
-            ahead = math.remainder(stands - plan.angle_rad, 2.0 * math.pi)
-            if abs(ahead) <= BIAS_OFF_RAD + abs(encoder.lag_rad):
+            ahead = self._rotor_ahead(encoder, plan)
+            aligned = plan
+            for _ in range(ALIGN_TRIES):
+                if abs(ahead) > BIAS_OFF_RAD + abs(encoder.lag_rad):
+                    break
                 # the frame goes to the rotor: a d bias off its axis would pull, and mix the axes
-                angle = plan.angle_rad + ahead
-                clear = clear_ripple(plan.ripple_a, plan.bias_d_a, knee_a, angle)
-                aligned = replace(plan, angle_rad=angle, ripple_a=clear)
+                angle = aligned.angle_rad + ahead
+                ripple = max(floor, clear_ripple(wanted, plan.bias_d_a, knee_a, angle))
+                aligned = replace(aligned, angle_rad=angle, ripple_a=ripple)
                 square_injection.hold_bias(self.drive, aligned)
-                ahead = math.remainder(self._rotor_angle(encoder) - angle, 2.0 * math.pi)
+                ahead = self._rotor_ahead(encoder, aligned)
                 if abs(ahead) <= BIAS_ON_RAD:
                     return aligned
             wanted, bias = 0.5 * wanted, 0.5 * plan.bias_d_a
-            plan = replace(plan, bias_d_a=bias, ripple_a=clear_ripple(wanted, bias, knee_a))
+            plan = replace(plan, bias_d_a=bias, ripple_a=max(floor, clear_ripple(wanted, bias, knee_a)))
         raise refuse(
             "E_ROTOR_MOVED",
             f"the rotor stands {math.degrees(ahead):.3g} deg (electrical) off the bias vector",
@@ -304,11 +351,12 @@ class Measurement:
             likely="a load on the shaft, or a machine with much more reluctance than magnet torque",
         )
 
-    def _rotor_angle(self, encoder: EncoderResult) -> float:
-        """Electrical angle of the rotor with the coarse offset (rad)."""
+    def _rotor_ahead(self, encoder: EncoderResult, plan: square_injection.SquarePlan) -> float:
+        """Electrical angle of the rotor, with the coarse offset, ahead of the frozen frame (rad)."""
         periods = max(1, round(0.02 / self.drive.period_s))
         theta_M = self.drive.average(("theta_m_rad",), periods)["theta_m_rad"]
-        return encoder.direction * encoder.pole_pairs.value * theta_M - encoder.offset.value
+        theta_e = encoder.direction * encoder.pole_pairs.value * theta_M - encoder.offset.value
+        return math.remainder(theta_e - plan.angle_rad, 2.0 * math.pi)
 
     # ---- what turns the shaft ---------------------------------------------------------------------
 
