@@ -23,7 +23,6 @@ from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap
 
 COMMUTATION_ANGLE = DriveObject(0x60EA, 0, "H")
-TARGET_TORQUE = DriveObject(0x6071, 0, "h")
 POSITION = DriveObject(0x6064, 0, "i")
 ENCODER_COUNTS = DriveObject(0x608F, 1, "I")
 MOTOR_TURNS = DriveObject(0x608F, 2, "I")
@@ -105,7 +104,7 @@ class StandardDrive(CanopenDrive):
 
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero torque with the master's commutation angle."""
-        self.node.put(TARGET_TORQUE, 0)
+        self.node.put(objects.TARGET_TORQUE_PERMILLE, 0)
         self._set_mode(Mode.CYCLIC_TORQUE_ANGLE)
         self.may_be_energised = True
         self.node.enable()
@@ -118,7 +117,7 @@ class StandardDrive(CanopenDrive):
         if fixed_angle_rad is not None:
             angle = fixed_angle_rad + math.atan2(i_q_a, i_d_a) - QUARTER_TURN
             self.node.put(COMMUTATION_ANGLE, round(angle / (2.0 * math.pi) * ANGLE_COUNTS) % ANGLE_COUNTS)
-        self.node.put(TARGET_TORQUE, round(1000.0 * length / self._rated_apk))
+        self.node.put(objects.TARGET_TORQUE_PERMILLE, round(1000.0 * length / self._rated_apk))
 
     def command_speed(self, omega_m_rad_s: float) -> None:
         """Refuse: the unit of the target velocity is not known."""
@@ -171,7 +170,7 @@ class RecorderDrive(CanopenDrive):
 
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero torque."""
-        self.node.put(TARGET_TORQUE, 0)
+        self.node.put(objects.TARGET_TORQUE_PERMILLE, 0)
         self._set_mode(Mode.PROFILE_TORQUE)
         self.may_be_energised = True
         self.node.enable()
@@ -180,7 +179,7 @@ class RecorderDrive(CanopenDrive):
         """Ask for the torque of a q current."""
         if i_d_a or fixed_angle_rad is not None:
             raise NotAvailable("the drive takes no current set-point, only torque", where=f"node {self.node.node}")
-        self.node.put(TARGET_TORQUE, round(1000.0 * i_q_a / self._rated_apk))
+        self.node.put(objects.TARGET_TORQUE_PERMILLE, round(1000.0 * i_q_a / self._rated_apk))
 
     def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
         """Return the live values: the drive has no averages."""

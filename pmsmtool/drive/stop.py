@@ -64,7 +64,7 @@ def disable_at_once(node: DriveNode) -> None:
 
 def zero_references(node: DriveNode) -> None:
     """End an excitation and bring all references to zero; a drive without these objects needs none."""
-    references = [objects.TARGET_VELOCITY_MRPM]
+    references = [objects.TARGET_VELOCITY_MRPM, objects.TARGET_TORQUE_PERMILLE]
     if node.map.staging and _is_maps_drive(node):  # 0x2050 and 0x2052 of another maker's drive are something else
         with contextlib.suppress(SdoAbort):
             node.command(objects.EXCITATION_COMMAND, 0)

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
 
 from pmsmtool.bus.connect import connect
+from pmsmtool.cia402 import State
 from pmsmtool.cli.main import cli
+from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
-from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
+from pmsmtool.errors import ConfigError, IdentificationError, Interrupted, NotAvailable
 from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
@@ -32,6 +35,8 @@ from pmsmtool.workflow.capabilities import (
 from pmsmtool.workflow.random_drives import draw_drive
 from pmsmtool.workflow.tier_identify import HEADROOM, identify_recorder, identify_standard
 
+COMMANDS = (0x604000, 0x206007)
+"""Controlword and the recorder's command: nothing a restore would bring back."""
 CHANNEL = "interior-2k2?nv=:memory:"
 
 
@@ -243,6 +248,34 @@ def test_a_recorder_drive_that_does_not_commutate_is_refused(tmp_path: Path) -> 
             identify_recorder(recorder, envelope_for(drive))
         assert not connection.bus.line.nodes[0].session.power.state.energised  # type: ignore[attr-defined]
         recorder.close()
+
+
+@pytest.mark.parametrize("tier", ["drive=cia402", "tier=recorder"])
+def test_an_interrupted_run_is_stopped_and_restored(tier: str) -> None:
+    """Ctrl-C with current flowing: stopped, confirmed, no torque left behind, every object as it was."""
+    with connect("pmsmsim", f"{CHANNEL}&{tier}") as connection:
+        session = connection.bus.line.nodes[0].session  # type: ignore[attr-defined]
+
+        def memory() -> dict[int, bytes]:
+            rows = ((entry.row.index << 8 | entry.row.sub, entry) for entry in session.dictionary)
+            return {key: entry.value for key, entry in rows if entry.writable and key not in COMMANDS}
+
+        before = memory()
+        drive = (
+            StandardDrive(connection, 1, drive_map=load_family("cia402"))
+            if tier == "drive=cia402"
+            else RecorderDrive(connection, 1)
+        )
+        identify = identify_standard if isinstance(drive, StandardDrive) else identify_recorder
+        moment = connection.clock.now() + 2.5
+        connection.clock.after(2.5, lambda: signal.raise_signal(signal.SIGINT))  # type: ignore[attr-defined]
+        with pytest.raises(Interrupted):
+            identify(drive, Envelope(7.0, 300.0))  # type: ignore[arg-type, operator]
+        assert connection.clock.now() > moment
+        assert session.power.state is State.SWITCH_ON_DISABLED
+        assert drive.node.get(objects.TARGET_TORQUE_PERMILLE) == 0
+        assert memory() == before
+        drive.close()
 
 
 @pytest.mark.parametrize("family", family_names())
