@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.machine.flux_map_scaled import FluxScale, scaled_struct
+from pmsmtool.machine.flux_map_scaled import FluxScale, ScalableMap
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import open_simulation
@@ -184,7 +184,9 @@ def simulate_many(
     machine_file, model, periods = open_simulation(machine_file, params, scenario, None, application)
     n = len(variations)
     setups = (Setup * n)()
-    keep = [_vary(setups[k], model.setup, machine_file, variation) for k, variation in enumerate(variations)]
+    flux_map = machine_file.flux_map
+    scalable = None if flux_map is None else ScalableMap.of(flux_map, machine_file.machine.psi_f_wb)
+    keep = [_vary(setups[k], model.setup, scalable, variation) for k, variation in enumerate(variations)]
     workers = min(max(1, cores() if threads is None else threads), max(1, n), THREADS_MAX)
     memory = np.zeros(workers * lib.pmsm_monte_carlo_memory() // 8)
     names = np.ascontiguousarray(signals, dtype=np.uint32)
@@ -219,7 +221,7 @@ def _runs(result: NDArray[Any], periods: int, T_s: float, record: Array) -> Driv
     )
 
 
-def _vary(out: Setup, nominal: Setup, machine_file: MachineFile, by: Variation) -> object:
+def _vary(out: Setup, nominal: Setup, flux_map: ScalableMap | None, by: Variation) -> object:
     """Write one machine over the nominal one; returns what must live as long as the setup."""
     ctypes.memmove(ctypes.byref(out), ctypes.byref(nominal), ctypes.sizeof(Setup))
     machine = out.machine
@@ -235,8 +237,8 @@ def _vary(out: Setup, nominal: Setup, machine_file: MachineFile, by: Variation) 
     out.U_dc = out.U_dc if by.U_dc_v is None else by.U_dc_v
     out.seed = by.seed
     scale = FluxScale(by.L_d, by.L_q, by.psi_f)
-    if machine_file.flux_map is None or scale == FluxScale():
+    if flux_map is None or scale == FluxScale():
         return None
-    struct = scaled_struct(machine_file.flux_map, scale, machine_file.machine.psi_f_wb)
+    struct = flux_map.struct(scale)
     machine.map = ctypes.pointer(struct)
     return struct
