@@ -41,7 +41,7 @@ MISFIT_LIMIT = 0.004
 POINT_ANGLES = 181
 POINT_LEAST = 0.1
 """Least d current, of the vector, at which an apparent L_d means anything."""
-RECIPROCITY_NOTED = 0.005
+RECIPROCITY_NOTED = 0.002
 """Distance to a reciprocal map, of the flux range, above which it is reported: a machine has none."""
 
 
