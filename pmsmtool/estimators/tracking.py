@@ -45,8 +45,6 @@ SETTLED = 8
 """First observations that the mean innovation leaves out."""
 NOISE_FLOOR = 1e-4
 """Least noise of a mean voltage, of the largest: quantisation and slow errors of the drive."""
-ENTANGLED = 0.9
-"""Correlation from which two states count as one."""
 _ALPHA, _BETA, _KAPPA = 0.5, 2.0, 0.0
 
 
@@ -299,12 +297,10 @@ def _refuse_entangled(
     std = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(std, std)
     own = STATES.index(name)
-    others = [(abs(float(correlation[own, k])), other) for k, other in enumerate(STATES) if k != own]
-    strongest, partner = max(others)
+    partner = max((other for other in STATES if other != name), key=lambda o: abs(correlation[own, STATES.index(o)]))
     blind = {"R_s_ohm": "no current flows", "psi_f_wb": "the shaft hardly turns"}[name]
-    told = (
-        f"{name} and {partner} cannot be told apart" if strongest >= ENTANGLED else f"{name} shows in nothing: {blind}"
-    )
+    seen = float(information[own, own]) ** -0.5 <= LIMIT[name]  # alone, all else given
+    told = f"{name} and {partner} cannot be told apart" if seen else f"{name} shows in nothing: {blind}"
     raise refuse(
         "E_NOT_IDENTIFIABLE",
         f"{told}; its standard deviation is {relative:.3g} %, limit {100.0 * LIMIT[name]:g} %",

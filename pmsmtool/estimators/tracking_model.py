@@ -33,7 +33,9 @@ PRIOR = {"R_s_ohm": 0.30, "psi_f_wb": 0.10}
 INDUCTANCE_STD = 0.02
 """Least relative standard deviation of an inductance away from its bias point."""
 STEADY = 0.05
-"""Largest change of a current or the speed within a window, of the largest there is: transients are left out."""
+NOISY = 5.0
+"""Largest change of a current or the speed within a window, of the largest there is: transients are left out. What is
+only noise (a machine at rest) is told by the median change times the second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +117,9 @@ def _steady(blocks: Mapping[str, Array]) -> NDArray[np.bool_]:
     calm = np.ones(len(blocks["i_d_a"]), dtype=bool)
     for name, scale in (("i_d_a", largest), ("i_q_a", largest), ("omega_e_rad_s", fastest)):
         change = np.abs(_rise(blocks[name]))
-        calm &= change <= STEADY * scale
-        calm[1:] &= change[:-1] <= STEADY * scale
+        limit = max(STEADY * scale, NOISY * float(np.median(change)) if len(change) else 0.0)
+        calm &= change <= limit
+        calm[1:] &= change[:-1] <= limit
     return calm
 
 

@@ -1,0 +1,124 @@
+"""The tracking filter on a machine that warms up: errors, coverage, and every refusal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.tracking import LIMIT, NIS_GATE, Track, Tracker, track
+from pmsmtool.estimators.tracking_model import TRACKED, condense
+from pmsmtool.trace import Trace
+from tests.tracking.simulated import known, machine, true_values, warming_run
+
+SECONDS = 8.0
+ROWS = 60
+"""Rows of a window: 20 ms."""
+SETTLED_S = 2.0
+ERROR = {"R_s_ohm": 0.02, "psi_f_wb": 0.004}
+"""Largest mean error after the first seconds, relative; measured at most 0.7 and 0.1 % over the seeds below."""
+SEEDS = (1, 2)
+
+
+def relative_errors(found: Track, trace: Trace) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:  # type: ignore[type-arg]
+    """Errors over the truth, and over the standard deviation, after the filter has settled."""
+    late = found.t_s > SETTLED_S
+    truth = true_values(machine(), trace, found.t_s)
+    off = {name: (found.value[name] - truth[name])[late] for name in TRACKED}
+    return {n: off[n] / truth[n][late] for n in TRACKED}, {n: off[n] / found.std[n][late] for n in TRACKED}
+
+
+@pytest.fixture(scope="module")
+def warming() -> dict[int, Trace]:
+    return {seed: warming_run(machine(), SECONDS, seed) for seed in SEEDS}
+
+
+def test_resistance_and_flux_are_followed_while_they_change(warming: dict[int, Trace]) -> None:
+    covered: dict[str, list[float]] = {name: [] for name in TRACKED}
+    for seed, trace in warming.items():
+        R, psi = trace["R_s_ohm"], trace["T_magnet_c"]
+        assert R[-1] > 1.03 * R[0] and psi[-1] > psi[0] + 5.0, "the run must warm the machine"
+        found = track(condense(trace, ROWS), known(machine()))
+        relative, normal = relative_errors(found, trace)
+        for name in TRACKED:
+            assert abs(float(np.mean(relative[name]))) < ERROR[name], (seed, name)
+            assert found.std[name][-1] < LIMIT[name] * found.value[name][-1]
+            covered[name].append(float(np.mean(np.abs(normal[name]) < 1.96)))
+        assert found.nis <= NIS_GATE[1] and found.restarts == 0
+    # errors within a run are one draw and not hundreds: the mean over runs is what can be asked for
+    assert all(np.mean(values) > 0.8 for values in covered.values()), covered
+
+
+def test_an_inverter_error_that_nobody_told_of_is_refused(warming: dict[int, Trace]) -> None:
+    """13.8 V of dead time and thresholds against 20 V of R i: R would be off by as much as itself."""
+    with pytest.raises(IdentificationError) as caught:
+        track(condense(warming[1], ROWS), known(machine(), curve=False))
+    assert caught.value.reason in ("E_MODEL_MISMATCH", "E_NOT_IDENTIFIABLE")
+
+
+def test_another_machine_is_refused(warming: dict[int, Trace]) -> None:
+    other = replace(known(machine()), L_q_h=0.5 * machine().machine.L_q_h)
+    with pytest.raises(IdentificationError) as caught:
+        track(condense(warming[1], ROWS), other)
+    assert caught.value.reason == "E_MODEL_MISMATCH"
+
+
+def test_one_operating_point_is_refused_naming_the_pair() -> None:
+    trace = warming_run(machine(), 3.0, 4, vary=False)
+    observations = condense(trace, ROWS)
+    with pytest.raises(
+        IdentificationError, match="R_s_ohm and (psi_f_wb|inverter error) cannot be told apart"
+    ) as caught:
+        track(observations, known(machine()))
+    assert caught.value.reason == "E_NOT_IDENTIFIABLE"
+
+
+def test_flux_alone_is_given_where_resistance_is_not() -> None:
+    observations = condense(warming_run(machine(), 3.0, 4, vary=False), ROWS)
+    exact = replace(known(machine()), error_share=(1.0, 0.01))
+    found = track(observations, exact, ("psi_f_wb",))
+    truth = machine().machine.psi_f_wb * (1.0 - 0.0012 * (25.0 + 1.5 - 20.0))
+    assert abs(found.value["psi_f_wb"][-1] - truth) < 4.0 * found.std["psi_f_wb"][-1]
+
+
+def test_without_current_resistance_shows_in_nothing() -> None:
+    n = 64
+    omega = np.linspace(50.0, 400.0, n)
+    rng = np.random.default_rng(0)
+    signals = {"u_d_v": 0.01 * rng.standard_normal(n), "u_q_v": 0.545 * omega + 0.01 * rng.standard_normal(n)}
+    signals |= {"i_d_a": np.zeros(n), "i_q_a": np.zeros(n), "omega_e_rad_s": omega}
+    observations = Trace(0.02 * np.arange(n), signals, dict.fromkeys(signals, "1"))
+    with pytest.raises(IdentificationError, match="no current flows"):
+        track(observations, known(machine()))
+    found = track(observations, known(machine()), ("psi_f_wb",))
+    assert found.value["psi_f_wb"][-1] == pytest.approx(0.545, rel=1e-3)
+
+
+def test_too_few_observations_are_refused(warming: dict[int, Trace]) -> None:
+    whole = condense(warming[1], ROWS)
+    few = Trace(whole.t_s[:10], {n: v[:10] for n, v in whole.signals.items()}, whole.units, whole.meta)
+    with pytest.raises(IdentificationError) as caught:
+        track(few, known(machine()))
+    assert caught.value.reason == "E_EXCITATION"
+
+
+def test_what_is_no_number_is_no_observation() -> None:
+    tracker = Tracker(known(machine()), (0.1, 0.1))
+    with pytest.raises(ValueError, match="not a number"):
+        tracker.update(0.0, np.array([0.0, np.nan, 1.0, 0.0, 0.0, 0.0, 0.0]), np.zeros(2))
+
+
+def test_windows_that_are_limited_or_unsteady_are_left_out() -> None:
+    n = 400
+    current = np.where(np.arange(n) < 200, 1.0, 3.0)
+    signals = {name: np.zeros(n) for name in ("u_d_v", "u_q_v", "i_d_a")}
+    signals |= {"i_q_a": current, "omega_e_rad_s": np.full(n, 100.0), "flags": np.zeros(n)}
+    signals["flags"][30] = 1.0
+    signals["i_q_a"][205] = 3.0
+    signals["i_q_a"][190:200] = 2.0  # the change itself, inside the fifth window
+    trace = Trace(1e-3 * np.arange(n), signals, dict.fromkeys(signals, "1"))
+    found = condense(trace, 40)
+    assert len(found) == 7  # of ten: one is limited, one unsteady, and the one after it
+    assert np.all((found["i_q_a"] == 1.0) | (found["i_q_a"] == 3.0))
