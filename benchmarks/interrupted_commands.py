@@ -52,6 +52,7 @@ NEW_SET = "new/params.toml"
 WAYS = ("ctrl-c", "adapter")
 _CONTROLWORD_WRITTEN = b"\x2b\x40\x60\x00"
 _STATUSWORD_READ = b"\x4b\x41\x60\x00"
+MEASURING = ("identify", "commission")
 JOURNALED = ("flash-params", "restore", "commission")
 COMMANDS = {
     "jog": ("jog", "--current", "2Apk", "--for", "1s"),
@@ -91,6 +92,7 @@ class Held:
 
     everything: Any
     crc: int
+    stored: int
     off: bool
 
 
@@ -101,7 +103,8 @@ def held(channel: str) -> Held:
         entries = {entry.name: entry.old for entry in take_backup(drive.node, drive.identity).entries}
         entries = {name: data for name, data in entries.items() if not name.startswith("configuration_")}
         limits = [drive.node.sdo.read(*where) for where in LIMIT_OBJECTS]
-        found = Held((entries, limits), drive.parameters.crc_active, is_safe(drive.node.state()))
+        crcs = drive.parameters.crc_active, drive.parameters.crc_stored
+        found = Held((entries, limits), *crcs, is_safe(drive.node.state()))
         drive.close()
     return found
 
@@ -212,8 +215,8 @@ def interrupted(how: str, command: str, moment: int | None) -> Outcome:
 def _compare(command: str, before: Held, after: Held, *, gone: bool) -> tuple[str, bool]:
     """Return what the drive holds now, and whether the command may leave it so.
 
-    With the adapter gone nothing can be restored: limits and staged values stay until the next run or reset, the
-    *active* set may not be mixed.
+    With the adapter gone nothing can be restored: limits, staged values and what a measurement has set stay until the
+    next run or reset. A download may not leave a mixed *active* set, a measurement not another *stored* one.
     """
     if not after.off:
         return "NOT OFF", False
@@ -228,6 +231,8 @@ def _compare(command: str, before: Held, after: Held, *, gone: bool) -> tuple[st
         return "off, the one value written", True
     if gone and after.crc == before.crc:
         return "off, the active set as before", True
+    if gone and command in MEASURING and after.stored == before.stored:
+        return "off, values of the measurement until the next reset, the stored set as before", True
     return "CHANGED", False
 
 
