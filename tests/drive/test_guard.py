@@ -111,7 +111,7 @@ def test_second_ctrl_c_while_stopping_still_ends_confirmed(bench: SimBench, mome
 
 def test_second_ctrl_c_removes_the_voltage_at_once(bench: SimBench) -> None:
     """A quick stop ramp of seconds is cut short."""
-    with guarded(bench.drive, Envelope(i_max_apk=5.0, speed_max_rad_s=100.0)) as guard:
+    with guarded(bench.drive, Envelope(i_max_apk=5.0, speed_max_rad_s=150.0)) as guard:
         bench.drive.node.put(DECELERATION, 60)
         guard.write(RUNNING)
         guard.enable()
