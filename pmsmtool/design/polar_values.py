@@ -58,8 +58,8 @@ NEEDS_SWITCH = (
     " regularised law (polar.options, bit 3), whose transition shows in the torque; the unified law has none"
 )
 LINEAR_ONLY = (
-    "polar: a law of the linear range; where the voltage limit is reached it loses torque, above base speed down to the"
-    " wrong sign. The unified law covers both ranges"
+    "polar: a law of the linear range without a table of currents; where the voltage limit is reached it loses torque,"
+    " above base speed down to the wrong sign"
 )
 
 MAP_SPEED_SHARES = (0.25, 0.5, 0.75, 1.0)
@@ -70,23 +70,48 @@ DESIGN_SPEED_SHARE = 0.8
 """Speed at which the placed loops are looked at, over base speed: inside the linear range, voltage well above zero."""
 
 
+def weakening_mode(source: MachineFile, law: str) -> str:
+    """Return the mode of field weakening that suits a law: ``lookup`` or ``off``.
+
+    The laws of the linear range need the table's i_d. The unified law weakens the field of a surface machine best
+    itself, at full voltage; with L_d != L_q or saturation the table knows the current of least loss, and beyond the
+    largest i_q of the voltage ellipse the way to the maximum torque per volt.
+    """
+    if law in PHASE_LAWS:
+        return "off"
+    if law == "unified" and source.flux_map is None and _surface(source) is not None:
+        return "off"
+    return "lookup"
+
+
+def _surface(source: MachineFile) -> SurfaceMachine | None:
+    try:
+        return SurfaceMachine.of(source.machine)
+    except DesignInfeasible:
+        return None
+
+
 def polar_values(
-    source: MachineFile, rated: Ratings, law: str
+    source: MachineFile, rated: Ratings, law: str, weakening: str
 ) -> tuple[dict[str, DesignValue], dict[str, Scalar], tuple[str, ...]]:
     """Return catalogue values, facts and notes of a polar law.
+
+    Parameters
+    ----------
+    source, rated : MachineFile, Ratings
+        Machine and its limits.
+    law : str
+        A key of :data:`LAWS`.
+    weakening : str
+        Mode of field weakening that was designed; other than ``lookup`` it is switched off.
 
     Raises
     ------
     DesignInfeasible
         A law of the paper on a machine with L_d != L_q.
     """
-    machine, T_s = source.machine, source.inverter.T_s
-    surface: SurfaceMachine | None = None
-    try:
-        surface = SurfaceMachine.of(machine)
-    except DesignInfeasible:
-        if law in SURFACE_ONLY:
-            raise
+    T_s = source.inverter.T_s
+    surface = SurfaceMachine.of(source.machine) if law in SURFACE_ONLY else _surface(source)
     options, how = _options(source.inverter.delay_periods, law)
     values = {
         "polar.mode": DesignValue(LAWS[law], f"{law}, as asked for"),
@@ -100,9 +125,12 @@ def polar_values(
         "polar.V_ref_ratio": DesignValue(V_REF_RATIO, "smoother on ramps than full voltage"),
         # the laws weaken the field by themselves, and a governed reference is not theirs
         "governor.mode": DesignValue(0, "off: the polar law limits the voltage itself"),
-        "field_weakening.mode": DesignValue(0, "off: the polar law weakens the field itself"),
     }
-    notes = (NEEDS_SWITCH,) if law in PHASE_LAWS else (LINEAR_ONLY,) if law != "unified" else ()
+    if weakening != "lookup":
+        values["field_weakening.mode"] = DesignValue(0, "off: the polar law weakens the field itself")
+    notes: tuple[str, ...] = (NEEDS_SWITCH,) if law in PHASE_LAWS else ()
+    if law not in PHASE_LAWS and law != "unified" and weakening != "lookup":
+        notes = (LINEAR_ONLY,)
     if surface is None:
         differ = "polar: L_d and L_q differ; the placed loops of the paper do not apply, the law does"
         return values, {}, (differ, *notes)

@@ -15,6 +15,7 @@ from pmsmtool.design.lookup_design import LookupRequest, design_table
 from pmsmtool.design.lookup_file import lut_values
 from pmsmtool.design.lookup_table import RPM
 from pmsmtool.design.polar_values import polar_values
+from pmsmtool.design.polar_values import weakening_mode as polar_weakening_mode
 from pmsmtool.design.ratings import Ratings, rating_values, ratings
 from pmsmtool.design.sampled_loop import LoopMargins, margins
 from pmsmtool.design.speed_loop import (
@@ -90,7 +91,8 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
         table, tables = _design_table(source, request, rated)
         parts.append(table)
     if request.controller == "polar":
-        found, facts, notes = polar_values(source, rated, request.polar_law)
+        mode = _weakening_mode(source, request)
+        found, facts, notes = polar_values(source, rated, request.polar_law, mode)
         parts.append(_Part(found, {}, facts, notes))
     for part in parts:
         values |= part.values
@@ -158,6 +160,8 @@ def _design_current(current: CurrentChoice) -> _Part:
 def _weakening_mode(source: MachineFile, request: TuneRequest) -> str:
     if request.field_weakening != "auto":
         return request.field_weakening
+    if request.controller == "polar":
+        return polar_weakening_mode(source, request.polar_law)
     return "accelerated" if source.flux_map is None else "lookup"
 
 

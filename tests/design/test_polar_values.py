@@ -37,10 +37,30 @@ def test_phase_laws_get_the_switch_they_need_at_standstill(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", ["linear", "regularised"])
-def test_laws_of_the_linear_range_say_so(law: str) -> None:
-    design = tune(load_machine_file(ASSUMED), TuneRequest(controller="polar", polar_law=law))
-    assert not int(design["polar.options"]) & LINEAR_RANGE
-    assert any("linear range" in note for note in design.notes)
+def test_laws_of_the_linear_range_get_a_table_or_say_what_they_lack(law: str) -> None:
+    source = load_machine_file(ASSUMED)
+    with_table = tune(source, TuneRequest(controller="polar", polar_law=law))
+    assert with_table["field_weakening.mode"] == 1.0
+    assert with_table.tables
+    without = tune(source, TuneRequest(controller="polar", polar_law=law, field_weakening="off"))
+    assert without["field_weakening.mode"] == 0.0
+    assert any("linear range" in note for note in without.notes)
+    assert not any("linear range" in note for note in with_table.notes)
+    assert not int(without["polar.options"]) & LINEAR_RANGE
+
+
+@pytest.mark.parametrize(
+    ("profile", "mode"), [("interior-2k2", 1.0), ("saturated-pmsyrm", 1.0), ("miyajima-2013-assumed", 0.0)]
+)
+def test_unified_law_gets_a_table_where_the_table_knows_more(profile: str, mode: float) -> None:
+    design = tune(load_machine_file(PROFILES / f"{profile}.toml"), TuneRequest(controller="polar"))
+    assert design["field_weakening.mode"] == mode
+    assert design["governor.mode"] == 0.0
+
+
+def test_an_optimisation_that_reads_the_integrators_is_switched_off() -> None:
+    request = TuneRequest(controller="polar", field_weakening="accelerated")
+    assert tune(load_machine_file(PROFILES / "interior-2k2.toml"), request)["field_weakening.mode"] == 0.0
 
 
 def test_facts_state_the_voltage_limit_the_reach_and_the_slowest_true_pole() -> None:

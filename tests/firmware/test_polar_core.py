@@ -32,9 +32,11 @@ from pmsmtool.workflow.reproduce.polar_scene import (
     PROPOSED,
     PROPOSED_ON_MEASUREMENT,
     REGULARISED,
+    REGULARISED_TABLE,
     SIMULATION,
     SWITCHED,
     UNIFIED,
+    UNIFIED_TABLE,
     UNIFIED_TUNED,
     WOUND_UP,
     Bench,
@@ -301,6 +303,22 @@ def test_unified_law_holds_torque_on_an_interior_machine(rpm: float, torque: flo
     point = polar_salient.point(polar_salient.response(UNIFIED_TUNED, rpm, torque))
     assert point.torque == pytest.approx(torque, rel=polar_salient.TORQUE_SHARE)
     assert point.voltage <= 1.0 + 1e-4
+
+
+@pytest.mark.parametrize("law", [UNIFIED_TABLE, REGULARISED_TABLE], ids=lambda law: law.name)
+@pytest.mark.parametrize(("rpm", "torque"), [(500.0, 4.0), (2000.0, 14.0), (-2500.0, -14.0)])
+def test_laws_follow_the_table_on_an_interior_machine(law: Controller, rpm: float, torque: float) -> None:
+    point = polar_salient.point(polar_salient.response(law, rpm, torque))
+    assert point.torque == pytest.approx(torque, rel=polar_salient.TORQUE_SHARE)  # 0.0013, the table's
+    assert point.voltage <= 0.97
+
+
+def test_regularised_law_with_the_table_works_in_field_weakening() -> None:
+    step = measured(REGULARISED_TABLE)
+    assert step.up_ms <= UNIFIED_UP  # 5.1
+    assert step.down_ms <= UNIFIED_DOWN  # 2.0
+    assert step.peak_a <= 0.5  # 0.21
+    assert step.loss_w == pytest.approx(50.4, abs=0.2)  # 0.95 V_max
 
 
 def test_regularised_law_holds_torque_on_an_interior_machine() -> None:

@@ -116,7 +116,7 @@ class Controller:
     values : tuple of (str, float)
         Further values of the catalogue.
     request : TuneRequest
-        What is asked of ``tune`` besides.
+        What is asked of ``tune`` besides; a polar law weakens the field itself unless it asks for the table.
     cdm : bool
         Field-oriented gains of the coefficient diagram method with tau = 10 T_u in place of the tuned ones, so that
         no bandwidth separates them from the paper's linear-range law.
@@ -140,7 +140,11 @@ LINEAR = Controller("linear range, (15) corrected", "linear", 0)
 PRINTED = Controller("linear range, (15) as printed", "linear-printed", 0)
 REGULARISED = Controller("regularised polar map", "regularised", 0)
 UNIFIED = Controller("unified, V_ref = V_max", "unified", 0, (("polar.V_ref_ratio", 1.0),))
-UNIFIED_TUNED = Controller("unified, V_ref = 0.97 V_max (tune)", "unified", 0)
+UNIFIED_TUNED = Controller("unified, V_ref = 0.97 V_max", "unified", 0)
+TABLE = TuneRequest(field_weakening="lookup", voltage_margin=0.05)
+"""A table of currents with the voltage margin of the baselines."""
+REGULARISED_TABLE = Controller("regularised polar map, table of currents", "regularised", 0, request=TABLE)
+UNIFIED_TABLE = Controller("unified, table of currents", "unified", 0, request=TABLE)
 
 
 def _field_oriented(name: str, governor: str, weakening: str, margin: float, *, cdm: bool = False) -> Controller:
@@ -172,9 +176,10 @@ def parameter_set(controller: Controller, source: MachineFile) -> ParameterSet:
     DesignInfeasible
         The law does not hold for this machine.
     """
-    request = replace(controller.request, controller="polar" if controller.law else "pi")
+    request = controller.request
     if controller.law:
-        request = replace(request, polar_law=controller.law)
+        own = "off" if request.field_weakening == "auto" else request.field_weakening
+        request = replace(request, controller="polar", polar_law=controller.law, field_weakening=own)
     design = tune(source, request)
     tuned = design.parameter_set()
     values = dict(tuned.values)
