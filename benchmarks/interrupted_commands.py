@@ -52,6 +52,7 @@ NEW_SET = "new/params.toml"
 WAYS = ("ctrl-c", "adapter")
 _CONTROLWORD_WRITTEN = b"\x2b\x40\x60\x00"
 _STATUSWORD_READ = b"\x4b\x41\x60\x00"
+TO_DO = ("hardware stop", "reset the drive")
 MEASURING = ("identify", "commission")
 JOURNALED = ("flash-params", "restore", "commission")
 COMMANDS = {
@@ -205,7 +206,7 @@ def interrupted(how: str, command: str, moment: int | None) -> Outcome:
     if how == "ctrl-c":
         wanted = code == 130
     else:
-        wanted = code == 8 and "hardware stop" in told if watch.enabled else code in (3, 8)
+        wanted = code == 8 and all(word in told for word in TO_DO) if watch.enabled else code in (3, 8)
         verdict += ", the machine energised when it went" if watch.enabled else ", nothing energised"
     if not told.strip() or "Traceback" in told:
         verdict, wanted = f"{verdict}; said: {told[-300:]!r}", False
