@@ -48,7 +48,7 @@ def test_determinant_and_condition_number(omega_e: float, i_q: float) -> None:
     _, b = polar.linearised(SET_A, point)
     assert np.linalg.det(b) == pytest.approx(point.V_a / SET_A.L_s_h**2, rel=IDENTITY_TOLERANCE)
     scaled = b @ np.diag([V_MAX, 1.0])
-    assert np.linalg.cond(scaled) == pytest.approx(V_MAX / point.V_a, rel=1e-8)
+    assert np.linalg.cond(scaled) == pytest.approx(V_MAX / point.V_a, rel=IDENTITY_TOLERANCE)
 
 
 @given(st.floats(-1500.0, 1500.0), st.floats(-40.0, 40.0), st.floats(0.5, V_MAX))
