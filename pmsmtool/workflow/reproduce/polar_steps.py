@@ -255,10 +255,10 @@ def compared(seed: int) -> Reproduction:
     )
     notes = (
         *ASSUMED,
-        "field-oriented control with the gains tune chooses (10000 rad/s, 3333 rad/s with a period of delay) settles the"
-        " step down faster than the unified law (1250 rad/s), which has overshoot, i_d and loss in its favour; at"
+        "field-oriented control with the gains tune chooses (10000 rad/s, 3333 rad/s with a period of delay) settles"
+        " the step down faster than the unified law (1250 rad/s), which has overshoot, i_d and loss in its favour; at"
         " 2500 rad/s it would settle in 3.5 and 1.0 ms, but its phase at standstill would oscillate eight times more",
-        "field weakening by optimisation keeps i_d negative for seconds after the step down; the table does not",
+        "field weakening by optimisation brings i_d back more slowly after the step down than the table",
     )
     return Reproduction(
         "polar-steps",
