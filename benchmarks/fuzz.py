@@ -28,7 +28,8 @@ from pmsmtool.drive.port import Identity
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.firmware.dcf import Entry as Written
 from pmsmtool.firmware.dcf import read_concise, update_dcf, values_of, write_concise
-from pmsmtool.firmware.drive_map import dump_drive_map, parse_drive_map, reference_map
+from pmsmtool.firmware.drive_map import reference_map
+from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.firmware.eds import parse_eds
 from pmsmtool.flash.journal import Entry, Snapshot, check_sum, parse_snapshot
 from pmsmtool.machine.flux_map import FluxMap
