@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.options import BITRATE, FILE, WholeNumber, examples, output_options
+from pmsmtool.cli.drive_access import map_option
+from pmsmtool.cli.options import BITRATE, FILE, BusOptions, WholeNumber, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
@@ -18,7 +20,7 @@ _NODE_ID = WholeNumber("node", 1, 255)
 _COUNT = WholeNumber("count", 1, 127)
 
 
-_HELP = """Serve simulated drives to other programs; list the profiles; show faults.
+_HELP = """Serve simulated drives to other programs; list the profiles; clone a drive; show faults.
 
 A simulated drive in this process needs no server: -i pmsmsim -c CHANNEL, or --sim CHANNEL, with a CHANNEL of
 NAME[?key=value&...], NAME a profile or a machine file:
@@ -110,6 +112,50 @@ def _serve(server: SocketcandServer) -> None:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+@sim_command.command(
+    "clone",
+    epilog=examples(
+        "pmsmtool -i socketcan -c can0 -n 5 sim clone runs/20260101T120000Z-000055f1 -o twin.toml",
+        "pmsmtool sim clone machine.toml -n 5 -o twin.toml --draw 1   # then: pmsmtool --sim twin.toml info",
+    ),
+)
+@click.argument("machine")
+@click.option("-o", "--output", "path", type=FILE, required=True, help="Machine file of the clone; others beside it.")
+@click.option("--draw", type=_SEED, metavar="SEED", help="Draw the clone's truth from the estimates' intervals.")
+@map_option
+@bus_options
+@output_options
+def clone_command(
+    bus: BusOptions, out: Output, machine: str, path: Path, draw: int | None, map_file: Path | None
+) -> None:
+    """Make a simulated drive in the image of a real one: its machine, its parameters, its data sheet.
+
+    MACHINE is the machine file, run directory or profile that says what is on the drive; the drive is only read.
+    """
+    from pmsmtool.cli.drive_access import open_node, read_map
+    from pmsmtool.cli.output_file import write_file
+    from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+    from pmsmtool.machine.profile import machine_path
+    from pmsmtool.workflow.capabilities import examine
+    from pmsmtool.workflow.clone import clone_drive
+
+    machine_file = load_machine_file(machine_path(machine))
+    with open_node(bus) as node:
+        found = examine(node, None if map_file is None else read_map(map_file))
+        clone = clone_drive(node, found, machine_file, draw)
+    embed = machine_file.flux_map is not None
+    contents: dict[Path, bytes] = {path: dump_machine_file(clone.machine_file, embed_flux_map=embed).encode()}
+    if clone.parameters.values:
+        contents[path.with_suffix(".params.toml")] = clone.parameters.to_toml().encode()
+    if clone.data_sheet:
+        contents[path.with_suffix(".eds")] = clone.data_sheet
+    for file, content in contents.items():
+        write_file(file, content)
+    channel = str(path) if clone.family == "pmsmsim" else f"'{path}?drive={clone.family}'"
+    data = {"files": [str(file) for file in contents], "family": clone.family, "draw": draw}
+    out.result("sim-clone", data, [f"wrote {', '.join(map(str, contents))}", f"pmsmtool --sim {channel} info"])
 
 
 @sim_command.command(

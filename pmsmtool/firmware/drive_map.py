@@ -138,7 +138,8 @@ class Cell:
         raw = struct.unpack("<" + letter, data)[0]
         if letter == "f":
             raw = shortest_binary32(raw)
-        return self._meant(raw * self.factor + self.offset, values)
+        # fifteen digits: one count more or less shows, the product's last bit does not
+        return self._meant(float(f"{raw * self.factor + self.offset:.15g}"), values)
 
     def _formed(self, value: float, values: Mapping[str, float]) -> float:
         """What the drive keeps for a value."""
