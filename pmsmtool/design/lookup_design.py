@@ -147,12 +147,15 @@ def design_table(
     DesignInfeasible
         The bounds cannot be kept in the drive's memory, or no speed can be reached.
     """
+    known = loss_map if request.axis == "speed" else None
     machine = at_temperature(
         source.machine, source.flux_map,
-        T_winding_c=request.T_winding_c, T_magnet_c=request.T_magnet_c, loss_map=loss_map,
+        T_winding_c=request.T_winding_c, T_magnet_c=request.T_magnet_c, loss_map=known,
     )  # fmt: skip
     problem = _Problem(machine, source, rated, request, voltage_margin)
     y, notes = problem.second_axis()
+    if loss_map is not known:
+        notes = (*notes, "a flux table knows no speed: least copper loss, the iron-loss map is left out")
     torque = problem.largest_torque()
     if request.torque_points is not None and request.y_points is not None:
         x = np.linspace(-torque, torque, request.torque_points)

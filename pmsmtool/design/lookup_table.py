@@ -211,8 +211,13 @@ def flux_table(
 ) -> LookupTable:
     """Solve a table over torque and flux limit |psi| <= y: exact for a machine without resistance only.
 
-    Parameters are those of :func:`speed_table`; ``flux_limit_wb`` (Wb) is positive.
+    Parameters are those of :func:`speed_table`; ``flux_limit_wb`` (Wb) is positive. Iron loss needs the speed, which
+    such a table does not know: a machine with a loss map is refused (``ConfigError``).
     """
+    if machine.loss_map is not None:
+        raise ConfigError(
+            "knows no speed, so it cannot minimise iron loss", where="flux table", hint="take a table over speed"
+        )
     y = np.atleast_1d(np.asarray(flux_limit_wb, dtype=np.float64))
     lossless = replace(machine, R=0.0)
     # |v| = |psi| at w = 1 rad/s without resistance: each limit is one "voltage" of one "speed".

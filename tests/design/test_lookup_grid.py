@@ -371,6 +371,19 @@ def test_references_beyond_the_iron_loss_map_are_refused() -> None:
         speed_table(machine, torque_nm=[90.0], speed_rpm=[1500.0], V_max_v=[100.0], I_max_apk=150.0)
 
 
+def test_a_flux_table_does_not_pretend_to_know_iron_loss() -> None:
+    axis = np.linspace(-200.0, 200.0, 9)
+    flux = np.hypot(*M.flux(axis[:, None], axis[None, :])) ** 2
+    loss = FluxMap(axis, axis, 60.0 * flux, 0.4 * flux)
+    with pytest.raises(ConfigError, match="knows no speed"):
+        flux_table(replace(M, loss_map=loss), torque_nm=[20.0], flux_limit_wb=[0.1], I_max_apk=150.0)
+    source = load_machine_file(PROFILES / "mtpv-test.toml")
+    rated, request = ratings(source, 0.92 * source.inverter.V_max_v), LookupRequest("flux", 5, 5)
+    design = design_table(source, rated, request, 0.08, loss)
+    assert any("iron-loss map is left out" in note for note in design.notes)
+    assert np.array_equal(design.table.i_d_a, design_table(source, rated, request, 0.08).table.i_d_a)
+
+
 # -- files and command ---------------------------------------------------------------------------------------
 
 
