@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from pmsmtool.cli.main import cli
 from pmsmtool.design.polar_values import LINEAR_RANGE
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
@@ -83,6 +85,15 @@ def test_the_improved_laws_take_it_and_say_so(law: str, mode: float) -> None:
     design = tune(load_machine_file(PROFILES / "interior-2k2.toml"), TuneRequest(controller="polar", polar_law=law))
     assert design["polar.mode"] == mode
     assert any("differ" in note for note in design.notes)
+
+
+def test_tune_shows_the_values_of_the_law_and_what_the_true_loop_makes_of_it(tmp_path: Path) -> None:
+    arguments = ["tune", str(ASSUMED), "--controller", "polar", "-o", str(tmp_path / "design.toml")]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    for name in ("polar.omega_c_rad_s", "polar_V_a_max_v", "polar_two_input_stable", "polar_slowest_pole_rad_s"):
+        assert name in result.output
+    assert "current.K_p_d" not in result.output
 
 
 def test_pi_leaves_polar_control_off() -> None:

@@ -167,6 +167,14 @@ def test_torque_bump_on_ramps(ramp: polar_ramps.Ramp) -> None:
     assert bump[PROPOSED.name] > bump[UNIFIED.name]
 
 
+def test_reversal_through_zero_voltage() -> None:
+    r = polar_ramps.response(UNIFIED_TUNED, polar_ramps.REVERSAL)
+    bump, error, i_d = polar_ramps.measured(r, polar_ramps.REVERSAL)
+    assert bump <= RAMP_BUMP  # 0.0172
+    assert error <= 2 * RAMP_BUMP  # 0.0233
+    assert i_d <= UNIFIED_PEAK  # 0.037
+
+
 # ---- linear range --------------------------------------------------------------------------------------------
 
 STANDSTILL_OVER, STANDSTILL_OVER_ROOM = 18.5, 1.5  # %; 18.5

@@ -74,6 +74,15 @@ SPEED = Ramp(
     0.60,
     0.64,
 )
+REVERSAL = Ramp(
+    "reversal -1400 -> 1400 -> -1400 rpm in 1 s each way at 2 N m",
+    ((0.0, 2.0),),
+    ((0.0, -1400.0), (0.10, -1400.0), (1.10, 1400.0), (1.20, 1400.0), (2.20, -1400.0)),
+    0.06,
+    2.25,
+    2.3,
+)
+"""Through zero voltage, where the phase turns by pi; the phase laws cannot, without their switch."""
 
 
 def response(law: Controller, ramp: Ramp, bench: Bench = SIMULATION, seed: int = 0) -> Response:
@@ -95,7 +104,8 @@ def _table(ramp: Ramp, bench: Bench, seed: int) -> tuple[Table, dict[str, tuple[
         Column("largest torque error", "N m", 3),
         Column("largest i_d", "A", 3),
     )
-    found = {law.name: measured(response(law, ramp, bench, seed), ramp) for law in LAWS}
+    laws = [law for law in LAWS if ramp is not REVERSAL or law not in (CONVENTIONAL, PROPOSED)]
+    found = {law.name: measured(response(law, ramp, bench, seed), ramp) for law in laws}
     rows = tuple((name, *m) for name, m in found.items())
     return Table(f"{ramp.name}; {bench.name}", columns, rows), found
 
@@ -115,6 +125,10 @@ def transitions(seed: int) -> Reproduction:
         expected = 0.031 if ramp is TORQUE else 0.020
         what = f"proposed: torque bump, {ramp.name.split()[0]} ramp"
         checks.append(Check(what, expected, bump, "N m", 0.5 * expected, 1.5 * expected, EXPECTED))
+    table, found = _table(REVERSAL, SIMULATION, seed)
+    tables += [table, _table(REVERSAL, EXPERIMENT, seed)[0]]
+    what = f"{UNIFIED_TUNED.name}: torque bump, reversal"
+    checks.append(at_most(what, found[UNIFIED_TUNED.name][0], BUMP_NM, "N m", where=EXPECTED))
     plots = []
     for ramp in (TORQUE, SPEED):
         runs = [(law.name, response(law, ramp, seed=seed)) for law in (PROPOSED, UNIFIED, UNIFIED_TUNED, *BASELINES)]
