@@ -59,7 +59,8 @@ class TuneRequest:
         Tightening of its steady-state row.
     field_weakening : str
         Mode of field weakening (``field_weakening.MODES``), or ``auto``: a look-up table for a machine with a flux map,
-        the accelerated optimisation for a constant one.
+        the accelerated optimisation for a constant one; for a polar law the table where it knows more than the law
+        (``polar_values.weakening_mode``).
     """
 
     controller: str = "pi"
