@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.estimators.estimate import information_weights, scaled_covariance
-from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, central_jacobian, levenberg_marquardt
+from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt
 from pmsmtool.estimators.output_error import AxisModel, bend, recursion, respond
 from pmsmtool.estimators.refusals import refuse
 
@@ -342,10 +342,18 @@ class _Problem:
         return np.concatenate([*self.per_shot(x), prior])
 
     def derivative(self, x: Vector) -> NDArray[np.float64]:
-        """Jacobian: differences for what all shots share, the decay of a starting current in closed form."""
+        """Jacobian: differences for what all shots share, the decay of a starting current in closed form.
+
+        One-sided: a step of 1e-5 leaves 1e-5 of a column, and central ones would double the time of a fit.
+        """
         shared = len(x) - self.layout.shots
-        step = np.full(shared, RELATIVE_STEP)
-        columns = [central_jacobian(lambda head: self(np.concatenate([head, x[shared:]])), x[:shared], step)]
+        here = self(x)
+        sides = []
+        for k in range(shared):
+            aside = x.copy()
+            aside[k] += RELATIVE_STEP
+            sides.append((self(aside) - here) / (aside[k] - x[k]))
+        columns = [np.stack(sides, axis=1)]
         first = 0
         for shot, slow, response in zip(self.shots, self.slow, self.layout.responses(x), strict=True):
             decay = respond(response.model, np.zeros(len(shot.u_v)), shot.period_s, 1.0)[-len(slow) - 1 : -1]
