@@ -50,33 +50,32 @@ def truth_of(drive: MachineFile, evaluation: Evaluation) -> dict[str, float]:
     truth["R_at_T_ohm"] = devices + copper * (1.0 + drive.machine.alpha_R_per_k * rise)
     truth["offset_rad"] = values.number("encoder_offset_rad")
     if drive.flux_map is not None and evaluation.inductance is not None:
-        for k, (name, found) in enumerate(
-            (("L_d_h", evaluation.inductance.L_d), ("L_q_h", evaluation.inductance.L_q))
-        ):
+        for k, (name, found) in enumerate((("L_d_h", evaluation.inductance.L_d), ("L_q_h", evaluation.inductance.L_q))):
             truth[name] = float(drive.flux_map.incremental_inductance(found.i_d_apk, found.i_q_apk)[k, k])
         truth["psi_f_wb"] = float(drive.flux_map.flux(0.0, 0.0)[0])
     return truth
 
 
+def drawn(profile: str, seed: int, block: str) -> MachineFile:
+    """Return a drive around a profile, or of the population where that is empty."""
+    if not profile:
+        return draw_drive(seed, block)  # type: ignore[arg-type]
+    base = load_machine_file(data_folder("profiles") / f"{profile}.toml")
+    return draw_around(base, seed, block, spread=DRAWN_SPREAD)  # type: ignore[arg-type]
+
+
 def identify_one(job: tuple[str, int, str]) -> dict[str, Any]:
     """Identify one drive; returns errors, half widths and refusal, all JSON."""
     profile, seed, block = job
-    if profile:
-        source = data_folder("profiles") / f"{profile}.toml"
-        base = load_machine_file(source)
-        drive = draw_around(base, seed, block, spread=DRAWN_SPREAD)  # type: ignore[arg-type]
-    else:
-        drive = draw_drive(seed, block)  # type: ignore[arg-type]
+    drive = drawn(profile, seed, block)
     row: dict[str, Any] = {"profile": profile, "seed": seed, "block": block}
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "drive.toml"
-        path.write_text(dump_machine_file(drive, embed_flux_map=drive.flux_map is not None), encoding="utf-8")
-        try:
-            evaluation, seconds = _measure(path)
-        except PmsmtoolError as error:
-            row["refused"] = getattr(error, "reason", type(error).__name__)
-            row["text"] = str(error).splitlines()[0]
-            return row
+    try:
+        traces, nameplate, seconds = measured(drive)
+        evaluation = evaluated(traces, nameplate)
+    except PmsmtoolError as error:
+        row["refused"] = getattr(error, "reason", type(error).__name__)
+        row["text"] = str(error).splitlines()[0]
+        return row
     truth = truth_of(drive, evaluation)
     found = evaluation.estimates()
     assert evaluation.resistance is not None
@@ -97,7 +96,20 @@ def identify_one(job: tuple[str, int, str]) -> dict[str, Any]:
     return row
 
 
-def _measure(path: Path) -> tuple[Evaluation, float]:
+def measured(drive: MachineFile) -> tuple[dict[str, Trace], MachineFile, float]:
+    """Run the experiments on a simulated drive; return traces, nameplate and time on the bus (s)."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.toml"
+        path.write_text(dump_machine_file(drive, embed_flux_map=drive.flux_map is not None), encoding="utf-8")
+        return _measured(path)
+
+
+def evaluated(traces: dict[str, Trace], nameplate: MachineFile) -> Evaluation:
+    """Estimate from the traces of :func:`measured`."""
+    return evaluate(traces, nameplate.inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=nameplate.inverter.U_dc_v)
+
+
+def _measured(path: Path) -> tuple[dict[str, Trace], MachineFile, float]:
     traces: dict[str, Trace] = {}
     with connect("pmsmsim", f"{path}?nv=:memory:") as connection:
         drive = CanopenDrive(connection, 1)
@@ -115,10 +127,7 @@ def _measure(path: Path) -> tuple[Evaluation, float]:
             Measurement(guard, limits, traces.__setitem__, lambda text: None).run(request.quantities)
         seconds = connection.clock.now() - start
         drive.close()
-    found = evaluate(
-        traces, nameplate.inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=nameplate.inverter.U_dc_v
-    )
-    return found, seconds
+    return traces, nameplate, seconds
 
 
 def clopper_pearson(hits: int, n: int) -> tuple[float, float]:
