@@ -23,9 +23,9 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow.random_drives import true_loop_resistance
 
 TOLERANCE = 0.01
-"""Largest deviation from the truth with ideal sensor gains; measured 0.15 % (L_q of the switched machine)."""
+"""Largest deviation from the truth with ideal sensor gains; measured 0.15 % (psi_f of the switched machine)."""
 OFFSET_TOLERANCE_RAD = math.radians(0.5)
-"""Measured 0.05 deg."""
+"""Measured 0.003 deg (switched machine)."""
 
 Result = tuple[int, str, str]
 Tool = Callable[..., Result]

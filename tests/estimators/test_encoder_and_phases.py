@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import ExitCode, IdentificationError
-from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
+from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise, estimate_noise
-from pmsmtool.estimators.phase_check import check_phases
+from pmsmtool.estimators.phase_check import check_pairs, check_phases
 from pmsmtool.estimators.refusals import REFUSALS, refuse
 from pmsmtool.trace import Trace
 
@@ -109,6 +110,75 @@ def test_a_bad_motor_is_named(phases: tuple[float, float, float], reason: str) -
     with pytest.raises(IdentificationError) as caught:
         check_phases(vectors(phases=phases), NOISE)
     assert caught.value.reason == reason
+
+
+def test_an_encoder_that_does_not_count_is_named_and_a_slow_one_is_not() -> None:
+    imposed = np.array([0.0, math.radians(150.0)])
+    check_encoder_counts(trace(theta_imposed_rad=imposed, theta_M_rad=-imposed / 32.0))
+    with pytest.raises(IdentificationError) as caught:
+        check_encoder_counts(trace(theta_imposed_rad=imposed, theta_M_rad=np.array([1.0, 1.0001])))
+    assert caught.value.reason == "E_ENCODER"
+
+
+def test_a_motor_without_current_and_a_drive_without_signal_are_told_apart() -> None:
+    small = vectors(phases=(0.02, 0.02, 0.02))
+    small.meta["i_command_a"] = 0.5
+    with pytest.raises(IdentificationError, match="E_NOT_CONNECTED"):
+        check_phases(small, NOISE)
+    with pytest.raises(IdentificationError, match="E_SNR"):
+        check_phases(small, Noise(1.0, 0.0, 0.0, 2048))
+    with pytest.raises(IdentificationError, match="E_CURRENT_SENSOR"):
+        check_phases(vectors_of(0.5), Noise(0.005, 0.2, 0.0, 2048))
+
+
+def vectors_of(command: float) -> Trace:
+    healthy = vectors()
+    healthy.meta["i_command_a"] = command
+    return healthy
+
+
+def pairs(R: tuple[float, float, float], gains: tuple[float, float, float] = (1.0, 1.0, 1.0), moved: int = 0) -> Trace:
+    """Two currents through each pair of phases of resistances R, read by sensors of different gains."""
+    rows = []
+    for k in range(3):
+        angle = math.pi / 2.0 + 2.0 * math.pi / 3.0 * k
+        for i in (1.0, 2.0):
+            phase = [i * math.cos(angle - 2.0 * math.pi / 3.0 * x) for x in range(3)]
+            drops = [r * c for r, c in zip(R, phase, strict=True)]
+            along = 2.0 / 3.0 * sum(u * math.cos(angle - 2.0 * math.pi / 3.0 * x) for x, u in enumerate(drops))
+            dead = 5.0 * 2.0 / math.sqrt(3.0)  # a curve of 5 V on every phase, along a vector with one phase idle
+            rows.append((*(g * c for g, c in zip(gains, phase, strict=True)), along + dead, i, float(moved)))
+    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "moved")
+    return trace(**{name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)})
+
+
+STEP = InverterCurve(np.array([1e-3, 10.0]), np.array([5.0, 5.0]), 0.0)
+
+
+def test_equal_pairs_show_their_resistance_whatever_the_dead_time() -> None:
+    result = check_pairs(pairs((2.0, 2.0, 2.0)), NOISE, STEP)
+    assert result.resistance_ohm == pytest.approx((2.0, 2.0, 2.0))
+    assert result.spread == pytest.approx(0.0, abs=1e-12) and result.sensor_sum == pytest.approx(0.0, abs=1e-12)
+    assert result.judged
+
+
+@pytest.mark.parametrize(
+    ("found", "reason"),
+    [
+        (pairs((3.0, 2.0, 2.0)), "E_UNBALANCED"),
+        (pairs((2.0, 2.0, 1.5)), "E_UNBALANCED"),
+        (pairs((2.0, 2.0, 2.0), gains=(1.0, 0.98, 1.0)), "E_CURRENT_SENSOR"),
+        (pairs((3.0, 2.0, 2.0), gains=(1.15, 1.0, 1.0)), "E_CURRENT_SENSOR"),
+    ],
+)
+def test_unequal_pairs_and_unequal_sensors_are_told_apart(found: Trace, reason: str) -> None:
+    with pytest.raises(IdentificationError) as caught:
+        check_pairs(found, NOISE, STEP)
+    assert caught.value.reason == reason
+
+
+def test_pairs_under_a_moving_rotor_are_not_judged() -> None:
+    assert not check_pairs(pairs((3.0, 2.0, 2.0), moved=1), NOISE, STEP).judged
 
 
 def test_noise_is_found_and_a_slow_drift_is_not_noise() -> None:
