@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.drive_map import DriveMap
@@ -80,11 +80,14 @@ class Plan:
         Entries of the set the drive has no object for.
     content : str
         Content hash of the set.
+    reasons : mapping of str to str
+        Why the drive's map leaves an entry out, as far as it says.
     """
 
     entries: tuple[Change, ...]
     missing: tuple[str, ...] = ()
     content: str = ""
+    reasons: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def changes(self) -> tuple[Change, ...]:
@@ -101,7 +104,10 @@ class Plan:
         ]
         equal = len(self.entries) - len(rows)
         lines.append(f"{len(rows)} of {len(self.entries)} objects change, {equal} hold their value already")
-        lines += [f"this drive has no object for {name}" for name in self.missing]
+        lines += [
+            f"this drive has no object for {name}" + (f": {self.reasons[name]}" if name in self.reasons else "")
+            for name in self.missing
+        ]
         return lines
 
 
@@ -131,7 +137,7 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
         values = (before.get(name, math.nan), wanted.values[name], held[name]) if scalar else (math.nan,) * 3
         unit = BY_NAME[name].unit if scalar else table_unit(name)
         entries.append(Change(name, index, sub, found[name], new, *values, unit))
-    return Plan(tuple(entries), drive_map.missing(wanted), wanted.content_hash())
+    return Plan(tuple(entries), drive_map.missing(wanted), wanted.content_hash(), drive_map.left_out)
 
 
 def names_to_read(drive_map: DriveMap, wanted: ParameterSet) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
-from pmsmtool.errors import ConfigError, IdentificationError
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
@@ -170,11 +170,15 @@ def tier_stage(
 
     Raises
     ------
+    NotAvailable
+        The shaft is locked.
     Declined
         The person did not consent; nothing was moved.
     IdentificationError, StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
         As :func:`identify_standard` and :func:`identify_recorder`.
     """
+    if request.shaft == "locked":
+        raise NotAvailable("without injection the rotor must turn, and the shaft is locked", hint="free the shaft")
     envelope = tier_envelope(drive, request)
     envelope.refuse_gravity()
     moves = (

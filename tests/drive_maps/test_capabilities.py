@@ -168,6 +168,12 @@ def test_identify_ends_in_exit_9_and_names_what_is_missing(
     assert not (tmp_path / "runs").exists()  # nothing was begun
 
 
+def test_a_locked_shaft_gives_nothing_without_injection(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = run("--sim", CHANNEL + "&tier=recorder", "--yes", "identify", "R", "--shaft", "locked")
+    assert isinstance(outcome.exception, NotAvailable) and "must turn" in str(outcome.exception)
+
+
 def test_commission_of_another_family_is_exit_9(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     outcome = run("--sim", CHANNEL + "&drive=epos4", "--yes", "commission")

@@ -190,6 +190,15 @@ gain = "current.K_p_q_v_per_a"
         assert shown["current.K_i_q_v_per_as"] == pytest.approx(expected, rel=1e-12)
 
 
+def test_a_plan_says_why_a_value_is_left_out_and_what_is_rounded() -> None:
+    with opened("epos4") as node:
+        wanted = ParameterSet({"current.K_i_q_v_per_as": 12.3457, "current.K_p_d_v_per_a": 1.0, "motor.R_s_ohm": 0.1})
+        lines = plan_download(node, wanted).lines()
+    assert any("12.346 V/(A s)" in line and "asked for 12.3457" in line for line in lines)
+    assert any("K_p_d_v_per_a: one pair of gains" in line for line in lines)
+    assert any("motor.R_s_ohm: 0x3002:01" in line for line in lines)
+
+
 def test_a_value_the_type_cannot_hold_is_refused_before_anything_is_written() -> None:
     with opened("copley") as node:
         before = DriveParameters(node).read(node.map.cells)
