@@ -1,8 +1,8 @@
 """How far the numbers of the random governor figures move with the seed.
 
-Run from the repository: ``python benchmarks/governor_seeds.py [--seeds 5] [--cases 300]``; about half a minute of one core
-per seed. Every checked number is listed with its least and largest value over the seeds. Exit code 1 when one of them is
-out of its range for a seed.
+Run from the repository: ``python benchmarks/governor_seeds.py [--seeds 5] [--cases 300]``; about half a minute of one
+core per seed. Every checked number is listed with its least and largest value over the seeds. Exit code 1 when one of
+them is out of its range for a seed.
 """
 
 from __future__ import annotations

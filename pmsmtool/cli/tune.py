@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     default="best",
     help="Reference governor.",
 )
-@click.option("--eps", type=float, metavar="RATIO", help="Tightening of its steady state.  [default: 0.01 or more]")
+@click.option("--eps", type=float, metavar="RATIO", help="Tightening of its steady state.  [default: 0.015 or more]")
 @click.option(
     "--field-weakening",
     type=click.Choice(["auto", "off", "lookup", "gradient", "accelerated", "uncompensated"]),

@@ -63,7 +63,7 @@ def test_modes_and_options() -> None:
     options = int(best.values["governor.options"].value)
     assert options == CURRENT_ROW | PRE_PROJECTION | MINIMUM_TIME | PREDICTOR
     assert best.values["governor.k_max"].value == 0.0
-    assert best.values["governor.eps"].value == 0.01
+    assert best.values["governor.eps"].value == 0.015
     assert best.values["governor.observer_gain"].value == pytest.approx(0.1, rel=0.05)
     assert best.facts["straight_segment"] is True
     paper = design_governor(source, rated, gains, "paper", predictor=False)
