@@ -19,6 +19,7 @@ from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
+from pmsmtool.estimators.rotation_offset import offset_by_turns
 from pmsmtool.experiments.recorded_push import PushPlan, swing
 from pmsmtool.experiments.rotation import RotationPlan, rotate_vector
 from pmsmtool.machine.parameters import Estimate
@@ -84,13 +85,14 @@ def identify_standard(
             except IdentificationError as error:
                 if error.reason not in OFF_THE_VECTOR or share == VECTOR_SHARES[-1]:
                     raise
-    return TierResult(encoder_estimates(found), {}, traces)
+    return TierResult(encoder_estimates(found, traces), {}, traces)
 
 
-def encoder_estimates(found: EncoderResult) -> dict[str, Estimate]:
+def encoder_estimates(found: EncoderResult, traces: Mapping[str, Trace]) -> dict[str, Estimate]:
     """Return pole pairs, direction and offset by the keys of a machine file."""
-    direction = Estimate(float(found.direction), 0.0, 0.0, "1", n=found.offset.n, method=found.offset.method)
-    return {"pole_pairs": found.pole_pairs, "direction": direction, "offset_rad": found.offset}
+    direction = Estimate(float(found.direction), 0.0, 0.0, "1", n=found.offset.n, method=found.pole_pairs.method)
+    offset = offset_by_turns(found, traces["rotation_forward"], traces["rotation_backward"])
+    return {"pole_pairs": found.pole_pairs, "direction": direction, "offset_rad": offset}
 
 
 def identify_recorder(
