@@ -2,9 +2,10 @@
 
 The compiler is ``arm-none-eabi-gcc`` where it is installed, else the ziglang package; the emulator is the unicorn
 package. ``missing()`` names what is absent. Instruction counts are exact and repeat bit for bit. Cycles are a model,
-not silicon: the weights of the Cortex-M4 technical reference manual as in the firmware reference (division and square root
-14, single load or store 2, multiple 1 + N, taken branch 3, everything else 1, one more where a floating-point result is
-used by the next instruction); no flash wait states, no interrupt entry, no stacking of registers. Test code only.
+not silicon: the weights of the Cortex-M4 technical reference manual as in the firmware reference (division and square
+root 14, single load or store 2, multiple 1 + N, taken branch 3, everything else 1, one more where a floating-point
+result is used by the next instruction); no flash wait states, no interrupt entry, no stacking of registers. Test code
+only.
 """
 
 from __future__ import annotations

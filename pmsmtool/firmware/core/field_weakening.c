@@ -27,7 +27,7 @@ typedef struct {
     pmsm_real k_t, k_s;    /* T = (k_t + k_s i_d) i_q */
     uint32_t empty;        /* 1: no current satisfied both rows */
     uint32_t steps;
-    uint32_t unfinished;   /* 1: the time of this period ended the iteration */
+    uint32_t left;         /* iterations that an accelerated call still may take */
 } problem;
 
 static pmsm_row voltage_row(const pmsm_period *period)
@@ -181,18 +181,20 @@ static pmsm_dq gradient_steps(problem *q, const pmsm_params *params, pmsm_dq x)
 }
 
 /* FISTA (Beck, Teboulle, DOI 10.1137/080716542) with gradient restart, step 1/L from a local bound of the curvature. */
-static pmsm_dq accelerated_steps(problem *q, const pmsm_params *params, pmsm_dq x)
+static pmsm_dq accelerated_steps(problem *q, pmsm_dq x)
 {
     pmsm_real t = PMSM_C(1.0);
     x = project(q, x);
     pmsm_dq y = x;
-    for (uint32_t k = 0u; k < params->field_weakening_iterations && q->empty == 0u; k++) {
+    while (q->left > 0u && q->empty == 0u) {
         const pmsm_real e = torque_error(q, y);
         const pmsm_real slope = q->k_t + q->k_s * y.d;
         const pmsm_real side = q->k_s * y.q;
         const pmsm_real curvature = PMSM_C(2.1) * q->h1 * (slope * slope + side * side + pmsm_abs(q->k_s * e)) +
                                     PMSM_C(2.0) * q->h2;
+        q->left--;
         if (curvature <= PMSM_C(0.0)) {
+            q->left = 0u;
             break;
         }
         const pmsm_dq g = gradient(q, y);
@@ -205,19 +207,18 @@ static pmsm_dq accelerated_steps(problem *q, const pmsm_params *params, pmsm_dq 
         const pmsm_real t_next = PMSM_C(0.5) * (PMSM_C(1.0) + PMSM_SQRT(PMSM_C(1.0) + PMSM_C(4.0) * t * t));
         const pmsm_real ahead = (t - PMSM_C(1.0)) / t_next;
         const pmsm_real change = distance(z, x);
-        q->unfinished = (q->steps >= STEPS_PER_PERIOD) ? 1u : 0u;
         y.d = z.d + ahead * (z.d - x.d);
         y.q = z.q + ahead * (z.q - x.q);
         x = z;
         t = t_next;
         if (change < STEP_END) {
-            q->unfinished = 0u;
-            break;
+            q->left = 0u;
         }
-        if (q->unfinished != 0u) {
+        if (q->steps >= STEPS_PER_PERIOD) {
             break;
         }
     }
+    q->left = (q->empty != 0u) ? 0u : q->left;
     return x;
 }
 
@@ -239,13 +240,21 @@ pmsm_dq pmsm_field_weakening(pmsm_period *period, pmsm_real tau)
     pmsm_state *state = period->state;
     const pmsm_params *params = period->params;
     if (is_due(period, tau) != 0u) {
-        problem q = state_problem(period, tau);
-        state->fw_reference = (params->field_weakening_mode == PMSM_FW_ACCELERATED)
-                                  ? accelerated_steps(&q, params, state->fw_reference)
-                                  : gradient_steps(&q, params, state->fw_reference);
+        state->fw_count = params->field_weakening_N_fw;
+        state->fw_left = params->field_weakening_iterations;
         state->fw_tau = tau;
+    }
+    if (state->fw_left > 0u) {
+        problem q = state_problem(period, tau);
+        q.left = state->fw_left;
+        if (params->field_weakening_mode == PMSM_FW_ACCELERATED) {
+            state->fw_reference = accelerated_steps(&q, state->fw_reference);
+            state->fw_left = q.left;
+        } else {
+            state->fw_reference = gradient_steps(&q, params, state->fw_reference);
+            state->fw_left = 0u;
+        }
         state->fw_empty = q.empty;
-        state->fw_count = (q.unfinished != 0u) ? 1u : params->field_weakening_N_fw;
         state->live.iterations += q.steps;
     }
     state->fw_count--;

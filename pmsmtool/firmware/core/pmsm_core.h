@@ -117,6 +117,7 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     uint32_t reachable_age;  /* 1: computed in the last period, 0: not valid */
     uint32_t landing;        /* 1: a minimum-time transfer has not reached its target yet */
     pmsm_real fw_tau;        /* N m, request of the last optimisation */
+    uint32_t fw_left;        /* iterations that it has left for the following periods */
     uint32_t fw_empty;       /* 1: it found no current that satisfies both limits */
     pmsm_real i2t_carry;     /* rounding remainder of i2t */
     uint32_t i2t_exhausted;  /* 1 from a used-up budget until a tenth of it has recovered */

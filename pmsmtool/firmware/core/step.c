@@ -30,6 +30,7 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->time_to_go = PMSM_C(0.0);
     state->landing = 0u;
     state->reachable_age = 0u;
+    state->fw_left = 0u;
     state->speed_integrator = PMSM_C(0.0);
     state->notch_1 = PMSM_C(0.0);
     state->notch_2 = PMSM_C(0.0);
