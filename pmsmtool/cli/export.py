@@ -135,8 +135,9 @@ def header_command(design: Path, prefix: str, out: Output) -> str:
     required=True,
     help="Folder to write into; made when it is not there.",
 )
+@click.option("--fixed-point", is_flag=True, help="Add the reference governor in Q4.27, for parts without an FPU.")
 @text_options
-def c_command(design: Path, prefix: str, folder: Path, out: Output) -> None:
+def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, out: Output) -> None:
     """Write the parameters and the control core as C99 sources.
 
     The core is what the simulated drive runs, byte for byte; the compiler flags it is checked with stand at the top of
@@ -149,6 +150,10 @@ def c_command(design: Path, prefix: str, folder: Path, out: Output) -> None:
 
     wanted = load_parameters(design)
     files = c_files(image_of(wanted), prefix=prefix, design_id=wanted.content_hash())
+    if fixed_point:
+        from pmsmtool.firmware.export_q import q_files
+
+        files |= q_files(wanted.values, prefix=prefix, design_id=wanted.content_hash())
     make_folder(folder)
     for name, text in files.items():
         write_file(folder / name, text)

@@ -112,7 +112,7 @@ def test_an_incomplete_set_is_written_directly_but_never_a_table() -> None:
 
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler on this machine")
 def test_exported_c_compiles_and_is_the_image(folder: Path, tmp_path: Path) -> None:
-    export("c", folder, "--prefix", "left", "-o", tmp_path / "new" / "firmware")
+    export("c", folder, "--prefix", "left", "--fixed-point", "-o", tmp_path / "new" / "firmware")
     sources = tmp_path / "new" / "firmware"
     image = image_of(load_parameters(folder))
     assert image_of_json((sources / "left_cfg.json").read_text()) == image
@@ -121,6 +121,7 @@ def test_exported_c_compiles_and_is_the_image(folder: Path, tmp_path: Path) -> N
         "int main(void) { return fwrite(&left_cfg, 1, LEFT_CFG_BYTES, stdout) == LEFT_CFG_BYTES ? 0 : 1; }\n"
     )
     names = sorted(path.name for path in sources.glob("*.c"))
+    assert {"left_cfg_q.c", "pmsm_governor_q.c", "left_main.c"} <= set(names)
     subprocess.run([str(COMPILER), *FLAGS.split(), "-o", "read_back", *names], cwd=sources, check=True)
     assert subprocess.run([sources / "read_back"], capture_output=True, check=True).stdout == image
 
