@@ -17,7 +17,8 @@ from pmsmtool.design.current_loop import AxisPlant, axis_loop, imc, second_order
 from pmsmtool.design.design_file import Design, design_text
 from pmsmtool.design.margins import (
     BLOCK,
-    BlockResult,
+    BLOCKS_PER_TASK,
+    Blocks,
     BlockTask,
     MarginReport,
     MarginRequest,
@@ -196,16 +197,16 @@ def test_nominal_voltage_headroom_is_the_reserve_that_was_kept() -> None:
 class Shuffled:
     """An executor that works from the last task to the first."""
 
-    def map(self, function: Callable[[BlockTask], BlockResult], tasks: Iterable[BlockTask], /) -> Iterator[BlockResult]:
+    def map(self, function: Callable[[BlockTask], Blocks], tasks: Iterable[BlockTask], /) -> Iterator[Blocks]:
         waiting = list(tasks)
         done = [function(task) for task in reversed(waiting)]
         return iter(reversed(done))
 
 
 class Dying:
-    """An executor that loses its workers after one block."""
+    """An executor that loses its workers after one task."""
 
-    def map(self, function: Callable[[BlockTask], BlockResult], tasks: Iterable[BlockTask], /) -> Iterator[BlockResult]:
+    def map(self, function: Callable[[BlockTask], Blocks], tasks: Iterable[BlockTask], /) -> Iterator[Blocks]:
         for count, task in enumerate(tasks):
             if count == 1:
                 raise concurrent.futures.BrokenExecutor("a worker died")
@@ -215,7 +216,7 @@ class Dying:
 def test_the_result_is_the_same_whoever_works() -> None:
     design = design_of()
     box = tolerance_box(design.machine)
-    count = 3 * BLOCK + 17
+    count = BLOCKS_PER_TASK * BLOCK + 17
 
     def report(executor: object = None) -> MarginReport:
         return margin_report(design, box, samples=count, seed=7, executor=executor)  # type: ignore[arg-type]
