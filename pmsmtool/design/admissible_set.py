@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,6 +178,7 @@ class Horizon:
         return "not finitely determined" if self.k_max is None else str(self.k_max)
 
 
+@lru_cache(maxsize=256)
 def horizon(
     model: PredictionModel,
     omega_e: float,

@@ -21,7 +21,7 @@ from pmsmtool.workflow.reproduce.random_steps import (
 from pmsmtool.workflow.reproduce.speed_rise import speed_ramp, speed_steps
 from pmsmtool.workflow.reproduce.weakening import figure_11, figure_12, table_2
 
-CASES = 40
+CASES = 24
 """Random cases here; the command takes 300 to 1000."""
 
 MADE: dict[str, Callable[[], Reproduction]] = {

@@ -19,7 +19,7 @@ REFERENCE = {"modulus optimum": (18, 24, 34), "IMC 2000 rad/s": (36, 49, 71), "s
 """k_max at eps = 0.1, 0.01, 1e-3, computed independently."""
 K_ROOM = 1
 SPEED_RPM = 620.0
-CAP = 120
+CAP = 100
 """Horizons beyond this count as not finitely determined here; the reference looked up to 800."""
 MATRIX_ROOM = 1e-12
 """Largest relative deviation of the matrices that must hold; measured 2e-16."""
