@@ -17,7 +17,13 @@ from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import ConfigError, NotAvailable
-from pmsmtool.estimators.estimate import SensorTolerance, Verdict, coverage_factor, total_half_width
+from pmsmtool.estimators.estimate import (
+    SensorTolerance,
+    Verdict,
+    coverage_factor,
+    statistical_half_width,
+    total_half_width,
+)
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import (
     EncoderParameters,
@@ -360,7 +366,8 @@ def value_facts(name: str, estimate: Estimate) -> dict[str, Any]:
     for key in ("chi2", "T_c", "i_d_apk", "i_q_apk"):
         number = getattr(estimate, key)
         facts[key] = number if math.isfinite(number) else None
-    return {"name": name, **facts, "coverage_factor": coverage_factor(estimate.dof)}
+    halves = {"statistical_95": statistical_half_width(estimate), "total_95": total_half_width(estimate)}
+    return {"name": name, **facts, "coverage_factor": coverage_factor(estimate.dof), **halves}
 
 
 def _limit(name: str) -> float | None:

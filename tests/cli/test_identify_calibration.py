@@ -54,6 +54,9 @@ def test_a_scale_is_taken_out_and_its_tolerance_takes_the_sensors_place(
     # what is left: two instruments of 0.1 % and the 2 K of the temperature sensor
     assert true["systematic"] / true["value"] == pytest.approx(math.hypot(1e-3, 1e-3, 2.0 * 0.00393), rel=0.01)
 
+    for value in (shown, true):
+        assert value["statistical_95"] == pytest.approx(value["coverage_factor"] * value["std"])
+        assert value["total_95"] == pytest.approx(math.hypot(value["statistical_95"], value["systematic"]))
     kept = tomllib.loads((folder / "machine.toml").read_text(encoding="utf-8"))
     assert kept["std"]["R_s_ohm"] == pytest.approx(true["std"])
     assert kept["systematic"]["R_s_ohm"] == pytest.approx(true["systematic"])
