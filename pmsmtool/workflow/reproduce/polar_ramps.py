@@ -130,11 +130,13 @@ def transitions(seed: int) -> Reproduction:
     what = f"{UNIFIED_TUNED.name}: torque bump, reversal"
     checks.append(at_most(what, found[UNIFIED_TUNED.name][0], BUMP_NM, "N m", where=EXPECTED))
     plots = []
-    for ramp in (TORQUE, SPEED):
-        runs = [(law.name, response(law, ramp, seed=seed)) for law in (PROPOSED, UNIFIED, UNIFIED_TUNED, *BASELINES)]
-        t = 1e3 * runs[0][1].t
-        lines = tuple(Series(name, t, 1e3 * (r.torque - r.torque_asked)) for name, r in runs)
-        plots.append(Panel(ramp.name, "time / ms", "torque error / mN m", lines, x_range=(60.0, 600.0)))
+    for ramp in (TORQUE, SPEED, REVERSAL):
+        paper = SWITCHED if ramp is REVERSAL else PROPOSED
+        runs = [(law.name, response(law, ramp, seed=seed)) for law in (paper, UNIFIED, UNIFIED_TUNED, *BASELINES)]
+        kept = slice(runs[0][1].index(ramp.from_s), runs[0][1].index(ramp.to_s))
+        t = 1e3 * runs[0][1].t[kept]
+        lines = tuple(Series(name, t, 1e3 * (r.torque - r.torque_asked)[kept]) for name, r in runs)
+        plots.append(Panel(ramp.name, "time / ms", "torque error / mN m", lines))
     return Reproduction(
         "polar-ramps", "transitions on ramps", SOURCE, tuple(tables), tuple(plots), tuple(checks), ASSUMED
     )

@@ -42,7 +42,7 @@ NOISY_ERROR_A, NOISY_RIPPLE_A = 0.1, 0.5
 """Whole drive: the same with 0.03 A of noise per phase, 12 bit and dead time; measured 0.004 and 0.18."""
 
 RANDOM_ERROR_A, RANDOM_RIPPLE_A = 0.5, 0.1
-"""Wrong parameters: i_q may keep an error where a wrong voltage limits, but no limit cycle (A); 12 seeds: .083, 7e-4."""
+"""Wrong parameters: i_q may keep an error where a wrong voltage limits, no limit cycle (A); 12 seeds: .083, 7e-4."""
 
 R_RANGE, L_RANGE, PSI_RANGE = (0.5, 2.0), (0.6, 1.6), (0.75, 1.2)
 """True over believed resistance, inductances (each axis its own) and flux."""
