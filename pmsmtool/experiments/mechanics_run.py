@@ -1,0 +1,124 @@
+"""Pushes and coasting in both directions: positions and currents for inertia and friction.
+
+A push from rest, coasting, a push the other way through standstill, coasting (identification reference, 3.5). The shaft
+coasts with the voltage off: the sampled current of a switched bridge is not the mean of its ripple, which at commanded
+zero current leaves a torque of a part in a thousand of the rated one, as much as a good bearing's friction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
+from pmsmtool.experiments.signals import readable
+from pmsmtool.trace import Trace
+
+SIGNALS = ("i_d_a", "i_q_a", "theta_m_rad", "flags")
+ROWS = 4000
+"""Rows of four signals that 64 kB hold: several per block that the estimator averages."""
+UNIT_LEAST_S, UNIT_MOST_S = 0.03, 0.6
+"""Shortest and longest push: the current loop needs milliseconds, a person's patience ends somewhere."""
+COAST_UNITS, COAST_LEAST_S, COAST_MOST_S = 6.0, 0.5, 2.5
+"""Time of coasting, in pushes, and its bounds."""
+
+
+@dataclass(frozen=True, slots=True)
+class MechanicsPlan:
+    """Pushes and coasting.
+
+    Attributes
+    ----------
+    i_q_a : float
+        Current of a push (A peak).
+    unit_s : float
+        Length of the first push (s); the second is twice as long.
+    omega_rad_s : float
+        Mechanical speed they are to reach (rad/s).
+    """
+
+    i_q_a: float
+    unit_s: float
+    omega_rad_s: float
+
+    @property
+    def coast_s(self) -> float:
+        """Length of one coasting (s)."""
+        return min(COAST_MOST_S, max(COAST_LEAST_S, COAST_UNITS * self.unit_s))
+
+    @property
+    def duration_s(self) -> float:
+        """Time of the whole run (s)."""
+        return 3.0 * self.unit_s + 2.0 * self.coast_s
+
+
+def plan_mechanics(i_q_a: float, omega_rad_s: float, J_kgm2: float, torque_per_a: float) -> MechanicsPlan:
+    """Return pushes that reach a speed: as long as that takes, or weaker where it takes too little time.
+
+    Parameters
+    ----------
+    i_q_a : float
+        Largest current (A peak).
+    omega_rad_s : float
+        Largest mechanical speed (rad/s).
+    J_kgm2 : float
+        Rough inertia.
+    torque_per_a : float
+        Torque per q current (N m/A).
+    """
+    unit = J_kgm2 * omega_rad_s / (torque_per_a * i_q_a)
+    if unit < UNIT_LEAST_S:
+        return MechanicsPlan(i_q_a * unit / UNIT_LEAST_S, UNIT_LEAST_S, omega_rad_s)
+    longest = min(unit, UNIT_MOST_S)
+    return MechanicsPlan(i_q_a, longest, omega_rad_s * longest / unit)
+
+
+def push_and_coast(drive: Drive, plan: MechanicsPlan, abort_speed_rad_s: float, keep: Callable[[Trace], None]) -> None:
+    """Record push, coasting, push the other way, coasting; each trace is handed over as soon as it is there.
+
+    The drive is enabled and at rest on entry, and off on return. It ends a push by itself at the abort speed
+    (electrical rad/s).
+    """
+    first = _push(drive, plan.i_q_a, plan.unit_s, abort_speed_rad_s)
+    keep(first)
+    coasting = _coast(drive, plan)
+    keep(coasting)
+    left = _end_speed(coasting) / _end_speed(first)
+    drive.enable()
+    keep(_push(drive, -plan.i_q_a, plan.unit_s * (1.0 + min(1.0, max(0.0, left))), abort_speed_rad_s))
+    keep(_coast(drive, plan))
+
+
+def _coast(drive: Drive, plan: MechanicsPlan) -> Trace:
+    drive.disable()
+    samples, decimation = _rows(drive, plan.coast_s)
+    trace = readable(drive.record(SIGNALS, samples, decimation=decimation))
+    return replace(trace, meta={**trace.meta, "coasting": True})
+
+
+def _end_speed(trace: Trace) -> float:
+    """Mean speed over the last twentieth of a trace (rad/s mechanical)."""
+    rows = max(2, len(trace) // 20)
+    return float(trace["theta_M_rad"][-1] - trace["theta_M_rad"][-rows]) / ((rows - 1) * trace.period_s)
+
+
+def _push(drive: Drive, i_q_a: float, seconds: float, abort_speed_rad_s: float) -> Trace:
+    samples, decimation = _rows(drive, seconds)
+    excitation = Excitation(
+        shape=Shape.STEP,
+        point=Injection.I_Q,
+        amplitude=i_q_a,
+        duration_s=samples * decimation * drive.period_s,
+        abort_speed_rad_s=abort_speed_rad_s,
+    )
+    drive.command_current(0.0, 0.0)
+    trace = readable(drive.record(SIGNALS, samples, decimation=decimation, excitation=excitation))
+    return replace(trace, meta={**trace.meta, "coasting": False})
+
+
+def _rows(drive: Drive, seconds: float) -> tuple[int, int]:
+    """Return samples and decimation of a record of that length."""
+    periods = max(2, round(seconds / drive.period_s))
+    decimation = max(1, math.ceil(periods / ROWS))
+    return periods // decimation, decimation
