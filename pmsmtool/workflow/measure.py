@@ -23,7 +23,7 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
 from pmsmtool.trace import Trace
-from pmsmtool.workflow import map_stage
+from pmsmtool.workflow import map_stage, mechanics_stage
 from pmsmtool.workflow.evaluate import resistance_of, tolerance_on
 
 PHASE_CHECK_SHARE = 0.05
@@ -70,7 +70,8 @@ REACTANCE_SHARE = 0.25
 EMF_SHARE = 0.8
 """Largest speed of the flux run: back-emf of this share of the largest voltage."""
 
-QUANTITIES = ("R", "L", "psi", "encoder", "poles", "inverter", "mechanics")
+QUANTITIES = ("R", "L", "psi", "encoder", "poles", "inverter")
+"""What is measured unless something is asked for; the pushes of the flux run give a rough inertia all the same."""
 NEEDS: Mapping[str, tuple[str, ...]] = {
     "R": ("levels",),
     "inverter": ("levels",),
@@ -78,7 +79,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "encoder": ("levels", "rotation", "square", "speeds"),
     "L": ("levels", "rotation", "square"),
     "psi": ("levels", "rotation", "square", "speeds"),
-    "mechanics": ("levels", "rotation", "square", "speeds"),
+    "mechanics": ("levels", "rotation", "square", "speeds", "coasting"),
     "map": ("levels", "rotation", "square", "speeds", "map"),
 }
 """Experiments behind each quantity."""
@@ -205,6 +206,9 @@ class Measurement:
             if inductances is not None and "speeds" in steps:
                 self._turn(resistance, encoder, inductances)
                 self._tell_spent()
+                if "coasting" in steps:
+                    mechanics_stage.measure_mechanics(self.drive, self.limits, self.keep, self.say)
+                    self._tell_spent()
         if resistance is not None and "map" in steps:
             map_stage.measure_map(self.drive, self.limits, noise, resistance, self.held, self.keep, self.say)
 
