@@ -14,6 +14,7 @@ from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, est
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.flux_map_result import FluxMapResult
+from pmsmtool.estimators.mechanics import MechanicsResult
 from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
 from pmsmtool.estimators.inertia import InertiaResult, estimate_inertia
 from pmsmtool.estimators.noise import Noise, estimate_noise
@@ -23,7 +24,7 @@ from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
-from pmsmtool.workflow import map_stage
+from pmsmtool.workflow import map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_traces
 
 MOVED_SHARE = 0.25
@@ -48,6 +49,7 @@ class Evaluation:
     inductance: InductanceResult | None = None
     flux: FluxResult | None = None
     inertia: InertiaResult | None = None
+    mechanics: MechanicsResult | None = None
     flux_map: FluxMapResult | None = None
     map_estimates: Mapping[str, Estimate] = field(default_factory=dict)
 
@@ -76,6 +78,8 @@ class Evaluation:
             found["offset_rad"] = self.offset
         if self.inertia is not None:
             found["J_kgm2"], found["tau_c_nm"] = self.inertia.J, self.inertia.tau_c
+        if self.mechanics is not None:
+            found |= {"J_kgm2": self.mechanics.J, "B_nms": self.mechanics.B, "tau_c_nm": self.mechanics.tau_c}
         found.update((name, estimate) for name, estimate in self.map_estimates.items() if name not in found)
         return found
 
@@ -106,7 +110,7 @@ def evaluate(
     traces : mapping of str to Trace
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
         ``phase_pairs``, ``rotation_forward``, ``rotation_backward``, ``square_d_<half period>``,
-        ``square_q_<half period>``, ``push_<k>``, ``speeds``, ``wave_<k>``, ``map_<k>``.
+        ``square_q_<half period>``, ``push_<k>``, ``speeds``, ``wave_<k>``, ``map_<k>``, ``inertia_<k>``.
     period_s : float
         Control period (s).
     T_ref_c : float
@@ -152,7 +156,7 @@ def evaluate(
     flux_map = map_stage.flux_map_of(traces, result, tolerance)
     if flux_map is not None:
         result = replace(result, flux_map=flux_map, map_estimates=map_stage.map_estimates(result, flux_map, traces))
-    return result
+    return replace(result, mechanics=mechanics_stage.mechanics_of(traces, result, tolerance))
 
 
 def resistance_of(
@@ -275,6 +279,9 @@ def machine_of(evaluation: Evaluation, nameplate: MachineFile, conditions: Mappi
     machine = replace(nameplate.machine, **values)  # type: ignore[arg-type]
     if evaluation.inertia is not None:
         machine = replace(machine, tau_c_nm=max(0.0, evaluation.inertia.tau_c.value), B_nms=None)
+    if evaluation.mechanics is not None:
+        B, tau_c = evaluation.mechanics.B, evaluation.mechanics.tau_c
+        machine = replace(machine, tau_c_nm=max(0.0, tau_c.value), B_nms=max(0.0, B.value))
     flux_map = nameplate.flux_map
     if evaluation.flux_map is not None:
         machine, flux_map = map_stage.with_map(machine, evaluation.map_estimates), evaluation.flux_map.flux_map
