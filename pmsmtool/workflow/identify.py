@@ -35,7 +35,7 @@ from pmsmtool.machine.parameters import (
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
 from pmsmtool.units import format_estimate
-from pmsmtool.workflow import map_stage
+from pmsmtool.workflow import map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
 from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Limits, Measurement, steps_of
@@ -174,6 +174,8 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest) -> list[str]:
         lines.append("the shaft turns slowly through one turn each way")
     if "speeds" in steps:
         lines.append("the shaft is pushed both ways and runs at eight steady speeds, both directions")
+    if "coasting" in steps:
+        lines.append(mechanics_stage.PLAN_LINE)
     if "map" in steps:
         lines.append(map_stage.PLAN_LINE)
     lines.append("nothing is stored in the drive; every changed object is restored")
