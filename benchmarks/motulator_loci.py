@@ -1,7 +1,7 @@
 """Table of motulator's reference generator, for ``lookup_table.py``: run by a Python that has motulator >= 0.18.
 
 ``python motulator_loci.py IN.npz OUT.npz``. IN holds the flux map (i_d_a, i_q_a, psi_d_wb, psi_q_wb), the axes and the
-limits; OUT the currents of every cell and the time (s) the loci and all cells took, imports not counted. The loci are
+limits; OUT the currents of every cell and the processor time (s) the loci and all cells took, imports not counted. The loci are
 motulator's (16 points); the tracking law is stepped to its fixed point, alpha T_s = 1, as one would for a table.
 """
 
@@ -36,7 +36,7 @@ def main() -> None:
 
     I_max, V_max = float(data["I_max"]), float(data["V_max"])
     torque, omega = data["torque_nm"], data["omega_e"]
-    start = time.perf_counter()
+    start = time.process_time()
     par = SaturatedSynchronousMachinePars(n_p=int(data["pole_pairs"]), R_s=float(data["R"]), psi_s_dq_fcn=flux)
     generator = ReferenceGenerator(par, I_max, None, float(data["psi_max"]), 1.0, 1.0, 1.0)
     found = np.empty((torque.size, omega.size), dtype=complex)
@@ -51,7 +51,7 @@ def main() -> None:
             if not np.isfinite(generator.i_s_ref) or abs(generator.i_s_ref) > 3.0 * I_max:
                 generator.i_s_ref = complex(generator.i_s_mtpa(abs(float(T))))  # lost: start again where it may hold
             found[x, y] = generator.compute_current_ref(float(T))
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     np.savez(sys.argv[2], i_d_a=found.real, i_q_a=found.imag, seconds=seconds)
 
 
