@@ -409,7 +409,7 @@ def to_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
         "fault": {name: fault.text for name, fault in prediction.faults.items()},
         "facts": dict(prediction.facts),
     }
-    return {**arrays, "_meta": np.array(json.dumps(facts, sort_keys=True))}
+    return {**arrays, "_meta": np.array(json.dumps(facts))}
 
 
 def from_arrays(arrays: Mapping[str, NDArray[Any]], *, where: str = "prediction") -> Prediction:

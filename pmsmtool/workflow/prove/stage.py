@@ -12,6 +12,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -200,10 +201,12 @@ def commit(run: RunDirectory, prediction: Prediction) -> tuple[str, str]:
     """
     data = npz_bytes(to_arrays(prediction))
     digest = hashlib.sha256(data).hexdigest()
-    folder = f"{FOLDER}/{digest[:_HASH_DIGITS]}"
+    stem = f"{FOLDER}/{digest[:_HASH_DIGITS]}"
+    names = chain((stem,), (f"{stem}-{k}" for k in count(2)))
+    folder = next(name for name in names if not (run.path / name).exists())
     path = run.path / folder / PREDICTION
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True)
         with path.open("wb") as stream:
             stream.write(data)
             stream.flush()

@@ -1,0 +1,95 @@
+"""The experiments fit the design, the voltage and the envelope, and what does not fit is left out with its reason."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from pmsmtool.design.design_file import Design, DesignValue
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive.port import Injection
+from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.resources import data_folder
+from pmsmtool.workflow.prove.plan import RPM, STEPS, Conditions, plan_proof
+from pmsmtool.workflow.random_drives import draw_drive
+
+
+def design(name: str = "interior-2k2") -> Design:
+    return tune(load_machine_file(data_folder("profiles") / f"{name}.toml"), TuneRequest(field_weakening="lookup"))
+
+
+def conditions(made: Design, **other: object) -> Conditions:
+    U_dc, i_max = made.machine.inverter.U_dc_v, made["motor.I_max_apk"]
+    standard = Conditions(U_dc, 25.0, 25.0, 1 << 17, i_max, made["motor.n_max_rpm"] * RPM)
+    return replace(standard, **other)  # type: ignore[arg-type]
+
+
+def changed(made: Design, **values: float) -> Design:
+    names = {name.replace("__", "."): value for name, value in values.items()}
+    return replace(made, values={**made.values, **{n: DesignValue(v, "test") for n, v in names.items()}})
+
+
+def test_everything_the_issue_asks_for_is_there() -> None:
+    plan = plan_proof(design(), conditions(design()))
+    assert [e.name for e in plan.experiments] == ["speed_step", "q_steps", "d_steps", "unreachable", "weakening"]
+    assert plan.left_out == ()
+    assert sorted({abs(share) for share in STEPS if share}) == [0.5, 1.0] and sum(STEPS) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_nothing_leaves_the_envelope(seed: int) -> None:
+    made = tune(draw_drive(seed), TuneRequest(field_weakening="lookup"))
+    allowed = conditions(
+        made, i_max_apk=0.6 * made["motor.I_max_apk"], speed_max_rad_s=0.7 * made["motor.n_max_rpm"] * RPM
+    )
+    V_max = made.machine.inverter.V_max_v
+    for experiment in plan_proof(made, allowed).experiments:
+        wave = experiment.excitation
+        assert wave.amplitude > 0.0
+        if wave.point is Injection.SPEED:
+            assert experiment.base_rad_s + wave.amplitude <= allowed.speed_max_rad_s
+        else:
+            assert wave.amplitude <= allowed.i_max_apk
+            assert experiment.base_rad_s * made["motor.pole_pairs"] * made["motor.psi_f_wb"] < V_max
+        assert experiment.rows * 5 * 4 <= 65536, "the recorder's memory"
+        assert experiment.rows % experiment.repeats == 0
+
+
+def test_a_locked_shaft_leaves_the_current_steps() -> None:
+    made = design()
+    plan = plan_proof(made, conditions(made, shaft="locked"))
+    assert [e.name for e in plan.experiments] == ["q_steps", "d_steps"]
+    assert all(e.base_rad_s == 0.0 for e in plan.experiments)
+    assert "the shaft is locked" in plan.left_out[0]
+
+
+def test_without_a_speed_controller_nothing_is_turned() -> None:
+    made = changed(design(), speed__K_p_nms_per_rad=0.0)
+    plan = plan_proof(made, conditions(made))
+    assert [e.name for e in plan.experiments] == ["q_steps", "d_steps"]
+    assert "no speed controller" in plan.left_out[0]
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [({"governor__mode": 0.0}, "no governor"), ({"field_weakening__mode": 0.0}, "it is off in the design")],
+)
+def test_what_the_design_does_not_have_is_left_out(value: dict[str, float], reason: str) -> None:
+    made = changed(design(), **value)
+    plan = plan_proof(made, conditions(made))
+    assert len(plan.experiments) == 4 and any(reason in line for line in plan.left_out)
+
+
+def test_a_speed_limit_below_field_weakening_is_said() -> None:
+    made = design()
+    plan = plan_proof(made, conditions(made, speed_max_rad_s=100.0))
+    assert [line for line in plan.left_out if "field weakening: it begins at" in line]
+    assert "weakening" not in [e.name for e in plan.experiments]
+
+
+def test_a_sensor_that_is_missing_is_no_number_in_the_record() -> None:
+    facts = conditions(design(), T_magnet_c=math.nan).facts()
+    assert facts["T_magnet_c"] is None and facts["T_winding_c"] == 25.0
