@@ -1,8 +1,8 @@
 """Table of motulator's reference generator, for ``lookup_table.py``: run by a Python that has motulator >= 0.18.
 
 ``python motulator_loci.py IN.npz OUT.npz``. IN holds the flux map (i_d_a, i_q_a, psi_d_wb, psi_q_wb), the axes and the
-limits; OUT the currents of every cell and the processor time (s) the loci and all cells took, imports not counted. The loci are
-motulator's (16 points); the tracking law is stepped to its fixed point, alpha T_s = 1, as one would for a table.
+limits; OUT the currents of every cell and the processor time (s) the loci and all cells took, imports not counted. The
+loci are motulator's (16 points); the tracking law is stepped to its fixed point, alpha T_s = 1, as for a table.
 """
 
 import math
