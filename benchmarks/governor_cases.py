@@ -123,6 +123,7 @@ def steps(count: int) -> list[Verdict]:
         "paper, modulus optimum": (paper(governor__eps=1e-3), (1.25, 1.40)),
         "best, alpha 7540": (best(), (1.06, 1.10)),
         "best, delay and predictor": (best(**DELAYED), (1.11, 1.18)),
+        "back-calculation, modulus optimum": (reference_case(4000.0), None),
         "back-calculation, alpha 7540": (reference_case(7540.0), None),
         "back-calculation, delay and predictor": (reference_case(7540.0, **BACK_CALCULATION_DELAYED), None),
     }

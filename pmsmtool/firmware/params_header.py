@@ -7,6 +7,7 @@ catalogue, so they cannot drift apart. The output depends on the catalogue only.
 from __future__ import annotations
 
 import struct
+import textwrap
 from pathlib import Path
 
 from pmsmtool.params.catalogue import (
@@ -23,6 +24,7 @@ BANNER = (
     "/* Generated from pmsmtool/params/catalogue.py by python -m pmsmtool.firmware.params_header: do not edit. */"
 )
 _EXACT_IN_BINARY32 = 1 << 24
+_LINE_LENGTH = 120
 
 
 def c_float(value: float) -> str:
@@ -31,15 +33,18 @@ def c_float(value: float) -> str:
     return f"{text}F" if any(mark in text for mark in ".e") else f"{text}.0F"
 
 
-def _comment(text: str) -> str:
-    """Return text that cannot close a C comment."""
-    return text.replace("*/", "* /")
+def commented(code: str, text: str) -> str:
+    """Return a line of C with a comment behind it, which goes on under itself where the line would get too long."""
+    text = text.replace("*/", "* /")
+    column = len(code) + 4
+    lines = textwrap.wrap(text, _LINE_LENGTH - column - 3) or [""]
+    return f"{code} /* " + f"\n{' ' * column}".join(lines) + " */"
 
 
 def _member(row: Parameter, width: int) -> str:
     kind = "uint32_t" if row.is_integer else "float   "
     unit = "" if row.unit == "1" else f"[{row.unit}] "
-    return f"    {kind} {row.c_name + ';':<{width}} /* {_comment(unit + row.meaning)} */"
+    return commented(f"    {kind} {row.c_name + ';':<{width}}", unit + row.meaning)
 
 
 def header_text() -> str:

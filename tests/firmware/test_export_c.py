@@ -105,6 +105,8 @@ def test_two_exports_are_equal_and_the_text_is_plain() -> None:
     first, second = (c_files(IMAGES["int16"], design_id="sha256:ab") for _ in range(2))
     assert first == second
     assert all(text.isascii() and "\r" not in text for text in first.values())
+    sources = [text for name, text in first.items() if name.endswith((".c", ".h"))]
+    assert max(len(line) for text in sources for line in text.splitlines()) <= 120
 
 
 @pytest.mark.parametrize("prefix", ["", "2nd", "a-b", "x" * 40, "a b"])

@@ -290,8 +290,8 @@ static uint32_t solve_line(const pmsm_period *period, const rows_of_period *rows
 }
 
 /* Where not all rows can be met the current row is given up; where row 0 and the steady state exclude each other, the
- * smallest steady-state voltage that row 0 allows is taken. Row 0 always can be met, so the inverter's limit holds in any
- * case. */
+ * smallest steady-state voltage that row 0 allows is taken. Row 0 always can be met, so the inverter's limit holds in
+ * any case. */
 static pmsm_dq solve(pmsm_period *period, const rows_of_period *rows, pmsm_dq r, uint32_t *binding, uint32_t *steps)
 {
     const uint32_t mode = period->params->governor_mode;
@@ -430,8 +430,8 @@ static uint32_t is_admissible(const rows_of_period *rows, pmsm_dq r)
 }
 
 /* The reachable request: inside the steady-state row, and inside the current row where both can be met. The second is
- * costly, so unless a transfer is under way it is done in every other period, and what it was done for stands meanwhile;
- * the period between is for the rows, or to start a transfer. */
+ * costly, so unless a transfer is under way it is done in every other period, and what it was done for stands
+ * meanwhile; the period between is for the rows, or to start a transfer. */
 static pmsm_dq pre_project(pmsm_period *period, rows_of_period *rows, pmsm_dq r, uint32_t *steps)
 {
     pmsm_state *state = period->state;

@@ -54,7 +54,9 @@ typedef struct pmsm_params {
     float    current_K_i_d_v_per_as;         /* [V/(A s)] integral gain, d axis */
     float    current_K_p_q_v_per_a;          /* [V/A] proportional gain, q axis */
     float    current_K_i_q_v_per_as;         /* [V/(A s)] integral gain, q axis */
-    uint32_t current_options;                /* bit0 decoupling, bit1 emf feed-forward, bit2 back-calculation, bit3 hexagon limit, bit4 one-step predictor, bit5 record the dead-time compensation in u_d_lim, u_q_lim */
+    uint32_t current_options;                /* bit0 decoupling, bit1 emf feed-forward, bit2 back-calculation, bit3
+                                                hexagon limit, bit4 one-step predictor, bit5 record the dead-time
+                                                compensation in u_d_lim, u_q_lim */
     float    speed_K_p_nms_per_rad;          /* [N m s/rad] proportional gain */
     float    speed_K_i_nm_per_rad;           /* [N m/rad] integral gain */
     float    speed_filter_hz;                /* [Hz] feedback filter cut-off */
@@ -64,10 +66,12 @@ typedef struct pmsm_params {
     float    speed_notch_zeta_num;           /* notch numerator damping */
     float    speed_notch_zeta_den;           /* notch denominator damping */
     float    speed_acceleration_rpm_per_s;   /* [rpm/s] slope limit of the speed reference */
-    uint32_t governor_mode;                  /* 0 off, 1 paper (exact), 2 line search, 3 best, 4 linearised, 5 observe */
+    uint32_t governor_mode;                  /* 0 off, 1 paper (exact), 2 line search, 3 best, 4 linearised, 5
+                                                observe */
     uint32_t governor_k_max;                 /* horizon in T_s, 255 not determined */
     float    governor_eps;                   /* tightening of the steady-state row */
-    uint32_t governor_options;               /* bit0 hexagon row 0, bit1 predictor, bit2 current row, bit3 pre-projection, bit4 minimum-time direction */
+    uint32_t governor_options;               /* bit0 hexagon row 0, bit1 predictor, bit2 current row, bit3 pre-
+                                                projection, bit4 minimum-time direction */
     float    governor_I_transient_apk;       /* [A] transient current limit */
     float    governor_observer_gain;         /* disturbance observer gain per T_s */
     float    governor_alpha_rad_s;           /* [rad/s] bandwidth the rows are built for */
@@ -88,8 +92,10 @@ typedef struct pmsm_params {
     uint32_t lut_n_y;                        /* nodes of the speed or flux axis */
     uint32_t lut_n_z;                        /* nodes of the U_dc axis, 1 when there is none */
     float    lut_lsb_a;                      /* [A] current of one int16 step */
-    uint32_t polar_mode;                     /* 0 off, 1 conventional, 2 proposed, 3 linear range, 4 linear as printed, 5 regularised, 6 unified */
-    uint32_t polar_options;                  /* bit0 P and D on the measurement, bit1 no anti-windup, bit2 predict over the delay, bit3 switch to 5 in the linear range */
+    uint32_t polar_mode;                     /* 0 off, 1 conventional, 2 proposed, 3 linear range, 4 linear as
+                                                printed, 5 regularised, 6 unified */
+    uint32_t polar_options;                  /* bit0 P and D on the measurement, bit1 no anti-windup, bit2 predict
+                                                over the delay, bit3 switch to 5 in the linear range */
     float    polar_V_a_max_ratio;            /* amplitude limit / V_max */
     float    polar_sigma_phase_rad_s;        /* [rad/s] real part of the phase loop's poles */
     float    polar_sigma_amplitude_rad_s;    /* [rad/s] real part of the amplitude loop's poles */

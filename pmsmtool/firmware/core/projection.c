@@ -148,8 +148,8 @@ static pmsm_real square_of_change(const pmsm_row *row, pmsm_dq step)
 }
 
 /* Newton's method for the corner where both rows are met with equality; 1 when it is the optimum, that is when r - v is
- * a non-negative combination of the two outward normals. The rows are quadratic, so what a step leaves of |w|^2 - V^2 is
- * the square of the change of w: known without looking again. */
+ * a non-negative combination of the two outward normals. The rows are quadratic, so what a step leaves of |w|^2 - V^2
+ * is the square of the change of w: known without looking again. */
 static uint32_t find_corner(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq *v, uint32_t *steps)
 {
     const pmsm_real limit_1 = first->V * first->V;
@@ -191,10 +191,10 @@ static pmsm_dq on_arc(const pmsm_row *first, pmsm_dq a, pmsm_dq b, pmsm_real t)
 }
 
 /* Both rows with equality, 0: there is no such optimum. outside is on the first row and violates the second, whose
- * voltage is smallest at best of all points of the first row's disc; if it is too large even there, the two cannot be met
- * at once. On the boundary of the first row the excess of the second grows from that point like a parabola, which tells
- * where to start Newton's method: also the short lens of two rows that hardly meet has its corners where the parabola
- * says. */
+ * voltage is smallest at best of all points of the first row's disc; if it is too large even there, the two cannot be
+ * met at once. On the boundary of the first row the excess of the second grows from that point like a parabola, which
+ * tells where to start Newton's method: also the short lens of two rows that hardly meet has its corners where the
+ * parabola says. */
 static uint32_t project_pair(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq outside, pmsm_dq best,
                              pmsm_dq *v, uint32_t *steps)
 {
