@@ -175,7 +175,7 @@ def test_a_users_file_keeps_its_other_bytes(folder: Path, tmp_path: Path) -> Non
 
 BAD = {
     "no file": (["csv", "missing.toml"], "no such file|cannot be read"),
-    "not toml": (["csv", "text.toml"], "cannot be read"),
+    "not toml": (["csv", "text.toml"], "is not TOML"),
     "another schema": (["csv", "machine.toml"], "schema is"),
     "no design in the folder": (["csv", "empty"], "no design in this folder"),
     "a sheet without values": (["csv", "empty.dcf"], "holds no parameter|no usable|object"),
