@@ -168,6 +168,17 @@ def _covered(rows: list[dict[str, Any]], name: str, kind: str) -> str:
     return f" {hits:4d}/{len(rows)} ({low:.3f} .. {high:.3f})"
 
 
+def show(rows: list[dict[str, Any]], profiles: list[str]) -> None:
+    """Print the table of each profile, and of all together."""
+    for profile in profiles:
+        mine = [row for row in rows if row["profile"] == profile]
+        print(f"== {profile or 'population'}, block {', '.join(sorted({row['block'] for row in mine}))}")
+        print(summary(mine))
+    if len(profiles) > 1:
+        print("== all")
+        print(summary(rows))
+
+
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -177,7 +188,12 @@ def main() -> None:
     parser.add_argument("--around", nargs="*", default=[], metavar="PROFILE", help="draw around these profiles")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--rows", type=Path, help="write every drive's result there (JSON lines)")
+    parser.add_argument("--tabulate", type=Path, metavar="ROWS", help="only print the table of a file of --rows")
     options = parser.parse_args()
+    if options.tabulate:
+        stored = [json.loads(line) for line in options.tabulate.read_text(encoding="utf-8").splitlines()]
+        show(stored, sorted({row["profile"] for row in stored}))
+        return
     profiles = options.around or [""]
     seeds = range(options.first, options.first + options.drives)
     jobs = [(profiles[k % len(profiles)], seed, options.block) for k, seed in enumerate(seeds)]
@@ -188,12 +204,7 @@ def main() -> None:
             if options.rows:
                 with options.rows.open("a", encoding="utf-8") as stream:
                     stream.write(json.dumps(row) + "\n")
-    for profile in profiles:
-        print(f"== {profile or 'population'}, block {options.block}")
-        print(summary([row for row in rows if row["profile"] == profile]))
-    if len(profiles) > 1:
-        print("== all")
-        print(summary(rows))
+    show(rows, profiles)
 
 
 if __name__ == "__main__":
