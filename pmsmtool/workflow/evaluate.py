@@ -14,9 +14,9 @@ from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, est
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.flux_map_result import FluxMapResult
-from pmsmtool.estimators.mechanics import MechanicsResult
 from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
 from pmsmtool.estimators.inertia import InertiaResult, estimate_inertia
+from pmsmtool.estimators.mechanics import MechanicsResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases
 from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance
