@@ -204,7 +204,8 @@ def refined_table(
     DesignInfeasible
         The drive's memory is full before the bounds hold; the message names what was reached.
     """
-    axes = stored_axes(*(np.asarray(axis, dtype=np.float64) for axis in (torque_nm, y, U_dc_v)))
+    x, y, z = stored_axes(*(np.asarray(axis, dtype=np.float64) for axis in (torque_nm, y, U_dc_v)))
+    axes: Axes = (x, y, z)
     for turn in range(_TURNS_MAX):
         table = as_stored(solve(*axes), bounds.stored)
         worst = cell_errors(table)
