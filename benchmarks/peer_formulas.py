@@ -7,8 +7,8 @@ quantity one line per formula: error against the truth over the drives it gave a
 
 R: voltage over current at the largest level (VESC, ODrive, SimpleFOC); slope between two levels (moteus, phobia); one
 fixed curve v = R i + V tanh(i/i_c) through all levels (as STMBL fits a dead-time curve). L: voltage times half
-period over the ripple (ODrive, SimpleFOC); first-order regression without delay (ARX); our output-error fit with the
-axes as they stand. psi_f: (u_q - R i_q)/w at the fastest speed, and the same of the slope over speeds without an
+period over the ripple (ODrive, SimpleFOC); our output-error fit with the axes as they stand, which is ours where the
+frame stands on the rotor's axis. psi_f: (u_q - R i_q)/w at the fastest speed, and the slope over speeds without an
 intercept. The formulas are written here from their descriptions, not taken from those programs.
 """
 
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from benchmarks.identification_coverage import drawn, evaluated, measured, truth_of
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.estimators.axis_fit import arx_guess, initial_inductance
+from pmsmtool.estimators.axis_fit import initial_inductance
 from pmsmtool.estimators.inductance import bare_shot
 from pmsmtool.estimators.resistance import single_point_resistance, two_point_resistance
 from pmsmtool.trace import Trace
@@ -56,11 +56,6 @@ def ripple_inductance(traces: Traces, axis: str) -> float:
     return initial_inductance(bare_shot(traces[f"square_{axis}_6"], axis))
 
 
-def arx_inductance(traces: Traces, axis: str) -> float:
-    """Return L of a first-order regression that takes the voltage as acting at once (H)."""
-    return arx_guess(bare_shot(traces[f"square_{axis}_6"], axis), 0)[0]
-
-
 def speed_flux(traces: Traces, R_ohm: float, *, slope: bool) -> float:
     """Return (u_q - R i_q)/w at the fastest speed, or the least-squares slope through zero over all speeds (Wb)."""
     speeds = traces["speeds"]
@@ -82,7 +77,6 @@ def _inductance_formulas(axis: str) -> dict[str, Formula]:
 
     return {
         "voltage times time over ripple": lambda traces, found: ripple_inductance(traces, axis),
-        "regression without delay (ARX)": lambda traces, found: arx_inductance(traces, axis),
         "output error, axes as they stand": as_they_stand,
         "ours": ours,
     }
