@@ -23,7 +23,7 @@ U_DC = 210.0
 V_MAX = U_DC / math.sqrt(3)
 VALUES = reference_case(4000.0, governor__mode=LINE, governor__eps=0.01)
 SAME_INPUT = 1e-3  # A; measured 5.9e-4, the resolution of the search (2^-20 of a way of up to 112 A)
-CLOSED_LOOP = 0.05  # A of current; measured 0.016 at 800 rpm, where held references jam at the boundary
+CLOSED_LOOP = 0.02  # A of current; measured 0.016 at 800 rpm, where held references jam at the boundary
 DEMAND = 2e-6  # relative excess of the demanded voltage; measured 4.8e-8
 
 EXTREMES = r"""

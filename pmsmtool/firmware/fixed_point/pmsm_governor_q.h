@@ -6,6 +6,8 @@
  * "line search" without options: the largest step from the last governed reference towards the request that keeps the
  * demanded voltage inside V_max now and, with what the integrators hold, in the steady state; where the held reference
  * became inadmissible its steady-state voltage is scaled down. Row 0, the voltage now, is met in any case.
+ * For the machine of Jercic et al. it stays within 1e-3 A of the float core on equal inputs, and the currents of closed
+ * loops within 0.02 A (pmsmtool's tests/firmware/test_governor_q.py).
  */
 #ifndef PMSM_GOVERNOR_Q_H
 #define PMSM_GOVERNOR_Q_H
