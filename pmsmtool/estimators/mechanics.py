@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.estimators.estimate import SensorTolerance, chi2_gate, condition_gate, information_bound
-from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt, linear_solve
+from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt, linear_solve
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
@@ -203,19 +203,43 @@ def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float]:
     scale = np.array([1.0, largest / speed, largest, *(value for run in runs for value in (1.0, speed))])
     x = start
     for _ in range(REPEATS):
-        factors = [_whitener(run, math.exp(float(x[0]))) for run in runs]
-
-        def residual(at: Array, factors: Sequence[Array] = factors) -> Array:
-            return np.concatenate(
-                [
-                    factor @ (positions(run.torque, run.T, np.append(at[:3], at[3 + 2 * k : 5 + 2 * k])) - run.theta)
-                    for k, (run, factor) in enumerate(zip(runs, factors, strict=True))
-                ]
-            )
-
-        fit = levenberg_marquardt(residual, x, scale, cost_tolerance=1e-4)
+        problem = _Problem(runs, [_whitener(run, math.exp(float(x[0]))) for run in runs], RELATIVE_STEP * scale)
+        fit = levenberg_marquardt(problem.residual, x, scale, cost_tolerance=1e-4, derivative=problem.jacobian)
         x = fit.x
     return fit, fit.cost / fit.dof
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """Whitened residual of all traces; a trace knows the three common parameters and its own two."""
+
+    runs: Sequence[_Run]
+    factors: Sequence[Array]
+    step: Array
+
+    def of_run(self, k: int, x: Array) -> Array:
+        """Whitened residual of one trace."""
+        run = self.runs[k]
+        own = np.append(x[:3], x[3 + 2 * k : 5 + 2 * k])
+        return np.asarray(self.factors[k] @ (positions(run.torque, run.T, own) - run.theta))
+
+    def residual(self, x: Array) -> Array:
+        """Whitened residual, shape (n,)."""
+        return np.concatenate([self.of_run(k, x) for k in range(len(self.runs))])
+
+    def jacobian(self, x: Array) -> Array:
+        """Its derivative by central differences, shape (n, k)."""
+        blocks = []
+        for k, run in enumerate(self.runs):
+            block = np.zeros((len(run.theta), len(x)))
+            for column in (0, 1, 2, 3 + 2 * k, 4 + 2 * k):
+                plus, minus = x.copy(), x.copy()
+                plus[column] += self.step[column]
+                minus[column] -= self.step[column]
+                change = self.of_run(k, plus) - self.of_run(k, minus)
+                block[:, column] = change / (plus[column] - minus[column])
+            blocks.append(block)
+        return np.concatenate(blocks)
 
 
 def _whitener(run: _Run, J: float) -> Array:

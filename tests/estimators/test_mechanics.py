@@ -1,0 +1,138 @@
+"""Inertia and friction from pushes and coasting: closed-form motion, accuracy, intervals over many drives, refusals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.mechanics import MechanicsResult, estimate_mechanics, positions
+from pmsmtool.experiments.mechanics_run import UNIT_LEAST_S, UNIT_MOST_S, plan_mechanics
+from pmsmtool.trace import Trace
+
+Array = NDArray[np.float64]
+
+PER_A = 0.9
+SIGMA = 0.02
+J, B, TAU_C = 2e-3, 1.5e-3, 0.05
+ROWS, T_ROW = 1600, 2e-4
+SCALE_STD = 5e-4
+
+
+def move(torque: Array, T: float, truth: tuple[float, float, float], omega: float) -> tuple[Array, float]:
+    """Positions and last speed by small explicit steps with stick-slip, an independent reference."""
+    inertia, viscous, coulomb = truth
+    h, theta = T / 40, 0.0
+    out = [theta]
+    for tau in torque:
+        for _ in range(40):
+            friction = viscous * omega + coulomb * math.copysign(1.0, omega if omega != 0.0 else tau)
+            if omega == 0.0 and abs(tau) <= coulomb:
+                continue
+            after = omega + h * (tau - friction) / inertia
+            if omega != 0.0 and after * omega < 0.0:
+                after = 0.0
+            theta += 0.5 * h * (omega + after)
+            omega = after
+        out.append(theta)
+    return np.array(out), omega
+
+
+def run_of(rng: np.random.Generator, truth: tuple[float, float, float] = (J, B, TAU_C), bits: int = 16) -> list[Trace]:
+    """Push, coasting, push back, coasting."""
+    step = 2.0 * math.pi / 2**bits
+    omega = 0.0
+    traces = []
+    for current, units, coasting in ((4.0, 1.0, False), (0.0, 4.0, True), (-4.0, 2.0, False), (0.0, 4.0, True)):
+        period = T_ROW * units
+        true = current + 0.3 * np.sin(np.arange(ROWS) * period * 300.0) * (current != 0.0)
+        mean = 0.5 * (true[:-1] + true[1:])
+        x = np.array([math.log(truth[0]), truth[1], truth[2], 0.0, omega])
+        theta = positions(PER_A * mean, period, x)
+        omega = speed_after(PER_A * mean, period, truth, omega)
+        signals = {
+            "i_d_a": np.zeros(ROWS),
+            "i_q_a": true + SIGMA * rng.standard_normal(ROWS),
+            "theta_M_rad": step * np.round((theta + rng.uniform(0.0, step)) / step),
+            "flagged": np.zeros(ROWS),
+        }
+        meta = {"coasting": coasting}
+        traces.append(Trace(period * np.arange(ROWS, dtype=np.float64), signals, dict.fromkeys(signals, "1"), meta))
+    return traces
+
+
+def speed_after(torque: Array, T: float, truth: tuple[float, float, float], omega: float) -> float:
+    """Last speed: the way of one more short interval without torque."""
+    x = np.array([math.log(truth[0]), truth[1], truth[2], 0.0, omega])
+    after = positions(np.append(torque, 0.0), T, x)
+    first = (after[-1] - after[-2]) / T
+    # half an interval of friction later than the end of the push
+    return float(first + 0.5 * T * (truth[1] * first + truth[2] * math.copysign(1.0, first)) / truth[0])
+
+
+def estimate(traces: Sequence[Trace]) -> MechanicsResult:
+    return estimate_mechanics(traces, lambda i_d, i_q: PER_A * i_q, PER_A, SIGMA, 1e-6)
+
+
+def test_the_closed_form_is_the_motion_through_reversal_sticking_and_breaking_away() -> None:
+    truth = (J, B, TAU_C)
+    torque = np.concatenate([np.full(40, 0.4), np.full(400, 0.0), np.full(40, 0.04), np.full(40, -0.3)])
+    T = 5e-3
+    x = np.array([math.log(J), B, TAU_C, 0.0, -2.0])
+    exact = positions(torque, T, x)
+    stepped, _ = move(torque, T, truth, -2.0)
+    assert np.max(np.abs(exact - stepped)) < 2e-3 * np.ptp(stepped)
+    assert np.ptp(exact[441:481]) < 1e-12  # friction holds
+    no_friction = positions(np.full(10, 0.2), 0.01, np.array([math.log(J), 0.0, 0.0, 1.0, 3.0]))
+    t = 0.01 * np.arange(11)
+    assert np.allclose(no_friction, 1.0 + 3.0 * t + 0.5 * 0.2 / J * t * t, rtol=1e-12)
+
+
+def test_errors_lie_in_their_intervals_and_within_the_limits() -> None:
+    """Four drives; the floor of the scale over-covers."""
+    inside = []
+    rng = np.random.default_rng(7)
+    for _ in range(4):
+        truth = (J * rng.uniform(0.5, 2.0), B * rng.uniform(0.3, 2.0), TAU_C * rng.uniform(0.3, 2.0))
+        found = estimate(run_of(rng, truth, bits=int(rng.integers(12, 18))))
+        for value, true, limit in zip((found.J, found.B, found.tau_c), truth, (0.002, 0.04, 0.02), strict=True):
+            assert value.value == pytest.approx(true, rel=limit)
+            inside.append(abs(value.value - true) <= 1.96 * value.std)
+        assert found.chi2 < 1.25
+    assert sum(inside) >= 10
+
+
+def test_what_is_not_a_free_shaft_is_refused_by_name() -> None:
+    good = run_of(np.random.default_rng(3))
+
+    def reason(traces: Sequence[Trace]) -> str:
+        with pytest.raises(IdentificationError) as caught:
+            estimate(traces)
+        return caught.value.reason
+
+    def changed(trace: Trace, **signals: Array) -> Trace:
+        return replace(trace, signals={**trace.signals, **signals})
+
+    assert reason(good[:3]) == "E_EXCITATION"
+    held = [changed(trace, theta_M_rad=np.zeros(ROWS)) for trace in good]
+    assert reason(held) == "E_EXCITATION"
+    clipped = [changed(good[0], flagged=np.ones(ROWS)), *good[1:]]
+    assert reason(clipped) == "E_CLIPPED"
+    t = good[1].t_s
+    cogging = changed(good[1], theta_M_rad=good[1]["theta_M_rad"] + 0.004 * np.sin(40.0 * t))
+    assert reason([good[0], cogging, *good[2:]]) == "E_MODEL_MISMATCH"
+
+
+def test_pushes_are_sized_by_speed_and_time() -> None:
+    plan = plan_mechanics(4.0, 100.0, 2e-3, 0.9)
+    assert plan.unit_s == pytest.approx(2e-3 * 100.0 / 3.6) and plan.i_q_a == 4.0 and plan.omega_rad_s == 100.0
+    quick = plan_mechanics(4.0, 100.0, 2e-5, 0.9)
+    assert quick.unit_s == UNIT_LEAST_S and quick.i_q_a < 4.0 and quick.omega_rad_s == 100.0
+    assert 0.9 * quick.i_q_a * quick.unit_s / 2e-5 == pytest.approx(100.0)
+    heavy = plan_mechanics(4.0, 100.0, 2.0, 0.9)
+    assert heavy.unit_s == UNIT_MOST_S and heavy.omega_rad_s < 100.0
