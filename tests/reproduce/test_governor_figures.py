@@ -106,6 +106,7 @@ def test_unreachable_references_lose_back_calculation_and_stall_the_paper() -> N
     assert cells(found, "> 100 ms", law="back", condition="nominal")[0] >= 0.9 * CASES
     assert cells(found, "> 100 ms", law="paper", eps=1e-3)[0] >= 0.3 * CASES
     assert cells(found, "peak |i|", law="back", condition="nominal")[0] > 80.0
+    assert set(cells(found, "shown", 1)) == {"less"}
 
 
 def test_back_calculation_brakes_when_the_speed_rises() -> None:
@@ -127,6 +128,8 @@ def test_paper_rows_fail_on_table_2b_where_the_offset_free_do_not() -> None:
     found = made("plant-mismatch")
     assert cells(found, "not converged", plant="Table 2 (b)", law="paper")[0] >= 0.05 * CASES
     assert max(cells(found, "not converged", law="best")) == 0
+    assert len(cells(found, "shown", 1)) == 30  # five plants, with and without delay, three statistics
+    assert "less" not in cells(found, "shown", 1, difference="best, Table 2 (a): 0.7 L, delayed", of="median")
 
 
 def test_voltage_is_robust_and_torque_is_not() -> None:
