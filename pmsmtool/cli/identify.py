@@ -69,7 +69,8 @@ def identify_command(
     """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
 
     "map" measures the flux linkages over the plane of currents with saturation and cross-saturation; a held rotor
-    (--shaft locked) allows R, inverter and map. Without a quantity all but the map are measured, with "all" all.
+    (--shaft locked) allows R, inverter and map. "mechanics" fits inertia, viscous and Coulomb friction to pushes and
+    coasting. Without a quantity all but these two are measured, the inertia roughly; with "all", all.
 
     The limits are printed and consent is asked before anything moves. Every number comes with its statistical and its
     systematic part; what cannot be trusted is refused by name. The run directory keeps raw traces and machine.toml;
