@@ -51,7 +51,7 @@ from tests.firmware.test_projection import (
     smallest_excess,
 )
 
-DELAYED = {"inverter__delay_periods": 1.5, "options": ALL_OPTIONS | PREDICTOR}
+DELAYED = {"inverter__delay_periods": 1.5}
 PLANTS = {"0.7 L": (1, 0.7, 1), "1.43 L": (1, 1.43, 1), "0.7 psi, 1.5 R": (1.5, 1, 0.7), "1.1 psi": (1, 1, 1.1),
           "1.5 R": (1.5, 1, 1)}
 BACK_CALCULATION_DELAYED = {"inverter__delay_periods": 1.5, "current__options": 23}
@@ -122,7 +122,7 @@ def steps(count: int) -> list[Verdict]:
     laws: dict[str, tuple[dict[str, float], tuple[float, float] | None]] = {
         "paper, modulus optimum": (paper(governor__eps=1e-3), (1.25, 1.40)),
         "best, alpha 7540": (best(), (1.06, 1.10)),
-        "best, delay and predictor": (best(**DELAYED), (1.11, 1.18)),
+        "best, delay and predictor": (best(options=ALL_OPTIONS | PREDICTOR, **DELAYED), (1.11, 1.18)),
         "back-calculation, modulus optimum": (reference_case(4000.0), None),
         "back-calculation, alpha 7540": (reference_case(7540.0), None),
         "back-calculation, delay and predictor": (reference_case(7540.0, **BACK_CALCULATION_DELAYED), None),
@@ -167,7 +167,8 @@ def unreachable(count: int) -> list[Verdict]:
 
 def mismatch(count: int) -> list[Verdict]:
     """Steps that are feasible for the plant and do not arrive within 1 A."""
-    m, out = Table1(), []
+    m = Table1()
+    out: list[Verdict] = []
     for name, plant in PLANTS.items():
         missed = done = 0
         for rpm, start, target in random_cases(100 * count, 4):

@@ -170,13 +170,14 @@ def judged(
     missed = violated = 0
     for at, truth in truths.items():
         d, q = found[at]
+        i_d, i_q = np.asarray(d), np.asarray(q)
         if not (math.isfinite(d) and math.isfinite(q)):
             missed += not math.isnan(truth.torque)
             continue
         if not math.isnan(truth.current):
             current = max(current, abs(math.hypot(d, q) - truth.current) / I_MAX)
-        torque = max(torque, abs(float(truth.case.torque(d, q)) - truth.torque) / T_max)
-        over = max(math.hypot(d, q) / I_MAX, float(truth.case.voltage(d, q)) / V_MAX) - 1.0
+        torque = max(torque, abs(float(truth.case.torque(i_d, i_q)) - truth.torque) / T_max)
+        over = max(math.hypot(d, q) / I_MAX, float(truth.case.voltage(i_d, i_q)) / V_MAX) - 1.0
         excess, violated = max(excess, over), violated + (over > NAMED_EXCESS)
     return {
         "current_error_over_I_max": current, "torque_error_over_T_max": torque, "largest_excess": excess,

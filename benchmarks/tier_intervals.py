@@ -94,13 +94,13 @@ def main() -> None:
     print("quantity           n   error: median    p90      max   half width: median   p90    covered")
     for name, rows in errors.items():
         unit, factor = ("deg", 1.0) if name.endswith("_rad") else ("%", 100.0)
-        off, half = sorted(row[0] * factor for row in rows), sorted(row[1] * factor for row in rows)
+        sizes, half = sorted(row[0] * factor for row in rows), sorted(row[1] * factor for row in rows)
         n = len(rows)
         p90 = round(0.9 * (n - 1))
         hits = sum(row[0] <= row[1] + 1e-12 for row in rows)
         low, high = clopper_pearson(hits, n)
         print(
-            f"{name:17s} {n:3d}  {off[n // 2]:9.3f} {off[p90]:8.3f} {off[-1]:8.3f} {unit:3s}  {half[n // 2]:9.3f} "
+            f"{name:17s} {n:3d}  {sizes[n // 2]:9.3f} {sizes[p90]:8.3f} {sizes[-1]:8.3f} {unit:3s}  {half[n // 2]:9.3f} "
             f"{half[p90]:8.3f}   {hits}/{n} ({low:.3f} .. {high:.3f})"
         )
 
