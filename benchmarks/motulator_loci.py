@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from motulator.drive.control._sm_reference_gen import ReferenceGenerator
 from motulator.drive.utils._parameters import SaturatedSynchronousMachinePars
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 STEPS_MAX = 60
@@ -27,7 +26,7 @@ def main() -> None:
     flux_d, flux_q = (RectBivariateSpline(data["i_d_a"], data["i_q_a"], grid, s=0) for grid in grids)
     low_d, high_d, low_q, high_q = (float(axis[k]) for axis in (data["i_d_a"], data["i_q_a"]) for k in (0, -1))
 
-    def flux(i: complex | NDArray[np.complex128]) -> Any:
+    def flux(i: Any) -> Any:
         d, q = np.real(i), np.imag(i)
         c, e = np.clip(d, low_d, high_d), np.clip(q, low_q, high_q)
         value = flux_d.ev(c, e) + 1j * flux_q.ev(c, e)

@@ -100,7 +100,7 @@ def main() -> None:
         hits = sum(row[0] <= row[1] + 1e-12 for row in rows)
         low, high = clopper_pearson(hits, n)
         print(
-            f"{name:17s} {n:3d}  {sizes[n // 2]:9.3f} {sizes[p90]:8.3f} {sizes[-1]:8.3f} {unit:3s}  {half[n // 2]:9.3f} "
+            f"{name:17s} {n:3d}  {sizes[n // 2]:9.3f} {sizes[p90]:8.3f} {sizes[-1]:8.3f} {unit:3s} {half[n // 2]:9.3f} "
             f"{half[p90]:8.3f}   {hits}/{n} ({low:.3f} .. {high:.3f})"
         )
 
