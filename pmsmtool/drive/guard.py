@@ -135,10 +135,6 @@ class GuardedDrive:
             except KeyboardInterrupt:
                 interrupted = True
                 self._drive.disable_at_once()
-            except StopNotConfirmed as error:
-                if self._before:
-                    error.hint = f"{error.hint}; then reset the drive: until then it holds values of this run"
-                raise
         return interrupted
 
     def restore(self) -> int:

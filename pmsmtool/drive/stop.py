@@ -89,7 +89,8 @@ def not_confirmed(node: DriveNode, why: str) -> StopNotConfirmed:
         f"the drive did not confirm that it stopped ({why}): the machine may be energised",
         where=f"node {node.node}, 0x6041:00",
         likely="the bus or the drive does not answer; its heartbeat supervision stops it if that was set",
-        hint="use the hardware stop (emergency stop, safe torque off, or mains), then check cable and supply",
+        hint="use the hardware stop (emergency stop, safe torque off, or mains), check cable and supply, then reset the"
+        " drive: until then it may hold values of an interrupted run",
     )
 
 
