@@ -75,7 +75,8 @@ class PushResult:
     Attributes
     ----------
     R : Estimate or None
-        Loop resistance at the temperature of the run; None when the inverter's error hides it.
+        Loop resistance at the temperature of the run, a rough figure: on 18 fresh random drives off by up to 22 %, and
+        outside its interval on four. None when the inverter's error hides it altogether.
     psi_f, L_q, frame_offset : Estimate
         Flux linkage at the temperature of the run, apparent L_q at the pushes' currents, angle of the frame ahead of
         the d axis (rad electrical).

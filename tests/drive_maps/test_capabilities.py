@@ -152,6 +152,7 @@ def test_caps_of_an_unknown_drive_says_so() -> None:
         ("&drive=epos4", (), "encoder by standard: not available: needs mode 11"),
         ("&drive=cia402", ("psi",), "psi by standard: not available: needs the undriven machine's voltage"),
         ("&tier=recorder", ("encoder",), "encoder by inject: not available: needs"),
+        ("&tier=recorder", ("R",), "R by recorder: not available: needs DC levels by current set-points"),
         ("", ("R", "--method", "vendor"), "R by vendor: not available: needs the maker's identification"),
         ("", ("R", "--method", "manual"), "R by manual: a number you bring"),
         ("", ("map", "--method", "standard"), "map has no standard method"),
@@ -170,7 +171,7 @@ def test_identify_ends_in_exit_9_and_names_what_is_missing(
 
 def test_a_locked_shaft_gives_nothing_without_injection(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    outcome = run("--sim", CHANNEL + "&tier=recorder", "--yes", "identify", "R", "--shaft", "locked")
+    outcome = run("--sim", CHANNEL + "&tier=recorder", "--yes", "identify", "psi", "--shaft", "locked")
     assert isinstance(outcome.exception, NotAvailable) and "must turn" in str(outcome.exception)
 
 
