@@ -52,8 +52,8 @@ RATIO_PRIOR_STD = 0.3
 DISPERSION_SHARE = 0.5
 """Standard deviation of L, of its difference between the injection frequencies where the fit found one."""
 DELAY_STARTS = (0.05, 0.45, 0.95, 1.45, 1.95)
-LAG_STARTS = (0.02, 0.1, 0.4, 0.8)
-"""Delays and lags tried before the fit (T_s)."""
+LAG_STARTS = ((0.02, 0.1), (0.4, 0.8))
+"""Delays and lags tried before the fit (T_s); one fit begins at the best of each group of lags."""
 ITERATIONS = 30
 STEP_TOLERANCE = 1e-7
 """Relative size of the last step."""
@@ -365,15 +365,16 @@ class _Problem:
         return np.concatenate(columns, axis=1)
 
     def fit(self, x: Vector) -> Fit:
-        return levenberg_marquardt(
-            self,
-            x,
-            np.ones(len(x)),
-            iterations=ITERATIONS,
-            tolerance=STEP_TOLERANCE,
-            cost_tolerance=COST_TOLERANCE,
-            derivative=self.derivative,
-        )
+        with np.errstate(over="ignore", invalid="ignore"):  # a step that runs away has no finite cost and is refused
+            return levenberg_marquardt(
+                self,
+                x,
+                np.ones(len(x)),
+                iterations=ITERATIONS,
+                tolerance=STEP_TOLERANCE,
+                cost_tolerance=COST_TOLERANCE,
+                derivative=self.derivative,
+            )
 
 
 def initial_inductance(shot: Shot) -> float:
@@ -431,13 +432,14 @@ def fit_axis(shots: Sequence[Shot], sigma_a: float, R_guess: float, *, allow_mot
     motion_scale = 0.01 * L_0 / (shots[0].half_period * T_s) ** 2
     base = Layout(len(shots), Effects(), L_0, R_guess, T_s, ripple, motion_scale)
     problem = _Problem(shots, slow, sigma_a, base)
-    starts = [
-        np.array([0.0, 1.0, delay, math.log(lag), *([0.0] * len(shots))])
-        for delay in DELAY_STARTS
-        for lag in LAG_STARTS
-    ]
-    x_0 = min(starts, key=lambda x: float(np.sum(problem(x) ** 2)))
-    tried: dict[Effects, tuple[Fit, Layout]] = {Effects(): (problem.fit(x_0), base)}
+    firsts = []
+    # a long lag and a longer delay are two valleys: begin in each, on a first guess of L either may look better
+    for lags in LAG_STARTS:
+        starts = [
+            np.array([0.0, 1.0, delay, math.log(lag), *([0.0] * len(shots))]) for delay in DELAY_STARTS for lag in lags
+        ]
+        firsts.append(problem.fit(min(starts, key=lambda x: float(np.sum(problem(x) ** 2)))))
+    tried: dict[Effects, tuple[Fit, Layout]] = {Effects(): (min(firsts, key=lambda fit: fit.cost), base)}
     wanted = ["bend"]
     if allow_motion:
         wanted.append("motion")
