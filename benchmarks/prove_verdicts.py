@@ -8,6 +8,11 @@ is given the true parameters off by draws from the intervals that identification
 flashes over the bus, and proves. Every drive is proven healthy, and once more with one defect that its objects do
 not show (the kinds in turn): K_p 20 % up or down, one more period of delay, decoupling of the wrong sign, one pole
 pair more or less. A spoiled drive is caught when the proof fails, however it fails.
+
+Seeds 0 to 119 of the first command above, ended early for lack of time:
+119 of 120 healthy drives pass (99.2 %, Clopper-Pearson 95.4 to 100.0 %);
+119 of 120 spoiled ones are caught (99.2 %, 95.4 to 100.0 %).
+The drive that got away had K_p 20 % too low.
 """
 
 from __future__ import annotations
