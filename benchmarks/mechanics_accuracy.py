@@ -3,6 +3,10 @@
     python -m benchmarks.mechanics_accuracy --drives 30
 
 Drives follow from their seeds (``workflow/random_drives.py``, switched inverter); the tool sees their nameplate only.
+
+Measured with ``--drives 6`` and ``--drives 8 --first 6``: 12 of 14 accepted (one E_MODEL_MISMATCH, one drive fault),
+J, tau_c and B off by at most 0.31 %, every interval holds its truth. The error is that of the torque's scale: what a
+sample of a switched current differs from its mean.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ TORQUE_FLOOR = 1e-3
 """Deviation of a block's torque beyond the noise of the currents, of the push's: ripple that samples do not show."""
 SCALE_FLOOR = 5e-4
 """Relative deviation of the torque's scale beyond that of the flux linkage: the sample of a switched current is not its
-mean. Measured over random drives: 0.0003."""
+mean. Largest error of J over twelve random drives, that of the flux linkage included: 0.0031, inside its interval."""
 SMALLEST_DECAY = 1e-9
 """B T/J below which an interval is a parabola."""
 ROUNDING_RAD = 1e-6
