@@ -44,6 +44,7 @@ from pmsmtool.flash.restore import marks_of, plan_download
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.sim.drive_kernel import KernelCore
 from pmsmtool.sim.kernel import Params
+from pmsmtool.sim.simulated_machine import Settings
 from pmsmtool.workflow.prove import stage as proving
 from pmsmtool.workflow.prove.simulated import predict_proof
 from pmsmtool.workflow.random_drives import draw_drive
@@ -99,20 +100,20 @@ KINDS: dict[str, Change] = {
 
 def declared(drive: MachineFile) -> MachineFile:
     """Return what identification would say of a drive: the truth, off by a draw from its own intervals."""
-    rng = np.random.default_rng([20261121, int(drive.simulation_settings()["seed"])])  # type: ignore[arg-type]
-    true, settings = drive.machine, drive.simulation_settings()
-    values = {}
+    true, settings = drive.machine, Settings(drive.simulation_settings())
+    rng = np.random.default_rng([20261121, int(settings.number("seed"))])
+    values: dict[str, Any] = {}
     for name, (std, systematic) in DECLARED.items():
         off = std * float(rng.standard_normal()) + systematic * float(rng.uniform(-1.0, 1.0))
         values[name] = (1.0 + off) * float(getattr(true, name))
-    step = 2.0 * float(settings["adc_full_scale_apk"]) / 2**12
-    noise = math.sqrt(2.0 / 3.0) * math.hypot(float(settings["sensor_noise_apk"]), step / math.sqrt(12.0))
+    step = 2.0 * settings.number("adc_full_scale_apk") / 2**12
+    noise = math.sqrt(2.0 / 3.0) * math.hypot(settings.number("sensor_noise_apk"), step / math.sqrt(12.0))
     dead, U_dc, T_s = drive.inverter.dead_time_s, drive.inverter.U_dc_v, drive.inverter.T_s
     plateau = U_dc * dead / T_s
-    if float(settings["device_drop_v"]) > 0.0:  # of a MOSFET bridge the diodes conduct in the dead time only
-        plateau += 0.5 * (float(settings["device_drop_v"]) + float(settings["diode_drop_v"]))
-    knee = 2.0 * float(settings["output_capacitance_f"]) * U_dc / dead  # charges a leg's output within the dead time
-    offset = float(settings["encoder_offset_rad"]) + OFFSET_STD_RAD * float(rng.standard_normal())
+    if settings.number("device_drop_v") > 0.0:  # of a MOSFET bridge the diodes conduct in the dead time only
+        plateau += 0.5 * (settings.number("device_drop_v") + settings.number("diode_drop_v"))
+    knee = 2.0 * settings.number("output_capacitance_f") * U_dc / dead  # charges a leg's output within the dead time
+    offset = settings.number("encoder_offset_rad") + OFFSET_STD_RAD * float(rng.standard_normal())
     return replace(
         drive,
         machine=replace(true, **values, B_nms=None, tau_c_nm=float(rng.uniform(0.7, 1.3)) * (true.tau_c_nm or 0.0)),
@@ -122,7 +123,7 @@ def declared(drive: MachineFile) -> MachineFile:
         systematic={n: s * values[n] for n, (_, s) in DECLARED.items()},
         conditions={"noise_apk": noise},
         simulation={},
-    )  # type: ignore[arg-type]
+    )
 
 
 @contextmanager
@@ -204,7 +205,7 @@ def main() -> None:
     parser.add_argument("--verbose", action="store_true", help="a line for every proof")
     asked = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    proving.predict_proof = Shared().predict  # type: ignore[assignment]
+    setattr(proving, "predict_proof", Shared().predict)  # noqa: B010 - replaced on purpose
     good: Counter[str] = Counter()
     total: Counter[str] = Counter()
     named: Counter[str] = Counter()

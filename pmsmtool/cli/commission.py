@@ -65,8 +65,9 @@ def commission_command(
 
     MACHINE is a machine file with what is known (ratings, limits); without it the drive's own ratings are the start.
     Consents are asked one by one: the motion envelope before anything moves, the list of differences before anything
-    is written, and the envelope of the proof, which runs the flashed drive up to its designed limits. The chain ends at the first criterion that is not met, with the drive off and as it was; --resume goes on
-    there. A simulated drive starts from factory memory unless its channel names a memory file (nv=).
+    is written, and the envelope of the proof, which runs the flashed drive up to its designed limits. The chain ends
+    at the first criterion that is not met, with the drive off and as it was; --resume goes on there. A simulated drive
+    starts from factory memory unless its channel names a memory file (nv=).
     """
     from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.errors import ConfigError
