@@ -117,7 +117,7 @@ class CoenergySpline:
         fold = np.zeros((n_q, half))
         for b in range(half):
             fold[b, b] = fold[n_q - 1 - b, b] = 1.0
-        return np.kron(np.eye(n_d), fold)
+        return np.asarray(np.kron(np.eye(n_d), fold), np.float64)
 
     def roughness(self) -> Array:
         """Return the quadratic form of the squared third differences of the coefficients, shape (size, size)."""

@@ -155,7 +155,7 @@ class CoenergyFit:
         fitted = np.stack([self._std(i_d_a, i_q_a, 1, 0), self._std(i_d_a, i_q_a, 0, 1)])
         L_dd, L_dq, L_qq = self.inductance(i_d_a, i_q_a)
         misfit = self.misfit_a * np.stack([np.hypot(L_dd, L_dq), np.hypot(L_dq, L_qq)])
-        return np.sqrt(fitted**2 + misfit**2 + np.array([[self.magnet_std_wb], [0.0]]) ** 2)
+        return np.asarray(np.sqrt(fitted**2 + misfit**2 + np.array([[self.magnet_std_wb], [0.0]]) ** 2))
 
     def inductance_std(self, i_d_a: Array, i_q_a: Array) -> Array:
         """Return the standard deviations of L_dd, L_dq, L_qq (H), shape (3, n).
@@ -167,7 +167,8 @@ class CoenergyFit:
         L_dd, L_dq, L_qq = self.inductance(i_d_a, i_q_a)
         misfit_d, misfit_q = self.misfit_a * np.hypot(L_dd, L_dq), self.misfit_a * np.hypot(L_dq, L_qq)
         h_d, h_q = _spacing(self.spline.breaks_d, i_d_a), _spacing(self.spline.breaks_q, i_q_a)
-        return np.hypot(fitted, np.stack([misfit_d / h_d, np.sqrt(misfit_d * misfit_q / (h_d * h_q)), misfit_q / h_q]))
+        misfit = np.stack([misfit_d / h_d, np.sqrt(misfit_d * misfit_q / (h_d * h_q)), misfit_q / h_q])
+        return np.asarray(np.hypot(fitted, misfit))
 
     def _std(self, i_d_a: Array, i_q_a: Array, by_d: int, by_q: int) -> Array:
         rows = self.spline.derivative(i_d_a, i_q_a, by_d, by_q)

@@ -274,14 +274,15 @@ def _rows(
     def seen(vector: Array) -> Array:
         return turn(-trace.theta, vector).T
 
+    i_d, i_q = trace.i
     parts = [
-        np.stack([spline.derivative(*trace.i, 1, 0), spline.derivative(*trace.i, 0, 1)], axis=1),
+        np.stack([spline.derivative(i_d, i_q, 1, 0), spline.derivative(i_d, i_q, 0, 1)], axis=1),
         seen(trace.current_seconds)[:, :, None],
         *(seen(error)[:, :, None] for error in trace.error_seconds),
         seen(trace.volts_before)[:, :, None],
     ]
     if skew is not None:
-        field = skew.derivative(*trace.i, 0, 0)
+        field = skew.derivative(i_d, i_q, 0, 0)
         parts.append(np.stack([field, np.zeros_like(field)], axis=1))
     c, s = np.cos(trace.theta), np.sin(trace.theta)
     constants = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)

@@ -151,8 +151,8 @@ def _magnet_of(speeds: Trace, psi: Estimate) -> MagnetFlux:
     """Return the flux linkage with the currents it was measured at; fast rows decide the regression over speeds."""
     weight = np.square(speeds["omega_e_rad_s"])
     weight = weight / np.sum(weight)
-    points = (tuple(map(float, speeds[name])) for name in ("i_d_a", "i_q_a"))
-    return MagnetFlux(psi.value, psi.std, *points, tuple(map(float, weight)))
+    i_d, i_q = (tuple(map(float, speeds[name])) for name in ("i_d_a", "i_q_a"))
+    return MagnetFlux(psi.value, psi.std, i_d, i_q, tuple(map(float, weight)))
 
 
 def map_estimates(result: Evaluation, flux_map: FluxMapResult, traces: Mapping[str, Trace]) -> dict[str, Estimate]:
