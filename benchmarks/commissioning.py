@@ -105,7 +105,8 @@ def commission_one(job: tuple[str, str]) -> str:
         drive = drive_of(name, model)
         Path("drive.toml").write_text(dump_machine_file(drive, embed_flux_map=True))
         start = time.perf_counter()
-        code, told = commanded("commission", "-i", "pmsmsim", "-c", "drive.toml", "--yes")
+        options = () if drive.flux_map is None else ("--flux-map",)
+        code, told = commanded("commission", "-i", "pmsmsim", "-c", "drive.toml", "--yes", *options)
         seconds = time.perf_counter() - start
         (folder,) = Path("runs").iterdir()
         record = RunDirectory(folder).read()

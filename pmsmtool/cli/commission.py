@@ -28,6 +28,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     "commission",
     epilog=examples(
         "pmsmtool commission --sim interior-2k2 --yes",
+        "pmsmtool commission --sim saturated-pmsyrm --flux-map --i-max 20Apk --yes",
         "pmsmtool commission -i socketcan -c can0 -n 5 --i-max 12Apk --speed-max 3000rpm --shaft free",
         "pmsmtool commission --resume runs/20260101T120000Z-000055f1",
     ),
@@ -35,6 +36,8 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 @click.argument("machine", required=False, type=FILE)
 @click.option("--resume", type=FOLDER, metavar="RUN_DIR", help="Go on with a run where it ended.")
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
+@click.option("--flux-map", is_flag=True, help="Measure the flux map too, and design with it: for a machine that "
+              "saturates.")  # fmt: skip
 @click.option("--bandwidth-hz", type=float, metavar="HZ", help="Bandwidth of the current loops.  [default: modulus "
               "optimum, lowered to the margins]")  # fmt: skip
 @click.option("--phase-margin-deg", type=float, default=45.0, metavar="DEG", help="Least phase margin of the design.")
@@ -59,6 +62,7 @@ def commission_command(
     runs: Path,
     map_file: Path | None,
     sensor_tol: float,
+    flux_map: bool,
     **design: Any,
 ) -> None:
     """Identify the machine, design its control, make the table, judge the margins, flash, verify, prove, report.
@@ -77,7 +81,7 @@ def commission_command(
     begun = RunDirectory(resume) if resume is not None else None
     if begun is not None and machine is not None:
         raise ConfigError("MACHINE and --resume exclude each other", hint="a run keeps the machine it began with")
-    asked = _asked(machine if begun is None else _kept_nameplate(begun), motion, sensor_tol, design)
+    asked = _asked(machine if begun is None else _kept_nameplate(begun), motion, sensor_tol, flux_map, design)
     if begun is not None:
         bus = _as_begun(bus, begun)
     elif bus.simulated():
@@ -98,14 +102,18 @@ def _kept_nameplate(run: RunDirectory) -> Path | None:
     return path if path.is_file() else None
 
 
-def _asked(machine: Path | None, motion: MotionOptions, sensor_tol: float, design: dict[str, Any]) -> dict[str, Any]:
+def _asked(
+    machine: Path | None, motion: MotionOptions, sensor_tol: float, flux_map: bool, design: dict[str, Any]
+) -> dict[str, Any]:
     """Check and collect what is asked of the chain, before anything is opened."""
     from pmsmtool.design.tune_request import TuneRequest
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.workflow.identify import IdentifyRequest
+    from pmsmtool.workflow.measure import QUANTITIES
 
     wanted = IdentifyRequest(
+        quantities=(*QUANTITIES, "map") if flux_map else QUANTITIES,
         i_max_apk=motion.i_max_apk,
         speed_max_rad_s=motion.speed_max_rad_s,
         shaft=motion.shaft or "free",
