@@ -40,8 +40,6 @@ commissioning.py)."""
 BUSY_RETRIES = 2
 """The served drive runs in real time; a machine that is busy with other things may starve it."""
 QUANTITIES = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
-"""Machines whose inductance falls to a third of what it is at the bias: a design with constant ones is flashed and
-verified, but does not do what it promises at rated current, and the proof says so."""
 Result = tuple[int, str, str]
 Tool = Callable[..., Result]
 
