@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from typing import Any, get_args
@@ -31,6 +30,7 @@ from pmsmtool.firmware.drive_map import (
 from pmsmtool.firmware.wire_units import counted_in, wire_unit
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, Parameter
 from pmsmtool.params.parameter_set import TABLE_NAMES
+from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_text
 
 SCHEMA = "pmsmtool.drive-map/1"
@@ -42,6 +42,7 @@ POLE_PAIRS = "motor.pole_pairs"
 _HEAD = ("schema", "name", "vendor", "product", "more_products", "staging")
 _TABLES = ("capabilities", "objects", "signals", "tables", "left_out", "sources")
 _CELL_KEYS = ("index", "sub", "type", "factor", "offset", "unit", "rounding", "form", "gain", "source")
+_TEXT_KEYS = ("type", "unit", "form", "rounding", "gain", "source")
 _SIGNAL_KEYS = ("index", "sub", "type", "unit", "source")
 _FORM_UNIT: dict[str, str] = {"time": "s", "rate": "1/s", "torque constant": "N m/A"}
 _CHOICES = {"recorder": get_args(Recording), "injection": get_args(Injecting)}
@@ -119,10 +120,7 @@ def parse_drive_map(text: str, where: str = "map.toml") -> DriveMap:
     ConfigError
         Everything that is wrong with it, at once, each with its line.
     """
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"not a TOML file: {error}", where=where) from error
+    document = parse_toml(text, where=where)
     if document.get("schema") != SCHEMA:
         raise ConfigError(f"schema is {document.get('schema')!r}, expected {SCHEMA!r}", where=where)
     wrong: list[str] = []
@@ -290,6 +288,11 @@ def _check_row(
         tell("index", f"index 0x{index:04X} is outside 0x2000 .. 0x9FFF, where devices keep their parameters")
     elif index in COMMANDS and not commands:
         tell("index", f"index 0x{index:04X} is a command that moves the machine, not a parameter")
+    no_text = [key for key in _TEXT_KEYS if key in row and not isinstance(row[key], str)]
+    for key in no_text:
+        tell(key, f"{key} must be text")
+    if no_text:
+        return False
     usable = True
     if row.get("type") not in LETTERS:
         tell("type", f"type {row.get('type')!r} is none of {', '.join(LETTERS)}")
