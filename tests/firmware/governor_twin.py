@@ -27,7 +27,7 @@ from tests.firmware.projection_twin import (
 )
 
 EMPTY, STEERED = 254, 250
-EMPTY_MARGIN, HOLD_SHARE, LANDING_REST, ACCURACY = f(1.00001), f(0.99), f(0.26), f(1e-2)
+EMPTY_MARGIN, HOLD_SHARE, LANDING_REST, ACCURACY, CLOSE_SHARE = f(1.00001), f(0.99), f(0.26), f(1e-2), f(0.95)
 FLAG_FALLBACK = 64
 
 
@@ -114,7 +114,7 @@ class GovernedTwin(Twin):
         kappa, active = ONE, NONE
         for k, row in enumerate(rows):
             share = row_share(row, p, way, self["governor.slack"])
-            if share < kappa:
+            if share < kappa and (k <= steady or share >= 0):
                 kappa, active = share, k
             if kappa < 0:
                 break
@@ -192,9 +192,9 @@ class GovernedTwin(Twin):
         if steered is not None:
             self.landing, self.binding = True, STEERED
             return steered
-        if empty or barred:
+        if empty or (barred and square(last.voltage(self.i)) > self.V_max * self.V_max):
             return v
-        if (self.time_to_go > 0 or not may_start):
+        if barred or self.time_to_go > 0 or not may_start:
             self.binding = 0
             return project_row(rows[0], r)
         v, self.binding = self.solve(rows, steady, r)
@@ -241,7 +241,7 @@ class GovernedTwin(Twin):
         T, m = self.time_to_go - self.T_s, None
         if T > 0:
             T, m = self.find_time((a, b, drops), T, least, 3)
-        elif may_start:
+        elif may_start and not self.is_cornered(offset):
             direct = f(0.7) * np.sqrt(square((b[0] - a[0], b[1] - a[1]))) / self.V_max
             T, m = self.find_time((a, b, drops), max(direct, least), least, 4)
         else:
@@ -257,6 +257,12 @@ class GovernedTwin(Twin):
             return None, True
         self.time_to_go = T
         return ((kept[0] - now.c[0]) / now.dd, (kept[1] - now.c[1]) / now.qq), False
+
+    def is_cornered(self, offset: Vector) -> bool:
+        model, limit, power = (self.model_voltage(self.i), CLOSE_SHARE * self["governor.I_transient_apk"],
+                               self.V_max * self.V_max)
+        hold = square((model[0] + offset[0], model[1] + offset[1]))
+        return bool(square(self.i) > limit * limit and HOLD_SHARE * HOLD_SHARE * power < hold <= power)
 
     def keep_current(self, offset: Vector, w: Vector) -> Vector | None:
         model, i = self.model_voltage(self.i), self.i

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.firmware.core_binding import core
+from pmsmtool.workflow.reproduce.governed_drive import DELAYED, NOMINAL, Condition, GovernedDrive, Law
 from tests.firmware.closed_loop import (
     BEST,
     CURRENT_ROW,
@@ -254,6 +255,24 @@ def test_speed_ramp_and_speed_steps_without_field_weakening() -> None:
         assert step["i"][-1, 1] > 0
     baseline = run(reference_case(7540.0), 620, (0, 28), (0, 28), 2400, end_rpm=900, ramp_periods=240)
     assert baseline["i"][-1, 1] < -50  # back-calculation ends in full braking torque
+
+
+@pytest.mark.parametrize("condition", [NOMINAL, DELAYED])
+def test_line_search_follows_a_speed_step_to_where_no_current_within_the_row_can_be_held(condition: Condition) -> None:
+    drive = GovernedDrive(Law("line search", "line", eps=1e-3), condition)
+    seen = drive.speed_change(((0.0, 620.0), (0.0, 1200.0)), (0.0, 28.0), (0.0, 28.0), 0.1)
+    assert np.linalg.norm(seen.i, axis=1).max() <= 105  # A; measured 95.7 and 98.5; a held reference gave 335 and 321
+    assert seen.i[-1] == pytest.approx([-75.67, 7.87], abs=0.1)  # A; where the best mode ends
+    assert np.hypot(*seen.demanded.T).max() <= V_MAX * (1 + VOLTAGE_FLOAT)
+
+
+def test_barred_transfer_comes_to_rest_in_the_corner_of_steady_state_and_current_row() -> None:
+    seen = run(best(), -825.4457, (-44.7322, 31.3255), (-32.154, -45.0282), 600)
+    end = seen["i"][-120:]
+    assert np.ptp(end, axis=0).max() <= 0.01  # A; measured 4e-4, and 7.2 while it went back to the smallest voltage
+    assert np.linalg.norm(seen["i"], axis=1).max() <= 56.1
+    assert np.linalg.norm(end[-1]) == pytest.approx(56.0, abs=0.02)
+    assert steady_voltage(end[-1], -825.4457 * RPM) == pytest.approx(0.999 * V_MAX, rel=1e-3)
 
 
 @pytest.mark.parametrize("plant", [(1, 0.7, 1), (1, 1.43, 1), (1.5, 1, 0.7), (1, 1, 1.1), (1.5, 1, 1)])

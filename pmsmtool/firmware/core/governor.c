@@ -262,7 +262,8 @@ static pmsm_dq scale_voltage(const pmsm_row *row, pmsm_dq v)
 }
 
 /* Line search from the last governed reference. When that one became inadmissible (speed or U_dc moved), its
- * steady-state voltage is scaled down; row 0 is met afterwards in any case. */
+ * steady-state voltage is scaled down; row 0 is met afterwards in any case. Beyond the current row that row is given
+ * up: a reference that stays there does not follow what the voltage can hold, and the current runs away. */
 static uint32_t solve_line(const pmsm_period *period, const rows_of_period *rows, pmsm_dq r, pmsm_dq *v,
                            uint32_t *active, uint32_t *steps)
 {
@@ -273,7 +274,7 @@ static uint32_t solve_line(const pmsm_period *period, const rows_of_period *rows
     pmsm_real kappa = PMSM_C(1.0);
     for (uint32_t k = 0u; k < rows->count && kappa >= PMSM_C(0.0); k++) {
         const pmsm_real share = row_share(&rows->row[k], p, way, slack);
-        if (share < kappa) {
+        if (share < kappa && (k <= rows->steady || share >= PMSM_C(0.0))) {
             kappa = share;
             *active = k;
         }
@@ -389,7 +390,8 @@ static uint32_t asks_first(const pmsm_params *params)
 
 /* An inadmissible request: along the minimum-time direction where that is asked for and possible, else what the solver
  * of the mode finds. Whether row 0 and the steady state can be met at once is settled first: an empty set changes what
- * the direction may do to the current, and the smallest steady-state voltage is then the answer. */
+ * the direction may do to the current, and the smallest steady-state voltage is then the answer. So it is where the
+ * direction is barred by the current limit and the voltage cannot hold the present current; where it can, row 0. */
 static pmsm_dq restrain(pmsm_period *period, rows_of_period *rows, pmsm_dq r, uint32_t *binding, uint32_t *steps)
 {
     pmsm_state *state = period->state;
@@ -409,10 +411,12 @@ static pmsm_dq restrain(pmsm_period *period, rows_of_period *rows, pmsm_dq r, ui
         *binding = PMSM_BINDING_MINIMUM_TIME;
         return v;
     }
-    if (empty != 0u || transfer == PMSM_TRANSFER_BARRED) { /* out of the reach of the voltage: back into it first */
-        return v;
+    const uint32_t barred = (transfer == PMSM_TRANSFER_BARRED) ? 1u : 0u;
+    const pmsm_real hold = pmsm_square(pmsm_voltage_of(steady, period->i_model));
+    if (empty != 0u || (barred != 0u && hold > period->V_max * period->V_max)) {
+        return v; /* out of the reach of the voltage: back into it first */
     }
-    if (transfer == PMSM_TRANSFER_SOUGHT || rows->may_start == 0u) { /* little time is left: row 0 only */
+    if (barred != 0u || transfer == PMSM_TRANSFER_SOUGHT || rows->may_start == 0u) { /* little time: row 0 only */
         *binding = 0u;
         return pmsm_project_row(&rows->row[0], r, steps);
     }

@@ -15,6 +15,7 @@
 #define LONGEST_STEP PMSM_C(1.0)     /* rad */
 #define LONGEST_ANGLE PMSM_C(100.0)  /* rad */
 #define HOLD_SHARE PMSM_C(0.99)      /* of V_max: a current that needs more is not held at its limit */
+#define CLOSE_SHARE PMSM_C(0.95)     /* of the transient current limit */
 #define ACCURACY PMSM_C(1e-2)        /* of V T, before the last step of Newton's method */
 
 typedef struct {
@@ -142,6 +143,21 @@ static uint32_t keep_current(const pmsm_period *period, pmsm_dq offset, pmsm_dq 
     return 1u;
 }
 
+/* At the transient current limit, where the voltage only just holds the current: a transfer from here is barred at
+ * once, or as soon as it slides along the limit, and would start again from where that leads. */
+static uint32_t is_cornered(const pmsm_period *period, pmsm_dq offset)
+{
+    const pmsm_dq model = pmsm_model_voltage(period, period->i_model);
+    const pmsm_dq hold = {model.d + offset.d, model.q + offset.q};
+    const pmsm_real limit = CLOSE_SHARE * (pmsm_real)period->params->governor_I_transient_apk;
+    const pmsm_real V_square = period->V_max * period->V_max;
+    const pmsm_real hold_square = pmsm_square(hold);
+    return (pmsm_square(period->i_model) > limit * limit && hold_square > HOLD_SHARE * HOLD_SHARE * V_square &&
+            hold_square <= V_square)
+               ? 1u
+               : 0u;
+}
+
 /* offset: voltage beside the model's, which turns with the rotor as the resistance drop does. may_start: 0 only follows
  * a transfer that is under way, which takes little time. */
 enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq offset, pmsm_dq target,
@@ -162,7 +178,7 @@ enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, p
     enum pmsm_transfer found = PMSM_TRANSFER_NONE;
     if (T > PMSM_C(0.0)) {
         found = find_time(&t, least, TRIALS_FOLLOW, &T, &m);
-    } else if (may_start != 0u) {
+    } else if (may_start != 0u && is_cornered(period, offset) == 0u) {
         const pmsm_dq way = {t.b.d - t.a.d, t.b.q - t.a.q};
         T = DIRECT_SHARE * PMSM_SQRT(pmsm_square(way)) / t.V;
         T = (T > least) ? T : least;
