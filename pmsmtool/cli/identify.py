@@ -29,7 +29,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
         "pmsmtool identify --replay runs/20260101T120000Z-000055f1",
     ),
 )
-@click.argument("quantities", nargs=-1, metavar="[R|L|psi|encoder|poles|inverter|mechanics|map|all]...")
+@click.argument("quantities", nargs=-1, metavar="[R|L|psi|encoder|poles|inverter|mechanics|map|frf|all]...")
 @click.option(
     "--method",
     type=click.Choice(["auto", "inject", "recorder", "standard", "vendor", "manual"]),
@@ -70,7 +70,8 @@ def identify_command(
 
     "map" measures the flux linkages over the plane of currents with saturation and cross-saturation; a held rotor
     (--shaft locked) allows R, inverter and map. "mechanics" fits inertia, viscous and Coulomb friction to pushes and
-    coasting. Without a quantity all but these two are measured, the inertia roughly; with "all", all.
+    coasting; "frf" measures the mechanical frequency response, and a resonance where the data support one. Without a
+    quantity all but these three are measured, the inertia roughly; with "all", all.
 
     The limits are printed and consent is asked before anything moves. Every number comes with its statistical and its
     systematic part; what cannot be trusted is refused by name. The run directory keeps raw traces and machine.toml;

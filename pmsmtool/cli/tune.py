@@ -61,7 +61,8 @@ if TYPE_CHECKING:
 @click.option("--speed-decimation", type=int, metavar="N", help="Control periods per speed-controller period.")
 @click.option("--speed-filter-hz", type=float, metavar="HZ", help="Cut-off of the speed filter.")
 @click.option("--pll-rad-s", type=float, metavar="RAD/S", help="Pole of the speed estimate.")
-@click.option("--notch-hz", type=float, default=0.0, metavar="HZ", help="Notch on the torque; 0 is off.")
+@click.option("--notch-hz", type=float, metavar="HZ", help="Notch on the torque, 0 off.  [default: at the resonance "
+              "that identify frf found]")  # fmt: skip
 @click.option("--notch-zeta-num", type=float, default=0.05, help="Numerator damping of the notch.")
 @click.option("--notch-zeta-den", type=float, default=0.5, help="Denominator damping of the notch.")
 @click.option("--voltage-margin", type=float, default=0.08, metavar="RATIO", help="Share of V_max kept for control.")

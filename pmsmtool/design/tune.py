@@ -41,6 +41,8 @@ PLL_PER_PERIOD = 0.1
 FILTER_PER_RATE = 1.0 / 60.0
 """Default cut-off of the speed filter over the sampling rate: 200 Hz at 12 kHz."""
 
+NOTCH_RATE_SHARE = 0.4
+"""Largest resonance that gets a notch unasked, of the rate of the speed controller: half of it is the end."""
 SPEED_RATE_HZ = 1200.0
 """Default rate of the speed controller; the decimation is rounded to reach it."""
 
@@ -204,7 +206,7 @@ def _design_speed(
     pll = request.pll_rad_s or PLL_PER_PERIOD / T_s
     filter_hz = request.speed_filter_hz or FILTER_PER_RATE / T_s
     decimation = request.speed_decimation or max(1, round(1.0 / (SPEED_RATE_HZ * T_s)))
-    notch = Notch(request.notch_hz, request.notch_zeta_num, request.notch_zeta_den)
+    notch, notch_choice, notes = _notch(source, request, decimation * T_s)
     choice = "asked for" if request.pll_rad_s else "a tenth of the sampling rate"
     values = {
         "encoder.pll_bandwidth_rad_s": DesignValue(pll, choice),
@@ -213,7 +215,7 @@ def _design_speed(
             decimation, "asked for" if request.speed_decimation else f"nearest to {SPEED_RATE_HZ:g} Hz"
         ),
         "speed.tau_max_nm": DesignValue(rated.tau_max_nm, rated.methods["tau_max"]),
-        "speed.notch_hz": DesignValue(notch.hz, "asked for" if notch.hz else "off"),
+        "speed.notch_hz": DesignValue(notch.hz, notch_choice),
         "speed.notch_zeta_num": DesignValue(notch.zeta_num, "request"),
         "speed.notch_zeta_den": DesignValue(notch.zeta_den, "request"),
     }
@@ -221,7 +223,7 @@ def _design_speed(
     if J is None:
         off = DesignValue(0.0, "off: the inertia J_kgm2 is not known", "")
         values |= {"speed.K_p_nms_per_rad": off, "speed.K_i_nm_per_rad": off}
-        return _Part(values, {}, {}, ("speed control is off: the machine file gives no inertia J_kgm2",))
+        return _Part(values, {}, {}, ("speed control is off: the machine file gives no inertia J_kgm2", *notes))
     path = SpeedPath(J, source.machine.B_nms or 0.0, current.loop("q"), decimation, pll, filter_hz, notch)
     gains = _speed_gains(request, path, current.alpha)
     found = margins(speed_loop(gains, path))
@@ -241,7 +243,24 @@ def _design_speed(
         "speed.K_i_nm_per_rad": DesignValue(gains.K_i, how, "speed"),
         "speed.acceleration_rpm_per_s": DesignValue(slope, why),
     }
-    return _Part(values, {"speed": found}, {"speed_crossover_rad_s": found.crossover_rad_s}, ())
+    return _Part(values, {"speed": found}, {"speed_crossover_rad_s": found.crossover_rad_s}, notes)
+
+
+def _notch(source: MachineFile, request: TuneRequest, T_speed: float) -> tuple[Notch, str, tuple[str, ...]]:
+    """Return the notch asked for, else one at the machine's resonance; with how it was chosen, and notes."""
+    asked, resonance = request.notch_hz, source.machine.resonance_hz
+    choice = "asked for" if asked else "off"
+    notes: tuple[str, ...] = ()
+    if asked is None and resonance is not None:
+        if resonance * T_speed < NOTCH_RATE_SHARE:
+            asked, choice = resonance, "at the resonance of the machine file"
+            notes = (f"notch at {resonance:.4g} Hz, the resonance of the machine file; --notch-hz 0 leaves it out",)
+        else:
+            notes = (
+                f"no notch at the resonance of {resonance:.4g} Hz: it is above {NOTCH_RATE_SHARE:g} of the speed "
+                f"controller's rate, {1.0 / T_speed:.4g} Hz",
+            )
+    return Notch(asked or 0.0, request.notch_zeta_num, request.notch_zeta_den), choice, notes
 
 
 def _speed_gains(request: TuneRequest, path: SpeedPath, alpha: float) -> SpeedGains:

@@ -49,8 +49,8 @@ class TuneRequest:
         Control periods per speed-controller period.
     speed_filter_hz, pll_rad_s : float or None
         Feedback filter and speed estimate.
-    notch_hz, notch_zeta_num, notch_zeta_den : float
-        Notch on the torque; 0 Hz is off.
+    notch_hz, notch_zeta_num, notch_zeta_den : float or None, float, float
+        Notch on the torque; 0 Hz is off, None: at the machine's resonance where one is known.
     voltage_margin : float
         Share of V_max kept for control in steady state.
     governor : str
@@ -78,7 +78,7 @@ class TuneRequest:
     speed_decimation: int | None = None
     speed_filter_hz: float | None = None
     pll_rad_s: float | None = None
-    notch_hz: float = 0.0
+    notch_hz: float | None = None
     notch_zeta_num: float = 0.05
     notch_zeta_den: float = 0.5
     voltage_margin: float = 0.08

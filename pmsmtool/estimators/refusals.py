@@ -66,6 +66,12 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
         "raise the amplitude (--i-max) or the number of samples",
     ),
     (
+        "E_COHERENCE",
+        "the answer is not explained by the excitation",
+        "too small an excitation for the encoder's resolution, or a shaft that something else moves",
+        "allow more current (--i-max) or speed, or take the load's motion away",
+    ),
+    (
         "E_MODEL_MISMATCH",
         "the residual is larger than the noise explains",
         "an effect that is not in the model: saturation, eddy currents, a moving rotor, a lagging sensor",

@@ -49,6 +49,9 @@ MACHINE_KEYS: tuple[Key, ...] = (
     _key("machine", "J_kgm2", "kg m2", 1e-9, 1e4, None, "inertia"),
     _key("machine", "B_nms", "N m s", 0, 1e4, None, "viscous friction"),
     _key("machine", "tau_c_nm", "N m", 0, 1e5, None, "Coulomb friction torque"),
+    _key("machine", "resonance_hz", "Hz", 0.01, 1e5, None, "resonance of rotor and load behind an elastic shaft"),
+    _key("machine", "antiresonance_hz", "Hz", 0.01, 1e5, None, "antiresonance below it: the load swings alone"),
+    _key("machine", "resonance_zeta", "1", 0, 10, None, "damping of the resonance"),
     _text("machine", "flux_map", "file of the flux map, relative to this file"),
     _text("machine", "iron_loss_map", "file of the iron-loss map, relative to this file"),
 )

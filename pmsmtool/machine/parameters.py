@@ -78,6 +78,9 @@ class MachineParameters:
     J_kgm2: float | None = None
     B_nms: float | None = None
     tau_c_nm: float | None = None
+    resonance_hz: float | None = None
+    antiresonance_hz: float | None = None
+    resonance_zeta: float | None = None
     flux_map: str | None = None
     iron_loss_map: str | None = None
 

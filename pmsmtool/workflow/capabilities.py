@@ -60,7 +60,6 @@ FEATURES: Mapping[str, str] = {
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
     "dc levels": "DC levels by current set-points: at running currents the inverter's error hides R",
     "vendor result": "the maker's identification in the drive map",
-    "frf": "a frequency-response experiment, which this program does not have",
     "line voltage": "the undriven machine's voltage, or a recorder of voltages",
 }
 """What methods need, as a person reads it."""
@@ -95,7 +94,7 @@ NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
         Method.MANUAL: (),
     },
     "mechanics": {Method.INJECT: _INJECT, Method.MANUAL: ()},
-    "frf": {Method.INJECT: ("frf",)},
+    "frf": {Method.INJECT: _INJECT},
 }
 """Methods of each quantity and what they need."""
 

@@ -14,6 +14,7 @@ from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, est
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.flux_map_result import FluxMapResult
+from pmsmtool.estimators.frequency_response import FrequencyResponse
 from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
 from pmsmtool.estimators.inertia import InertiaResult, estimate_inertia
 from pmsmtool.estimators.mechanics import MechanicsResult
@@ -24,9 +25,11 @@ from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
-from pmsmtool.workflow import map_stage, mechanics_stage
+from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_traces
 
+RESONANCE = ("resonance_hz", "antiresonance_hz", "resonance_zeta")
+"""Keys of a second mass: a response without one takes them out of the machine file."""
 MOVED_SHARE = 0.25
 """Largest share of levels that may be left out; with more the estimator sees them, and refuses what has not settled."""
 CROSS_SATURATION = 0.25
@@ -51,6 +54,7 @@ class Evaluation:
     inertia: InertiaResult | None = None
     mechanics: MechanicsResult | None = None
     flux_map: FluxMapResult | None = None
+    frequency_response: FrequencyResponse | None = None
     map_estimates: Mapping[str, Estimate] = field(default_factory=dict)
 
     @property
@@ -80,6 +84,8 @@ class Evaluation:
             found["J_kgm2"], found["tau_c_nm"] = self.inertia.J, self.inertia.tau_c
         if self.mechanics is not None:
             found |= {"J_kgm2": self.mechanics.J, "B_nms": self.mechanics.B, "tau_c_nm": self.mechanics.tau_c}
+        if self.frequency_response is not None:
+            found |= self.frequency_response.found
         found.update((name, estimate) for name, estimate in self.map_estimates.items() if name not in found)
         return found
 
@@ -110,7 +116,7 @@ def evaluate(
     traces : mapping of str to Trace
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
         ``phase_pairs``, ``rotation_forward``, ``rotation_backward``, ``square_d_<half period>``,
-        ``square_q_<half period>``, ``push_<k>``, ``speeds``, ``wave_<k>``, ``map_<k>``, ``inertia_<k>``.
+        ``square_q_<half period>``, ``push_<k>``, ``speeds``, ``wave_<k>``, ``map_<k>``, ``inertia_<k>``, ``frf_<k>``.
     period_s : float
         Control period (s).
     T_ref_c : float
@@ -156,7 +162,8 @@ def evaluate(
     flux_map = map_stage.flux_map_of(traces, result, tolerance)
     if flux_map is not None:
         result = replace(result, flux_map=flux_map, map_estimates=map_stage.map_estimates(result, flux_map, traces))
-    return replace(result, mechanics=mechanics_stage.mechanics_of(traces, result, tolerance))
+    result = replace(result, mechanics=mechanics_stage.mechanics_of(traces, result, tolerance))
+    return replace(result, frequency_response=frequency_stage.frequency_response_of(traces, result))
 
 
 def resistance_of(
@@ -282,6 +289,9 @@ def machine_of(evaluation: Evaluation, nameplate: MachineFile, conditions: Mappi
     if evaluation.mechanics is not None:
         B, tau_c = evaluation.mechanics.B, evaluation.mechanics.tau_c
         machine = replace(machine, tau_c_nm=max(0.0, tau_c.value), B_nms=max(0.0, B.value))
+    if evaluation.frequency_response is not None:
+        resonant = {name: estimate.value for name, estimate in evaluation.frequency_response.found.items()}
+        machine = replace(machine, **{**dict.fromkeys(RESONANCE), **resonant})  # type: ignore[arg-type]
     flux_map = nameplate.flux_map
     if evaluation.flux_map is not None:
         machine, flux_map = map_stage.with_map(machine, evaluation.map_estimates), evaluation.flux_map.flux_map

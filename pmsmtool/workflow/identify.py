@@ -35,7 +35,7 @@ from pmsmtool.machine.parameters import (
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
 from pmsmtool.units import format_estimate
-from pmsmtool.workflow import map_stage, mechanics_stage
+from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
 from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Limits, Measurement, steps_of
@@ -59,7 +59,7 @@ class IdentifyRequest:
     Attributes
     ----------
     quantities : tuple of str
-        Out of ``R L psi encoder poles inverter mechanics map``.
+        Out of ``R L psi encoder poles inverter mechanics map frf``.
     i_max_apk, speed_max_rad_s : float or None
         Envelope (A peak, rad/s mechanical).
     shaft, load, brake : str
@@ -176,6 +176,8 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest) -> list[str]:
         lines.append("the shaft is pushed both ways and runs at eight steady speeds, both directions")
     if "coasting" in steps:
         lines.append(mechanics_stage.PLAN_LINE)
+    if "response" in steps:
+        lines.append(frequency_stage.PLAN_LINE)
     if "map" in steps:
         lines.append(map_stage.PLAN_LINE)
     lines.append("nothing is stored in the drive; every changed object is restored")
@@ -245,6 +247,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     )
     machine = machine_of(evaluation, nameplate, _conditions(evaluation, request))
     map_files = map_stage.save_map(run, evaluation.flux_map)
+    map_files |= frequency_stage.save_response(run, evaluation.frequency_response)
     run.save(MACHINE, dump_machine_file(machine))
     found = evaluation.estimates()
     acceptance = [_accepted(name, estimate) for name, estimate in found.items() if _limit(name) is not None]
@@ -263,7 +266,8 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
             for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
             if name in found
         )
-        + map_stage.map_summary(evaluation.flux_map),
+        + map_stage.map_summary(evaluation.flux_map)
+        + frequency_stage.response_summary(evaluation.frequency_response),
     )
 
 

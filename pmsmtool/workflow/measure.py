@@ -23,7 +23,7 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
 from pmsmtool.trace import Trace
-from pmsmtool.workflow import map_stage, mechanics_stage
+from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
 from pmsmtool.workflow.evaluate import resistance_of, tolerance_on
 
 PHASE_CHECK_SHARE = 0.05
@@ -81,6 +81,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "psi": ("levels", "rotation", "square", "speeds"),
     "mechanics": ("levels", "rotation", "square", "speeds", "coasting"),
     "map": ("levels", "rotation", "square", "speeds", "map"),
+    "frf": ("levels", "rotation", "square", "speeds", "response"),
 }
 """Experiments behind each quantity."""
 HELD = ("levels", "map")
@@ -208,6 +209,9 @@ class Measurement:
                 self._tell_spent()
                 if "coasting" in steps:
                     mechanics_stage.measure_mechanics(self.drive, self.limits, self.keep, self.say)
+                    self._tell_spent()
+                if "response" in steps:
+                    frequency_stage.measure_frequency_response(self.drive, self.limits, self.keep, self.say)
                     self._tell_spent()
         if resistance is not None and "map" in steps:
             map_stage.measure_map(self.drive, self.limits, noise, resistance, self.held, self.keep, self.say)

@@ -85,8 +85,8 @@ def mechanics_of(
     behind = result.offset.value - float(parts[0].meta["offset_rad"])
     psi = result.flux.psi_measured
     return estimate_mechanics(
-        [_in_frame(part, behind) for part in parts],
-        _torque_of(result, pole_pairs),
+        [in_frame(part, behind) for part in parts],
+        torque_of(result, pole_pairs),
         1.5 * pole_pairs * psi.value,
         result.noise.sigma_a,
         psi.std / psi.value,
@@ -95,14 +95,14 @@ def mechanics_of(
     )
 
 
-def _in_frame(trace: Trace, behind_rad: float) -> Trace:
+def in_frame(trace: Trace, behind_rad: float) -> Trace:
     """Return a trace with its currents in a frame that stands so much behind the recorded one."""
     c, s = math.cos(behind_rad), math.sin(behind_rad)
     i_d, i_q = trace["i_d_a"], trace["i_q_a"]
     return replace(trace, signals={**trace.signals, "i_d_a": c * i_d - s * i_q, "i_q_a": s * i_d + c * i_q})
 
 
-def _torque_of(result: Evaluation, pole_pairs: int) -> Torque:
+def torque_of(result: Evaluation, pole_pairs: int) -> Torque:
     """Torque by the flux map where there is one, else by flux linkage and the difference of the inductances."""
     assert result.flux is not None
     psi = result.flux.psi_measured.value

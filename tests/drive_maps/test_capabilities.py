@@ -135,7 +135,7 @@ def test_caps_as_a_table_and_as_json() -> None:
     by_way = {(row["quantity"], row["method"]): row for row in facts["quantities"]}
     assert by_way["psi", "inject"]["expected"][0]["name"] == "psi_f_wb"
     assert by_way["map", "inject"]["available"] and by_way["map", "inject"]["expected"] == []
-    assert by_way["frf", "inject"]["needs"]
+    assert by_way["frf", "inject"]["available"]
 
 
 def test_caps_of_an_unknown_drive_says_so() -> None:

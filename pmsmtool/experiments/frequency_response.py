@@ -1,0 +1,114 @@
+"""Random torque on a steady speed: currents and positions for the mechanical frequency response.
+
+The speed keeps its sign, so that Coulomb friction is a constant and the response is linear. A binary sequence on the q
+current moves the shaft; its level is what the limits leave, and what keeps the speed's random walk small.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
+from pmsmtool.experiments.signals import readable
+from pmsmtool.experiments.speed_run import reach
+from pmsmtool.trace import Trace
+
+SIGNALS = ("i_d_a", "i_q_a", "theta_m_rad", "flags")
+ROWS = 4000
+"""Rows of four signals that 64 kB hold."""
+ROW_RATE_HZ = 4000.0
+"""Rows per second: a record of a second tells frequencies a hertz apart."""
+BIT_RATE_HZ = 2000.0
+"""Bits of the sequence per second; it excites evenly up to 0.4 of that."""
+REPEATS = 6
+"""Records: their spread is the noise of a line."""
+LEAD_S, LEAD_STEP_S = 0.3, 0.15
+"""Sequence before the first record, and more before each further one: another part of it."""
+WALK_SHARE = 0.1
+"""Standard deviation of the speed's random walk at the end of a record, of the speed."""
+BUS_ALLOWANCE_S = 0.5
+"""Time the recorder may be started late; the sequence lasts longer by it."""
+BIAS_WINDOW_S = 0.2
+"""Window of the mean current that friction and load need at the speed."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrequencyPlan:
+    """Random torque on a speed.
+
+    Attributes
+    ----------
+    i_q_a : float
+        Level of the sequence (A peak).
+    omega_rad_s : float
+        Steady mechanical speed (rad/s).
+    hold_periods : int
+        Control periods per bit.
+    decimation : int
+        Control periods per row.
+    """
+
+    i_q_a: float
+    omega_rad_s: float
+    hold_periods: int
+    decimation: int
+
+    def duration_s(self, period_s: float) -> float:
+        """Time of the records with their leads (s)."""
+        leads = sum(LEAD_S + k * LEAD_STEP_S for k in range(REPEATS))
+        return leads + REPEATS * ROWS * self.decimation * period_s
+
+
+def plan_frequency_response(
+    i_q_a: float, omega_rad_s: float, J_kgm2: float, torque_per_a: float, period_s: float
+) -> FrequencyPlan:
+    """Return the level of the sequence: the largest current, or less where the speed would walk too far.
+
+    Parameters
+    ----------
+    i_q_a : float
+        Largest level (A peak).
+    omega_rad_s : float
+        Steady mechanical speed (rad/s).
+    J_kgm2 : float
+        Rough inertia.
+    torque_per_a : float
+        Torque per q current (N m/A).
+    period_s : float
+        Control period (s).
+    """
+    decimation = max(1, round(1.0 / (ROW_RATE_HZ * period_s)))
+    hold = max(1, round(1.0 / (BIT_RATE_HZ * period_s)))
+    longest = LEAD_S + (REPEATS - 1) * LEAD_STEP_S + ROWS * decimation * period_s
+    walk_per_a = torque_per_a / J_kgm2 * math.sqrt(longest * hold * period_s)
+    return FrequencyPlan(min(i_q_a, WALK_SHARE * omega_rad_s / walk_per_a), omega_rad_s, hold, decimation)
+
+
+def excite_at_speed(
+    drive: Drive, plan: FrequencyPlan, pole_pairs: int, abort_speed_rad_s: float, keep: Callable[[Trace], None]
+) -> None:
+    """Record the answer to the sequence several times; each trace is handed over as soon as it is there.
+
+    The drive is enabled on entry with a speed controller that holds the machine, and asked for standstill on
+    return; the guard stops it on every other way out. It ends a sequence by itself at the abort speed (electrical
+    rad/s).
+    """
+    for k in range(REPEATS):
+        drive.command_speed(plan.omega_rad_s)
+        reach(drive, pole_pairs * plan.omega_rad_s)
+        bias = drive.average(("i_q_a",), max(1, round(BIAS_WINDOW_S / drive.period_s)))["i_q_a"]
+        lead = LEAD_S + k * LEAD_STEP_S
+        excitation = Excitation(
+            shape=Shape.PRBS,
+            point=Injection.I_Q,
+            amplitude=plan.i_q_a,
+            bias_q_a=bias,
+            hold_periods=plan.hold_periods,
+            duration_s=lead + BUS_ALLOWANCE_S + ROWS * plan.decimation * drive.period_s,
+            abort_speed_rad_s=abort_speed_rad_s,
+            lead_s=lead,
+        )
+        keep(readable(drive.record(SIGNALS, ROWS, decimation=plan.decimation, excitation=excitation)))
+    drive.command_speed(0.0)
