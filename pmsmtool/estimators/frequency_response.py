@@ -51,6 +51,8 @@ ZETA_MOST = 0.5
 """Damping from which a pair of poles is no resonance."""
 RESONANCE_STD, ANTIRESONANCE_STD = 0.01, 0.02
 """Largest relative standard deviations of a resonance and an antiresonance that are claimed."""
+APART = 0.02
+"""Least distance of resonance and antiresonance: closer, a second mass would be a twenty-fifth of the first."""
 BAND_SHARE = 0.95
 """Of the supported band: a resonance must lie below."""
 START_STEP = 0.02
@@ -332,7 +334,9 @@ def _against(
     if chi2 > CHI2_REFUSE:
         return f"two masses do not explain the response either, reduced chi-square {chi2:.3g}"
     if not frequency[0] < antiresonance.value < resonance.value < BAND_SHARE * highest_hz:
-        return f"{antiresonance.value:.3g} and {resonance.value:.3g} Hz are not a resonance inside the band"
+        return f"{antiresonance.value:.3g} and {resonance.value:.3g} Hz are not the pair of two masses inside the band"
+    if resonance.value < (1.0 + APART) * antiresonance.value:
+        return f"zeros and poles at {resonance.value:.3g} Hz are less than {100.0 * APART:g} % apart"
     if zeta > ZETA_MOST:
         return f"the damping {zeta:.3g} is above {ZETA_MOST:g}"
     width = max(zeta * resonance.value, HALF_WIDTH * float(frequency[1] - frequency[0]))
