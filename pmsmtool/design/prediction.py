@@ -179,7 +179,7 @@ def predict(
     scales : mapping
         Scale of each signal, for the floor of its standard deviation.
     directions : mapping of str to Direction, optional
-        Derived quantities.
+        Derived quantities; one that changes no response, as the decoupling at standstill, is left out.
     faults : mapping of str to (text, runs), optional
         Responses of drives with something wrong.
     facts : mapping, optional
@@ -187,7 +187,8 @@ def predict(
     """
     floors = {key: FLOOR_SHARE * scale for key, scale in scales.items()}
     spread = {key: _spread(values, floors[key]) for key, values in runs.items()}
-    signatures = {name: _signature(direction, spread) for name, direction in (directions or {}).items()}
+    shown = {name: direction for name, direction in (directions or {}).items() if _shows(direction)}
+    signatures = {name: _signature(direction, spread) for name, direction in shown.items()}
     amplitudes = {
         name: np.sum([(runs[key] - spread[key][0]) @ weights for key, weights in signature.items()], axis=0)
         for name, signature in signatures.items()
@@ -202,7 +203,7 @@ def predict(
         {key: Band(*spread[key], factors[key]) for key in runs},
         {
             name: _quantity(direction, signatures[name], amplitudes[name], quantity_factors[name])
-            for name, direction in (directions or {}).items()
+            for name, direction in shown.items()
         },
         {name: _fault(text, wrong, floors) for name, (text, wrong) in (faults or {}).items()},
         dict(facts or {}),
@@ -212,7 +213,7 @@ def predict(
 def _factors(deviations: Mapping[Key, Array]) -> dict[Key, float]:
     """Return half widths over standard deviations such that the band of all signals together holds every run."""
     normal = {key: float(np.quantile(v, NORMALISING_QUANTILE)) for key, v in deviations.items()}
-    common = max((float(np.max(v)) / normal[key] for key, v in deviations.items()), default=1.0)
+    common = max((float(np.max(v)) / normal[key] for key, v in deviations.items() if normal[key] > 0.0), default=1.0)
     return {key: max(LEAST_FACTOR, MODEL_ALLOWANCE * common * q) for key, q in normal.items()}
 
 
@@ -236,6 +237,10 @@ def _largest_left_out(values: Array, floor: float) -> Array:
     out = centred * (n / (n - 1.0))
     variance = np.maximum((np.sum(centred**2, axis=0) - centred * out) / (n - 2.0), 0.0)
     return np.asarray(np.max(np.abs(out) / np.sqrt(_widest_nearby(variance) + floor**2), axis=1))
+
+
+def _shows(direction: Direction) -> bool:
+    return any(bool(np.any(direction.high[key] != direction.low[key])) for key in direction.high)
 
 
 def _signature(

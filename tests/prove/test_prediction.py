@@ -107,6 +107,20 @@ def test_a_signal_that_nothing_moves_keeps_its_floor() -> None:
     assert band.factor >= LEAST_FACTOR and float(np.min(band.high - band.low)) > 0.01
 
 
+def test_a_response_in_which_no_run_differs_from_another_is_predicted() -> None:
+    """A locked machine: the speed is exactly zero in all runs, and the decoupling changes nothing."""
+    still = ("step", "omega_e_rad_s")
+    runs = {KEY: responses(32, 0), still: np.zeros((32, ROWS))}
+    same = {key: values[:6] for key, values in runs.items()}
+    nothing = Direction(1.0, "1", same, same, 1.0, -1.0)
+    found = predict({"step": T_S}, runs, {KEY: 1.0, still: 1.0}, directions={"decoupling": nothing})
+    alone = predict({"step": T_S}, {KEY: runs[KEY]}, {KEY: 1.0})
+    assert found.bands[KEY].factor == alone.bands[KEY].factor
+    assert found.quantities == {}, "what shows in nothing is not judged"
+    assert judge(found, {key: values[0] for key, values in runs.items()}).inside
+    assert not judge(found, {KEY: runs[KEY][0], still: np.ones(ROWS)}).inside
+
+
 def test_another_length_is_refused() -> None:
     with pytest.raises(ConfigError, match="120 were predicted"):
         judge(prediction(), {KEY: np.zeros(119)})
