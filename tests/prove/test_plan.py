@@ -11,9 +11,11 @@ from pmsmtool.design.design_file import Design, DesignValue
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.port import Injection
+from pmsmtool.errors import NotAvailable
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.workflow.prove.plan import RPM, STEPS, Conditions, plan_proof
+from pmsmtool.workflow.prove.stage import ProofRequest, envelope_of
 from pmsmtool.workflow.random_drives import draw_drive
 
 
@@ -93,3 +95,16 @@ def test_a_speed_limit_below_field_weakening_is_said() -> None:
 def test_a_sensor_that_is_missing_is_no_number_in_the_record() -> None:
     facts = conditions(design(), T_magnet_c=math.nan).facts()
     assert facts["T_magnet_c"] is None and facts["T_winding_c"] == 25.0
+
+
+def test_zero_is_a_limit_and_not_the_absence_of_one() -> None:
+    made = design()
+    nothing = envelope_of(made, ProofRequest(i_max_apk=0.0, speed_max_rad_s=0.0))
+    assert (nothing.i_max_apk, nothing.speed_max_rad_s) == (0.0, 0.0)
+    free = envelope_of(made, ProofRequest())
+    assert free.i_max_apk == made["motor.I_max_apk"]
+    assert free.speed_max_rad_s == pytest.approx(made["motor.n_max_rpm"] * RPM)
+    with pytest.raises(NotAvailable):
+        plan_proof(made, conditions(made, i_max_apk=0.0))
+    plan = plan_proof(made, conditions(made, speed_max_rad_s=0.0))
+    assert all(e.base_rad_s == 0.0 for e in plan.experiments)

@@ -96,8 +96,8 @@ def envelope_of(design: Design, request: ProofRequest, plan: ProofPlan | None = 
     """Return the motion envelope: what the request says, else the design's largest current and speed."""
     T_s = design.machine.inverter.T_s
     return Envelope(
-        i_max_apk=request.i_max_apk or design["motor.I_max_apk"],
-        speed_max_rad_s=request.speed_max_rad_s or design["motor.n_max_rpm"] * RPM,
+        i_max_apk=design["motor.I_max_apk"] if request.i_max_apk is None else request.i_max_apk,
+        speed_max_rad_s=design["motor.n_max_rpm"] * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,
         duration_s=60.0 if plan is None else 30.0 + 2.0 * plan.seconds(T_s),
         shaft=request.shaft,
         load=request.load,
