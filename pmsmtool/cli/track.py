@@ -35,7 +35,7 @@ QUANTITIES = {"R": "R_s_ohm", "psi": "psi_f_wb"}
 @click.option("--for", "seconds", type=TIME, default="10s", help="How long.")
 @click.option("--by", type=click.Choice(["pdo", "trace"]), default="pdo", help="Process data, or recordings.")
 @click.option("--rate", "rate_hz", type=FREQUENCY, default="100Hz", help="Process data per second.")
-@click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="From the traces of a run; asks no drive.")
+@click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="From what an earlier track kept; asks no drive.")
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
 @bus_options
 @output_options
@@ -54,6 +54,7 @@ def track_command(
 
     The values, their statistical and systematic intervals and the temperatures they mean are printed. What the
     operating points do not show is refused by name (exit code 6): R needs current, psi needs speed, both need change.
+    --replay takes a run of track; runs of identify and commission hold no such observations (exit code 9).
     """
     from pmsmtool.workflow.track import follow, track_stage
 

@@ -37,7 +37,7 @@ LIMIT = {"R_s_ohm": 0.05, "psi_f_wb": 0.02}
 NIS_GATE = (1.5, 2.6)
 """Mean normalised innovation squared of a consistent filter; two per observation is ideal."""
 INFLATIONS = 4
-INFLATION_MAX = 10.0
+INFLATION_MAX = 2.0
 """Times the noise may be inflated, and the most of it: beyond, the model is wrong and not the noise."""
 MINIMUM = 16
 """Observations for a noise estimate."""

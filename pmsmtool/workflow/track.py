@@ -22,7 +22,7 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.objects import signal_unit
 from pmsmtool.drive.process_data import live_values
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import Track, track
 from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, SIGNALS, TRACKED, Known, condense
@@ -41,8 +41,6 @@ RECORD_ROWS, RECORD_WINDOWS = 1024, 4
 """Rows of one recording, and observations that it makes."""
 RECORD_S = 0.2
 """Time of one recording (s)."""
-REPLAY_ROWS = 16
-"""Rows of a stored fast trace that make one observation."""
 SAY_S = 1.0
 KNEE_POINTS = 64
 
@@ -177,27 +175,26 @@ def _recorder_kept(drive: CanopenDrive) -> Iterator[None]:
 
 
 def replay_observations(run: RunDirectory) -> Trace:
-    """Return the observations that a run's traces hold: its own, or those of identification's pushes and speeds.
+    """Return the observations that a run of ``track`` kept.
+
+    What identification and commissioning record does not serve: their pushes are transients, in which inductance and
+    delay decide the voltage, and their steady speeds are too few to tell the noise.
 
     Raises
     ------
-    ConfigError
-        The run holds no trace with voltages, currents and speed in the rotor's frame.
+    NotAvailable
+        The run is not one of ``track``.
     """
     traces = stored_traces(run)
-    if OBSERVATIONS in traces:
-        return traces[OBSERVATIONS]
-    parts = []
-    for name, trace in sorted(traces.items()):
-        if all(signal in trace.signals for signal in SIGNALS) and "fixed_angle_rad" not in trace.meta:
-            parts.append(condense(trace, REPLAY_ROWS) if name != "speeds" else trace)
-    if not parts:
-        raise ConfigError(
-            "no trace of the run has voltages, currents and speed while the machine turned",
+    if OBSERVATIONS not in traces:
+        others = ", ".join(sorted(traces)) or "none"
+        raise NotAvailable(
+            f"the run holds no observations of `track` (traces/{OBSERVATIONS}.npz); its traces: {others}",
             where=str(run.path),
-            hint="give a run of track, identify or commission",
+            likely="a run of identify or commission, whose traces do not show steady operation over time",
+            hint="`pmsmtool track` while the machine is operated records what a replay needs",
         )
-    return joined(parts)
+    return traces[OBSERVATIONS]
 
 
 def joined(parts: Sequence[Trace]) -> Trace:

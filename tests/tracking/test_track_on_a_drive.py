@@ -20,6 +20,7 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_m
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.kernel import Truth
 from pmsmtool.trace import Trace
+from pmsmtool.trace_file import trace_npz
 from pmsmtool.workflow.commission import begin_run
 from pmsmtool.workflow.run_directory import RunDirectory
 from pmsmtool.workflow.track import (
@@ -153,9 +154,19 @@ def test_replay_from_the_command_line(here: Path, capsys: pytest.CaptureFixture[
     assert "psi_f_wb" in (text := capsys.readouterr().out) and "R_s_ohm" not in text
 
 
-def test_a_run_without_such_traces_is_named(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("recorded", [(), ("push_0", "push_1", "speeds")])
+def test_a_run_of_another_command_is_refused_by_name(
+    recorded: tuple[str, ...], here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Identification's traces have voltages, currents and speed too, and still give no number."""
     with sim_bench() as bench:
+        observations, _ = operated(bench, "trace") if recorded else (None, None)
         run: RunDirectory = begin_run(bench.drive, here / "runs")
     shutil.copy(data_folder("profiles") / "interior-2k2.toml", run.path / "machine.toml")
-    assert program(["track", "--replay", str(run.path)]) == 2
-    assert "no trace of the run has voltages" in capsys.readouterr().err
+    for name in recorded:
+        assert observations is not None
+        run.save(f"traces/{name}.npz", trace_npz(observations))
+    assert program(["track", "--replay", str(run.path)]) == 9
+    printed = capsys.readouterr()
+    assert printed.out == "" and "no observations of `track` (traces/track.npz)" in printed.err
+    assert f"its traces: {', '.join(recorded) or 'none'}" in printed.err
