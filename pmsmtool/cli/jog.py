@@ -8,9 +8,9 @@ from typing import Any
 import click
 
 from pmsmtool.cli.options import (
-    CURRENT,
+    DURATION,
+    LARGEST_CURRENT,
     SPEED,
-    TIME,
     BusOptions,
     MotionOptions,
     Quantity,
@@ -35,10 +35,10 @@ SAMPLE_S = 0.05
         "pmsmtool -n 5 jog --speed 100rpm --for 2s --i-max 5Apk --shaft free",
     ),
 )
-@click.option("--current", "current_apk", type=CURRENT, help="Hold this current vector, e.g. 2Apk.")
+@click.option("--current", "current_apk", type=LARGEST_CURRENT, help="Hold this current vector, e.g. 2Apk.")
 @click.option("--angle", "angle_rad", type=Quantity("angle"), default="0deg", help="Electrical angle of the vector.")
 @click.option("--speed", "speed_rad_s", type=SPEED, help="Run at this speed, e.g. 100rpm.")
-@click.option("--for", "seconds", type=TIME, default="1s", help="How long.")
+@click.option("--for", "seconds", type=DURATION, default="1s", help="How long.")
 @bus_options
 @motion_options
 @output_options
@@ -64,6 +64,9 @@ def jog_command(
     if (current_apk is None) == (speed_rad_s is None):
         raise ConfigError("give one of --current and --speed")
     with open_drive(bus) as drive:
+        _refuse_beyond("current", current_apk or 0.0, drive.read("motor.I_max_apk"), "Apk", "motor.I_max_apk")
+        rpm = abs(speed_rad_s or 0.0) * 30.0 / math.pi
+        _refuse_beyond("speed", rpm, drive.read("motor.n_max_rpm"), "rpm", "motor.n_max_rpm")
         i_nom_apk = drive.read("motor.I_nom_apk")
         speed = abs(speed_rad_s) * SPEED_MARGIN if speed_rad_s is not None else CURRENT_JOG_SPEED_RAD_S
         envelope = Envelope(
@@ -88,6 +91,18 @@ def jog_command(
     out.result(
         "jog", facts, lambda: table(heads, [(name, f"{value:.6g}", unit) for name, value, unit in _means(readings)])
     )
+
+
+def _refuse_beyond(quantity: str, value: float, limit: float, unit: str, name: str) -> None:
+    """Refuse what the drive would cut without a word: its own limit of the machine, where it knows one."""
+    from pmsmtool.errors import SafetyRefusal
+
+    if 0.0 < limit < value:
+        raise SafetyRefusal(
+            f"a {quantity} of {value:.4g} {unit} is asked for, the machine's largest is {limit:.4g} {unit}",
+            where=name,
+            hint=f"ask for less, or set {name} if the machine allows it",
+        )
 
 
 def _watch(guard: Any, seconds: float) -> list[dict[str, float]]:

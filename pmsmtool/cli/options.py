@@ -52,11 +52,20 @@ class WholeNumber(click.ParamType[int]):
 
 
 class Quantity(click.ParamType[float]):
-    """A value with its unit (``800Hz``, ``1200rpm``, ``12Apk``), converted to the dimension's SI unit."""
+    """A value with its unit (``800Hz``, ``1200rpm``, ``12Apk``), converted to the dimension's SI unit.
 
-    def __init__(self, dimension: str) -> None:
+    Parameters
+    ----------
+    dimension : str
+        As ``units.UNITS`` names it.
+    positive : bool
+        Whether zero and less are refused: a limit of zero would be taken for none.
+    """
+
+    def __init__(self, dimension: str, *, positive: bool = False) -> None:
         self.name = dimension
         self.dimension = dimension
+        self.positive = positive
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return the SI value (A peak for a current), or fail as a usage error."""
@@ -65,9 +74,12 @@ class Quantity(click.ParamType[float]):
         if isinstance(value, float):
             return value
         try:
-            return parse_quantity(str(value), self.dimension)
+            found = parse_quantity(str(value), self.dimension)
         except ConfigError as error:
             self.fail("; ".join(part for part in (error.what, error.likely, error.hint) if part), param, ctx)
+        if self.positive and not found > 0.0:
+            self.fail(f"{value} is not above zero", param, ctx)
+        return found
 
 
 class FilePath(click.Path):
@@ -88,6 +100,9 @@ CURRENT = Quantity("current")
 SPEED = Quantity("angular speed")
 FREQUENCY = Quantity("frequency")
 TIME = Quantity("time")
+LARGEST_CURRENT = Quantity("current", positive=True)
+LARGEST_SPEED = Quantity("angular speed", positive=True)
+DURATION = Quantity("time", positive=True)
 
 
 def examples(*lines: str) -> str:
@@ -150,8 +165,8 @@ def _yes_parameter(auto: bool) -> Option:
 
 
 _ENVELOPE_PARAMETERS: tuple[Option, ...] = (
-    click.option("--i-max", type=CURRENT, metavar="CURRENT", help="Largest current, e.g. 12Apk or 8.5Arms."),
-    click.option("--speed-max", type=SPEED, metavar="SPEED", help="Largest speed of the shaft, e.g. 1200rpm."),
+    click.option("--i-max", type=LARGEST_CURRENT, metavar="CURRENT", help="Largest current, e.g. 12Apk or 8.5Arms."),
+    click.option("--speed-max", type=LARGEST_SPEED, metavar="SPEED", help="Largest speed of the shaft, e.g. 1200rpm."),
     click.option("--shaft", type=click.Choice(["free", "locked", "coupled"]), help="What the shaft may do."),
     click.option("--serial", type=SERIAL, metavar="NUMBER", help="Serial number the drive must have."),
 )

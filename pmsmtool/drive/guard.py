@@ -38,6 +38,8 @@ from pmsmtool.trace import Trace
 
 WATCH_S = 0.05
 """The machine is looked at this often while time passes."""
+LOCKED_TRAVEL_RAD = math.radians(20.0)
+"""A clamp and its coupling give by a few degrees; a shaft that goes further is not locked."""
 OVERSHOOT = 1.25
 """Measured current or speed over its limit that ends an experiment: regulation overshoots, noise peaks."""
 _ROUNDING = 1e-9
@@ -249,6 +251,7 @@ class GuardedDrive:
     def command_speed(self, omega_m_rad_s: float) -> None:
         """Run at a mechanical speed (rad/s) within the envelope."""
         self._check("speed", abs(omega_m_rad_s), self.envelope.speed_max_rad_s, "rad/s")
+        self._refuse_turning()
         self._drive.command_speed(omega_m_rad_s)
 
     def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
@@ -314,12 +317,21 @@ class GuardedDrive:
             self._check("current", largest, i_max, "A")
         if excitation.point is Injection.SPEED:
             self._check("speed", peak, self.envelope.speed_max_rad_s, "rad/s")
+            self._refuse_turning()
         speed = self._pole_pairs * self.envelope.speed_max_rad_s
         return replace(
             excitation,
             abort_current_apk=min(excitation.abort_current_apk or math.inf, OVERSHOOT * i_max),
             abort_speed_rad_s=min(excitation.abort_speed_rad_s or math.inf, OVERSHOOT * speed),
         )
+
+    def _refuse_turning(self) -> None:
+        if self.envelope.shaft == "locked":
+            raise SafetyRefusal(
+                "a speed is asked for, and the shaft is said to be locked",
+                where=f"node {self._node.node}",
+                hint="unlock the shaft and say --shaft free or coupled",
+            )
 
     def _watch(self, seconds: float) -> None:
         i_d, i_q = self._drive.live("i_d_a"), self._drive.live("i_q_a")
@@ -334,9 +346,10 @@ class GuardedDrive:
             ("time energised", self.energised_s, envelope.duration_s, "s"),
             ("energy in the winding", self.energy_j, envelope.energy_j, "J"),
         ]
-        if not math.isinf(envelope.travel_rad) and self._start_rad is not None:
+        travel = min(envelope.travel_rad, LOCKED_TRAVEL_RAD) if envelope.shaft == "locked" else envelope.travel_rad
+        if not math.isinf(travel) and self._start_rad is not None:
             way = abs(self._drive.live("theta_m_rad") - self._start_rad)
-            checks.append(("travel", way, envelope.travel_rad, "rad"))
+            checks.append(("travel", way, travel, "rad"))
         for quantity, value, limit, unit in checks:
             if value > limit:
                 self.stop()

@@ -150,6 +150,9 @@ def bias_and_ripple(I_test_apk: float, ripple_share: float, knee_a: float) -> tu
     return bias, clear_ripple(wanted, bias, knee_a)
 
 
+COMPENSATION = "inverter.deadtime_compensation"
+
+
 @dataclass(slots=True)
 class Measurement:
     """One run of the experiments.
@@ -189,6 +192,8 @@ class Measurement:
             A trap was seen; nothing more is moved.
         """
         steps = steps_of(quantities, self.held)
+        if self.drive.read(COMPENSATION) != 0.0:
+            self.drive.write({COMPENSATION: 0.0})  # of an earlier commissioning: the inverter's own error is asked for
         noise = self._zero_current()
         phases = self._phase_check(noise)
         self._predict(noise, phases, steps)

@@ -97,6 +97,20 @@ def test_the_truth_is_found_the_drive_is_as_before_and_the_replay_gives_the_same
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == files
 
 
+def test_a_drive_that_compensates_its_dead_time_is_measured_without_and_keeps_it(tool: Tool) -> None:
+    """As every drive does that was commissioned before; left on, the phases seemed 190 % apart."""
+    bus = ("-i", "pmsmsim", "-c", profile("interior-2k2", inverter_model="switched"), "--yes")
+    stored = ("inverter.deadtime_compensation=1", "inverter.V_dead_v=7", "inverter.i_knee_apk=1", "--store")
+    assert tool("param", "set", *stored, *bus)[0] == 0
+    code, out, err = tool("identify", "R", *bus, "--json")
+    assert code == 0, err
+    found = {value["name"]: value["value"] for value in json.loads(out)["values"]}
+    truth = true_loop_resistance(load_machine_file(Path("drive.toml")))
+    assert found["R_s_ohm"] == pytest.approx(truth, rel=TOLERANCE)
+    code, out, _ = tool("param", "get", "inverter.deadtime_compensation", *bus[:-1], "--json")
+    assert code == 0 and json.loads(out)["parameters"][0]["value"] == 1.0
+
+
 I_NOM_APK = 6.08
 """Rated current of ``interior-2k2``."""
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {

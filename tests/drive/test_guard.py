@@ -6,7 +6,9 @@ import math
 import random
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from pmsmtool.cia402 import State
@@ -82,6 +84,24 @@ def test_envelope_reaches_the_drive_itself(bench: SimBench) -> None:
     rated_apk = 1e-3 * bench.session.dictionary["cia402.rated_current"].number() * math.sqrt(2.0)
     assert 2.0 <= limits["max_current"] / 1000.0 * rated_apk < 2.0 + 0.002 * rated_apk
     assert limits["max_speed"] == math.ceil(50.0 * 60.0 / (2.0 * math.pi))
+
+
+def test_a_shaft_said_to_be_locked_is_not_turned(bench: SimBench) -> None:
+    locked = replace(ENVELOPE, shaft="locked")
+    with pytest.raises(SafetyRefusal, match="said to be locked"), guarded(bench.drive, locked) as guard:
+        guard.enable()
+        guard.command_speed(5.0)
+    assert bench.drive.node.state() is State.SWITCH_ON_DISABLED
+
+
+def test_a_shaft_that_turns_though_said_to_be_locked_is_stopped(bench: SimBench) -> None:
+    locked = replace(ENVELOPE, shaft="locked", travel_rad=math.inf)
+    with pytest.raises(LimitExceeded, match="travel"), guarded(bench.drive, locked) as guard:
+        guard.enable()
+        for angle in np.arange(0.0, 12.0, 0.2):  # a vector that turns takes the free rotor with it
+            guard.command_current(2.0, 0.0, fixed_angle_rad=float(angle))
+            guard.wait(0.05)
+    assert bench.drive.node.state() is State.SWITCH_ON_DISABLED
 
 
 @pytest.mark.parametrize("moment", range(INTERRUPTIONS))
