@@ -101,6 +101,8 @@ def test_fault_show_and_reset(tool: Tool, tmp_path: Path) -> None:
     assert code == 0 and "no error" in out
     found = loaded(tool("fault", "reset", "--json"))
     assert found["state"] == "switch-on-disabled" and found["error_code"] == 0
+    assert found["schema"] == "pmsmtool.fault-reset/1"
+    assert loaded(tool("fault", "show", "--json"))["schema"] == "pmsmtool.fault-show/1"
 
 
 def test_doctor_passes_on_a_good_bus(tool: Tool) -> None:
@@ -199,7 +201,8 @@ def test_flash_verify_backup_restore(tool: Tool, wanted: str, tmp_path: Path) ->
     assert done["outcome"]["written"] == 3 and done["outcome"]["stored"] is True
     code, out, _ = tool("verify", wanted)
     assert code == 0 and "behaviour: run `prove`" in out
-    assert tool("verify", "before.json")[0] == 1
+    code, _, err = tool("verify", "before.json")
+    assert code == 1 and "restore before.json" in err
     assert tool("flash-params", wanted, "--check")[0] == 0
     assert tool("restore", "--yes")[0] == 0
     assert tool("verify", "before.json")[0] == 0
@@ -281,7 +284,11 @@ def test_jog_current(tool: Tool) -> None:
     [
         (("--for", "1s", "--yes"), 2, "one of --current and --speed"),
         (("--current", "2Apk"), 7, "at most 2 Apk"),
-        (("--current", "50Apk", "--yes"), 5, "outside the limit"),
+        (("--current", "50Apk", "--yes"), 5, "the machine's largest"),
+        (("--speed", "9000rpm", "--yes"), 5, "the machine's largest"),
+        (("--speed", "100rpm", "--shaft", "locked", "--yes"), 5, "said to be locked"),
+        (("--current", "2Apk", "--i-max", "0Apk", "--yes"), 2, "above zero"),
+        (("--current", "2Apk", "--for", "0s", "--yes"), 2, "above zero"),
         (("--current", "2Apk", "--load", "gravity", "--yes"), 5, "gravity"),
         (("--current", "2A", "--yes"), 2, "peak"),
     ],
