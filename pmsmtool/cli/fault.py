@@ -29,7 +29,7 @@ def show_command(bus: BusOptions, out: Output) -> None:
 
     with open_node(bus) as node:
         facts = _faults(node)
-        out.result("fault", facts, lambda: _lines(facts))
+        out.result("fault-show", facts, lambda: _lines(facts))
         if facts["state"] in (State.FAULT, State.FAULT_REACTION_ACTIVE):
             raise node.fault_error()
 
@@ -42,7 +42,7 @@ def reset_command(bus: BusOptions, out: Output) -> None:
     with open_node(bus) as node, node.emergencies_tolerated():
         node.reset_fault()
         facts = _faults(node)
-        out.result("fault", facts, lambda: _lines(facts))
+        out.result("fault-reset", facts, lambda: _lines(facts))
 
 
 def _faults(node: DriveNode) -> dict[str, Any]:

@@ -12,7 +12,12 @@ from pmsmtool.cli.output import Output
 
 
 @click.command(
-    "verify", epilog=examples("pmsmtool -i pmsmsim verify params.toml", "pmsmtool -n 5 verify runs/last --json")
+    "verify",
+    epilog=examples(
+        "pmsmtool -i pmsmsim verify params.toml",
+        "pmsmtool -n 5 verify runs/20260101T120000Z-000055f1 --json",
+        "pmsmtool -n 5 verify drive.json       # a backup",
+    ),
 )
 @click.argument("source", type=click.Path(path_type=Path))
 @map_option
@@ -30,9 +35,10 @@ def verify_command(bus: BusOptions, out: Output, source: Path, map_file: Path | 
     from pmsmtool.workflow.parameter_source import load_parameters
 
     drive_map = read_map(map_file)
+    backup = source.suffix == ".json"
     with open_node(bus, drive_map) as node:
         identity = checked_identity(node)
-        if source.suffix == ".json":
+        if backup:
             plan = plan_restore(node, read_snapshot(source))
         else:
             plan = plan_download(node, load_parameters(source, drive_map))
@@ -44,5 +50,5 @@ def verify_command(bus: BusOptions, out: Output, source: Path, map_file: Path | 
             f"{len(plan.changes)} of {len(plan.entries)} objects hold something else",
             where=f"node {identity.node}",
             differences=plan.lines()[: len(plan.changes)],
-            hint="`pmsmtool flash-params` writes the set",
+            hint=f"`pmsmtool {'restore' if backup else 'flash-params'} {source}` brings them to the drive",
         )
