@@ -6,6 +6,7 @@ bytes years later. Nothing is stored in the drive.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -45,6 +46,9 @@ MACHINE = "machine.toml"
 NAMEPLATE = "nameplate.toml"
 REQUEST = "request.json"
 """What was asked, as far as the estimates depend on it: a replay is to give the same bytes."""
+REPLAYED = "replayed"
+"""Folder of a run for what a replay makes of it once a design stands on its machine file."""
+_MADE_FROM_MACHINE = ("design.toml", "params.toml")
 
 LIMIT: Mapping[str, float] = {"R_s_ohm": 0.03, "L_d_h": 0.05, "L_q_h": 0.05, "psi_f_wb": 0.03, "J_kgm2": 0.10}
 """Largest relative 95 % total half width of an accepted value; measured with 1 % sensors: 1.7, 1.4, 1.4, 1.1, 3 %."""
@@ -232,6 +236,9 @@ def identify_stage(
 def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: IdentifyRequest) -> Stage:
     """Estimate from the stored traces, write ``machine.toml``, and judge every value.
 
+    Where a design or a parameter set was already made from the machine file, another one does not take its place: it
+    goes into the folder ``replayed``, with the map and the response that belong to it.
+
     Raises
     ------
     IdentificationError
@@ -246,9 +253,12 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         tolerance=request.tolerance,
     )
     machine = machine_of(evaluation, nameplate, _conditions(evaluation, request))
-    map_files = map_stage.save_map(run, evaluation.flux_map)
-    map_files |= frequency_stage.save_response(run, evaluation.frequency_response)
-    run.save(MACHINE, dump_machine_file(machine))
+    text = dump_machine_file(machine)
+    target, prefix = (run, "") if _may_write(run, text) else (_beside(run), f"{REPLAYED}/")
+    made = map_stage.save_map(target, evaluation.flux_map)
+    made |= frequency_stage.save_response(target, evaluation.frequency_response)
+    target.save(MACHINE, text)
+    made_files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
     found = evaluation.estimates()
     acceptance = [_accepted(name, estimate) for name, estimate in found.items() if _limit(name) is not None]
     acceptance += map_stage.map_acceptance(evaluation.flux_map)
@@ -259,7 +269,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         values=[value_facts(name, estimate) for name, estimate in found.items()],
         acceptance=acceptance,
         fallbacks=[f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback],
-        files={MACHINE: "", **map_files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
+        files={**made_files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
         note="; ".join(warnings_of(evaluation)),
         summary=", ".join(
             f"{name} {format_estimate(found[name].value, total_half_width(found[name]), found[name].unit)}"
@@ -271,13 +281,32 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     )
 
 
+def _may_write(run: RunDirectory, text: str) -> bool:
+    """Whether a machine file may stand in the run: nothing was made from it yet, or it is the one that was used."""
+    if not any((run.path / name).is_file() for name in _MADE_FROM_MACHINE):
+        return True
+    recorded = run.read().stage("identify")
+    used = run.sha256(MACHINE) if (run.path / MACHINE).is_file() else recorded and recorded.files.get(MACHINE)
+    return hashlib.sha256(text.encode()).hexdigest() == used
+
+
+def _beside(run: RunDirectory) -> RunDirectory:
+    folder = run.path / REPLAYED
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot be made: {error.strerror or error}", where=str(folder)) from error
+    return RunDirectory(folder)
+
+
 def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibration: Sequence[str] = ()) -> Stage:
     """Recompute every estimate of a run from its traces.
 
     Parameters
     ----------
     run : RunDirectory
-        Of ``identify`` or ``commission``. When the machine file becomes another one, the stage is recorded anew.
+        Of ``identify`` or ``commission``. When the machine file becomes another one, the stage is recorded anew; a run
+        with a design keeps its own and its record, and the other one goes beside it (:data:`REPLAYED`).
     tolerance : SensorTolerance, optional
         Replaces the sensor tolerances that the run was made with.
     calibration : sequence of str
@@ -299,7 +328,7 @@ def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibrat
     request = replace(request, tolerance=calibrated_tolerance(request.tolerance, calibration))
     recorded = run.read().stage("identify")
     stage = evaluated_stage(run, load_machine_file(run.path / NAMEPLATE), request)
-    if recorded is not None and recorded.files.get(MACHINE) != run.sha256(MACHINE):
+    if recorded is not None and MACHINE in stage.files and recorded.files.get(MACHINE) != run.sha256(MACHINE):
         run.save(REQUEST, dump_request(request))
         run.add(replace(stage, seconds=recorded.seconds))
     return stage

@@ -11,6 +11,7 @@ import pytest
 
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import Connection
+from pmsmtool.cli.main import run as main
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
@@ -21,6 +22,7 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow.evaluate import tolerance_on
 from pmsmtool.workflow.identify import (
     MACHINE,
+    REPLAYED,
     REQUEST,
     IdentifyRequest,
     dump_request,
@@ -122,6 +124,31 @@ def test_a_replay_takes_the_recorded_tolerance_and_another_one_is_recorded(tmp_p
     (run.path / REQUEST).unlink()
     with pytest.raises(ConfigError, match="no request.json"):
         replay(run)
+
+
+def test_a_replay_leaves_a_run_with_a_design_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Connection(PmsmSimBus(CHANNEL)) as connection:
+        drive = CanopenDrive(connection, 1)
+        run, stage = identify(drive, tmp_path, ("R",), SensorTolerance(0.02, 0.02))
+        drive.close()
+    (run.path / "design.toml").write_text("made from machine.toml", encoding="utf-8")
+
+    def held() -> dict[str, bytes]:
+        return {str(path): path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+
+    before = held()
+    assert replay(run).values == stage.values
+    assert held() == before and not (run.path / REPLAYED).exists()
+    other = replay(run, SensorTolerance(0.001, 0.001))
+    assert other.values[0]["systematic"] < 0.5 * stage.values[0]["systematic"]
+    after = held()
+    (new,) = set(after) - set(before)
+    assert Path(new) == run.path / REPLAYED / MACHINE and {name: after[name] for name in before} == before
+    assert f"{REPLAYED}/{MACHINE}" in other.files and MACHINE not in other.files
+    assert load_machine_file(Path(new)).systematic["R_s_ohm"] == pytest.approx(other.values[0]["systematic"])
+
+    assert main(("identify", "--replay", str(run.path), "--sensor-tol", "0.001")) == 0
+    assert "stay as they are" in capsys.readouterr().err and {name: held()[name] for name in before} == before
 
 
 def test_the_bridge_of_the_nameplate_widens_the_statistical_part(tmp_path: Path) -> None:
