@@ -48,7 +48,8 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     "--cal",
     multiple=True,
     metavar="V_dc|I=SHOWN:TRUE:TOL",
-    help="What an instrument read while the drive showed SHOWN, and its 95 % tolerance; takes that scale out.",
+    help="What an instrument read while the drive showed SHOWN, and its 95 % tolerance, with units: "
+    "V_dc=540V:537V:0.5V, I=5.00Apk:5.02Apk:0.2%; takes that scale out.",
 )
 @map_option
 @bus_options
@@ -84,12 +85,19 @@ def identify_command(
 
     declared = None if sensor_tol is None else SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol)
     if replay is not None:
+        from pmsmtool.workflow.identify import MACHINE, REPLAYED
         from pmsmtool.workflow.identify import replay as recompute
         from pmsmtool.workflow.run_directory import RunDirectory
 
         run = RunDirectory(replay)
         run.read()
-        _show(run, recompute(run, declared, cal), out)
+        stage = recompute(run, declared, cal)
+        if f"{REPLAYED}/{MACHINE}" in stage.files:
+            out.warn(
+                f"the design in this run was made from its {MACHINE}: that file, run.json and report.html stay as they "
+                f"are, and the other values go to {run.path / REPLAYED / MACHINE}"
+            )
+        _show(run, stage, out)
         return
     chosen = tuple(NEEDS) if "all" in quantities else quantities or QUANTITIES
     request = IdentifyRequest(

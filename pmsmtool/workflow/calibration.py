@@ -1,4 +1,4 @@
-"""Scales of the drive's sensors against an instrument: ``--cal V_dc=SHOWN:TRUE:TOLERANCE``.
+"""Scales of the drive's sensors against an instrument: ``--cal V_dc=540V:537V:0.5V``.
 
 No experiment on the machine sees the gain of its own current or DC-link measurement. An instrument does: what it reads
 over what the drive shows at the same moment is a factor on every voltage or current of the traces, and the instrument's
@@ -14,9 +14,11 @@ from dataclasses import replace
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.trace import Trace
+from pmsmtool.units import parse_quantity
 
 QUANTITIES = {"V_dc": "voltage", "I": "current"}
-"""What can be calibrated, and which tolerance it replaces."""
+"""What can be calibrated: its dimension, and which tolerance it replaces."""
+EXAMPLES = {"V_dc": "540V:537V:0.5V", "I": "5.00Apk:5.02Apk:0.01Apk"}
 LARGEST_DEVIATION = 0.2
 """A ratio further from one is a slip of the pen or a broken sensor, not a scale."""
 
@@ -29,8 +31,8 @@ def calibrated_tolerance(tolerance: SensorTolerance, texts: Sequence[str]) -> Se
     tolerance : SensorTolerance
         Declared tolerances.
     texts : sequence of str
-        ``V_dc=SHOWN:TRUE:TOLERANCE`` (V) or ``I=SHOWN:TRUE:TOLERANCE`` (A); the tolerance is the instrument's 95 % half
-        width in the same unit.
+        ``V_dc=SHOWN:TRUE:TOLERANCE`` or ``I=SHOWN:TRUE:TOLERANCE``, each with its unit, a current with its kind; the
+        tolerance is the instrument's 95 % half width, a quantity or a percentage of TRUE.
 
     Raises
     ------
@@ -41,22 +43,30 @@ def calibrated_tolerance(tolerance: SensorTolerance, texts: Sequence[str]) -> Se
         name, _, numbers = text.partition("=")
         if name not in QUANTITIES:
             raise ConfigError(f"{name!r} cannot be calibrated", hint=f"one of {', '.join(QUANTITIES)}")
-        try:
-            shown, true, tolerated = (float(number) for number in numbers.split(":"))
-        except ValueError:
-            raise ConfigError(
-                f"{text!r} is not {name}=SHOWN:TRUE:TOLERANCE",
-                hint="what the drive shows, what the instrument reads, and its tolerance, e.g. V_dc=47.9:48.2:0.05",
-            ) from None
+        kind = QUANTITIES[name]
+        shown, true, tolerated = _readings(text, name, numbers)
         ratio = true / shown if shown else math.inf
         if not abs(ratio - 1.0) <= LARGEST_DEVIATION or not 0.0 < tolerated < LARGEST_DEVIATION * abs(true):
             raise ConfigError(
                 f"{text!r}: the instrument reads {ratio:.4g} of what the drive shows",
                 hint=f"a calibration is within {100 * LARGEST_DEVIATION:g} % and has a tolerance",
             )
-        kind = QUANTITIES[name]
         tolerance = replace(tolerance, **{f"{kind}_scale": ratio, f"{kind}_gain": tolerated / abs(true)})
     return tolerance
+
+
+def _readings(text: str, name: str, numbers: str) -> tuple[float, float, float]:
+    hint = f"what the drive shows, what the instrument reads, and its tolerance: {name}={EXAMPLES[name]}"
+    parts = numbers.split(":")
+    if len(parts) != 3:
+        raise ConfigError(f"{text!r} is not {name}=SHOWN:TRUE:TOLERANCE", hint=hint)
+    try:
+        shown, true = (parse_quantity(part, QUANTITIES[name]) for part in parts[:2])
+        if parts[2].rstrip().endswith("%"):
+            return shown, true, abs(true) * parse_quantity(parts[2], "ratio")
+        return shown, true, parse_quantity(parts[2], QUANTITIES[name])
+    except ConfigError as error:
+        raise ConfigError(f"{text!r}: {error.what}", likely=error.likely, hint=hint) from None
 
 
 def calibrated_traces(traces: Mapping[str, Trace], tolerance: SensorTolerance) -> Mapping[str, Trace]:

@@ -12,8 +12,11 @@ import can
 import pytest
 
 from pmsmtool.cli.main import run
+from pmsmtool.errors import ConfigError
+from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
+from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.random_drives import true_loop_resistance
 
 GAIN = 1.01
@@ -47,7 +50,7 @@ def test_a_scale_is_taken_out_and_its_tolerance_takes_the_sensors_place(
     assert shown["value"] == pytest.approx(R * GAIN, rel=3e-3)  # measured 0.1 %
 
     (folder,) = Path("runs").iterdir()
-    true = answer(capsys, "--replay", str(folder), "--cal", "V_dc=565.6:560:0.56", "--cal", "I=5:5:0.005")
+    true = answer(capsys, "--replay", str(folder), "--cal", "V_dc=565.6V:560V:0.56V", "--cal", "I=5Apk:5Apk:0.1%")
     assert true["value"] == pytest.approx(shown["value"] / GAIN, rel=1e-6)
     assert true["value"] == pytest.approx(R, rel=3e-3)
     assert true["std"] == pytest.approx(shown["std"] / GAIN, rel=1e-3)
@@ -66,9 +69,28 @@ def test_a_scale_is_taken_out_and_its_tolerance_takes_the_sensors_place(
 
 
 @pytest.mark.parametrize(
-    "text", ["U=1:1:0.1", "V_dc=48", "V_dc=48:0:0.1", "V_dc=0:48:0.1", "V_dc=48:48:0", "V_dc=48:480:1", "V_dc=a:b:c"]
-)
+    "text",
+    [
+        "U=1V:1V:0.1V", "V_dc=48V", "V_dc=48V:0V:0.1V", "V_dc=0V:48V:0.1V", "V_dc=48V:48V:0V", "V_dc=48V:480V:1V",
+        "V_dc=a:b:c", "V_dc=48:48:0.1", "V_dc=48V:48V:0.1", "V_dc=48V:48V:0.1A", "V_dc=48V:48V:1V:1V", "I=5:5:0.1",
+        "I=5A:5A:0.1A", "I=5Apk:5Apk:0.1", "I=5Apk:5Apk:0%",
+    ],
+)  # fmt: skip
 def test_what_is_no_calibration_is_a_usage_error(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(("identify", "-i", "virtual", "-c", "nothing", "--yes", "--cal", text)) == 2
     err = capsys.readouterr().err
     assert "instrument" in err or "cannot be calibrated" in err
+
+
+def test_a_calibration_carries_its_units() -> None:
+    bare = SensorTolerance()
+    volts = calibrated_tolerance(bare, ["V_dc=540V:0.537kV:500mV"])
+    assert volts.voltage_scale == pytest.approx(537.0 / 540.0) and volts.voltage_gain == pytest.approx(0.5 / 537.0)
+    peak = calibrated_tolerance(bare, ["I=5.00Apk:5.02Apk:0.2%"])
+    assert peak.current_scale == pytest.approx(1.004) and peak.current_gain == pytest.approx(0.002)
+    mixed = calibrated_tolerance(bare, ["I=5Apk:3.5355339Arms:10mArms"])
+    assert mixed.current_scale == pytest.approx(1.0) and mixed.current_gain == pytest.approx(0.01 / 3.5355339)
+    with pytest.raises(ConfigError, match="has no unit"):
+        calibrated_tolerance(bare, ["V_dc=540:537:0.5"])
+    with pytest.raises(ConfigError, match="peak or an rms"):
+        calibrated_tolerance(bare, ["I=5A:5A:0.1A"])
