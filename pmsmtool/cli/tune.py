@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 )
 @click.argument("machine")
 @click.option("-o", "--output", "path", type=FILE, required=True, help="Design file to write.")
-@click.option("--params", "params_path", type=FILE, help="Parameter set to write.  [default: params.toml beside it]")
+@click.option("--params", "params_path", type=FILE, help="Parameter set to write.  [default: beside "
+              "it, params.toml for design.toml, X.params.toml for X.toml]")  # fmt: skip
 @click.option("--controller", type=click.Choice(["pi", "polar"]), default="pi", help="Field-oriented PI, or polar.")
 @click.option(
     "--polar-law",
@@ -94,7 +95,7 @@ def tune_command(machine: str, path: Path, params_path: Path | None, out: Output
 
     design = tune(load_machine_file(machine_path(machine)), TuneRequest(**asked))
     params = design.parameter_set()
-    params_path = path.with_name("params.toml") if params_path is None else params_path
+    params_path = _params_path(path) if params_path is None else params_path
     write_file(path, design_text(design))
     write_file(params_path, params.to_toml())
     data = {
@@ -111,6 +112,11 @@ def tune_command(machine: str, path: Path, params_path: Path | None, out: Output
     for note in design.notes:
         out.note(note)
     out.note(f"wrote {path}, {params_path}")
+
+
+def _params_path(design: Path) -> Path:
+    # Two designs in one folder keep a parameter set each.
+    return design.with_name("params.toml" if design.name == "design.toml" else f"{design.stem}.params.toml")
 
 
 _SHOWN = (

@@ -212,6 +212,11 @@ def test_command_writes_both_files_and_prints_margins(tmp_path: Path) -> None:
     design: Design = load_design(tmp_path / "design.toml")
     params = parse_parameter_set((tmp_path / "params.toml").read_text())
     assert params.content_hash() == design.parameter_set().content_hash()
+    first = (tmp_path / "params.toml").read_bytes()
+    assert run(source, "-o", str(tmp_path / "fast.toml"), "--bandwidth-hz", "100")[0] == 0
+    assert (tmp_path / "params.toml").read_bytes() == first, "another design does not take its set"
+    fast = parse_parameter_set((tmp_path / "fast.params.toml").read_text())
+    assert fast.content_hash() == load_design(tmp_path / "fast.toml").parameter_set().content_hash()
 
 
 def test_command_exit_codes(tmp_path: Path) -> None:
