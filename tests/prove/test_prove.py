@@ -139,6 +139,18 @@ def test_a_spoiled_drive_is_caught_and_the_cause_named(kind: str, cause: str, de
         assert "OUTSIDE its band" in report_page(run.path)
 
 
+def test_a_healthy_drive_passes_within_a_small_current_limit(design: Design) -> None:
+    """At full torque 5 A of the design's 12 A would all go into i_d, and the base speed would not be reached."""
+    few = replace(FEW, i_max_apk=5.0)
+    with flashed(design) as drive:
+        run = begin_run(drive, Path("runs"))
+        stage = prove_stage(run, drive, design, few, lambda shown: None, lambda line: None)
+    assert stage.status == "pass", stage.note
+    (folder,) = (run.path / "prove").iterdir()
+    prediction, traces = read_proof(folder)
+    assert prediction.facts["conditions"]["i_max_apk"] == 5.0 and "unreachable" in traces
+
+
 def test_a_gross_deviation_ends_the_proof_before_more_is_asked(design: Design) -> None:
     with spoiled("pole_pairs_high"), flashed(design) as drive:
         _, stage = prove(drive, design)

@@ -98,7 +98,7 @@ def envelope_of(design: Design, request: ProofRequest, plan: ProofPlan | None = 
     return Envelope(
         i_max_apk=design["motor.I_max_apk"] if request.i_max_apk is None else request.i_max_apk,
         speed_max_rad_s=design["motor.n_max_rpm"] * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,
-        duration_s=60.0 if plan is None else 30.0 + 2.0 * plan.seconds(T_s),
+        duration_s=60.0 if plan is None else 45.0 + 2.0 * plan.seconds(T_s),
         shaft=request.shaft,
         load=request.load,
         brake=request.brake,
