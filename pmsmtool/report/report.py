@@ -155,11 +155,27 @@ def total_interval(std: float, systematic: float, coverage_factor: float = 1.96)
 def _conditions(record: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [("command", " ".join(map(str, record.get("command", ()))))]
     for group in ("drive", "bus", "envelope", "versions"):
-        rows += [(f"{group}: {key}", str(value)) for key, value in record.get(group, {}).items()]
+        known = {key: value for key, value in record.get(group, {}).items() if value is not None}
+        rows += [(f"{group}: {key}", _readable(key, value)) for key, value in known.items()]
     rows += [("instrument", str(line)) for line in record.get("instruments", ())]
     for consent in record.get("consents", ()):
-        rows.append(("consent", ", ".join(f"{key}: {value}" for key, value in consent.items())))
+        rows.append(("consent", ", ".join(f"{key}: {_readable(key, value)}" for key, value in consent.items())))
     return rows
+
+
+_HEX = frozenset({"vendor", "product", "revision"})
+"""Numbers of the drive that the command line shows in hexadecimal."""
+
+
+def _readable(key: str, value: Any) -> str:
+    """Return a recorded fact as a person reads it; nothing of it is left out."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name}: {_readable(name, part)}" for name, part in value.items())
+    if isinstance(value, list | tuple):
+        return "; ".join(_readable(key, part) for part in value)
+    if key in _HEX and isinstance(value, int):
+        return f"{value:#010x}" if key == "vendor" else f"{value:#x}"
+    return str(value)
 
 
 def _finite(value: Any) -> bool:

@@ -52,6 +52,19 @@ def _record() -> dict:
     }
 
 
+def test_conditions_are_read_by_a_person() -> None:
+    record = _record()
+    record["drive"] |= {"vendor": 0x1F5, "product": 0x504D, "revision": 0x10001, "serial": 22001}
+    record["bus"] |= {"bitrate": None, "node": 5}
+    record["consents"] = [
+        {"subject": "motion", "answer": "--yes", "text": ["at most 6 A", "free shaft"], "limits": {"i_max": "6 A"}}
+    ]
+    page = render(record)
+    assert "0x000001f5" in page and "0x504d" in page and "0x10001" in page and "22001" in page
+    assert "bitrate" not in page and "None" not in page
+    assert "subject: motion, answer: --yes, text: at most 6 A; free shaft, limits: i_max: 6 A" in page
+
+
 def test_all_passed_is_pass_and_names_the_value_with_its_interval() -> None:
     page = render(_record(), not_checked=["thermal behaviour under load"])
     assert ">PASS</strong>" in page
