@@ -24,7 +24,7 @@ _TEMPERATURE = Quantity("temperature")
         "pmsmtool lut design.toml -o lut.npz",
         "pmsmtool lut machine.toml -o lut.npz --torque-points 100 --speed-points 100 --plot lut.svg",
         "pmsmtool lut machine.toml -o lut.npz && pmsmtool -n 5 flash-params lut.npz",
-        "pmsmtool lut machine.toml -o hot.npz --winding 140degC --magnet 110degC --u-dc 480V --u-dc 540V",
+        "pmsmtool lut machine.toml -o hot.npz --winding 140degC --magnet 110degC --u-dc 510V --u-dc 540V",
     ),
 )
 @click.argument("source")
@@ -109,10 +109,11 @@ def _counts(made: LookupDesign) -> dict[str, Any]:
 def _lines(made: LookupDesign) -> Iterator[str]:
     lookup, error = made.table, made.error
     shape = " x ".join(map(str, lookup.i_d_a.shape))
-    end = f"torque to {lookup.torque_nm[-1]:.4g} N m, {lookup.axis_kind} to {lookup.y[-1]:.5g}"
+    y_unit = "rpm" if lookup.axis_kind == "speed" else "Wb"
+    end = f"torque to {lookup.torque_nm[-1]:.4g} N m, {lookup.axis_kind} to {lookup.y[-1]:.5g} {y_unit}"
     yield f"{shape} cells, {made.stored}; {end}"
     yield (
-        f"between nodes: torque within {error.torque_nm:.3g} N m, voltage at most {error.voltage_v:.3g} "
+        f"between nodes: torque within {error.torque_nm:.3g} N m, voltage at most {error.voltage_v:.3g} V "
         f"and current at most {error.current_a:.3g} A beyond their limits"
     )
     yield ""
