@@ -37,12 +37,13 @@ def restore_command(
 ) -> None:
     """Bring back what a backup holds, or without FILE what this drive held before its last download.
 
-    The journal is found by the drive's serial number. An interrupted download ends here too.
+    The journal is found by the drive's serial number. An interrupted download ends here too. Where the
+    drive holds it all already, nothing is written, stored or reset.
     """
     from pmsmtool.cli.flash_session import checked_identity, plan_facts, told, write_plan
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.journal import JournalFolder, read_snapshot
-    from pmsmtool.flash.restore import check_snapshot, old_marks, plan_restore
+    from pmsmtool.flash.restore import check_snapshot, nothing_written, old_marks, plan_restore
 
     with open_node(bus, read_map(map_file)) as node:
         identity = checked_identity(node)
@@ -60,6 +61,13 @@ def restore_command(
         plan = plan_restore(node, snapshot)
         if dry_run:
             out.result("restore", {"identity": identity, **plan_facts(plan)}, plan.lines())
+            return
+        if not plan.changes and snapshot.state != "open":
+            outcome = nothing_written(node, plan)
+            text = f"{told(outcome, node)}: nothing to restore, nothing was done"
+            out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [text])
+            if not outcome.stored:
+                out.warn("whether the drive keeps these values over a reset is not known; flash-params stores a set")
             return
         outcome = write_plan(
             node, identity, plan, old_marks(snapshot), bus, motion, out, restoring=snapshot_file is None

@@ -12,6 +12,7 @@ from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import ConfigError, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap
+from pmsmtool.flash.download import Outcome
 from pmsmtool.flash.journal import MARKS, Entry, Snapshot
 from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
 from pmsmtool.params.catalogue import BY_NAME, layout_signature
@@ -147,6 +148,13 @@ def restore_plan(drive_map: DriveMap, snapshot: Snapshot, found: Mapping[str, by
         change = Change(entry.name, entry.index, entry.sub, found[entry.name], entry.old, old_value, value, value, unit)
         entries.append(change)
     return Plan(tuple(entries), (), snapshot.content)
+
+
+def nothing_written(node: DriveNode, plan: Plan) -> Outcome:
+    """Return the outcome of a plan without a change that is left alone; the drive is only read."""
+    parameters = DriveParameters(node)
+    crc = parameters.crc_active if node.map.staging else None
+    return Outcome(0, len(plan.entries), parameters.is_stored(), crc, node.sdo.retries, node.sdo.discarded, 0)
 
 
 def names_of(snapshot: Snapshot) -> tuple[str, ...]:

@@ -208,7 +208,9 @@ def test_flash_verify_backup_restore(tool: Tool, wanted: str, tmp_path: Path) ->
     assert tool("verify", "before.json")[0] == 0
     code, _, err = tool("verify", wanted)
     assert code == 1 and "motor.R_s_ohm" in err
-    assert tool("restore", "before.json", "--yes")[0] == 0
+    outcome = loaded(tool("restore", "before.json", "--json"))["outcome"]  # without --yes: nothing to consent to
+    assert outcome["written"] == 0 and outcome["starts"] == 0
+    assert "nothing was done" in tool("restore", "before.json", "--yes")[1]
 
 
 def test_backup_into_a_spare_part(tool: Tool, wanted: str) -> None:
