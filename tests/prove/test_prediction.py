@@ -84,6 +84,16 @@ def test_what_looks_like_no_fault_has_no_cause() -> None:
     assert not judgement.inside and judgement.cause == ""
 
 
+def test_what_lies_between_two_faults_is_blamed_on_neither() -> None:
+    one = {KEY: responses(6, 0, gain=1.25)}
+    found = predict({"step": T_S}, {KEY: responses(96, 0)}, {KEY: 1.0}, faults={
+        "a": ("too much gain", one), "b": ("its twin", {KEY: responses(6, 1, gain=1.27)})})  # fmt: skip
+    alone = predict({"step": T_S}, {KEY: responses(96, 0)}, {KEY: 1.0}, faults={"a": ("too much gain", one)})
+    wrong = {KEY: responses(1, 5, gain=1.3)[0]}
+    assert judge(alone, wrong).cause == "too much gain"
+    assert judge(found, wrong).cause == ""
+
+
 def test_quantities_measure_what_they_say() -> None:
     found = prediction()
     gain, delay = found.quantities["gain"], found.quantities["delay"]

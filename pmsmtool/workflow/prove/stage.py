@@ -282,7 +282,7 @@ def _stage(plan: ProofPlan, prediction: Prediction, record: _Record, event: str,
 def _note(found: Judgement, event: str) -> str:
     outside = [line.what for line in found.seen if not line.inside]
     text = event or f"outside the predicted band: {', '.join(outside)}"
-    return f"{text}; likely {found.cause}" if found.cause else f"{text}; no known cause looks like it"
+    return f"{text}; likely {found.cause}" if found.cause else f"{text}; no known cause fits"
 
 
 def _summary(found: Judgement, experiments: int) -> str:
