@@ -223,8 +223,8 @@ def refined_table(
         f"voltage within {error.voltage_v:.3g} V; asked for: {bounds.torque_nm:.3g} N m, {bounds.voltage_v:.3g} V",
         where=f"look-up table ({bounds.stored}, {bounds.capacity_words} words)",
         likely="the drive's memory for tables is full",
-        hint=f"ask for larger bounds{', take int16' if bounds.stored == 'float32' else ''}, or reduce the range of torque, "
-        "speed or DC-link voltage",
+        hint=f"ask for larger bounds{', take int16' if bounds.stored == 'float32' else ''}, or reduce the range of "
+        "torque, speed or DC-link voltage",
     )
 
 
