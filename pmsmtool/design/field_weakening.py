@@ -10,9 +10,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pmsmtool.design.design_file import DesignValue, Scalar
 from pmsmtool.design.lookup_table import RPM, torque_limits
 from pmsmtool.design.operating_machine import at_temperature, magnet_flux_at
@@ -198,20 +195,23 @@ def _bisected(below: Callable[[float], bool], low: float, high: float) -> float:
 
 def _least_voltage(machine: MachineParameters, omega_e: float, I_max: float) -> float:
     """Return the smallest steady-state voltage (V) over |i| <= I_max; the minimum lies on the circle or is zero."""
-    R, psi = machine.R_s_ohm, machine.psi_f_wb
+    R, emf = machine.R_s_ohm, omega_e * machine.psi_f_wb
     X_d, X_q = omega_e * machine.L_d_decoupling_h, omega_e * machine.L_q_decoupling_h
-    M = np.array([[R, -X_q], [X_d, R]])
-    c = np.array([0.0, omega_e * psi])
-    gram, pull = M.T @ M, M.T @ c
+    # normal equations of |M i + c| with M = [[R, -X_q], [X_d, R]], c = [0, emf]; written out: numpy's solve took 40 ms
+    g_dd, g_dq, g_qq = R * R + X_d * X_d, R * (X_d - X_q), R * R + X_q * X_q
+    pull_d, pull_q = X_d * emf, R * emf
 
-    def point(ridge: float) -> NDArray[np.float64]:
-        return np.asarray(-np.linalg.solve(gram + ridge * np.eye(2), pull))
+    def point(ridge: float) -> tuple[float, float]:
+        a, c = g_dd + ridge, g_qq + ridge
+        det = a * c - g_dq * g_dq
+        return (g_dq * pull_q - c * pull_d) / det, (g_dq * pull_d - a * pull_q) / det
 
-    if float(np.hypot(*point(0.0))) <= I_max:
+    if math.hypot(*point(0.0)) <= I_max:
         return 0.0
-    largest = float(np.hypot(*pull)) / I_max
-    ridge = _bisected(lambda mu: float(np.hypot(*point(mu))) > I_max, 0.0, largest)
-    return float(np.hypot(*(M @ point(ridge) + c)))
+    largest = math.hypot(pull_d, pull_q) / I_max
+    ridge = _bisected(lambda mu: math.hypot(*point(mu)) > I_max, 0.0, largest)
+    i_d, i_q = point(ridge)
+    return math.hypot(R * i_d - X_q * i_q, X_d * i_d + R * i_q + emf)
 
 
 MTPVA_SHARE = 0.95
