@@ -153,7 +153,7 @@ def _settings(arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[Kind, tup
     if "inverse_nodes" in arrays:
         try:
             first, second = (int(n) for n in np.ravel(arrays["inverse_nodes"]))
-        except ValueError:
+        except (ValueError, OverflowError, TypeError):
             raise ConfigError("inverse_nodes is not two whole numbers", where=where) from None
         nodes = (first, second)
     try:
