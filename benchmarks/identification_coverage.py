@@ -1,6 +1,7 @@
 """Identify many random drives over CANopen frames and say how often the truth lies in the printed interval.
 
-    python -m benchmarks.identification_coverage --drives 200 --around jercic-2017 interior-2k2 saturated-pmsyrm
+    python -m benchmarks.identification_coverage --drives 200 --around jercic-2017 interior-2k2 \
+        saturated-pmsyrm measured-map
     python -m benchmarks.identification_coverage --drives 400 --block timing
 
 Drives follow from their seeds (``workflow/random_drives.py``); the tool sees their nameplate only. Printed per
@@ -20,13 +21,13 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from benchmarks.commissioning import drive_of
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import statistical_half_width, total_half_width
-from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
-from pmsmtool.resources import data_folder
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.sim.simulated_machine import Settings, device_slope_ohm
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, evaluate
@@ -60,7 +61,7 @@ def drawn(profile: str, seed: int, block: str) -> MachineFile:
     """Return a drive around a profile, or of the population where that is empty."""
     if not profile:
         return draw_drive(seed, block)  # type: ignore[arg-type]
-    base = load_machine_file(data_folder("profiles") / f"{profile}.toml")
+    base = drive_of(profile, "switched")
     return draw_around(base, seed, block, spread=DRAWN_SPREAD)  # type: ignore[arg-type]
 
 
@@ -185,7 +186,8 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=200, help="number of drives (with --around: in all)")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--block", choices=["ideal", "timing", "gains"], default="ideal")
-    parser.add_argument("--around", nargs="*", default=[], metavar="PROFILE", help="draw around these profiles")
+    around = "draw around these profiles; measured-map: the map in ../shared/maps"
+    parser.add_argument("--around", nargs="*", default=[], metavar="PROFILE", help=around)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--rows", type=Path, help="write every drive's result there (JSON lines)")
     parser.add_argument("--tabulate", type=Path, metavar="ROWS", help="only print the table of a file of --rows")

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import (
@@ -119,8 +120,9 @@ def draw_drive(seed: int, block: Block = "ideal") -> MachineFile:
 def draw_around(base: MachineFile, seed: int, block: Block = "ideal", *, spread: float = 0.15) -> MachineFile:
     """Return a drive around a machine file: its parameters times log-normal factors of ``spread``.
 
-    Resistance, inductances, flux linkage (or the flux map's machine, left as it is), temperature, offset, sensors,
-    dead time and devices vary; the nameplate stays, so the tool meets a machine it was not told about.
+    Resistance, inductances, flux linkage (of a flux map: all inductances by one factor, which keeps it reciprocal, and
+    the magnet's share), temperature, offset, sensors, dead time and devices vary; the nameplate stays, so the tool
+    meets a machine it was not told about.
     """
     rng = np.random.default_rng([20260102, seed])
     kind = LOW_VOLTAGE if base.inverter.U_dc_v < 100.0 else HIGH_VOLTAGE
@@ -134,8 +136,20 @@ def draw_around(base: MachineFile, seed: int, block: Block = "ideal", *, spread:
         name=f"{base.name}-{seed}",
         inverter=replace(base.inverter, dead_time_s=dead_time),
         simulation={**base.simulation, **truth},
+        flux_map=None if base.flux_map is None else _varied(base.flux_map, spread, rng),
     )
     return _with_truth(drive, kind, rng, seed, block)
+
+
+def _varied(flux_map: FluxMap, spread: float, rng: np.random.Generator) -> FluxMap:
+    """Return the map of a machine of the same kind."""
+    of_current, of_magnet = (math.exp(spread * float(rng.standard_normal())) for _ in range(2))
+    psi_f = float(flux_map.flux(0.0, 0.0)[0])
+    return replace(
+        flux_map,
+        psi_d_wb=of_magnet * psi_f + of_current * (flux_map.psi_d_wb - psi_f),
+        psi_q_wb=of_current * flux_map.psi_q_wb,
+    )
 
 
 def _with_truth(
