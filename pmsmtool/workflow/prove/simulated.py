@@ -1,4 +1,4 @@
-"""The Monte Carlo prediction: the drive's own firmware on machines drawn from their intervals, in one call each.
+"""The Monte Carlo prediction: the drive's own firmware on machines drawn from their intervals.
 
 What varies: the machine's parameters (statistical and systematic part), the encoder offset, temperatures about what
 the drive measures, the DC link, friction, the inverter's error, sensor offsets and mismatch, lag, the angle at the
@@ -22,7 +22,6 @@ from pmsmtool.drive.port import Excitation, Injection
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
-from pmsmtool.sim.batch import run_batch
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
 from pmsmtool.sim.kernel import Params, Part, Setup, Simulation, library
 from pmsmtool.sim.scenarios import MODES
@@ -201,13 +200,13 @@ class SimulatedDrives:
             crossover = float(self._design.facts.get("speed_crossover_rad_s", 50.0))
             run_in = round((RUN_IN if experiment.base_rad_s else 0.25) / (crossover * self._T_s))
         for drive, phase in zip(drives, self._phase, strict=False):
-            drive.run(phase)
-        run_batch(drives, run_in)
+            drive.run(phase + run_in)
         wanted = [DRIVE_SIGNALS[name][0] for name in SIGNALS]
         for drive in drives:
             _excite(drive, experiment.excitation)
         records = [drive.record(wanted, experiment.rows, experiment.decimation) for drive in drives]
-        run_batch(drives, experiment.rows * experiment.decimation)
+        for drive in drives:
+            drive.run(experiment.rows * experiment.decimation)
         return averaged(np.stack(records).transpose(0, 2, 1), experiment)
 
     def _start(self, row: int, experiment: Experiment, defect: Defect | None) -> Simulation:
