@@ -334,8 +334,7 @@ class GuardedDrive:
             )
 
     def _watch(self, seconds: float) -> None:
-        i_d, i_q = self._drive.live("i_d_a"), self._drive.live("i_q_a")
-        current = math.hypot(i_d, i_q)
+        current = self._current()
         self.energised_s += seconds
         self.energy_j += 1.5 * self._R_s_ohm * current * current * seconds
         envelope = self.envelope
@@ -354,6 +353,18 @@ class GuardedDrive:
             if value > limit:
                 self.stop()
                 self._check(quantity, value, limit, unit)
+
+    def _current(self) -> float:
+        """Return the length of the current vector (A) from two objects, which are read one after the other.
+
+        Where the vector turns, two reads are not one vector: braking out of field weakening at the current limit,
+        i_d gives way to i_q within some 10 ms, and a slow host saw 1.29 of the limit that was kept throughout. What
+        seems too much is therefore judged with i_d read on either side of i_q, of which the smaller counts.
+        """
+        i_d, i_q = self._drive.live("i_d_a"), self._drive.live("i_q_a")
+        if math.hypot(i_d, i_q) > OVERSHOOT * self.envelope.i_max_apk:
+            i_d = min(abs(i_d), abs(self._drive.live("i_d_a")))
+        return math.hypot(i_d, i_q)
 
     def _check(self, quantity: str, value: float, limit: float, unit: str) -> None:
         if value > limit * (1.0 + _ROUNDING):

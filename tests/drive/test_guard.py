@@ -14,7 +14,7 @@ import pytest
 from pmsmtool.cia402 import State
 from pmsmtool.drive import objects
 from pmsmtool.drive.envelope import Envelope
-from pmsmtool.drive.guard import GuardedDrive, guarded
+from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive, guarded
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.errors import (
     DriveFault,
@@ -186,6 +186,39 @@ def test_speed_beyond_the_envelope_stops(bench: SimBench) -> None:
         guard.wait(5.0)
     assert caught.value.exit_code == 5
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def test_current_beyond_the_envelope_stops(bench: SimBench) -> None:
+    with pytest.raises(LimitExceeded, match="current") as caught, guarded(bench.drive, Envelope(3.0, 100.0)) as guard:
+        guard.enable()
+        bench.drive.node.put(objects.MAX_CURRENT_PERMILLE, 2000)  # the drive's own limit is out of the way
+        bench.drive.command_current(-2.8, 2.8, fixed_angle_rad=0.0)
+        guard.wait(1.0)
+    assert caught.value.exit_code == 5
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def test_a_vector_that_turns_between_two_reads_is_no_excess(bench: SimBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """i_d and i_q are two objects; a slow host reads one before, one after a turn by 90 degree."""
+    read = bench.drive.live
+    seen: dict[str, list[float]] = {"i_d_a": [], "i_q_a": []}
+
+    def slowly(name: str) -> float:
+        if name == "i_q_a":
+            bench.drive.command_current(0.0, 2.9, fixed_angle_rad=0.0)
+            bench.drive.wait(1.0)
+        value = read(name)
+        seen.get(name, []).append(value)
+        return value
+
+    with guarded(bench.drive, ENVELOPE) as guard:
+        guard.enable()
+        guard.command_current(-2.9, 0.0, fixed_angle_rad=0.0)
+        bench.drive.wait(1.0)
+        monkeypatch.setattr(bench.drive, "live", slowly)
+        guard.wait(0.0)
+        monkeypatch.undo()
+    assert math.hypot(seen["i_d_a"][0], seen["i_q_a"][0]) > OVERSHOOT * ENVELOPE.i_max_apk, "the trap was set"
 
 
 @pytest.mark.parametrize(
