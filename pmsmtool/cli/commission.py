@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, open_drive, read_map
+from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output
 from pmsmtool.cli.progress import StageProgress
 
 if TYPE_CHECKING:
     from pmsmtool.drive.canopen_drive import CanopenDrive
+    from pmsmtool.firmware.drive_map import DriveMap
+    from pmsmtool.workflow.capabilities import Capabilities
     from pmsmtool.workflow.run_directory import RunDirectory
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
@@ -30,6 +32,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
         "pmsmtool commission --sim interior-2k2 --yes",
         "pmsmtool commission --sim saturated-pmsyrm --flux-map --i-max 20Apk --yes",
         "pmsmtool commission -i socketcan -c can0 -n 5 --i-max 12Apk --speed-max 3000rpm --shaft free",
+        "pmsmtool commission drive.toml -i socketcan -c can0 -n 5 --map epos4 --i-max 5Apk --shaft free",
         "pmsmtool commission --resume runs/20260101T120000Z-000055f1",
     ),
 )
@@ -72,6 +75,10 @@ def commission_command(
     is written, and the envelope of the proof, which runs the flashed drive up to its designed limits. The chain ends
     at the first criterion that is not met, with the drive off and as it was; --resume goes on there. A simulated drive
     starts from factory memory unless its channel names a memory file (nv=).
+
+    On a drive that gives less than the reference drive (`pmsmtool caps`) every stage runs as far as its tier and its
+    map go: what it cannot measure is taken from MACHINE and marked so, and a stage that cannot run says what it needs.
+    The verdict is then for its tier.
     """
     from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.errors import ConfigError
@@ -86,13 +93,35 @@ def commission_command(
         bus = _as_begun(bus, begun)
     elif bus.simulated():
         _erase_memory(bus, out)
-    with open_drive(bus, read_map(map_file)) as drive:
-        checked_identity(drive.node)
-        run = begun or begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=_recorded(bus))
+    given = None if map_file is None else read_map(map_file)
+    with _opened(bus, given) as (drive, found):
+        if given is not None:
+            checked_identity(drive.node)
+        run = begun or begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=_recorded(bus), tier=found.tier)
         progress = StageProgress(out)
         person = _Person(run, drive, bus, motion, out, progress)
+        chain = Commissioning(run, drive, person, progress, **asked, capabilities=found)
+        for line in () if chain.tier is None else chain.tier.plan_lines():
+            out.note(line)
         with _reported(run, out, fresh=begun is None):
-            Commissioning(run, drive, person, progress, **asked).carry_out()
+            chain.carry_out()
+
+
+@contextmanager
+def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDrive, Capabilities]]:
+    """Open the drive with what it has; without a map, the one of its identity is used."""
+    from pmsmtool.cli.drive_access import choose_node
+    from pmsmtool.drive.drive_node import DriveNode
+    from pmsmtool.workflow.capabilities import examine
+    from pmsmtool.workflow.tier_stages import open_tier_drive
+
+    with bus.connect() as connection:
+        node = DriveNode(connection, choose_node(connection, bus.node))
+        found = examine(node, given)
+        node.close()
+        drive = open_tier_drive(connection, node.node, found)
+        yield drive, found
+        drive.close()
 
 
 def _kept_nameplate(run: RunDirectory) -> Path | None:

@@ -112,7 +112,7 @@ def identify_command(
     request.check()
     found, how, request = _choose(bus, map_file, method, request, everything=not quantities)
     if how == "inject":
-        run, stage = _measure(bus, motion, out, request, runs)
+        run, stage = _measure(bus, motion, out, request, runs, found)
     else:
         run, stage = _measure_without_injection(bus, motion, out, request, runs, found)
     _show(run, stage, out)
@@ -151,14 +151,13 @@ def _measure_without_injection(
     from pmsmtool import __version__
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.cli.drive_access import choose_node
-    from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
     from pmsmtool.workflow.run_directory import RunDirectory, new_record
     from pmsmtool.workflow.tier_identify import tier_stage
+    from pmsmtool.workflow.tier_stages import open_tier_drive
 
     identity = found.identity
-    kind = RecorderDrive if "recorder" in found.features else StandardDrive
     with bus.connect() as connection:
-        drive = kind(connection, choose_node(connection, bus.node), drive_map=found.drive_map)
+        drive = open_tier_drive(connection, choose_node(connection, bus.node), found)
         record = new_record(
             ["pmsmtool", *sys.argv[1:]],
             drive=asdict(identity),
@@ -170,25 +169,32 @@ def _measure_without_injection(
         def allow(lines: Any) -> None:
             ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
 
-        stage = tier_stage(run, drive, request, allow, out.note)
+        stage = tier_stage(run, drive, found, request, allow, out.note)
         drive.close()
     run.add(stage)
     return run, stage
 
 
 def _measure(
-    bus: BusOptions, motion: MotionOptions, out: Output, request: IdentifyRequest, runs: Path
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    request: IdentifyRequest,
+    runs: Path,
+    found: Capabilities,
 ) -> tuple[RunDirectory, Stage]:
     from dataclasses import asdict
 
     from pmsmtool import __version__
     from pmsmtool.cli.consent import Consent, ask_motion
-    from pmsmtool.cli.drive_access import open_drive
+    from pmsmtool.cli.drive_access import choose_node
     from pmsmtool.workflow.identify import identify_stage, nameplate_of
     from pmsmtool.workflow.run_directory import RunDirectory, new_record
+    from pmsmtool.workflow.tier_stages import open_tier_drive
 
     consents: list[Consent] = []
-    with open_drive(bus) as drive:
+    with bus.connect() as connection:
+        drive = open_tier_drive(connection, choose_node(connection, bus.node), found)
         identity = drive.identity
 
         def allow(lines: Any) -> None:
@@ -203,6 +209,7 @@ def _measure(
         nameplate = nameplate_of(drive, identity.name or f"drive {identity.serial:#010x}")
         run = RunDirectory.create(runs, identity.serial, record)
         stage = identify_stage(run, drive, nameplate, request, allow, out.note)
+        drive.close()
     run.add(stage)
     return run, stage
 

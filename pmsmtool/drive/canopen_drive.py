@@ -193,7 +193,11 @@ class CanopenDrive:
             return self.finish_record(signals, decimation=decimation, excitation=excitation)
         finally:
             if excitation is not None:
-                self.node.command(objects.EXCITATION_COMMAND, 0)
+                self.end_excitation()
+
+    def end_excitation(self) -> None:
+        """End an excitation, whether it runs or not."""
+        self.node.command(objects.EXCITATION_COMMAND, 0)
 
     def prepare(self, excitation: Excitation) -> None:
         """Write the fields of an excitation; nothing moves yet."""

@@ -282,7 +282,7 @@ class GuardedDrive:
             return self._drive.finish_record(signals, decimation=decimation, excitation=within)
         finally:
             if within is not None:
-                self._node.command(objects.EXCITATION_COMMAND, 0)
+                self._drive.end_excitation()
 
     def wait(self, seconds: float) -> None:
         """Let time pass, looking at the machine in between."""

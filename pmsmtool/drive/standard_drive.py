@@ -17,7 +17,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.drive.port import Excitation
+from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.recorder import Recorder
 from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap
@@ -67,11 +67,14 @@ class StandardDrive(CanopenDrive):
             ) from abort
 
     def read(self, name: str) -> float:
-        """Return one parameter; of those the guard scales with, neutral values where the drive has none."""
-        if name in self.node.map.cells:
-            return super().read(name)
+        """Return one parameter; of those the guard scales with, neutral values.
+
+        The pole pairs are one even where the drive's map knows them: its speed is counted per mechanical turn.
+        """
         if name == "motor.pole_pairs":
             return 1.0
+        if name in self.node.map.cells:
+            return super().read(name)
         if name == "motor.R_s_ohm":
             return 0.0
         raise NotAvailable(f"the drive has no object for {name}", where=f"node {self.node.node}")
@@ -180,6 +183,29 @@ class RecorderDrive(CanopenDrive):
         if i_d_a or fixed_angle_rad is not None:
             raise NotAvailable("the drive takes no current set-point, only torque", where=f"node {self.node.node}")
         self.node.put(objects.TARGET_TORQUE_PERMILLE, round(1000.0 * i_q_a / self._rated_apk))
+
+    def prepare(self, excitation: Excitation) -> None:
+        """Check that a speed reference is all that is asked for: there is no excitation."""
+        if excitation.point is not Injection.SPEED or excitation.shape is not Shape.STEP:
+            raise NotAvailable("the drive has no excitation, only references", where=f"node {self.node.node}")
+
+    def begin_record(
+        self,
+        signals: Sequence[str],
+        samples: int,
+        *,
+        decimation: int,
+        excitation: Excitation | None,
+        pretrigger: int,
+        wait: Callable[[float], None],
+    ) -> None:
+        """Start the recorder, and right behind it the speed step that is asked for."""
+        self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=False)
+        if excitation is not None:
+            self.command_speed(excitation.amplitude)
+
+    def end_excitation(self) -> None:
+        """Leave the speed where it is: the next command takes it back."""
 
     def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
         """Return the live values: the drive has no averages."""

@@ -137,7 +137,7 @@ def estimate_pushes(
     count = sum(len(push.w) for push in rows)
 
     def estimate(k: int, unit: str, systematic: float) -> Estimate:
-        return Estimate(float(full[k]), float(std[k]), systematic, unit, n=count, method=METHOD, dof=n - 1.0)
+        return Estimate(float(full[k]), float(std[k]), float(systematic), unit, n=count, method=METHOD, dof=n - 1.0)
 
     if not full[1] > 0.0:
         raise refuse("E_EXCITATION", f"the voltage over speed is {full[1]:.3g} Wb", stage=STAGE)

@@ -16,6 +16,9 @@ from pmsmtool.units import format_estimate, format_quantity
 COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
 """Stages of a full commissioning; one that is missing keeps the verdict open."""
 
+UNAVAILABLE = "not available"
+"""Status of a stage that the drive cannot give."""
+
 
 @dataclass(frozen=True, slots=True)
 class Figure:
@@ -107,7 +110,7 @@ def verdict_of(stages: Sequence[Mapping[str, Any]], complete: Sequence[str] = CO
         Stages that a green verdict needs.
     """
     latest = _latest(stages)
-    failed = [stage for stage in latest if stage["status"] != "pass"]
+    failed = [stage for stage in latest if stage["status"] not in ("pass", UNAVAILABLE)]
     done = {stage["name"] for stage in latest}
     missing = [name for name in complete if name not in done]
     if failed:
@@ -115,7 +118,26 @@ def verdict_of(stages: Sequence[Mapping[str, Any]], complete: Sequence[str] = CO
     if missing:
         return Verdict("open", "NOT COMPLETE", (f"not run yet: {', '.join(missing)}",))
     criteria = sum(len(stage.get("acceptance", ())) for stage in latest)
+    lacking = [stage for stage in latest if stage["status"] == UNAVAILABLE]
+    values = [value for stage in latest for value in stage.get("values", ())]
+    given = [str(value["name"]) for value in values if "source" in value and "std" not in value]
+    if lacking or given:
+        return _partial([stage for stage in latest if stage["status"] == "pass"], lacking, given, criteria)
     return Verdict("pass", "PASS", (f"{len(latest)} stages, {criteria} criteria, all met",))
+
+
+def _partial(
+    passed: list[Mapping[str, Any]], lacking: list[Mapping[str, Any]], given: list[str], criteria: int
+) -> Verdict:
+    """Return the verdict on a drive that cannot give everything: green for its tier, and what that leaves open."""
+    if not passed:
+        return Verdict("open", "NOTHING AVAILABLE", tuple(f"{s['name']}: not available: {s['note']}" for s in lacking))
+    names = ", ".join(str(stage["name"]) for stage in passed)
+    behaviour = "" if any(stage["name"] == "prove" for stage in passed) else "; its behaviour was not proven"
+    head = f"as far as this drive goes: {names}; {criteria} criteria, all met{behaviour}"
+    taken = (f"taken as given, not measured: {', '.join(given)}",) if given else ()
+    missing = (f"{stage['name']}: not available: {stage['note']}" for stage in lacking)
+    return Verdict("pass", "PASS FOR ITS TIER", (head, *taken, *missing))
 
 
 def _failure(stage: Mapping[str, Any]) -> str:

@@ -60,14 +60,16 @@ FEATURES: Mapping[str, str] = {
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
     "dc levels": "DC levels by current set-points: at running currents the inverter's error hides R",
     "vendor result": "the maker's identification in the drive map",
-    "line voltage": "the undriven machine's voltage, or a recorder of voltages",
+    "line voltage": "the DC link (0x6079), or the machine's voltage in the drive map",
+    "current": "its current (0x6078)",
 }
 """What methods need, as a person reads it."""
 
 _SAFE = ("heartbeat", "abort option", "quick stop", "limits")
-_INJECT = (*_SAFE, "set-points", "excitation", "averages", "recorder")
+_INJECT = (*_SAFE, "set-points", "excitation", "recorder")
 _RECORD = (*_SAFE, "recorder", "torque mode")
 _STANDARD = (*_SAFE, "position", "commutation angle")
+_PUSH = (*_SAFE, "torque mode", "position", "current")
 
 NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
     "R": {
@@ -80,7 +82,7 @@ NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
     "psi": {
         Method.INJECT: _INJECT,
         Method.RECORDER: _RECORD,
-        Method.STANDARD: ("line voltage",),
+        Method.STANDARD: (*_PUSH, "line voltage"),
         Method.VENDOR: ("vendor result",),
         Method.MANUAL: (),
     },
@@ -93,7 +95,12 @@ NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
         Method.VENDOR: ("vendor result",),
         Method.MANUAL: (),
     },
-    "mechanics": {Method.INJECT: _INJECT, Method.MANUAL: ()},
+    "mechanics": {
+        Method.INJECT: _INJECT,
+        Method.RECORDER: (*_RECORD, "position"),
+        Method.STANDARD: _PUSH,
+        Method.MANUAL: (),
+    },
     "frf": {Method.INJECT: _INJECT},
 }
 """Methods of each quantity and what they need."""
@@ -101,7 +108,10 @@ NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
 NOTES: Mapping[tuple[str, Method], str] = {
     ("L", Method.RECORDER): "L_q at running currents only",
     ("psi", Method.RECORDER): "the drive must commutate already",
+    ("psi", Method.STANDARD): "where the voltage limit is within the speed limit, or the drive shows its voltage",
     ("mechanics", Method.INJECT): "inertia, roughly",
+    ("mechanics", Method.RECORDER): "J/psi and tau_c/psi",
+    ("mechanics", Method.STANDARD): "J/psi and tau_c/psi; the pole pairs must be known",
 }
 
 
@@ -243,8 +253,8 @@ class Capabilities:
 
 _MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD)
 _TIERS = (
-    (Tier.FULL, _INJECT),
-    (Tier.INJECT, (*_SAFE, "set-points", "excitation", "recorder")),
+    (Tier.FULL, (*_INJECT, "averages")),
+    (Tier.INJECT, _INJECT),
     (Tier.RECORDER, _RECORD),
     (Tier.STANDARD, (*_SAFE, "torque mode")),
 )
@@ -275,6 +285,8 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
         "quick stop": node.has(0x605A, 0),
         "limits": all(node.has(index, 0) for index in (0x6073, 0x6075, 0x6080)),
         "position": node.has(0x6064, 0) and node.has(0x608F, 1),
+        "current": node.has(0x6078, 0),
+        "line voltage": node.has(0x6079, 0) or {"u_d_v", "u_q_v"} <= set(drive_map.signals),
         "torque mode": drive_map.capabilities.torque_mode
         and bool(modes & (_bit(Mode.PROFILE_TORQUE) | _bit(Mode.CYCLIC_TORQUE)))
         and node.has(0x6071, 0),
@@ -308,7 +320,7 @@ def _modes(node: DriveNode) -> int:
 
 def reference_capabilities(identity: Identity) -> Capabilities:
     """Return what the reference drive with everything gives, for tests and documentation."""
-    every = frozenset(_INJECT) | frozenset(_RECORD) | {"position"}
+    every = frozenset(_INJECT) | frozenset(_RECORD) | frozenset(_PUSH) | {"averages", "line voltage"}
     return Capabilities(identity, reference_map(), True, every)
 
 

@@ -34,12 +34,14 @@ from pmsmtool.errors import (
     VerifyMismatch,
 )
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.workflow.capabilities import Capabilities, Tier
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
 from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplate_of
 from pmsmtool.workflow.prove.stage import ProofRequest, not_proven, prove_stage
 from pmsmtool.workflow.report_page import report_page
 from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, Status, new_record
+from pmsmtool.workflow.tier_stages import TierStages
 
 FROM_TABLE = TuneRequest(field_weakening="lookup")
 """The chain's default design: the drive takes its current references from the table the chain makes and checks."""
@@ -90,7 +92,7 @@ def due_stages(run: RunDirectory, record: RunRecord) -> tuple[str, ...]:
     for k, name in enumerate(STAGES):
         places = [place for place, stage in enumerate(record.stages) if stage.name == name]
         latest = record.stages[places[-1]] if places else None
-        fresh = latest is not None and latest.status == "pass" and places[-1] > position
+        fresh = latest is not None and latest.status in SETTLED and places[-1] > position
         if latest is None or not fresh or not all((run.path / file).is_file() for file in latest.files):
             _check_unchanged(run, expected, OUTPUTS.get(name, ()))
             return STAGES[k:]
@@ -100,6 +102,8 @@ def due_stages(run: RunDirectory, record: RunRecord) -> tuple[str, ...]:
     return ()
 
 
+SETTLED = ("pass", "not available")
+"""How a stage may have ended that is not run again."""
 OUTPUTS: Mapping[str, tuple[str, ...]] = {
     "identify": ("machine.toml",),
     "tune": ("design.toml",),
@@ -137,6 +141,9 @@ class Commissioning:
         What is known of the machine; the drive's own ratings and set when not given.
     identify, tune, lookup, margins, prove
         What is asked.
+    capabilities : Capabilities, optional
+        What a drive below the full tier has: its stages run as far as that goes, and those that cannot run are
+        recorded as not available. Without, everything is expected, and the chain ends where something is missing.
     """
 
     run: RunDirectory
@@ -149,6 +156,7 @@ class Commissioning:
     lookup: LookupRequest = field(default_factory=LookupRequest)
     margins: MarginRequest = field(default_factory=MarginRequest)
     prove: ProofRequest | None = None
+    capabilities: Capabilities | None = None
 
     def carry_out(self) -> None:
         """Run what is due.
@@ -169,10 +177,22 @@ class Commissioning:
                     self._carry_out(name, number)
                 else:
                     self.progress.skip(name, number, len(STAGES))
+            self._refuse_nothing()
         except KeyboardInterrupt:
             raise Interrupted("the machine is off") from None
         finally:
             self._make_sure()
+
+    def _refuse_nothing(self) -> None:
+        """Refuse a run of which nothing was available: it is not green."""
+        record = self.run.read()
+        stages = [stage for name in STAGES if (stage := record.stage(name)) is not None]
+        if not any(stage.status == "pass" for stage in stages):
+            raise NotAvailable(
+                "\n  - ".join(["nothing of the chain can be done", *(f"{s.name}: {s.note}" for s in stages)]),
+                where=f"node {self.drive.identity.node}",
+                hint="`pmsmtool caps` lists what this drive can give; a machine file allows a design",
+            )
 
     def _check_drive(self, record: RunRecord) -> None:
         found = drive_facts(self.drive.identity)
@@ -194,6 +214,9 @@ class Commissioning:
         try:
             stage = replace(self._steps()[name](), seconds=clock.now() - start)
         except BaseException as error:
+            if isinstance(error, NotAvailable) and self.tier is not None:
+                self._not_available(name, number, error, clock.now() - start)
+                return
             failed = Stage(name, _status(error), clock.now() - start, note=_text(error))
             # The error that ended the stage outranks a record that cannot be written.
             with contextlib.suppress(ConfigError):
@@ -205,8 +228,31 @@ class Commissioning:
         if stage.status != "pass":
             raise _not_good(stage, self.run)
 
+    def _not_available(self, name: str, number: int, error: NotAvailable, seconds: float) -> None:
+        stage = Stage(name, "not available", seconds, note=error.what)
+        self.run.add(stage)
+        self.progress.end(stage, number, len(STAGES))
+
+    @property
+    def tier(self) -> TierStages | None:
+        """The stages of a drive below the full tier, None for one that has everything."""
+        if self.capabilities is None or self.capabilities.tier is Tier.FULL:
+            return None
+        return TierStages(self.run, self.drive, self.capabilities, self.nameplate)
+
     def _steps(self) -> dict[str, Callable[[], Stage]]:
-        say = self.progress.say
+        say, tier, person = self.progress.say, self.tier, self.person
+        if tier is not None:
+            asked = self.prove or proof_within(self.identify)
+            return {
+                "identify": lambda: tier.identify(self.identify, person.allow_motion, say),
+                "tune": lambda: tier.tune(self.tune),
+                "lut": lambda: tier.lut(self.lookup),
+                "margins": lambda: tier.margins(self.margins),
+                "flash": lambda: tier.flash(person.allow_writing, say),
+                "verify": tier.verify,
+                "prove": lambda: tier.prove(asked, person.allow_motion, say),
+            }
         return {
             "identify": self._identify,
             "tune": lambda: tune_stage(self.run, self.tune),
@@ -271,12 +317,17 @@ def drive_facts(identity: Identity) -> dict[str, Any]:
 
 
 def begin_run(
-    drive: CanopenDrive, runs: Path, *, command: Sequence[str] = ("commission",), bus: Mapping[str, Any] | None = None
+    drive: CanopenDrive,
+    runs: Path,
+    *,
+    command: Sequence[str] = ("commission",),
+    bus: Mapping[str, Any] | None = None,
+    tier: str = "",
 ) -> RunDirectory:
     """Make the run directory of a drive below ``runs``; raises ``ConfigError`` when it cannot be written."""
     record = new_record(
         command,
-        drive=drive_facts(drive.identity),
+        drive={**drive_facts(drive.identity), **({"tier": tier, "map": drive.node.map.name} if tier else {})},
         bus={**(bus or {}), "node": drive.identity.node},
         versions={"pmsmtool": __version__, **{name: version(name) for name in ("numpy", "scipy", "python-can")}},
     )
@@ -313,6 +364,7 @@ def commission(
     nameplate: MachineFile | None = None,
     identify: IdentifyRequest | None = None,
     tune: TuneRequest | None = None,
+    capabilities: Capabilities | None = None,
 ) -> RunDirectory:
     """Take a drive from unknown machine to proven parameters, in a new run directory with its report.
 
@@ -330,6 +382,8 @@ def commission(
         What is known of the machine; the drive's own ratings and set when not given.
     identify, tune : optional
         What is asked; the defaults of their classes.
+    capabilities : Capabilities, optional
+        Of a drive below the full tier (``workflow.capabilities.examine``, ``workflow.tier_stages.open_tier_drive``).
 
     Raises
     ------
@@ -338,8 +392,9 @@ def commission(
     """
     run = begin_run(drive, runs)
     chain = Commissioning(
-        run, drive, person, progress or Silent(), nameplate, identify or IdentifyRequest(), tune or FROM_TABLE
-    )
+        run, drive, person, progress or Silent(), nameplate, identify or IdentifyRequest(), tune or FROM_TABLE,
+        capabilities=capabilities,
+    )  # fmt: skip
     try:
         chain.carry_out()
     except BaseException:

@@ -24,7 +24,7 @@ from pmsmtool.errors import ConfigError
 SCHEMA = "pmsmtool.run/1"
 RECORD = "run.json"
 
-Status = Literal["pass", "fail", "refused", "interrupted"]
+Status = Literal["pass", "fail", "refused", "interrupted", "not available"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class Stage:
     name : str
         ``identify``, ``tune``, ``lut``, ``margins``, ``flash``, ``verify`` ...
     status : Status
-        ``pass`` only when every acceptance holds.
+        ``pass`` only when every acceptance holds; ``not available``: the drive lacks what ``note`` names.
     seconds : float
         Time the stage took on the bus clock (s).
     values : sequence of mapping

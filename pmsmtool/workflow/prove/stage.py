@@ -29,6 +29,7 @@ from pmsmtool.errors import (
     ConfigError,
     DriveFault,
     LimitExceeded,
+    NotAvailable,
     PmsmtoolError,
     SdoAbort,
     VerifyMismatch,
@@ -62,6 +63,8 @@ class ProofRequest:
         What hangs on the shaft; it must be what the design was made for.
     runs, seed : int
         Machines drawn for the prediction, and the seed of the draw.
+    experiments : tuple of str
+        Names of the experiments the drive can show; empty: all.
     """
 
     i_max_apk: float | None = None
@@ -71,6 +74,7 @@ class ProofRequest:
     brake: Brake = "none"
     runs: int = RUNS
     seed: int = 0
+    experiments: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -128,7 +132,7 @@ def prove_stage(
     envelope = envelope_of(design, request)
     envelope.refuse_gravity()
     conditions = conditions_of(drive, envelope)
-    plan = plan_proof(design, conditions)
+    plan = _shown(plan_proof(design, conditions), request.experiments)
     envelope = envelope_of(design, request, plan)
     allow_motion([*envelope.lines(), *(e.text for e in plan.experiments), "nothing is stored in the drive"])
     say(f"predicting {len(plan.experiments)} responses on {request.runs} machines")
@@ -152,6 +156,23 @@ def prove_stage(
             raise
         event = error.what  # the guard has stopped the machine and restored the drive
     return _stage(plan, prediction, record, event, digest, folder)
+
+
+def _shown(plan: ProofPlan, names: tuple[str, ...]) -> ProofPlan:
+    """Return the plan without the experiments that the drive cannot show.
+
+    Raises
+    ------
+    NotAvailable
+        Nothing is left.
+    """
+    if not names:
+        return plan
+    left = tuple(f"{e.text}: the drive has no excitation" for e in plan.experiments if e.name not in names)
+    kept = tuple(e for e in plan.experiments if e.name in names)
+    if not kept:
+        raise NotAvailable(f"needs one of {', '.join(names)}, and the design has none", hint="see `pmsmtool caps`")
+    return ProofPlan(kept, (*plan.left_out, *left))
 
 
 def refuse_other_set(node: DriveNode, design: Design) -> None:

@@ -1,0 +1,111 @@
+"""Flux linkage from voltage over speed where nothing records at loop rate: a coasting machine, or its voltage limit.
+
+Undriven (identification reference, 3.4 no. 8): without current the voltage is the machine's own,
+
+    u_q = w psi_q + c_q sgn(w),   u_d = -w psi_d + c_d sgn(w),   psi = hypot(psi_q, psi_d);
+
+the intercepts take what the inverter adds at zero current. At the voltage limit: a machine that a torque no longer
+accelerates has w psi = utilisation U_dc; what a maker adds to it or keeps back is a doubt of :data:`LIMIT_DOUBT`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.trace import Trace
+
+BLOCKS = 12
+UNDRIVEN_FLOOR = 0.01
+"""Relative 95 % model error of the undriven voltage: polled speed and voltage are not of the same instant."""
+LIMIT_DOUBT = 0.05
+"""Relative 95 % doubt of the largest voltage: overmodulation to the hexagon adds up to 5 %, dead time takes 3 %."""
+HELD_SHARE = 0.6
+"""Current, of the one asked for, above which it is not the voltage that holds the speed."""
+STEADY = 0.02
+"""Largest relative change of the speed over the record of the top."""
+
+
+def flux_by_undriven_voltage(
+    coasts: Sequence[Trace], *, pole_pairs: int, tolerance: SensorTolerance | None = None
+) -> Estimate:
+    """Return the flux linkage (Wb) from ``theta_M_rad``, ``u_d_v`` and ``u_q_v`` of a coasting machine.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``: too few rows, or no speed in one of the directions.
+    """
+    rows = [row for coast in coasts for row in _means(coast, pole_pairs)]
+    w, u_d, u_q = (np.array([row[k] for row in rows]) for k in range(3))
+    if len(rows) < BLOCKS or not (np.any(w > 0.0) and np.any(w < 0.0)):
+        raise refuse("E_EXCITATION", "the machine did not coast both ways", stage="undriven voltage")
+    matrix = np.column_stack([w, np.sign(w)])
+    inverse = np.linalg.inv(matrix.T @ matrix)
+    parts, variance = [], 0.0
+    for u in (u_q, u_d):
+        solution = inverse @ matrix.T @ u
+        residual = u - matrix @ solution
+        parts.append(float(solution[0]))
+        variance += float(residual @ residual) / (len(rows) - 2) * float(inverse[0, 0])
+    psi = math.hypot(*parts)
+    doubt = math.hypot((tolerance or SensorTolerance()).flux, UNDRIVEN_FLOOR)
+    return Estimate(
+        psi, math.sqrt(variance), doubt * psi, "Wb", n=len(rows), method="undriven voltage over speed",
+        dof=len(rows) - 2.0,
+    )  # fmt: skip
+
+
+def _means(coast: Trace, pole_pairs: int) -> list[tuple[float, float, float]]:
+    """Return electrical speed and voltages at the blocks of a coast."""
+    size = len(coast) // BLOCKS
+    rows = []
+    for k in range(BLOCKS if size >= 3 else 0):
+        part = slice(k * size, (k + 1) * size)
+        t, theta = coast.t_s[part], coast["theta_M_rad"][part]
+        w = pole_pairs * float(np.polyfit(t - t[0], theta, 1)[0])
+        rows.append((w, float(coast["u_d_v"][part].mean()), float(coast["u_q_v"][part].mean())))
+    return rows
+
+
+def flux_by_voltage_limit(
+    top: Trace, *, pole_pairs: int, utilisation: float, tolerance: SensorTolerance | None = None
+) -> Estimate:
+    """Return the flux linkage (Wb) from the speed at which the voltage ends.
+
+    Parameters
+    ----------
+    top : Trace
+        ``theta_M_rad``, ``i_q_a`` and ``U_dc_v``; ``i_command_a`` in its meta.
+    utilisation : float
+        Largest phase voltage amplitude over the DC link.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_NOT_SETTLED``: the speed still changes; ``E_EXCITATION``: the torque asked for is friction's.
+    """
+    t = top.t_s - top.t_s[0]
+    half = len(top) // 2
+    first, second = (
+        abs(float(np.polyfit(t[part], top["theta_M_rad"][part], 1)[0])) for part in (slice(0, half), slice(half, None))
+    )
+    w_M = 0.5 * (first + second)
+    if not w_M > 0.0 or abs(second - first) > STEADY * w_M:
+        raise refuse("E_NOT_SETTLED", "the speed at the voltage limit is not steady", stage="voltage limit")
+    share = abs(float(top["i_q_a"].mean()) / float(top.meta["i_command_a"]))
+    if share > HELD_SHARE:
+        raise refuse(
+            "E_EXCITATION", f"{100.0 * share:.0f} % of the current still flows: the speed is not the voltage's limit",
+            stage="voltage limit", likely="friction or a load holds it",
+        )  # fmt: skip
+    psi = utilisation * float(top["U_dc_v"].mean()) / (pole_pairs * w_M)
+    doubt = math.hypot((tolerance or SensorTolerance()).flux, LIMIT_DOUBT)
+    return Estimate(
+        psi, psi * abs(second - first) / w_M, doubt * psi, "Wb", n=len(top), method="speed at the voltage limit"
+    )

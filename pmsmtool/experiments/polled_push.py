@@ -1,0 +1,175 @@
+"""Torque pushes on a drive that only shows position and current at up to 1 kHz, and the speed its voltage ends at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pmsmtool.drive.port import Drive
+from pmsmtool.errors import IdentificationError
+from pmsmtool.experiments.signals import readable
+from pmsmtool.trace import Trace
+
+SIGNALS = ("theta_m_rad", "i_q_a")
+FIRST_SHARE = 0.08
+FIRST_S = 0.02
+ANSWER_RAD = 0.02
+"""Angle that counts as an answer of the shaft: an encoder of 1024 increments has three of them."""
+MOST_TRIES = 10
+LEAST_RAMP_S = 0.04
+CHECK_S = 0.012
+"""Speed is looked at this often while the machine runs up to its voltage."""
+RUNNING = 0.2
+"""Speed, of the largest one, above which it is looked for."""
+PATIENCE = 3.0
+"""Longest run-up, over that at the current of the top."""
+STALLED_SHARE = 0.25
+"""Acceleration, of the first one at the same current, at which the voltage is taken to be the limit."""
+RUN_SHARE = 0.5
+"""Current of the run-up, of the test current."""
+HOLD_SHARE = 0.08
+"""Current asked for at the top, of the test current: more than friction, little enough to weaken no field."""
+HOLD_S = 0.4
+COAST_S = 0.3
+STOP_SLICES = 160
+
+
+@dataclass(frozen=True, slots=True)
+class PolledPushPlan:
+    """How the shaft is pushed.
+
+    Attributes
+    ----------
+    i_test_a : float
+        Largest torque current (A peak).
+    omega_m_rad_s : float
+        Mechanical speed the pushes go to, both ways (rad/s).
+    omega_top_rad_s : float
+        Speed no run-up goes beyond (rad/s).
+    shares : tuple of float
+        Torque currents of the pushes, of the largest.
+    """
+
+    i_test_a: float
+    omega_m_rad_s: float
+    omega_top_rad_s: float
+    shares: tuple[float, ...] = (0.3, 0.5, 0.7)
+
+
+def push_both_ways(drive: Drive, plan: PolledPushPlan, keep: Callable[[str, Trace], None]) -> float:
+    """Swing the shaft and keep every push as ``torque_push_<k>``; returns the acceleration per ampere (rad/s2/A).
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``: the shaft does not answer.
+    """
+    rate = _rate(drive, plan)
+    count = 0
+    for share in plan.shares:
+        current = share * plan.i_test_a
+        ramp_s = max(LEAST_RAMP_S, plan.omega_m_rad_s / (rate * current))
+        for sign, ramps in ((1.0, 1.0), (-1.0, 2.0), (1.0, 2.0), (-1.0, 1.0)):
+            keep(f"torque_push_{count}", _polled(drive, sign * current, ramps * ramp_s))
+            count += 1
+    stop_shaft(drive, 0.3 * plan.i_test_a, rate)
+    return rate
+
+
+def run_to_voltage(drive: Drive, plan: PolledPushPlan, rate: float) -> Trace | None:
+    """Run up until the voltage takes the current away and return a record of the speed there.
+
+    Returns
+    -------
+    Trace or None
+        ``theta_M_rad``, ``i_q_a`` and ``U_dc_v``; None when the top speed came first. The shaft is nearly at rest.
+    """
+    hold = HOLD_SHARE * plan.i_test_a
+    top, found = plan.omega_top_rad_s, None
+    before, speed, spent = drive.live("theta_m_rad"), 0.0, 0.0
+    while spent < PATIENCE * top / (rate * hold):
+        # what is left to the top is approached by halves, so that a weak voltage is seen before it
+        current = min(RUN_SHARE * plan.i_test_a, max(hold, 0.5 * (top - speed) / (rate * CHECK_S)))
+        drive.command_current(0.0, current)
+        drive.wait(CHECK_S)
+        spent += CHECK_S
+        angle = drive.live("theta_m_rad")
+        now, last = abs(angle - before) / CHECK_S, speed
+        before, speed = angle, now
+        if now > top:
+            break
+        if last > RUNNING * top and now - last < STALLED_SHARE * rate * current * CHECK_S:
+            drive.command_current(0.0, hold)
+            drive.wait(HOLD_S)
+            found = _recorded_top(drive, hold)
+            break
+    stop_shaft(drive, 0.3 * plan.i_test_a, rate)
+    return found
+
+
+def coast_both_ways(
+    drive: Drive, plan: PolledPushPlan, rate: float, signals: tuple[str, ...], keep: Callable[[str, Trace], None]
+) -> None:
+    """Let the shaft coast without torque from the plan's speed, both ways, and keep each as ``coast_<k>``."""
+    current = RUN_SHARE * plan.i_test_a
+    for number, sign in enumerate((1.0, -1.0)):
+        drive.command_current(0.0, sign * current)
+        drive.wait(plan.omega_m_rad_s / (rate * current))
+        drive.command_current(0.0, 0.0)
+        drive.wait(CHECK_S)
+        keep(f"coast_{number}", readable(drive.record(signals, round(COAST_S / drive.period_s))))
+        stop_shaft(drive, 0.3 * plan.i_test_a, rate)
+
+
+def _recorded_top(drive: Drive, command_a: float) -> Trace:
+    trace = drive.record((*SIGNALS, "U_dc_v"), round(HOLD_S / drive.period_s))
+    return readable(trace, i_command_a=command_a)
+
+
+def _polled(drive: Drive, i_q_a: float, seconds: float) -> Trace:
+    drive.command_current(0.0, i_q_a)
+    return readable(drive.record(SIGNALS, max(2, round(seconds / drive.period_s))), i_command_a=i_q_a)
+
+
+def _rate(drive: Drive, plan: PolledPushPlan) -> float:
+    """Return the acceleration per ampere (rad/s2/A) from short pushes that grow until the shaft answers."""
+    current, seconds = FIRST_SHARE * plan.i_test_a, FIRST_S
+    for _ in range(MOST_TRIES):
+        before = drive.live("theta_m_rad")
+        drive.command_current(0.0, current)
+        drive.wait(seconds)
+        way = abs(drive.live("theta_m_rad") - before)
+        drive.command_current(0.0, -current)
+        drive.wait(seconds)
+        drive.command_current(0.0, 0.0)
+        if way > ANSWER_RAD:
+            return 2.0 * way / (seconds * seconds * current)
+        if current < 0.5 * plan.i_test_a:
+            current *= 2.0
+        else:
+            seconds *= 1.6
+    raise IdentificationError(
+        "E_EXCITATION",
+        "the shaft does not answer a torque push",
+        where="torque push",
+        likely="a locked shaft or a closed brake, or a drive whose commutation is not set up",
+        hint="free the shaft; run the maker's own set-up first",
+    )
+
+
+def stop_shaft(drive: Drive, current: float, rate: float) -> None:
+    """Bring the shaft to about rest against its own sense of turning."""
+    step_s = CHECK_S / 5.0
+    before = drive.live("theta_m_rad")
+    drive.wait(step_s)
+    for _ in range(STOP_SLICES):
+        angle = drive.live("theta_m_rad")
+        speed = (angle - before) / step_s
+        before = angle
+        push = min(current, abs(speed) / (rate * step_s))
+        if push < 0.1 * current:
+            break
+        drive.command_current(0.0, -math.copysign(push, speed))
+        drive.wait(step_s)
+    drive.command_current(0.0, 0.0)

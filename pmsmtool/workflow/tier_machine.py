@@ -1,0 +1,164 @@
+"""The machine file of a tier that measures a part of it: what was measured, and the rest as it was given, by source.
+
+Nothing is made up: a value that was neither measured nor given is named as lacking, and there is no machine file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.machine_keys import MEASURABLE
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.workflow.run_directory import Acceptance
+
+NEEDED = ("pole_pairs", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
+"""Keys of a machine that a design stands on."""
+ALSO = ("J_kgm2", "tau_c_nm")
+"""Keys it uses where they are known."""
+UNKNOWN_TEMPERATURE_K = 20.0
+"""A magnet whose temperature nothing tells is taken within this of the reference temperature (95 %)."""
+AGREEMENT = 0.15
+"""A flux linkage further than this from the given one, beyond its own interval, is another machine's."""
+PER_PSI = {"J_per_psi": "J_kgm2", "tau_c_per_psi": "tau_c_nm"}
+"""Ratios to the flux linkage, and what they are with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class TierMachine:
+    """What is known of a machine after a tier's experiments.
+
+    Attributes
+    ----------
+    machine : MachineFile or None
+        None when values are lacking.
+    measured, given : tuple of str
+        Keys by where their values come from.
+    lacking : tuple of str
+        Keys that nothing tells.
+    criteria : tuple of Acceptance
+        Whether what was measured agrees with what was given.
+    notes : tuple of str
+        What was done to the values.
+    """
+
+    machine: MachineFile | None
+    measured: tuple[str, ...]
+    given: tuple[str, ...]
+    lacking: tuple[str, ...]
+    criteria: tuple[Acceptance, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def given_values(self, source: str) -> list[Mapping[str, Any]]:
+        """Return what was given as a stage records it: with its source, without an interval of ours."""
+        if self.machine is None:
+            return []
+        table = self.machine.machine
+        return [
+            {"name": name, "value": getattr(table, name), "unit": MEASURABLE[name].unit, "source": source}
+            for name in self.given
+        ]
+
+
+def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], source: str) -> TierMachine:
+    """Put measured values into a machine that is known otherwise.
+
+    Parameters
+    ----------
+    known : MachineFile, optional
+        Data sheet, or what the maker's set-up left in the drive.
+    found : mapping of str to Estimate
+        Measured: keys of a machine file, ``direction``, ``frame_offset_rad`` and the ratios of :data:`PER_PSI`.
+    source : str
+        Where ``known`` comes from.
+    """
+    if known is None:
+        told = {"psi_f_wb", "pole_pairs", "R_s_ohm"} & set(found)
+        return TierMachine(None, tuple(sorted(told)), (), tuple(name for name in NEEDED if name not in told))
+    values, notes = _at_reference(known, found)
+    psi = values["psi_f_wb"].value if "psi_f_wb" in values else known.machine.psi_f_wb
+    for ratio, key in PER_PSI.items():
+        if ratio in found:
+            values[key] = _times(found[ratio], psi, values.get("psi_f_wb"), MEASURABLE[key].unit)
+    fields = {name for name in values if hasattr(known.machine, name)}
+    table = {name: values[name].value for name in fields}
+    if "pole_pairs" in table:
+        table["pole_pairs"] = round(table["pole_pairs"])
+    encoder, more = _encoder(known, found)
+    given = tuple(name for name in (*NEEDED, *ALSO) if name not in fields and getattr(known.machine, name) is not None)
+    measured = tuple(name for name in MEASURABLE if name in values)
+    kept = {name: values[name] for name in measured}
+    machine = replace(
+        known,
+        machine=replace(known.machine, **table),  # type: ignore[arg-type]
+        encoder=encoder,
+        std={**known.std, **{name: e.std for name, e in kept.items()}},
+        systematic={**known.systematic, **{name: e.systematic for name, e in kept.items()}},
+        estimates={**known.estimates, **kept},
+        provenance={"source": f"measured: {', '.join(measured) or 'nothing'}; {source}: {', '.join(given)}"},
+        simulation={},
+    )
+    return TierMachine(machine, measured, given, (), _agreement(known, values), (*notes, *more))
+
+
+def _at_reference(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[dict[str, Estimate], tuple[str, ...]]:
+    """Return the measured values with the flux linkage and the resistance at the reference temperature."""
+    values = {name: estimate for name, estimate in found.items() if name in MEASURABLE}
+    notes = []
+    for name, alpha in (("psi_f_wb", known.machine.alpha_psi_per_k), ("R_s_ohm", known.machine.alpha_R_per_k)):
+        if name not in values:
+            continue
+        estimate = values[name]
+        if math.isfinite(estimate.T_c):
+            factor = 1.0 / (1.0 + alpha * (estimate.T_c - known.machine.T_ref_c))
+            values[name] = replace(
+                estimate, value=factor * estimate.value, std=factor * estimate.std,
+                systematic=factor * estimate.systematic,
+            )  # fmt: skip
+        else:
+            doubt = abs(alpha) * UNKNOWN_TEMPERATURE_K * estimate.value
+            values[name] = replace(estimate, systematic=math.hypot(estimate.systematic, doubt))
+            notes.append(
+                f"{name}: no sensor tells its temperature; {known.machine.T_ref_c:g} +-{UNKNOWN_TEMPERATURE_K:g} degC "
+                "is assumed"
+            )
+    return values, tuple(notes)
+
+
+def _times(ratio: Estimate, psi: float, of: Estimate | None, unit: str) -> Estimate:
+    doubt = 0.0 if of is None else ratio.value * total_half_width(of)
+    return replace(
+        ratio, value=ratio.value * psi, std=ratio.std * psi, systematic=math.hypot(ratio.systematic * psi, doubt),
+        unit=unit, method=f"{ratio.method}, times the flux linkage",
+    )  # fmt: skip
+
+
+def _encoder(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[Any, tuple[str, ...]]:
+    """Return the encoder: as measured, or corrected where the drive's frame is seen to be off."""
+    if "offset_rad" in found:
+        direction = round(found["direction"].value) if "direction" in found else known.encoder.direction
+        return replace(known.encoder, offset_rad=found["offset_rad"].value, direction=direction), ()
+    frame = found.get("frame_offset_rad")
+    if frame is not None and abs(frame.value) > total_half_width(frame):
+        offset = math.remainder(known.encoder.offset_rad + frame.value, 2.0 * math.pi)
+        text = f"encoder offset corrected: the frame is {math.degrees(frame.value):.2g} deg ahead of the d axis"
+        return replace(known.encoder, offset_rad=offset), (text,)
+    return known.encoder, ()
+
+
+def _agreement(known: MachineFile, values: Mapping[str, Estimate]) -> tuple[Acceptance, ...]:
+    lines = []
+    if "pole_pairs" in values:
+        measured, given = round(values["pole_pairs"].value), known.machine.pole_pairs
+        lines.append(Acceptance("pole pairs are those that were given", str(measured), str(given), measured == given))
+    if "psi_f_wb" in values and known.machine.psi_f_wb > 0.0:
+        estimate, given_psi = values["psi_f_wb"], known.machine.psi_f_wb
+        off = abs(estimate.value / given_psi - 1.0)
+        limit = AGREEMENT + total_half_width(estimate) / estimate.value
+        what = "flux linkage is the given one, as far as a data sheet goes"
+        lines.append(Acceptance(what, f"{100.0 * off:.2g} % off", f"<= {100.0 * limit:.2g} %", off <= limit))
+    return tuple(lines)

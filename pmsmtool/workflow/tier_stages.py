@@ -1,0 +1,262 @@
+"""The chain's stages on a drive that gives less than all: each runs as far as tier and map go, or says what it needs.
+
+A stage that cannot run raises ``NotAvailable``; the chain records it as not available and goes on. What runs is judged
+by the same criteria as on the reference drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pmsmtool.bus.connection import Connection
+from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design
+from pmsmtool.design.lookup_design import LookupRequest
+from pmsmtool.design.margins import MarginRequest
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.recorded_means import RecordingDrive
+from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
+from pmsmtool.drive.tier_drives import ParameterDrive
+from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.firmware.drive_map import DriveMap
+from pmsmtool.flash.journal import JournalFolder
+from pmsmtool.flash.map_gate import check_map
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.workflow.capabilities import Capabilities, Method, Tier
+from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
+from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
+from pmsmtool.workflow.identify import MACHINE, NAMEPLATE, IdentifyRequest, identify_stage, nameplate_of
+from pmsmtool.workflow.measure import QUANTITIES
+from pmsmtool.workflow.prove.stage import ProofRequest, prove_stage
+from pmsmtool.workflow.run_directory import RunDirectory, Stage
+from pmsmtool.workflow.tier_identify import can_measure, tier_stage
+from pmsmtool.workflow.tier_machine import NEEDED, tier_machine
+
+DATA_SHEET = "as given"
+SET_UP = "the drive's own set, from its maker's set-up"
+ONE_PAIR = {
+    "current.K_p_q_v_per_a": "current.K_p_d_v_per_a",
+    "current.K_i_q_v_per_as": "current.K_i_d_v_per_as",
+}
+"""Gains of q that serve both axes on a drive without an object for those of d."""
+RECORDER_STEPS = ("speed_step",)
+"""Experiments of a proof that need no excitation: a speed reference while the drive records."""
+PREDICTED = ("speed.K_p_nms_per_rad", "speed.filter_hz")
+"""What a predicted speed step stands on besides the gains of the current loops."""
+Allow = Callable[[Sequence[str]], None]
+Say = Callable[[str], None]
+
+
+def open_tier_drive(connection: Connection, node: int, found: Capabilities) -> CanopenDrive:
+    """Return the port that fits what a drive has.
+
+    Raises
+    ------
+    NotAvailable
+        It lacks what even its tier needs.
+    """
+    kinds: dict[Tier, type[CanopenDrive]] = {
+        Tier.FULL: CanopenDrive,
+        Tier.INJECT: RecordingDrive,
+        Tier.RECORDER: RecorderDrive,
+        Tier.STANDARD: StandardDrive,
+    }
+    return kinds.get(found.tier, ParameterDrive)(connection, node, drive_map=found.drive_map)
+
+
+@dataclass(frozen=True, slots=True)
+class TierStages:
+    """The stages of one run on one drive below the full tier.
+
+    Parameters
+    ----------
+    run : RunDirectory
+        Where everything goes.
+    drive : CanopenDrive
+        As :func:`open_tier_drive` gives it.
+    found : Capabilities
+        What the drive has.
+    nameplate : MachineFile or None
+        What is known of the machine.
+    """
+
+    run: RunDirectory
+    drive: CanopenDrive
+    found: Capabilities
+    nameplate: MachineFile | None
+
+    def plan_lines(self) -> list[str]:
+        """Return what the chain will do, one line per stage, before anything moves."""
+        drive_map, tier = self.found.drive_map, self.found.tier
+        known = self._known()
+        lines = [f"tier {tier}, map {drive_map.name}: {len(drive_map.cells)} parameters"]
+        lines.append("identify: " + ("; ".join(self._measurable()) or f"not available: {self._nothing()}"))
+        rest = "what is measured" if known is None else f"what is measured, the rest {known[1]}"
+        design = f"on {rest}" if self._complete(known) else f"not available: {_machine_needed(NEEDED)}"
+        lines.append(f"tune, lut, margins: {design}")
+        flash = self._no_writing()
+        lines.append("flash, verify: " + (f"not available: {flash}" if flash else "what the map has an object for"))
+        proof = self._no_proof()
+        lines.append("prove: " + (f"not available: {proof}" if proof else self._provable()))
+        return lines
+
+    # ---- the stages -----------------------------------------------------------------------------
+
+    def identify(self, request: IdentifyRequest, allow: Allow, say: Say) -> Stage:
+        """Measure what the tier can; the machine file is completed by what was given.
+
+        Raises
+        ------
+        NotAvailable
+            Nothing can be measured; where a machine file was given, it stands in the run all the same.
+        PmsmtoolError
+            As the experiments end.
+        """
+        known = self._known()
+        if self.found.tier is Tier.INJECT:
+            return self._by_injection(request, allow, say)
+        if known is not None:
+            self.run.save(NAMEPLATE, dump_machine_file(known[0]))
+        reason = self._nothing()
+        if not reason and request.shaft == "locked":
+            reason = "needs a rotor that may turn, and the shaft is locked"
+        if not reason:
+            asked = replace(request, quantities=tuple(self._quantities()))
+            return tier_stage(self.run, self.drive, self.found, asked, allow, say, known=known)
+        if known is not None:
+            made = tier_machine(known[0], {}, known[1])
+            assert made.machine is not None
+            self.run.save(MACHINE, dump_machine_file(made.machine))
+        raise NotAvailable(reason, where=f"node {self.found.identity.node}")
+
+    def tune(self, request: TuneRequest) -> Stage:
+        """Design the control; one pair of gains for both axes where the drive has no more."""
+        if not (self.run.path / MACHINE).is_file():
+            raise NotAvailable(_machine_needed(self._lacking()))
+        stage = tune_stage(self.run, request)
+        return _for_map(self.run, stage, self.found.drive_map)
+
+    def lut(self, request: LookupRequest) -> Stage:
+        """Make the table of the design."""
+        self._need_design()
+        stage = lut_stage(self.run, request)
+        if self.found.drive_map.tables:
+            return stage
+        return replace(stage, fallbacks=(*stage.fallbacks, "the drive takes no table: it is for reading"))
+
+    def margins(self, request: MarginRequest) -> Stage:
+        """Judge the design over what the machine may be."""
+        self._need_design()
+        return margins_stage(self.run, request)
+
+    def flash(self, allow: Allow, say: Say) -> Stage:
+        """Write what the map has an object for."""
+        self._need_design()
+        self._refuse(self._no_writing())
+        return flash_stage(self.run, self.drive, allow, say)
+
+    def verify(self) -> Stage:
+        """Compare what was written."""
+        self._need_design()
+        self._refuse(self._no_writing())
+        return verify_stage(self.run, self.drive)
+
+    def prove(self, request: ProofRequest, allow: Allow, say: Say) -> Stage:
+        """Prove what the drive can show."""
+        self._need_design()
+        self._refuse(self._no_proof())
+        if self.found.tier is Tier.RECORDER:
+            request = replace(request, experiments=RECORDER_STEPS)
+        return prove_stage(self.run, self.drive, load_design(self.run.path / "design.toml"), request, allow, say)
+
+    # ---- what there is --------------------------------------------------------------------------
+
+    def _known(self) -> tuple[MachineFile, str] | None:
+        if self.nameplate is not None:
+            return self.nameplate, DATA_SHEET
+        if self.found.drive_map.staging:
+            name = self.found.identity.name or f"drive {self.found.identity.serial:#010x}"
+            return nameplate_of(self.drive, name), SET_UP
+        return None
+
+    def _complete(self, known: Any) -> bool:
+        return known is not None or self.found.tier is Tier.INJECT
+
+    def _measurable(self) -> list[str]:
+        if self.found.tier is Tier.INJECT:
+            return [", ".join(QUANTITIES)]
+        return can_measure(self.drive, self.found)
+
+    def _quantities(self) -> list[str]:
+        return [
+            name
+            for name in QUANTITIES
+            if any(self.found.row(name, m).available for m in (Method.RECORDER, Method.STANDARD))
+        ]
+
+    def _nothing(self) -> str:
+        if self._measurable():
+            return ""
+        missing = self.found.row("mechanics", Method.STANDARD).missing
+        return f"needs {', '.join(missing)}"
+
+    def _lacking(self) -> tuple[str, ...]:
+        stage = self.run.read().stage("identify")
+        measured = {str(value["name"]) for value in (stage.values if stage else ())}
+        return tuple(name for name in NEEDED if name not in measured)
+
+    def _need_design(self) -> None:
+        if not (self.run.path / "design.toml").is_file():
+            raise NotAvailable("needs a design, and there is none without a whole machine file")
+
+    def _no_writing(self) -> str:
+        """Return why nothing can be written, empty when something can."""
+        drive_map = self.found.drive_map
+        if not drive_map.cells:
+            return f"needs a map with objects for parameters: {drive_map.name!r} has none"
+        if not self.found.map_is_drives:
+            return f"needs a map that names this drive's vendor and product (0x1018): {drive_map.name!r} does not"
+        try:
+            check_map(drive_map, self.found.identity, JournalFolder(self.found.identity))
+        except ConfigError as error:
+            return error.what
+        return ""
+
+    def _no_proof(self) -> str:
+        if self.found.tier in (Tier.INJECT, Tier.RECORDER):
+            return ""
+        lacking = [name for name in PREDICTED if name not in self.found.drive_map.cells]
+        return f"needs a loop that is all ours, to predict its response: the map has no object for {', '.join(lacking)}"
+
+    def _provable(self) -> str:
+        if self.found.tier is Tier.INJECT:
+            return "speed step, current steps, unreachable reference, field weakening"
+        return "speed step; the others need excitation"
+
+    def _by_injection(self, request: IdentifyRequest, allow: Allow, say: Say) -> Stage:
+        known = self.nameplate or nameplate_of(self.drive, self.found.identity.name)
+        stage = identify_stage(self.run, self.drive, known, request, allow, say)
+        return replace(stage, fallbacks=(*stage.fallbacks, "means are made from records: the drive has no averages"))
+
+    def _refuse(self, reason: str) -> None:
+        if reason:
+            raise NotAvailable(reason, where=f"node {self.found.identity.node}")
+
+
+def _machine_needed(names: Sequence[str]) -> str:
+    return f"needs {', '.join(names)}: give a machine file (`pmsmtool machine new` takes a data sheet or a meter)"
+
+
+def _for_map(run: RunDirectory, stage: Stage, drive_map: DriveMap) -> Stage:
+    """Choose the gains of a drive that has one pair for both axes: the smaller of each, so that both keep margins."""
+    pairs = {q: d for q, d in ONE_PAIR.items() if q in drive_map.cells and d not in drive_map.cells}
+    if not pairs:
+        return stage
+    design = load_design(run.path / "design.toml")
+    how = "the smaller of both axes: the drive has one pair"
+    values = {name: DesignValue(min(design[q], design[d]), how) for q, d in pairs.items() for name in (q, d)}
+    changed: Design = replace(design, values={**design.values, **values})
+    run.save("design.toml", design_text(changed))
+    return replace(stage, fallbacks=(*stage.fallbacks, "current loops: one pair of gains, the smaller of both axes"))
