@@ -373,8 +373,8 @@ class Session:
         """Look after what happened in the core since the last time."""
         self.attending = True
         try:
+            self.power.check_trip()  # before the excitation, which a trip aborts, too
             self.measurement.attend()
-            self.power.check_trip()
             self.pdo.changed()
         finally:
             self.attending = False
