@@ -89,6 +89,8 @@ class Quantity:
         Predicted band.
     signature : mapping of (experiment, signal) to ndarray
         Deviation per amplitude, already over the variance: the inner product with a deviation is the amplitude.
+    below, above : str
+        What is wrong when it lies below its band, or above; empty when nothing is known to do that.
     """
 
     nominal: float
@@ -96,6 +98,8 @@ class Quantity:
     low: float
     high: float
     signature: Mapping[tuple[str, str], Array]
+    below: str = ""
+    above: str = ""
 
     def of(self, deviation: Mapping[tuple[str, str], Array]) -> float:
         """Return the quantity that a deviation from the mean shows."""
@@ -150,7 +154,8 @@ Runs = Mapping[tuple[str, str], Array]
 class Direction:
     """How a derived quantity is made: two sets of runs that differ in nothing but the quantity.
 
-    ``high`` and ``low`` are responses of the same machines at the values ``at_high`` and ``at_low``.
+    ``high`` and ``low`` are responses of the same machines at the values ``at_high`` and ``at_low``; ``below`` and
+    ``above`` as for :class:`Quantity`.
     """
 
     nominal: float
@@ -159,6 +164,8 @@ class Direction:
     low: Runs
     at_high: float
     at_low: float
+    below: str = ""
+    above: str = ""
 
 
 def predict(
@@ -263,7 +270,9 @@ def _quantity(
     direction: Direction, signature: Mapping[tuple[str, str], Array], amplitude: Array, factor: float
 ) -> Quantity:
     middle, half = direction.nominal + float(np.median(amplitude)), factor * _least_std(amplitude)
-    return Quantity(direction.nominal, direction.unit, middle - half, middle + half, signature)
+    return Quantity(
+        direction.nominal, direction.unit, middle - half, middle + half, signature, direction.below, direction.above
+    )
 
 
 def _fault(text: str, runs: Runs, floors: Mapping[tuple[str, str], float]) -> Fault:
@@ -351,8 +360,23 @@ def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> 
         return found
     outside = {line.what for line in seen if not line.inside}
     keys = {key for key in measured if f"{key[0]}: {key[1]}" in outside}
+    only_quantities = not keys
     keys |= {key for name, q in prediction.quantities.items() if name in outside for key in q.signature}
-    return Judgement(found.seen, likely_cause(prediction, {key: measured[key] for key in sorted(keys)}))
+    cause = likely_cause(prediction, {key: measured[key] for key in sorted(keys)})
+    if not cause and only_quantities:  # no response alone is far enough off to tell, but what they tell together is
+        cause = _cause_of_quantities(prediction, deviation)
+    return Judgement(found.seen, cause)
+
+
+def _cause_of_quantities(prediction: Prediction, deviation: Mapping[tuple[str, str], Array]) -> str:
+    """Return what puts the only quantity that is outside there; empty when two are."""
+    causes = []
+    for quantity in prediction.quantities.values():
+        if set(quantity.signature) <= set(deviation):
+            value = quantity.of(deviation)
+            if not quantity.low <= value <= quantity.high:
+                causes.append(quantity.below if value < quantity.low else quantity.above)
+    return causes[0] if len(causes) == 1 else ""
 
 
 def _seen_quantity(name: str, quantity: Quantity, value: float) -> Seen:
@@ -412,7 +436,14 @@ def to_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
         "schema": SCHEMA,
         "factor": {f"{e}|{s}": band.factor for (e, s), band in prediction.bands.items()},
         "quantity": {
-            name: {"nominal": q.nominal, "unit": q.unit, "low": q.low, "high": q.high}
+            name: {
+                "nominal": q.nominal,
+                "unit": q.unit,
+                "low": q.low,
+                "high": q.high,
+                "below": q.below,
+                "above": q.above,
+            }
             for name, q in prediction.quantities.items()
         },
         "fault": {name: fault.text for name, fault in prediction.faults.items()},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -102,6 +103,19 @@ def test_quantities_measure_what_they_say() -> None:
     high = np.mean(responses(400, 3, gain=1.25), axis=0) - mean
     assert gain.of({KEY: high}) == pytest.approx(1.25, abs=0.06)
     assert delay.of({KEY: np.mean(responses(400, 3, delay=3), axis=0) - mean}) == pytest.approx(3.0, abs=0.2)
+
+
+@pytest.mark.parametrize(("sign", "cause"), [(1.0, "too much"), (-1.0, "too little")])
+def test_a_quantity_that_is_outside_alone_names_the_cause(sign: float, cause: str) -> None:
+    """Every response is inside its band, what they tell together is not; no fault has a signature here."""
+    fast, slow = {KEY: responses(6, 0, gain=1.25)}, {KEY: responses(6, 0, gain=0.8)}
+    direction = Direction(1.0, "1", fast, slow, 1.25, 0.8, "too little", "too much")
+    found = predict({"step": T_S}, {KEY: responses(96, 0)}, {KEY: 1.0}, directions={"gain": direction})
+    change = np.mean(fast[KEY] - slow[KEY], axis=0) / 0.45
+    narrow = replace(found, quantities={"gain": replace(found.quantities["gain"], low=0.98, high=1.02)})
+    judgement = judge(from_arrays(to_arrays(narrow)), {KEY: found.bands[KEY].mean + sign * 0.04 * change})
+    assert [line.what for line in judgement.seen if not line.inside] == ["gain"]
+    assert judgement.cause == cause
 
 
 def test_a_number_that_is_none_is_outside() -> None:

@@ -9,11 +9,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
 
-from benchmarks.prove_verdicts import Shared, flash, spoiled
+from benchmarks.prove_verdicts import KINDS, Shared, flash, spoiled
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import connect
 from pmsmtool.cli.main import run as program
@@ -23,12 +24,16 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
+from pmsmtool.drive.recorder import Recorder
 from pmsmtool.errors import Declined, Interrupted, VerifyMismatch
 from pmsmtool.flash.restore import take_backup
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
+from pmsmtool.sim.kernel import Params
 from pmsmtool.workflow.commission import begin_run
+from pmsmtool.workflow.prove import measured
 from pmsmtool.workflow.prove import stage as stages
+from pmsmtool.workflow.prove.plan import Conditions
 from pmsmtool.workflow.prove.stage import ProofRequest, prove_stage, read_proof, responses
 from pmsmtool.workflow.report_page import report_page
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
@@ -69,10 +74,11 @@ def design() -> Design:
 
 
 @contextmanager
-def flashed(design: Design, *, delay: float = 0.0) -> Iterator[CanopenDrive]:
+def flashed(design: Design, *, delay: float = 0.0, rotor: str = "free") -> Iterator[CanopenDrive]:
     """A simulated drive that holds the design."""
     truth = machine()
     truth = replace(truth, inverter=replace(truth.inverter, delay_periods=1.5 + delay))
+    truth = replace(truth, simulation={**truth.simulation, "rotor": rotor})
     Path("drive.toml").write_text(dump_machine_file(truth))
     with connect("pmsmsim", "drive.toml?nv=drive.nv") as connection:
         drive = CanopenDrive(connection, 1)
@@ -126,7 +132,8 @@ def test_a_healthy_drive_passes_and_the_prediction_came_first(design: Design) ->
         ("gain_high", "gain of the current loops is higher"),
         ("delay", "one more control period of delay"),
         ("decoupling", "decoupling has the wrong sign"),
-        ("pole_pairs_high", "pole pairs"),
+        ("pole_pairs_high", "wrong pole pairs"),
+        ("pole_pairs_low", "wrong pole pairs"),
     ],
 )
 def test_a_spoiled_drive_is_caught_and_the_cause_named(kind: str, cause: str, design: Design) -> None:
@@ -149,6 +156,73 @@ def test_a_healthy_drive_passes_within_a_small_current_limit(design: Design) -> 
     (folder,) = (run.path / "prove").iterdir()
     prediction, traces = read_proof(folder)
     assert prediction.facts["conditions"]["i_max_apk"] == 5.0 and "unreachable" in traces
+
+
+def test_a_link_below_what_it_showed_at_rest_is_named(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    conditions_of = stages.conditions_of
+
+    def at_rest(*asked: Any) -> Conditions:
+        found = conditions_of(*asked)
+        return replace(found, U_dc_v=found.U_dc_v / 0.85)
+
+    monkeypatch.setattr(stages, "conditions_of", at_rest)
+    with flashed(design) as drive:
+        _, stage = prove(drive, design)
+    assert stage.status == "fail" and "likely the voltage is too low" in stage.note
+
+
+def test_a_shaft_that_is_held_is_named(design: Design) -> None:
+    with flashed(design, rotor="locked") as drive:
+        _, stage = prove(drive, design)
+        assert is_safe(drive.node.state())
+    assert stage.status == "fail" and "likely something holds the shaft" in stage.note
+    assert stage.note.startswith("the speed was not reached: speed_step ends at ")
+    assert [line.what for line in stage.acceptance if not line.ok][-1] == "the speed is reached"
+
+
+def test_a_fault_is_named_with_the_experiment(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    def touchy(params: Params) -> None:
+        params.protection_i_trip_apk = 4.0
+
+    monkeypatch.setitem(KINDS, "touchy", touchy)
+    with spoiled("touchy"), flashed(design) as drive:
+        _, stage = prove(drive, design)
+    assert stage.status == "fail" and "0x2310" in stage.note and "during speed_step" in stage.note
+
+
+def test_current_that_stays_in_d_is_named(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At full torque 5 A of the design's 12 A all go into i_d on the way to the speed of the unreachable current."""
+    monkeypatch.setattr(measured, "RISE_S", 0.0)
+    with flashed(design) as drive:
+        run = begin_run(drive, Path("runs"))
+        stage = prove_stage(run, drive, design, replace(FEW, i_max_apk=5.0), lambda shown: None, lambda line: None)
+    assert stage.status == "fail"
+    assert "the speed was not reached: " in stage.note and "before unreachable" in stage.note
+    assert "all current stays in i_d" in stage.note
+    assert [line.what for line in stage.acceptance if not line.ok] == ["all experiments are run to their end"]
+
+
+@pytest.mark.parametrize("slow", [1, 99])
+def test_a_record_that_begins_at_another_speed_does_not_count(
+    slow: int, design: Design, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A slow host arms the recorder for seconds while the shaft coasts: once is forgiven, always is named."""
+    arm, count = Recorder.arm, 0
+    said: list[str] = []
+
+    def slowly(self: Recorder, *asked: Any, at_excitation: bool) -> None:
+        nonlocal count
+        arm(self, *asked, at_excitation=at_excitation)
+        count += at_excitation
+        if 1 < count <= 1 + slow:
+            self._node.connection.clock.wait(1.5)
+
+    monkeypatch.setattr(Recorder, "arm", slowly)
+    with flashed(design) as drive:
+        _, stage = prove(drive, design, said)
+    assert [line for line in said if "off its speed; again" in line]
+    assert stage.status == ("pass" if slow == 1 else "fail"), stage.note
+    assert slow == 1 or stage.note.startswith("the speed was not kept: 3 times q_steps began more than 5 % below")
 
 
 def test_a_gross_deviation_ends_the_proof_before_more_is_asked(design: Design) -> None:

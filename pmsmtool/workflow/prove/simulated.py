@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
 from pmsmtool.sim.kernel import Params, Part, Setup, Simulation, library
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.simulated_machine import MODELS, SHAPES, build_setup
+from pmsmtool.workflow.prove.defects import DEFECTS, QUANTITIES, Defect, is_possible
 from pmsmtool.workflow.prove.plan import SIGNALS, Conditions, Experiment, ProofPlan
 
 RUNS = 96
@@ -60,86 +61,6 @@ PHASES = 64
 """Periods over which the start is drawn: slower tasks of the drive (speed control) are anywhere in their cycle."""
 RUN_IN = 4.0
 """A speed is held for this many time constants of the speed loop before a speed step."""
-
-Change = Callable[[Setup, Params], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Defect:
-    """Something wrong with a drive: what a person reads, and what it changes in the simulated one."""
-
-    text: str
-    change: Change
-
-
-def _gain(factor: float) -> Change:
-    def change(setup: Setup, params: Params) -> None:
-        params.current_K_p_d_v_per_a *= factor
-        params.current_K_p_q_v_per_a *= factor
-
-    return change
-
-
-def _delayed(setup: Setup, params: Params) -> None:
-    setup.delay += 1
-
-
-def _decoupling_reversed(setup: Setup, params: Params) -> None:
-    params.motor_L_d_app_h *= -1.0
-    params.motor_L_q_app_h *= -1.0
-
-
-def _pole_pairs(step: int) -> Change:
-    def change(setup: Setup, params: Params) -> None:
-        params.motor_pole_pairs = max(1, params.motor_pole_pairs + step)
-
-    return change
-
-
-def _link(factor: float) -> Change:
-    def change(setup: Setup, params: Params) -> None:
-        setup.U_dc *= factor
-
-    return change
-
-
-def _inertia(factor: float) -> Change:
-    def change(setup: Setup, params: Params) -> None:
-        setup.machine.J *= factor
-
-    return change
-
-
-def _saturated(setup: Setup, params: Params) -> None:
-    setup.machine.L_d *= 0.7
-    setup.machine.L_q *= 0.7
-
-
-def _compensation(setup: Setup, params: Params) -> None:
-    params.inverter_V_dead_v *= 2.0
-
-
-DEFECTS: Mapping[str, Defect] = {
-    "gain_low": Defect("the gain of the current loops is lower than designed", _gain(0.8)),
-    "gain_high": Defect("the gain of the current loops is higher than designed", _gain(1.25)),
-    "delay": Defect("one more control period of delay than designed", _delayed),
-    "decoupling": Defect("the decoupling has the wrong sign", _decoupling_reversed),
-    "pole_pairs_high": Defect("wrong pole pairs: the drive counts too many", _pole_pairs(1)),
-    "pole_pairs_low": Defect("wrong pole pairs: the drive counts too few", _pole_pairs(-1)),
-    "voltage": Defect("the voltage is too low: the DC link falls below what it shows at rest", _link(0.85)),
-    "inductance": Defect("less inductance than designed for, as when the machine saturates", _saturated),
-    "compensation": Defect("the dead-time compensation does not fit the inverter", _compensation),
-    "inertia_high": Defect("more inertia than designed for", _inertia(1.4)),
-    "inertia_low": Defect("less inertia than designed for", _inertia(0.7)),
-}
-"""What the likely cause is looked for among."""
-
-QUANTITIES = {
-    "loop gain over the designed one": ("gain_high", 1.25, "gain_low", 0.8, 1.0, "1"),
-    "delay beyond the designed one": ("delay", 1.0, "", 0.0, 0.0, "1"),
-    "decoupling over the designed one": ("", 1.0, "decoupling", -1.0, 1.0, "1"),
-}
-"""Derived quantity: the two sets of runs and their values (empty: the healthy drive), nominal value, unit."""
 
 
 class SimulatedDrives:
@@ -254,7 +175,7 @@ def predict_proof(
     wrong = {
         name: {e.name: drives.respond(e, defect, few_runs) for e in plan.experiments}
         for name, defect in DEFECTS.items()
-        if _possible(name, design)
+        if is_possible(name, design)
     }
     T_s = design.machine.inverter.T_s
     facts = {
@@ -271,7 +192,8 @@ def predict_proof(
     directions = {}
     for name, (high, at_high, low, at_low, nominal, unit) in QUANTITIES.items():
         pair = [_judged(steps, wrong[fault] if fault else few) for fault in (high, low)]
-        directions[name] = Direction(nominal, unit, pair[0], pair[1], at_high, at_low)
+        below, above = (DEFECTS[fault].text if fault else "" for fault in (low, high))
+        directions[name] = Direction(nominal, unit, pair[0], pair[1], at_high, at_low, below, above)
     return predict(
         {e.name: np.arange(e.pattern_rows, dtype=np.float64) * (T_s * e.decimation) for e in plan.experiments},
         _judged(plan.experiments, healthy),
@@ -280,12 +202,6 @@ def predict_proof(
         faults={name: (DEFECTS[name].text, _judged(plan.experiments, values)) for name, values in wrong.items()},
         facts=facts,
     )  # fmt: skip
-
-
-def _possible(defect: str, design: Design) -> bool:
-    if defect == "pole_pairs_low":
-        return design["motor.pole_pairs"] >= 2
-    return defect != "compensation" or design["inverter.deadtime_compensation"] != 0.0
 
 
 def _judged(experiments: Sequence[Experiment], responses: Mapping[str, Array]) -> Runs:

@@ -38,7 +38,7 @@ from pmsmtool.flash.restore import plan_download
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
-from pmsmtool.workflow.prove.measured import run_experiments
+from pmsmtool.workflow.prove.measured import SpeedNotReached, run_experiments
 from pmsmtool.workflow.prove.plan import RPM, Conditions, Experiment, ProofPlan, plan_proof
 from pmsmtool.workflow.prove.simulated import RUNS, averaged, predict_proof
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
@@ -47,6 +47,7 @@ FOLDER = "prove"
 PREDICTION = "prediction.npz"
 GROSS = 3.0
 """A response this far outside its band, in half widths, ends the proof: what is demanded next needs what has failed."""
+SPEED = "omega_e_rad_s"
 ENCODER_INCREMENTS = DriveObject(0x608F, 1, "I")
 _HASH_DIGITS = 12
 
@@ -147,14 +148,14 @@ def prove_stage(
 
     record = _Record(prediction, save)
     drive.recorder.forget()  # a download before this may have reset the drive
-    event = ""
+    event: PmsmtoolError | None = None
     try:
         with guarded(drive, envelope, say=say) as guard:
-            run_experiments(guard, plan, design.machine.machine.pole_pairs, record.keep, say)
-    except (DriveFault, LimitExceeded) as error:
+            run_experiments(guard, plan, design, conditions, record.keep, say)
+    except (DriveFault, LimitExceeded, SpeedNotReached) as error:
         if isinstance(error, SdoAbort):
             raise
-        event = error.what  # the guard has stopped the machine and restored the drive
+        event = error  # the guard has stopped the machine and restored the drive
     return _stage(plan, prediction, record, event, digest, folder)
 
 
@@ -277,33 +278,55 @@ def read_proof(folder: Path) -> tuple[Prediction, dict[str, Trace]]:
     return prediction, {name: read_trace(folder / f"{name}.npz") for name in names}
 
 
-def _stage(plan: ProofPlan, prediction: Prediction, record: _Record, event: str, digest: str, folder: str) -> Stage:
+def _stage(
+    plan: ProofPlan, prediction: Prediction, record: _Record, event: PmsmtoolError | None, digest: str, folder: str
+) -> Stage:
     found = judge(prediction, record.measured)
     missing = [e.name for e in plan.experiments if e.name not in record.done]
     criteria = [Acceptance(line.what, f"{100.0 * line.share:.3g} % of the band: {line.where}", "<= 100 %", line.inside)
                 for line in found.seen]  # fmt: skip
-    if event or missing:
-        what = event or f"not run after a response far outside its band: {', '.join(missing)}"
+    happened = "" if event is None else _happened(event, missing)
+    if happened or missing:
+        what = happened or f"not run after a response far outside its band: {', '.join(missing)}"
         criteria.append(Acceptance("all experiments are run to their end", what, "all", False))
+    slow = _too_slow(prediction, record.measured)
+    if slow:
+        criteria.append(Acceptance("the speed is reached", slow, "within the band", False))
     good = bool(found.seen) and all(line.ok for line in criteria)
+    cause = found.cause or ("" if event is None else event.likely)
+    outside = [line.what for line in found.seen if not line.inside]
+    told = [happened, slow and f"the speed was not reached: {slow}",
+            outside and f"outside the predicted band: {', '.join(outside)}"]  # fmt: skip
+    note = "; ".join(str(text) for text in told if text) + (f"; likely {cause}" if cause else "; no known cause fits")
     values: list[Mapping[str, Any]] = [
         {"name": "prediction", "value": f"sha256:{digest}"},
-        {"name": "cause", "value": found.cause},
-        {"name": "event", "value": event},
+        {"name": "cause", "value": cause},
+        {"name": "event", "value": happened},
         *({"name": line.what, "value": line.share, "where": line.where} for line in found.seen),
     ]
     files = [f"{folder}/{PREDICTION}", *(f"{folder}/{name}.npz" for name in record.done)]
     return Stage(
         "prove", "pass" if good else "fail", 0.0, values=values, acceptance=criteria,
-        files=dict.fromkeys(files, ""), fallbacks=plan.left_out, note="" if good else _note(found, event),
+        files=dict.fromkeys(files, ""), fallbacks=plan.left_out, note="" if good else note,
         summary=_summary(found, len(record.done)),
     )  # fmt: skip
 
 
-def _note(found: Judgement, event: str) -> str:
-    outside = [line.what for line in found.seen if not line.inside]
-    text = event or f"outside the predicted band: {', '.join(outside)}"
-    return f"{text}; likely {found.cause}" if found.cause else f"{text}; no known cause fits"
+def _happened(event: PmsmtoolError, missing: Sequence[str]) -> str:
+    """Return what ended the measurement, and where in the proof."""
+    if isinstance(event, SpeedNotReached):
+        return event.what
+    return f"{event.what}, {f'during {missing[0]}' if missing else 'after the last experiment'}"
+
+
+def _too_slow(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> str:
+    """Return which records end below the band of their speed; empty when none does."""
+    lines = []
+    for (experiment, signal), values in measured.items():
+        band = prediction.bands[experiment, signal]
+        if signal == SPEED and abs(values[-1]) < min(abs(band.low[-1]), abs(band.high[-1])):
+            lines.append(f"{experiment} ends at {values[-1]:.4g} instead of {band.mean[-1]:.4g} rad/s (electrical)")
+    return ", ".join(lines)
 
 
 def _summary(found: Judgement, experiments: int) -> str:
