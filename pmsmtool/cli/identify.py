@@ -72,7 +72,7 @@ def identify_command(
     "map" measures the flux linkages over the plane of currents with saturation and cross-saturation; a held rotor
     (--shaft locked) allows R, inverter and map. "mechanics" fits inertia, viscous and Coulomb friction to pushes and
     coasting; "frf" measures the mechanical frequency response, and a resonance where the data support one. Without a
-    quantity all but these three are measured, the inertia roughly; with "all", all.
+    quantity all but map and frf are measured; with "all", all.
 
     The limits are printed and consent is asked before anything moves. Every number comes with its statistical and its
     systematic part; what cannot be trusted is refused by name. The run directory keeps raw traces and machine.toml;

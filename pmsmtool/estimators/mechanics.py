@@ -5,19 +5,27 @@
 Pushes by a known current, and coasting with the voltage off; each trace has its own first position and speed. The
 measured currents drive the model, so their noise is torque noise, a random walk in speed. The residual of the
 position is whitened with Sigma = s_theta^2 I + s_T^2 G G', G_kj = (k - j - 1/2) T^2/J for j < k; without it friction
-wanders by several standard deviations. Every interval is solved in closed form, with the instant of a reversal.
+wanders by several standard deviations. Torque that neither model nor noise explains (an inverter's ripple between the
+samples, cogging) counts as more noise of the torque, until the residual agrees with it or it is too much. Every
+interval is solved in closed form, with the instant of a reversal.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import SensorTolerance, chi2_gate, condition_gate, information_bound
+from pmsmtool.estimators.estimate import (
+    CHI2_WARN,
+    SensorTolerance,
+    chi2_gate,
+    condition_gate,
+    information_bound,
+)
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt, linear_solve
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
@@ -28,19 +36,29 @@ Torque = Callable[[Array, Array], Array]
 """Torque (N m) of arrays of i_d, i_q (A)."""
 
 STAGE = "mechanics"
-BLOCKS = 400
+BLOCKS = 250
 """Positions of a trace in the fit; the currents between two are averaged."""
 TRACES_LEAST = 4
 """A push and a coasting in each direction."""
 ENCODER_STEPS_LEAST = 200
 """Way of the shaft in encoder steps below which the run says nothing."""
-REPEATS = 2
-"""Fits; the second whitens with the inertia of the first."""
+REST_SHARE = 0.005
+"""Way of the shaft, of a trace's whole, from which on it is fitted."""
+STEP_SHARE = 0.1
+"""Part of a push within which its step may be limited."""
+COARSE_RIPPLE = 0.3
+"""Noise of the torque in the first fit, of the push's: with an encoder's resolution alone the cost is a narrow, bent
+valley in which a fit from rough starting values does not arrive."""
+FITS_MOST = 8
+"""Fits after it; the second whitens with the inertia of the first, more only where the torque's noise grows."""
 TORQUE_FLOOR = 1e-3
 """Deviation of a block's torque beyond the noise of the currents, of the push's: ripple that samples do not show."""
-SCALE_FLOOR = 5e-4
-"""Relative deviation of the torque's scale beyond that of the flux linkage: the sample of a switched current is not its
-mean. Largest error of J over twelve random drives, that of the flux linkage included: 0.0031, inside its interval."""
+COASTING_FLOOR = 1e-4
+"""The same of a coasting, from where it grows."""
+RIPPLE_MOST = 0.05
+"""Largest deviation of a block's torque, of the push's: above, the shaft is not what the model says."""
+SCALE_FLOOR = 3e-4
+"""Relative deviation of the torque's scale beyond that of the flux linkage and of the samples' displacement."""
 SMALLEST_DECAY = 1e-9
 """B T/J below which an interval is a parabola."""
 ROUNDING_RAD = 1e-6
@@ -56,6 +74,10 @@ class MechanicsResult:
     ----------
     J, B, tau_c : Estimate
         Inertia (kg m2), viscous (N m s) and Coulomb friction (N m).
+    fit_std : tuple of float
+        Standard deviations of the three by the fit alone, without the torque's scale that they share.
+    ripple : float
+        Deviation of a block's torque that the residual asked for, of the push's.
     chi2 : float
         Reduced chi-square of the whitened position.
     condition : float
@@ -65,6 +87,8 @@ class MechanicsResult:
     J: Estimate
     B: Estimate
     tau_c: Estimate
+    fit_std: tuple[float, float, float]
+    ripple: float
     chi2: float
     condition: float
 
@@ -78,6 +102,7 @@ class _Run:
     T: float
     theta_std: float
     torque_std: float
+    coasting: bool
 
 
 def estimate_mechanics(
@@ -95,8 +120,8 @@ def estimate_mechanics(
     Parameters
     ----------
     runs : sequence of Trace
-        ``i_d_a i_q_a theta_M_rad flagged`` of pushes and coasting in both directions, in the frame of the d axis;
-        ``meta["coasting"]``: no torque.
+        ``theta_M_rad`` of pushes and coasting in both directions; of a push ``i_d_a i_q_a flagged``, too, in the frame
+        of the d axis; ``meta["coasting"]``: no torque.
     torque : callable
         Torque of the currents, by flux linkage or flux map at the temperature of the run.
     torque_per_a : float
@@ -118,15 +143,14 @@ def estimate_mechanics(
     tolerance = tolerance or SensorTolerance()
     if len(runs) < TRACES_LEAST:
         raise refuse("E_EXCITATION", f"{len(runs)} traces, {TRACES_LEAST} needed", stage=STAGE)
+    runs = [_window(run) for run in runs]
     flagged = sum(int(np.sum(run["flagged"] > 0.0)) for run in runs if not run.meta["coasting"])
     if flagged:
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
     step = _encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, torque_per_a, sigma_a, direction, step) for run in runs]
     start = _start(blocks)
-    fit, chi2 = _fit(blocks, start)
-    if not fit.converged:
-        raise refuse("E_NOT_CONVERGED", f"{fit.iterations} steps without a minimum", stage=STAGE)
+    fit, chi2, ripple = _fit(blocks, start)
     bound, condition = information_bound(fit.jacobian)
     condition_gate(condition, "B and tau_c", STAGE)
     _, widen = chi2_gate(chi2, STAGE)
@@ -146,7 +170,7 @@ def estimate_mechanics(
         )
         for value, std, unit in zip((J, B, tau_c), stds, ("kg m2", "N m s", "N m"), strict=True)
     ]
-    return MechanicsResult(estimates[0], estimates[1], estimates[2], chi2, condition)
+    return MechanicsResult(estimates[0], estimates[1], estimates[2], stds, ripple, chi2, condition)
 
 
 def _encoder_step(positions: Sequence[Array]) -> float:
@@ -166,16 +190,29 @@ def _encoder_step(positions: Sequence[Array]) -> float:
     return step
 
 
+def _window(run: Trace) -> Trace:
+    """Return a trace from where the shaft moves and the step of the current is over.
+
+    At rest, the first speed leaves no slope for a fit to go down; and a step may meet the voltage limit.
+    """
+    theta = run["theta_M_rad"]
+    first = int(np.argmax(np.abs(theta - theta[0]) > REST_SHARE * np.ptp(theta)))
+    if not run.meta["coasting"]:
+        limited = np.nonzero(run["flagged"][: round(STEP_SHARE * len(run))] > 0.0)[0]
+        first = max(first, int(limited[-1]) + 1 if len(limited) else 0)
+    return replace(run, t_s=run.t_s[first:], signals={name: values[first:] for name, values in run.signals.items()})
+
+
 def _blocks(run: Trace, torque: Torque, torque_per_a: float, sigma_a: float, direction: int, step: float) -> _Run:
     rows = max(1, (len(run) - 1) // BLOCKS)
     count = (len(run) - 1) // rows
     theta = direction * run["theta_M_rad"][: count * rows + 1 : rows]
     if run.meta["coasting"]:
-        return _Run(theta, np.zeros(count), rows * run.period_s, step / math.sqrt(12.0), 0.0)
+        return _Run(theta, np.zeros(count), rows * run.period_s, step / math.sqrt(12.0), 0.0, True)
     tau = torque(run["i_d_a"], run["i_q_a"])
     mean = (0.5 * (tau[:-1] + tau[1:]))[: count * rows].reshape(count, rows).mean(axis=1)
     noise = math.hypot(abs(torque_per_a) * sigma_a / math.sqrt(rows), TORQUE_FLOOR * float(np.max(np.abs(mean))))
-    return _Run(theta, mean, rows * run.period_s, step / math.sqrt(12.0), noise)
+    return _Run(theta, mean, rows * run.period_s, step / math.sqrt(12.0), noise, False)
 
 
 def _start(runs: Sequence[_Run]) -> Array:
@@ -197,16 +234,58 @@ def _start(runs: Sequence[_Run]) -> Array:
     return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
 
 
-def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float]:
+def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float, float]:
+    """Return the fit, its reduced chi-square, and the torque's noise that it took, of the largest torque."""
     speed = max(float(np.max(np.abs(np.diff(run.theta)))) / run.T for run in runs)
     largest = max(float(np.max(np.abs(run.torque))) for run in runs)
     scale = np.array([1.0, largest / speed, largest, *(value for run in runs for value in (1.0, speed))])
-    x = start
-    for _ in range(REPEATS):
-        problem = _Problem(runs, [_whitener(run, math.exp(float(x[0]))) for run in runs], RELATIVE_STEP * scale)
-        fit = levenberg_marquardt(problem.residual, x, scale, cost_tolerance=1e-4, derivative=problem.jacobian)
+    coarse = [replace(run, torque_std=COARSE_RIPPLE * largest) for run in runs]
+    x = _minimum(coarse, start, scale).x
+    for count in range(FITS_MOST):
+        fit = _minimum(runs, x, scale)
         x = fit.x
-    return fit, fit.cost / fit.dof
+        chi2 = fit.cost / fit.dof
+        ripple = max(run.torque_std for run in runs) / largest
+        noisier = _noisier(runs, fit.residual, largest)
+        if ripple > RIPPLE_MOST:
+            raise refuse(
+                "E_MODEL_MISMATCH",
+                f"torque off by {100.0 * ripple:.2g} % of the push's, and more, from one {1e3 * runs[0].T:.2g} ms to "
+                f"the next, limit {100.0 * RIPPLE_MOST:g} %",
+                stage=STAGE,
+                likely="cogging, a load or a gear on the shaft, an elastic coupling, an encoder that is off centre",
+            )
+        if count and noisier is runs:
+            break
+        runs = noisier
+    if not fit.converged:
+        raise refuse("E_NOT_CONVERGED", f"{fit.iterations} steps without a minimum", stage=STAGE)
+    return fit, chi2, ripple
+
+
+def _minimum(runs: Sequence[_Run], x: Array, scale: Array) -> Fit:
+    problem = _Problem(runs, [_whitener(run, math.exp(float(x[0]))) for run in runs], RELATIVE_STEP * scale)
+    return levenberg_marquardt(problem.residual, x, scale, cost_tolerance=1e-4, derivative=problem.jacobian)
+
+
+def _noisier(runs: Sequence[_Run], residual: Array, largest: float) -> Sequence[_Run]:
+    """Return the runs with as much more noise of the torque as the residual asks for; the same where it agrees."""
+    ends = np.cumsum([len(run.theta) for run in runs])
+    parts = np.split(residual, ends[:-1])
+    more = {False: 1.0, True: 1.0}
+    for coasting in more:
+        own = np.concatenate([part for part, run in zip(parts, runs, strict=True) if run.coasting is coasting])
+        chi2 = float(own @ own) / len(own)
+        if chi2 > CHI2_WARN:
+            more[coasting] = math.sqrt(chi2)
+    if max(more.values()) == 1.0:
+        return runs
+    return [
+        run
+        if more[run.coasting] == 1.0
+        else replace(run, torque_std=more[run.coasting] * max(run.torque_std, COASTING_FLOOR * largest))
+        for run in runs
+    ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,8 +16,11 @@ from pmsmtool.experiments.signals import readable
 from pmsmtool.trace import Trace
 
 SIGNALS = ("i_d_a", "i_q_a", "theta_m_rad", "flags")
-ROWS = 4000
-"""Rows of four signals that 64 kB hold: several per block that the estimator averages."""
+COASTING_SIGNALS = ("theta_m_rad",)
+ROWS = 2000
+"""Rows of a push: several per block that the estimator averages."""
+COASTING_ROWS = 800
+"""Rows of a coasting, of which the estimator takes every second or every one."""
 UNIT_LEAST_S, UNIT_MOST_S = 0.03, 0.6
 """Shortest and longest push: the current loop needs milliseconds, a person's patience ends somewhere."""
 COAST_UNITS, COAST_LEAST_S, COAST_MOST_S = 6.0, 0.5, 2.5
@@ -84,16 +87,18 @@ def push_and_coast(drive: Drive, plan: MechanicsPlan, abort_speed_rad_s: float, 
     keep(first)
     coasting = _coast(drive, plan)
     keep(coasting)
-    left = _end_speed(coasting) / _end_speed(first)
+    reached, left = abs(_end_speed(first)), abs(_end_speed(coasting))
+    # what the first push really did decides how long the other one may be: the plan's inertia is a rough one
+    both = min(2.0 * reached, reached + left, 2.0 * plan.omega_rad_s)
     drive.enable()
-    keep(_push(drive, -plan.i_q_a, plan.unit_s * (1.0 + min(1.0, max(0.0, left))), abort_speed_rad_s))
+    keep(_push(drive, -plan.i_q_a, plan.unit_s * both / max(reached, 0.1 * plan.omega_rad_s), abort_speed_rad_s))
     keep(_coast(drive, plan))
 
 
 def _coast(drive: Drive, plan: MechanicsPlan) -> Trace:
     drive.disable()
-    samples, decimation = _rows(drive, plan.coast_s)
-    trace = readable(drive.record(SIGNALS, samples, decimation=decimation))
+    samples, decimation = _rows(drive, plan.coast_s, COASTING_ROWS)
+    trace = readable(drive.record(COASTING_SIGNALS, samples, decimation=decimation))
     return replace(trace, meta={**trace.meta, "coasting": True})
 
 
@@ -104,7 +109,7 @@ def _end_speed(trace: Trace) -> float:
 
 
 def _push(drive: Drive, i_q_a: float, seconds: float, abort_speed_rad_s: float) -> Trace:
-    samples, decimation = _rows(drive, seconds)
+    samples, decimation = _rows(drive, seconds, ROWS)
     excitation = Excitation(
         shape=Shape.STEP,
         point=Injection.I_Q,
@@ -117,8 +122,8 @@ def _push(drive: Drive, i_q_a: float, seconds: float, abort_speed_rad_s: float) 
     return replace(trace, meta={**trace.meta, "coasting": False})
 
 
-def _rows(drive: Drive, seconds: float) -> tuple[int, int]:
+def _rows(drive: Drive, seconds: float, most: int) -> tuple[int, int]:
     """Return samples and decimation of a record of that length."""
     periods = max(2, round(seconds / drive.period_s))
-    decimation = max(1, math.ceil(periods / ROWS))
+    decimation = max(1, math.ceil(periods / most))
     return periods // decimation, decimation

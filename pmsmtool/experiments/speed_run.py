@@ -97,8 +97,8 @@ def speeds_trace(rows: Rows, pole_pairs: int) -> Trace:
     return table(rows, [float(k) for k in range(len(rows))], pole_pairs=pole_pairs)
 
 
-def reach(drive: Drive, omega_e_rad_s: float, *, limit_s: float = REACH_LIMIT_S) -> float:
-    """Wait until the speed has arrived, seen twice, or the limit is over; return the time (s)."""
+def reach(drive: Drive, omega_e_rad_s: float, *, limit_s: float = REACH_LIMIT_S, band_rad_s: float = 0.0) -> float:
+    """Wait until the speed has arrived within a band, seen twice, or the limit is over; return the time (s)."""
     periods = max(1, round(0.5 * LOOK_S / drive.period_s))
     waited = 0.0
     seen = 0
@@ -106,7 +106,7 @@ def reach(drive: Drive, omega_e_rad_s: float, *, limit_s: float = REACH_LIMIT_S)
         drive.wait(0.5 * LOOK_S)
         omega = drive.average(("omega_e_rad_s",), periods)["omega_e_rad_s"]
         waited += LOOK_S
-        seen = seen + 1 if abs(omega - omega_e_rad_s) <= NEAR * abs(omega_e_rad_s) else 0
+        seen = seen + 1 if abs(omega - omega_e_rad_s) <= max(band_rad_s, NEAR * abs(omega_e_rad_s)) else 0
     return waited
 
 

@@ -109,7 +109,6 @@ NOTES: Mapping[tuple[str, Method], str] = {
     ("L", Method.RECORDER): "L_q at running currents only",
     ("psi", Method.RECORDER): "the drive must commutate already",
     ("psi", Method.STANDARD): "where the voltage limit is within the speed limit, or the drive shows its voltage",
-    ("mechanics", Method.INJECT): "inertia, roughly",
     ("mechanics", Method.RECORDER): "J/psi and tau_c/psi",
     ("mechanics", Method.STANDARD): "J/psi and tau_c/psi; the pole pairs must be known",
 }

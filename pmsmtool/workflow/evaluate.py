@@ -16,7 +16,6 @@ from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.flux_map_result import FluxMapResult
 from pmsmtool.estimators.frequency_response import FrequencyResponse
 from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
-from pmsmtool.estimators.inertia import InertiaResult, estimate_inertia
 from pmsmtool.estimators.mechanics import MechanicsResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases
@@ -51,7 +50,6 @@ class Evaluation:
     encoder: EncoderResult | None = None
     inductance: InductanceResult | None = None
     flux: FluxResult | None = None
-    inertia: InertiaResult | None = None
     mechanics: MechanicsResult | None = None
     flux_map: FluxMapResult | None = None
     frequency_response: FrequencyResponse | None = None
@@ -80,8 +78,6 @@ class Evaluation:
             found["pole_pairs"] = self.encoder.pole_pairs
         if self.offset is not None:
             found["offset_rad"] = self.offset
-        if self.inertia is not None:
-            found["J_kgm2"], found["tau_c_nm"] = self.inertia.J, self.inertia.tau_c
         if self.mechanics is not None:
             found |= {"J_kgm2": self.mechanics.J, "B_nms": self.mechanics.B, "tau_c_nm": self.mechanics.tau_c}
         if self.frequency_response is not None:
@@ -116,7 +112,7 @@ def evaluate(
     traces : mapping of str to Trace
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
         ``phase_pairs``, ``rotation_forward``, ``rotation_backward``, ``square_d_<half period>``,
-        ``square_q_<half period>``, ``push_<k>``, ``speeds``, ``wave_<k>``, ``map_<k>``, ``inertia_<k>``, ``frf_<k>``.
+        ``square_q_<half period>``, ``speeds``, ``wave_<k>``, ``map_<k>``, ``inertia_<k>``, ``frf_<k>``.
     period_s : float
         Control period (s).
     T_ref_c : float
@@ -154,15 +150,14 @@ def evaluate(
         result = replace(result, flux=flux)
     if result.resistance is not None and result.encoder is not None and any(k.startswith("square_d") for k in traces):
         result = replace(result, inductance=inductance_of(traces, result, tolerance))
-    if result.encoder is not None and result.flux is not None and "push_0" in traces:
-        inertia = estimate_inertia(
-            pushes_of(traces), result.flux.psi_measured, round(result.encoder.pole_pairs.value), tolerance
-        )
-        result = replace(result, inertia=inertia)
     flux_map = map_stage.flux_map_of(traces, result, tolerance)
     if flux_map is not None:
         result = replace(result, flux_map=flux_map, map_estimates=map_stage.map_estimates(result, flux_map, traces))
-    result = replace(result, mechanics=mechanics_stage.mechanics_of(traces, result, tolerance))
+    dead_time_s = 0.0
+    if result.resistance is not None and math.isfinite(U_dc_v):
+        dead_time_s = max(0.0, result.resistance.V_dead_v) * period_s / U_dc_v
+    mechanics = mechanics_stage.mechanics_of(traces, result, tolerance, dead_time_s)
+    result = replace(result, mechanics=mechanics)
     return replace(result, frequency_response=frequency_stage.frequency_response_of(traces, result))
 
 
@@ -187,11 +182,6 @@ def resistance_of(
         return result
     fallback = "; ".join(part for part in (result.R_s.fallback, note) if part)
     return replace(result, R_s=replace(result.R_s, fallback=fallback))
-
-
-def pushes_of(traces: Mapping[str, Trace]) -> list[Trace]:
-    """Return the pushes in the order they were made."""
-    return [traces[f"push_{k}"] for k in range(sum(name.startswith("push_") for name in traces))]
 
 
 def flux_of(
@@ -284,8 +274,6 @@ def machine_of(evaluation: Evaluation, nameplate: MachineFile, conditions: Mappi
     found = evaluation.estimates()
     values = {name: found[name].value for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2") if name in found}
     machine = replace(nameplate.machine, **values)  # type: ignore[arg-type]
-    if evaluation.inertia is not None:
-        machine = replace(machine, tau_c_nm=max(0.0, evaluation.inertia.tau_c.value), B_nms=None)
     if evaluation.mechanics is not None:
         B, tau_c = evaluation.mechanics.B, evaluation.mechanics.tau_c
         machine = replace(machine, tau_c_nm=max(0.0, tau_c.value), B_nms=max(0.0, B.value))

@@ -11,6 +11,8 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from pmsmtool.design.current_loop import imc
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError, LimitExceeded
@@ -58,7 +60,7 @@ U_SHARE = 0.5
 """Largest injection amplitude, of the largest voltage."""
 RUN_BANDWIDTH_RAD_S = 2.0 * math.pi * 120.0
 """Current bandwidth of the runs that turn the shaft, at most a fifteenth of the sampling rate."""
-PUSH_SHARES = (0.25, 0.5)
+PUSH_SHARE = 0.5
 PUSH_SPEED_SHARE = 0.12
 PUSH_SAMPLES = 1024
 SPEED_LOOP_RAD_S = 25.0
@@ -67,11 +69,13 @@ TORQUE_LOSS_SHARE = 0.2
 """Part of the magnet torque that i_d may take away by reluctance: psi + (L_d - L_q) i_d."""
 REACTANCE_SHARE = 0.25
 """Voltage that the accelerating current may need at the largest speed, of the largest voltage."""
+REST_SHARE = 0.02
+"""Speed that counts as standstill, of the largest of the flux run."""
 EMF_SHARE = 0.8
 """Largest speed of the flux run: back-emf of this share of the largest voltage."""
 
-QUANTITIES = ("R", "L", "psi", "encoder", "poles", "inverter")
-"""What is measured unless something is asked for; the pushes of the flux run give a rough inertia all the same."""
+QUANTITIES = ("R", "L", "psi", "encoder", "poles", "inverter", "mechanics")
+"""What is measured unless something is asked for: all that current and speed control need."""
 NEEDS: Mapping[str, tuple[str, ...]] = {
     "R": ("levels",),
     "inverter": ("levels",),
@@ -395,21 +399,16 @@ class Measurement:
         self._speeds(psi, J, pole_pairs, L)
 
     def _pushes(self, resistance: ResistanceResult, pole_pairs: int) -> tuple[float, float]:
-        """Push the rotor both ways; return rough flux linkage (Wb) and inertia (kg m2)."""
+        """Push the rotor there and back; return flux linkage (Wb) and inertia (kg m2), good for a speed controller."""
         limits = self.limits
         self.say("flux and inertia, roughly: short pushes both ways")
         target = PUSH_SPEED_SHARE * limits.omega_max_rad_s
         rate = self._acceleration_per_ampere(target, pole_pairs)
-        pushes = []
-        k = 0
-        for share in PUSH_SHARES:
-            current = share * limits.I_test_apk
-            decimation = max(1, round(target / (rate * current) / (PUSH_SAMPLES * self.drive.period_s)))
-            for sign in (1.0, -1.0, -1.0, 1.0):
-                push = self._push(sign * current, PUSH_SAMPLES, decimation, pole_pairs)
-                self.keep(f"push_{k}", push)
-                pushes.append(push)
-                k += 1
+        current = PUSH_SHARE * limits.I_test_apk
+        decimation = max(1, round(target / (rate * current) / (PUSH_SAMPLES * self.drive.period_s)))
+        pushes = [self._push(sign * current, PUSH_SAMPLES, decimation, pole_pairs) for sign in (1.0, -1.0)]
+        for k, push in enumerate(pushes):
+            self.keep(f"push_{k}", push)
         fastest = max(pushes, key=lambda trace: float(abs(trace["omega_e_rad_s"][-64:].mean())))
         tail = slice(-64, None)
         omega = float(fastest["omega_e_rad_s"][tail].mean())
@@ -436,7 +435,8 @@ class Measurement:
             change = float(omega[-16:].mean() - omega[:16].mean())
             self._push(-current, 256, decimation, pole_pairs)
             if abs(change) > 0.15 * target:
-                return abs(change) / (0.94 * seconds * current)
+                # from the current that flowed: a slow loop, or a dead time, lets it rise late
+                return abs(change) / abs(float(np.sum(push["i_q_a"][8:-8])) * push.period_s)
             if current < 0.4 * self.limits.I_test_apk:
                 current *= 2.0
             else:
@@ -492,7 +492,7 @@ class Measurement:
             for wave in waves:
                 self.keep(f"wave_{len(rows)}", wave)
                 rows.append(more.pop(0))
-            speed_run.reach(self.drive, 0.0, limit_s=1.0)
+            speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)
         self.keep("speeds", speed_run.speeds_trace(rows, pole_pairs))
 
     def _off_and_write(self, values: Mapping[str, float]) -> None:
