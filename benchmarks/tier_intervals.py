@@ -112,7 +112,8 @@ def _by_injection(drive: RecordingDrive) -> TierResult:
     )  # fmt: skip
     with guarded(drive, envelope) as guard:
         Measurement(guard, limits, traces.__setitem__, lambda text: None).run(request.quantities)
-    found = evaluate(traces, nameplate.inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=nameplate.inverter.U_dc_v)
+    T_s, T_ref, U_dc = nameplate.inverter.T_s, nameplate.machine.T_ref_c, nameplate.inverter.U_dc_v
+    found = evaluate(traces, T_s, T_ref_c=T_ref, U_dc_v=U_dc)
     estimates: dict[str, Estimate] = found.estimates()
     return TierResult({name: estimates[name] for name in OF_THE_MACHINE}, {}, {})
 
