@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import FILE, examples, output_options
 from pmsmtool.cli.output import Output, table
 from pmsmtool.cli.output_file import write_file
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
+    from pmsmtool.machine.machine_file import MachineFile
 
 
 @click.command(
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
         "pmsmtool tune interior-2k2 -o design.toml --bandwidth-hz 600 --phase-margin-deg 55",
         "pmsmtool tune machine.toml -o design.toml --method second-order --bandwidth-hz 300 --damping 0.9",
         "pmsmtool tune machine.toml -o design.toml --speed-bandwidth-hz 12 --notch-hz 180",
+        "pmsmtool tune machine.toml -o design.toml --map my-drive.toml --drive-bandwidth-hz 95",
     ),
 )
 @click.argument("machine")
@@ -80,20 +83,31 @@ if TYPE_CHECKING:
     default="auto",
     help="auto: a table for a saturated machine, else the accelerated optimisation.",
 )
+@map_option
+@click.option("--drive-bandwidth-hz", type=float, metavar="HZ", help="Current bandwidth of a drive of --map that takes "
+              "no gains.")  # fmt: skip
+@click.option("--limit-speed-rpm", type=float, metavar="RPM", help="Speed up to which a drive of --map never saturates."
+              "  [default: at the most torque x speed]")  # fmt: skip
+@click.option("--limit-rise-s", type=float, default=0.02, metavar="S", help="Its time from zero to its torque limit.")
+@click.option("--limit-acceleration-rpm-per-s", type=float, metavar="RPM/S", help="Its largest acceleration.  "
+              "[default: torque limit / J]")  # fmt: skip
 @output_options
-def tune_command(machine: str, path: Path, params_path: Path | None, out: Output, **asked: Any) -> None:
+def tune_command(
+    machine: str, path: Path, params_path: Path | None, map_file: Path | None, out: Output, **asked: Any
+) -> None:
     """Design the control of MACHINE (a machine file, a run directory or a profile).
+
+    With --map of a drive that cannot be reflashed: its gains as far as it takes them, and the torque, slope and speed
+    limits that keep its voltage demand within its limit; the guarantee and its cost are said.
 
     Writes the design with the machine embedded and every gain with its unit, method and achieved margin, and beside it
     the parameter set that flash-params sends. Exit code 1 when the margins asked for cannot be met.
     """
     from pmsmtool.design.design_file import design_text
-    from pmsmtool.design.tune import tune
-    from pmsmtool.design.tune_request import TuneRequest
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.machine.profile import machine_path
 
-    design = tune(load_machine_file(machine_path(machine)), TuneRequest(**asked))
+    design = _design(load_machine_file(machine_path(machine)), map_file, asked)
     params = design.parameter_set()
     params_path = _params_path(path) if params_path is None else params_path
     write_file(path, design_text(design))
@@ -114,6 +128,24 @@ def tune_command(machine: str, path: Path, params_path: Path | None, out: Output
     out.note(f"wrote {path}, {params_path}")
 
 
+def _design(source: MachineFile, map_file: Path | None, asked: dict[str, Any]) -> Design:
+    from pmsmtool.design.tune import tune
+    from pmsmtool.design.tune_request import TuneRequest
+
+    drive_map = read_map(map_file)
+    limits = {name.removeprefix("limit_"): asked.pop(name) for name in _LIMITS}
+    bandwidth_hz = asked.pop("drive_bandwidth_hz")
+    if drive_map.staging:
+        return tune(source, TuneRequest(**asked))
+    from pmsmtool.design.closed_drive import ClosedDrive, tune_closed
+
+    drive = ClosedDrive(drive_map.name, frozenset(drive_map.cells), bandwidth_hz, **limits)
+    return tune_closed(source, TuneRequest(**asked), drive)[0]
+
+
+_LIMITS = ("limit_speed_rpm", "limit_rise_s", "limit_acceleration_rpm_per_s")
+
+
 def _params_path(design: Path) -> Path:
     # Two designs in one folder keep a parameter set each.
     return design.with_name("params.toml" if design.name == "design.toml" else f"{design.stem}.params.toml")
@@ -129,6 +161,7 @@ _SHOWN_LIMITS = (
     "field_weakening.h1", "field_weakening.h2", "field_weakening.beta", "field_weakening.sigma",
     "field_weakening.iterations", "field_weakening.i_d_min_a", "field_weakening.i_d_lm_a",
 )  # fmt: skip
+_SHOWN_CLOSED = ("reference.tau_rated_nm", "reference.torque_slope_nm_per_s")
 _SHOWN_POLAR = (
     "polar.mode", "polar.options", "polar.sigma_phase_rad_s", "polar.sigma_amplitude_rad_s", "polar.tau_s",
     "polar.omega_c_rad_s", "polar.omega_dob_rad_s", "polar.V_ref_ratio", *_SHOWN[4:],
@@ -139,7 +172,9 @@ def _lines(design: Design) -> Iterator[str]:
     from pmsmtool.params.catalogue import BY_NAME
 
     polar = design["polar.mode"] != 0.0
-    shown = _SHOWN_POLAR if polar else (*_SHOWN, *_SHOWN_LIMITS)
+    shown: tuple[str, ...] = _SHOWN_POLAR if polar else (*_SHOWN, *_SHOWN_LIMITS)
+    if any(name in design.values for name in _SHOWN_CLOSED):
+        shown = (*_SHOWN, *_SHOWN_CLOSED, "motor.n_max_rpm")
     rows = [(name, f"{design[name]:.6g}", BY_NAME[name].unit, design.values[name].method) for name in shown]
     yield from table(("parameter", "value", "unit", "method"), rows)
     yield ""

@@ -14,7 +14,7 @@ from pmsmtool.design.sampled_loop import LoopMargins
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.key import did_you_mean
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_from_tables, machine_tables
-from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
+from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
@@ -104,7 +104,7 @@ def design_text(design: Design) -> str:
         "loop": {name: _loop_table(loop) for name, loop in design.loops.items()},
     }
     groups: dict[str, dict[str, Any]] = {}
-    for row in CATALOGUE:
+    for row in EVERY:
         if row.name in design.values:
             group, key = row.name.split(".", 1)
             groups.setdefault(group, {})[key] = _value_table(design, row.name)
@@ -229,7 +229,7 @@ def _read_values(table: Any) -> tuple[dict[str, DesignValue], list[str]]:
             else:
                 values[name] = DesignValue(float(number), str(entry.get("method", "")), str(entry.get("loop", "")))
     wrong += [f"{row.name}: is missing" for row in CATALOGUE if row.name not in values and not wrong]
-    ordered = {row.name: values[row.name] for row in CATALOGUE if row.name in values}
+    ordered = {row.name: values[row.name] for row in EVERY if row.name in values}
     return ordered, wrong
 
 

@@ -19,7 +19,7 @@ from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 
 Rounding = Literal["nearest", "down", "up"]
-Form = Literal["value", "time", "rate", "torque constant"]
+Form = Literal["value", "time", "rate", "relative", "torque constant"]
 Recording = Literal["none", "element", "index", "domain"]
 Injecting = Literal["none", "current", "voltage"]
 
@@ -72,8 +72,9 @@ class Cell:
         What one count is worth (``firmware/wire_units.py``), as in the drive's manual.
     form : str
         ``value``; ``time``: the drive keeps gain / value (an integral time T_n = K_p / K_i); ``rate``: value / gain
-        (an integral rate K_i / K_p); ``torque constant``: 1.5 p psi_f instead of the flux linkage (``gain`` is the
-        number of pole pairs).
+        (an integral rate K_i / K_p, a torque slope / rated torque); ``relative``: value / gain of the same unit (a
+        torque / rated torque); ``torque constant``: 1.5 p psi_f instead of the flux linkage (``gain`` is the number of
+        pole pairs).
     source : str
         Key of ``DriveMap.sources`` that confirms the object.
     """
@@ -148,7 +149,7 @@ class Cell:
         other = self._other(values)
         if self.form == "torque constant":
             return TORQUE_FACTOR * other * value
-        divided = (value, other) if self.form == "rate" else (other, value)
+        divided = (other, value) if self.form == "time" else (value, other)
         return divided[0] / divided[1] if divided[1] else math.inf
 
     def _meant(self, kept: float, values: Mapping[str, float]) -> float:
@@ -156,7 +157,7 @@ class Cell:
         if self.form == "value":
             return kept
         other = self._other(values)
-        if self.form == "rate":
+        if self.form in ("rate", "relative"):
             return kept * other
         if self.form == "torque constant":
             return kept / (TORQUE_FACTOR * other) if other else math.inf

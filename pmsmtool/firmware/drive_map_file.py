@@ -28,7 +28,7 @@ from pmsmtool.firmware.drive_map import (
     SignalCell,
 )
 from pmsmtool.firmware.wire_units import counted_in, wire_unit
-from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, Parameter
+from pmsmtool.params.catalogue import BY_NAME, EVERY, Parameter
 from pmsmtool.params.parameter_set import TABLE_NAMES
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_text
@@ -44,7 +44,7 @@ _TABLES = ("capabilities", "objects", "signals", "tables", "left_out", "sources"
 _CELL_KEYS = ("index", "sub", "type", "factor", "offset", "unit", "rounding", "form", "gain", "source")
 _TEXT_KEYS = ("type", "unit", "form", "rounding", "gain", "source")
 _SIGNAL_KEYS = ("index", "sub", "type", "unit", "source")
-_FORM_UNIT: dict[str, str] = {"time": "s", "rate": "1/s", "torque constant": "N m/A"}
+_FORM_UNIT: dict[str, str] = {"time": "s", "rate": "1/s", "relative": "1", "torque constant": "N m/A"}
 _CHOICES = {"recorder": get_args(Recording), "injection": get_args(Injecting)}
 
 Complain = Callable[[str, str], None]
@@ -187,7 +187,7 @@ def _parse_tables(
     live = table("signals").items()
     signals = {name: _parse_signal(name, row, sources, about("signals", name)) for name, row in live}
     return {
-        "cells": {row.name: cells[row.name] for row in CATALOGUE if row.name in cells},
+        "cells": {row.name: cells[row.name] for row in EVERY if row.name in cells},
         "tables": {name: _parse_table(name, row, about("tables", name)) for name, row in table("tables").items()},
         "capabilities": _parse_capabilities(table("capabilities"), complain),
         "signals": {name: signal for name, signal in signals.items() if signal is not None},
@@ -217,7 +217,7 @@ def _parse_cell(name: str, row: Any, sources: Mapping[str, str], complain: Compl
     gain = row.get("gain", POLE_PAIRS if form == "torque constant" else "")
     if gain and gain not in BY_NAME:
         tell("gain", f"gain {gain!r} is not in the parameter catalogue")
-    if form in ("time", "rate") and not gain:
+    if form in ("time", "rate", "relative") and not gain:
         tell("form", f"form {form!r} needs the gain it is relative to")
     if said:
         return None

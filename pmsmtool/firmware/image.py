@@ -18,6 +18,7 @@ from enum import IntEnum
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import (
     CATALOGUE,
+    CLOSED_DRIVE,
     LUT_CAPACITY_WORDS,
     SCHEMA_VERSION,
     Parameter,
@@ -93,7 +94,9 @@ def _check_names(values: Mapping[str, float]) -> None:
             ImageStatus.SIZE,
             "the values do not fill the image",
             violations=tuple(wrong),
-            likely="the set was written for another schema",
+            likely="it is for a drive that cannot be reflashed, which has no image"
+            if any(row.name in values for row in CLOSED_DRIVE)
+            else "the set was written for another schema",
         )
 
 

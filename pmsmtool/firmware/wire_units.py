@@ -50,6 +50,8 @@ _COMPOSITE: dict[str, tuple[str, float]] = {
     "rev": ("angle", 2.0 * math.pi),
     "rev/s": ("angular speed", 2.0 * math.pi),
     "1/s": ("frequency", 1.0),
+    "permille": ("ratio", 1e-3),
+    "permille/s": ("frequency", 1e-3),
     "us": ("time", 1e-6),
     "ms": ("time", 1e-3),
 }

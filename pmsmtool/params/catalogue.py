@@ -175,7 +175,19 @@ _ROWS: tuple[tuple[str, int, int, WireType, str, float, float, float, bool, str]
 CATALOGUE: tuple[Parameter, ...] = tuple(Parameter(*row) for row in _ROWS)
 """All parameters, in the order of the C struct and of the packed image."""
 
-BY_NAME: dict[str, Parameter] = {row.name: row for row in CATALOGUE}
+CLOSED_DRIVE: tuple[Parameter, ...] = tuple(
+    Parameter(*row)
+    for row in (
+        ("reference.tau_rated_nm", 0x6076, 0, _F32, "N m", 65, 1e-3, 4e6, False, "rated torque, base of relative torques"),
+        ("reference.torque_slope_nm_per_s", 0x6087, 0, _F32, "N m/s", 1e4, 1e-3, 1e9, False, "slope limit of the torque set-point"),
+    )
+)
+"""What limits a drive whose control cannot be changed; objects of CiA 402. Not in the reference drive's image."""
+
+EVERY: tuple[Parameter, ...] = (*CATALOGUE, *CLOSED_DRIVE)
+"""Everything a parameter set may hold, in its order."""
+
+BY_NAME: dict[str, Parameter] = {row.name: row for row in EVERY}
 BY_OBJECT: dict[tuple[int, int], Parameter] = {(row.index, row.sub): row for row in CATALOGUE}
 
 LUT_CAPACITY_WORDS = 8192

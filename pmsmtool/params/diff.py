@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
+from pmsmtool.params.catalogue import BY_NAME, EVERY
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 
 
@@ -50,7 +50,7 @@ def compare(old: ParameterSet, new: ParameterSet, *, common_only: bool = False) 
         Leave out what only one of the sets holds.
     """
     found = []
-    for row in CATALOGUE:
+    for row in EVERY:
         a, b = old.values.get(row.name), new.values.get(row.name)
         if a != b and not (common_only and None in (a, b)):
             found.append(Difference(row.name, a, b, row.unit))

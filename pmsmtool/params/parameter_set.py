@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, LUT_CAPACITY_WORDS
+from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY, LUT_CAPACITY_WORDS
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_text
 
@@ -56,7 +56,7 @@ class ParameterSet:
         if unknown:
             raise ConfigError("not in the parameter catalogue", violations=unknown)
         object.__setattr__(
-            self, "values", {r.name: float(self.values[r.name]) for r in CATALOGUE if r.name in self.values}
+            self, "values", {r.name: float(self.values[r.name]) for r in EVERY if r.name in self.values}
         )
         object.__setattr__(
             self, "tables", {n: tuple(map(float, self.tables[n])) for n in TABLE_NAMES if n in self.tables}
@@ -160,7 +160,7 @@ def _read_groups(document: Mapping[str, Any]) -> tuple[dict[str, float], dict[st
     wrong: list[str] = []
     for group, entries in document.items():
         if not isinstance(entries, dict):
-            wrong.append(_unknown(group, {row.name.split(".")[0]: None for row in CATALOGUE}))
+            wrong.append(_unknown(group, {row.name.split(".")[0]: None for row in EVERY}))
             continue
         for key, value in entries.items():
             name = f"{group}.{key}"

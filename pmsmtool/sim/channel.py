@@ -9,7 +9,8 @@ NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
 ``bitrate`` bit rate (bit/s) for bit-exact frame times; default: nominal times at 1 Mbit/s
 ``node``   node id of the first drive, outranks one stored by LSS; default 1; 255: unconfigured
 ``nodes``  number of drives on the line, with consecutive node ids and serial numbers; default 1
-``drive``  family whose object dictionary the drive shows (``firmware-params``); default: the reference drive's own
+``drive``  family whose object dictionary the drive shows (``firmware-params``), or the path of a map file; default:
+           the reference drive's own
 ``tier``   ``inject`` or ``recorder``: the reference drive without its averages, without its excitation too
 ``speed``  how fast idle time passes at most, as a multiple of the wall clock; default: at once
 ========== =============================================================================================
@@ -25,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.drive_map_file import parse_drive_map
 from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.faults import load_faults
@@ -36,6 +38,7 @@ from pmsmtool.sim.node.memory import FileStorage, Memory, RamStorage, Storage
 from pmsmtool.sim.node.node import Node
 
 if TYPE_CHECKING:
+    from pmsmtool.firmware.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.sim.node.drive_core import DriveCore
 
@@ -151,7 +154,17 @@ def _face(channel: Channel) -> Face | Reduced | None:
         return None if channel.tier is None else Reduced(channel.tier)
     if channel.tier is not None:
         raise ConfigError("tier is of the reference drive, not of another family", where=f"channel {channel.name}")
-    return Face(load_family(channel.drive))
+    return Face(_map(str(channel.drive)))
+
+
+def _map(drive: str) -> DriveMap:
+    """Return a shipped family's map, or that of a file."""
+    if not drive.endswith(".toml"):
+        return load_family(drive)
+    try:
+        return parse_drive_map(Path(drive).read_text(encoding="utf-8"), drive)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"the drive map cannot be read: {error}", where=drive) from error
 
 
 CoreMaker = Callable[["MachineFile", int], "DriveCore"]
@@ -194,7 +207,7 @@ def build_line(
     path = machine_path(channel.name)
     machine_file = load_machine_file(path)
     face = _face(channel)
-    stem = f"{path.stem}-{channel.drive}" if isinstance(face, Face) else path.stem
+    stem = f"{path.stem}-{Path(str(channel.drive)).stem}" if isinstance(face, Face) else path.stem
     plan = None if channel.faults is None else load_faults(channel.faults)
     seed = int(machine_file.simulation.get("seed", 0)) if channel.seed is None else channel.seed  # type: ignore[arg-type]
     line = Line(channel.bitrate or bitrate, plan, seed=seed, instant=instant)

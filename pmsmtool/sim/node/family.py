@@ -23,6 +23,8 @@ from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM
 
 OWN = range(0x2000, 0x6000)
 """Indices of the reference drive's own objects."""
+STANDARD = range(0x6000, 0x6800)
+"""Indices of the standard's objects of one axis."""
 DATA_SHEET = (0x1021, 0x1022)
 """Stored data sheet: the reference drive's would describe another drive."""
 ONE_FOR_BOTH_AXES = {
@@ -178,6 +180,8 @@ class _Parameters:
     def entries(self) -> Iterator[Entry]:
         """Make the entries."""
         for cell in self._map.cells.values():
+            if cell.index in STANDARD and self._has(cell):
+                continue  # works as the standard says, for every family
             parameter = BY_NAME[cell.name]
             row = _row(cell.index, cell.sub, cell.wire, parameter.meaning, "rw", "R" if parameter.live else "0", True)
             entry = Entry(row, 0)
@@ -185,6 +189,13 @@ class _Parameters:
             entry.source, entry.sink = self._source(cell), self._sink(cell)
             self._shown[cell.name] = entry
             yield entry
+
+    def _has(self, cell: Cell) -> bool:
+        """Whether the drive itself has the object, in the type of the map."""
+        return any(
+            (entry.row.index, entry.row.sub, entry.row.type) == (cell.index, cell.sub, _TYPES[cell.wire])
+            for entry in self._dictionary
+        )
 
     def _source(self, cell: Cell) -> Callable[[], bytes]:
         def read() -> bytes:
@@ -206,7 +217,7 @@ class _Parameters:
             self._act(cell, data)
             self._shown[cell.name].value = bytes(data)
             for other in self._map.cells.values():
-                if other.gain == cell.name and self._shown[other.name].value:
+                if other.gain == cell.name and other.name in self._shown and self._shown[other.name].value:
                     self._follow(other)
 
         return write

@@ -14,6 +14,7 @@ from pmsmtool.machine.key import did_you_mean
 from pmsmtool.workflow.reproduce.figure import Reproduction
 
 JERCIC = "Jercic et al. 2017, DOI 10.1080/00051144.2018.1453441"
+OURS = "ours; scenarios of Jercic et al. 2017"
 MIYAJIMA = "Miyajima, Fujimoto, Fujitsuna 2013"
 
 
@@ -55,6 +56,7 @@ FIGURES: tuple[Row, ...] = (
     Row("plant-mismatch", "random_steps:plant_mismatch", "300 steps on each of five other plants", JERCIC, 6.0),
     Row("speed-ramp", "speed_rise:speed_ramp", "620 to 900 rpm in 20 ms without field weakening", JERCIC, 2.0),
     Row("speed-steps", "speed_rise:speed_steps", "620 to 900 and 1200 rpm without field weakening", JERCIC, 2.0),
+    Row("closed-drive", "closed_drive:closed_drive", "a drive that cannot be reflashed: guarantee, cost", OURS, 5.0),
     Row("miyajima-fig2", "polar_steps:figure_2", "conventional voltage-phase control at 800 rpm", MIYAJIMA, 0.5),
     Row("miyajima-fig3", "polar_steps:figure_3", "proposed phase and amplitude control at 800 rpm", MIYAJIMA, 0.5),
     Row("miyajima-fig4", "polar_steps:figure_4", "Fig. 2 on the whole drive, with noise", MIYAJIMA, 0.5),

@@ -1,0 +1,390 @@
+"""The governor of a drive that cannot be reflashed: the admissible set projected onto what it offers.
+
+A closed drive takes no governed reference. It offers a limit of its torque (0x6072), a slope of its set-point (0x6087)
+and a limit of its speed (0x6080), all constant. :func:`tune_closed` chooses the three so that its voltage demand never
+exceeds the limit and its current never I_max, for every course of the torque asked for and of the speed within them
+(``slope_response.py``), and says what that costs against the full governor with field weakening.
+
+What is taken as known: i_d = 0 (no field weakening), PI control with the gains that are written or said, demand
+proportional to torque, a command frame turned ahead to the middle of the period. Whether it decouples is not published
+by any maker: the worse of both is kept. The voltage margin covers what no model holds: noise, encoder error, ripple.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.design.design_file import Design, DesignValue, Scalar
+from pmsmtool.design.lookup_table import RPM, torque_limits
+from pmsmtool.design.minimum_time import TransferProblem, minimum_time
+from pmsmtool.design.operating_machine import at_temperature
+from pmsmtool.design.ratings import Ratings, ratings
+from pmsmtool.design.slope_response import CurrentLoops, MachineBox, SlopeResponse, slope_response
+from pmsmtool.design.tolerance import ToleranceBox, tolerance_box
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.errors import ConfigError, DesignInfeasible, NotAvailable
+from pmsmtool.machine.machine_file import MachineFile
+
+Array = NDArray[np.float64]
+
+RATED, SLOPE, TORQUE, SPEED = (
+    "reference.tau_rated_nm", "reference.torque_slope_nm_per_s", "speed.tau_max_nm", "motor.n_max_rpm",
+)  # fmt: skip
+GAINS = ("current.K_p_q_v_per_a", "current.K_i_q_v_per_as")
+SPEEDS = 26
+"""Speeds of the responses; the cells between them widen the bound by 1 % of the voltage (measured on interior-2k2)."""
+STAIR_S = 1e-3
+"""Time between two steps of a closed drive's slope, where its maker does not say."""
+RISE_S = 0.02
+"""Time from zero to the torque limit where none is asked for."""
+HALVINGS = 14
+LOWER, TRIES = 0.8, 20
+"""Where the loops are unstable at the largest speed, a lower one is tried."""
+DEAD_TIME_VECTOR = 4.0 / 3.0
+"""Length of the sum of three phase errors of one size and the signs of their currents."""
+BAND = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class ClosedDrive:
+    """What a closed drive offers and what is known of its control.
+
+    Attributes
+    ----------
+    name : str
+        Family.
+    offers : frozenset of str
+        Catalogue names it has an object for.
+    bandwidth_hz : float or None
+        Bandwidth of its current control where its gains cannot be written.
+    rise_s : float
+        Largest time from zero to the torque limit.
+    speed_rpm : float or None
+        Speed up to which the guarantee is to hold; None: where torque times speed is largest.
+    acceleration_rpm_per_s : float or None
+        Largest acceleration, whatever causes it; None: what the torque limit does to the least inertia.
+    stair_s, filter_s : float
+        Time between two steps of its slope; time constant of a set-point filter it is known to have.
+    decoupled : bool or None
+        Whether its current control adds omega (L i + psi); None: not known, both are held to.
+    """
+
+    name: str
+    offers: frozenset[str]
+    bandwidth_hz: float | None = None
+    rise_s: float = RISE_S
+    speed_rpm: float | None = None
+    acceleration_rpm_per_s: float | None = None
+    stair_s: float = STAIR_S
+    filter_s: float = 0.0
+    decoupled: bool | None = None
+
+    def __post_init__(self) -> None:
+        numbers = {"bandwidth_hz": self.bandwidth_hz, "rise_s": self.rise_s, "speed_rpm": self.speed_rpm,
+                   "acceleration_rpm_per_s": self.acceleration_rpm_per_s, "stair_s": self.stair_s}  # fmt: skip
+        wrong = [
+            f"{name} = {value!r} is not a positive number"
+            for name, value in numbers.items()
+            if value is not None and not (math.isfinite(value) and value > 0.0)
+        ]
+        if not (math.isfinite(self.filter_s) and self.filter_s >= 0.0):
+            wrong.append(f"filter_s = {self.filter_s!r} is negative")
+        if wrong:
+            raise ConfigError("the request cannot be used", where="closed drive", violations=wrong)
+        missing = [name for name in (RATED, SLOPE, TORQUE) if name not in self.offers]
+        if missing:
+            raise NotAvailable(
+                f"the drive map {self.name!r} has no object for {', '.join(missing)}",
+                where="closed drive",
+                likely="its maker documents no torque mode with a slope (0x6087, 0x6072, 0x6076)",
+                hint="a master that limits the slope of 0x6071 itself has the same effect",
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Guarantee:
+    """In which range the voltage demand never exceeds the limit, and what that costs.
+
+    Attributes
+    ----------
+    tau_nm, n_rpm, slope_nm_per_s, acceleration_rpm_per_s : float
+        The range: torque, speed, slope of the set-point, acceleration.
+    I_apk, deviation_a : float
+        Largest current of the reference, and how far the current may stray from it (A).
+    demand_v, limit_v, V_max_v : float
+        Bound of the demand; what it is held to: the least V_max less margin and dead time; the least V_max.
+    speeds_rpm, closed_nm, governed_nm : ndarray, shape (m,)
+        Largest torque over speed: of a limit that followed the speed, and of the full governor.
+    governed_rise_s : float
+        Time from zero to ``tau_nm`` at ``n_rpm`` in the shortest possible way, which the full governor takes.
+    """
+
+    tau_nm: float
+    n_rpm: float
+    slope_nm_per_s: float
+    acceleration_rpm_per_s: float
+    I_apk: float
+    deviation_a: float
+    demand_v: float
+    limit_v: float
+    V_max_v: float
+    speeds_rpm: Array
+    closed_nm: Array
+    governed_nm: Array
+    governed_rise_s: float
+
+    @property
+    def torque_loss(self) -> float:
+        """Share of the full governor's torque at the guaranteed speed that is lost."""
+        return 1.0 - self.tau_nm / float(np.interp(self.n_rpm, self.speeds_rpm, self.governed_nm))
+
+    @property
+    def standstill_loss(self) -> float:
+        """The same at standstill."""
+        return 1.0 - self.tau_nm / float(self.governed_nm[0])
+
+    @property
+    def rise_s(self) -> float:
+        """Time from zero to the torque limit along the slope."""
+        return self.tau_nm / self.slope_nm_per_s
+
+    def facts(self) -> dict[str, Scalar]:
+        """Return everything as facts of a design."""
+        return {
+            "closed_drive_torque_nm": self.tau_nm,
+            "closed_drive_speed_rpm": self.n_rpm,
+            "closed_drive_slope_nm_per_s": self.slope_nm_per_s,
+            "closed_drive_acceleration_rpm_per_s": self.acceleration_rpm_per_s,
+            "closed_drive_current_apk": self.I_apk,
+            "closed_drive_current_deviation_a": self.deviation_a,
+            "closed_drive_demand_v": self.demand_v,
+            "closed_drive_limit_v": self.limit_v,
+            "closed_drive_V_max_v": self.V_max_v,
+            "closed_drive_torque_loss_percent": 100.0 * self.torque_loss,
+            "closed_drive_standstill_loss_percent": 100.0 * self.standstill_loss,
+            "closed_drive_rise_s": self.rise_s,
+            "closed_drive_governed_rise_s": self.governed_rise_s,
+        }
+
+    def sentence(self) -> str:
+        """Return the guarantee as a person reads it."""
+        return (
+            f"voltage demand <= {self.demand_v:.4g} V (limit {self.limit_v:.4g} V of {self.V_max_v:.4g} V) for every "
+            f"torque set-point within +-{self.tau_nm:.4g} N m, every speed within +-{self.n_rpm:.4g} rpm and every "
+            f"acceleration up to {self.acceleration_rpm_per_s:.3g} rpm/s, delay and intervals included; current within "
+            f"{self.I_apk + self.deviation_a:.4g} A; beyond that speed nothing is promised. "
+            f"Cost: {100.0 * self.torque_loss:.1f} % of the full governor's torque at that speed, "
+            f"{100.0 * self.standstill_loss:.1f} % at standstill; {1e3 * self.rise_s:.3g} ms to the torque limit "
+            f"instead of {1e3 * self.governed_rise_s:.3g} ms"
+        )
+
+
+def tune_closed(source: MachineFile, request: TuneRequest, drive: ClosedDrive) -> tuple[Design, Guarantee]:
+    """Design a closed drive: gains as far as it takes them, and the limits that keep it out of saturation.
+
+    Raises
+    ------
+    ConfigError
+        What is needed and not known: bandwidth of a drive whose gains cannot be written, inertia or acceleration.
+    DesignInfeasible
+        No torque is admissible, not even at the lowest speeds.
+    """
+    design = tune(source, replace(request, controller="pi", governor="off", field_weakening="off"))
+    rated = ratings(source, (1.0 - request.voltage_margin) * source.inverter.V_max_v)
+    loops = current_loops(design, source, drive)
+    found = _Projection(source, rated, request, drive, loops).guarantee()
+    how = f"{drive.name}: largest torque x speed whose demand is bounded by the voltage limit"
+    rated_nm = TORQUE_FACTOR * source.machine.pole_pairs * source.machine.psi_f_wb * rated.I_nom_apk
+    values = {
+        **design.values,
+        RATED: DesignValue(rated_nm, "torque of the rated current without i_d"),
+        SLOPE: DesignValue(found.slope_nm_per_s, f"{drive.name}: largest slope with a bounded demand"),
+        TORQUE: DesignValue(found.tau_nm, how),
+        SPEED: DesignValue(min(found.n_rpm, rated.n_max_rpm), how),
+    }
+    notes = (*design.notes, *tolerance_box(source).notes, found.sentence())
+    if SPEED not in drive.offers:
+        notes += (f"{drive.name} has no object for the speed limit: keep {found.n_rpm:.4g} rpm in the application",)
+    asked: dict[str, Scalar] = {**design.request, "drive": drive.name}
+    return replace(design, values=values, facts={**design.facts, **found.facts()}, notes=notes, request=asked), found
+
+
+TORQUE_FACTOR = 1.5
+
+
+def current_loops(design: Design, source: MachineFile, drive: ClosedDrive) -> CurrentLoops:
+    """Return the current control: the design's gains where the drive takes them, else what its bandwidth says."""
+    machine, inverter = source.machine, source.inverter
+    if all(name in drive.offers for name in GAINS):
+        own = [name if name in drive.offers else name.replace("_d_", "_q_") for name in _D_GAINS]
+        K_p, K_i = (design[own[0]], design[GAINS[0]]), (design[own[1]], design[GAINS[1]])
+    elif drive.bandwidth_hz is not None:
+        alpha = 2.0 * math.pi * drive.bandwidth_hz
+        K_p = (alpha * machine.L_d_h, alpha * machine.L_q_h)
+        K_i = (alpha * machine.R_s_ohm, alpha * machine.R_s_ohm)
+    else:
+        raise ConfigError(
+            f"the gains of {drive.name!r} cannot be written, and its current bandwidth is not known",
+            where="closed drive",
+            hint="give --drive-bandwidth-hz, as the maker's tool or manual says",
+        )
+    whole = max(0, math.ceil(inverter.delay_periods - 0.5 - 1e-9))
+    if whole > 1:
+        raise ConfigError(f"{inverter.delay_periods:g} periods of delay are not modelled", where="closed drive")
+    return CurrentLoops(K_p, K_i, inverter.T_s, whole, False, drive.stair_s, drive.filter_s)
+
+
+_D_GAINS = ("current.K_p_d_v_per_a", "current.K_i_d_v_per_as")
+
+
+def machine_box(source: MachineFile, box: ToleranceBox) -> MachineBox:
+    """Return the constants' 95 % intervals over the temperatures of a tolerance box."""
+    machine = source.machine
+
+    def ends(name: str, low: float, high: float) -> tuple[float, float]:
+        half = box.factors[name].half_width if name in box.factors else 0.0
+        return (1.0 - half) * low, (1.0 + half) * high
+
+    copper = machine.R_s_ohm if machine.R_winding_ohm is None else machine.R_winding_ohm
+    R = [machine.R_s_ohm + copper * machine.alpha_R_per_k * (T - machine.T_ref_c) for T in box.T_winding_c]
+    psi = [machine.psi_f_wb * (1.0 + machine.alpha_psi_per_k * (T - machine.T_ref_c)) for T in box.T_magnet_c]
+    return MachineBox(
+        ends("R_s_ohm", min(R), max(R)),
+        ends("L_d_h", machine.L_d_h, machine.L_d_h),
+        ends("L_q_h", machine.L_q_h, machine.L_q_h),
+        ends("psi_f_wb", min(psi), max(psi)),
+    )
+
+
+class _Projection:
+    """Search of the largest range; everything in SI, electrical speed."""
+
+    def __init__(
+        self, source: MachineFile, rated: Ratings, request: TuneRequest, drive: ClosedDrive, loops: CurrentLoops
+    ) -> None:
+        machine, inverter = source.machine, source.inverter
+        tolerance = tolerance_box(source)
+        self.source, self.rated, self.drive = source, rated, drive
+        self.box = machine_box(source, tolerance)
+        self.V_max = inverter.voltage_utilisation * min(tolerance.U_dc_v)
+        dead = DEAD_TIME_VECTOR * inverter.dead_time_s / inverter.T_s * max(tolerance.U_dc_v)
+        self.margin = request.voltage_margin
+        self.limit = (1.0 - request.voltage_margin) * self.V_max - dead
+        flux = tolerance.factors["psi_f_wb"].half_width if "psi_f_wb" in tolerance.factors else 0.0
+        self.per_ampere = TORQUE_FACTOR * machine.pole_pairs * machine.psi_f_wb * (1.0 - flux)
+        if machine.psi_f_wb == 0.0:
+            raise DesignInfeasible("without a magnet there is no torque at i_d = 0", where="closed drive")
+        if machine.J_kgm2 is None and drive.acceleration_rpm_per_s is None:
+            raise ConfigError(
+                "neither the inertia J_kgm2 nor the largest acceleration is known",
+                where="closed drive",
+                hint="put J_kgm2 into the machine file, or give --acceleration-rpm-per-s",
+            )
+        J = tolerance.factors["J_kgm2"].half_width if "J_kgm2" in tolerance.factors else 0.0
+        self.least_J = (machine.J_kgm2 or math.inf) * (1.0 - J)
+        self.per_rpm = machine.pole_pairs / RPM
+        self.responses = self._responses(loops)
+        self.I_top = min(rated.I_max_apk, rated.tau_max_nm / self.per_ampere)
+
+    def _responses(self, loops: CurrentLoops) -> Sequence[SlopeResponse]:
+        """Return the responses of both structures; without a speed asked for, up to where the loops are stable."""
+        asked = self.drive.speed_rpm
+        # beyond, the magnet alone takes the whole voltage
+        top_rpm = min(self.rated.n_max_rpm, self.limit / self.box.psi[0] / self.per_rpm) if asked is None else asked
+        structures = (False, True) if self.drive.decoupled is None else (self.drive.decoupled,)
+        for _ in range(TRIES):
+            try:
+                return [
+                    slope_response(self.box, replace(loops, decoupled=one), top_rpm * self.per_rpm, SPEEDS)
+                    for one in structures
+                ]
+            except DesignInfeasible:
+                if asked is not None:
+                    raise
+                top_rpm *= LOWER
+        raise DesignInfeasible("the current loops of the closed drive are unstable", where="closed drive")
+
+    def demand(self, I_apk: float, slope_a: float, speeds: int) -> tuple[float, float]:
+        """Return bounds of the demand (V) and of the current's deviation (A)."""
+        stair = min(slope_a * self.drive.stair_s, 2.0 * I_apk)
+        rate = self.acceleration(I_apk)
+        bounds = [one.largest_demand(I_apk, stair, rate, speeds) for one in self.responses]
+        return max(float(demand.max()) for demand, _ in bounds), max(deviation for _, deviation in bounds)
+
+    def holds(self, I_apk: float, slope_a: float, speeds: int) -> bool:
+        """Whether neither voltage nor current can leave their limits."""
+        demand, deviation = self.demand(I_apk, slope_a, speeds)
+        return demand <= self.limit and I_apk + deviation <= self.rated.I_max_apk
+
+    def acceleration(self, I_apk: float) -> float:
+        """Return the largest |d omega_e / dt| (rad/s2)."""
+        if self.drive.acceleration_rpm_per_s is not None:
+            return self.drive.acceleration_rpm_per_s * self.per_rpm
+        # the machine's own torque, at the largest flux
+        machine = self.source.machine
+        torque = TORQUE_FACTOR * machine.pole_pairs * self.box.psi[1] * I_apk
+        return machine.pole_pairs * torque / self.least_J
+
+    def _rises(self, speeds: int, I_apk: float) -> bool:
+        return self.holds(I_apk, I_apk / self.drive.rise_s, speeds)
+
+    def currents(self) -> Array:
+        """Return the largest current admissible up to each speed, rising within the time asked for."""
+        found = [self.I_top]
+        for k in range(SPEEDS):
+            # the more speeds the less current
+            found.append(_largest(partial(self._rises, k + 1), found[-1]))
+        return np.array(found[1:])
+
+    def guarantee(self) -> Guarantee:
+        """Return the chosen range and its cost."""
+        omega = self.responses[0].omega_e
+        speeds_rpm = omega / self.per_rpm
+        currents = self.currents()
+        last = len(omega) - 1 if self.drive.speed_rpm is not None else int(np.argmax(currents * omega))
+        I_apk = float(currents[last])
+        if I_apk <= 0.0 or omega[last] <= 0.0:
+            demand, _ = self.demand(0.0, 0.0, last + 1)
+            raise DesignInfeasible(
+                f"no torque is admissible up to {speeds_rpm[last]:.5g} rpm",
+                where="closed drive",
+                likely=f"without any torque the demand is bounded by {demand:.4g} V, the limit is {self.limit:.4g} V",
+                hint="ask for a lower speed, a longer rise, or a smaller acceleration",
+            )
+        slope_a = _largest(
+            lambda slope: self.holds(I_apk, slope, last + 1), 2.0 * I_apk / self.drive.stair_s
+        )
+        demand, deviation = self.demand(I_apk, slope_a, last + 1)
+        machine = at_temperature(self.source.machine, self.source.flux_map)
+        V = (1.0 - self.margin) * self.source.inverter.V_max_v
+        full = torque_limits(machine, omega, [V], self.rated.I_max_apk, self.rated.i_d_min_a).largest_nm[:, 0]
+        # the drive's own constant may be the least of the interval: then a torque takes the most current
+        per_ampere = self.per_ampere
+        return Guarantee(
+            per_ampere * I_apk, float(speeds_rpm[last]), per_ampere * slope_a, self.acceleration(I_apk) / self.per_rpm,
+            I_apk, deviation, demand, self.limit, self.V_max, speeds_rpm, per_ampere * currents,
+            np.minimum(full, self.rated.tau_max_nm), self._shortest(I_apk, float(omega[last]), V),
+        )  # fmt: skip
+
+    def _shortest(self, I_apk: float, omega: float, V: float) -> float:
+        m = self.source.machine
+        problem = TransferProblem(m.R_s_ohm, m.L_d_h, m.L_q_h, m.psi_f_wb, omega, V)
+        return minimum_time(problem, (0.0, 0.0), (0.0, I_apk), radius=BAND * I_apk)
+
+
+def _largest(holds: Callable[[float], bool], top: float) -> float:
+    """Return the largest number up to ``top`` for which something holds that holds less and less."""
+    if holds(top):
+        return top
+    low, high = 0.0, top
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
