@@ -5,8 +5,6 @@ The times are those of Miyajima et al. 2013 and of the laws built on it, in cont
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from pmsmtool.design.design_file import DesignValue, Scalar
@@ -20,23 +18,11 @@ from pmsmtool.design.polar import (
     design_at,
     largest_i_q,
 )
+from pmsmtool.design.polar_laws import LAWS, LINEAR_RANGE, ON_MEASUREMENT, PHASE_LAWS, PREDICT, SURFACE_ONLY
 from pmsmtool.design.polar_map import stability_map
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
-
-LAWS: Mapping[str, int] = {
-    "conventional": 1,
-    "proposed": 2,
-    "linear": 3,
-    "linear-printed": 4,
-    "regularised": 5,
-    "unified": 6,
-}
-"""``polar.mode`` of the catalogue."""
-
-SURFACE_ONLY = ("conventional", "proposed", "linear", "linear-printed")
-"""Laws of the paper: they hold for L_d = L_q."""
 
 TAU_PERIODS = 10.0
 """Equivalent time constant of the coefficient diagram method, in control periods."""
@@ -46,12 +32,6 @@ OMEGA_C_PER_PERIOD, OMEGA_DOB_PER_PERIOD = 0.125, 0.04
 
 V_REF_RATIO = 0.97
 """Reference amplitude of the unified law over V_max: smoother torque on speed ramps than 1."""
-
-ON_MEASUREMENT, NO_ANTI_WINDUP, PREDICT, LINEAR_RANGE = 1, 2, 4, 8
-"""Bits of ``polar.options``: P and D on the measurement, (ablation), prediction, switch to the regularised law."""
-
-PHASE_LAWS = ("conventional", "proposed")
-"""Laws of section III: the phase is the input for i_q, which needs speed."""
 
 NEEDS_SWITCH = (
     "polar: the phase is no input for i_q at standstill; inside the voltage limit the drive switches to the"
@@ -101,7 +81,7 @@ def polar_values(
     source, rated : MachineFile, Ratings
         Machine and its limits.
     law : str
-        A key of :data:`LAWS`.
+        A key of :data:`polar_laws.LAWS`.
     weakening : str
         Mode of field weakening that was designed; other than ``lookup`` it is switched off.
 

@@ -1,4 +1,8 @@
-"""From a machine file and a request to a complete design: every row of the parameter catalogue, with its reason."""
+"""From a machine file and a request to a complete design: every row of the parameter catalogue, with its reason.
+
+What only some designs need (tables, polar control, flux maps) is imported where it is used: every command that designs
+on its way pays for what is imported here.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,7 @@ from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.design.field_weakening import design_field_weakening
 from pmsmtool.design.governor import design_governor
-from pmsmtool.design.lookup_design import LookupRequest, design_table
-from pmsmtool.design.lookup_file import lut_values
 from pmsmtool.design.lookup_table import RPM
-from pmsmtool.design.polar_values import polar_values
-from pmsmtool.design.polar_values import weakening_mode as polar_weakening_mode
 from pmsmtool.design.ratings import Ratings, rating_values, ratings
 from pmsmtool.design.sampled_loop import LoopMargins, margins
 from pmsmtool.design.speed_loop import (
@@ -31,7 +31,6 @@ from pmsmtool.design.speed_loop import (
 )
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
-from pmsmtool.machine.flux_map_check import check_flux_map
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import CATALOGUE
 
@@ -93,6 +92,8 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
         table, tables = _design_table(source, request, rated)
         parts.append(table)
     if request.controller == "polar":
+        from pmsmtool.design.polar_values import polar_values
+
         mode = _weakening_mode(source, request)
         found, facts, notes = polar_values(source, rated, request.polar_law, mode)
         parts.append(_Part(found, {}, facts, notes))
@@ -118,7 +119,11 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
 
 
 def _map_complaints(source: MachineFile) -> tuple[str, ...]:
-    return () if source.flux_map is None else check_flux_map(source.flux_map).complaints
+    if source.flux_map is None:
+        return ()
+    from pmsmtool.machine.flux_map_check import check_flux_map
+
+    return check_flux_map(source.flux_map).complaints
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +168,9 @@ def _weakening_mode(source: MachineFile, request: TuneRequest) -> str:
     if request.field_weakening != "auto":
         return request.field_weakening
     if request.controller == "polar":
-        return polar_weakening_mode(source, request.polar_law)
+        from pmsmtool.design.polar_values import weakening_mode
+
+        return weakening_mode(source, request.polar_law)
     return "accelerated" if source.flux_map is None else "lookup"
 
 
@@ -177,6 +184,9 @@ def _design_table(
     source: MachineFile, request: TuneRequest, rated: Ratings
 ) -> tuple[_Part, dict[str, tuple[float, ...]]]:
     """The table of the look-up mode, with the tightest bound that fits the drive."""
+    from pmsmtool.design.lookup_design import LookupRequest, design_table
+    from pmsmtool.design.lookup_file import lut_values
+
     refused: DesignInfeasible | None = None
     for bound in TABLE_BOUNDS:
         asked = LookupRequest(torque_bound=bound, voltage_bound=bound)

@@ -9,7 +9,7 @@ from pmsmtool.design.current_loop import Method
 from pmsmtool.design.design_file import Scalar
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING_MODES
 from pmsmtool.design.governor import MODES as GOVERNOR_MODES
-from pmsmtool.design.polar_values import LAWS as POLAR_LAWS
+from pmsmtool.design.polar_laws import LAWS as POLAR_LAWS
 from pmsmtool.design.speed_loop import SpeedMethod
 from pmsmtool.errors import ConfigError
 
@@ -25,7 +25,7 @@ class TuneRequest:
     controller : str
         ``pi`` (field-oriented) or ``polar`` (voltage amplitude and phase as inputs).
     polar_law : str
-        Law of ``polar`` (``polar_values.LAWS``).
+        Law of ``polar`` (``polar_laws.LAWS``).
     method : str
         Rule of the current gains: ``imc``, ``modulus-optimum`` or ``second-order``.
     bandwidth_hz : float or None
