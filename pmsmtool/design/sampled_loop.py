@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -107,8 +108,9 @@ class LoopMargins:
         return 20.0 * math.log10(self.gain_margin)
 
 
+@lru_cache(maxsize=8)
 def margins(loop: SampledLoop) -> LoopMargins:
-    """Return all margins of a loop, exactly.
+    """Return all margins of a loop, exactly; the last few are remembered, for a design looks at its loops twice.
 
     Phase crossings include the Nyquist frequency, where L is real: without a computation delay an integrating loop
     meets -180 degree only there.

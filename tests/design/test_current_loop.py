@@ -11,6 +11,7 @@ import pytest
 from pmsmtool.design.current_loop import (
     AxisPlant,
     CurrentGains,
+    Method,
     axis_loop,
     imc,
     maximum_delay_periods,
@@ -80,6 +81,19 @@ def test_the_loop_is_marginal_exactly_at_its_margins(gains: CurrentGains, delay:
     assert spectral_radius(slower) == pytest.approx(1.0, abs=MARGINAL_RADIUS)
     # Phase margin over crossover is that delay up to the aliasing of the extra delay.
     assert found.delay_margin_s / T_S == pytest.approx(largest - delay, rel=0.02)
+
+
+def test_the_largest_delay_is_the_first_limit_though_the_loop_is_stable_again_beyond() -> None:
+    """A predictor made for two periods: unstable from 2.19 to 2.81, stable to 2.95, unstable from there on."""
+    plant = AxisPlant(R=2.2785e-3, L=0.42428e-3, T_s=152.03e-6, delay_periods=2.0)
+    gains = CurrentGains(K_p=2.3804, K_i=3017.3, alpha=2666.7, method=Method.SECOND_ORDER)
+
+    def radius(delay: float) -> float:
+        return spectral_radius(axis_loop(gains, replace(plant, delay_periods=delay), plant))
+
+    assert radius(2.4) > 1.0 > radius(2.88)
+    assert all(radius(delay) > 1.0 for delay in (2.96, 3.5, 5.0))
+    assert maximum_delay_periods(gains, plant, plant) == pytest.approx(2.192, abs=0.001)
 
 
 def test_pulse_response_of_a_fractional_delay() -> None:
