@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import io
 import os
 import select
@@ -18,6 +20,10 @@ from pmsmtool.cli.lazy_group import COMPLETE_VARIABLE, LazyGroup
 from pmsmtool.cli.options import VERBOSITY, examples, global_options
 
 PROGRAM = "pmsmtool"
+
+_GARBAGE_THRESHOLD = 100_000
+"""Objects made before Python looks for cycles among them. A simulation ends with 43 000, imports nearly all: to search
+them on the way, and once more at exit, took 30 of 240 ms."""
 
 
 @click.group(
@@ -93,6 +99,8 @@ def _interrupt(number: int, frame: object) -> None:
 
 def main() -> None:
     """Entry point of the program."""
+    gc.set_threshold(_GARBAGE_THRESHOLD)
+    atexit.register(gc.freeze)  # what is left at exit goes with the process
     if COMPLETE_VARIABLE in os.environ:
         from click.shell_completion import shell_complete
 
