@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from benchmarks.identification_coverage import drawn, evaluated, measured, truth_of
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.estimators.axis_fit import initial_inductance
+from pmsmtool.estimators.axis_response import initial_inductance
 from pmsmtool.estimators.inductance import bare_shot
 from pmsmtool.estimators.resistance import single_point_resistance, two_point_resistance
 from pmsmtool.trace import Trace

@@ -13,42 +13,21 @@ the loop that holds the bias and heating live there, and none of it carries info
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.estimators.axis_layout import Effects, Layout, Motion, Timing
+from pmsmtool.estimators.axis_response import SKIP_SAMPLES, Shot, arx_guess, simulate
 from pmsmtool.estimators.estimate import information_weights, scaled_covariance
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt
-from pmsmtool.estimators.output_error import AxisModel, bend, recursion, respond
+from pmsmtool.estimators.output_error import respond
 from pmsmtool.estimators.refusals import refuse
 
 Vector = NDArray[np.float64]
 
-SKIP_SAMPLES = 10
-"""First samples that are simulated but not compared: the voltage before the record and the sensor's start."""
-SLOW_FRACTION = 4.0
-"""Injection frequency over the highest frequency that is projected out."""
-PASSES = 2
-"""Passes of the small non-linear terms; each shrinks what is left by R T/L, the bend or K (h T_s)^2/L."""
-LAG_CENTRE = 0.1
-"""Centre of the prior of the sensor time constant (T_s)."""
-LAG_PRIOR_STD = 1.5
-"""Prior standard deviation of ln(lag/T_s): 0.005 to 2 T_s in 95 %; keeps the fit where lag and delay are one."""
-R_PRIOR_STD = 0.5
-"""Prior of the effective resistance at the injection, relative to the loop resistance (eddy currents raise it)."""
-BEND_PRIOR_STD = 3.0
-"""Prior of the bend: relative change of L over one rms ripple, in tenths."""
-LARGEST_LOG_L, LARGEST_LOG_LAG = 3.0, 10.0
-SMALLEST_DECAY, LARGEST_DECAY = -0.3, 5.0
-"""Region of the fit: L relative to its first guess, lag relative to T_s, and R T_s/L."""
-BEND_LIMIT = 10.0
-"""Bend at which L would change by its own size over one rms ripple."""
-MOTION_PRIOR_STD = 10.0
-"""Prior of the motional term, in hundredths of L over the square of a half period."""
-RATIO_PRIOR_STD = 0.3
-"""Prior of the relative difference of L and R between injection frequencies."""
 DISPERSION_SHARE = 0.5
 """Standard deviation of L, of its difference between the injection frequencies where the fit found one."""
 DELAY_STARTS = (0.05, 0.45, 0.95, 1.45, 1.95)
@@ -65,67 +44,6 @@ NEGLIGIBLE_WEIGHT = 1e-6
 """Information weight below which a model does not count."""
 UNPHYSICAL = 1e9
 """Residual outside the region where the model is defined."""
-
-
-@dataclass(frozen=True, slots=True)
-class VoltageError:
-    """Inverter error along the axis at the bias: e(i), increasing grid of currents."""
-
-    i_a: Vector
-    u_v: Vector
-
-    def at(self, i_a: Vector) -> Vector:
-        """Error at given currents, linear between the points (V)."""
-        return np.asarray(np.interp(i_a, self.i_a, self.u_v), dtype=np.float64)
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """One record of a square wave on one axis, frozen frame.
-
-    Attributes
-    ----------
-    u_v, i_a : ndarray, shape (n,)
-        Voltage computed and current sampled at each instant.
-    cross_a : ndarray, shape (n,)
-        Current of the other axis.
-    half_period : int
-        Samples between sign changes.
-    period_s : float
-        Control period (s).
-    error : VoltageError or None
-        Inverter error from the DC levels.
-    """
-
-    u_v: Vector
-    i_a: Vector
-    cross_a: Vector
-    half_period: int
-    period_s: float
-    error: VoltageError | None = None
-
-    def slow_basis(self) -> NDArray[np.float64]:
-        """Orthonormal cosines slower than the injection, shape (n - SKIP_SAMPLES, j)."""
-        n = len(self.i_a) - SKIP_SAMPLES
-        count = max(1, round(n / (self.half_period * SLOW_FRACTION)))
-        k = np.arange(n) + 0.5
-        basis = np.cos(np.pi * np.outer(k, np.arange(count)) / n)
-        return np.asarray(basis / np.sqrt(np.sum(basis**2, axis=0)))
-
-
-@dataclass(frozen=True, slots=True)
-class Effects:
-    """Which optional effects a fit has."""
-
-    lag: bool = True
-    bend: bool = False
-    motion: bool = False
-    dispersion: bool = False
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the effects in use."""
-        return tuple(name for name in ("lag", "bend", "motion", "dispersion") if getattr(self, name))
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +76,8 @@ class AxisFit:
         Effects of the best model.
     condition : float
         Condition number of its scaled Jacobian.
+    timing : Timing
+        What the axis says about delay and lag, for the other one.
     """
 
     L_h: float
@@ -175,144 +95,7 @@ class AxisFit:
     residuals: tuple[Vector, ...]
     effects: tuple[str, ...]
     condition: float
-
-
-@dataclass(frozen=True, slots=True)
-class Response:
-    """Everything one shot is simulated with."""
-
-    model: AxisModel
-    start_a: float
-    c_2: float
-    c_3: float
-    motion: float
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Where each parameter sits in the vector, and its typical size."""
-
-    shots: int
-    effects: Effects
-    L_scale: float
-    R_scale: float
-    period_s: float
-    ripple_a: float
-    motion_scale: float
-
-    def blocks(self) -> Iterator[tuple[str, int]]:
-        """Names and lengths of the parts of the vector."""
-        yield "main", 3
-        if self.effects.lag:
-            yield "lag", 1
-        if self.effects.bend:
-            yield "bend", 2
-        if self.effects.motion:
-            yield "motion", 1
-        if self.effects.dispersion:
-            yield "dispersion", 2 * (self.shots - 1)
-        yield "start", self.shots
-
-    def split(self, x: Vector) -> dict[str, list[float]]:
-        """The parts of the vector by name."""
-        parts, first = {}, 0
-        for name, length in self.blocks():
-            parts[name] = [float(value) for value in x[first : first + length]]
-            first += length
-        return parts
-
-    def responses(self, x: Vector) -> list[Response]:
-        """Parameters of every shot."""
-        parts = self.split(x)
-        log_L, R, delay = parts["main"]
-        lag = math.exp(parts["lag"][0]) * self.period_s if self.effects.lag else 0.0
-        b_2, b_3 = parts.get("bend", [0.0, 0.0])
-        motion = parts.get("motion", [0.0])[0] * self.motion_scale
-        ratios = [0.0, 0.0, *parts.get("dispersion", [0.0] * (2 * (self.shots - 1)))]
-        return [
-            Response(
-                model=AxisModel(
-                    self.L_scale * math.exp(log_L + ratios[2 * k]),
-                    R * self.R_scale * (1.0 + ratios[2 * k + 1]),
-                    delay,
-                    lag,
-                ),
-                start_a=parts["start"][k] * self.ripple_a,
-                c_2=0.1 * b_2 / self.ripple_a,
-                c_3=0.1 * b_3 / self.ripple_a**2,
-                motion=motion,
-            )
-            for k in range(self.shots)
-        ]
-
-    def prior(self, x: Vector) -> Vector:
-        """Residuals of the weak priors that keep an undetermined effect from running away."""
-        parts = self.split(x)
-        rows = [(parts["main"][1] - 1.0) / R_PRIOR_STD]
-        rows += [(value - math.log(LAG_CENTRE)) / LAG_PRIOR_STD for value in parts.get("lag", [])]
-        rows += [value / BEND_PRIOR_STD for value in parts.get("bend", [])]
-        rows += [value / MOTION_PRIOR_STD for value in parts.get("motion", [])]
-        rows += [value / RATIO_PRIOR_STD for value in parts.get("dispersion", [])]
-        return np.array(rows)
-
-    def changed(self, x: Vector, effects: Effects) -> tuple[Layout, Vector]:
-        """The layout with more effects, or without the lag, and its starting vector."""
-        richer = replace(self, effects=effects)
-        parts = self.split(x)
-        if self.effects.lag and not effects.lag:
-            # the pure delay takes over what the lag was, as far as the record allows
-            parts["main"][2] = min(parts["main"][2] + math.exp(parts["lag"][0]), SKIP_SAMPLES - 3.5)
-        start = {"bend": [0.0, 0.0], "motion": [0.0], "dispersion": [0.0] * (2 * (self.shots - 1))}
-        values = [value for name, _ in richer.blocks() for value in parts.get(name, start.get(name, []))]
-        return richer, np.array(values)
-
-    def defined(self, x: Vector) -> bool:
-        """Whether the model can be evaluated at x."""
-        parts = self.split(x)
-        (log_L, _, delay), log_lag = parts["main"], parts.get("lag", [0.0])[0]
-        sizes = [log_L, *(log_L + ratio for ratio in parts.get("dispersion", [0.0])[::2])]
-        bent = max(abs(value) for value in parts.get("bend", [0.0]))
-        if max(map(abs, sizes)) > LARGEST_LOG_L or abs(log_lag) > LARGEST_LOG_LAG or bent > BEND_LIMIT:
-            return False
-        decays = [r.model.R_ohm * self.period_s / r.model.L_h for r in self.responses(x)]
-        return 0.0 <= delay <= SKIP_SAMPLES - 3 and min(decays) > SMALLEST_DECAY and max(decays) < LARGEST_DECAY
-
-
-def simulate(response: Response, shot: Shot, slow: NDArray[np.float64]) -> Vector:
-    """Modelled current of a shot at the compared samples, without its mean (A), shape (n - SKIP_SAMPLES,)."""
-    model, T_s = response.model, shot.period_s
-    count = len(shot.i_a) - SKIP_SAMPLES
-    linear = respond(model, shot.u_v - np.mean(shot.u_v), T_s, response.start_a)
-    centre_a = float(np.mean(shot.i_a))
-    curved = response.c_2 != 0.0 or response.c_3 != 0.0
-    if not curved and response.motion == 0.0 and shot.error is None:
-        return linear[-count - 1 : -1]
-    rate = model.R_ohm * T_s / model.L_h
-    pole = math.exp(-rate)
-    gain = T_s / model.L_h * (-math.expm1(-rate) / rate if abs(rate) > 1e-9 else 1.0)
-    i = y = linear
-    for _ in range(PASSES):
-        i = bend(y, float(np.mean(y[-count:])), response.c_2, response.c_3)
-        lost = model.R_ohm * (i - y)  # the bent part of the current drops R i too
-        if shot.error is not None:
-            lost = lost + shot.error.at(i - float(np.mean(i[-count:])) + centre_a)
-        if response.motion != 0.0:
-            lost = lost + response.motion * _fast_charge(i, slow, T_s)
-        middle = 0.5 * (lost[1:] + lost[:-1])
-        y = linear + recursion(pole, -gain * (middle - np.mean(middle)), 0.0)
-    i = bend(y, float(np.mean(y[-count:])), response.c_2, response.c_3)
-    # sample n - 1 of the record is the last but one of the response
-    return i[-count - 1 : -1]
-
-
-def _fast_charge(i: Vector, slow: NDArray[np.float64], T_s: float) -> Vector:
-    """Integral of the fast part of a current (A s)."""
-    rows = slow.shape[0]
-    fast = i - np.mean(i[-rows:])
-    fast[-rows:] -= slow @ (slow.T @ fast[-rows:])
-    charge = np.concatenate([[0.0], np.cumsum(0.5 * (fast[1:] + fast[:-1]))]) * T_s
-    charge[-rows:] -= slow @ (slow.T @ charge[-rows:])
-    return charge
+    timing: Timing
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,36 +160,15 @@ class _Problem:
             )
 
 
-def initial_inductance(shot: Shot) -> float:
-    """Inductance from the ripple: voltage times the half period over the swing (H); a starting value only."""
-    u = shot.u_v - np.mean(shot.u_v)
-    window = 2 * shot.half_period
-    i = shot.i_a
-    swings = [np.ptp(i[k : k + window]) for k in range(SKIP_SAMPLES, len(i) - window, window)]
-    swing = float(np.median(swings)) if swings else 0.0
-    if not swing > 0.0:
-        raise refuse("E_EXCITATION", "the current does not follow the square wave at all", stage="inductance")
-    return float(np.mean(np.abs(u))) * shot.half_period * shot.period_s / swing
-
-
-def arx_guess(shot: Shot, delay: int) -> tuple[float, float, float]:
-    """Least squares of i[k+1] on (i[k], v[k - delay], 1): L (H), R (ohm) and residual power; a starting value only.
-
-    Noise on i attenuates it (1.1 to 8 times the bound, -1.8 % bias): never a result.
-    """
-    i, v = shot.i_a[SKIP_SAMPLES:], shot.u_v[SKIP_SAMPLES - delay : len(shot.u_v) - delay]
-    columns = np.stack([i[:-1], v[:-1], np.ones(len(i) - 1)], axis=1)
-    x, *_ = np.linalg.lstsq(columns, i[1:], rcond=None)
-    residual = i[1:] - columns @ x
-    a, b = float(x[0]), float(x[1])
-    power = float(residual @ residual)
-    if not 0.0 < a < 1.0 or not b > 0.0:
-        return initial_inductance(shot), 0.0, power
-    R = (1.0 - a) / b
-    return -R * shot.period_s / math.log(a), R, power
-
-
-def fit_axis(shots: Sequence[Shot], sigma_a: float, R_guess: float, *, allow_motion: bool) -> AxisFit:
+def fit_axis(
+    shots: Sequence[Shot],
+    sigma_a: float,
+    R_guess: float,
+    *,
+    torque: bool,
+    motion: Motion | None = None,
+    other: AxisFit | None = None,
+) -> AxisFit:
     """Fit one axis jointly over its shots.
 
     Parameters
@@ -417,8 +179,13 @@ def fit_axis(shots: Sequence[Shot], sigma_a: float, R_guess: float, *, allow_mot
         Noise of one current sample (A).
     R_guess : float
         Loop resistance (ohm), a starting value.
-    allow_motion : bool
-        Whether the axis makes torque, so that the rotor may follow the injection.
+    torque : bool
+        Whether it is the axis that makes torque: the rotor may follow the injection, and there is no bias on it.
+    motion : Motion or None
+        What other experiments say of it; then it is in every model.
+    other : AxisFit or None
+        The other axis, fitted before. Delay and lag belong to the drive, and a rotor that follows looks like them; a
+        machine that bends on its d axis saturates on q as well, however little of it the noise leaves to see.
 
     Raises
     ------
@@ -430,7 +197,8 @@ def fit_axis(shots: Sequence[Shot], sigma_a: float, R_guess: float, *, allow_mot
     L_0 = min((arx_guess(shots[0], delay) for delay in (0, 1, 2)), key=lambda guess: guess[2])[0]
     T_s = shots[0].period_s
     motion_scale = 0.01 * L_0 / (shots[0].half_period * T_s) ** 2
-    base = Layout(len(shots), Effects(), L_0, R_guess, T_s, ripple, motion_scale)
+    timing = None if other is None else other.timing
+    base = Layout(len(shots), Effects(), L_0, R_guess, T_s, ripple, motion_scale, timing, motion, torque)
     problem = _Problem(shots, slow, sigma_a, base)
     firsts = []
     # a long lag and a longer delay are two valleys: begin in each, on a first guess of L either may look better
@@ -439,13 +207,16 @@ def fit_axis(shots: Sequence[Shot], sigma_a: float, R_guess: float, *, allow_mot
             np.array([0.0, 1.0, delay, math.log(lag), *([0.0] * len(shots))]) for delay in DELAY_STARTS for lag in lags
         ]
         firsts.append(problem.fit(min(starts, key=lambda x: float(np.sum(problem(x) ** 2)))))
-    tried: dict[Effects, tuple[Fit, Layout]] = {Effects(): (min(firsts, key=lambda fit: fit.cost), base)}
-    wanted = ["bend"]
-    if allow_motion:
-        wanted.append("motion")
-    if len(shots) > 1:
-        wanted.append("dispersion")
-    current = Effects()
+    first = min(firsts, key=lambda fit: fit.cost)
+    # what is there, whether this axis can show it or not
+    current = Effects(
+        bend=other is not None and "bend" in other.effects,
+        motion=torque and motion is not None,
+    )
+    optional = {"bend": not current.bend, "motion": torque and motion is None, "dispersion": len(shots) > 1}
+    wanted = [name for name, open_to_data in optional.items() if open_to_data]
+    layout, start = base.changed(first.x, current)
+    tried = {current: (first if current == Effects() else _Problem(shots, slow, sigma_a, layout).fit(start), layout)}
     while True:
         fit, layout = tried[current]
         for name in wanted:
@@ -453,19 +224,45 @@ def fit_axis(shots: Sequence[Shot], sigma_a: float, R_guess: float, *, allow_mot
             if richer not in tried:
                 new_layout, start = layout.changed(fit.x, richer)
                 tried[richer] = (_Problem(shots, slow, sigma_a, new_layout).fit(start), new_layout)
-        best = min(tried, key=lambda effects: _criterion(effects, tried[effects][0]))
+        best = min(tried, key=lambda effects: _criterion(effects, tried[effects][0], timing))
         if not set(best.names) > set(current.names):
             break
         current = best
     fit, layout = tried[current]
     without_lag, start = layout.changed(fit.x, replace(current, lag=False))
     tried[without_lag.effects] = (_Problem(shots, slow, sigma_a, without_lag).fit(start), without_lag)
-    return _average(shots, slow, sigma_a, tried)
+    return _average(shots, slow, sigma_a, tried, timing)
 
 
-def _criterion(effects: Effects, fit: Fit) -> float:
-    """Information criterion; a rotor that follows is free of charge: it is there, whether it can be seen or not."""
-    return fit.cost + PENALTY * (len(fit.x) - effects.motion)
+def _criterion(effects: Effects, fit: Fit, timing: Timing | None) -> float:
+    """Information criterion; a rotor that follows is free of charge: it is there, whether it can be seen or not.
+
+    With the timing of another axis it is the criterion of both together, which share the lag.
+    """
+    if timing is None:
+        return fit.cost + PENALTY * (len(fit.x) - effects.motion)
+    return fit.cost + PENALTY * (len(fit.x) - effects.motion - effects.lag) + timing.criterion(effects.lag)
+
+
+def _timing(tried: dict[Effects, tuple[Fit, Layout]]) -> Timing:
+    """Delay and lag of the best models with and without lag."""
+    best: dict[bool, tuple[float, Vector, NDArray[np.float64]]] = {}
+    for effects, (fit, _) in tried.items():
+        criterion = _criterion(effects, fit, None)
+        if effects.lag not in best or criterion < best[effects.lag][0]:
+            best[effects.lag] = criterion, fit.x, scaled_covariance(fit.jacobian)[0]
+    (with_lag, x, covariance), (without, x_0, covariance_0) = best[True], best[False]
+    slope = np.array([1.0, math.exp(float(x[3]))])
+    return Timing(
+        total=float(x[2] + slope[1]),
+        total_std=math.sqrt(float(slope @ covariance[2:4, 2:4] @ slope)),
+        log_lag=float(x[3]),
+        log_lag_std=math.sqrt(float(covariance[3, 3])),
+        delay=float(x_0[2]),
+        delay_std=math.sqrt(float(covariance_0[2, 2])),
+        lag_criterion=with_lag,
+        plain_criterion=without,
+    )
 
 
 def _average(
@@ -473,13 +270,14 @@ def _average(
     slow: Sequence[NDArray[np.float64]],
     sigma_a: float,
     tried: dict[Effects, tuple[Fit, Layout]],
+    timing: Timing | None,
 ) -> AxisFit:
     rows = [(effects, fit, layout, scaled_covariance(fit.jacobian)[0]) for effects, (fit, layout) in tried.items()]
     rows = [row for row in rows if np.isfinite(row[3][0, 0]) and row[1].cost < UNPHYSICAL]
     rows = [row for row in rows if row[2].responses(row[1].x)[0].motion >= 0.0]  # a rotor cannot push back
     if not rows:
         raise refuse("E_NOT_CONVERGED", "no model of the axis could be fitted", stage="inductance")
-    weights = information_weights([_criterion(effects, fit) for effects, fit, _, _ in rows])
+    weights = information_weights([_criterion(effects, fit, timing) for effects, fit, _, _ in rows])
     L = float(sum(w * row[2].L_scale * math.exp(row[1].x[0]) for w, row in zip(weights, rows, strict=True)))
     variance = 0.0
     for w, (_, fit, layout, covariance) in zip(weights, rows, strict=True):
@@ -512,4 +310,5 @@ def _average(
         residuals=residuals,
         effects=effects.names,
         condition=condition,
+        timing=_timing(tried),
     )

@@ -17,7 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.axis_fit import SKIP_SAMPLES, AxisFit, Shot, VoltageError, fit_axis
+from pmsmtool.estimators.axis_fit import AxisFit, fit_axis
+from pmsmtool.estimators.axis_layout import Motion
+from pmsmtool.estimators.axis_response import SKIP_SAMPLES, Shot, VoltageError
 from pmsmtool.estimators.estimate import SensorTolerance, Verdict, chi2_gate, condition_gate, ljung_box
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
@@ -33,6 +35,8 @@ FREQUENCY_LIMIT = 0.01
 """Relative difference between two injection frequencies above which both values are reported."""
 ROTOR_LIMIT_RAD = math.radians(2.0)
 """Rotor motion in one shot (electrical, beyond one encoder step): mixes the axes by sin^2(2 deg) = 0.12 %."""
+EDGE_STD = 0.05
+"""Standard deviation of the instant at which a leg's error depends on its current (T_s): a fifth of its distance."""
 MINIMUM_PERIODS = 20
 """Full periods of the square wave below which a shot is not an excitation."""
 CURVE_POINTS = 256
@@ -104,6 +108,7 @@ def estimate_inductances(
     *,
     frame: FrameAhead | None = None,
     inverter: InverterCurve | None = None,
+    motion: Motion | None = None,
     tolerance: SensorTolerance | None = None,
 ) -> InductanceResult:
     """Incremental inductances from square-wave shots.
@@ -122,6 +127,8 @@ def estimate_inductances(
         machine is salient enough, and said so in ``fallback``.
     inverter : InverterCurve or None
         Voltage error from the DC levels.
+    motion : Motion or None
+        How the rotor follows an injection on q, from the flux run and the pushes; None: free in the fit.
     tolerance : SensorTolerance
         Declared sensor tolerances.
 
@@ -138,7 +145,14 @@ def estimate_inductances(
     for axis, records in traces.items():
         stage = f"inductance, {axis} axis"
         shots[axis] = sorted((_shot(record, axis, inverter, stage) for record in records), key=lambda s: s.half_period)
-        fits[axis] = fit_axis(shots[axis], noise.sigma_a, R_ohm, allow_motion=axis == "q")
+        fits[axis] = fit_axis(
+            shots[axis],
+            noise.sigma_a,
+            R_ohm,
+            torque=axis == "q",
+            motion=motion,
+            other=fits.get("d"),
+        )
         condition_gate(fits[axis].condition, f"L_{axis} and the delay", stage)
         cross[axis] = _cross_response(shots[axis][0], fits[axis], noise.sigma_a)
     widen = {axis: chi2_gate(fit.chi2, f"inductance, {axis} axis") for axis, fit in fits.items()}
@@ -210,16 +224,17 @@ def _bias(traces: Sequence[Trace], ahead_rad: float) -> tuple[float, float]:
 def _commutation_std(shots: Sequence[Shot]) -> float:
     """What an inverter error that depends on the current adds to L (H).
 
-    The error acts at switching edges, up to half a period from the middle of the interval where the model puts it; a
-    slope of de/di then looks like an inductance within +-|de/di| T_s/2 (uniform).
+    What depends on the current acts at one switching edge (``VoltageError``); where that edge lies is known to
+    :data:`EDGE_STD` of a period, and a slope de/di there looks like an inductance of |de/di| T_s times that.
     """
     worst = 0.0
     for shot in shots:
         if shot.error is not None:
             low, high = float(np.min(shot.i_a)), float(np.max(shot.i_a))
-            rise = shot.error.at(np.array([low, high]))
-            slope = abs(float(rise[1] - rise[0])) / (high - low)
-            worst = max(worst, slope * shot.period_s / 2.0 / math.sqrt(3.0))
+            for part in (shot.error.early_v, shot.error.late_v):
+                rise = np.interp([low, high], shot.error.i_a, part)
+                slope = abs(float(rise[1] - rise[0])) / (high - low)
+                worst = max(worst, EDGE_STD * slope * shot.period_s)
     return worst
 
 
@@ -248,7 +263,7 @@ def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, stage: str) -
         margin = 0.2 * float(np.ptp(i))
         grid = np.linspace(float(np.min(i)) - margin, float(np.max(i)) + margin, CURVE_POINTS)
         frame = float(trace.meta["fixed_angle_rad"])
-        error = VoltageError(grid, inverter.along_axis(frame, axis, grid, float(np.mean(cross))))
+        error = VoltageError(grid, *inverter.along_axis(frame, axis, grid, float(np.mean(cross)), float(np.mean(i))))
     return Shot(trace[f"u_{axis}_v"], i, cross, half_period, trace.period_s, error)
 
 

@@ -52,13 +52,33 @@ class InverterCurve:
         e_alpha, e_beta = (2.0 * e_a - e_b - e_c) / 3.0, (e_b - e_c) / root
         return c * e_alpha + s * e_beta, c * e_beta - s * e_alpha
 
-    def along_axis(self, frame_rad: float, axis: str, i_a: Vector, other_a: float) -> Vector:
-        """Error along one axis of a frozen frame while the other axis carries a constant current (V)."""
-        angle = np.full_like(i_a, frame_rad)
-        other = np.full_like(i_a, other_a)
-        if axis == "d":
-            return self.error_dq_v(i_a, other, angle)[0]
-        return self.error_dq_v(other, i_a, angle)[1]
+    def along_axis(
+        self, frame_rad: float, axis: str, i_a: Vector, other_a: float, bias_a: float
+    ) -> tuple[Vector, Vector]:
+        """Error along one axis of a frozen frame (V), of the legs that take current in and of those that feed it out.
+
+        Parameters
+        ----------
+        frame_rad : float
+            Angle of the frame (rad electrical).
+        axis : str
+            ``d`` or ``q``.
+        i_a : ndarray, shape (n,)
+            Current along the axis (A).
+        other_a, bias_a : float
+            Constant current of the other axis, and mean current of this one (A): they give the legs their signs.
+        """
+        early = np.zeros_like(i_a)
+        late = np.zeros_like(i_a)
+        for k in range(3):
+            angle = frame_rad - 2.0 * math.pi / 3.0 * k
+            along, across = (math.cos(angle), -math.sin(angle)) if axis == "d" else (-math.sin(angle), math.cos(angle))
+            error = 2.0 / 3.0 * along * self.error_v(along * i_a + across * other_a)
+            if along * bias_a + across * other_a > 0.0:
+                late += error
+            else:
+                early += error
+        return early, late
 
     def knee_a(self, V_plateau_v: float) -> float:
         """Current at which a ramp to the plateau fits the curve best (A): the drive's compensation has that shape."""

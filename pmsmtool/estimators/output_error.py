@@ -6,8 +6,8 @@ sampled at t_k. Computation delay and sampling instant enter only through D, so 
 tau = 0 this is i[k+1] = a i[k] + (1 - a)/R (v[k-1] - v0), a = exp(-R T_s/L) (identification reference, 3.2 and its
 addendum). The model runs free: no measured current enters it.
 
-A slightly saturated machine bends the response: the measured current is y + c_2 (y - y_b)^2 + c_3 (y - y_b)^3 about its
-mean y_b, so that L stays the incremental inductance *at* the bias whatever the ripple.
+A slightly saturated machine bends the response: the measured current is y + c_2 x^2 + c_3 x^3 with x the
+distance of y from the bias, so that L stays the incremental inductance *at* the bias whatever the ripple.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ FAST_POLE = 0.6
 """Poles up to this are summed by their impulse response, at most 82 taps."""
 BLOCK_LOSS = 7.0
 """Decay over one block of a slow pole (nepers): three decimal digits of the running sum."""
+FIRST_SAMPLE = 3
+"""First sample that is modelled."""
 SMALLEST_RATE = 1e-9
 """R T_s/L below which the limit of a pure inductance is used."""
 
@@ -91,14 +93,14 @@ def acting_voltages(command: Vector, delay: float) -> tuple[Vector, Vector, floa
     Returns
     -------
     early, late : ndarray, shape (n - first,)
-        Commands acting in the first and the second part of the interval from sample k, k = first ... n - 1, with
-        first = ceil(D).
+        Commands acting in the first and the second part of the interval from sample k, k = first ... n - 1; ``first``
+        is :data:`FIRST_SAMPLE` for every delay below it, so that a fit sees no step where D crosses a whole number.
     fraction : float
         Length of the first part (T_s).
     """
     whole = math.floor(delay)
     fraction = delay - whole
-    first = whole + 1
+    first = max(whole + 1, FIRST_SAMPLE)
     n = len(command)
     early = command[first - whole - 1 : n - whole - 1]
     late = command[first - whole : n - whole]
@@ -127,7 +129,7 @@ def _advance(model: AxisModel, h: float) -> tuple[float, float, float, float, fl
 
 
 def respond(model: AxisModel, command: Vector, period_s: float, start_a: float) -> Vector:
-    """Measured current from sample ceil(D) on, shape (n - first + 1,), started in equilibrium at ``start_a``.
+    """Measured current from the first modelled sample on, shape (n - first + 1,), in equilibrium at ``start_a``.
 
     Parameters
     ----------
@@ -152,7 +154,6 @@ def respond(model: AxisModel, command: Vector, period_s: float, start_a: float) 
     return recursion(e_1 * e_2, forced, start_a)
 
 
-def bend(y: Vector, centre_a: float, c_2: float, c_3: float) -> Vector:
-    """Saturation about the bias: y + c_2 (y - centre)^2 + c_3 (y - centre)^3 (A)."""
-    x = y - centre_a
-    return np.asarray(y + x * x * (c_2 + c_3 * x), dtype=np.float64)
+def bend(x: Vector, c_2: float, c_3: float) -> Vector:
+    """What saturation adds to a current x about the bias (A)."""
+    return np.asarray(x * x * (c_2 + c_3 * x), dtype=np.float64)

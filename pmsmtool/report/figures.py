@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from pmsmtool.design.prediction import Prediction
 from pmsmtool.design.sampled_loop import LoopMargins, SampledLoop
-from pmsmtool.estimators.axis_fit import SKIP_SAMPLES, AxisFit
+from pmsmtool.estimators.axis_fit import AxisFit
+from pmsmtool.estimators.axis_response import SKIP_SAMPLES
 from pmsmtool.estimators.flux_linkage import I_D_SPREAD, FluxResult, mean_inverter_error
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.report.report import Figure

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.estimators.axis_fit import initial_inductance
+from pmsmtool.estimators.axis_layout import Motion
+from pmsmtool.estimators.axis_response import initial_inductance
 from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
@@ -33,6 +34,10 @@ MOVED_SHARE = 0.25
 """Largest share of levels that may be left out; with more the estimator sees them, and refuses what has not settled."""
 CROSS_SATURATION = 0.25
 """Standard deviation of dL_q/di_d, of (L_q - L_d)/I: the reluctance machine of the profiles has 0.24."""
+MOTION_STD = 0.2
+"""Relative standard deviation of the rotor's answer to an injection as the pushes show it: friction takes part."""
+RELUCTANCE_STD = 0.3
+"""Standard deviation of what reluctance takes from it, relative: the inductances are rough and incremental."""
 COPPER_ALPHA_PER_K = 0.00393
 """Temperature coefficient of copper at 20 degC (IEC 60028)."""
 MOSFET_LINK_V = 100.0
@@ -243,8 +248,27 @@ def inductance_of(
         result.resistance.R_measured.value,
         frame=frame,
         inverter=result.resistance.curve,
+        motion=None if result.flux is None else motion_of(traces, result.flux.psi_measured.value, shots["q"]),
         tolerance=tolerance,
     )
+
+
+def motion_of(traces: Mapping[str, Trace], psi_wb: float, q_shots: Sequence[Trace]) -> Motion | None:
+    """Return how the rotor answers an injection on q, from the pushes of the flux run; None without them.
+
+    A push at i_d = 0 shows the acceleration per ampere, 1.5 p^2 psi/J; reluctance takes some of the torque away.
+    """
+    pushes = [traces[name] for name in ("push_0", "push_1") if name in traces]
+    charges = [float(np.sum(push["i_q_a"][8:-8])) * push.period_s for push in pushes]
+    if not pushes or min(map(abs, charges)) == 0.0:
+        return None
+    changes = [float(np.mean(push["omega_e_rad_s"][-16:]) - np.mean(push["omega_e_rad_s"][:16])) for push in pushes]
+    rate = float(np.mean([abs(change / charge) for change, charge in zip(changes, charges, strict=True)]))
+    rough = [_rough_inductance(traces, axis) for axis in "dq"]
+    i_d = float(np.mean([np.mean(shot["i_d_a"]) for shot in q_shots]))
+    weakened = max(0.0, psi_wb + (rough[0] - rough[1]) * i_d)
+    free, per_f = rate * psi_wb, rate * weakened**2 / psi_wb
+    return Motion(per_f, MOTION_STD * per_f + RELUCTANCE_STD * abs(free - per_f))
 
 
 def shots_of(traces: Mapping[str, Trace], axis: str, pole_pairs: int) -> list[Trace]:

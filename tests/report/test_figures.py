@@ -10,7 +10,9 @@ import pytest
 
 from pmsmtool.design.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.design.sampled_loop import margins
-from pmsmtool.estimators.axis_fit import SKIP_SAMPLES, AxisFit
+from pmsmtool.estimators.axis_fit import AxisFit
+from pmsmtool.estimators.axis_layout import Timing
+from pmsmtool.estimators.axis_response import SKIP_SAMPLES
 from pmsmtool.estimators.flux_linkage import estimate_flux_linkage
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.report import figures
@@ -63,7 +65,8 @@ def test_the_fitted_response_is_measured_plus_residual(canvases: list[Any]) -> N
     n, sigma = 200, 0.02
     current = np.sin(np.arange(n))
     residual = np.random.default_rng(1).standard_normal(n - SKIP_SAMPLES)
-    fit = AxisFit(1e-3, 1e-6, 1e-6, (1e-3,), 0.1, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, n, (residual,), (), 1.0)
+    timing = Timing(1.0, 1e-3, -3.0, 1.0, 1.0, 1e-3, 0.0, 0.0)
+    fit = AxisFit(1e-3, 1e-6, 1e-6, (1e-3,), 0.1, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, n, (residual,), (), 1.0, timing)
     shots = {axis: trace({f"i_{axis}_a": current}, half_period=6) for axis in "dq"}
     figures.inductance_figure(shots, {"d": fit, "q": fit}, sigma)
     drawn = lines(canvases[0])
