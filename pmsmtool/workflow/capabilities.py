@@ -58,7 +58,6 @@ FEATURES: Mapping[str, str] = {
     "torque mode": "torque mode (0x6502 bit 3 or 9)",
     "position": "position in increments of a known number per turn (0x6064, 0x608F)",
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
-    "dc levels": "DC levels by current set-points: at running currents the inverter's error hides R",
     "vendor result": "the maker's identification in the drive map",
     "line voltage": "the DC link (0x6079), or the machine's voltage in the drive map",
     "current": "its current (0x6078)",
@@ -74,7 +73,7 @@ _PUSH = (*_SAFE, "torque mode", "position", "current")
 NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
     "R": {
         Method.INJECT: _INJECT,
-        Method.RECORDER: ("dc levels",),
+        Method.RECORDER: _RECORD,
         Method.VENDOR: ("vendor result",),
         Method.MANUAL: (),
     },
@@ -106,6 +105,7 @@ NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
 """Methods of each quantity and what they need."""
 
 NOTES: Mapping[tuple[str, Method], str] = {
+    ("R", Method.RECORDER): "where the inverter's error does not hide it",
     ("L", Method.RECORDER): "L_q at running currents only",
     ("psi", Method.RECORDER): "the drive must commutate already",
     ("psi", Method.STANDARD): "where the voltage limit is within the speed limit, or the drive shows its voltage",

@@ -22,6 +22,8 @@ ALSO = ("J_kgm2", "tau_c_nm")
 """Keys it uses where they are known."""
 UNKNOWN_TEMPERATURE_K = 20.0
 """A magnet whose temperature nothing tells is taken within this of the reference temperature (95 %)."""
+DEVICE_SHARE = 0.3
+"""Largest part of the loop resistance that is not copper (as ``SensorTolerance.device_share_max``)."""
 AGREEMENT = 0.15
 """A flux linkage further than this from the given one, beyond its own interval, is another machine's."""
 PER_PSI = {"J_per_psi": "J_kgm2", "tau_c_per_psi": "tau_c_nm"}
@@ -114,10 +116,13 @@ def _at_reference(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[di
             continue
         estimate = values[name]
         if math.isfinite(estimate.T_c):
-            factor = 1.0 / (1.0 + alpha * (estimate.T_c - known.machine.T_ref_c))
+            rise = alpha * (estimate.T_c - known.machine.T_ref_c)
+            factor, doubt = 1.0 / (1.0 + rise), 0.0
+            if name == "R_s_ohm":  # devices do not warm like copper, and their share is unknown
+                doubt = DEVICE_SHARE * abs(rise) * estimate.value
             values[name] = replace(
                 estimate, value=factor * estimate.value, std=factor * estimate.std,
-                systematic=factor * estimate.systematic,
+                systematic=factor * math.hypot(estimate.systematic, doubt),
             )  # fmt: skip
         else:
             doubt = abs(alpha) * UNKNOWN_TEMPERATURE_K * estimate.value
