@@ -40,8 +40,7 @@ def commands() -> dict[str, list[str]]:
 
 
 def measure(runs: int, folder: str) -> dict[str, tuple[float, float, float]]:
-    """Return name -> median wall time, median and least processor time (ms); the first round has cold caches and is
-    not counted."""
+    """Return name -> median wall time, median and least processor time (ms) without the first round (cold caches)."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}  # this checkout, installed or not
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package has its bytecode
     wall: dict[str, list[float]] = {name: [] for name in commands()}
