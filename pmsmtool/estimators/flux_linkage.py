@@ -1,15 +1,17 @@
-"""PM flux linkage, encoder offset and a check of L_q from steady speeds (identification reference, 3.4).
+"""PM flux linkage, encoder offset and a check of L_q from a coasting shaft (identification reference, 3.4).
 
-For a drive that turns its voltage by the delay times the speed, the command at constant speed is exactly
+For a drive that turns its voltage by the delay times the speed, the command is
 
     v* = j w sinc(w T_s/2) psi(i) + R <i> + v_err,      sinc x = sin x / x,
 
-so u = (v* - v_err - R i) (w T_s/2)/sin(w T_s/2) is j w psi: the correction DIVIDES by sinc. Over all speeds
+so u = (v* - v_err - R i) (w T_s/2)/sin(w T_s/2) is j w psi: the correction DIVIDES by sinc. The shaft coasts with
+i_q = 0, where the inverter's error has no q part but the one of the ripple (:mod:`switching_ripple`), and i_d is held
+with both signs one after the other: their sum cancels the flux of i_d and what the ripple of the currents does,
 
-    u_q = x1 w + c sgn(w) + m w i_q,        u_d = -L_q w i_q + x2 w - psi w^2 dt,
+    (u_q+ + u_q-)/(w+ + w-) = x1 (1 + k2 i_d^2 + k4 i_d^4),      u_d = -L_q w i_q + x2 w - psi w^2 dt + ...,
 
-psi = hypot(x1, x2), frame ahead of the d axis by eps = atan2(x2, x1), m the coupling (L_d - L_q)/2 sin(2 eps) of a
-frame that is off its axis, and dt what is left of angle and voltage delay.
+psi = hypot(x1, x2), frame ahead of the d axis by eps = atan2(x2, x1), k2 and k4 the saturation of the d axis, and dt
+what is left of angle and voltage delay.
 """
 
 from __future__ import annotations
@@ -21,32 +23,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import SensorTolerance, condition_gate
+from pmsmtool.estimators.estimate import SensorTolerance, condition_gate, information_weights
+from pmsmtool.estimators.flux_linkage_rows import STAGE, Corrected, SpeedLag, check_speeds, corrected, pairs_of
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.estimators.switching_ripple import Modulation, rippled_error_dq_v
+from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
-STAGE = "flux linkage"
 Vector = NDArray[np.float64]
 
-MINIMUM_SPEEDS = 4
-"""Speeds per direction."""
-SPEED_RATIO = 2.0
-"""Largest over smallest speed below which psi and the intercept are one."""
 RELATIVE_FLOOR = 5e-5
-"""Relative model floor of psi (measured: 0.00-0.03 % bias from the intercept on shapes outside the model)."""
+"""Relative model floor of psi, one standard deviation."""
 OFFSET_FLOOR_RAD = 1e-4
 OFFSET_LIMIT_RAD = math.radians(30.0)
 """Offset above which the speed run cannot have been what it claims; the coarse offset comes first."""
-CURRENT_SETTLE_LIMIT = 0.25
-"""Change of a current between the halves of a window, of the largest current."""
-I_D_SPREAD = 0.5
-"""Spread of i_d over the speeds, of the largest current, from which on L_d is fitted with psi."""
-SETTLE_LIMIT = 0.02
-"""Relative change of the speed between the halves of a window."""
+RIPPLE_DOUBT = 0.2
+"""Standard deviation of the ripple's share of the inverter error, relative: diodes and capacitances that it leaves out
+(measured on 20 drives of the population and around the profiles: 0.02 to 0.3)."""
+CURVE_DOUBT = 0.15
+"""The same of what the measured curve says about the small i_q that is left."""
+LEVEL_RATIO = 1.2
+"""Ratio of d currents above which they are different levels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,13 +61,16 @@ class FluxResult:
     frame_offset : Estimate
         Angle of the frame ahead of the d axis (rad electrical): add it to the stored encoder offset.
     L_q_h, L_q_std_h : float
-        Apparent L_q at the small q current of the run, a check only (H).
+        Apparent L_q at the q currents of the run, a check only (H).
     angle_delay_s : float
         Delay between angle and voltage that the drive does not compensate (s).
-    intercept_v : float
-        Dead-time voltage that remains in u_q (V).
-    residual_v : float
-        Residual standard deviation of u_q (V).
+    curvature : float
+        Mean of psi_d(i_d) and psi_d(-i_d) over psi_f, less one, at the largest d current.
+    low_wb, low_std_wb, low_i_d_a : float
+        That mean itself at the smallest d current (Wb, Wb, A): measured, where psi_f of a machine that saturates is
+        extrapolated.
+    omega_rad_s, residual_wb : ndarray, shape (n,)
+        Electrical speed of every pair of d currents, and what its flux linkage is off (rad/s, Wb).
     """
 
     psi_f: Estimate
@@ -77,8 +79,12 @@ class FluxResult:
     L_q_h: float
     L_q_std_h: float
     angle_delay_s: float
-    intercept_v: float
-    residual_v: float
+    curvature: float
+    low_wb: float
+    low_std_wb: float
+    low_i_d_a: float
+    omega_rad_s: Vector
+    residual_wb: Vector
 
 
 def estimate_flux_linkage(
@@ -87,34 +93,30 @@ def estimate_flux_linkage(
     *,
     period_s: float,
     inverter: InverterCurve | None = None,
-    waves: Sequence[Trace] = (),
     modulation: Modulation | None = None,
-    cross_h_per_a: float = 0.0,
+    lag: SpeedLag | None = None,
     tolerance: SensorTolerance | None = None,
     T_ref_c: float = 20.0,
     alpha_psi_per_k: float = -0.0012,
 ) -> FluxResult:
-    """PM flux linkage from the means of steady speeds.
+    """PM flux linkage from the means of windows at steady currents.
 
     Parameters
     ----------
     speeds : Trace
-        One row per speed: ``u_d_v u_q_v i_d_a i_q_a omega_e_rad_s`` (means over whole turns), ``omega_first_rad_s
-        omega_second_rad_s i_d_first_a i_d_second_a i_q_first_a i_q_second_a`` (halves of the window), ``T_magnet_c``
-        (NaN without a sensor).
+        One row per window, d currents of both signs next to each other: ``u_d_v u_q_v i_d_a i_q_a omega_e_rad_s``
+        (means over whole turns), ``omega_first_rad_s omega_second_rad_s i_d_first_a i_d_second_a i_q_first_a
+        i_q_second_a`` (halves of the window), ``half_s`` (their length), ``T_magnet_c`` (NaN without a sensor).
     R_ohm : float
         Loop resistance at the temperature of the run (ohm).
     period_s : float
         Control period (s).
     inverter : InverterCurve or None
-        Voltage error from the DC levels; the intercept takes what is left.
-    waves : sequence of Trace
-        ``i_d_a i_q_a theta_e_rad`` over about the window of each speed: the mean error of a current with ripple near
-        its zero crossing is not the error of the mean current. Empty: the mean currents are used.
+        Voltage error from the DC levels.
     modulation : Modulation or None
-        With waves: what ripple at the switching edges may do to the inverter's error counts as a standard deviation.
-    cross_h_per_a : float
-        Standard deviation of dL_q/di_d (H/A), which by reciprocity bends psi_d by half of it times i_q^2.
+        What the ripple at the switching edges makes of that error; None: nothing.
+    lag : SpeedLag or None
+        By how much the measured speed lags; None: not at all.
     tolerance : SensorTolerance
         Declared sensor tolerances.
     T_ref_c, alpha_psi_per_k : float
@@ -126,30 +128,13 @@ def estimate_flux_linkage(
         ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``, ``E_NOT_IDENTIFIABLE``.
     """
     tolerance = tolerance or SensorTolerance()
-    w = speeds["omega_e_rad_s"]
-    _check_speeds(speeds, w)
-    i_d, i_q = speeds["i_d_a"], speeds["i_q_a"]
-    x = 0.5 * w * period_s
-    correction = x / np.sin(x)
-    e_d, e_q = _inverter_error(inverter, i_d, i_q, waves)
-    u_d = (speeds["u_d_v"] - e_d - R_ohm * i_d) * correction
-    u_q = (speeds["u_q_v"] - e_q - R_ohm * i_q) * correction
-    one = np.ones_like(w)
-    q_columns = [w, np.sign(w), w * i_q]
-    d_columns = [-w * i_q, w, -w * w]
-    if np.ptp(i_d) > I_D_SPREAD * float(np.max(np.hypot(i_d, i_q))):
-        # the flux of i_d and its share on the q axis of a frame that is off are unknowns of the same run
-        q_columns.append(w * i_d)
-        d_columns.append(-w * i_d)
-    q_matrix = np.stack(q_columns, axis=1)
-    q_fit, q_cov, q_residual, q_condition = linear_solve(q_matrix, u_q, one)
-    d_fit, d_cov, d_residual, d_condition = linear_solve(np.stack(d_columns, axis=1), u_d, one)
-    condition_gate(q_condition, "psi and the dead-time voltage", STAGE)
-    condition_gate(d_condition, "L_q, the offset and the angle delay", STAGE)
-    dof_q, dof_d = len(w) - len(q_columns), len(w) - len(d_columns)
-    s_q = math.sqrt(float(q_residual @ q_residual) / dof_q)
-    s_d = math.sqrt(float(d_residual @ d_residual) / dof_d)
-    x1, x2 = float(q_fit[0]), float(d_fit[1])
+    lag = lag or SpeedLag(0.0, 0.0)
+    pairs = pairs_of(speeds)
+    check_speeds(speeds, pairs)
+    rows = corrected(speeds, R_ohm, period_s, inverter, modulation, lag)
+    d_fit, d_std, d_dof = _fit_d(rows)
+    even = _fit_even(rows, pairs)
+    x1, x2 = even.flux_wb, float(d_fit[1])
     psi = math.hypot(x1, x2)
     eps = math.atan2(x2, x1)
     if not x1 > 0.0 or abs(eps) > OFFSET_LIMIT_RAD:
@@ -161,121 +146,138 @@ def estimate_flux_linkage(
             likely="wrong encoder offset, direction or pole pairs",
             hint="identify poles and encoder first",
         )
-    std_1, std_2 = s_q * math.sqrt(float(q_cov[0, 0])), s_d * math.sqrt(float(d_cov[1, 1]))
-    # what two effects outside the model would do to psi: the same regression of their voltages
-    crossed = 0.5 * cross_h_per_a * w * i_q**2
-    rippled = np.zeros_like(w)
-    if inverter is not None and modulation is not None and waves:
-        rippled = (_rippled_error(inverter, speeds, waves, modulation) - e_q) * correction
-    model = [float(linear_solve(q_matrix, voltage, one)[0][0]) for voltage in (crossed, rippled)]
-    std = math.hypot(
-        math.cos(eps) * std_1,
-        math.sin(eps) * std_2,
+    model_std = math.hypot(
+        RIPPLE_DOUBT * even.change(rows.ripple_q_v),
+        CURVE_DOUBT * even.change(rows.curve_q_v),
+        lag.std_s * even.change(psi * rows.acceleration_rad_s2),
         RELATIVE_FLOOR * psi,
         tolerance.voltage_scale_std * psi,
-        *model,
     )
+    fitted = math.hypot(math.cos(eps) * even.std_wb, math.sin(eps) * d_std[1])
+    std = math.hypot(fitted, model_std)
     T = float(np.mean(speeds["T_magnet_c"]))
     measured = Estimate(
         value=psi,
         std=std,
         systematic=tolerance.flux * psi,
         unit="Wb",
-        n=len(w),
+        n=len(rows.w),
         chi2=math.nan,
         T_c=T,
-        method="regression over speeds in both directions, sampled-data correction",
-        i_d_apk=float(np.mean(i_d)),
-        i_q_apk=float(np.mean(np.abs(i_q))),
-        dof=dof_q,
+        method="coasting in both directions, d currents of both signs, sampled-data correction",
+        i_d_apk=0.0,
+        i_q_apk=0.0,
+        dof=even.dof * (std / fitted) ** 4 if fitted > 0.0 else math.inf,  # Welch-Satterthwaite, GUM G.4
     )
     offset = Estimate(
         value=eps,
-        std=math.hypot(math.cos(eps) * std_2 / psi, math.sin(eps) * std_1 / psi, OFFSET_FLOOR_RAD),
+        std=math.hypot(math.cos(eps) * d_std[1] / psi, math.sin(eps) * even.std_wb / psi, OFFSET_FLOOR_RAD),
         systematic=0.0,
         unit="rad",
-        n=len(w),
+        n=len(rows.w),
         T_c=T,
         method="direction of the no-load voltage over speeds in both directions",
-        dof=dof_d,
+        dof=d_dof,
     )
     return FluxResult(
         psi_f=_normalise(measured, T_ref_c, alpha_psi_per_k, tolerance),
         psi_measured=measured,
         frame_offset=offset,
         L_q_h=float(d_fit[0]),
-        L_q_std_h=s_d * math.sqrt(float(d_cov[0, 0])),
+        L_q_std_h=float(d_std[0]),
         angle_delay_s=float(d_fit[2]) / psi,
-        intercept_v=float(q_fit[1]),
-        residual_v=s_q,
+        curvature=even.curvature,
+        low_wb=math.hypot(even.low_wb, x2),
+        low_std_wb=math.hypot(even.low_std_wb, model_std),
+        low_i_d_a=even.low_i_d_a,
+        omega_rad_s=even.w,
+        residual_wb=even.residual_wb,
     )
 
 
-def _inverter_error(
-    curve: InverterCurve | None, i_d: Vector, i_q: Vector, waves: Sequence[Trace]
-) -> tuple[Vector, Vector]:
-    if curve is None:
-        return np.zeros_like(i_d), np.zeros_like(i_d)
-    if not waves:
-        return mean_inverter_error(curve, i_d, i_q)
-    errors = [curve.error_dq_v(wave["i_d_a"], wave["i_q_a"], wave["theta_e_rad"]) for wave in waves]
-    return np.array([float(np.mean(e[0])) for e in errors]), np.array([float(np.mean(e[1])) for e in errors])
+def _fit_d(rows: Corrected) -> tuple[Vector, Vector, int]:
+    """Regress u_d; returns (L_q, x2, psi dt, ...), their standard deviations and the degrees of freedom."""
+    w, i_d = rows.w, rows.i_d
+    columns = [-w * rows.i_q, w, -w * w, -w * i_d, i_d]
+    levels = np.abs(i_d[rows.is_d])
+    if np.max(levels) > LEVEL_RATIO * np.min(levels):
+        columns.append(np.sign(i_d) * rows.is_d)
+    matrix = np.stack(columns, axis=1)
+    fit, covariance, residual, condition = linear_solve(matrix, rows.u_d, np.ones_like(w))
+    condition_gate(condition, "L_q, the offset and the angle delay", STAGE)
+    dof = len(w) - len(columns)
+    return fit, np.sqrt(float(residual @ residual) / dof * np.diag(covariance)), dof
 
 
-def _rippled_error(
-    curve: InverterCurve, speeds: Trace, waves: Sequence[Trace], modulation: Modulation
-) -> Vector:
-    """Mean q error of each speed with the ripple at the switching edges (V)."""
-    errors = []
-    for wave, u_d, u_q in zip(waves, speeds["u_d_v"], speeds["u_q_v"], strict=True):
-        voltage = (np.full(len(wave), u_d), np.full(len(wave), u_q))
-        current = (wave["i_d_a"], wave["i_q_a"])
-        errors.append(float(np.mean(rippled_error_dq_v(curve, current, voltage, wave["theta_e_rad"], modulation)[1])))
-    return np.array(errors)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Even:
+    """Fit of the flux that does not depend on the sign of i_d; ``row`` maps the q voltages of all rows onto it."""
+
+    flux_wb: float
+    std_wb: float
+    dof: float
+    curvature: float
+    low_wb: float
+    low_std_wb: float
+    low_i_d_a: float
+    w: Vector
+    residual_wb: Vector
+    row: Vector
+
+    def change(self, voltage_v: Vector) -> float:
+        """Change of the flux that a q voltage of every row makes (Wb)."""
+        return float(self.row @ voltage_v)
 
 
-def mean_inverter_error(curve: InverterCurve, i_d: Vector, i_q: Vector) -> tuple[Vector, Vector]:
-    """Mean of the three-phase error over one electrical turn, in the rotor frame (V)."""
-    angle = np.asarray((np.arange(360) + 0.5) * (2.0 * np.pi / 360.0), dtype=np.float64)
-    e_d, e_q = np.empty_like(i_d), np.empty_like(i_q)
-    for k, (d, q) in enumerate(zip(i_d, i_q, strict=True)):
-        wave_d, wave_q = curve.error_dq_v(np.full_like(angle, d), np.full_like(angle, q), angle)
-        e_d[k], e_q[k] = float(np.mean(wave_d)), float(np.mean(wave_q))
-    return e_d, e_q
+def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
+    """Average the models without curvature, with i_d^2, and with i_d^4, as their data support them."""
+    w, i_d = rows.w, rows.i_d
+    first, second = (np.array([pair[k] for pair in pairs]) for k in (0, 1))
+    w_sum = w[first] + w[second]
+    # every pair as a linear map of the rows' voltages, so that doubts about voltages go the same way
+    reduce = np.zeros((len(pairs), len(w)))
+    index = np.arange(len(pairs))
+    reduce[index, first] = reduce[index, second] = 1.0 / w_sum
+    y = reduce @ (rows.u_q - _rough_L_d(rows, np.concatenate([first, second])) * w * i_d)
+    level = 0.5 * np.abs(i_d[first] - i_d[second])
+    s = level / np.max(level)
+    weight = np.abs(w_sum) * s  # an error voltage that falls with the current
+    weight = weight / np.mean(weight)
+    sizes = np.sort(level)
+    levels = 1 + int(np.sum(sizes[1:] > LEVEL_RATIO * sizes[:-1]))
+    n = len(y)
+    hats, residuals = [], []
+    for order in range(levels):
+        matrix = np.stack([s ** (2 * k) for k in range(order + 1)], axis=1)
+        hats.append(np.linalg.pinv(matrix * weight[:, None]) * weight)
+        residuals.append(y - matrix @ (hats[-1] @ y))
+    chi = np.array([float(np.sum((weight * residual) ** 2)) for residual in residuals])
+    dof = n - 1.0 - np.arange(levels)
+    variance = max(float(chi[-1] / dof[-1]), (np.finfo(np.float64).eps * float(np.max(np.abs(y)))) ** 2)
+    share = information_weights([float(c / variance + (n - d) * math.log(n)) for c, d in zip(chi, dof, strict=True)])
+    values = np.array([float(hat[0] @ y) for hat in hats])
+    value = float(share @ values)
+    within = chi / dof * np.array([float(np.sum((hat[0] / weight) ** 2)) for hat in hats])
+    low = level < LEVEL_RATIO * sizes[0]
+    return _Even(
+        flux_wb=value,
+        std_wb=math.sqrt(float(share @ (within + (values - value) ** 2))),
+        dof=float(share @ dof),
+        curvature=sum(float(p * np.sum((hat @ y)[1:])) for p, hat in zip(share, hats, strict=True)) / value,
+        low_wb=float(np.average(y[low], weights=weight[low])),
+        low_std_wb=float(np.std(y[low])) / math.sqrt(max(1, int(np.sum(low)) - 1)),
+        low_i_d_a=float(np.mean(level[low])),
+        w=0.5 * w_sum,
+        residual_wb=np.asarray(share @ np.stack(residuals)),
+        row=np.asarray(share @ np.stack([hat[0] for hat in hats]) @ reduce),
+    )
 
 
-def _check_speeds(speeds: Trace, w: Vector) -> None:
-    for sign, name in ((1.0, "forward"), (-1.0, "backward")):
-        mine = np.abs(w[np.sign(w) == sign])
-        if len(mine) < MINIMUM_SPEEDS or float(np.max(mine)) < SPEED_RATIO * float(np.min(mine)):
-            raise refuse(
-                "E_EXCITATION",
-                f"{len(mine)} speeds {name}; {MINIMUM_SPEEDS} over a range of {SPEED_RATIO:g} to 1 are needed",
-                stage=STAGE,
-            )
-    if "flagged" in speeds.signals and np.any(speeds["flagged"] > 0.0):
-        count = int(np.sum(speeds["flagged"] > 0.0))
-        raise refuse("E_CLIPPED", f"voltage or current limited at {count} speeds", stage=STAGE)
-    change = np.abs(speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / np.abs(w)
-    if float(np.max(change)) > SETTLE_LIMIT:
-        worst = int(np.argmax(change))
-        raise refuse(
-            "E_NOT_SETTLED",
-            f"at {w[worst]:.4g} rad/s the speed still moves by {100 * change[worst]:.2g} % in one window, "
-            f"limit {100 * SETTLE_LIMIT:g} %",
-            stage=STAGE,
-        )
-    for axis in ("d", "q"):
-        drift = np.abs(speeds[f"i_{axis}_second_a"] - speeds[f"i_{axis}_first_a"])
-        limit = CURRENT_SETTLE_LIMIT * float(np.max(np.hypot(speeds["i_d_a"], speeds["i_q_a"])))
-        if float(np.max(drift)) > limit:
-            worst = int(np.argmax(drift))
-            raise refuse(
-                "E_NOT_SETTLED",
-                f"at {w[worst]:.4g} rad/s i_{axis} still moves by {drift[worst]:.2g} A in one window, "
-                f"limit {limit:.2g} A",
-                stage=STAGE,
-            )
+def _rough_L_d(rows: Corrected, which: NDArray[np.int64]) -> float:
+    """L_d from u_q (H): the two windows of a pair differ a little in speed."""
+    w, i_d = rows.w[which], rows.i_d[which]
+    columns = np.stack([w, w * i_d, np.sign(w) * np.sign(i_d)], axis=1)
+    return float(np.linalg.lstsq(columns, rows.u_q[which], rcond=None)[0][1])
 
 
 def _normalise(measured: Estimate, T_ref_c: float, alpha: float, tolerance: SensorTolerance) -> Estimate:

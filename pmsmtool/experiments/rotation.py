@@ -13,6 +13,8 @@ MAX_POLE_PAIRS = 32
 """A machine with more is not found by turning its vector; the run ends with E_POLE_PAIRS."""
 
 ALIGN_S = 0.3
+BACK_AT_MOST = 1.15
+"""Steps of the way back, of those of the way there: a rotor that lags or sticks at a turning point needs more."""
 LEAD_STEPS = 8
 """Steps before the recorded ones: the rotor's own transient after standstill or reversal."""
 
@@ -35,7 +37,7 @@ class RotationPlan:
 
     i_a: float
     step_rad: float = math.radians(15.0)
-    dwell_s: float = 0.03
+    dwell_s: float = 0.015
     turns_mechanical: float = 1.02
 
 
@@ -59,17 +61,19 @@ def rotate_vector(drive: Drive, plan: RotationPlan, *, start_rad: float = 0.0) -
 
 
 def _run(drive: Drive, plan: RotationPlan, angle: float, step: float, count: int | None) -> tuple[float, Trace]:
-    """Turn in one direction: a lead-in that brings the rotor to speed, then ``count`` steps or the mechanical turns."""
+    """Turn in one direction: a lead-in that brings the rotor to speed, then the turns, and ``count`` steps."""
     for _ in range(LEAD_STEPS):
         angle += step
         _step(drive, plan, angle)
     rows = [_row(drive, angle)]
-    limit = round(2.0 * math.pi * MAX_POLE_PAIRS * plan.turns_mechanical / plan.step_rad) if count is None else count
+    limit = round(2.0 * math.pi * MAX_POLE_PAIRS * plan.turns_mechanical / plan.step_rad)
+    if count is not None:
+        limit = min(limit, round(BACK_AT_MOST * count))
     while len(rows) < limit:
         angle += step
         rows.append(_step(drive, plan, angle))
         way = abs(rows[-1]["theta_M_rad"] - rows[0]["theta_M_rad"])
-        if count is None and way >= 2.0 * math.pi * plan.turns_mechanical:
+        if way >= 2.0 * math.pi * plan.turns_mechanical and len(rows) >= (count or 0):
             break
     return angle, table(rows, [k * plan.dwell_s for k in range(len(rows))], i_command_a=plan.i_a)
 

@@ -1,21 +1,29 @@
-"""Steady speeds in both directions at i_d = 0: means for the flux linkage and the fine encoder offset."""
+"""Windows at steady currents while the shaft coasts: means for the flux linkage and the fine encoder offset.
+
+The speed controller brings the shaft to a speed; then a current vector is held in the rotor frame and the shaft coasts.
+Without i_q the inverter's error has hardly a q part, whatever friction and inertia are.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
 from pmsmtool.experiments.signals import readable, table
 from pmsmtool.trace import Trace
 
-SHARES = (0.25, 0.45, 0.65, 0.85)
-"""Of the largest speed of the run, both directions (identification reference, 3.4)."""
+SHARES = (0.40, 0.55, 0.70, 0.85)
+"""Of the largest speed of the run, both directions."""
+D_SHARES = ((1.0,), (1.0,), (1.0 / 3.0, 2.0 / 3.0, 1.0), (1.0 / 3.0, 2.0 / 3.0, 1.0))
+"""d currents at each speed, of the largest; the low ones tell how the d axis saturates."""
+Q_AT = (1, 2)
+"""Speeds at which q currents are held, too."""
 MEANS = ("u_d_v", "u_q_v", "i_d_a", "i_q_a", "omega_e_rad_s", "T_magnet_c", "T_winding_c", "flags")
-WAVES = ("i_d_a", "i_q_a", "theta_e_rad")
 
 LOOK_S = 0.05
+SLOWEST = 0.82
+"""Part of the set speed below which a coasting shaft is brought back to it."""
 NEAR = 0.005
 """Relative distance from the set speed that counts as reached."""
 REACH_LIMIT_S = 8.0
@@ -24,77 +32,93 @@ REACH_LIMIT_S = 8.0
 
 @dataclass(frozen=True, slots=True)
 class SpeedPlan:
-    """Speeds to hold.
+    """Speeds to reach, and currents to hold there.
 
     Attributes
     ----------
-    speeds_rad_s : sequence of float
-        Mechanical speeds in the order they are held (rad/s).
-    pole_pairs : int
-        Pole pairs, to average over whole mechanical turns.
+    omega_max_rad_s : float
+        Largest mechanical speed (rad/s).
+    i_d_a : float
+        Largest d current, held with both signs (A peak).
+    i_q_a : float
+        q current, held with both signs (A peak).
     settle_s : float
-        Time between reaching the speed and the window (s).
-    window_s : float
-        Shortest window (s); it is rounded up to whole mechanical turns.
-    wave_samples : int
-        Samples of the current waveform recorded at each speed, 0 for none.
+        Time between a current's command and its window (s).
+    first_s : float
+        The same after the speed controller (s).
+    window_s, longest_s : float
+        Shortest window, rounded up to whole mechanical turns; where one turn is longer than the longest, whole
+        electrical turns must do (s).
+    q_window_s : float
+        Shortest window of a q current, which accelerates the shaft: whole electrical turns (s).
     """
 
-    speeds_rad_s: Sequence[float]
-    pole_pairs: int
-    settle_s: float = 0.25
-    window_s: float = 0.15
-    wave_samples: int = 2048
+    omega_max_rad_s: float
+    i_d_a: float
+    i_q_a: float
+    settle_s: float = 0.025
+    first_s: float = 0.05
+    window_s: float = 0.06
+    longest_s: float = 0.2
+    q_window_s: float = 0.03
 
-    def duration_s(self) -> float:
-        """Return about how long the run takes (s)."""
-        return sum(self.settle_s + 2.0 * (self.window_s + 2.0 * math.pi / abs(w)) for w in self.speeds_rad_s)
-
-
-def speeds_of(omega_max_rad_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the speeds in two groups, one for each sign of i_d; each has every second share in each direction."""
-    odd, even = SHARES[::2], SHARES[1::2]
-    groups = ((odd, even), (even, odd))
-    return tuple(  # type: ignore[return-value]
-        tuple(
-            sign * share * omega_max_rad_s for sign, shares in zip((1.0, -1.0), group, strict=True) for share in shares
-        )
-        for group in groups
-    )
+    def stations(self) -> list[tuple[float, list[tuple[float, float]]]]:
+        """Return the mechanical speeds in the order they are reached, and the vectors that are held at each."""
+        found = []
+        for k, sense in enumerate((1.0, -1.0)):
+            for n, share in enumerate(SHARES):
+                vectors = []
+                for m, part in enumerate(D_SHARES[n]):
+                    # the shaft slows down: which sign comes first takes turns
+                    first = 1.0 if (k + n + m) % 2 else -1.0
+                    vectors += [(first * part * self.i_d_a, 0.0), (-first * part * self.i_d_a, 0.0)]
+                if n in Q_AT:
+                    # slower first, so that the two leave the speed where it was
+                    vectors += [(0.0, -sense * self.i_q_a), (0.0, sense * self.i_q_a)]
+                found.append((sense * share / SHARES[-1] * self.omega_max_rad_s, vectors))
+        return found
 
 
 Rows = list[dict[str, float]]
 
 
-def hold_speeds(drive: Drive, plan: SpeedPlan) -> tuple[Rows, list[Trace]]:
-    """Hold the speeds and return one row of means for each, and the current waveforms.
+def coast_through(drive: Drive, plan: SpeedPlan, pole_pairs: int) -> Rows:
+    """Hold the vectors at every speed and return one row of means for each.
 
     The drive is enabled on entry with a speed controller that holds the machine; it is asked for standstill on return.
     """
     rows: Rows = []
-    waves = []
-    for speed in plan.speeds_rad_s:
-        drive.command_speed(speed)
-        reach(drive, speed * plan.pole_pairs)
-        drive.wait(plan.settle_s)
-        half = _half_window(drive, plan, speed)
-        first, second = (drive.average(MEANS, half) for _ in range(2))
-        row = {name: 0.5 * (first[name] + second[name]) for name in MEANS if name != "flags"}
-        for name in ("i_d", "i_q"):
-            row[f"{name}_first_a"], row[f"{name}_second_a"] = first[f"{name}_a"], second[f"{name}_a"]
-        row["omega_first_rad_s"] = first["omega_e_rad_s"]
-        row["omega_second_rad_s"] = second["omega_e_rad_s"]
-        row["flagged"] = float(first["flags"] + second["flags"] > 0.0)  # a mean of flag words: any bit counts
-        rows.append(row)
-        if plan.wave_samples:
-            waves.append(readable(drive.record(WAVES, plan.wave_samples)))
+    for speed, vectors in plan.stations():
+        omega_e = speed * pole_pairs
+        controlled = False
+        for i_d, i_q in vectors:
+            if not controlled or abs(rows[-1]["omega_second_rad_s"]) < SLOWEST * abs(omega_e):
+                drive.command_speed(speed)
+                reach(drive, omega_e)
+                controlled, settle_s = True, plan.first_s
+            drive.command_current(i_d, i_q)
+            drive.wait(settle_s)
+            settle_s = plan.settle_s
+            rows.append(_window(drive, _half_window(drive, plan, speed, pole_pairs, i_q != 0.0)))
     drive.command_speed(0.0)
-    return rows, waves
+    return rows
 
 
-def speeds_trace(rows: Rows, pole_pairs: int) -> Trace:
-    """Return the rows of all groups as one trace; its time base counts them."""
-    return table(rows, [float(k) for k in range(len(rows))], pole_pairs=pole_pairs)
+def _window(drive: Drive, half: int) -> dict[str, float]:
+    """Return the means over two halves of a window, one after the other."""
+    first, second = (drive.average(MEANS, half) for _ in range(2))
+    row = {name: 0.5 * (first[name] + second[name]) for name in MEANS if name != "flags"}
+    for name in ("i_d", "i_q"):
+        row[f"{name}_first_a"], row[f"{name}_second_a"] = first[f"{name}_a"], second[f"{name}_a"]
+    row["omega_first_rad_s"], row["omega_second_rad_s"] = first["omega_e_rad_s"], second["omega_e_rad_s"]
+    row["half_s"] = half * drive.period_s
+    row["flagged"] = float(first["flags"] + second["flags"] > 0.0)  # a mean of flag words: any bit counts
+    return row
+
+
+def speeds_trace(rows: Rows, pole_pairs: int, U_dc_v: float) -> Trace:
+    """Return the rows as one trace; its time base counts them."""
+    return table(rows, [float(k) for k in range(len(rows))], pole_pairs=pole_pairs, U_dc_v=U_dc_v)
 
 
 def reach(drive: Drive, omega_e_rad_s: float, *, limit_s: float = REACH_LIMIT_S, band_rad_s: float = 0.0) -> float:
@@ -110,11 +134,13 @@ def reach(drive: Drive, omega_e_rad_s: float, *, limit_s: float = REACH_LIMIT_S,
     return waited
 
 
-def _half_window(drive: Drive, plan: SpeedPlan, speed: float) -> int:
-    """Periods of half a window: whole mechanical turns, so that what repeats per turn averages out."""
-    turn_s = 2.0 * math.pi / abs(speed)
-    turns = max(1, math.ceil(0.5 * plan.window_s / turn_s))
-    return max(64, round(turns * turn_s / drive.period_s))
+def _half_window(drive: Drive, plan: SpeedPlan, speed: float, pole_pairs: int, accelerates: bool) -> int:
+    """Periods of half a window: in all whole turns, so that what repeats per turn averages out."""
+    turn_s, least_s = 2.0 * math.pi / abs(speed), plan.window_s
+    if accelerates or turn_s > plan.longest_s:
+        turn_s, least_s = turn_s / pole_pairs, plan.q_window_s if accelerates else 0.5 * plan.longest_s
+    turns = max(1, math.ceil(least_s / turn_s))
+    return max(64, round(0.5 * turns * turn_s / drive.period_s))
 
 
 def push_and_record(drive: Drive, i_q_a: float, samples: int, decimation: int, abort_speed_rad_s: float) -> Trace:

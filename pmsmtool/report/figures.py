@@ -18,7 +18,7 @@ from pmsmtool.design.prediction import Prediction
 from pmsmtool.design.sampled_loop import LoopMargins, SampledLoop
 from pmsmtool.estimators.axis_fit import AxisFit
 from pmsmtool.estimators.axis_response import SKIP_SAMPLES
-from pmsmtool.estimators.flux_linkage import I_D_SPREAD, FluxResult, mean_inverter_error
+from pmsmtool.estimators.flux_linkage import FluxResult
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.report.report import Figure
 from pmsmtool.trace import Trace
@@ -117,68 +117,30 @@ def inductance_figure(shots: Mapping[str, Trace], fits: Mapping[str, AxisFit], s
     return Figure(svg(canvas), f"Square-wave injection, first periods; {'; '.join(texts)}.")
 
 
-def flux_figure(
-    speeds: Trace,
-    result: FluxResult,
-    curve: InverterCurve | None,
-    waves: Sequence[Trace] = (),
-    *,
-    R_ohm: float,
-    period_s: float,
-) -> Figure:
-    """Draw the voltage of the magnets over speed, and how far each speed lies off the common flux linkage.
+def flux_figure(result: FluxResult) -> Figure:
+    """Draw the voltage of the magnets over speed, and how far each pair of windows lies off the common flux linkage.
 
     Parameters
     ----------
-    speeds, waves : Trace
-        As ``estimate_flux_linkage`` takes them.
     result : FluxResult
         The regression.
-    curve, R_ohm, period_s
-        What was taken off the commanded voltage.
     """
-    w = speeds["omega_e_rad_s"]
-    psi, residual = _flux_regression(speeds, _mean_error_q(speeds, curve, waves), R_ohm, period_s)
+    w, residual, psi = result.omega_rad_s, result.residual_wb, result.psi_measured.value
     canvas, (left, right) = _canvas(1, 2)
     order = np.argsort(w)
     left.plot(w[order], psi * w[order], color=_MODEL, label="psi_f omega")
-    left.plot(w, psi * w + residual, "o", ms=3.5, color=_MEASURED, label="measured")
+    left.plot(w, (psi + residual) * w, "o", ms=3.5, color=_MEASURED, label="measured")
     left.set(xlabel="electrical speed / rad/s", ylabel="voltage of the magnets / V")
     left.legend()
     right.axhline(0.0, color=_MODEL)
-    right.plot(w, 1e2 * residual / (w * psi), "o", ms=3.5, color=_MEASURED)
+    right.plot(w, 1e2 * residual / psi, "o", ms=3.5, color=_MEASURED)
     right.set(xlabel="electrical speed / rad/s", ylabel="deviation from psi_f / %")
     caption = (
-        f"Regression over {len(w)} speeds in both directions: psi_f = {result.psi_measured.value:.5g} Wb at the "
-        f"temperature of the run, {result.intercept_v:+.3g} V left as intercept, residual {result.residual_v:.2g} V."
+        f"Coasting in both directions, {len(w)} pairs of d currents of both signs: psi_f = {psi:.5g} Wb at the "
+        f"temperature of the run; the largest d current changes the flux of the magnets by "
+        f"{100 * result.curvature:+.2g} %."
     )
     return Figure(svg(canvas), caption)
-
-
-def _mean_error_q(speeds: Trace, curve: InverterCurve | None, waves: Sequence[Trace]) -> Vector:
-    """Mean inverter error on the q axis at each speed (V)."""
-    if curve is None:
-        return np.zeros_like(speeds["i_q_a"])
-    if not waves:
-        return mean_inverter_error(curve, speeds["i_d_a"], speeds["i_q_a"])[1]
-    errors = [curve.error_dq_v(wave["i_d_a"], wave["i_q_a"], wave["theta_e_rad"])[1] for wave in waves]
-    return np.array([float(np.mean(error)) for error in errors])
-
-
-def _flux_regression(speeds: Trace, e_q: Vector, R_ohm: float, period_s: float) -> tuple[float, Vector]:
-    """Return the q-axis flux of the magnets (Wb) and what every speed's voltage is off (V).
-
-    The model of ``estimators.flux_linkage``; what is not the magnets' (intercept, coupling, flux of i_d) is fitted too.
-    """
-    w, i_d, i_q = speeds["omega_e_rad_s"], speeds["i_d_a"], speeds["i_q_a"]
-    x = 0.5 * w * period_s
-    u_q = (speeds["u_q_v"] - e_q - R_ohm * i_q) * x / np.sin(x)
-    columns = [w, np.sign(w), w * i_q]
-    if np.ptp(i_d) > I_D_SPREAD * float(np.max(np.hypot(i_d, i_q))):
-        columns.append(w * i_d)
-    matrix = np.stack(columns, axis=1)
-    fit = np.linalg.lstsq(matrix, u_q, rcond=None)[0]
-    return float(fit[0]), np.asarray(u_q - matrix @ fit, dtype=np.float64)
 
 
 def bode_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMargins]) -> Figure:

@@ -14,6 +14,7 @@ from pmsmtool.estimators.axis_response import initial_inductance
 from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
+from pmsmtool.estimators.flux_linkage_rows import speed_lag
 from pmsmtool.estimators.flux_map_result import FluxMapResult
 from pmsmtool.estimators.frequency_response import FrequencyResponse
 from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
@@ -32,8 +33,6 @@ RESONANCE = ("resonance_hz", "antiresonance_hz", "resonance_zeta")
 """Keys of a second mass: a response without one takes them out of the machine file."""
 MOVED_SHARE = 0.25
 """Largest share of levels that may be left out; with more the estimator sees them, and refuses what has not settled."""
-CROSS_SATURATION = 0.25
-"""Standard deviation of dL_q/di_d, of (L_q - L_d)/I: the reluctance machine of the profiles has 0.24."""
 MOTION_STD = 0.2
 """Relative standard deviation of the rotor's answer to an injection as the pushes show it: friction takes part."""
 RELUCTANCE_STD = 0.3
@@ -117,7 +116,7 @@ def evaluate(
     traces : mapping of str to Trace
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
         ``phase_pairs``, ``rotation_forward``, ``rotation_backward``, ``square_d_<half period>``,
-        ``square_q_<half period>``, ``speeds``, ``wave_<k>``, ``map_<k>``, ``inertia_<k>``, ``frf_<k>``.
+        ``square_q_<half period>``, ``speeds``, ``map_<k>``, ``inertia_<k>``, ``frf_<k>``.
     period_s : float
         Control period (s).
     T_ref_c : float
@@ -151,7 +150,7 @@ def evaluate(
         encoder = estimate_encoder(traces["rotation_forward"], traces["rotation_backward"])
         result = replace(result, encoder=encoder)
     if "speeds" in traces and result.resistance is not None:
-        flux = flux_of(traces, result.resistance, period_s, T_ref_c, tolerance, U_dc_v)
+        flux = flux_of(traces, result.resistance, period_s, T_ref_c, tolerance)
         result = replace(result, flux=flux)
     if result.resistance is not None and result.encoder is not None and any(k.startswith("square_d") for k in traces):
         result = replace(result, inductance=inductance_of(traces, result, tolerance))
@@ -195,29 +194,26 @@ def flux_of(
     period_s: float,
     T_ref_c: float,
     tolerance: SensorTolerance | None,
-    U_dc_v: float = math.inf,
 ) -> FluxResult:
     """Return the flux linkage, with the resistance at the temperature of the speed run."""
     speeds = traces["speeds"]
-    waves = [traces[f"wave_{k}"] for k in range(len(speeds)) if f"wave_{k}" in traces]
     R = resistance.R_measured
     T = float(np.mean(speeds["T_winding_c"]))
     warmer = COPPER_ALPHA_PER_K * (T - R.T_c) if math.isfinite(T) and math.isfinite(R.T_c) else 0.0
-    modulation, cross = None, 0.0
+    modulation = None
     rough = [_rough_inductance(traces, axis) for axis in "dq"]
-    if all(L > 0.0 for L in rough):
-        cross = CROSS_SATURATION * abs(rough[1] - rough[0]) / R.i_d_apk
-        if math.isfinite(U_dc_v):
-            dead_time = max(0.0, resistance.V_dead_v) * period_s / U_dc_v
-            modulation = Modulation(U_dc_v, 2.0 / (1.0 / rough[0] + 1.0 / rough[1]), period_s, dead_time)
+    U_dc_v = float(speeds.meta.get("U_dc_v", math.inf))
+    if all(L > 0.0 for L in rough) and math.isfinite(U_dc_v):
+        dead_time = max(0.0, resistance.V_dead_v) * period_s / U_dc_v
+        modulation = Modulation(U_dc_v, 2.0 / (1.0 / rough[0] + 1.0 / rough[1]), period_s, dead_time)
+    pushes = [traces[name] for name in ("push_0", "push_1") if name in traces]
     return estimate_flux_linkage(
         speeds,
         R.value * (1.0 + warmer),
         period_s=period_s,
         inverter=resistance.curve,
-        waves=waves,
         modulation=modulation,
-        cross_h_per_a=cross,
+        lag=speed_lag(pushes, int(speeds.meta["pole_pairs"])),
         tolerance=tolerance,
         T_ref_c=T_ref_c,
     )

@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_map_fit import MagnetFlux
@@ -130,7 +128,8 @@ def flux_map_of(
     offset = drive_offset
     if result.flux is not None and result.offset is not None:
         measured = result.flux.psi_measured
-        magnet = _magnet_of(traces["speeds"], measured)
+        i_d = result.flux.low_i_d_a
+        magnet = MagnetFlux(result.flux.low_wb, result.flux.low_std_wb, (i_d, -i_d), (0.0, 0.0), (0.5, 0.5))
         to_reference = result.flux.psi_f.value - measured.value
         offset = result.offset.value
     elif not held:
@@ -147,19 +146,11 @@ def flux_map_of(
     )
 
 
-def _magnet_of(speeds: Trace, psi: Estimate) -> MagnetFlux:
-    """Return the flux linkage with the currents it was measured at; fast rows decide the regression over speeds."""
-    weight = np.square(speeds["omega_e_rad_s"])
-    weight = weight / np.sum(weight)
-    i_d, i_q = (tuple(map(float, speeds[name])) for name in ("i_d_a", "i_q_a"))
-    return MagnetFlux(psi.value, psi.std, i_d, i_q, tuple(map(float, weight)))
-
-
 def map_estimates(result: Evaluation, flux_map: FluxMapResult, traces: Mapping[str, Trace]) -> dict[str, Estimate]:
     """Return what the map says of the machine, by machine-file key.
 
-    Inductances at the largest torque of the rated current; and psi_f, which the run over speeds knows at its currents
-    only, at none.
+    Inductances at the largest torque of the rated current; and psi_f, which the run over speeds measures at d currents
+    and extrapolates, at none.
     """
     facts = traces["map_0"].meta
     fallback = HELD_FALLBACK if facts["held"] else ""

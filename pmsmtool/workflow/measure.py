@@ -64,9 +64,13 @@ PUSH_SHARE = 0.5
 PUSH_SPEED_SHARE = 0.12
 PUSH_SAMPLES = 1024
 SPEED_LOOP_RAD_S = 25.0
-RUN_I_D_SHARE = 0.25
-TORQUE_LOSS_SHARE = 0.2
-"""Part of the magnet torque that i_d may take away by reluctance: psi + (L_d - L_q) i_d."""
+RUN_I_D_SHARE = 0.45
+"""Largest d current of the flux run, of the test current: a third of it is still beyond the inverter's knee."""
+SATURATED = 1.5
+"""Largest ratio of the chord of psi_d over the run's i_d to the rough L_d, which is that of a saturated bias."""
+RUN_I_Q_SPEED_SHARE = 0.15
+RUN_I_Q_S = 0.08
+"""A q current of the flux run may change the speed by this share of the largest in this time."""
 REACTANCE_SHARE = 0.25
 """Voltage that the accelerating current may need at the largest speed, of the largest voltage."""
 REST_SHARE = 0.02
@@ -454,46 +458,39 @@ class Measurement:
 
     def _speeds(self, psi: float, J: float, pole_pairs: int, L: tuple[float, float]) -> None:
         limits = self.limits
-        saliency = abs(L[0] - L[1])
         run_i_d = RUN_I_D_SHARE * limits.I_test_apk
-        if saliency * run_i_d > TORQUE_LOSS_SHARE * psi:
-            run_i_d = TORQUE_LOSS_SHARE * psi / saliency
-        flux = psi + L[0] * run_i_d
+        flux = psi + SATURATED * L[0] * run_i_d
         largest = min(limits.omega_max_rad_s / 1.1, EMF_SHARE * limits.V_max_v / (flux * pole_pairs))
         if largest <= 0.0:
             raise LimitExceeded("speed", 0.0, largest, "rad/s")
         # the accelerating current must leave voltage for itself: omega_e L_q i_q stands beside the back-emf
         i_run = min(0.5 * limits.I_test_apk, REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L)))
-        tau = 1.5 * pole_pairs * psi * i_run
-        slope = tau / J
+        per_ampere = 1.5 * pole_pairs * psi / J
+        i_q = min(0.5 * i_run, RUN_I_Q_SPEED_SHARE * largest / (RUN_I_Q_S * per_ampere))
+        # a current that is slow because the inverter's error is steep would not be steady in its window
+        alpha = min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s))
+        R_ohm = self.drive.read("motor.R_s_ohm")
+        K_i_d, K_i_q = (max(alpha * R_ohm, 0.25 * alpha**2 * inductance) for inductance in L)
         self._off_and_write(
             {
+                "current.K_i_d_v_per_as": K_i_d,
+                "current.K_i_q_v_per_as": K_i_q,
                 "motor.psi_f_wb": psi,
                 "motor.J_kgm2": J,
                 "current.options": 7.0,
                 "speed.K_p_nms_per_rad": 2.0 * SPEED_LOOP_RAD_S * J,
                 "speed.K_i_nm_per_rad": SPEED_LOOP_RAD_S**2 * J,
-                "speed.tau_max_nm": 1.6 * tau,
-                "speed.acceleration_rpm_per_s": slope * 30.0 / math.pi,
+                "speed.tau_max_nm": 1.6 * J * per_ampere * i_run,
+                "speed.acceleration_rpm_per_s": per_ampere * i_run * 30.0 / math.pi,
             }
         )
-        groups = speed_run.speeds_of(largest / max(speed_run.SHARES))
-        rows: speed_run.Rows = []
-        for sign, speeds in zip((1.0, -1.0), groups, strict=True):
-            # i_d keeps the phase currents away from zero, where the inverter's error is not known well; the two signs
-            # cancel its flux
-            i_d = sign * run_i_d
-            self._off_and_write({"field_weakening.i_d_lm_a": i_d})
-            self.drive.enable()
-            self.say(
-                f"psi_f and fine offset: {len(speeds)} speeds up to {largest * 30 / math.pi:.0f} rpm, i_d {i_d:.3g} A"
-            )
-            more, waves = speed_run.hold_speeds(self.drive, speed_run.SpeedPlan(speeds, pole_pairs))
-            for wave in waves:
-                self.keep(f"wave_{len(rows)}", wave)
-                rows.append(more.pop(0))
-            speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)
-        self.keep("speeds", speed_run.speeds_trace(rows, pole_pairs))
+        self.drive.enable()
+        fastest_rpm = largest * 30.0 / math.pi
+        self.say(f"psi_f and fine offset: coasting from up to {fastest_rpm:.0f} rpm, i_d up to {run_i_d:.3g} A")
+        plan = speed_run.SpeedPlan(largest, run_i_d, i_q)
+        rows = speed_run.coast_through(self.drive, plan, pole_pairs)
+        speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)
+        self.keep("speeds", speed_run.speeds_trace(rows, pole_pairs, math.sqrt(3.0) * limits.V_max_v))
 
     def _off_and_write(self, values: Mapping[str, float]) -> None:
         self.drive.disable()

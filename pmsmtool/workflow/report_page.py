@@ -82,13 +82,11 @@ def _identification_figures(run: RunDirectory, record: RunRecord) -> Iterator[Fi
     if inductance is not None and found.encoder is not None:
         shots = {axis: shots_of(traces, axis, round(found.encoder.pole_pairs.value))[0] for axis in "dq"}
         yield figures.inductance_figure(shots, inductance.axes, found.noise.sigma_a)
-    if flux is not None and resistance is not None:
-        waves = [traces[f"wave_{k}"] for k in range(len(traces["speeds"])) if f"wave_{k}" in traces]
-        R_ohm = resistance.R_measured.value
-        yield figures.flux_figure(traces["speeds"], flux, resistance.curve, waves, R_ohm=R_ohm, period_s=period_s)
+    if flux is not None:
+        yield figures.flux_figure(flux)
 
 
-_EXPERIMENTS = (("phase_vectors",), ("levels",), ("rotation",), ("square",), ("push",), ("wave", "speeds"))
+_EXPERIMENTS = (("phase_vectors",), ("levels",), ("rotation",), ("square",), ("push",), ("speeds",))
 """How the names of their traces begin, in the order the experiments are made."""
 
 

@@ -142,7 +142,7 @@ def test_values_with_a_deviation_become_the_table(made: Path, tmp_path: Path) ->
             {"rotation_forward"},
         ),
         (["phase_vectors", "levels"], True, {"phase_vectors", "levels"}),
-        (["levels", "square_d_6", "square_q_6", "push_0", "wave_0"], False, {"push_0", "square_q_6"}),
+        (["levels", "square_d_6", "square_q_6", "push_0", "speeds"], False, {"push_0", "square_q_6"}),
     ],
 )
 def test_an_experiment_that_was_cut_short_is_not_evaluated(

@@ -10,47 +10,54 @@ import pytest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import statistical_half_width
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
+from pmsmtool.estimators.flux_linkage_rows import SpeedLag, speed_lag
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, curve_points, draw, repeat, run
 
 Change = Callable[[Trace], Mapping[str, np.ndarray]]
 
-SPEEDS = np.array([sign * fraction for fraction in (0.25, 0.45, 0.65, 0.85) for sign in (1.0, -1.0)])
+D, Q = 0.45, 0.3  # currents of the windows, of the rated one
+STATIONS = [
+    (sense * share, vector)
+    for sense in (1.0, -1.0)
+    for share, levels in ((0.40, (1.0,)), (0.55, (1.0,)), (0.70, (1 / 3, 1.0)), (0.85, (1 / 3, 1.0)))
+    for vector in [(sign * level * D, 0.0) for level in levels for sign in (1.0, -1.0)]
+    + [(0.0, sign * Q) for sign in (1.0, -1.0) if share == 0.70]
+]
 SETTLE, WINDOW = 600, 1700
-PSI_P90, PSI_MAX = 3e-4, 2e-3  # targets 1e-3 and 3e-3; measured 1.3e-4 and 1.0e-3 on 24 drives
-OFFSET_P90_RAD, OFFSET_MAX_RAD = math.radians(0.02), math.radians(0.05)  # measured 0.004 and 0.007 deg
+PSI_P90, PSI_MAX = 1e-4, 3e-4  # targets 1e-3 and 3e-3; measured 0.6e-5 to 1.7e-5 and 0.8e-5 to 4.1e-5, seeds 11 to 15
+OFFSET_P90_RAD, OFFSET_MAX_RAD = math.radians(0.005), math.radians(0.01)  # measured 0.0007 and 0.0012 deg
 
 
 class Population:
-    """24 drives, 8 speeds each, in one run."""
+    """12 drives, 28 windows each, in one run."""
 
-    def __init__(self, seed: int, count: int = 24) -> None:
+    def __init__(self, seed: int, count: int = 12) -> None:
         rng = np.random.default_rng(seed)
         self.drives = draw(count, rng)
-        many = repeat(self.drives, len(SPEEDS))
-        factor = np.repeat(SPEEDS, count)
+        many = repeat(self.drives, len(STATIONS))
+        factor = np.repeat([speed for speed, _ in STATIONS], count)
+        d, q = (np.repeat([vector[axis] for _, vector in STATIONS], count) for axis in (0, 1))
         self.w = factor * many.w_base
         self.result = run(
             many,
             rng,
             SETTLE + WINDOW,
-            bias_q=0.1 * np.sign(factor) * many.I_r,
+            bias_d=d * many.I_r,
+            bias_q=q * many.I_r,
             imposed_speed=self.w,
             bandwidth=2 * math.pi * 200.0,
-            substeps=6,
+            substeps=4,
         )
         turn = 2 * math.pi / (np.abs(self.w) * many.T_s)
         self.length = np.round(turn * np.maximum(1, np.floor(WINDOW / turn))).astype(int)  # whole turns
         self.length = np.minimum(self.length, WINDOW)
 
-    def rows(self, k: int) -> list[int]:
-        return [k + j * self.drives.n for j in range(len(SPEEDS))]
-
     def speeds(self, k: int) -> Trace:
-        """Means over the window, as the drive delivers them."""
+        """Means over the windows, as the drive delivers them."""
         r = self.result
-        rows = self.rows(k)
+        rows = [k + j * self.drives.n for j in range(len(STATIONS))]
 
         def mean(values: np.ndarray, first: int = SETTLE, part: float = 1.0) -> np.ndarray:
             return np.array([values[first : first + int(self.length[j] * part), j].mean() for j in rows])
@@ -64,6 +71,7 @@ class Population:
             "omega_e_rad_s": w,
             "omega_first_rad_s": w,
             "omega_second_rad_s": w,
+            "half_s": 0.5 * self.length[rows] * self.drives.T_s[k],
             "T_magnet_c": np.full_like(w, math.nan),
             "i_d_first_a": mean(r.i_d, part=0.5),
             "i_q_first_a": mean(r.i_q, part=0.5),
@@ -72,22 +80,10 @@ class Population:
         }
         return Trace(np.arange(float(len(rows))), signals, dict.fromkeys(signals, "1"))
 
-    def waves(self, k: int) -> list[Trace]:
-        out = []
-        for j in self.rows(k):
-            part = slice(SETTLE, SETTLE + self.length[j])
-            signals = {
-                "i_d_a": self.result.i_d[part, j],
-                "i_q_a": self.result.i_q[part, j],
-                "theta_e_rad": self.result.theta[part, j] + self.drives.offset[k],
-            }
-            out.append(Trace(np.arange(float(self.length[j])), signals, dict.fromkeys(signals, "1")))
-        return out
-
     def estimate(self, k: int) -> FluxResult:
         curve = InverterCurve(*curve_points(self.drives, k), 0.0)
         d = self.drives
-        return estimate_flux_linkage(self.speeds(k), d.R[k], period_s=d.T_s[k], inverter=curve, waves=self.waves(k))
+        return estimate_flux_linkage(self.speeds(k), d.R[k], period_s=d.T_s[k], inverter=curve)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +101,7 @@ def test_psi_and_offset_over_drives(population: Population) -> None:
     assert np.max(errors) < PSI_MAX
     assert np.quantile(offsets, 0.9) < OFFSET_P90_RAD
     assert np.max(offsets) < OFFSET_MAX_RAD
-    assert np.mean(errors <= half_widths) > 0.83  # the 2 % quantile of 24 drives at 92 % coverage
+    assert np.sum(errors <= half_widths) >= 9  # of 12: the 2 % quantile at 92 % coverage
     assert np.median(half_widths) < 1e-3
 
 
@@ -115,18 +111,14 @@ def test_the_q_inductance_comes_out_beside(population: Population) -> None:
 
 
 def test_without_the_sampled_data_correction_psi_is_low(population: Population) -> None:
-    """Omitting the division by sinc costs (w T_s)^2/24, weighted with the fast speeds."""
+    """Omitting the division by sinc costs (w T_s)^2/24."""
     drives = population.drives
     k = int(np.argmax(drives.w_base * drives.T_s))
     curve = InverterCurve(*curve_points(drives, k), 0.0)
-    uncorrected = estimate_flux_linkage(
-        population.speeds(k), drives.R[k], period_s=1e-9, inverter=curve, waves=population.waves(k)
-    )
-    w = population.w[population.rows(k)]
-    deficit = w * ((0.5 * w * drives.T_s[k]) ** 2 / -6.0)
-    expected = np.linalg.lstsq(np.stack([w, np.sign(w)], axis=1), deficit, rcond=None)[0][0]
+    uncorrected = estimate_flux_linkage(population.speeds(k), drives.R[k], period_s=1e-9, inverter=curve)
+    fast, slow = (-((share * drives.w_base[k] * drives.T_s[k]) ** 2) / 24.0 for share in (0.85, 0.4))
     error = uncorrected.psi_measured.value / drives.psi[k] - 1.0
-    assert error == pytest.approx(expected, rel=0.3)
+    assert 1.2 * fast < error < slow
 
 
 def test_temperature_moves_psi_to_its_reference(population: Population) -> None:
@@ -140,16 +132,18 @@ def test_temperature_moves_psi_to_its_reference(population: Population) -> None:
 
 
 def _changed(trace: Trace, **signals: np.ndarray) -> Trace:
-    return replace(trace, signals={**trace.signals, **signals})
+    return replace(trace, signals={**trace.signals, **signals}, units={**trace.units, **dict.fromkeys(signals, "1")})
 
 
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
         (lambda t: {"omega_e_rad_s": np.abs(t["omega_e_rad_s"])}, "E_EXCITATION"),
+        (lambda t: {"i_d_a": np.abs(t["i_d_a"])}, "E_EXCITATION"),
         (lambda t: {"omega_e_rad_s": -t["omega_e_rad_s"]}, "E_NOT_IDENTIFIABLE"),
-        (lambda t: {"omega_second_rad_s": 1.05 * t["omega_first_rad_s"]}, "E_NOT_SETTLED"),
+        (lambda t: {"omega_second_rad_s": 1.25 * t["omega_first_rad_s"]}, "E_NOT_SETTLED"),
         (lambda t: {"i_d_second_a": t["i_d_first_a"] + np.max(np.abs(t["i_q_a"]))}, "E_NOT_SETTLED"),
+        (lambda t: {"flagged": np.array([0.0] * (len(t) - 1) + [3.0])}, "E_CLIPPED"),
     ],
 )
 def test_refusals(population: Population, change: Change, reason: str) -> None:
@@ -160,12 +154,53 @@ def test_refusals(population: Population, change: Change, reason: str) -> None:
         )
 
 
-def test_refuses_limited_samples(population: Population) -> None:
-    trace = population.speeds(0)
-    flagged = replace(
-        trace,
-        signals={**trace.signals, "flagged": np.array([0.0] * 7 + [3.0])},
-        units={**trace.units, "flagged": "1"},
-    )
-    with pytest.raises(IdentificationError, match="E_CLIPPED"):
-        estimate_flux_linkage(flagged, population.drives.R[0], period_s=population.drives.T_s[0])
+PSI, R, T_S = 0.3, 0.4, 1e-4
+
+
+def _windows(flux: Callable[[np.ndarray], np.ndarray], *, odd_v: float = 0.0, slope: float = 0.0) -> Trace:
+    """Windows of an ideal inverter whose q voltage is w psi_d(i_d) and an error that is odd in i_d."""
+    w = np.array([400.0 * speed for speed, _ in STATIONS])
+    i_d, i_q = (np.array([10.0 * vector[axis] for _, vector in STATIONS]) for axis in (0, 1))
+    x = 0.5 * w * T_S
+    u_q = w * flux(i_d) * np.sin(x) / x + R * i_q + odd_v * np.sign(w) * np.sign(i_d)
+    half = 0.05 + 0.0 * w
+    a = slope * w
+    signals = {"u_d_v": R * i_d - 5e-3 * w * i_q, "u_q_v": u_q, "i_d_a": i_d, "i_q_a": i_q, "omega_e_rad_s": w,
+               "omega_first_rad_s": w - 0.5 * half * a, "omega_second_rad_s": w + 0.5 * half * a, "half_s": half,
+               "T_magnet_c": np.full_like(w, math.nan)}  # fmt: skip
+    signals |= {f"i_{axis}_{part}_a": signals[f"i_{axis}_a"] for axis in "dq" for part in ("first", "second")}
+    return Trace(np.arange(float(len(w))), signals, dict.fromkeys(signals, "1"))
+
+
+@pytest.mark.parametrize("bend", [0.0, 3e-3])
+def test_a_saturating_axis_is_taken_back_to_zero_current(bend: float) -> None:
+    trace = _windows(lambda i: PSI * (1.0 + bend * i * i) + 4e-3 * i, odd_v=0.7)
+    found = estimate_flux_linkage(trace, R, period_s=T_S)
+    assert found.psi_measured.value == pytest.approx(PSI, rel=1e-5)
+    assert found.curvature == pytest.approx(bend * (10.0 * D) ** 2, abs=1e-4)
+    assert found.low_wb == pytest.approx(PSI * (1.0 + bend * (10.0 * D / 3.0) ** 2), rel=1e-5)
+    assert found.low_i_d_a == pytest.approx(10.0 * D / 3.0)
+    assert found.psi_measured.std < 2e-4 * PSI
+
+
+def test_a_speed_that_lags_while_the_shaft_slows_down_is_put_right() -> None:
+    trace = _windows(lambda i: 0.0 * i + PSI, slope=-0.4)
+    wrong = estimate_flux_linkage(trace, R, period_s=T_S).psi_measured.value
+    # the rotor is where the shown speed was a lag ago: shown = true + 0.4 lag
+    lag = SpeedLag(3e-3, 3e-5)
+    right = estimate_flux_linkage(trace, R, period_s=T_S, lag=lag).psi_measured.value
+    assert right / wrong == pytest.approx(1.0 / (1.0 - 0.4 * 3e-3), rel=1e-4)
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_the_lag_of_the_speed_shows_in_a_push(sense: float) -> None:
+    lag, p = 3.3e-3, 4
+    pushes = []
+    for a in (800.0, -800.0, 1600.0):
+        t = np.arange(1024) * 1e-4
+        signals = {"theta_M_rad": sense * 0.5 * a * t * t, "omega_e_rad_s": p * a * (t - lag)}
+        pushes.append(Trace(t, signals, {"theta_M_rad": "rad", "omega_e_rad_s": "rad/s"}))
+    found = speed_lag(pushes, p)
+    assert found is not None
+    assert found.value_s == pytest.approx(lag, rel=1e-6)
+    assert speed_lag([], p) is None

@@ -1,0 +1,227 @@
+"""The windows of a speed run as the flux estimator needs them: paired, gated, and without what is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.switching_ripple import Modulation, rippled_error_dq_v
+from pmsmtool.trace import Trace
+
+STAGE = "flux linkage"
+Vector = NDArray[np.float64]
+
+MINIMUM_PAIRS = 4
+"""Pairs of d currents in each direction."""
+SPEED_RATIO = 1.6
+"""Largest over smallest speed below which delay and offset are one."""
+PAIR_RATIO = 1.2
+"""Ratio of two d currents of opposite sign up to which they are one level."""
+Q_SHARE = 0.3
+"""Part of i_d up to which an i_q counts as none."""
+CURRENT_SETTLE_LIMIT = 0.25
+"""Change of a current between the halves of a window, of the largest current."""
+SETTLE_LIMIT = 0.2
+"""Relative change of the speed between the halves of a window: the shaft coasts, but slowly."""
+DELAY_PERIODS = 1.5
+"""Periods from the samples of a row to the middle of its voltage."""
+ANGLES = 360
+"""Angles over which an error is averaged; a multiple of six."""
+LAG_STD = 0.03
+"""Relative standard deviation of a lag from few pushes (measured: 0.01 with encoders of 12 to 19 bits)."""
+LAG_ACCELERATION = 0.3
+"""Acceleration of a push, of the strongest one's, below which it does not say how the speed lags."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedLag:
+    """Delay of the drive's speed behind the rotor's while it accelerates (s), and its standard deviation."""
+
+    value_s: float
+    std_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Corrected:
+    """Rows without resistance and inverter error.
+
+    Attributes
+    ----------
+    w, acceleration_rad_s2 : ndarray, shape (n,)
+        Electrical speed at the time of the voltage, and its slope.
+    i_d, i_q : ndarray, shape (n,)
+        Mean currents (A).
+    u_d, u_q : ndarray, shape (n,)
+        Voltage of the flux linkages (V).
+    ripple_q_v, curve_q_v : ndarray, shape (n,)
+        q parts of the error that was taken off: of the ripple, and of the mean current (V).
+    is_d : ndarray of bool, shape (n,)
+        Rows with a d current.
+    """
+
+    w: Vector
+    acceleration_rad_s2: Vector
+    i_d: Vector
+    i_q: Vector
+    u_d: Vector
+    u_q: Vector
+    ripple_q_v: Vector
+    curve_q_v: Vector
+    is_d: NDArray[np.bool_]
+
+
+def speed_lag(pushes: Sequence[Trace], pole_pairs: int) -> SpeedLag | None:
+    """Return how far the drive's speed lags, from pushes at constant current; None without a useful one.
+
+    Parameters
+    ----------
+    pushes : sequence of Trace
+        ``theta_M_rad omega_e_rad_s`` of an accelerating shaft. Both are fitted by parabolas over the second half.
+    pole_pairs : int
+        Pole pairs.
+    """
+    found = []
+    for push in pushes:
+        n = len(push)
+        half = slice(n // 2, n)
+        t = push.t_s[half] - float(np.mean(push.t_s[half]))
+        basis = np.stack([np.ones_like(t), t, t * t, t**3], axis=1)
+        theta = np.linalg.lstsq(basis, np.unwrap(push["theta_M_rad"][half]), rcond=None)[0]
+        omega = np.linalg.lstsq(basis, push["omega_e_rad_s"][half] / pole_pairs, rcond=None)[0]
+        sense = 1.0 if theta[1] * omega[0] > 0.0 else -1.0  # an encoder may count against the phases
+        found.append((2.0 * float(theta[2]) * sense, float(theta[1]) * sense - float(omega[0])))
+    strongest = max((abs(a) for a, _ in found), default=0.0)
+    lags = np.array([off / a for a, off in found if abs(a) > LAG_ACCELERATION * strongest])
+    if not len(lags):
+        return None
+    value = float(np.median(lags))
+    return SpeedLag(value, math.hypot(LAG_STD * value, float(np.std(lags)) / math.sqrt(len(lags))))
+
+
+def pairs_of(speeds: Trace) -> list[tuple[int, int]]:
+    """Return the rows that follow each other with d currents of one size and opposite signs."""
+    i_d, i_q, w = speeds["i_d_a"], speeds["i_q_a"], speeds["omega_e_rad_s"]
+    pairs = []
+    k = 0
+    while k + 1 < len(w):
+        sizes = sorted((abs(float(i_d[k])), abs(float(i_d[k + 1]))))
+        quiet = max(abs(float(i_q[k])), abs(float(i_q[k + 1]))) < Q_SHARE * sizes[0]
+        if quiet and i_d[k] * i_d[k + 1] < 0.0 and w[k] * w[k + 1] > 0.0 and sizes[1] < PAIR_RATIO * sizes[0]:
+            pairs.append((k, k + 1))
+            k += 1
+        k += 1
+    return pairs
+
+
+def corrected(
+    speeds: Trace,
+    R_ohm: float,
+    period_s: float,
+    inverter: InverterCurve | None,
+    modulation: Modulation | None,
+    lag: SpeedLag,
+) -> Corrected:
+    """Take off what is known: lag of the speed, resistance, inverter error, and sampling."""
+    i_d, i_q = speeds["i_d_a"], speeds["i_q_a"]
+    acceleration = (speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / speeds["half_s"]
+    w = speeds["omega_e_rad_s"] + (lag.value_s + DELAY_PERIODS * period_s) * acceleration
+    voltage = (speeds["u_d_v"], speeds["u_q_v"])
+    plain = rippled = np.zeros((2, len(w)))
+    if inverter is not None:
+        plain = rippled = mean_inverter_error(inverter, (i_d, i_q))
+        if modulation is not None:
+            rippled = mean_inverter_error(inverter, (i_d, i_q), voltage, modulation)
+    x = 0.5 * w * period_s
+    correction = x / np.sin(x)
+    return Corrected(
+        w=w,
+        acceleration_rad_s2=acceleration,
+        i_d=i_d,
+        i_q=i_q,
+        u_d=(voltage[0] - rippled[0] - R_ohm * i_d) * correction,
+        u_q=(voltage[1] - rippled[1] - R_ohm * i_q) * correction,
+        ripple_q_v=rippled[1] - plain[1],
+        curve_q_v=plain[1],
+        is_d=np.abs(i_q) < Q_SHARE * np.abs(i_d),
+    )
+
+
+def mean_inverter_error(
+    curve: InverterCurve,
+    current: tuple[Vector, Vector],
+    voltage: tuple[Vector, Vector] | None = None,
+    modulation: Modulation | None = None,
+) -> NDArray[np.float64]:
+    """Mean of the three-phase error over one electrical turn in the rotor frame (V), shape (2, n).
+
+    Parameters
+    ----------
+    curve : InverterCurve
+        Error of one phase.
+    current, voltage : (ndarray, ndarray)
+        d and q means of every window (A, V), shape (n,).
+    modulation : Modulation or None
+        With a voltage: the ripple at the switching edges counts.
+    """
+    angle = np.asarray((np.arange(ANGLES) + 0.5) * (2.0 * np.pi / ANGLES), dtype=np.float64)
+    means = np.empty((2, len(current[0])))
+    one = np.ones_like(angle)
+    for k in range(len(current[0])):
+        i = (current[0][k] * one, current[1][k] * one)
+        if voltage is not None and modulation is not None:
+            v = (voltage[0][k] * one, voltage[1][k] * one)
+            error = rippled_error_dq_v(curve, i, v, angle, modulation)
+        else:
+            error = curve.error_dq_v(*i, angle)
+        means[:, k] = [float(np.mean(part)) for part in error]
+    return means
+
+
+def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]]) -> None:
+    """Refuse a run that was limited or not settled, or that has too few speeds.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``.
+    """
+    w = speeds["omega_e_rad_s"]
+    for sign, name in ((1.0, "forward"), (-1.0, "backward")):
+        mine = np.array([abs(w[k]) for k, _ in pairs if w[k] * sign > 0.0])
+        if len(mine) < MINIMUM_PAIRS or float(np.max(mine)) < SPEED_RATIO * float(np.min(mine)):
+            raise refuse(
+                "E_EXCITATION",
+                f"{len(mine)} pairs of d currents {name}; {MINIMUM_PAIRS} over speeds of {SPEED_RATIO:g} to 1 are "
+                "needed",
+                stage=STAGE,
+            )
+    if "flagged" in speeds.signals and np.any(speeds["flagged"] > 0.0):
+        count = int(np.sum(speeds["flagged"] > 0.0))
+        raise refuse("E_CLIPPED", f"voltage or current limited in {count} windows", stage=STAGE)
+    change = np.abs(speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / np.abs(w)
+    if float(np.max(change)) > SETTLE_LIMIT:
+        worst = int(np.argmax(change))
+        raise refuse(
+            "E_NOT_SETTLED",
+            f"at {w[worst]:.4g} rad/s the speed moves by {100 * change[worst]:.2g} % in one window, "
+            f"limit {100 * SETTLE_LIMIT:g} %",
+            stage=STAGE,
+            likely="a load or friction that stops a coasting shaft at once",
+        )
+    for axis in ("d", "q"):
+        drift = np.abs(speeds[f"i_{axis}_second_a"] - speeds[f"i_{axis}_first_a"])
+        limit = CURRENT_SETTLE_LIMIT * float(np.max(np.hypot(speeds["i_d_a"], speeds["i_q_a"])))
+        if float(np.max(drift)) > limit:
+            worst = int(np.argmax(drift))
+            raise refuse(
+                "E_NOT_SETTLED",
+                f"at {w[worst]:.4g} rad/s i_{axis} still moves by {drift[worst]:.2g} A in one window, "
+                f"limit {limit:.2g} A",
+                stage=STAGE,
+            )
