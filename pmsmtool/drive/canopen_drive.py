@@ -220,14 +220,17 @@ class CanopenDrive:
     ) -> None:
         """Start the (prepared) excitation and the recorder, in the order its ``lead_s`` asks for."""
         lead_s = 0.0 if excitation is None else excitation.lead_s
-        if excitation is not None and excitation.point is not Injection.SPEED:
-            self._set_mode(Mode.IDENTIFICATION)
+        in_current_mode = excitation is not None and excitation.point is not Injection.SPEED
         if lead_s > 0.0:
+            if in_current_mode:
+                self._set_mode(Mode.IDENTIFICATION)
             self.node.command(objects.EXCITATION_COMMAND, 2)
             wait(lead_s)
         at_start = excitation is not None and lead_s <= 0.0
         self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=at_start)
         if at_start:
+            if in_current_mode:  # not before: a shaft that turned under speed control coasts from here on
+                self._set_mode(Mode.IDENTIFICATION)
             wait(pretrigger * decimation * self.period_s)
             self.node.command(objects.EXCITATION_COMMAND, 2)
 

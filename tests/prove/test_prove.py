@@ -17,6 +17,7 @@ import pytest
 from benchmarks.prove_verdicts import KINDS, Shared, flash, spoiled
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import connect
+from pmsmtool.cia402 import Mode
 from pmsmtool.cli.main import run as program
 from pmsmtool.design.design_file import Design, design_text
 from pmsmtool.design.prediction import judge
@@ -24,7 +25,6 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
-from pmsmtool.drive.recorder import Recorder
 from pmsmtool.errors import Declined, Interrupted, VerifyMismatch
 from pmsmtool.flash.restore import take_backup
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
@@ -206,18 +206,18 @@ def test_current_that_stays_in_d_is_named(design: Design, monkeypatch: pytest.Mo
 def test_a_record_that_begins_at_another_speed_does_not_count(
     slow: int, design: Design, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A slow host arms the recorder for seconds while the shaft coasts: once is forgiven, always is named."""
-    arm, count = Recorder.arm, 0
+    """A slow host leaves the shaft coasting before the step: once is forgiven, always is named."""
+    set_mode, count = CanopenDrive._set_mode, 0
     said: list[str] = []
 
-    def slowly(self: Recorder, *asked: Any, at_excitation: bool) -> None:
+    def slowly(self: CanopenDrive, mode: Mode) -> None:
         nonlocal count
-        arm(self, *asked, at_excitation=at_excitation)
-        count += at_excitation
-        if 1 < count <= 1 + slow:
-            self._node.connection.clock.wait(1.5)
+        set_mode(self, mode)
+        if mode is Mode.IDENTIFICATION and self.live("omega_e_rad_s") > 100.0:
+            count += 1
+            self.node.connection.clock.wait(1.5 if count <= slow else 0.0)
 
-    monkeypatch.setattr(Recorder, "arm", slowly)
+    monkeypatch.setattr(CanopenDrive, "_set_mode", slowly)
     with flashed(design) as drive:
         _, stage = prove(drive, design, said)
     assert [line for line in said if "off its speed; again" in line]
