@@ -12,8 +12,9 @@ from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
-from pmsmtool.sim.kernel import Application, Part, Rotor, Seen, Simulation, Target, Truth
+from pmsmtool.sim.kernel import Application, Part, Rotor, Simulation, Target
 from pmsmtool.sim.scenarios import MODES, SCHEDULES, Scenario
+from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import (
     RECORD_COMPENSATION,
     ROTORS,
@@ -28,24 +29,24 @@ from pmsmtool.trace import Trace
 ROWS_MAX = 20_000_000
 """Rows of a trace; more do not fit a memory that has other things to do (26 signals: 4 GB)."""
 
-DRIVE_SIGNALS: dict[str, tuple[Seen, str]] = {
-    "i_d_a": (Seen.I_D, "A"),
-    "i_q_a": (Seen.I_Q, "A"),
-    "i_d_req_a": (Seen.I_D_REQ, "A"),
-    "i_q_req_a": (Seen.I_Q_REQ, "A"),
-    "i_d_ref_a": (Seen.I_D_REF, "A"),
-    "i_q_ref_a": (Seen.I_Q_REF, "A"),
-    "u_d_v": (Seen.U_D, "V"),
-    "u_q_v": (Seen.U_Q, "V"),
-    "u_d_lim_v": (Seen.U_D_LIM, "V"),
-    "u_q_lim_v": (Seen.U_Q_LIM, "V"),
-    "theta_e_rad": (Seen.THETA_E, "rad"),
-    "omega_e_rad_s": (Seen.OMEGA_E, "rad/s"),
-    "torque_nm": (Seen.TAU, "N m"),
-    "U_dc_v": (Seen.U_DC, "V"),
-    "T_winding_c": (Seen.T_WINDING, "degC"),
-    "kappa": (Seen.KAPPA, "1"),
-    "flags": (Seen.FLAGS, "1"),
+DRIVE_SIGNALS: dict[str, tuple[Signal, str]] = {
+    "i_d_a": (Signal.I_D, "A"),
+    "i_q_a": (Signal.I_Q, "A"),
+    "i_d_req_a": (Signal.I_D_REQ, "A"),
+    "i_q_req_a": (Signal.I_Q_REQ, "A"),
+    "i_d_ref_a": (Signal.I_D_REF, "A"),
+    "i_q_ref_a": (Signal.I_Q_REF, "A"),
+    "u_d_v": (Signal.U_D, "V"),
+    "u_q_v": (Signal.U_Q, "V"),
+    "u_d_lim_v": (Signal.U_D_LIM, "V"),
+    "u_q_lim_v": (Signal.U_Q_LIM, "V"),
+    "theta_e_rad": (Signal.THETA_E, "rad"),
+    "omega_e_rad_s": (Signal.OMEGA_E, "rad/s"),
+    "torque_nm": (Signal.TAU, "N m"),
+    "U_dc_v": (Signal.U_DC, "V"),
+    "T_winding_c": (Signal.T_WINDING, "degC"),
+    "kappa": (Signal.KAPPA, "1"),
+    "flags": (Signal.FLAGS, "1"),
 }
 """What the drive itself sees; names as in its live values."""
 

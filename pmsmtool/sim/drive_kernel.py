@@ -28,8 +28,8 @@ from pmsmtool.sim.node.drive_core import (
     RecorderSetup,
     RecorderState,
     RecorderStatus,
-    Signal,
 )
+from pmsmtool.sim.signals import Signal
 from pmsmtool.sim.simulated_machine import (
     RECORD_COMPENSATION,
     build_setup,

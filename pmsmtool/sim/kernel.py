@@ -235,67 +235,6 @@ class Target(IntEnum):
     U_Q = 8
 
 
-class Seen(IntEnum):
-    """Signals of the drive that a simulated trace shows (``enum pmsm_signal``).
-
-    The same numbers as in ``node.drive_core.Signal``, whose module a simulation without a node need not import; a test
-    compares them.
-    """
-
-    I_D = 1
-    I_Q = 2
-    I_D_REQ = 3
-    I_Q_REQ = 4
-    I_D_REF = 5
-    I_Q_REF = 6
-    U_D = 7
-    U_Q = 8
-    U_D_LIM = 9
-    U_Q_LIM = 10
-    THETA_E = 11
-    OMEGA_E = 12
-    TAU = 13
-    KAPPA = 14
-    FLAGS = 17
-    U_DC = 21
-    T_WINDING = 22
-
-
-class Truth(IntEnum):
-    """Signals of the plant (``enum pmsm_truth``), beside those of the drive (:class:`Seen`)."""
-
-    T = 64
-    I_D = 65
-    I_Q = 66
-    I_A = 67
-    I_B = 68
-    I_C = 69
-    PSI_D = 70
-    PSI_Q = 71
-    PSI_ALPHA = 72
-    PSI_BETA = 73
-    THETA_E = 74
-    THETA_M = 75
-    OMEGA_M = 76
-    TORQUE = 77
-    LOAD = 78
-    U_DC = 79
-    T_WINDING = 80
-    T_MAGNET = 81
-    DUTY_A = 82
-    DUTY_B = 83
-    DUTY_C = 84
-    GATES = 85
-    U_ALPHA = 86
-    U_BETA = 87
-    OMEGA_LOAD = 88
-    TWIST = 89
-    R = 90
-    U_ALPHA_MEAN = 91
-    U_BETA_MEAN = 92
-    TRIP = 93
-
-
 class Part(IntEnum):
     """Parts of a drive that are read and written between calls (``enum pmsm_part``)."""
 

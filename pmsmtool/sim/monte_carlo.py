@@ -171,7 +171,7 @@ def simulate_many(
     threads : int, optional
         Threads; one per core when not given. The result does not depend on it.
     signals : sequence of int
-        Signals (``kernel.Seen``, ``kernel.Truth``) recorded of every drive, every ``scenario.decimation`` periods.
+        Signals (``signals.Signal``, ``signals.Truth``) recorded of every drive, every ``scenario.decimation`` periods.
     application : Application
         The whole drive, or the control core alone.
 

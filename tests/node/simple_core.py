@@ -18,10 +18,10 @@ from pmsmtool.sim.node.drive_core import (
     RecorderSetup,
     RecorderState,
     RecorderStatus,
-    Signal,
     Trigger,
 )
 from pmsmtool.sim.node.parameter_set import ParameterImage
+from pmsmtool.sim.signals import Signal
 
 R_OHM, L_H = 0.5, 0.002
 CURRENT_SHARE = 0.2

@@ -15,7 +15,6 @@ from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.drive_kernel import IDEAL_ENCODER_COUNTS, KernelCore, create
-from pmsmtool.sim.kernel import Truth
 from pmsmtool.sim.node.drive_core import (
     AverageState,
     Command,
@@ -24,9 +23,9 @@ from pmsmtool.sim.node.drive_core import (
     ExcitationState,
     RecorderSetup,
     RecorderState,
-    Signal,
     Trigger,
 )
+from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import with_simulation
 from pmsmtool.workflow.simulate import find_drive
 

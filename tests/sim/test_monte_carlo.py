@@ -15,9 +15,9 @@ from pmsmtool.machine.flux_map_scaled import FluxScale, ScalableMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import simulate
-from pmsmtool.sim.kernel import Seen, Truth
 from pmsmtool.sim.monte_carlo import DriveRuns, Variation, cores, simulate_many
 from pmsmtool.sim.scenarios import Scenario
+from pmsmtool.sim.signals import Signal, Truth
 from tests.sim.bench import U_DC, values
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
@@ -50,7 +50,7 @@ def test_every_drive_runs_as_it_would_alone() -> None:
     noisy = replace(machine, simulation={**machine.simulation, "sensor_noise_apk": 0.05})
     scenario = replace(STEPS, decimation=3)
     runs = simulate_many(
-        noisy, params, scenario, [Variation(seed=7), Variation(seed=8)], signals=(Truth.I_D, Truth.I_Q, Seen.I_Q)
+        noisy, params, scenario, [Variation(seed=7), Variation(seed=8)], signals=(Truth.I_D, Truth.I_Q, Signal.I_Q)
     )
     for k, seed in enumerate((7, 8)):
         alone = simulate(noisy, params, scenario, seed=seed)

@@ -13,8 +13,6 @@ from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, TRUE_SIGNALS, drive_values, image_of, simulate
-from pmsmtool.sim.kernel import Seen
-from pmsmtool.sim.node.drive_core import Signal
 from pmsmtool.sim.scenarios import BUILT_IN, FILE_EXAMPLE, Scenario, built_in, load_scenario
 from pmsmtool.sim.simulated_machine import (
     DRIVE_FAULTS,
@@ -63,10 +61,6 @@ def test_trace_has_units_time_and_provenance(drive):
     assert trace.meta["machine"] == "interior-2k2"
     assert trace.meta["params"] == drive.params.content_hash()
     assert trace.meta["machine_sha256"] == drive.machine.content_hash()
-
-
-def test_signals_of_the_drive_are_those_of_the_node():
-    assert {signal.name: int(signal) for signal in Seen}.items() <= {s.name: int(s) for s in Signal}.items()
 
 
 def test_steps_arrive_when_they_are_scheduled(drive):

@@ -11,8 +11,9 @@ from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
-from pmsmtool.sim.kernel import Part, Simulation, Target, Truth
+from pmsmtool.sim.kernel import Part, Simulation, Target
 from pmsmtool.sim.scenarios import MODES
+from pmsmtool.sim.signals import Truth
 from pmsmtool.sim.simulated_machine import build_setup, with_simulation
 from pmsmtool.trace import Trace
 

@@ -18,7 +18,7 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
-from pmsmtool.sim.kernel import Truth
+from pmsmtool.sim.signals import Truth
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
 from pmsmtool.workflow.commission import begin_run

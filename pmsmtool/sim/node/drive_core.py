@@ -14,6 +14,7 @@ from enum import IntEnum
 from typing import Protocol
 
 from pmsmtool.drive.port import Excitation
+from pmsmtool.sim.signals import Signal
 
 TRACE_BYTES = 65536
 """Capacity of the recorder (bytes)."""
@@ -21,36 +22,6 @@ TRACE_CHANNELS = 8
 """Channels of the recorder, and of the window averages."""
 BUFFER_SAMPLES = 4096
 """Capacity of the excitation buffer (binary32 samples)."""
-
-
-class Signal(IntEnum):
-    """A quantity that can be read, recorded, averaged or triggered on (``enum pmsm_signal``)."""
-
-    NONE = 0
-    I_D = 1
-    I_Q = 2
-    I_D_REQ = 3
-    I_Q_REQ = 4
-    I_D_REF = 5
-    I_Q_REF = 6
-    U_D = 7
-    U_Q = 8
-    U_D_LIM = 9
-    U_Q_LIM = 10
-    THETA_E = 11
-    OMEGA_E = 12
-    TAU = 13
-    KAPPA = 14
-    BINDING = 15
-    ITERATIONS = 16
-    FLAGS = 17
-    I_A = 18
-    I_B = 19
-    I_C = 20
-    U_DC = 21
-    T_WINDING = 22
-    T_MAGNET = 23
-    THETA_M = 24
 
 
 class ControlMode(IntEnum):

@@ -24,10 +24,10 @@ from pmsmtool.sim.node.drive_core import (
     ExcitationState,
     RecorderSetup,
     RecorderState,
-    Signal,
     Trigger,
 )
 from pmsmtool.sim.node.power_drive import EXCITATION_ABORTED, Plant, PowerDrive
+from pmsmtool.sim.signals import Signal
 
 LIVE_SIGNALS: dict[str, Signal] = {
     "i_d_a": Signal.I_D,

@@ -14,10 +14,11 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import Timer
 from pmsmtool.cia402 import AbortConnection, Control, FaultReaction, Mode, QuickStop, State, Status
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
-from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore, Signal
+from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore
 from pmsmtool.sim.node.emergency import Emergency
 from pmsmtool.sim.node.quick_stop import Stopping
 from pmsmtool.sim.node.schedule import Schedule
+from pmsmtool.sim.signals import Signal
 
 RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 HEARTBEAT_LOST = 0x8130
@@ -384,5 +385,3 @@ class PowerDrive:
         self._plant.core.command(Command(ControlMode.TORQUE, torque_nm=torque))
         if self._torque_demand != target:
             self._slope_timer = self._schedule.after(_SLOPE_STEP_S, self._step_torque)
-
-

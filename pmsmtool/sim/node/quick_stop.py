@@ -13,8 +13,9 @@ from collections.abc import Callable
 from pmsmtool.bus.clock import NS, Timer
 from pmsmtool.cia402 import QuickStop
 from pmsmtool.sim.node.dictionary import Dictionary
-from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore, Signal
+from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore
 from pmsmtool.sim.node.schedule import Schedule
+from pmsmtool.sim.signals import Signal
 
 CURRENT_GONE_SHARE = 0.02
 """Share of I_nom below which a ramped-down current counts as zero."""

@@ -18,7 +18,7 @@ from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.drive_kernel import KernelCore
-from pmsmtool.sim.kernel import Seen, Target, Truth
+from pmsmtool.sim.kernel import Target
 from pmsmtool.sim.line import Line
 from pmsmtool.sim.node.drive_core import Command, ControlMode
 from pmsmtool.sim.node.factory import drive_settings
@@ -26,6 +26,7 @@ from pmsmtool.sim.node.family import Face
 from pmsmtool.sim.node.memory import Memory, RamStorage
 from pmsmtool.sim.node.node import Node
 from pmsmtool.sim.node.session import Session
+from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import with_simulation
 from pmsmtool.workflow.reproduce.figure import Array
 
@@ -38,7 +39,7 @@ ENABLE = (0x0006, 0x0007, 0x000F)
 """Controlwords to operation enabled."""
 SETTLE_S = 0.3
 """Time at the first speed before anything is asked for."""
-_RECORDED = (Truth.T, Seen.U_D, Seen.U_Q, Seen.U_DC, Truth.TORQUE, Truth.I_D, Truth.I_Q, Truth.OMEGA_M)
+_RECORDED = (Truth.T, Signal.U_D, Signal.U_Q, Signal.U_DC, Truth.TORQUE, Truth.I_D, Truth.I_Q, Truth.OMEGA_M)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,9 @@ from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.sim.kernel import Application, Rotor, Seen, Setup, Simulation, Target, Truth
+from pmsmtool.sim.kernel import Application, Rotor, Setup, Simulation, Target
 from pmsmtool.sim.scenarios import MODES
+from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import RPM, build_setup, with_simulation
 from pmsmtool.workflow.reproduce.figure import Array
 
@@ -257,8 +258,8 @@ FLAG_FALLBACK = 1 << 6
 """The governor's admissible set was empty (``pmsm_core.h``)."""
 
 _RECORDED = (
-    Truth.T, Truth.I_D, Truth.I_Q, Seen.I_D_REF, Seen.I_Q_REF, Seen.U_D, Seen.U_Q, Seen.U_D_LIM, Seen.U_Q_LIM,
-    Seen.FLAGS, Truth.OMEGA_M, Truth.THETA_E,
+    Truth.T, Truth.I_D, Truth.I_Q, Signal.I_D_REF, Signal.I_Q_REF, Signal.U_D, Signal.U_Q, Signal.U_D_LIM,
+    Signal.U_Q_LIM, Signal.FLAGS, Truth.OMEGA_M, Truth.THETA_E,
 )  # fmt: skip
 
 
