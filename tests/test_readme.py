@@ -7,7 +7,6 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-import can
 import pytest
 
 import pmsmtool
@@ -18,6 +17,7 @@ from pmsmtool.cli.reference import BEGIN, END, reference, replaced
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_keys import machine_file_keys
 from pmsmtool.params.catalogue import CATALOGUE
+from tests.simulated_bus import settle
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -74,10 +74,7 @@ def as_shown(line: str) -> tuple[str, list[float]]:
 def test_the_first_session_is_what_the_program_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
-    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+    settle(tmp_path, monkeypatch)
     commands = list(session())
     assert commands[0][0].split()[:2] == ["pmsmtool", "commission"]
     for command, shown in commands:

@@ -6,19 +6,16 @@ import json
 import math
 import shutil
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import can
 import click
 import pytest
 
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli import consent
-from pmsmtool.cli.main import run
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.firmware.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, reference_map
@@ -31,6 +28,7 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow.commission import STAGES
 from pmsmtool.workflow.random_drives import true_loop_resistance
 from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, new_record
+from tests.cli.conftest import Tool
 from tests.drive.served import serving
 
 MEASURED_MAP = Path(__file__).parents[2].parent / "shared" / "maps" / "baldor_400rpm_map.npz"
@@ -40,25 +38,6 @@ commissioning.py)."""
 BUSY_RETRIES = 2
 """The served drive runs in real time; a machine that is busy with other things may starve it."""
 QUANTITIES = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
-Result = tuple[int, str, str]
-Tool = Callable[..., Result]
-
-
-@pytest.fixture
-def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Tool:
-    """Run a command line in this process, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
-    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
-
-    def call(*arguments: str) -> Result:
-        capsys.readouterr()
-        code = run(arguments)
-        printed = capsys.readouterr()
-        return code, printed.out, printed.err
-
-    return call
 
 
 def the_run() -> tuple[RunDirectory, RunRecord]:

@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,20 +18,17 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.firmware.drive_map import reference_map
 from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
+from tests.cli.conftest import Result, Tool
+from tests.simulated_bus import settle
 
 ROOT = Path(__file__).resolve().parents[2]
-Result = tuple[int, str, str]
-Tool = Callable[..., Result]
 WANTED = ParameterSet({"motor.R_s_ohm": 0.25, "motor.L_d_h": 0.003, "current.K_p_d_v_per_a": 7.5})
 
 
 @pytest.fixture
 def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Tool:
     """Run a command line in this process, in an empty folder, on a simulated drive with a memory file there."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
-    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+    settle(tmp_path, monkeypatch)
 
     def call(*arguments: str, channel: str = "interior-2k2?seed=3") -> Result:
         capsys.readouterr()

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import can
 import pytest
 
 from pmsmtool.bus.connect import Connection
-from pmsmtool.cli.main import run
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
@@ -21,31 +18,12 @@ from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow.random_drives import true_loop_resistance
+from tests.cli.conftest import Tool
 
 TOLERANCE = 0.01
 """Largest deviation from the truth with ideal sensor gains; measured 0.15 % (psi_f of the switched machine)."""
 OFFSET_TOLERANCE_RAD = math.radians(0.5)
 """Measured 0.003 deg (switched machine)."""
-
-Result = tuple[int, str, str]
-Tool = Callable[..., Result]
-
-
-@pytest.fixture
-def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Tool:
-    """Run a command line in this process, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
-    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
-
-    def call(*arguments: str) -> Result:
-        capsys.readouterr()
-        code = run(arguments)
-        printed = capsys.readouterr()
-        return code, printed.out, printed.err
-
-    return call
 
 
 def held(channel: str) -> tuple[int, int, list[bytes]]:

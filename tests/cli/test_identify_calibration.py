@@ -8,7 +8,6 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
-import can
 import pytest
 
 from pmsmtool.cli.main import run
@@ -18,6 +17,7 @@ from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.random_drives import true_loop_resistance
+from tests.simulated_bus import settle
 
 GAIN = 1.01
 """Of the simulated drive's DC-link measurement: commands come out smaller than the drive believes."""
@@ -35,10 +35,7 @@ def answer(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, flo
 def test_a_scale_is_taken_out_and_its_tolerance_takes_the_sensors_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
-    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+    settle(tmp_path, monkeypatch)
     base = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
     changed = {"rotor": "locked", "U_dc_gain": GAIN, "T_winding_c": 20.0, "thermal_on": False}
     drive = replace(base, simulation={**base.simulation, **changed})

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import can
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from pmsmtool.cli.main import run
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
+from tests.simulated_bus import settle
 
 Signals = dict[str, NDArray[np.float64]]
 Spoil = Callable[[Trace], Signals]
@@ -28,10 +28,7 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A run directory of a healthy drive."""
     folder = tmp_path_factory.mktemp("healthy")
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setenv("PMSMTOOL_HOME", str(folder / "home"))
-        patch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
-        patch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+        settle(folder, patch)
         assert run(("identify", "-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:", "--yes", "R", "L", "psi")) == 0
         (made,) = (folder / "runs").iterdir()
         yield made
