@@ -18,8 +18,9 @@ from pmsmtool.firmware.drive_map import Cell, DriveMap, SignalCell, reference_ma
 from pmsmtool.firmware.wire_units import WireUnit, wire_unit
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+from pmsmtool.sim.node.monitor import Monitor
 from pmsmtool.sim.node.objects import ObjectRow
-from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM
+from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, Plant
 
 OWN = range(0x2000, 0x6000)
 """Indices of the reference drive's own objects."""
@@ -92,6 +93,12 @@ class Face:
             dictionary.show(_signal_entry(name, signal, dictionary))
         for entry in (*_modes(self.modes, dictionary), *_Parameters(self.drive_map, dictionary).entries()):
             dictionary.show(entry)
+
+
+    def attach(self, dictionary: Dictionary, plant: Plant) -> None:
+        """Put the family's own functions over the running application."""
+        if self.drive_map.capabilities.recorder == "index":
+            Monitor(self.drive_map, dictionary, plant)
 
 
 @dataclass(frozen=True, slots=True)
