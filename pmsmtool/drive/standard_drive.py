@@ -10,17 +10,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 
+import numpy as np
+
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
-from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.canopen_drive import RAD_S_PER_MRPM, CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.recorder import Recorder
-from pmsmtool.errors import NotAvailable, SdoAbort
+from pmsmtool.errors import DriveTimeout, NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap
+from pmsmtool.trace import Trace
 
 COMMUTATION_ANGLE = DriveObject(0x60EA, 0, "H")
 POSITION = DriveObject(0x6064, 0, "i")
@@ -30,6 +33,8 @@ ANGLE_COUNTS = 1 << 16
 """Counts of 0x60EA per electrical turn."""
 POLL_PERIOD_S = 1e-3
 """Live values are polled about this often: process data of a CAN bus do not come faster."""
+SPARE_ROWS = 8
+"""Rows a record of a step is longer, to take off the beginning what came before it."""
 QUARTER_TURN = 0.5 * math.pi
 """Torque current flows a quarter turn ahead of the commutation angle; the rotor's d axis settles there."""
 
@@ -170,6 +175,7 @@ class RecorderDrive(CanopenDrive):
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)
         self._rated_apk = 1e-3 * math.sqrt(2.0) * self.node.get(objects.RATED_CURRENT_MA)
+        self._late_s = 0.0
 
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero torque."""
@@ -200,9 +206,33 @@ class RecorderDrive(CanopenDrive):
         wait: Callable[[float], None],
     ) -> None:
         """Start the recorder, and right behind it the speed step that is asked for."""
-        self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=False)
+        spare = 0 if excitation is None else SPARE_ROWS
+        self.recorder.arm(signals, samples + spare, decimation, pretrigger, at_excitation=False)
         if excitation is not None:
-            self.command_speed(excitation.amplitude)
+            clock = self.node.connection.clock
+            armed = clock.now()
+            self.node.put(objects.TARGET_VELOCITY_MRPM, excitation.amplitude / RAD_S_PER_MRPM)
+            self._late_s = clock.now() - armed
+            self._set_mode(Mode.PROFILE_VELOCITY)
+
+    def finish_record(self, signals: Sequence[str], *, decimation: int, excitation: Excitation | None) -> Trace:
+        """Return the record; of a speed step from the instant at which the drive got it.
+
+        Recorder and step are commanded one after the other: the transfers last about the same, so the time between
+        their answers is the time between their effects.
+        """
+        trace = super().finish_record(signals, decimation=decimation, excitation=excitation)
+        if excitation is None:
+            return trace
+        rows = len(trace) - SPARE_ROWS
+        if self._late_s > SPARE_ROWS * trace.period_s:
+            raise DriveTimeout(
+                f"the step came {1e3 * self._late_s:.2g} ms after the recorder was started",
+                where=f"node {self.node.node}", likely="a slow adapter",
+            )  # fmt: skip
+        at = trace.t_s[:rows] + self._late_s
+        signals_at = {name: np.interp(at, trace.t_s, values) for name, values in trace.signals.items()}
+        return Trace(trace.t_s[:rows], signals_at, trace.units, {**trace.meta, "late_s": self._late_s})
 
     def end_excitation(self) -> None:
         """Leave the speed where it is: the next command takes it back."""

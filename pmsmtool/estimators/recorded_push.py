@@ -8,7 +8,7 @@ points mix (identification reference, section 8):
     psi = hypot(psi_q, psi_d), frame ahead of the d axis = atan2(psi_d, psi_q)
 
 The axes are solved apart: R from u_d would rest on the small i_d. Of the inverter's error the plateau V and its tail
-stand in u_q; a little of it turns into u_d, the more the faster, and does not depend on the size of the current. A frame
+stand in u_q; a little turns into u_d, the more the faster, and does not depend on the size of the current. A frame
 that is off by an angle that grows with the speed turns w L_q i_q into u_q: k w^2 i_q takes that, and w L_d i_d is not
 nothing either; without the two, R was off by up to 11 %, and by 80 % on one drive of 20.
 

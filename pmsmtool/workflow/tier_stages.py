@@ -24,6 +24,7 @@ from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.map_gate import check_map
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.workflow.capabilities import Capabilities, Method, Tier
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
@@ -144,7 +145,8 @@ class TierStages:
         stage = lut_stage(self.run, request)
         if self.found.drive_map.tables:
             return stage
-        return replace(stage, fallbacks=(*stage.fallbacks, "the drive takes no table: it is for reading"))
+        notes = ["the drive takes no table: it is for reading", *_without_base(self.run, self.found.drive_map)]
+        return replace(stage, fallbacks=(*stage.fallbacks, *notes))
 
     def margins(self, request: MarginRequest) -> Stage:
         """Judge the design over what the machine may be."""
@@ -174,12 +176,16 @@ class TierStages:
     # ---- what there is --------------------------------------------------------------------------
 
     def _known(self) -> tuple[MachineFile, str] | None:
-        if self.nameplate is not None:
-            return self.nameplate, DATA_SHEET
-        if self.found.drive_map.staging:
+        """Return what completes the measured values; the encoder is the drive's own where its set can be read."""
+        known = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
+        if not self.found.drive_map.staging:
+            return known
+        if known is None:
             name = self.found.identity.name or f"drive {self.found.identity.serial:#010x}"
-            return nameplate_of(self.drive, name), SET_UP
-        return None
+            known = nameplate_of(self.drive, name), SET_UP
+        offset, reverse = (self.drive.read(f"encoder.{name}") for name in ("offset_rad", "reversed"))
+        encoder = replace(known[0].encoder, offset_rad=offset, direction=-1 if reverse else 1)
+        return replace(known[0], encoder=encoder), known[1]
 
     def _complete(self, known: Any) -> bool:
         return known is not None or self.found.tier is Tier.INJECT
@@ -243,6 +249,17 @@ class TierStages:
     def _refuse(self, reason: str) -> None:
         if reason:
             raise NotAvailable(reason, where=f"node {self.found.identity.node}")
+
+
+def _without_base(run: RunDirectory, drive_map: DriveMap) -> list[str]:
+    """Leave out of the set what the drive counts relative to a value the set does not have; say so."""
+    wanted = read_parameter_set(run.path / "params.toml")
+    cells = (cell for cell in drive_map.cells.values() if cell.name in wanted.values)
+    left = {cell.name: cell.gain for cell in cells if cell.gain and cell.gain not in wanted.values}
+    if left:
+        values = {name: value for name, value in wanted.values.items() if name not in left}
+        run.save("params.toml", replace(wanted, values=values).to_toml())
+    return [f"{name} stays as it is: counted relative to {base} (`pmsmtool tune --map`)" for name, base in left.items()]
 
 
 def _machine_needed(names: Sequence[str]) -> str:

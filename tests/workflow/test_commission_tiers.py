@@ -1,0 +1,248 @@
+"""The chain on drives of every tier and every mapped family: green for the tier, and honest about the rest."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from pmsmtool.bus.connect import Connection
+from pmsmtool.cli.main import cli
+from pmsmtool.design.design_file import load_design
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import DriveNode, is_safe
+from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.firmware.drive_map import DriveMap
+from pmsmtool.firmware.shipped_maps import family_names, load_family
+from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.params.parameter_set import read_parameter_set
+from pmsmtool.resources import data_folder
+from pmsmtool.sim import channel
+from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.workflow.capabilities import Capabilities, Tier, examine
+from pmsmtool.workflow.commission import Commissioning, begin_run, due_stages
+from pmsmtool.workflow.prove.stage import ProofRequest
+from pmsmtool.workflow.report_page import report_page, verdict
+from pmsmtool.workflow.run_directory import RunDirectory, Stage
+from pmsmtool.workflow.tier_stages import SET_UP, open_tier_drive
+
+PROFILE = data_folder("profiles") / "interior-2k2.toml"
+FOREIGN = [name for name in family_names() if name != "pmsmsim"]
+FILLED_IN = (0x1234, 0x5678)
+"""Vendor and product a person writes into a map whose maker's numbers are in no source."""
+
+
+class Told:
+    """A person who agrees, and notes what was shown."""
+
+    def __init__(self) -> None:
+        self.shown: list[str] = []
+
+    def allow_motion(self, lines: Sequence[str]) -> None:
+        pass
+
+    def allow_writing(self, lines: Sequence[str]) -> None:
+        self.shown += lines
+
+
+class Quiet:
+    """A progress that notes how the stages ended."""
+
+    def __init__(self) -> None:
+        self.ended: dict[str, str] = {}
+
+    def skip(self, name: str, number: int, count: int) -> None:
+        pass
+
+    def begin(self, name: str, number: int, count: int) -> None:
+        pass
+
+    def say(self, text: str) -> None:
+        pass
+
+    def end(self, stage: Stage, number: int, count: int) -> None:
+        self.ended[stage.name] = stage.status
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
+
+
+@contextmanager
+def opened(options: str, given: DriveMap | None = None) -> Iterator[tuple[CanopenDrive, Capabilities]]:
+    with Connection(PmsmSimBus(f"interior-2k2?nv=:memory:{options}")) as connection:
+        node = DriveNode(connection, 1)
+        found = examine(node, given)
+        node.close()
+        drive = open_tier_drive(connection, 1, found)
+        yield drive, found
+        drive.close()
+
+
+def chain(run: RunDirectory, drive: CanopenDrive, found: Capabilities, *, sheet: bool = True) -> tuple[Quiet, Told]:
+    progress, person = Quiet(), Told()
+    nameplate = load_machine_file(PROFILE) if sheet else None
+    proof = ProofRequest(runs=32)  # the proof's own tests draw as many as the tool
+    Commissioning(run, drive, person, progress, nameplate, prove=proof, capabilities=found).carry_out()
+    assert is_safe(drive.node.state())
+    return progress, person
+
+
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run up to its margins, made once: what comes after it depends on the drive."""
+    with opened("&drive=faulhaber") as (drive, found):
+        run = begin_run(drive, tmp_path_factory.mktemp("designed"), tier=found.tier)
+        progress, _ = chain(run, drive, found)
+    assert progress.ended == {
+        "identify": "not available", "tune": "pass", "lut": "pass", "margins": "pass", "flash": "not available",
+        "verify": "not available", "prove": "not available",
+    }  # fmt: skip
+    assert verdict(run.path).word == "PASS FOR ITS TIER"
+    return run.path
+
+
+def continued(designed: Path, folder: Path, drive: CanopenDrive, found: Capabilities) -> RunDirectory:
+    """The designed run as if this drive had been there from its beginning."""
+    run = begin_run(drive, folder, tier=found.tier)
+    for name in ("machine.toml", "nameplate.toml", "design.toml"):
+        shutil.copy(designed / name, run.path)
+    run.write(replace(run.read(), stages=RunDirectory(designed).read().stages[:2]))
+    return run
+
+
+def with_identity(drive_map: DriveMap) -> DriveMap:
+    vendor, product = FILLED_IN
+    return drive_map if drive_map.vendor else replace(drive_map, vendor=vendor, product=product)
+
+
+@pytest.mark.parametrize("family", FOREIGN)
+def test_what_a_family_holds_is_shown_before_and_equal_after(
+    family: str, designed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A map a person has completed with vendor and product: everything it has an object for, and nothing else."""
+    drive_map = with_identity(load_family(family))
+    monkeypatch.setattr(channel, "load_family", lambda name: drive_map)
+    with opened(f"&drive={family}", drive_map) as (drive, found):
+        assert found.map_is_drives
+        run = continued(designed, tmp_path, drive, found)
+        progress, person = chain(run, drive, found)
+        mapped = bool(set(drive_map.cells) & set(read_parameter_set(run.path / "params.toml").values))
+        assert progress.ended["flash"] == progress.ended["verify"] == ("pass" if drive_map.cells else "not available")
+        assert progress.ended["prove"] == "not available"
+        if mapped:
+            held = drive_map.quantised(read_parameter_set(run.path / "params.toml"))
+            assert all(DriveParameters(drive.node).read_value(name) == value for name, value in held.values.items())
+            changes = [row for row in run.read().stage("flash").values if "held" in row]  # type: ignore[union-attr]
+            for row in changes:
+                line = next(line for line in person.shown if line.startswith(row["name"]))
+                assert f"{row['held']:.7g}" in line
+    found_verdict = verdict(run.path)
+    assert found_verdict.word == "PASS FOR ITS TIER" and found_verdict.kind == "pass"
+    assert any(line.startswith("prove: not available: needs") for line in found_verdict.lines)
+    assert "its behaviour was not proven" in found_verdict.lines[0]
+    assert due_stages(run, run.read()) == ()  # a stage that is not available is not asked for again
+
+
+@pytest.mark.parametrize("family", [name for name in FOREIGN if not load_family(name).vendor])
+def test_nothing_is_written_through_a_map_that_names_no_drive(family: str, designed: Path, tmp_path: Path) -> None:
+    with opened(f"&drive={family}", load_family(family)) as (drive, found):
+        run = continued(designed, tmp_path, drive, found)
+        progress, person = chain(run, drive, found)
+    assert progress.ended["flash"] == "not available" and person.shown == []
+    assert "needs a map" in run.read().stage("flash").note  # type: ignore[union-attr]
+
+
+def test_one_pair_of_gains_is_the_smaller_of_both_axes(tmp_path: Path) -> None:
+    """EPOS4 has one pair: the q gain of a machine with L_q > L_d would be too large for d; measured by pushes alone."""
+    with opened("&drive=epos4") as (drive, found):
+        run = begin_run(drive, tmp_path, tier=found.tier)
+        progress, _ = chain(run, drive, found)
+        assert progress.ended["identify"] == progress.ended["flash"] == "pass"
+        design = load_design(run.path / "design.toml")
+        pair = design["current.K_p_q_v_per_a"], design["current.K_p_d_v_per_a"]
+        assert pair[0] == pair[1] and design.machine.machine.L_q_h > design.machine.machine.L_d_h
+        assert DriveParameters(drive.node).read_value("current.K_p_q_v_per_a") == pytest.approx(pair[0], abs=1e-6)
+    machine = load_machine_file(run.path / "machine.toml")
+    truth = load_machine_file(PROFILE).machine
+    assert machine.machine.J_kgm2 == pytest.approx(truth.J_kgm2, rel=0.06)
+    assert machine.machine.R_s_ohm == truth.R_s_ohm and "R_s_ohm" not in machine.estimates
+    assert "as given: pole_pairs, R_s_ohm" in str(machine.provenance["source"])
+    assert any("taken as given, not measured: pole_pairs, R_s_ohm" in line for line in verdict(run.path).lines)
+    assert "PASS FOR ITS TIER" in report_page(run.path)
+
+
+def test_without_a_data_sheet_what_is_missing_is_named(tmp_path: Path) -> None:
+    with opened("&drive=epos4") as (drive, found):
+        run = begin_run(drive, tmp_path, tier=found.tier)
+        progress, _ = chain(run, drive, found, sheet=False)
+    assert progress.ended["identify"] == "pass" and progress.ended["tune"] == "not available"
+    assert "R_s_ohm, L_d_h, L_q_h" in run.read().stage("tune").note  # type: ignore[union-attr]
+    assert not (run.path / "machine.toml").exists()
+
+
+def test_a_data_sheet_of_another_machine_is_seen(tmp_path: Path) -> None:
+    sheet = load_machine_file(PROFILE)
+    wrong = replace(sheet, machine=replace(sheet.machine, pole_pairs=4))
+    with opened("&drive=cia402") as (drive, found):
+        run = begin_run(drive, tmp_path, tier=found.tier)
+        running = Commissioning(run, drive, Told(), Quiet(), wrong, capabilities=found)
+        with pytest.raises(Exception, match="pole pairs are those that were given: 3, limit 4"):
+            running.carry_out()
+        assert is_safe(drive.node.state())
+    assert verdict(run.path).word == "FAIL"
+
+
+def test_recorder_tier_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Path) -> None:
+    with opened("&tier=recorder") as (drive, found):
+        run = begin_run(drive, tmp_path, tier=found.tier)
+        progress, _ = chain(run, drive, found, sheet=False)
+    assert set(progress.ended.values()) == {"pass"}
+    proof = run.read().stage("prove")
+    assert proof is not None and any("the drive has no excitation" in line for line in proof.fallbacks)
+    assert {str(value["name"]).split(":")[0] for value in proof.values if "where" in value} == {"speed_step"}
+    found_verdict = verdict(run.path)
+    assert found_verdict.word == "PASS FOR ITS TIER"
+    given = next(value for value in run.read().stage("identify").values if value["name"] == "L_d_h")  # type: ignore[union-attr]
+    assert given["source"] == SET_UP and "std" not in given
+    # the tier does not measure the encoder: its maker's offset must not be overwritten
+    offset = load_machine_file(run.path / "machine.toml").encoder.offset_rad
+    assert offset == pytest.approx(load_machine_file(PROFILE).encoder.offset_rad, abs=0.01)
+
+
+def test_inject_tier_measures_like_the_full_one_with_means_from_records(tmp_path: Path) -> None:
+    with opened("&tier=inject") as (drive, found):
+        assert found.tier is Tier.INJECT and found.best("L") is not None
+        angles = [drive.live("theta_m_rad")]
+        for _ in range(2):
+            drive.recorder.start_average(("theta_m_rad", "U_dc_v"), 800)
+            drive.wait(800 * drive.period_s)
+            means = drive.recorder.finish_average(("theta_m_rad", "U_dc_v"))
+            angles.append(means["theta_m_rad"])
+        assert means["U_dc_v"] == pytest.approx(drive.live("U_dc_v"), rel=0.02)
+        assert max(angles) - min(angles) < 0.01  # nothing turned, and no turn was lost
+
+
+def test_a_map_of_another_drive_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = CliRunner().invoke(cli, [
+        "-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=epos2", "commission", "--map", "epos4", "--yes"
+    ])  # fmt: skip
+    assert isinstance(outcome.exception, ConfigError) and "the map 'epos4' is for vendor" in str(outcome.exception)
+
+
+def test_the_plan_is_told_before_anything_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = CliRunner().invoke(
+        cli, ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=nanotec", "commission", str(PROFILE)], input=""
+    )
+    assert outcome.exit_code != 0 and "tier standard, map cia402" in outcome.stderr
+    assert "flash, verify: not available: needs a map" in outcome.stderr
+    assert not isinstance(outcome.exception, NotAvailable)
