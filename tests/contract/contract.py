@@ -10,7 +10,6 @@ from __future__ import annotations
 import random
 import struct
 from binascii import crc_hqx
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -97,10 +96,6 @@ class NodeContract:
     DEVIATIONS: ClassVar[dict[str, str]] = {}
     SURVIVING: ClassVar[int] = 24
     """Transfers of the 24 in the loss test that must come through."""
-
-    @pytest.fixture
-    def peer(self) -> Iterator[Peer]:
-        raise NotImplementedError
 
     @pytest.fixture(autouse=True)
     def _deviations(self, request: pytest.FixtureRequest) -> None:

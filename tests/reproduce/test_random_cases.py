@@ -103,16 +103,19 @@ def test_nearest_held_current_against_a_search(limit: float, eps: float) -> None
     plant, radius = plant_of(), np.linspace(0.0, 90.0, 721)
     angle = np.linspace(0.0, 2.0 * math.pi, 721)
     grid = np.stack([np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle))], axis=-1)
+    compared = 0
     for case in unreachable(12, 8):
         held = (plant.voltage(grid, case.rpm) <= (1.0 - eps) * V_max()) & (np.hypot(*grid.T).T <= limit)
         if not held.any():
             continue
+        compared += 1
         found = nearest_held(case, plant, limit, eps)
         distance = np.hypot(*(grid - np.array(case.target)).transpose(2, 0, 1))
         best = float(distance[held].min())
         assert best - 1.0 <= math.dist(found, case.target) <= best + 1e-6  # the grid is 0.1 to 0.8 A wide
         assert plant.voltage(np.array(found), case.rpm) <= (1.0 - eps) * V_max() * (1.0 + 1e-9)
         assert math.hypot(*found) <= limit * (1.0 + 1e-9)
+    assert compared >= 6
 
 
 def test_no_law_beats_the_least_time() -> None:
