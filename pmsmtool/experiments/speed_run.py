@@ -24,6 +24,10 @@ MEANS = ("u_d_v", "u_q_v", "i_d_a", "i_q_a", "omega_e_rad_s", "T_magnet_c", "T_w
 LOOK_S = 0.05
 SLOWEST = 0.82
 """Part of the set speed below which a coasting shaft is brought back to it."""
+COAST_BAND = 0.03
+COAST_LIMIT_S = 3.0
+"""Relative distance and time for a shaft that is left to coast at once: its windows measure where it is. An overshoot
+that friction takes back slowly cost up to 8 s per speed with the narrow band."""
 NEAR = 0.005
 """Relative distance from the set speed that counts as reached."""
 REACH_LIMIT_S = 8.0
@@ -94,7 +98,7 @@ def coast_through(drive: Drive, plan: SpeedPlan, pole_pairs: int) -> Rows:
         for i_d, i_q in vectors:
             if not controlled or abs(rows[-1]["omega_second_rad_s"]) < SLOWEST * abs(omega_e):
                 drive.command_speed(speed)
-                reach(drive, omega_e)
+                reach(drive, omega_e, limit_s=COAST_LIMIT_S, band_rad_s=COAST_BAND * abs(omega_e))
                 controlled, settle_s = True, plan.first_s
             drive.command_current(i_d, i_q)
             drive.wait(settle_s)
