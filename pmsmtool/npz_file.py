@@ -48,7 +48,9 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     try:
         loaded = np.load(path, allow_pickle=False)
         if not isinstance(loaded, np.lib.npyio.NpzFile):
-            raise ConfigError("is a single array, not an .npz archive", where=str(path))
+            raise ConfigError(
+                "is a single array, not an .npz archive", where=str(path), hint="write named arrays with numpy.savez"
+            )
         with loaded as archive:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError:

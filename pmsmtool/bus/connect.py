@@ -12,7 +12,7 @@ from typing import Any
 
 import can
 
-from pmsmtool.bus.connection import Connection
+from pmsmtool.bus.connection import TRACE_HINT, Connection
 from pmsmtool.errors import BusError, ConfigError, PmsmtoolError
 
 __all__ = ["Connection", "connect"]
@@ -116,4 +116,6 @@ def _open_trace(path: Path) -> Any:
     try:
         return can.Logger(str(path))
     except (OSError, ValueError) as error:
-        raise ConfigError(f"the bus trace cannot be written: {error}", where=f"--trace-can {path}") from error
+        raise ConfigError(
+            f"the bus trace cannot be written: {error}", where=f"--trace-can {path}", hint=TRACE_HINT
+        ) from error

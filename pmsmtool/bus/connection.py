@@ -22,6 +22,9 @@ import can
 from pmsmtool.bus.clock import Clock, clock_of
 from pmsmtool.errors import BusError, ConfigError, PmsmtoolError
 
+TRACE_HINT = "name a file in a folder that can be written and has room"
+"""What to do when a bus trace cannot be written."""
+
 SEND_PATIENCE_S = 0.5
 """A full transmit queue is waited for this long; a bus where nobody acknowledges stays full."""
 
@@ -310,7 +313,9 @@ class Connection:
             self._writer(message)
         except (OSError, ValueError) as error:
             self._writer = None
-            raise ConfigError(f"the bus trace cannot be written: {error}", where="--trace-can") from error
+            raise ConfigError(
+                f"the bus trace cannot be written: {error}", where="--trace-can", hint=TRACE_HINT
+            ) from error
 
     def _stamp(self) -> float:
         return time.time() if self._reader is not None else self.clock.now()

@@ -184,7 +184,9 @@ def parse_design(text: str, *, where: str = "design.toml") -> Design:
         raise ConfigError(f"schema is {schema!r}, expected {SCHEMA!r}", where=where, hint=hint)
     machine_part = tables.get("machine_file")
     if not isinstance(machine_part, dict):
-        raise ConfigError("the table [machine_file] is missing", where=where)
+        raise ConfigError(
+            "the table [machine_file] is missing", where=where, hint="make the design again with `pmsmtool tune`"
+        )
     machine = machine_from_tables(machine_part, where=where, lines=toml_lines(text), path=("machine_file",))
     if tables.get("machine_sha256") != machine.content_hash():
         raise ConfigError(

@@ -118,7 +118,11 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
         document = json.loads(text)
         check = document.pop("check")
         if document["schema"] != SCHEMA:
-            raise ConfigError(f"schema is {document['schema']!r}, expected {SCHEMA!r}", where=where)
+            raise ConfigError(
+                f"schema is {document['schema']!r}, expected {SCHEMA!r}",
+                where=where,
+                hint="restore it with the version of pmsmtool that wrote it",
+            )
         if check != check_sum(document):
             raise ConfigError(
                 "the snapshot is damaged: its check sum does not fit", where=where, likely="it was edited or cut"

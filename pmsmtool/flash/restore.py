@@ -126,7 +126,9 @@ def check_snapshot(drive_map: DriveMap, snapshot: Snapshot, identity: Identity, 
         )
     if drive_map.staging and snapshot.signature != layout_signature():
         raise ConfigError(
-            f"the snapshot's layout {snapshot.signature:#010x} is not this program's {layout_signature():#010x}"
+            f"the snapshot's layout {snapshot.signature:#010x} is not this program's {layout_signature():#010x}",
+            likely="it was taken by another version of pmsmtool",
+            hint="restore it with that version",
         )
     unknown = [e.name for e in snapshot.entries if e.name not in (*drive_map.cells, *drive_map.tables, *_MARK_NAMES)]
     if unknown:

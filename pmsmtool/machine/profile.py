@@ -30,7 +30,11 @@ def machine_path(source: str | Path) -> Path:
     if profile.is_file():
         return profile
     if path.is_dir():
-        raise ConfigError("there is no machine.toml in this folder", where=str(path))
+        raise ConfigError(
+            "there is no machine.toml in this folder",
+            where=str(path),
+            hint="give the machine file itself, a run directory of identify or commission, or the name of a profile",
+        )
     from difflib import get_close_matches
 
     near = get_close_matches(str(source), profile_names(), 3)

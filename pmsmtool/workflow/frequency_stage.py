@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.errors import LimitExceeded
+from pmsmtool.errors import SafetyRefusal
 from pmsmtool.estimators.frequency_response import FrequencyResponse, estimate_frequency_response
 from pmsmtool.experiments import frequency_response
 from pmsmtool.npz_file import npz_bytes
@@ -41,7 +41,7 @@ def measure_frequency_response(
 
     Raises
     ------
-    LimitExceeded
+    SafetyRefusal
         The envelope leaves no current for the sequence.
     """
     pole_pairs = round(drive.read("motor.pole_pairs"))
@@ -49,7 +49,9 @@ def measure_frequency_response(
     largest = min(limits.omega_max_rad_s, EMF_SHARE * limits.V_max_v / (pole_pairs * psi))
     level = I_SHARE * limits.I_test_apk
     if not level > 0.0:
-        raise LimitExceeded("current", 0.0, limits.i_max_apk, "A")
+        raise SafetyRefusal(
+            f"the current limit of {limits.i_max_apk:.4g} A leaves none for the sequence", hint="raise --i-max"
+        )
     plan = frequency_response.plan_frequency_response(
         level, SPEED_SHARE * largest, J, 1.5 * pole_pairs * psi, drive.period_s
     )

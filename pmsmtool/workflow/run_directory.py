@@ -23,6 +23,7 @@ from pmsmtool.errors import ConfigError
 
 SCHEMA = "pmsmtool.run/1"
 RECORD = "run.json"
+_OTHER_RUN = "this run cannot be read or continued: give another one, or begin anew"
 
 Status = Literal["pass", "fail", "refused", "interrupted", "not available"]
 
@@ -146,14 +147,14 @@ class RunDirectory:
                 "no run.json here", where=str(self.path), hint="give a directory that identify or commission made"
             ) from None
         except (OSError, ValueError) as error:
-            raise ConfigError(f"the record cannot be read: {error}", where=str(path)) from error
+            raise ConfigError(f"the record cannot be read: {error}", where=str(path), hint=_OTHER_RUN) from error
         if not isinstance(raw, dict) or raw.get("schema") != SCHEMA:
-            raise ConfigError(f"the record is not of schema {SCHEMA}", where=str(path))
+            raise ConfigError(f"the record is not of schema {SCHEMA}", where=str(path), hint=_OTHER_RUN)
         try:
             raw["stages"] = tuple(_stage(entry) for entry in raw.get("stages", ()))
             return RunRecord(**raw)
         except (TypeError, KeyError, AttributeError) as error:
-            raise ConfigError(f"the record is damaged: {error}", where=str(path)) from error
+            raise ConfigError(f"the record is damaged: {error}", where=str(path), hint=_OTHER_RUN) from error
 
     def write(self, record: RunRecord) -> None:
         """Replace the record in one step (write beside it, sync, rename)."""
