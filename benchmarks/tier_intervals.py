@@ -13,7 +13,8 @@ the standard tier needs one at which the voltage ends. Every estimate is printed
 ``p`` is the probability of at most so many hits if an interval held the truth 95 times in 100; at 0.001 or less the
 intervals are too narrow.
 
-Seeds that were looked at while the estimators were made: 0 to 9, 100 to 139, 300 to 329, 2000 to 2019, 3000 to 3019.
+Seeds that were looked at while the estimators were made: 0 to 9, 100 to 139, 300 to 329, 2000 to 2019, 3000 to 3019,
+5000 to 5075 (voltage limit).
 """
 
 from __future__ import annotations
@@ -96,9 +97,8 @@ def identify(tier: str, drive: MachineFile, path: Path, speed: float) -> TierRes
         found = identify_standard(turning, envelope)
         turning.close()
         pole_pairs = round(found.estimates["pole_pairs"].value)
-        utilisation = drive.inverter.voltage_utilisation
         pushing = TorqueDrive(connection, 1, drive_map=family)
-        pushed = identify_by_torque(pushing, envelope, pole_pairs=pole_pairs, utilisation=utilisation)
+        pushed = identify_by_torque(pushing, envelope, pole_pairs=pole_pairs, inverter=drive.inverter)
         return TierResult({**found.estimates, **pushed.estimates}, pushed.missing, {})
 
 

@@ -31,7 +31,9 @@ RUN_SHARE = 0.5
 HOLD_SHARE = 0.08
 """Current asked for at the top, of the test current: more than friction, little enough to weaken no field."""
 HOLD_S = 0.4
-COAST_S = 0.3
+COAST_S = 0.2
+COAST_SHARES = (1.0, -1.0, 0.4, -0.4)
+"""Speeds a coast begins at, of the plan's: one speed does not tell the flux from a constant voltage."""
 STOP_SLICES = 160
 
 
@@ -111,11 +113,11 @@ def run_to_voltage(drive: Drive, plan: PolledPushPlan, rate: float) -> Trace | N
 def coast_both_ways(
     drive: Drive, plan: PolledPushPlan, rate: float, signals: tuple[str, ...], keep: Callable[[str, Trace], None]
 ) -> None:
-    """Let the shaft coast without torque from the plan's speed, both ways, and keep each as ``coast_<k>``."""
+    """Let the shaft coast without torque from two speeds, both ways, and keep each as ``coast_<k>``."""
     current = RUN_SHARE * plan.i_test_a
-    for number, sign in enumerate((1.0, -1.0)):
-        drive.command_current(0.0, sign * current)
-        drive.wait(plan.omega_m_rad_s / (rate * current))
+    for number, share in enumerate(COAST_SHARES):
+        drive.command_current(0.0, math.copysign(current, share))
+        drive.wait(abs(share) * plan.omega_m_rad_s / (rate * current))
         drive.command_current(0.0, 0.0)
         drive.wait(CHECK_S)
         keep(f"coast_{number}", readable(drive.record(signals, round(COAST_S / drive.period_s))))

@@ -29,7 +29,7 @@ from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, pu
 from pmsmtool.experiments.recorded_push import PushPlan, swing
 from pmsmtool.experiments.rotation import RotationPlan, rotate_vector
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
 from pmsmtool.units import format_estimate
@@ -60,7 +60,7 @@ TOP_SHARE = 0.98
 OFFSET_LIMIT_RAD = math.radians(2.5)
 """Largest total 95 % half width of an accepted encoder offset; measured: 1.7 deg on nine of ten drives."""
 LIMITS: Mapping[str, float] = {
-    "R_s_ohm": 0.15, "psi_f_wb": 0.06, "L_q_app_h": 0.15, "J_per_psi": 0.05, "pole_pairs": 0.05,
+    "R_s_ohm": 0.15, "psi_f_wb": 0.08, "L_q_app_h": 0.15, "J_per_psi": 0.05, "pole_pairs": 0.05,
 }  # fmt: skip
 """Largest relative total 95 % half width of an accepted value."""
 TOLD_BY = {
@@ -125,7 +125,7 @@ def identify_by_torque(
     envelope: Envelope,
     *,
     pole_pairs: int,
-    utilisation: float,
+    inverter: InverterParameters | None = None,
     tolerance: SensorTolerance | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> TierResult:
@@ -135,8 +135,8 @@ def identify_by_torque(
     ----------
     pole_pairs : int
         As measured or given.
-    utilisation : float
-        Largest phase voltage amplitude over the DC link.
+    inverter : InverterParameters, optional
+        Its voltage utilisation and dead time, where known.
 
     Raises
     ------
@@ -172,12 +172,22 @@ def identify_by_torque(
             coasts = [traces[name] for name in traces if name.startswith("coast")]
             estimates["psi_f_wb"] = flux_by_undriven_voltage(coasts, **known)  # type: ignore[arg-type]
         elif top is not None:
-            estimates["psi_f_wb"] = flux_by_voltage_limit(top, utilisation=utilisation, **known)  # type: ignore[arg-type]
+            estimates["psi_f_wb"] = _at_the_limit(top, inverter, **known)  # type: ignore[arg-type]
         else:
             missing["psi_f_wb"] = BELOW_VOLTAGE if shows_link else NO_LINK
     except IdentificationError as error:
         missing["psi_f_wb"] = error.what
     return TierResult(estimates, missing, traces)
+
+
+def _at_the_limit(
+    top: Trace, inverter: InverterParameters | None, *, pole_pairs: int, tolerance: SensorTolerance | None
+) -> Estimate:
+    utilisation = UTILISATION if inverter is None else inverter.voltage_utilisation
+    share = None if inverter is None or not inverter.dead_time_s else inverter.dead_time_s / inverter.T_s
+    return flux_by_voltage_limit(
+        top, pole_pairs=pole_pairs, utilisation=utilisation, dead_time_share=share, tolerance=tolerance
+    )
 
 
 def _shows_link(drive: TorqueDrive) -> bool:
@@ -396,10 +406,10 @@ def _standard(
     if not pole_pairs:
         return replace(result, missing={**result.missing, "J_per_psi, psi_f_wb": NO_POLE_PAIRS})
     pushing = TorqueDrive(connection, node, drive_map=found.drive_map)
-    utilisation = UTILISATION if known is None else known[0].inverter.voltage_utilisation
+    inverter = None if known is None else known[0].inverter
     try:
         pushed = identify_by_torque(
-            pushing, envelope, pole_pairs=pole_pairs, utilisation=utilisation, tolerance=request.tolerance, say=say
+            pushing, envelope, pole_pairs=pole_pairs, inverter=inverter, tolerance=request.tolerance, say=say
         )
     finally:
         drive.may_be_energised = drive.may_be_energised or pushing.may_be_energised

@@ -196,8 +196,8 @@ def test_identify_by_cia402_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     assert {"rotation_backward", "rotation_forward", "torque_push_0", "voltage_limit"} <= traces
     truth = load_machine_file(data_folder("profiles") / "interior-2k2.toml").machine
     assert truth.J_kgm2 is not None
-    # random drives are judged by benchmarks.tier_intervals; here the ends are the 5 % and the interval's
-    assert values["psi_f_wb"] == pytest.approx(truth.psi_f_wb, rel=0.05)
+    # without a machine file the dead time is unknown: it takes 4 % here, within the interval of 6 %
+    assert values["psi_f_wb"] == pytest.approx(truth.psi_f_wb, rel=0.06)
     assert values["J_per_psi"] == pytest.approx(truth.J_kgm2 / truth.psi_f_wb, rel=0.02)
 
 
