@@ -24,9 +24,9 @@ QUANTITIES = {"R": "R_s_ohm", "psi": "psi_f_wb"}
 @click.command(
     "track",
     epilog=examples(
-        "pmsmtool -n 5 track --machine runs/last/machine.toml --for 60s",
+        "pmsmtool -n 5 track --machine runs/20260101T120000Z-000055f1 --for 60s",
         "pmsmtool -n 5 track psi --by trace --for 20s --json",
-        "pmsmtool track --replay runs/20260101T120000Z-000055f1",
+        "pmsmtool track --replay runs/20260101T130000Z-000055f1",
     ),
 )
 @click.argument("quantities", nargs=-1, metavar="[R|psi]...", type=click.Choice(list(QUANTITIES)))

@@ -55,6 +55,8 @@ TORQUE_FLOOR = 1e-3
 """Deviation of a block's torque beyond the noise of the currents, of the push's: ripple that samples do not show."""
 COASTING_FLOOR = 1e-4
 """The same of a coasting, from where it grows."""
+GROWTH_MOST = 2.5
+"""Largest growth of the torque's noise from one fit to the next: a fit that has not arrived asks for too much."""
 RIPPLE_MOST = 0.05
 """Largest deviation of a block's torque, of the push's: above, the shaft is not what the model says."""
 SCALE_FLOOR = 3e-4
@@ -277,7 +279,7 @@ def _noisier(runs: Sequence[_Run], residual: Array, largest: float) -> Sequence[
         own = np.concatenate([part for part, run in zip(parts, runs, strict=True) if run.coasting is coasting])
         chi2 = float(own @ own) / len(own)
         if chi2 > CHI2_WARN:
-            more[coasting] = math.sqrt(chi2)
+            more[coasting] = min(math.sqrt(chi2), GROWTH_MOST)
     if max(more.values()) == 1.0:
         return runs
     return [

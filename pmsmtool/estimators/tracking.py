@@ -22,7 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.estimators.tracking_model import STATES, TRACKED, Known, inputs, model_slopes, model_voltage
+from pmsmtool.estimators.tracking_model import (
+    STATES,
+    TRACKED,
+    Known,
+    inputs,
+    model_slopes,
+    model_voltage,
+    ripple_v,
+)
 from pmsmtool.trace import Trace
 
 Array = NDArray[np.float64]
@@ -123,7 +131,7 @@ class Tracker:
         self._filter.x = self._known.start
         self._filter.P = np.diag(self._known.start_std**2)
 
-    def update(self, t_s: float, given: Array, u_v: Array) -> float:
+    def update(self, t_s: float, given: Array, u_v: Array, ripple: Array | None = None) -> float:
         """Take one observation; return its normalised innovation squared.
 
         Parameters
@@ -134,6 +142,8 @@ class Tracker:
             Row of the inputs.
         u_v : ndarray, shape (2,)
             Measured u_d, u_q (V).
+        ripple : ndarray, shape (2,), optional
+            Further deviation of both (V).
         """
         if not (np.all(np.isfinite(given)) and np.all(np.isfinite(u_v))):
             raise ValueError("an observation is not a number")  # filterpy would take it without a word
@@ -142,7 +152,8 @@ class Tracker:
         try:
             self._filter.Q = np.diag(self._walk**2 * step)
             self._filter.predict()
-            self._filter.update(u_v, R=self._noise, given=given)
+            noise = self._noise if ripple is None else self._noise + np.diag(np.square(ripple))
+            self._filter.update(u_v, R=noise, given=given)
         except np.linalg.LinAlgError:
             self.restarts += 1
             self._restart()
@@ -248,8 +259,8 @@ def _pass(
     tracker = Tracker(known, noise, walk)
     measured = np.column_stack([observations["u_d_v"], observations["u_q_v"]])
     nis, states, stds = [], [], []
-    for t, row, u in zip(observations.t_s, given, measured, strict=True):
-        nis.append(tracker.update(float(t), row, u))
+    for t, row, u, ripple in zip(observations.t_s, given, measured, ripple_v(observations, given), strict=True):
+        nis.append(tracker.update(float(t), row, u, ripple))
         value, std = tracker.state()
         states.append(value)
         stds.append(std)

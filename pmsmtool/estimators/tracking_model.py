@@ -36,6 +36,8 @@ STEADY = 0.05
 NOISY = 5.0
 """Largest change of a current or the speed within a window, of the largest there is: transients are left out. What is
 only noise (a machine at rest) is told by the median change times the second."""
+ACROSS, ALONG = 12.0 / 35.0, 2.0 / 35.0
+"""Sixth harmonic of a square phase error in the frame of its fundamental: the difference and sum of 1/5 and 1/7."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +109,7 @@ def condense(trace: Trace, rows: int) -> Trace:
     means |= {f"{axis}_rise_a": _rise(blocks[f"i_{axis}_a"])[keep] for axis in "dq"}
     times = trace.t_s[: count * rows].reshape(count, rows).mean(axis=1)[keep]
     units = {name: trace.units[name] for name in names} | {"d_rise_a": "A", "q_rise_a": "A"}
-    return Trace(times, means, units, {**trace.meta, "window_s": rows * trace.period_s})
+    return Trace(times, means, units, {**trace.meta, "window_s": rows * trace.period_s, "rows": rows})
 
 
 def _steady(blocks: Mapping[str, Array]) -> NDArray[np.bool_]:
@@ -141,6 +143,25 @@ def inputs(observations: Trace, known: Known) -> Array:
         for axis in "dq"
     ]
     return np.column_stack([i_d, i_q, omega * np.sinc(omega * known.T_s / (2.0 * np.pi)), e_d, e_q, *rises])
+
+
+def ripple_v(observations: Trace, given: Array) -> Array:
+    """Amplitude of the inverter error's sixth harmonic that the windows leave in u_d and u_q (V), shape (n, 2).
+
+    Six steps of a phase error of fundamental e ripple by 12/35 e across the current and 2/35 e along it; the mean over
+    n rows keeps |sin(n x)/(n sin x)| of it, x half its step between two rows. A slow machine's windows are a part of a
+    period. Without the number of rows, as earlier observations are, zero.
+    """
+    rows = int(observations.meta.get("rows", 0))
+    if not rows:
+        return np.zeros((len(given), 2))
+    i_d, i_q, _, e_d, e_q = given.T[:5]
+    x = 3.0 * observations["omega_e_rad_s"] * float(observations.meta["window_s"]) / rows
+    bottom = rows * np.sin(x)
+    flat = np.abs(bottom) < 1e-9
+    left = np.where(flat, 1.0, np.abs(np.sin(rows * x) / np.where(flat, 1.0, bottom)))
+    size = np.hypot(e_d, e_q) * left / np.maximum(np.hypot(i_d, i_q), 1e-12)
+    return np.column_stack([size * np.hypot(ACROSS * i_q, ALONG * i_d), size * np.hypot(ACROSS * i_d, ALONG * i_q)])
 
 
 def model_voltage(x: Array, given: Array, scale: Array) -> Array:

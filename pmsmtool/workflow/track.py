@@ -211,14 +211,14 @@ def joined(parts: Sequence[Trace]) -> Trace:
     names = [name for name in (*NAMES, "d_rise_a", "q_rise_a") if all(name in part.signals for part in filled)]
     if not filled:
         return Trace(np.zeros(0), {name: np.zeros(0) for name in SIGNALS}, {n: signal_unit(n) for n in SIGNALS}, {})
-    windows = {float(part.meta.get("window_s", 0.0)) for part in filled}
+    windows = {(float(part.meta.get("window_s", 0.0)), int(part.meta.get("rows", 0))) for part in filled}
     if len(windows) > 1:  # rises over windows of different lengths are no common column
         names = [name for name in names if not name.endswith("_rise_a")]
     return Trace(
         np.concatenate(times),
         {name: np.concatenate([part[name] for part in filled]) for name in names},
         {name: filled[0].units[name] for name in names},
-        {"window_s": windows.pop()} if len(windows) == 1 else {},
+        dict(zip(("window_s", "rows"), windows.pop(), strict=True)) if len(windows) == 1 else {},
     )
 
 

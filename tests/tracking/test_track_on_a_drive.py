@@ -19,6 +19,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.signals import Truth
+from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
 from pmsmtool.workflow.commission import begin_run
@@ -64,7 +65,8 @@ def operated(bench: SimBench, by: str) -> tuple[Trace, float]:
                 parts.append(observe_process_data(bench.drive.node, 1.0, 100.0))
             else:
                 parts.append(observe_recordings(bench.drive, 1.0))
-        truth = core.simulation.signal(Truth.R)
+        devices = device_slope_ohm(settings_of(load_machine_file(data_folder("profiles") / "interior-2k2.toml")))
+        truth = core.simulation.signal(Truth.R) + devices
     assert bench.memory() == before, "what tracking borrowed is brought back"
     return joined(parts), truth
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import LIMIT, NIS_GATE, Track, Tracker, track
-from pmsmtool.estimators.tracking_model import TRACKED, condense
+from pmsmtool.estimators.tracking_model import ACROSS, ALONG, SIGNALS, TRACKED, condense, inputs, ripple_v
 from pmsmtool.trace import Trace
 from tests.tracking.simulated import known, machine, true_values, warming_run
 
@@ -17,8 +18,9 @@ SECONDS = 8.0
 ROWS = 60
 """Rows of a window: 20 ms."""
 SETTLED_S = 2.0
-ERROR = {"R_s_ohm": 0.02, "psi_f_wb": 0.004}
-"""Largest mean error after the first seconds, relative; measured at most 0.7 and 0.1 % over the seeds below."""
+ERROR = {"R_s_ohm": 0.03, "psi_f_wb": 0.004}
+"""Largest mean error after the first seconds, relative; measured 0.87 and 0.054 % with the seeds below, 1.9 and 0.084 %
+with seeds 1 to 7."""
 SEEDS = (1, 2)
 
 
@@ -94,6 +96,28 @@ def test_without_current_resistance_shows_in_nothing() -> None:
         track(observations, known(machine()))
     found = track(observations, known(machine()), ("psi_f_wb",))
     assert found.value["psi_f_wb"][-1] == pytest.approx(0.545, rel=1e-3)
+
+
+def test_windows_of_a_slow_machine_keep_a_part_of_the_inverters_ripple() -> None:
+    """The mean of a sixth harmonic over the rows of a window, by summing it up; none over whole periods."""
+    rows, period = 60, 1.0 / 3000.0
+    whole = 2.0 * np.pi / (6.0 * rows * period)
+    omega = np.array([0.3 * whole, 0.5 * whole, 1.4 * whole, 2.0 * whole, -0.7 * whole])
+    n = len(omega)
+    columns = {"u_d_v": np.zeros(n), "u_q_v": np.zeros(n), "i_d_a": np.zeros(n), "i_q_a": np.full(n, 50.0)}
+    signals = {**columns, "omega_e_rad_s": omega}
+    meta = {"window_s": rows * period, "rows": rows}
+    observations = Trace(np.arange(n) * 0.02, signals, dict.fromkeys(SIGNALS, "1"), meta)
+    flat = InverterCurve(np.array([1e-6, 100.0]), np.array([5.0, 5.0]), 0.0)
+    machine_known = replace(known(machine()), curve=flat)
+    found = ripple_v(observations, inputs(observations, machine_known))
+    angle = 6.0 * omega[:, None] * period * np.arange(rows)
+    kept = np.abs(np.mean(np.exp(1j * angle), axis=1))
+    fundamental = 4.0 / np.pi * 5.0
+    assert found[:, 0] == pytest.approx(fundamental * ACROSS * kept, abs=1e-3)
+    assert found[:, 1] == pytest.approx(fundamental * ALONG * kept, abs=1e-3)
+    assert found[3, 0] < 1e-9 < found[0, 0]
+    assert not np.any(ripple_v(replace(observations, meta={"window_s": 0.02}), inputs(observations, machine_known)))
 
 
 def test_too_few_observations_are_refused(warming: dict[int, Trace]) -> None:
