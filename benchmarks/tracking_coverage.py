@@ -40,7 +40,7 @@ PROFILES = ("interior-2k2", "jercic-2017", "miyajima-2013-assumed")
 SECONDS, SETTLED_S, WINDOW_S = 8.0, 2.0, 0.02
 SPREAD = 0.15
 SHAPES: dict[str, Callable[[Array], Array]] = {
-    "tanh": lambda x: np.tanh(x),
+    "tanh": lambda x: np.asarray(np.tanh(x)),
     "atan": lambda x: np.asarray(2.0 / math.pi * np.arctan(x)),
     "capacitive": lambda x: np.where(np.abs(x) < 1.0, 0.5 * x, np.sign(x) - 0.5 / np.where(x == 0.0, 1.0, x)),
 }
