@@ -12,6 +12,8 @@ NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
 ``drive``  family whose object dictionary the drive shows (``firmware-params``), or the path of a map file; default:
            the reference drive's own
 ``tier``   ``inject`` or ``recorder``: the reference drive without its averages, without its excitation too
+``filter`` time constant (s) of a set-point filter behind the torque slope; default: none
+``jitter`` how late (s) a process data object is sent at most; default: not late
 ``speed``  how fast idle time passes at most, as a multiple of the wall clock; default: at once
 ========== =============================================================================================
 """
@@ -19,7 +21,7 @@ NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,6 +69,8 @@ class Channel:
     speed: float | None = None
     drive: str | None = None
     tier: str | None = None
+    filter: float = 0.0
+    jitter: float = 0.0
 
 
 def _whole(low: int, high: int) -> Callable[[str], int]:
@@ -86,6 +90,13 @@ def _positive(text: str) -> float:
     return value
 
 
+def _short_time(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < 1.0:
+        raise ValueError("must be a time below 1 s")
+    return value
+
+
 def _tier(text: str) -> str:
     if text not in TIER_HIDES:
         raise ValueError(f"must be one of {', '.join(TIER_HIDES)}")
@@ -102,6 +113,8 @@ _KEYS: dict[str, Callable[[str], Any]] = {
     "speed": _positive,
     "drive": str,
     "tier": _tier,
+    "filter": _short_time,
+    "jitter": _short_time,
 }
 
 
@@ -215,6 +228,9 @@ def build_line(
     for position in range(channel.nodes):
         node_id = first if first == UNCONFIGURED else first + position
         settings = drive_settings(machine_file, path.stem, node_id, position, fixed_node_id=fixed, face=face)
+        settings = replace(
+            settings, set_point_filter_s=channel.filter, pdo_jitter_s=channel.jitter, seed=seed + position
+        )
         memory = Memory(_storage(channel, stem, position))
         line.add_node(Node(line, make_core(machine_file, seed + position), memory, settings))
     line.arm_faults()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -60,6 +61,12 @@ class Settings:
         Whether ``node_id`` outranks one stored by LSS (a switch on the drive).
     face : Face, Reduced or None
         The family whose dictionary it shows; None: the reference drive's own.
+    set_point_filter_s : float
+        Time constant of the filter behind its torque slope, 0 without (s).
+    pdo_jitter_s : float
+        How late a process data object is sent at most (s).
+    seed : int
+        Seed of how late they are.
     """
 
     node_id: int
@@ -70,6 +77,9 @@ class Settings:
     rated_torque_mnm: int
     fixed_node_id: bool = False
     face: Face | Reduced | None = None
+    set_point_filter_s: float = 0.0
+    pdo_jitter_s: float = 0.0
+    seed: int = 0
 
 
 class Node:
@@ -94,6 +104,8 @@ class Node:
         family = (VENDOR, PRODUCT) if self.face is None else (self.face.drive_map.vendor, self.face.drive_map.product)
         self.identity = (*family, REVISION, settings.serial)
         self.name = settings.name
+        self.set_point_filter_s = settings.set_point_filter_s
+        self.pdo_lateness: Iterator[float] = _lateness(settings)
         self.rated_current_ma = settings.rated_current_ma
         self.rated_torque_mnm = settings.rated_torque_mnm
         self.bitrate = line.bitrate
@@ -300,3 +312,12 @@ class Node:
         self.line.withdraw(self, can_id)
 
 
+def _lateness(settings: Settings) -> Iterator[float]:
+    """Yield how late each process data object is sent (s)."""
+    if settings.pdo_jitter_s == 0.0:
+        yield from itertools.repeat(0.0)
+    import numpy as np
+
+    rng = np.random.default_rng(settings.seed)
+    while True:
+        yield float(rng.uniform(0.0, settings.pdo_jitter_s))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from pmsmtool.bus.abort_codes import AbortCode
@@ -28,6 +28,7 @@ class _Pdo:
     entries: list[Entry] = field(default_factory=list)
     last: bytes = b""
     free_ns: int = 0
+    sent_ns: int = 0
     syncs: int = 0
     waiting: bytes | None = None
     event: Timer | None = None
@@ -45,6 +46,8 @@ class ProcessData:
         Transmits (COB-ID, data).
     fault : callable
         Reports an emergency code.
+    lateness : iterator of float
+        How late each PDO is sent (s).
     """
 
     def __init__(
@@ -54,12 +57,14 @@ class ProcessData:
         operational: Callable[[], bool],
         send: Callable[[int, bytes], None],
         fault: Callable[[int], None],
+        lateness: Iterator[float],
     ) -> None:
         self._dictionary = dictionary
         self._schedule = schedule
         self._operational = operational
         self._send = send
         self._fault = fault
+        self._lateness = lateness
         self.receive_ids: dict[int, _Pdo] = {}
         self._rpdos = [_Pdo(f"rpdo{number + 1}") for number in range(COUNT)]
         self._tpdos = [_Pdo(f"tpdo{number + 1}") for number in range(COUNT)]
@@ -222,7 +227,16 @@ class ProcessData:
             return
         pdo.last = content
         pdo.free_ns = now + self._number(pdo, "inhibit") * _TICK_NS
-        self._send(self._number(pdo, "cob_id") & 0x7FF, content)
+        self._transmit(pdo, self._number(pdo, "cob_id") & 0x7FF, content)
+
+    def _transmit(self, pdo: _Pdo, can_id: int, content: bytes) -> None:
+        """Send, as late as the node is this time, in the order of the samples."""
+        late_s = next(self._lateness)
+        if late_s == 0.0:
+            self._send(can_id, content)
+            return
+        pdo.sent_ns = max(self._schedule.now_ns + round(late_s * 1e9), pdo.sent_ns)
+        self._schedule.at(pdo.sent_ns, lambda: self._send(can_id, content))
 
     def _emit_deferred(self, pdo: _Pdo) -> None:
         pdo.deferred = None

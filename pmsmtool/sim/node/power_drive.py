@@ -28,6 +28,11 @@ STANDSTILL_SHARE = 0.002
 """Share of n_max below which the machine counts as standing."""
 STANDSTILL_FLOOR_RPM = 2.0
 _SLOPE_STEP_S = 0.001
+_SLOPE_STEP_NS = 1_000_000
+_NO_SLOPE = 10_000_000
+# Largest value of object 0x6087 and its default: a set-point is taken at once.
+_FILTERED_PERMILLE = 1e-3
+# Distance at which a filtered set-point counts as arrived.
 _SPEED_MODES = (Mode.PROFILE_VELOCITY, Mode.CYCLIC_VELOCITY)
 _TORQUE_MODES = (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE)
 _LIMIT_FLAGS = 0x01 | 0x02 | 0x04 | 0x100
@@ -38,6 +43,7 @@ class Plant(Protocol):
     """What the power drive needs of the hardware it sits on."""
 
     core: DriveCore
+    set_point_filter_s: float
 
     def look(self) -> None:
         """Bring the core to the present instant."""
@@ -70,8 +76,9 @@ class PowerDrive:
         self._emergency = emergency
         self._controlword = 0
         self._error_code = 0
-        self._torque_demand = 0.0
+        self._torque_demand = self._torque_filtered = 0.0
         self._slope_timer: Timer | None = None
+        self._stepped_ns = -_SLOPE_STEP_NS
         self._after_stop = State.SWITCH_ON_DISABLED
         self._stopping = Stopping(
             dictionary,
@@ -230,7 +237,7 @@ class PowerDrive:
         if state not in (State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE):
             self._stopping.cancel()
         if state is State.OPERATION_ENABLED:
-            self._torque_demand = 0.0
+            self._torque_demand = self._torque_filtered = 0.0
             self.apply()
         elif not state.energised:
             self._plant.core.command(Command())
@@ -331,7 +338,7 @@ class PowerDrive:
         self._dictionary["cia402.mode"].value = data
         if changed and self.state is State.OPERATION_ENABLED:
             self.on_leave()
-            self._torque_demand = 0.0
+            self._torque_demand = self._torque_filtered = 0.0
             self.apply()
 
     def _control_mode(self) -> ControlMode:
@@ -372,16 +379,29 @@ class PowerDrive:
             self._plant.core.command(Command(control))
 
     def _step_torque(self) -> None:
-        """Move the demand towards the target by the torque slope, once per millisecond."""
+        """Move the demand towards the target by the torque slope, once per millisecond however often it is written."""
         if self._slope_timer is not None:
             self._slope_timer.cancel()
             self._slope_timer = None
         if self.state is not State.OPERATION_ENABLED or self._control_mode() is not ControlMode.TORQUE:
             return
-        target = self._target_torque()
-        step = self._number("torque_slope") * _SLOPE_STEP_S
-        self._torque_demand += min(max(target - self._torque_demand, -step), step)
-        torque = self._torque_demand / 1000.0 * self._rated_torque_nm()
+        target, now_ns, slope = self._target_torque(), self._schedule.now_ns, self._number("torque_slope")
+        at_once = slope >= _NO_SLOPE and self._plant.set_point_filter_s == 0.0
+        if at_once or now_ns >= self._stepped_ns + _SLOPE_STEP_NS:
+            if self._torque_filtered != target:
+                self._stepped_ns = now_ns
+            step = slope * _SLOPE_STEP_S
+            self._torque_demand += min(max(target - self._torque_demand, -step), step)
+            self._filter_torque()
+        torque = self._torque_filtered / 1000.0 * self._rated_torque_nm()
         self._plant.core.command(Command(ControlMode.TORQUE, torque_nm=torque))
-        if self._torque_demand != target:
-            self._slope_timer = self._schedule.after(_SLOPE_STEP_S, self._step_torque)
+        if self._torque_demand != target or self._torque_filtered != self._torque_demand:
+            self._slope_timer = self._schedule.at(self._stepped_ns + _SLOPE_STEP_NS, self._step_torque)
+
+    def _filter_torque(self) -> None:
+        """First-order filter of the set-point, where the drive has one."""
+        filter_s, left = self._plant.set_point_filter_s, self._torque_demand - self._torque_filtered
+        if filter_s == 0.0 or abs(left) < _FILTERED_PERMILLE:
+            self._torque_filtered = self._torque_demand
+        else:
+            self._torque_filtered -= math.expm1(-_SLOPE_STEP_S / filter_s) * left

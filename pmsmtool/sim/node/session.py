@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 from typing import Protocol
 
@@ -63,6 +63,7 @@ class Hardware(Plant, Protocol):
     rated_current_ma: int
     rated_torque_mnm: int
     face: Face | Reduced | None
+    pdo_lateness: Iterator[float]
 
     def send(self, can_id: int, data: bytes) -> None:
         """Transmit a frame."""
@@ -121,8 +122,9 @@ class Session:
             self.dictionary, schedule, self._heartbeat_lost, self.power.connection_regained
         )
         self.pdo = ProcessData(
-            self.dictionary, schedule, self._is_operational, hardware.send, self.emergency.raise_error
-        )
+            self.dictionary, schedule, self._is_operational, hardware.send, self.emergency.raise_error,
+            hardware.pdo_lateness,
+        )  # fmt: skip
         self.lss = self._make_lss()
         self.power.on_state = self.pdo.changed
         self.dictionary["device.eds"].source = lambda: eds_text().encode("ascii")
