@@ -28,7 +28,7 @@ from pmsmtool.estimators.axis_response import initial_inductance
 from pmsmtool.estimators.inductance import bare_shot
 from pmsmtool.estimators.resistance import single_point_resistance, two_point_resistance
 from pmsmtool.trace import Trace
-from pmsmtool.workflow.evaluate import Evaluation
+from pmsmtool.workflow.evaluate import Evaluation, shots_of
 
 Vector = NDArray[np.float64]
 Traces = Mapping[str, Trace]
@@ -53,7 +53,7 @@ def curve_fit_resistance(levels: Trace) -> float:
 
 def ripple_inductance(traces: Traces, axis: str) -> float:
     """Return voltage times half period over the ripple (H)."""
-    return initial_inductance(bare_shot(traces[f"square_{axis}_6"], axis))
+    return initial_inductance(bare_shot(shots_of(traces, axis, 1)[0], axis))
 
 
 def speed_flux(traces: Traces, R_ohm: float, *, slope: bool) -> float:

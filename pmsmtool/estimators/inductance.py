@@ -116,8 +116,9 @@ def estimate_inductances(
     Parameters
     ----------
     d_shots, q_shots : sequence of Trace
-        ``u_d_v u_q_v i_d_a i_q_a theta_M_rad`` (and ``flagged``) in a frozen frame;
-        ``meta["half_period"]`` in samples, ``meta["fixed_angle_rad"]``, ``meta["pole_pairs"]``.
+        ``i_d_a i_q_a theta_M_rad`` (and ``flagged``) and the voltage of their axis, in a frozen frame;
+        ``meta["half_period"]`` in samples, ``meta["fixed_angle_rad"]``, ``meta["pole_pairs"]``, ``meta["T_winding_c"]``
+        where there is a sensor.
     noise : Noise
         From the zero-current trace.
     R_ohm : float
@@ -338,5 +339,6 @@ def _unmix(
 
 
 def _temperature(traces: Sequence[Trace]) -> float:
-    values = [float(np.mean(trace["T_winding_c"])) for trace in traces if "T_winding_c" in trace.signals]
+    values = [float(trace.meta["T_winding_c"]) for trace in traces if "T_winding_c" in trace.meta]
+    values += [float(np.mean(trace["T_winding_c"])) for trace in traces if "T_winding_c" in trace.signals]
     return float(np.mean(values)) if values else math.nan

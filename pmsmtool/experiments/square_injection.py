@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,15 +16,20 @@ from pmsmtool.trace import Trace
 
 Axis = Literal["d", "q"]
 
-SIGNALS = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "theta_m_rad", "flags", "T_winding_c")
 SHOT_SAMPLES = 2048
-SEARCH_SAMPLES = 360
+SEARCH_SAMPLES = 240
+SEARCH_LEAD_S = 0.05
+"""Lead of a shot of the search: the ripple is there at once, only the bias still moves."""
 BUS_ALLOWANCE_S = 2.0
 """The injection goes on this much longer than lead and record need: slow adapters arm the recorder late."""
 FIRST_SHARE = 0.01
 """First amplitude of the search, of the largest voltage: 1 % moves no machine of this population over its limit."""
+NEXT_SHARE = 0.3
+"""First amplitude of the second axis, of what the first axis took."""
+GROWTH = 10.0
+"""Largest step of the search: on a bias the ripple grows with the amplitude from the first volt."""
 SEARCH_STEPS = 12
-ENOUGH = 0.5
+ENOUGH = 0.2
 """A ripple of this share of the wanted one ends the search; the next shot is scaled from it."""
 
 
@@ -67,33 +73,42 @@ def hold_bias(drive: Drive, plan: SquarePlan) -> None:
     settle(drive, plan.bias_d_a)
 
 
-def find_amplitude(drive: Drive, plan: SquarePlan, axis: Axis) -> float:
-    """Return the amplitude (V) that makes the wanted ripple at the first half period, by rising small shots."""
-    amplitude = min(FIRST_SHARE * plan.u_max_v, plan.u_max_v)
+def find_amplitude(drive: Drive, plan: SquarePlan, axis: Axis, first_v: float | None = None) -> float:
+    """Return the amplitude (V) that makes the wanted ripple at the first half period, by rising small shots.
+
+    ``first_v`` is the amplitude of the first one; None: small enough for any machine.
+    """
+    quick = replace(plan, lead_s=SEARCH_LEAD_S)
+    amplitude = min(FIRST_SHARE * plan.u_max_v if first_v is None else first_v, plan.u_max_v)
     for _ in range(SEARCH_STEPS):
-        trace = inject_square(drive, plan, axis, plan.half_periods[0], amplitude, SEARCH_SAMPLES)
+        trace = inject_square(drive, quick, axis, plan.half_periods[0], amplitude, SEARCH_SAMPLES, (f"i_{axis}_a",))
         ripple = ripple_of(trace, axis)
         wanted = min(plan.u_max_v, amplitude * plan.ripple_a / max(ripple, 1e-9))
         if ripple >= ENOUGH * plan.ripple_a or amplitude >= plan.u_max_v:
             return wanted
-        amplitude = min(plan.u_max_v, 3.0 * amplitude, max(wanted, amplitude))
+        amplitude = min(plan.u_max_v, GROWTH * amplitude, max(wanted, amplitude))
     return amplitude
 
 
 def ripple_of(trace: Trace, axis: Axis) -> float:
-    """Return the ripple of one axis current, peak to peak (A), robust against single samples and slow drift."""
+    """Return the ripple of one axis current, peak to peak (A): of the triangle with the record's fundamental."""
     current = trace[f"i_{axis}_a"]
-    half_period = int(trace.meta["half_period"])
-    settled = current[len(current) // 3 :]
-    period = 2 * half_period
-    windows = settled[: len(settled) // period * period].reshape(-1, period)
-    return float(np.median(np.ptp(windows, axis=1)))
+    period = 2 * int(trace.meta["half_period"])
+    whole = current[len(current) - (2 * len(current) // 3) // period * period :]
+    turns = np.exp(-2j * math.pi * np.arange(len(whole)) / period)
+    return 0.25 * math.pi**2 * 2.0 * float(np.abs(np.mean((whole - np.mean(whole)) * turns)))
 
 
 def inject_square(
-    drive: Drive, plan: SquarePlan, axis: Axis, half_period: int, amplitude_v: float, samples: int | None = None
+    drive: Drive,
+    plan: SquarePlan,
+    axis: Axis,
+    half_period: int,
+    amplitude_v: float,
+    samples: int | None = None,
+    signals: Sequence[str] | None = None,
 ) -> Trace:
-    """Record one shot; the bias stays on before and after it.
+    """Record one shot, by default of all that an estimate needs; the bias stays on before and after it.
 
     Raises
     ------
@@ -114,5 +129,9 @@ def inject_square(
         fixed_angle_rad=plan.angle_rad,
         lead_s=plan.lead_s,
     )
-    trace = drive.record(SIGNALS, count, excitation=excitation)
-    return readable(trace, half_period=half_period, fixed_angle_rad=plan.angle_rad, axis=axis, amplitude_v=amplitude_v)
+    facts: dict[str, Any] = {"half_period": half_period, "fixed_angle_rad": plan.angle_rad}
+    facts |= {"axis": axis, "amplitude_v": amplitude_v}
+    if signals is None:
+        signals = ("i_d_a", "i_q_a", f"u_{axis}_v", "theta_m_rad", "flags")
+        facts["T_winding_c"] = drive.live("T_winding_c")
+    return readable(drive.record(signals, count, excitation=excitation), **facts)

@@ -21,7 +21,7 @@ from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_sh
 from pmsmtool.estimators.mechanics import MechanicsResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases
-from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance
+from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance, unsettled
 from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
@@ -173,7 +173,11 @@ def resistance_of(
     A reluctance machine has currents at which its rotor leaves the vector so slowly that it never comes to rest.
     """
     moved = levels.signals.get("moved", np.zeros(len(levels))) > 0.0
-    moved &= levels.signals.get("flagged", np.zeros(len(levels))) == 0.0  # a limit is no motion: the estimator names it
+    flagged = levels.signals.get("flagged", np.zeros(len(levels))) > 0.0
+    if np.any(flagged):
+        moved &= ~flagged  # a limit is no motion: the estimator names it
+    else:
+        moved |= unsettled(levels, noise)
     left_out = int(np.sum(moved))
     note = ""
     if 0 < left_out <= MOVED_SHARE * len(levels):

@@ -31,7 +31,7 @@ from pmsmtool.workflow.evaluate import resistance_of, tolerance_on
 PHASE_CHECK_SHARE = 0.05
 LEVELS = 12
 LOWEST_LEVEL = 0.08
-"""Lowest repeated DC level, of the largest; the low ones serve the inverter curve."""
+"""Lowest DC level of the sweep, of the largest; the low ones serve the inverter curve."""
 CURVE_SHARES = (0.02, 0.04)
 """Levels for the inverter curve alone: a speed run at small current lives there."""
 TURN_SHARE = 0.15
@@ -259,7 +259,7 @@ class Measurement:
         check_prediction(prediction)
 
     def _magnitudes(self) -> list[float]:
-        """DC levels that are held with both signs, several times (A)."""
+        """DC levels that are held with both signs (A)."""
         largest = self.limits.I_test_apk
         ratio = (1.0 / LOWEST_LEVEL) ** (1.0 / (LEVELS - 1))
         magnitudes = [largest * max(LOWEST_LEVEL, (k + 1) / LEVELS) for k in range(LEVELS)]
@@ -330,9 +330,11 @@ class Measurement:
         bias, ripple = bias_and_ripple(limits.I_test_apk, self.ripple_share, knee)
         plan = square_injection.SquarePlan(bias_d_a=bias, ripple_a=ripple, u_max_v=U_SHARE * limits.V_max_v)
         plan = self._hold_stable_bias(plan, encoder, knee, noise)
-        rough = []
+        rough: list[float] = []
+        first_v = None
         for axis in ("d", "q"):
-            amplitude = square_injection.find_amplitude(self.drive, plan, axis)
+            amplitude = square_injection.find_amplitude(self.drive, plan, axis, first_v)
+            first_v = square_injection.NEXT_SHARE * amplitude
             for half_period in plan.half_periods:
                 shot = square_injection.inject_square(self.drive, plan, axis, half_period, amplitude)
                 self.keep(f"square_{axis}_{half_period}", shot)

@@ -18,6 +18,7 @@ from pmsmtool.estimators.resistance import (
     single_point_resistance,
     tail_models,
     two_point_resistance,
+    unsettled,
 )
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, draw, inverter_shape
@@ -146,9 +147,10 @@ def test_the_inverter_curve_is_the_one_of_the_plant() -> None:
         assert 0.2 * d.knee[k] < knee < 8.0 * d.knee[k]
 
 
-def test_sixteen_tail_models() -> None:
-    assert len(tail_models()) == 16
-    assert len(set(tail_models())) == 16
+def test_nine_tail_models_with_a_leading_power_each() -> None:
+    assert len(tail_models()) == 9
+    assert len(set(tail_models())) == 9
+    assert all({1, 2} & set(powers) for powers in tail_models())
 
 
 def test_efficiency_against_the_bound_of_the_same_tail_terms() -> None:
@@ -222,6 +224,17 @@ def test_a_bridge_of_unequal_thresholds_is_a_voltage_scale_of_unknown_size() -> 
     igbt = estimate_resistance(levels, noise_of(d, 0), tolerance=SensorTolerance(U_dc_v=100.0)).R_measured
     assert igbt.value == mosfet.value
     assert math.sqrt(igbt.std**2 - mosfet.std**2) == pytest.approx(3.5e-3 * mosfet.value, rel=1e-6)
+
+
+def test_a_few_levels_that_move_are_told_apart() -> None:
+    rng = np.random.default_rng(13)
+    d = replace_inverter(draw(1, rng))
+    trace = levels_of(d, 0, rng)
+    assert not np.any(unsettled(trace, noise_of(d, 0)))
+    second = trace["u_d_second_v"].copy()
+    second[3] += 0.05 * float(np.max(trace["u_d_v"]))
+    moving = replace(trace, signals={**trace.signals, "u_d_second_v": second})
+    assert list(np.flatnonzero(unsettled(moving, noise_of(d, 0)))) == [3]
 
 
 def test_the_low_levels_may_settle_more_slowly_than_those_that_make_R() -> None:
