@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.flux_linkage import mean_inverter_error
+from pmsmtool.estimators.flux_linkage_rows import mean_inverter_error
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
 
@@ -136,7 +136,7 @@ def inputs(observations: Trace, known: Known) -> Array:
     i_d, i_q, omega = (observations[name] for name in ("i_d_a", "i_q_a", "omega_e_rad_s"))
     e_d = e_q = np.zeros_like(i_d)
     if known.curve is not None:
-        e_d, e_q = mean_inverter_error(known.curve, i_d, i_q)
+        e_d, e_q = mean_inverter_error(known.curve, (i_d, i_q))
     window = float(observations.meta.get("window_s", 0.0))
     rises = [
         observations[f"{axis}_rise_a"] / window if window and f"{axis}_rise_a" in observations.signals else 0.0 * i_d
