@@ -40,6 +40,8 @@ from pmsmtool.workflow.tier_machine import TierMachine, tier_machine
 
 VECTOR_SHARES = (0.35, 0.7)
 """Length of the turned vector, of the test current; the larger one where the rotor does not stay on the first."""
+DWELL_S = 0.03
+"""Time per step of the vector: nothing finer follows, so the rotor is given time to come to rest."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 SWING_SHARE = 0.4
 """Speed of the recorded pushes, of the largest one."""
@@ -108,7 +110,7 @@ def identify_standard(
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
         for share in VECTOR_SHARES:
-            plan = RotationPlan(i_a=share * envelope.i_max_apk / HEADROOM)
+            plan = RotationPlan(i_a=share * envelope.i_max_apk / HEADROOM, dwell_s=DWELL_S)
             say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
             traces["rotation_forward"], traces["rotation_backward"] = rotate_vector(guard, plan)
             try:
