@@ -1,9 +1,10 @@
 """The governor of a drive that cannot be reflashed: the admissible set projected onto what it offers.
 
-A closed drive takes no governed reference. It offers a limit of its torque (0x6072), a slope of its set-point (0x6087)
-and a limit of its speed (0x6080), all constant. :func:`tune_closed` chooses the three so that its voltage demand never
-exceeds the limit and its current never I_max, for every course of the torque asked for and of the speed within them
-(``slope_response.py``), and says what that costs against the full governor with field weakening.
+A closed drive takes no governed reference. It offers a limit of its torque (0x6072) or current, a slope of its set-point
+(0x6087, which acts in profile torque mode) and a limit of its speed (0x6080), all constant. :func:`tune_closed` chooses
+the three so that its voltage demand never exceeds the limit and its current never I_max, for every course of the torque
+asked for and of the speed within them (``slope_response.py``), and says what that costs against the full governor with
+field weakening.
 
 What is taken as known: i_d = 0 (no field weakening), PI control with the gains that are written or said, demand
 proportional to torque, a command frame turned ahead to the middle of the period. Whether it decouples is not published
@@ -34,8 +35,9 @@ from pmsmtool.machine.machine_file import MachineFile
 
 Array = NDArray[np.float64]
 
-RATED, SLOPE, TORQUE, SPEED = (
-    "reference.tau_rated_nm", "reference.torque_slope_nm_per_s", "speed.tau_max_nm", "motor.n_max_rpm",
+RATED, SLOPE, TORQUE, CURRENT, SPEED = (
+    "reference.tau_rated_nm", "reference.torque_slope_nm_per_s", "speed.tau_max_nm", "motor.I_max_apk",
+    "motor.n_max_rpm",
 )  # fmt: skip
 GAINS = ("current.K_p_q_v_per_a", "current.K_i_q_v_per_as")
 SPEEDS = 26
@@ -98,12 +100,13 @@ class ClosedDrive:
             wrong.append(f"filter_s = {self.filter_s!r} is negative")
         if wrong:
             raise ConfigError("the request cannot be used", where="closed drive", violations=wrong)
-        missing = [name for name in (RATED, SLOPE, TORQUE) if name not in self.offers]
+        missing = [name for name in (RATED, SLOPE) if name not in self.offers]
+        missing += [] if self.offers & {TORQUE, CURRENT} else [f"{TORQUE} or {CURRENT}"]
         if missing:
             raise NotAvailable(
                 f"the drive map {self.name!r} has no object for {', '.join(missing)}",
                 where="closed drive",
-                likely="its maker documents no torque mode with a slope (0x6087, 0x6072, 0x6076)",
+                likely="its maker documents no torque mode with a slope and a limit (0x6087, 0x6072, 0x6076)",
                 hint="a master that limits the slope of 0x6071 itself has the same effect",
             )
 
@@ -176,7 +179,7 @@ class Guarantee:
     def sentence(self) -> str:
         """Return the guarantee as a person reads it."""
         return (
-            f"voltage demand <= {self.demand_v:.4g} V (limit {self.limit_v:.4g} V of {self.V_max_v:.4g} V) for every "
+            f"in profile torque mode: voltage demand <= {self.demand_v:.4g} V (limit {self.limit_v:.4g} V of {self.V_max_v:.4g} V) for every "
             f"torque set-point within +-{self.tau_nm:.4g} N m, every speed within +-{self.n_rpm:.4g} rpm and every "
             f"acceleration up to {self.acceleration_rpm_per_s:.3g} rpm/s, delay and intervals included; current within "
             f"{self.I_apk + self.deviation_a:.4g} A; beyond that speed nothing is promised. "
@@ -209,6 +212,8 @@ def tune_closed(source: MachineFile, request: TuneRequest, drive: ClosedDrive) -
         TORQUE: DesignValue(found.tau_nm, how),
         SPEED: DesignValue(min(found.n_rpm, rated.n_max_rpm), how),
     }
+    if TORQUE not in drive.offers:
+        values[CURRENT] = DesignValue(found.I_apk, how)
     notes = (*design.notes, *tolerance_box(source).notes, found.sentence())
     if SPEED not in drive.offers:
         notes += (f"{drive.name} has no object for the speed limit: keep {found.n_rpm:.4g} rpm in the application",)

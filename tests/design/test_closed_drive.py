@@ -12,7 +12,17 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.design.closed_drive import GAINS, RATED, SLOPE, SPEED, TORQUE, ClosedDrive, Guarantee, tune_closed
+from pmsmtool.design.closed_drive import (
+    CURRENT,
+    GAINS,
+    RATED,
+    SLOPE,
+    SPEED,
+    TORQUE,
+    ClosedDrive,
+    Guarantee,
+    tune_closed,
+)
 from pmsmtool.design.design_file import Design, design_text, parse_design
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, NotAvailable
@@ -136,9 +146,20 @@ def test_gains_that_can_be_written_need_no_bandwidth() -> None:
     assert design[GAINS[0]] > 0.0
 
 
+def test_a_current_limit_serves_where_there_is_none_of_torque() -> None:
+    offers = frozenset(load_family("copley").cells)
+    assert TORQUE not in offers
+    drive = ClosedDrive("copley", offers, bandwidth(machine()), speed_rpm=600.0)
+    design, found = tune_closed(machine(), TuneRequest(), drive)
+    assert design[CURRENT] == found.I_apk < machine().machine.I_max_apk  # type: ignore[operator]
+    assert any("no object for the speed limit" in note for note in design.notes)
+
+
 def test_what_is_missing_is_named() -> None:
     with pytest.raises(NotAvailable, match="reference.torque_slope_nm_per_s"):
         ClosedDrive("test", frozenset((RATED, TORQUE)))
+    with pytest.raises(NotAvailable, match=f"{TORQUE} or {CURRENT}"):
+        ClosedDrive("test", frozenset((RATED, SLOPE)))
     with pytest.raises(ConfigError, match="bandwidth"):
         tune_closed(machine(), TuneRequest(), ClosedDrive("test", OFFERS))
     source = machine()
