@@ -2,9 +2,9 @@
 
 A closed drive takes no governed reference. It offers a limit of its torque (0x6072) or current, a slope of its
 set-point (0x6087, which acts in profile torque mode) and a limit of its speed (0x6080), all constant.
-:func:`tune_closed` chooses the three so that its voltage demand never exceeds the limit and its current never I_max, for every course of the torque
-asked for and of the speed within them (``slope_response.py``), and says what that costs against the full governor with
-field weakening.
+:func:`tune_closed` chooses the three so that its voltage demand never exceeds the limit and its current never I_max,
+for every course of the torque asked for and of the speed within them (``slope_response.py``), and says what that costs
+against the full governor with field weakening.
 
 What is taken as known: i_d = 0 (no field weakening), PI control with the gains that are written or said, demand
 proportional to torque, a command frame turned ahead to the middle of the period. Whether it decouples is not published
@@ -180,8 +180,8 @@ class Guarantee:
         """Return the guarantee as a person reads it."""
         return (
             f"in profile torque mode: voltage demand <= {self.demand_v:.4g} V (limit {self.limit_v:.4g} V of "
-            f"{self.V_max_v:.4g} V) for every torque set-point within +-{self.tau_nm:.4g} N m, every speed within +-{self.n_rpm:.4g} rpm and every "
-            f"acceleration up to {self.acceleration_rpm_per_s:.3g} rpm/s, delay and intervals included; current within "
+            f"{self.V_max_v:.4g} V) for every torque set-point within +-{self.tau_nm:.4g} N m, every speed within "
+            f"+-{self.n_rpm:.4g} rpm and every acceleration up to {self.acceleration_rpm_per_s:.3g} rpm/s, delay and intervals included; current within "
             f"{self.I_apk + self.deviation_a:.4g} A; beyond that speed nothing is promised. "
             f"Cost: {100.0 * self.torque_loss:.1f} % of the full governor's torque at that speed, "
             f"{100.0 * self.standstill_loss:.1f} % at standstill; {1e3 * self.rise_s:.3g} ms to the torque limit "
