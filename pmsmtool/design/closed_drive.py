@@ -180,10 +180,10 @@ class Guarantee:
         """Return the guarantee as a person reads it."""
         return (
             f"in profile torque mode: voltage demand <= {self.demand_v:.4g} V (limit {self.limit_v:.4g} V of "
-            f"{self.V_max_v:.4g} V) for every torque set-point within +-{self.tau_nm:.4g} N m, every speed within "
-            f"+-{self.n_rpm:.4g} rpm and every acceleration up to {self.acceleration_rpm_per_s:.3g} rpm/s, delay and intervals included; current within "
-            f"{self.I_apk + self.deviation_a:.4g} A; beyond that speed nothing is promised. "
-            f"Cost: {100.0 * self.torque_loss:.1f} % of the full governor's torque at that speed, "
+            f"{self.V_max_v:.4g} V) and current <= {self.I_apk + self.deviation_a:.4g} A for every torque set-point "
+            f"within +-{self.tau_nm:.4g} N m, every speed within +-{self.n_rpm:.4g} rpm and every acceleration up to "
+            f"{self.acceleration_rpm_per_s:.3g} rpm/s, delay and intervals included; beyond that speed nothing is "
+            f"promised. Cost: {100.0 * self.torque_loss:.1f} % of the full governor's torque at that speed, "
             f"{100.0 * self.standstill_loss:.1f} % at standstill; {1e3 * self.rise_s:.3g} ms to the torque limit "
             f"instead of {1e3 * self.governed_rise_s:.3g} ms"
         )
