@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.estimators.estimate import SensorTolerance, condition_gate, information_weights
-from pmsmtool.estimators.flux_linkage_rows import STAGE, Corrected, SpeedLag, check_speeds, corrected, pairs_of
+from pmsmtool.estimators.flux_linkage_rows import STAGE, Corrected, check_speeds, corrected, pairs_of
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.estimators.refusals import refuse
@@ -44,6 +44,11 @@ RIPPLE_DOUBT = 0.2
 (measured on 20 drives of the population and around the profiles: 0.02 to 0.3)."""
 CURVE_DOUBT = 0.15
 """The same of what the measured curve says about the small i_q that is left."""
+CURVATURE_DOUBT = 0.2
+"""Standard deviation of the way from the smallest d current to none, relative (measured on six reluctance machines that
+saturate, whose way is 0.5 %: 0.01 to 0.5)."""
+LAG_STD = 0.03
+"""Relative standard deviation of the lag (pushes of 18 drives show 0.99 of what the drive's bandwidth says)."""
 LEVEL_RATIO = 1.2
 """Ratio of d currents above which they are different levels."""
 
@@ -94,7 +99,7 @@ def estimate_flux_linkage(
     period_s: float,
     inverter: InverterCurve | None = None,
     modulation: Modulation | None = None,
-    lag: SpeedLag | None = None,
+    lag_s: float = 0.0,
     tolerance: SensorTolerance | None = None,
     T_ref_c: float = 20.0,
     alpha_psi_per_k: float = -0.0012,
@@ -115,8 +120,8 @@ def estimate_flux_linkage(
         Voltage error from the DC levels.
     modulation : Modulation or None
         What the ripple at the switching edges makes of that error; None: nothing.
-    lag : SpeedLag or None
-        By how much the measured speed lags; None: not at all.
+    lag_s : float
+        Delay of the drive's speed behind the rotor's while it accelerates: 2/omega of its estimate's double pole (s).
     tolerance : SensorTolerance
         Declared sensor tolerances.
     T_ref_c, alpha_psi_per_k : float
@@ -128,10 +133,9 @@ def estimate_flux_linkage(
         ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``, ``E_NOT_IDENTIFIABLE``.
     """
     tolerance = tolerance or SensorTolerance()
-    lag = lag or SpeedLag(0.0, 0.0)
     pairs = pairs_of(speeds)
     check_speeds(speeds, pairs)
-    rows = corrected(speeds, R_ohm, period_s, inverter, modulation, lag)
+    rows = corrected(speeds, R_ohm, period_s, inverter, modulation, lag_s)
     d_fit, d_std, d_dof = _fit_d(rows)
     even = _fit_even(rows, pairs)
     x1, x2 = even.flux_wb, float(d_fit[1])
@@ -149,7 +153,8 @@ def estimate_flux_linkage(
     model_std = math.hypot(
         RIPPLE_DOUBT * even.change(rows.ripple_q_v),
         CURVE_DOUBT * even.change(rows.curve_q_v),
-        lag.std_s * even.change(psi * rows.acceleration_rad_s2),
+        CURVATURE_DOUBT * (even.low_wb - even.flux_wb),
+        LAG_STD * lag_s * even.change(psi * rows.acceleration_rad_s2),
         RELATIVE_FLOOR * psi,
         tolerance.voltage_scale_std * psi,
     )
@@ -230,7 +235,10 @@ class _Even:
 
 
 def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
-    """Average the models without curvature, with i_d^2, and with i_d^4, as their data support them."""
+    """Average the model without curvature and the one with as many terms as there are levels, as the data support them.
+
+    A machine that saturates has all of them.
+    """
     w, i_d = rows.w, rows.i_d
     first, second = (np.array([pair[k] for pair in pairs]) for k in (0, 1))
     w_sum = w[first] + w[second]
@@ -247,12 +255,13 @@ def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
     levels = 1 + int(np.sum(sizes[1:] > LEVEL_RATIO * sizes[:-1]))
     n = len(y)
     hats, residuals = [], []
-    for order in range(levels):
+    orders = sorted({0, levels - 1})
+    for order in orders:
         matrix = np.stack([s ** (2 * k) for k in range(order + 1)], axis=1)
         hats.append(np.linalg.pinv(matrix * weight[:, None]) * weight)
         residuals.append(y - matrix @ (hats[-1] @ y))
     chi = np.array([float(np.sum((weight * residual) ** 2)) for residual in residuals])
-    dof = n - 1.0 - np.arange(levels)
+    dof = n - 1.0 - np.array(orders)
     variance = max(float(chi[-1] / dof[-1]), (np.finfo(np.float64).eps * float(np.max(np.abs(y)))) ** 2)
     share = information_weights([float(c / variance + (n - d) * math.log(n)) for c, d in zip(chi, dof, strict=True)])
     values = np.array([float(hat[0] @ y) for hat in hats])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,24 +26,12 @@ Q_SHARE = 0.3
 """Part of i_d up to which an i_q counts as none."""
 CURRENT_SETTLE_LIMIT = 0.25
 """Change of a current between the halves of a window, of the largest current."""
-SETTLE_LIMIT = 0.2
+SETTLE_LIMIT = 0.4
 """Relative change of the speed between the halves of a window: the shaft coasts, but slowly."""
 DELAY_PERIODS = 1.5
 """Periods from the samples of a row to the middle of its voltage."""
 ANGLES = 360
 """Angles over which an error is averaged; a multiple of six."""
-LAG_STD = 0.03
-"""Relative standard deviation of a lag from few pushes (measured: 0.01 with encoders of 12 to 19 bits)."""
-LAG_ACCELERATION = 0.3
-"""Acceleration of a push, of the strongest one's, below which it does not say how the speed lags."""
-
-
-@dataclass(frozen=True, slots=True)
-class SpeedLag:
-    """Delay of the drive's speed behind the rotor's while it accelerates (s), and its standard deviation."""
-
-    value_s: float
-    std_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,34 +63,6 @@ class Corrected:
     is_d: NDArray[np.bool_]
 
 
-def speed_lag(pushes: Sequence[Trace], pole_pairs: int) -> SpeedLag | None:
-    """Return how far the drive's speed lags, from pushes at constant current; None without a useful one.
-
-    Parameters
-    ----------
-    pushes : sequence of Trace
-        ``theta_M_rad omega_e_rad_s`` of an accelerating shaft. Both are fitted by parabolas over the second half.
-    pole_pairs : int
-        Pole pairs.
-    """
-    found = []
-    for push in pushes:
-        n = len(push)
-        half = slice(n // 2, n)
-        t = push.t_s[half] - float(np.mean(push.t_s[half]))
-        basis = np.stack([np.ones_like(t), t, t * t, t**3], axis=1)
-        theta = np.linalg.lstsq(basis, np.unwrap(push["theta_M_rad"][half]), rcond=None)[0]
-        omega = np.linalg.lstsq(basis, push["omega_e_rad_s"][half] / pole_pairs, rcond=None)[0]
-        sense = 1.0 if theta[1] * omega[0] > 0.0 else -1.0  # an encoder may count against the phases
-        found.append((2.0 * float(theta[2]) * sense, float(theta[1]) * sense - float(omega[0])))
-    strongest = max((abs(a) for a, _ in found), default=0.0)
-    lags = np.array([off / a for a, off in found if abs(a) > LAG_ACCELERATION * strongest])
-    if not len(lags):
-        return None
-    value = float(np.median(lags))
-    return SpeedLag(value, math.hypot(LAG_STD * value, float(np.std(lags)) / math.sqrt(len(lags))))
-
-
 def pairs_of(speeds: Trace) -> list[tuple[int, int]]:
     """Return the rows that follow each other with d currents of one size and opposite signs."""
     i_d, i_q, w = speeds["i_d_a"], speeds["i_q_a"], speeds["omega_e_rad_s"]
@@ -125,12 +84,12 @@ def corrected(
     period_s: float,
     inverter: InverterCurve | None,
     modulation: Modulation | None,
-    lag: SpeedLag,
+    lag_s: float,
 ) -> Corrected:
     """Take off what is known: lag of the speed, resistance, inverter error, and sampling."""
     i_d, i_q = speeds["i_d_a"], speeds["i_q_a"]
     acceleration = (speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / speeds["half_s"]
-    w = speeds["omega_e_rad_s"] + (lag.value_s + DELAY_PERIODS * period_s) * acceleration
+    w = speeds["omega_e_rad_s"] + (lag_s + DELAY_PERIODS * period_s) * acceleration
     voltage = (speeds["u_d_v"], speeds["u_q_v"])
     plain = rippled = np.zeros((2, len(w)))
     if inverter is not None:

@@ -7,6 +7,7 @@ Without i_q the inverter's error has hardly a q part, whatever friction and iner
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
@@ -120,9 +121,9 @@ def _window(drive: Drive, half: int) -> dict[str, float]:
     return row
 
 
-def speeds_trace(rows: Rows, pole_pairs: int, U_dc_v: float) -> Trace:
-    """Return the rows as one trace; its time base counts them."""
-    return table(rows, [float(k) for k in range(len(rows))], pole_pairs=pole_pairs, U_dc_v=U_dc_v)
+def speeds_trace(rows: Rows, facts: Mapping[str, float]) -> Trace:
+    """Return the rows as one trace with facts about the run; its time base counts them."""
+    return table(rows, [float(k) for k in range(len(rows))], **facts)
 
 
 def reach(drive: Drive, omega_e_rad_s: float, *, limit_s: float = REACH_LIMIT_S, band_rad_s: float = 0.0) -> float:

@@ -14,7 +14,6 @@ from pmsmtool.estimators.axis_response import initial_inductance
 from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
-from pmsmtool.estimators.flux_linkage_rows import speed_lag
 from pmsmtool.estimators.flux_map_result import FluxMapResult
 from pmsmtool.estimators.frequency_response import FrequencyResponse
 from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
@@ -210,14 +209,13 @@ def flux_of(
     if all(L > 0.0 for L in rough) and math.isfinite(U_dc_v):
         dead_time = max(0.0, resistance.V_dead_v) * period_s / U_dc_v
         modulation = Modulation(U_dc_v, 2.0 / (1.0 / rough[0] + 1.0 / rough[1]), period_s, dead_time)
-    pushes = [traces[name] for name in ("push_0", "push_1") if name in traces]
     return estimate_flux_linkage(
         speeds,
         R.value * (1.0 + warmer),
         period_s=period_s,
         inverter=resistance.curve,
         modulation=modulation,
-        lag=speed_lag(pushes, int(speeds.meta["pole_pairs"])),
+        lag_s=float(speeds.meta.get("speed_lag_s", 0.0)),
         tolerance=tolerance,
         T_ref_c=T_ref_c,
     )

@@ -492,7 +492,9 @@ class Measurement:
         plan = speed_run.SpeedPlan(largest, run_i_d, i_q)
         rows = speed_run.coast_through(self.drive, plan, pole_pairs)
         speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)
-        self.keep("speeds", speed_run.speeds_trace(rows, pole_pairs, math.sqrt(3.0) * limits.V_max_v))
+        lag_s = 2.0 / self.drive.read("encoder.pll_bandwidth_rad_s")  # its poles are a double one
+        facts = {"pole_pairs": pole_pairs, "U_dc_v": math.sqrt(3.0) * limits.V_max_v, "speed_lag_s": lag_s}
+        self.keep("speeds", speed_run.speeds_trace(rows, facts))
 
     def _off_and_write(self, values: Mapping[str, float]) -> None:
         self.drive.disable()

@@ -10,7 +10,6 @@ import pytest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import statistical_half_width
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
-from pmsmtool.estimators.flux_linkage_rows import SpeedLag, speed_lag
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, curve_points, draw, repeat, run
@@ -141,7 +140,7 @@ def _changed(trace: Trace, **signals: np.ndarray) -> Trace:
         (lambda t: {"omega_e_rad_s": np.abs(t["omega_e_rad_s"])}, "E_EXCITATION"),
         (lambda t: {"i_d_a": np.abs(t["i_d_a"])}, "E_EXCITATION"),
         (lambda t: {"omega_e_rad_s": -t["omega_e_rad_s"]}, "E_NOT_IDENTIFIABLE"),
-        (lambda t: {"omega_second_rad_s": 1.25 * t["omega_first_rad_s"]}, "E_NOT_SETTLED"),
+        (lambda t: {"omega_second_rad_s": 1.5 * t["omega_first_rad_s"]}, "E_NOT_SETTLED"),
         (lambda t: {"i_d_second_a": t["i_d_first_a"] + np.max(np.abs(t["i_q_a"]))}, "E_NOT_SETTLED"),
         (lambda t: {"flagged": np.array([0.0] * (len(t) - 1) + [3.0])}, "E_CLIPPED"),
     ],
@@ -187,20 +186,5 @@ def test_a_speed_that_lags_while_the_shaft_slows_down_is_put_right() -> None:
     trace = _windows(lambda i: 0.0 * i + PSI, slope=-0.4)
     wrong = estimate_flux_linkage(trace, R, period_s=T_S).psi_measured.value
     # the rotor is where the shown speed was a lag ago: shown = true + 0.4 lag
-    lag = SpeedLag(3e-3, 3e-5)
-    right = estimate_flux_linkage(trace, R, period_s=T_S, lag=lag).psi_measured.value
+    right = estimate_flux_linkage(trace, R, period_s=T_S, lag_s=3e-3).psi_measured.value
     assert right / wrong == pytest.approx(1.0 / (1.0 - 0.4 * 3e-3), rel=1e-4)
-
-
-@pytest.mark.parametrize("sense", [1.0, -1.0])
-def test_the_lag_of_the_speed_shows_in_a_push(sense: float) -> None:
-    lag, p = 3.3e-3, 4
-    pushes = []
-    for a in (800.0, -800.0, 1600.0):
-        t = np.arange(1024) * 1e-4
-        signals = {"theta_M_rad": sense * 0.5 * a * t * t, "omega_e_rad_s": p * a * (t - lag)}
-        pushes.append(Trace(t, signals, {"theta_M_rad": "rad", "omega_e_rad_s": "rad/s"}))
-    found = speed_lag(pushes, p)
-    assert found is not None
-    assert found.value_s == pytest.approx(lag, rel=1e-6)
-    assert speed_lag([], p) is None
