@@ -179,7 +179,8 @@ def test_a_saturating_axis_is_taken_back_to_zero_current(bend: float) -> None:
     assert found.curvature == pytest.approx(bend * (10.0 * D) ** 2, abs=1e-4)
     assert found.low_wb == pytest.approx(PSI * (1.0 + bend * (10.0 * D / 3.0) ** 2), rel=1e-5)
     assert found.low_i_d_a == pytest.approx(10.0 * D / 3.0)
-    assert found.psi_measured.std < 2e-4 * PSI
+    way = bend * (10.0 * D / 3.0) ** 2  # what is extrapolated is doubted, in part
+    assert 0.1 * way < found.psi_measured.std / PSI < 2e-4 + 0.3 * way
 
 
 def test_a_speed_that_lags_while_the_shaft_slows_down_is_put_right() -> None:
