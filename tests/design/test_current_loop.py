@@ -96,6 +96,20 @@ def test_the_largest_delay_is_the_first_limit_though_the_loop_is_stable_again_be
     assert maximum_delay_periods(gains, plant, plant) == pytest.approx(2.192, abs=0.001)
 
 
+def test_delay_margin_where_a_resonance_leads() -> None:
+    """An integrator and a resonance that crosses once more above -180 degree: its delay goes nearly once around.
+
+    Whole samples of delay are exact: the loop must stay stable up to the sample before its delay margin, and no longer.
+    """
+    pair = [1.0, -2.0 * 0.986 * math.cos(1.566), 0.986**2]
+    num = np.convolve([0.171], pair) - 0.0355 * np.convolve([1.0, -math.cos(1.566)], [1.0, -1.0])
+    loop = SampledLoop(tuple(num.tolist()), tuple(np.convolve([1.0, -1.0], pair).tolist()), T_S)
+    found = margins(loop)
+    assert found.phase_margin_deg < 0.0
+    assert 2.0 < found.delay_margin_s / T_S < 3.0  # 2.69
+    assert [margins(loop.delayed(samples)).stable for samples in range(4)] == [True, True, True, False]
+
+
 def test_pulse_response_of_a_fractional_delay() -> None:
     """The voltage of sample k acts over [t_k + 0.3 T, t_k + 1.3 T): step the exact plant piece by piece."""
     delay, fraction = 0.8, 0.3

@@ -19,6 +19,7 @@ from pmsmtool.design.field_weakening import (
     mtpva,
     overshoot_per_slope,
     ramp_limit_rpm_per_s,
+    torque_constant,
 )
 from pmsmtool.design.governor import (
     CURRENT_ROW,
@@ -125,6 +126,13 @@ def test_mtpva_is_the_corner_the_table_kernel_finds() -> None:
 def test_hot_magnet() -> None:
     """(36): 150 K at 0.12 %/K are 18 %."""
     assert flux_at_temperature(MTPV_MACHINE, 170.0) == pytest.approx(0.82 * 0.1)
+
+
+def test_torque_constant_is_the_slope_of_the_torque() -> None:
+    machine = at_temperature(MTPV_MACHINE)
+    for i_d in (-40.0, 0.0, 20.0):
+        slope = machine.torque_nm(i_d, 1.0) - machine.torque_nm(i_d, 0.0)
+        assert torque_constant(MTPV_MACHINE, i_d) == pytest.approx(float(slope), rel=1e-12)
 
 
 def test_field_weakening_numbers_of_the_reference_machine() -> None:

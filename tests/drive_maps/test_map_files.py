@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -186,6 +187,14 @@ def test_hash_follows_content_not_layout() -> None:
     again = parse(GOOD.replace("[left_out]", "# a remark\n\n[left_out]"))
     assert map_hash(again) == map_hash(parse(GOOD))
     assert map_hash(parse(GOOD.replace("sub = 4", "sub = 5"))) != map_hash(parse(GOOD))
+
+
+def test_an_offset_is_what_the_drive_shows_at_zero() -> None:
+    """SI = raw factor + offset, here of an encoder whose zero is at 30 degrees."""
+    angle = 'type = "INTEGER32", unit = "deg"'
+    cell = parse(GOOD.replace(angle, f"{angle}, offset = {math.radians(30.0)!r}")).cells["encoder.offset_rad"]
+    assert int.from_bytes(cell.encode(math.radians(75.0), {}), "little") == 45
+    assert cell.decode((45).to_bytes(4, "little"), {}) == pytest.approx(math.radians(75.0), rel=1e-12)
 
 
 def test_identity() -> None:

@@ -12,6 +12,7 @@ from pmsmtool.bus.supervision import SecondMaster
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.errors import ConfigError, DriveFault, NotAvailable, PmsmtoolError, SafetyRefusal, VerifyMismatch
 from pmsmtool.firmware.drive_map import Cell, DriveMap, reference_map
+from pmsmtool.flash.journal import MARKS
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.sim.line import Frame
 from tests.flash.rig import SMALL, Rig, attach, open_rig, with_tables
@@ -241,6 +242,25 @@ def test_silent_rounding_is_caught(tmp_path: Path) -> None:
     with pytest.raises(VerifyMismatch, match="motor.L_d_h"):
         rig.download(SMALL)
     assert rig.image() == before
+
+
+def test_a_stored_set_with_another_check_sum_is_not_confirmed(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every value that was written is there; something that was not written is another."""
+    right = DriveParameters.crc_stored.fget
+    assert right is not None
+    monkeypatch.setattr(DriveParameters, "crc_stored", property(lambda parameters: right(parameters) ^ 1))
+    with pytest.raises(VerifyMismatch, match="the stored set is"):
+        rig.download(SMALL)
+
+
+def test_a_mark_that_is_not_kept_is_told(rig: Rig) -> None:
+    session = rig.bench.node.session
+    assert session is not None
+    name, index, sub = MARKS[0]
+    (entry,) = [entry for entry in session.dictionary if (entry.row.index, entry.row.sub) == (index, sub)]
+    entry.sink = lambda data: None
+    with pytest.raises(VerifyMismatch, match=name):
+        rig.download(SMALL)
 
 
 def test_value_that_changes_over_the_reset_is_named_and_taken_back(rig: Rig) -> None:
