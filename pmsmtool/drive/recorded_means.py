@@ -6,18 +6,21 @@ import math
 from collections.abc import Mapping, Sequence
 
 from pmsmtool.bus.connection import Connection
+from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.recorder import Recorder
 from pmsmtool.firmware.drive_map import DriveMap
 
-SAMPLES = 256
-"""Samples of a mean: 8 signals are 8 KiB, 0.14 s on the bus, and the noise is a sixteenth of a sample's."""
-
+AT_REST, TURNING = 1024, 64
+"""Samples of a mean. With the shaft at rest there is time (32 KiB are half a second); a shaft that turns changes its
+speed while a record is uploaded, and 8 signals of 64 samples are 35 ms."""
+REST_RAD_S = 20.0
+"""Electrical speed below which a shaft counts as being at rest."""
 ANGLE = "theta_m_rad"
 
 
 class RecordedMeans(Recorder):
-    """Means over a window from a record of it, thinned out to :data:`SAMPLES`."""
+    """Means over a window from a record of it, thinned out to so many samples as there is time to upload."""
 
     _decimation = 1
     _angle_rad = 0.0
@@ -30,7 +33,8 @@ class RecordedMeans(Recorder):
         NotAvailable
             The drive has no recorder, or not these signals.
         """
-        self._decimation = max(1, math.ceil(periods / SAMPLES))
+        turning = abs(self._node.get(objects.LIVE["omega_e_rad_s"])) > REST_RAD_S
+        self._decimation = max(1, math.ceil(periods / (TURNING if turning else AT_REST)))
         self.arm(signals, max(1, periods // self._decimation), self._decimation, 0, at_excitation=False)
 
     def finish_average(self, signals: Sequence[str]) -> Mapping[str, float]:
