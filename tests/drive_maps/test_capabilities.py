@@ -142,7 +142,7 @@ def test_caps_of_an_unknown_drive_says_so() -> None:
     outcome = run("--sim", CHANNEL + "&drive=copley", "caps")
     assert outcome.exit_code == 0 and "no map names this drive" in outcome.stderr
     outcome = run("--sim", CHANNEL + "&drive=copley", "caps", "--map", "copley")
-    assert "map copley (7 parameters)" in outcome.stdout
+    assert "map copley (9 parameters)" in outcome.stdout
 
 
 @pytest.mark.parametrize(
