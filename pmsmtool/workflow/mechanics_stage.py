@@ -33,6 +33,9 @@ EMF_SHARE = 0.6
 ABORT_SHARE = 0.95
 REST_SHARE = 0.02
 """Largest speed before the first push, of the speed that it is to reach."""
+SATURATION_DOUBT = 0.25
+"""Relative standard deviation of the torque without a flux map, of the curvature of psi_d over i_d: the flux that a q
+current takes from the d axis is not seen. The saturated profile has a curvature of 3 % and its J was 0.77 % off."""
 SAMPLE_DOUBT = 0.2
 """Relative standard deviation of the displacement that a dead time gives the sample of a current; on nine random
 drives with a switched inverter 0.02 to 0.5 % of J went down to at most 0.03 % with it."""
@@ -118,12 +121,13 @@ def mechanics_of(
             parts[k] = _between_samples(sampled, direction * pole_pairs, result, dead_time_s)
             moved = float(np.mean(np.abs(parts[k]["i_q_a"] - sampled["i_q_a"])))
             displaced = max(displaced, moved / float(np.mean(np.abs(sampled["i_q_a"]))))
+    unseen = 0.0 if result.flux_map is not None else SATURATION_DOUBT * result.flux.curvature
     return estimate_mechanics(
         parts,
         torque_of(result, pole_pairs),
         1.5 * pole_pairs * psi.value,
         result.noise.sigma_a,
-        math.hypot(psi.std / psi.value, SAMPLE_DOUBT * displaced),
+        math.hypot(psi.std / psi.value, SAMPLE_DOUBT * displaced, unseen),
         direction=direction,
         tolerance=tolerance,
     )
