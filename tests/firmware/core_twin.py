@@ -132,8 +132,39 @@ class Twin:
             total = [t / weight for t in total]
         return total[0], sign * total[1]
 
+    def lookup_within_limit(self, tau: np.float32, *rest: np.float32) -> Vector:
+        """Cut the torque until the table's current keeps the limit."""
+        power = self["motor.I_max_apk"] * self["motor.I_max_apk"]
+
+        def size(i: Vector) -> np.float32:
+            return i[0] * i[0] + i[1] * i[1]
+
+        def way_out() -> np.float32:
+            way = outside[0] - inside[0], outside[1] - inside[1]
+            a, b, c = size(way), inside[0] * way[0] + inside[1] * way[1], size(inside) - power
+            root = np.sqrt(b * b - a * c)
+            return -c / (b + root) if b > 0 else (root - b) / a
+
+        outside = self.lookup(tau, *rest)
+        if size(outside) <= power:
+            return outside
+        flags = self.flags | 4
+        inside, low, high = self.lookup(f(0), *rest), f(0), tau
+        if size(inside) < power:
+            for _ in range(2):
+                middle = low + way_out() * (high - low)
+                i = self.lookup(middle, *rest)
+                if size(i) < power:
+                    inside, low = i, middle
+                else:
+                    outside, high = i, middle
+            share = way_out()
+            inside = (inside[0] + share * (outside[0] - inside[0]), inside[1] + share * (outside[1] - inside[1]))
+        self.flags = flags
+        return inside
+
     def torque_to_current(self, tau: np.float32, omega_M: np.float32, omega_e: np.float32, U_dc: np.float32) -> Vector:
-        i = self.lookup(tau, omega_M, omega_e, U_dc)
+        i = self.lookup_within_limit(tau, omega_M, omega_e, U_dc)
         if i[0] < self["field_weakening.i_d_min_a"]:
             self.flags |= 4
             i = self["field_weakening.i_d_min_a"], i[1]

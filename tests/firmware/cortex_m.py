@@ -313,6 +313,12 @@ class Emulator:
         self.uc.emu_start(start | 1, RETURN)
         return self.count, self.cycles
 
+    def set_floats(self, *values: float) -> None:
+        """Floating-point arguments of the next call, where they travel in registers."""
+        for k, value in enumerate(values):
+            (word,) = struct.unpack("<I", struct.pack("<f", value))
+            self.uc.reg_write(getattr(self.arm, f"UC_ARM_REG_S{k}"), word)
+
     def result(self) -> int:
         """First word that the last function returned."""
         return int(self.uc.reg_read(self.arm.UC_ARM_REG_R0))

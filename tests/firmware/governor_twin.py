@@ -28,6 +28,8 @@ from tests.firmware.projection_twin import (
 
 EMPTY, STEERED = 254, 250
 EMPTY_MARGIN, HOLD_SHARE, LANDING_REST, ACCURACY, CLOSE_SHARE = f(1.00001), f(0.99), f(0.26), f(1e-2), f(0.95)
+STILL_SHARE, MODEL_SHARE = f(0.2), f(0.1)
+TRIALS, INSIDE = 2, f(0.9999995)
 FLAG_FALLBACK = 64
 
 
@@ -41,6 +43,9 @@ class GovernedTwin(Twin):
     disturbance: Vector = (ZERO, ZERO)
     time_to_go: np.float32 = ZERO
     landing: bool = False
+    news: list[np.float32] = field(default_factory=lambda: [ZERO, ZERO])
+    off_model: bool = False
+    u: Vector = (ZERO, ZERO)
     reachable: Vector | None = None
     omega: np.float32 = ZERO
     T_s: np.float32 = ZERO
@@ -61,10 +66,13 @@ class GovernedTwin(Twin):
         u = park(self.committed, s * cosine + c * sine, c * cosine - s * sine)
         mean = HALF * (self.i[0] + self.before[0]), HALF * (self.i[1] + self.before[1])
         model, rate, gain = self.model_voltage(mean), ONE / self.T_s, self["governor.observer_gain"]
-        z = [u[k] - model[k] - self[f"motor.L_{axis}_h"] * ((self.i[k] - self.before[k]) * rate)
-             for k, axis in enumerate("dq")]
-        d = self.disturbance
-        self.disturbance = d[0] + gain * (z[0] - d[0]), d[1] + gain * (z[1] - d[1])
+        inductive = [self[f"motor.L_{axis}_h"] * ((self.i[k] - self.before[k]) * rate) for k, axis in enumerate("dq")]
+        d, before, power = self.disturbance, self.news, self.V_max * self.V_max
+        self.news = news = [u[k] - model[k] - inductive[k] - d[k] for k in range(2)]
+        if square((inductive[0], inductive[1])) <= STILL_SHARE * STILL_SHARE * power:
+            agreed = [ZERO if a * b <= 0 else (a if abs(a) < abs(b) else b) for a, b in zip(news, before, strict=True)]
+            self.disturbance = d[0] + gain * agreed[0], d[1] + gain * agreed[1]
+        self.off_model = bool(square((news[0], news[1])) > MODEL_SHARE * MODEL_SHARE * power)
 
     def rows(self) -> tuple[list[Row], int, Vector]:
         """All rows, the index of the steady-state one, and the voltage beside the model."""
@@ -108,12 +116,34 @@ class GovernedTwin(Twin):
             ))
         return rows
 
+    def admits(self, rows: list[Row], steady: int, r: Vector) -> bool:
+        """Row 0, steady state and current as rows; in between the demand along the trajectory of the request."""
+        if not all(square(row.voltage(r)) <= row.V * row.V for row in (rows[0], *rows[steady:])):
+            return False
+        w, R = self.omega, self["motor.R_s_ohm"]
+        X, emf = (w * self["motor.L_d_app_h"], w * self["motor.L_q_app_h"]), w * self["motor.psi_f_wb"]
+        K = self["current.K_p_d_v_per_a"], self["current.K_p_q_v_per_a"]
+        K_iT = [self.T_s * self[f"current.K_i_{axis}_v_per_as"] for axis in "dq"]
+        T_L = [self.T_s / self[f"motor.L_{axis}_h"] for axis in "dq"]
+        i, x = [*self.i], [*self.x]
+        u = [K[k] * (r[k] - i[k]) + x[k] for k in range(2)]
+        for _ in range(steady - 1):
+            for k in range(2):
+                following = x[k] + K_iT[k] * (r[k] - i[k])
+                i[k] = i[k] + T_L[k] * (u[k] - R * i[k])
+                x[k] = following
+                u[k] = K[k] * (r[k] - i[k]) + following
+            if square((u[0] - X[1] * i[1], u[1] + (X[0] * i[0] + emf))) > self.V_max * self.V_max:
+                return False
+        return True
+
     def line_search(self, rows: list[Row], steady: int, r: Vector) -> tuple[Vector, int]:
         p = self.held
         way = r[0] - p[0], r[1] - p[1]
         kappa, active = ONE, NONE
         for k, row in enumerate(rows):
             share = row_share(row, p, way, self["governor.slack"])
+            self.flags |= FLAG_FALLBACK if share < 0 else 0
             if share < kappa and (k <= steady or share >= 0):
                 kappa, active = share, k
             if kappa < 0:
@@ -144,7 +174,7 @@ class GovernedTwin(Twin):
             return v, True
         if kept is not None and self.time_to_go <= 0:
             return kept, True
-        both = project_rows([pre, rows[-1]], r)
+        both = project_rows([pre, rows[-1]], r, (v, [0 if v != r else NONE, NONE]))
         v = v if both is None else both[0]
         self.reachable = v
         return v, False
@@ -156,7 +186,7 @@ class GovernedTwin(Twin):
             r, may_start = self.pre_project(rows, steady, r)
         asks_first = int(self.values["governor.mode"]) in (PAPER, BEST)
         self.binding = NONE
-        if asks_first and all(square(row.voltage(r)) <= row.V * row.V for row in rows):
+        if asks_first and self.admits(rows, steady, r):
             v = self.land(rows[0], r)
         elif asks_first and options & MINIMUM_TIME:
             v = self.steer(rows, steady, offset, r, may_start)
@@ -164,16 +194,19 @@ class GovernedTwin(Twin):
             v, self.binding = self.solve(rows, steady, r)
         w = rows[0].voltage(v)
         power = square(w)
+        self.u = w
         if power > self.V_max * self.V_max:
-            share = ONE - self.V_max / np.sqrt(power)
-            v = v[0] - share * w[0] / rows[0].dd, v[1] - share * w[1] / rows[0].qq
+            share = ONE - INSIDE * self.V_max / np.sqrt(power)
+            over = share * w[0], share * w[1]
+            self.u = w[0] - over[0], w[1] - over[1]
+            v = v[0] - over[0] / rows[0].dd, v[1] - over[1] / rows[0].qq
         if v[0] != request[0] or v[1] != request[1]:
             self.flags |= 32
         return v
 
     def land(self, now: Row, r: Vector) -> Vector:
         landing, self.landing, self.time_to_go = self.landing, False, ZERO
-        if not landing:
+        if not landing or self.off_model:
             return r
         self.binding = STEERED
         out = []
@@ -201,24 +234,24 @@ class GovernedTwin(Twin):
         return v
 
     def at_time(self, T: np.float32, a: Vector, b: Vector, drops: tuple[Vector, Vector]) -> tuple:
-        """Way, its rate, gap and the slope of the gap after time T."""
+        """Way, its rate, gap, the slope of the gap times the way's length, and that length after time T."""
         s, c = sincos(self.omega * T)
         turned = c * b[0] - s * b[1], s * b[0] + c * b[1]
         drop = (drops[0][0] + c * drops[1][0] - s * drops[1][1], drops[0][1] + s * drops[1][0] + c * drops[1][1])
         m = turned[0] - a[0] + drop[0] * T, turned[1] - a[1] + drop[1] * T
         rate = drop[0] - self.omega * turned[1], drop[1] + self.omega * turned[0]
         size = np.sqrt(square(m))
-        return m, rate, size - self.V_max * T, (m[0] * rate[0] + m[1] * rate[1]) / (size + f(1e-12)) - self.V_max
+        return m, rate, size - self.V_max * T, (m[0] * rate[0] + m[1] * rate[1]) - self.V_max * size, size
 
-    def find_time(self, way: tuple, T: np.float32, least: np.float32, trials: int) -> tuple[np.float32, Vector | None]:
+    def find_time(self, way: tuple, T: np.float32, least: np.float32) -> tuple[np.float32, Vector | None]:
         """Time and way of the transfer; without a way the time to go on from, 0 when there is no transfer."""
         low, high, w = ZERO, ZERO, abs(self.omega)
-        for _ in range(trials):
+        for _ in range(TRIALS):
             if T * w > f(100):
                 break
-            m, rate, gap, slope = self.at_time(T, *way)
+            m, rate, gap, slope, size = self.at_time(T, *way)
             if slope < 0 and abs(gap) <= ACCURACY * self.V_max * T:
-                last = -gap / slope
+                last = -gap * size / slope
                 T = T + last
                 return (T, (m[0] + last * rate[0], m[1] + last * rate[1])) if T > least else (ZERO, None)
             low, high = (T, high) if gap > 0 else (low, T)
@@ -226,7 +259,7 @@ class GovernedTwin(Twin):
                 return ZERO, None
             step = ONE * T
             if slope < 0:
-                step = -gap / slope
+                step = -gap * size / slope
                 step = ONE / w if step * w > ONE else step
             following = T + step
             T = HALF * (low + high) if following <= low or (high > 0 and following >= high) else following
@@ -240,10 +273,10 @@ class GovernedTwin(Twin):
         drops = tuple((HALF * (R * x[0] + offset[0]), HALF * (R * x[1] + offset[1])) for x in (self.i, target))
         T, m = self.time_to_go - self.T_s, None
         if T > 0:
-            T, m = self.find_time((a, b, drops), T, least, 3)
+            T, m = self.find_time((a, b, drops), T, least)
         elif may_start and not self.is_cornered(offset):
             direct = f(0.7) * np.sqrt(square((b[0] - a[0], b[1] - a[1]))) / self.V_max
-            T, m = self.find_time((a, b, drops), max(direct, least), least, 4)
+            T, m = self.find_time((a, b, drops), max(direct, least), least)
         else:
             T = ZERO
         self.time_to_go = T if m is None else ZERO
@@ -301,7 +334,7 @@ class GovernedTwin(Twin):
         if self.observed:
             self.observe(s, c)
         v = self.govern(request)
-        u = self.demand((v[0] - i[0], v[1] - i[1]), i, omega)
+        u = self.u
         realised = self.limit_voltage(u, self.V_max)
         stator = park_inverse(realised, s_out, c_out)
         duties, clipped = self.duties(stator, U_dc)

@@ -101,7 +101,8 @@ class PolarTwin(Twin):
         u, i = park(self.committed, s, c), self.i
         psi = self["motor.L_d_app_h"] * i[0] + self.psi, self["motor.L_q_app_h"] * i[1]
         drop, lost = HALF * self.T_s * self.R, self.disturbance
-        sine, cosine = sincos(self.omega * self.T_s)
+        half, cosine_half = sincos(HALF * self.T_s * self.omega)
+        sine, cosine = TWO * half * cosine_half, ONE - TWO * half * half
         fixed = (psi[0] + self.T_s * (u[0] - lost[0]) - drop * i[0], psi[1] + self.T_s * (u[1] - lost[1]) - drop * i[1])
         turned = park(fixed, sine, cosine)
         L = self["motor.L_d_h"], self["motor.L_q_h"]

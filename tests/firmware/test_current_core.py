@@ -133,6 +133,40 @@ def test_lookup_equals_the_twin_in_both_formats(kind: int, n_z: int, holes: bool
     assert bool(seen & FLAG_NO_POINT) == holes
 
 
+LIMITED_TORQUE = 0.01
+"""Share of the torque within the limit that is left on the table; measured 0.0005."""
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_a_cut_current_limit_cuts_the_torque_not_its_current_alone(double: bool) -> None:
+    """The table's law is kept: largest torque whose current is inside the limit, not all current in d."""
+    L, psi, V_m, p = 2.2e-3, 0.41, 0.92 * 210 / math.sqrt(3), 4
+    torque, speed = np.linspace(0, 100, 9), np.linspace(100, 900, 17)
+    i_q = (torque / (1.5 * p * psi))[:, None] * np.ones(len(speed))
+    flux = np.broadcast_to(V_m / (speed * math.pi / 30 * p), i_q.shape)
+    i_d = np.minimum(0.0, (np.sqrt(np.maximum(flux**2 - (L * i_q) ** 2, 0.0)) - psi) / L)
+    lut = b"".join(np.asarray(x, dtype=f).tobytes() for x in (torque, speed, [210.0], i_d, i_q))
+    layout = {"lut.format": 1, "lut.n_x": 9, "lut.n_y": 17, "lut.n_z": 1, "lut.axis_kind": 0}
+
+    def currents(rpm: float, taus: np.ndarray, limit: float) -> list[tuple[float, float, int]]:
+        values = tuned(field_weakening__mode=1) | layout | {"motor.I_max_apk": limit, "motor.I_max_time_s": 3600.0}
+        loop = Loop(core(double=double), values, omega=rpm * math.pi / 30 * p, U_dc=210.0, lut=lut)
+        rows = []
+        for tau in taus:
+            live = loop.step(mode=MODE_TORQUE, tau_ref=tau)
+            rows.append((live.i_d_req, live.i_q_req, live.flags))
+        return rows
+
+    for rpm, limit in ((450.0, 20.0), (700.0, 20.0), (700.0, 36.0), (760.0, 30.0)):
+        best = max(q for d, q, _ in currents(rpm, np.linspace(0, 100, 401), 200.0) if math.hypot(d, q) <= limit)
+        for sign, (d, q, flags) in zip((1.0, -1.0), currents(rpm, np.array([95.0, -95.0]), limit), strict=True):
+            assert math.hypot(d, q) == pytest.approx(limit, rel=1e-5)
+            assert flags & FLAG_CURRENT
+            assert sign * q == pytest.approx(best, rel=LIMITED_TORQUE, abs=0.08)  # the grid of best is 0.1 A
+    d, q, _ = currents(880.0, np.array([50.0]), 20.0)[0]  # the voltage alone takes more than the limit: all to i_d
+    assert (d, q) == (pytest.approx(-20.0), 0.0)
+
+
 def test_double_build_follows_the_float_build() -> None:
     values = tuned()
     loops = [Loop(core(double=double), values, omega=620 * math.pi / 30 * 4, U_dc=210) for double in (False, True)]

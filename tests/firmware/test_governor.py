@@ -257,6 +257,44 @@ def test_speed_ramp_and_speed_steps_without_field_weakening() -> None:
     assert baseline["i"][-1, 1] < -50  # back-calculation ends in full braking torque
 
 
+def test_line_search_says_when_a_row_is_given_up() -> None:
+    values = reference_case(4000.0, governor__mode=LINE, governor__eps=0.001, governor__I_transient_apk=20.0,
+                            governor__options=CURRENT_ROW)
+    loop = Loop(core(), values, omega=300 * RPM, U_dc=V_DC)
+    loop.settle_at(0.0, 30.0)  # the held reference is beyond the row
+    first = loop.step(mode=MODE_CURRENT, i_q_ref=10.0)
+    assert first.flags & FLAG_FALLBACK
+    assert not loop.step(mode=MODE_CURRENT, i_q_ref=10.0).flags & FLAG_FALLBACK
+
+
+def test_observer_learns_a_wrong_flux_and_not_a_wrong_inductance_or_a_jump() -> None:
+    values = best(governor__observer_gain=0.1)
+
+    def lost(loop: Loop) -> float:
+        return math.hypot(loop.state.disturbance.d, loop.state.disturbance.q)
+
+    for rpm, most in ((0, 1.0), (500, 3.0)):  # V; 0.44, and 2.63 of which 2.64 are true; 23.5 and 25.4 without a hold
+        loop = Loop(core(), values, omega=rpm * RPM, U_dc=V_DC)
+        loop.plant.L_d, loop.plant.L_q = 0.7 * loop.plant.L_d, 0.7 * loop.plant.L_q
+        charged = []
+        for k in range(240):
+            loop.step(mode=MODE_CURRENT, i_q_ref=20.0 if k < 120 else -20.0)
+            charged.append(lost(loop))
+        assert max(charged) <= most
+    loop = Loop(core(), values, omega=500 * RPM, U_dc=V_DC)
+    loop.settle_at(0.0, 10.0)
+    loop.plant.psi *= 0.9
+    for _ in range(400):
+        loop.step(mode=MODE_CURRENT, i_q_ref=10.0)
+    assert loop.state.disturbance.q == pytest.approx(-0.1 * 0.41 * 500 * RPM, rel=0.01)
+    loop = Loop(core(), values, omega=500 * RPM, U_dc=V_DC)
+    loop.settle_at(0.0, 10.0)
+    loop.step(mode=MODE_CURRENT, i_q_ref=10.0)
+    loop.plant.omega *= 1.6
+    loop.step(mode=MODE_CURRENT, i_q_ref=10.0)
+    assert lost(loop) <= 0.05  # V; 8e-7, 5.2 without
+
+
 @pytest.mark.parametrize("condition", [NOMINAL, DELAYED])
 def test_line_search_follows_a_speed_step_to_where_no_current_within_the_row_can_be_held(condition: Condition) -> None:
     drive = GovernedDrive(Law("line search", "line", eps=1e-3), condition)

@@ -2,7 +2,23 @@
 #ifndef PMSM_ACTIVE_SET_H
 #define PMSM_ACTIVE_SET_H
 
+#include "pmsm_math.h"
 #include "pmsm_projection.h"
+
+#ifdef PMSM_REAL_DOUBLE
+#define PMSM_PROJECTION_VIOLATION 1e-10 /* |w|^2/V^2 - 1 that counts as satisfied */
+#define PMSM_PROJECTION_STALL 1e-7      /* the same, when rounding keeps a row from coming closer */
+#define PMSM_PROJECTION_SINGULAR 1e-13  /* relative determinant below which two normals count as parallel */
+#else
+#define PMSM_PROJECTION_VIOLATION 5e-6F
+#define PMSM_PROJECTION_STALL 2e-5F
+#define PMSM_PROJECTION_SINGULAR 1e-6F
+#endif
+
+static inline pmsm_real pmsm_dot(pmsm_dq x, pmsm_dq y)
+{
+    return x.d * y.d + x.q * y.q;
+}
 
 typedef struct {                  /* a projection under way; rows can be added to what is solved already */
     const pmsm_row *row;
@@ -15,9 +31,21 @@ typedef struct {                  /* a projection under way; rows can be added t
     pmsm_dq v;                    /* nearest point to r that satisfies the rows so far */
 } pmsm_active_set;
 
-/* Begin with no row, then take in the first count rows. An empty set leaves v as it was before the
- * row that emptied it. */
-void pmsm_projection_begin(pmsm_active_set *set, const pmsm_row *rows, pmsm_dq r);
+/* Begin with no row. */
+static inline void pmsm_projection_begin(pmsm_active_set *set, const pmsm_row *rows, pmsm_dq r)
+{
+    set->row = rows;
+    set->count = 0u;
+    set->basis[0] = PMSM_PROJECTION_NONE;
+    set->basis[1] = PMSM_PROJECTION_NONE;
+    set->limit = PMSM_PROJECTION_NONE;
+    set->goal = PMSM_PROJECTION_NONE;
+    set->smallest = r;
+    set->r = r;
+    set->v = r;
+}
+
+/* Take in the first count rows. An empty set leaves v as it was before the row that emptied it. */
 uint32_t pmsm_projection_extend(pmsm_active_set *set, uint32_t count, uint32_t *steps);
 
 #endif

@@ -105,17 +105,14 @@ pmsm_dq pmsm_model_voltage(const pmsm_period *period, pmsm_dq i)
     return u;
 }
 
-/* Voltage that the model lacks, from what acted over the last period: the applied voltage minus the model's at the
- * mean current and its change. First-order filter of this gain per period. */
-void pmsm_observe_disturbance(pmsm_period *period, pmsm_real gain)
+pmsm_dq pmsm_lost_voltage(const pmsm_period *period, pmsm_dq *inductive)
 {
-    pmsm_state *state = period->state;
+    const pmsm_state *state = period->state;
     const pmsm_params *params = period->params;
     const pmsm_dq held = (params->inverter_delay_periods >= 1.0F) ? state->voltage_before : state->voltage_committed;
     const pmsm_ab stator = {held.d, held.q};
-    pmsm_real sine;
-    pmsm_real cosine;
-    pmsm_sincos(PMSM_C(-0.5) * state->derived.T_s * period->omega_e, &sine, &cosine);
+    const pmsm_real sine = -period->sine_half;
+    const pmsm_real cosine = period->cosine_half;
     const pmsm_real sine_mean = period->sine * cosine + period->cosine * sine;
     const pmsm_real cosine_mean = period->cosine * cosine - period->sine * sine;
     const pmsm_dq u = pmsm_park(stator, sine_mean, cosine_mean);
@@ -125,10 +122,20 @@ void pmsm_observe_disturbance(pmsm_period *period, pmsm_real gain)
     const pmsm_real rate = PMSM_C(1.0) / state->derived.T_s;
     const pmsm_real slope_d = (period->i.d - state->current_before.d) * rate;
     const pmsm_real slope_q = (period->i.q - state->current_before.q) * rate;
-    const pmsm_real z_d = u.d - model.d - (pmsm_real)params->motor_L_d_h * slope_d;
-    const pmsm_real z_q = u.q - model.q - (pmsm_real)params->motor_L_q_h * slope_q;
-    state->disturbance.d += gain * (z_d - state->disturbance.d);
-    state->disturbance.q += gain * (z_q - state->disturbance.q);
+    inductive->d = (pmsm_real)params->motor_L_d_h * slope_d;
+    inductive->q = (pmsm_real)params->motor_L_q_h * slope_q;
+    const pmsm_dq lost = {u.d - model.d - inductive->d, u.q - model.q - inductive->q};
+    return lost;
+}
+
+void pmsm_observe_disturbance(pmsm_period *period, pmsm_real gain)
+{
+    pmsm_dq *held = &period->state->disturbance;
+    pmsm_dq inductive;
+    pmsm_turn_half(period);
+    const pmsm_dq lost = pmsm_lost_voltage(period, &inductive);
+    held->d += gain * (lost.d - held->d);
+    held->q += gain * (lost.q - held->q);
 }
 
 /* What the limiter took, as a change of the reference. A controller without a proportional part has none: at the limit
@@ -165,7 +172,7 @@ void pmsm_current_integrate(pmsm_period *period)
 
 /* Current at the start of the next period under the voltage that acts in this one. Flux in the stator frame is
  * integrated with the resistance drop at the mean current, then seen from the rotor turned by omega_e T_s. */
-pmsm_dq pmsm_predict_current(const pmsm_period *period)
+pmsm_dq pmsm_predict_current(pmsm_period *period)
 {
     const pmsm_params *params = period->params;
     const pmsm_real T_s = period->state->derived.T_s;
@@ -174,9 +181,10 @@ pmsm_dq pmsm_predict_current(const pmsm_period *period)
     const pmsm_dq psi = {(pmsm_real)params->motor_L_d_app_h * period->i.d + (pmsm_real)params->motor_psi_f_wb,
                          (pmsm_real)params->motor_L_q_app_h * period->i.q};
     const pmsm_real drop = PMSM_C(0.5) * T_s * period->R_s;
-    pmsm_real sine;
-    pmsm_real cosine;
-    pmsm_sincos(period->omega_e * T_s, &sine, &cosine);
+    pmsm_turn_half(period);
+    const pmsm_real half = period->sine_half;
+    const pmsm_real sine = PMSM_C(2.0) * half * period->cosine_half;
+    const pmsm_real cosine = PMSM_C(1.0) - PMSM_C(2.0) * half * half;
     const pmsm_dq lost = period->state->disturbance; /* what an observer found missing, zero without one */
     const pmsm_ab fixed = {psi.d + T_s * (u.d - lost.d) - drop * period->i.d,
                            psi.q + T_s * (u.q - lost.q) - drop * period->i.q};

@@ -113,11 +113,14 @@ static pmsm_dq project(problem *q, pmsm_dq y)
 {
     pmsm_dq x = y;
     uint32_t active;
+    uint32_t steps = 0u;
+    uint32_t more = 0u;
     q->empty = 0u;
-    if (pmsm_project_rows(q->row, q->rows, y, &x, &active, &q->steps) == PMSM_PROJECTION_EMPTY) {
-        x = pmsm_smallest_voltage(&q->row[1], &q->row[0], &q->steps);
+    if (pmsm_project_rows(q->row, q->rows, y, &x, &active, &steps) == PMSM_PROJECTION_EMPTY) {
+        x = pmsm_smallest_voltage(&q->row[1], &q->row[0], &more);
         q->empty = 1u;
     }
+    q->steps += steps + more;
     if (x.d > q->d_max) {
         return project_on_bound(q, q->d_max, y.q);
     }

@@ -8,8 +8,7 @@
 #include "pmsm_period.h"
 
 #define SHORTEST_PERIODS PMSM_C(3.0) /* a shorter transfer is left to the projection */
-#define TRIALS_START 4u  /* then the search goes on in the next period; 2.8 in the mean of random transfers */
-#define TRIALS_FOLLOW 3u
+#define TRIALS 2u /* then the search goes on in the next period; 2.8 in the mean to start, 1 to follow */
 #define DIRECT_SHARE PMSM_C(0.7)     /* first guess, of the time at standstill */
 #define GROWTH PMSM_C(1.0)           /* of T, where the gap does not close yet */
 #define LONGEST_STEP PMSM_C(1.0)     /* rad */
@@ -28,7 +27,8 @@ typedef struct {
     pmsm_dq m;
     pmsm_dq rate;    /* dm / dT */
     pmsm_real gap;   /* |m| - V T */
-    pmsm_real slope; /* d gap / dT */
+    pmsm_real slope; /* d gap / dT times |m| */
+    pmsm_real size;  /* |m| */
 } transfer_point;
 
 static transfer_point at_time(const transfer *t, pmsm_real T)
@@ -44,9 +44,9 @@ static transfer_point at_time(const transfer *t, pmsm_real T)
     point.m.q = turned.q - t->a.q + drop.q * T;
     point.rate.d = drop.d - t->omega * turned.q;
     point.rate.q = drop.q + t->omega * turned.d;
-    const pmsm_real size = PMSM_SQRT(pmsm_square(point.m));
-    point.gap = size - t->V * T;
-    point.slope = (point.m.d * point.rate.d + point.m.q * point.rate.q) / (size + PMSM_C(1e-12)) - t->V;
+    point.size = PMSM_SQRT(pmsm_square(point.m));
+    point.gap = point.size - t->V * T;
+    point.slope = (point.m.d * point.rate.d + point.m.q * point.rate.q) - t->V * point.size;
     return point;
 }
 
@@ -57,7 +57,7 @@ static pmsm_real next_time(const transfer *t, const transfer_point *point, pmsm_
 {
     pmsm_real step = GROWTH * T;
     if (point->slope < PMSM_C(0.0)) {
-        step = -point->gap / point->slope;
+        step = -point->gap * point->size / point->slope;
         step = (step * pmsm_abs(t->omega) > LONGEST_STEP) ? LONGEST_STEP / pmsm_abs(t->omega) : step;
     }
     const pmsm_real next = T + step;
@@ -66,14 +66,14 @@ static pmsm_real next_time(const transfer *t, const transfer_point *point, pmsm_
 }
 
 /* The time T of the transfer and the way m, from a first guess. Not when it is shorter than least. */
-static enum pmsm_transfer find_time(const transfer *t, pmsm_real least, uint32_t trials, pmsm_real *T, pmsm_dq *m)
+static enum pmsm_transfer find_time(const transfer *t, pmsm_real least, pmsm_real *T, pmsm_dq *m)
 {
     pmsm_real low = PMSM_C(0.0);
     pmsm_real high = PMSM_C(0.0);
-    for (uint32_t k = 0u; k < trials && *T * pmsm_abs(t->omega) <= LONGEST_ANGLE; k++) {
+    for (uint32_t k = 0u; k < TRIALS && *T * pmsm_abs(t->omega) <= LONGEST_ANGLE; k++) {
         const transfer_point point = at_time(t, *T);
         if (point.slope < PMSM_C(0.0) && pmsm_abs(point.gap) <= ACCURACY * t->V * *T) {
-            const pmsm_real last = -point.gap / point.slope;
+            const pmsm_real last = -point.gap * point.size / point.slope;
             m->d = point.m.d + last * point.rate.d;
             m->q = point.m.q + last * point.rate.q;
             *T += last;
@@ -177,22 +177,20 @@ enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, p
     pmsm_dq m;
     enum pmsm_transfer found = PMSM_TRANSFER_NONE;
     if (T > PMSM_C(0.0)) {
-        found = find_time(&t, least, TRIALS_FOLLOW, &T, &m);
+        found = find_time(&t, least, &T, &m);
     } else if (may_start != 0u && is_cornered(period, offset) == 0u) {
         const pmsm_dq way = {t.b.d - t.a.d, t.b.q - t.a.q};
         T = DIRECT_SHARE * PMSM_SQRT(pmsm_square(way)) / t.V;
         T = (T > least) ? T : least;
-        found = find_time(&t, least, TRIALS_START, &T, &m);
+        found = find_time(&t, least, &T, &m);
     }
     state->time_to_go = (found == PMSM_TRANSFER_SOUGHT) ? T : PMSM_C(0.0);
     if (found != PMSM_TRANSFER_FOUND) {
         return found;
     }
-    pmsm_real sine;
-    pmsm_real cosine;
-    pmsm_sincos(PMSM_C(0.5) * T_s * period->omega_e, &sine, &cosine);
     const pmsm_ab along = {m.d, m.q};
-    pmsm_dq w = pmsm_park(along, sine, cosine); /* seen from the rotor in the middle of the period */
+    pmsm_turn_half(period);
+    pmsm_dq w = pmsm_park(along, period->sine_half, period->cosine_half); /* from the rotor in mid-period */
     const pmsm_real scale = pmsm_voltage_radius(period, w) / PMSM_SQRT(pmsm_square(m));
     w.d *= scale;
     w.q *= scale;

@@ -32,7 +32,7 @@ enum pmsm_flag {
     PMSM_FLAG_LUT_EDGE = 1u << 3,         /* the look-up was asked outside its axes */
     PMSM_FLAG_LUT_NO_POINT = 1u << 4,     /* the look-up cell holds no operating point */
     PMSM_FLAG_GOVERNOR_ACTIVE = 1u << 5,  /* the governor changed the reference */
-    PMSM_FLAG_GOVERNOR_FALLBACK = 1u << 6,/* the admissible set was empty */
+    PMSM_FLAG_GOVERNOR_FALLBACK = 1u << 6,/* not all rows of the governor could be met */
     PMSM_FLAG_FW_EMPTY = 1u << 7,         /* no current satisfies voltage and current limit */
     PMSM_FLAG_I2T = 1u << 8,              /* the time-limited current budget is used up */
     PMSM_FLAG_ADC_CLIPPED = 1u << 9,      /* set by the drive: a current sample was at full scale */
@@ -111,6 +111,7 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_dq voltage_before;  /* V, stator frame: computed one period before voltage_committed */
     pmsm_dq current_before;  /* A, sampled in the last period */
     pmsm_dq reference_realised; /* A, reference of the last period that its limited voltage stood for */
+    pmsm_dq news_before;     /* V, what the last period said beside disturbance */
     pmsm_real tau_granted;   /* N m, torque of the reference that the limits left */
     pmsm_real time_to_go;    /* s, of the minimum-time transfer in progress, 0 when there is none */
     pmsm_dq reachable;       /* A, a request's projection on steady-state and current row */

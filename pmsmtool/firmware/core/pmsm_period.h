@@ -22,6 +22,7 @@ typedef struct {
     pmsm_real V_max;           /* V, radius of the voltage circle */
     pmsm_real R_s;             /* ohm, at the winding temperature */
     pmsm_real sine, cosine;    /* of the sampled angle */
+    pmsm_real sine_half, cosine_half; /* of the turn in half a period, after pmsm_turn_half() */
     pmsm_real sine_out, cosine_out; /* of the angle at the middle of the applied voltage */
     pmsm_dq i;                 /* A, sampled */
     pmsm_dq i_model;           /* A, the current the proportional part sees: sampled, or predicted */
@@ -57,11 +58,21 @@ void pmsm_current_integrate(pmsm_period *period);
 void pmsm_current_row(pmsm_period *period, pmsm_row *row); /* demand as a function of the reference */
 pmsm_dq pmsm_model_voltage(const pmsm_period *period, pmsm_dq i); /* steady state, nominal flux */
 pmsm_dq pmsm_hold_voltage(const pmsm_period *period, pmsm_dq i); /* what the controller gives without an error */
-void pmsm_observe_disturbance(pmsm_period *period, pmsm_real gain);
-pmsm_dq pmsm_predict_current(const pmsm_period *period);
+static inline void pmsm_turn_half(pmsm_period *period) /* once per period */
+{
+    if (period->cosine_half == PMSM_C(0.0)) {
+        pmsm_sincos(PMSM_C(0.5) * period->state->derived.T_s * period->omega_e, &period->sine_half,
+                    &period->cosine_half);
+    }
+}
+/* Voltage that the model lacks, from what acted over the last period: the applied voltage minus the model's at the mean
+ * current and minus L di/dt, which is told apart. After pmsm_turn_half(). */
+pmsm_dq pmsm_lost_voltage(const pmsm_period *period, pmsm_dq *inductive);
+void pmsm_observe_disturbance(pmsm_period *period, pmsm_real gain); /* its first-order filter */
+pmsm_dq pmsm_predict_current(pmsm_period *period);
 
-/* governor.c: period->reference becomes the governed one */
-void pmsm_govern(pmsm_period *period);
+/* governor.c: period->reference becomes the governed one; 1: period->u is its demand */
+uint32_t pmsm_govern(pmsm_period *period);
 
 /* minimum_time.c: when found, v is the reference that steers along the minimum-time direction; sought: the search takes
  * another period; barred: it would break the transient current limit */

@@ -19,7 +19,14 @@ typedef struct {                  /* the row |M v + c| <= V */
 #define PMSM_PROJECTION_EMPTY 255u /* the rows have no common point */
 #define PMSM_PROJECTION_NONE 255u  /* no row */
 #define PMSM_PROJECTION_ROWS 72u   /* most rows of one call */
-#define PMSM_PROJECTION_ROUNDS 16u /* bound of the outer loop, and of every Newton iteration inside */
+#define PMSM_PROJECTION_ROUNDS 16u /* exchanges of one call */
+/* Newton steps: a solver goes on from the count it is given up to this, so that one count bounds all that a period
+ * solves. Where it runs out the point is what was reached, on or beyond its row. At most 12 seen in binary32. */
+#ifdef PMSM_REAL_DOUBLE
+#define PMSM_PROJECTION_STEPS 32u
+#else
+#define PMSM_PROJECTION_STEPS 16u
+#endif
 
 /* M v + c. */
 static inline pmsm_dq pmsm_voltage_of(const pmsm_row *row, pmsm_dq v)

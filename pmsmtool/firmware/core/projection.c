@@ -6,27 +6,17 @@
  */
 #include "active_set.h"
 
-#include "pmsm_math.h"
+#define NONE PMSM_PROJECTION_NONE
 
 #ifdef PMSM_REAL_DOUBLE
 #define ROW_TOLERANCE 1e-11  /* | |w| - V | / V of a single-row projection */
 #define PAIR_TOLERANCE 1e-12 /* | |w|^2/V^2 - 1 | at a corner */
-#define VIOLATION 1e-10      /* |w|^2/V^2 - 1 that counts as satisfied */
-#define STALL 1e-7           /* the same, when rounding keeps a row from coming closer */
-#define SINGULAR 1e-13       /* relative determinant below which two normals count as parallel */
+#define CORNER_STEPS 8u
 #else
 #define ROW_TOLERANCE 1e-6F
 #define PAIR_TOLERANCE 1e-6F
-#define VIOLATION 5e-6F
-#define STALL 2e-5F
-#define SINGULAR 1e-6F
-#endif
-#ifdef PMSM_REAL_DOUBLE
-#define CORNER_STEPS 8u
-#else
 #define CORNER_STEPS 6u
 #endif
-#define NONE PMSM_PROJECTION_NONE
 
 typedef struct { /* symmetric 2x2 */
     pmsm_real a, b, c; /* [[a, b], [b, c]] */
@@ -73,11 +63,6 @@ static pmsm_dq times(symmetric s, pmsm_dq x)
     return y;
 }
 
-static pmsm_real dot(pmsm_dq x, pmsm_dq y)
-{
-    return x.d * y.d + x.q * y.q;
-}
-
 static pmsm_dq transposed_times(const pmsm_row *row, pmsm_dq w)
 {
     pmsm_dq y;
@@ -113,13 +98,13 @@ pmsm_dq pmsm_project_row(const pmsm_row *row, pmsm_dq r, uint32_t *steps)
     factor S = {{PMSM_C(1.0), PMSM_C(0.0), PMSM_C(1.0)}, PMSM_C(1.0)};
     pmsm_real lambda = PMSM_C(0.0);
     pmsm_dq w = a;
-    for (uint32_t k = 0u; k < PMSM_PROJECTION_ROUNDS; k++) {
+    while (*steps < PMSM_PROJECTION_STEPS) {
         const pmsm_real size = PMSM_SQRT(square);
         if (size <= enough) {
             break;
         }
         const pmsm_dq z = solve(&S, times(K, w));
-        lambda += (size - row->V) * square / (row->V * dot(w, z));
+        lambda += (size - row->V) * square / (row->V * pmsm_dot(w, z));
         S = shifted_identity(K, lambda);
         w = solve(&S, a);
         square = pmsm_square(w);
@@ -154,7 +139,7 @@ static uint32_t find_corner(const pmsm_row *first, const pmsm_row *second, pmsm_
 {
     const pmsm_real limit_1 = first->V * first->V;
     const pmsm_real limit_2 = second->V * second->V;
-    for (uint32_t k = 0u; k < CORNER_STEPS; k++) {
+    for (uint32_t k = 0u; k < CORNER_STEPS && *steps < PMSM_PROJECTION_STEPS; k++) {
         const pmsm_dq w1 = pmsm_voltage_of(first, *v);
         const pmsm_dq w2 = pmsm_voltage_of(second, *v);
         const pmsm_real f1 = PMSM_C(0.5) * (pmsm_square(w1) - limit_1);
@@ -162,7 +147,7 @@ static uint32_t find_corner(const pmsm_row *first, const pmsm_row *second, pmsm_
         const pmsm_dq n1 = transposed_times(first, w1);
         const pmsm_dq n2 = transposed_times(second, w2);
         const pmsm_real det = n1.d * n2.q - n1.q * n2.d;
-        if (det * det <= SINGULAR * (pmsm_square(n1) * pmsm_square(n2))) {
+        if (det * det <= PMSM_PROJECTION_SINGULAR * (pmsm_square(n1) * pmsm_square(n2))) {
             return 0u;
         }
         const pmsm_real inverse = PMSM_C(1.0) / det;
@@ -200,7 +185,7 @@ static uint32_t project_pair(const pmsm_row *first, const pmsm_row *second, pmsm
 {
     const pmsm_real inverse = PMSM_C(1.0) / (second->V * second->V);
     const pmsm_real depth = -excess(second, inverse, best);
-    if (depth < -VIOLATION) {
+    if (depth < -PMSM_PROJECTION_VIOLATION) {
         return 0u;
     }
     const pmsm_dq a = pmsm_voltage_of(first, outside);
@@ -228,18 +213,18 @@ pmsm_dq pmsm_smallest_voltage(const pmsm_row *goal, const pmsm_row *limit, uint3
                          B.m_dq * B.m_dq + B.m_qq * B.m_qq};
     const pmsm_dq right = transposed_times(&B, f);
     const pmsm_real enough = limit->V * (PMSM_C(1.0) + ROW_TOLERANCE);
-    pmsm_real mu = SINGULAR * (G.a + G.c); /* keeps a singular goal solvable */
+    pmsm_real mu = PMSM_PROJECTION_SINGULAR * (G.a + G.c); /* keeps a singular goal solvable */
     pmsm_real size = PMSM_C(0.0);
     pmsm_dq y = {PMSM_C(0.0), PMSM_C(0.0)};
-    for (uint32_t k = 0u; k < PMSM_PROJECTION_ROUNDS; k++) { /* Newton on 1/|y| = 1/V, monotone from below */
+    for (;;) { /* Newton on 1/|y| = 1/V, monotone from below */
         const factor S = shifted(G, mu);
         y = solve(&S, right);
         const pmsm_real square = pmsm_square(y);
         size = PMSM_SQRT(square);
-        if (size <= enough) {
+        if (size <= enough || *steps >= PMSM_PROJECTION_STEPS) {
             break;
         }
-        mu += (size - limit->V) * square / (limit->V * dot(y, solve(&S, y)));
+        mu += (size - limit->V) * square / (limit->V * pmsm_dot(y, solve(&S, y)));
         (*steps)++;
     }
     const pmsm_real scale = (size > limit->V) ? -limit->V / size : PMSM_C(-1.0);
@@ -266,7 +251,7 @@ static uint32_t most_violated(const pmsm_active_set *set, pmsm_dq v, pmsm_real *
 /* Does v satisfy the active rows? */
 static uint32_t satisfies(const pmsm_active_set *set, uint32_t k, pmsm_dq v)
 {
-    return (k == NONE || excess(&set->row[k], set->inverse[k], v) <= VIOLATION) ? 1u : 0u;
+    return (k == NONE || excess(&set->row[k], set->inverse[k], v) <= PMSM_PROJECTION_VIOLATION) ? 1u : 0u;
 }
 
 /* The new basis after row k turned out violated in v: k alone, or k with one of the old rows. 0: there is none. */
@@ -305,19 +290,6 @@ static uint32_t exchange(pmsm_active_set *set, uint32_t k, uint32_t *steps)
     return 0u;
 }
 
-void pmsm_projection_begin(pmsm_active_set *set, const pmsm_row *rows, pmsm_dq r)
-{
-    set->row = rows;
-    set->count = 0u;
-    set->basis[0] = NONE;
-    set->basis[1] = NONE;
-    set->limit = NONE;
-    set->goal = NONE;
-    set->smallest = r;
-    set->r = r;
-    set->v = r;
-}
-
 uint32_t pmsm_projection_extend(pmsm_active_set *set, uint32_t count, uint32_t *steps)
 {
     for (uint32_t k = set->count; k < count; k++) {
@@ -328,7 +300,7 @@ uint32_t pmsm_projection_extend(pmsm_active_set *set, uint32_t count, uint32_t *
         pmsm_real worst;
         const uint32_t k = most_violated(set, set->v, &worst);
         const uint32_t again = (k == set->basis[0] || k == set->basis[1]) ? 1u : 0u;
-        if (worst <= VIOLATION || (again != 0u && worst <= STALL)) {
+        if (worst <= PMSM_PROJECTION_VIOLATION || (again != 0u && worst <= PMSM_PROJECTION_STALL)) {
             return ((set->basis[0] != NONE) ? 1u : 0u) + ((set->basis[1] != NONE) ? 1u : 0u);
         }
         if (again != 0u || exchange(set, k, steps) == 0u) {
@@ -349,97 +321,4 @@ uint32_t pmsm_project_rows(const pmsm_row *rows, uint32_t count, pmsm_dq r, pmsm
         *active = set.basis[0];
     }
     return status;
-}
-
-/* --- half planes ------------------------------------------------------------------------------------------------- */
-
-typedef struct {
-    const pmsm_dq *a;
-    const pmsm_real *b;
-    pmsm_dq r;
-    uint32_t basis[2];
-} half_planes;
-
-/* a v - b, relative to the size of the terms. */
-static pmsm_real beyond(const half_planes *h, uint32_t k, pmsm_dq v)
-{
-    const pmsm_real size = pmsm_abs(h->a[k].d * v.d) + pmsm_abs(h->a[k].q * v.q) + pmsm_abs(h->b[k]);
-    return (dot(h->a[k], v) - h->b[k]) / (size + PMSM_C(1e-30));
-}
-
-/* Corner of two lines, if r sees it from inside the cone of their normals. */
-static uint32_t corner(const half_planes *h, uint32_t k, uint32_t other, pmsm_dq *v)
-{
-    const pmsm_dq n1 = h->a[k];
-    const pmsm_dq n2 = h->a[other];
-    const pmsm_real det = n1.d * n2.q - n1.q * n2.d;
-    if (pmsm_abs(det) <= SINGULAR * PMSM_SQRT(pmsm_square(n1) * pmsm_square(n2))) {
-        return 0u;
-    }
-    v->d = (h->b[k] * n2.q - h->b[other] * n1.q) / det;
-    v->q = (h->b[other] * n1.d - h->b[k] * n2.d) / det;
-    const pmsm_dq pull = {h->r.d - v->d, h->r.q - v->q};
-    const pmsm_real l1 = (pull.d * n2.q - pull.q * n2.d) / det;
-    const pmsm_real l2 = (pull.q * n1.d - pull.d * n1.q) / det;
-    return (l1 >= PMSM_C(0.0) && l2 >= PMSM_C(0.0)) ? 1u : 0u;
-}
-
-static uint32_t respects(const half_planes *h, uint32_t skip, pmsm_dq v)
-{
-    for (uint32_t k = 0u; k < 2u; k++) {
-        if (h->basis[k] != NONE && h->basis[k] != skip && beyond(h, h->basis[k], v) > VIOLATION) {
-            return 0u;
-        }
-    }
-    return 1u;
-}
-
-static uint32_t exchange_line(half_planes *h, uint32_t k, pmsm_dq *v)
-{
-    const pmsm_dq n = h->a[k];
-    const pmsm_real lambda = (dot(n, h->r) - h->b[k]) / pmsm_square(n);
-    pmsm_dq x = {h->r.d - lambda * n.d, h->r.q - lambda * n.q};
-    if (respects(h, NONE, x) != 0u) {
-        h->basis[0] = k;
-        h->basis[1] = NONE;
-        *v = x;
-        return 1u;
-    }
-    for (uint32_t j = 0u; j < 2u; j++) {
-        const uint32_t other = h->basis[j];
-        if (other != NONE && corner(h, k, other, &x) != 0u && respects(h, other, x) != 0u) {
-            h->basis[0] = k;
-            h->basis[1] = other;
-            *v = x;
-            return 1u;
-        }
-    }
-    return 0u;
-}
-
-uint32_t pmsm_project_half_planes(const pmsm_dq *a, const pmsm_real *b, uint32_t count, pmsm_dq r, pmsm_dq *v,
-                                  uint32_t *active, uint32_t *steps)
-{
-    half_planes h = {a, b, r, {NONE, NONE}};
-    pmsm_dq x = r;
-    for (uint32_t round = 0u; round < 2u * PMSM_PROJECTION_ROUNDS; round++) {
-        uint32_t k = 0u;
-        pmsm_real worst = beyond(&h, 0u, x);
-        for (uint32_t j = 1u; j < count; j++) {
-            const pmsm_real g = beyond(&h, j, x);
-            k = (g > worst) ? j : k;
-            worst = (g > worst) ? g : worst;
-        }
-        const uint32_t again = (k == h.basis[0] || k == h.basis[1]) ? 1u : 0u;
-        if (worst <= VIOLATION || (again != 0u && worst <= STALL)) {
-            *v = x;
-            *active = h.basis[0];
-            return ((h.basis[0] != NONE) ? 1u : 0u) + ((h.basis[1] != NONE) ? 1u : 0u);
-        }
-        if (again != 0u || exchange_line(&h, k, &x) == 0u) {
-            return PMSM_PROJECTION_EMPTY;
-        }
-        (*steps)++;
-    }
-    return PMSM_PROJECTION_EMPTY;
 }

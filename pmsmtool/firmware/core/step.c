@@ -26,6 +26,7 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->reference_held = zero;
     state->reference_realised = zero;
     state->disturbance = zero;
+    state->news_before = zero;
     state->fw_reference = zero;
     state->time_to_go = PMSM_C(0.0);
     state->landing = 0u;
@@ -101,10 +102,9 @@ static void field_oriented(pmsm_period *period, pmsm_output *output)
     if (pmsm_uses_predictor(period->params) != 0u) {
         period->i_model = pmsm_predict_current(period);
     }
-    if (period->params->governor_mode != PMSM_GOVERNOR_OFF) {
-        pmsm_govern(period);
+    if (period->params->governor_mode == PMSM_GOVERNOR_OFF || pmsm_govern(period) == 0u) {
+        pmsm_current_demand(period);
     }
-    pmsm_current_demand(period);
     pmsm_modulate(period, output);
     pmsm_current_integrate(period);
 }
@@ -199,6 +199,8 @@ void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut
     period.u = zero;
     period.u_realised = zero;
     period.u_compensation = zero;
+    period.sine_half = PMSM_C(0.0);
+    period.cosine_half = PMSM_C(0.0); /* not known yet */
     period.flags = 0u;
     state->live.kappa = PMSM_C(1.0);
     state->live.binding = PMSM_BINDING_NONE;

@@ -54,6 +54,8 @@ OURS = "no figure of the paper; conditions of its section 5, " + JERCIC
 BACK = Law("back-calculation")
 BEST = Law("best", "best", eps=EPS_LEAST)
 PAPER = Law("paper", "paper", alpha=MODULUS_OPTIMUM, eps=EPS)
+I_MAX_A = 56.0
+"""Current limit of the profile (A)."""
 WIDE_A = 80.0
 """Transient current limit of the laws that are judged against the voltage alone (A)."""
 
@@ -218,7 +220,7 @@ def unreachable_references(seed: int, cases: int = 300) -> Reproduction:
     ends: dict[tuple[str, str], Array] = {}
     for condition in (NOMINAL, DELAYED, NOISY):
         for law in (*best, *others) if condition == NOMINAL else (*best, BACK):
-            limit = law.I_transient_apk or (math.inf if law.governor in ("off", "paper") else _I_MAX)
+            limit = law.I_transient_apk or (math.inf if law.governor in ("off", "paper") else I_MAX_A)
             targets = [nearest_held(case, plant_of(), limit, law.eps or 0.0) for case in drawn]
             found = _held(law, condition, drawn, targets, seed)
             ms = 1e3 * found.settling_s
@@ -267,10 +269,6 @@ def unreachable_references(seed: int, cases: int = 300) -> Reproduction:
         "governor-unreachable", "References that need more voltage than there is", OURS, (table, differences),
         tuple(panels), tuple(checks), notes,
     )  # fmt: skip
-
-
-_I_MAX = 56.0
-"""Current limit of the profile (A)."""
 
 
 def _unreachable_checks(

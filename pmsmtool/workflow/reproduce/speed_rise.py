@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pmsmtool.design.governor import EPS_LEAST
 from pmsmtool.design.minimum_time import minimum_time
 from pmsmtool.workflow.reproduce.current_step import transfer
 from pmsmtool.workflow.reproduce.figure import (
@@ -36,7 +37,7 @@ from pmsmtool.workflow.reproduce.random_steps import (
     BACK,
     BEST,
     EPS,
-    NOISE_BAND_A,
+    I_MAX_A,
     NOISY,
     OURS,
     PAPER,
@@ -49,16 +50,22 @@ REFERENCE = (0.0, 28.0)
 FROM_RPM, TO_RPM, RISE_S = 620.0, 900.0, 0.02
 STEPS_RPM = (900.0, 1200.0)
 RECOVERY_MS = (1.2, 1.8)
-"""Time until |v_ss(i)| <= V_max is regained after a speed step, that is asked for."""
-RECOVERY_ALLOWED_MS = (1.2, 2.1)
-"""The same that is checked. To 1200 rpm it is 1.4 to 2.0 ms, changing by periods when the end speed changes by 1 rpm: a
-period whose time goes into the pre-projection enforces row 0 alone, and the current then hovers near the limit."""
+"""Time until |v_ss(i)| <= V_max is regained after a speed step; measured 1.00 and 1.42, row at 56 and 80 A, eps
+0.015 and 0.001."""
 RECOVERED = 1.0005
 """|v_ss(i)| / V_max that counts as regained."""
 RAMP_PEAK_A, STEP_A = 47.0, 80.0
+RAMP_NOISE_A = 1.0
+"""Added to the peak of the ramp with noisy samples; measured 47.19 to 47.47 A, seeds 1 to 4."""
 SHOWN_S = 0.1
 
 Nodes = Sequence[tuple[float, float]]
+BEST_LAWS = tuple(
+    replace(BEST, name=f"best, row {row:g} A, eps {eps:g}", eps=eps, I_transient_apk=row)
+    for row in (I_MAX_A, WIDE_A)
+    for eps in (EPS_LEAST, EPS)
+)
+"""Transient current limit and tightening of the steady-state row, side by side."""
 LAWS = (
     BEST, Law("line search", "line", eps=EPS), PAPER, BACK, replace(BACK, name="back-calculation", alpha=PAPER.alpha),
     Law("plain clipping", anti_windup=False),
@@ -84,7 +91,7 @@ def speed_ramp(seed: int) -> Reproduction:
             if condition == NOMINAL:
                 shown.append((law, seen))
             if law.governor == "best":
-                peak = RAMP_PEAK_A + (NOISE_BAND_A if condition.noise else 0.0)
+                peak = RAMP_PEAK_A + (RAMP_NOISE_A if condition.noise else 0.0)
                 checks += _common_checks(row)
                 checks += [
                     at_least(f"best, ramp, {condition.name}: least i_q", row[4], 0.0, "A"),
@@ -100,13 +107,11 @@ def speed_ramp(seed: int) -> Reproduction:
 def speed_steps(seed: int) -> Reproduction:
     """Step the speed from 620 to 900 and to 1200 rpm with the reference held."""
     rows, checks, shown = [], [], []
-    for end, asked_ms, limit_ms in zip(STEPS_RPM, RECOVERY_MS, RECOVERY_ALLOWED_MS, strict=True):
+    for end, asked_ms in zip(STEPS_RPM, RECOVERY_MS, strict=True):
         for condition in (NOMINAL, DELAYED, NOISY):
-            for law in (replace(BEST, I_transient_apk=WIDE_A), *LAWS):
+            for law in (*BEST_LAWS, *LAWS[1:]):
                 drive = GovernedDrive(law, condition, seed)
                 seen = drive.speed_change(((0.0, FROM_RPM), (0.0, end)), REFERENCE, REFERENCE, SHOWN_S)
-                if law.I_transient_apk is not None:
-                    law = replace(law, name=f"best, current row {WIDE_A:g} A")
                 row = _row(law, condition, drive, seen, end)
                 rows.append(row)
                 if condition == NOMINAL and end == STEPS_RPM[-1]:
@@ -117,11 +122,14 @@ def speed_steps(seed: int) -> Reproduction:
                     held = float(np.hypot(row[6], row[7]))
                     checks.append(at_most(f"{name}: current after it", held, STEP_A, "A", published=80.0))
                     if condition == NOMINAL:
-                        checks.append(at_most(f"{name}: voltage regained", row[9], limit_ms, "ms", published=asked_ms))
+                        checks.append(at_most(f"{name}: voltage regained", row[9], asked_ms, "ms", published=asked_ms))
+    least_ms = 1e3 * _least_time_s()
+    what = f"least time of any controller from 620 to {STEPS_RPM[-1]:g} rpm at a held current <= {STEP_A:g} A"
+    checks.append(at_least(f"{what}: beyond the recovery asked for", least_ms, RECOVERY_MS[-1], "ms", where="physics"))
     table = Table("speed step from 620 rpm, reference (0, 28) A held for 100 ms", HEADS, tuple(rows))
     return Reproduction(
-        "speed-steps", "Speed steps without field weakening (shown: to 1200 rpm)", OURS, (table,), _panels(shown),
-        tuple(checks), (*_notes(), _least_note()),
+        "speed-steps", "Speed steps without field weakening (shown: to 1200 rpm)", OURS,
+        (table, _recovery(rows, least_ms)), _panels(shown), tuple(checks), (*_notes(), _least_note(least_ms)),
     )  # fmt: skip
 
 
@@ -142,16 +150,35 @@ def _row(law: Law, condition: Condition, drive: GovernedDrive, seen: Response, e
     )  # fmt: skip
 
 
-def _least_note() -> str:
-    """Say how fast any controller could be at a held current within 80 A: the minimum-time bound."""
+def _recovery(rows: Sequence[Row], least_ms: float) -> Table:
+    """Return recovery and peak current of the best mode beside what is asked for and what is possible."""
+    found = tuple(
+        (row[0], row[2], row[3], row[9], RECOVERY_MS[STEPS_RPM.index(row[3])], row[5], float(np.hypot(row[6], row[7])),
+         least_ms if row[3] == STEPS_RPM[-1] else None)
+        for row in rows if row[0].startswith(BEST.name)
+    )  # fmt: skip
+    heads = (
+        Column("law"), Column("condition"), Column("to", "rpm"), Column("voltage regained", "ms"),
+        Column("asked", "ms"), Column("peak |i| on the way", "A"), Column("|i| held after", "A"),
+        Column(f"least time to hold <= {STEP_A:g} A, any controller", "ms"),
+    )  # fmt: skip
+    return Table("best mode: recovery after a speed step, and the bound on it", heads, found)
+
+
+def _least_time_s() -> float:
+    """Return how fast any controller could be at a held current within 80 A: the minimum-time bound."""
     plant, rpm = plant_of(), STEPS_RPM[-1]
     angles = math.pi + np.linspace(-1.0, 1.0, ANGLES)
     ends = [(STEP_A * math.cos(a), STEP_A * math.sin(a)) for a in angles]
     held = [end for end in ends if float(plant.voltage(np.asarray(end), rpm)) <= V_max()]
-    least = min(minimum_time(transfer(plant, rpm), REFERENCE, end) for end in held)
+    return min(minimum_time(transfer(plant, rpm), REFERENCE, end) for end in held)
+
+
+def _least_note(least_ms: float) -> str:
     return (
-        f"at {rpm:g} rpm no controller reaches a current of {STEP_A:g} A that V_max holds in less than "
-        f"{1e3 * least:.3g} ms from (0, 28) A: a faster recovery passes through more current"
+        f"at {STEPS_RPM[-1]:g} rpm no controller reaches a current of {STEP_A:g} A that V_max holds in less than "
+        f"{least_ms:.3g} ms from (0, 28) A: a recovery in {RECOVERY_MS[-1]:g} ms passes through more current, and "
+        f"<= {STEP_A:g} A can only be asked of what is held after it"
     )
 
 
