@@ -2,237 +2,22 @@
  *
  * Constant-torque contours: along t = T* the squared voltage is R^2 h + 2 R w T* + w^2 g with h = |i|^2, g = |psi|^2,
  * so one traced contour per torque (nodes with h and g) serves every speed and voltage: a cell is a scan of products
- * to bracket |v| = V, then Newton in (t, |v|^2) on the machine itself. The contour starts at its point of least
- * current and runs the way |psi| falls; started at the demagnetising end or at i_d = 0 it could end on another branch.
+ * to bracket |v| = V, then Newton in (t, |v|^2) on the machine itself.
  * Torques beyond the limits of a speed take the nearest torque there is (torque_limits.c).
  */
 #include "lookup_table.h"
 
+#include "torque_contour.h"
+
 #include <math.h>
 #include <stddef.h>
 
-#define RADII 40             /* of the least-current locus */
-#define LOCUS_NODES 40       /* per turn */
-#define BORDER_NODES 72      /* per turn */
-#define CONTOUR_NODES 160
-#define CONTOUR_STEP 0.05    /* of I_max */
 #define BINDING 1e-5         /* a limit binds within this, relative */
 #define FULL_VOLTAGE 1e-12   /* a node at the limit counts as inside, relative; the stored point is exact to 1e-13 */
 #define NEWTON_STEPS 12
 #define NEWTON_DONE 4e-15    /* residual of torque and voltage, relative */
 #define SAME_TORQUE 1e-10    /* torques that are one, relative to the range of a speed */
 #define UNSOLVED 255
-
-typedef struct {             /* least current per torque, one sign of torque */
-    int32_t n;
-    pmsm_point at[RADII + 2];
-} locus;
-
-typedef struct {             /* one side of a torque contour, from its start */
-    int32_t n;
-    int32_t traced;
-    int32_t rising;          /* 1: the current falls nowhere along it, as on every machine but the oddly saturated */
-    pmsm_point at[CONTOUR_NODES];
-} branch;
-
-typedef struct {
-    const pmsm_plane *plane;
-    pmsm_border border;
-    pmsm_point bound[2];     /* least and largest torque of the domain, whatever the voltage */
-    locus least[2];          /* negative, positive torque */
-} tables;
-
-typedef struct {
-    pmsm_curve curve;
-    pmsm_point start;
-    double first_length;     /* signed step of side 0 */
-    int32_t whole;           /* 1: traced to the edge of the domain, whatever current and flux do */
-    branch side[2];
-} contour;
-
-/* ---- least current ------------------------------------------------------------------------------- */
-
-static int32_t extremes_on(const pmsm_plane *plane, const pmsm_border *border, pmsm_point extreme[2])
-{
-    int32_t found = 0;
-    for (int32_t k = 0; k < border->n_nodes; k++) {
-        const pmsm_point *at = &border->node[k];
-        if (!pmsm_on_branch(plane, at))
-            continue;
-        if (!found || at->t < extreme[0].t)
-            extreme[0] = *at;
-        if (!found || at->t > extreme[1].t)
-            extreme[1] = *at;
-        found = 1;
-    }
-    return found;
-}
-
-static void build_locus(tables *all)
-{
-    const pmsm_rectangle *r = &all->border.rectangle;
-    const double corner_d = fmax(-r->d_low, r->d_high), corner_q = fmax(-r->q_low, r->q_high);
-    const double reach = fmin(all->plane->I_max, sqrt(corner_d * corner_d + corner_q * corner_q));
-    pmsm_border ring;
-    pmsm_point extreme[2];
-    for (int32_t side = 0; side < 2; side++) {
-        all->least[side].n = 1;
-        pmsm_plane_at(all->plane, 0.0, 0.0, &all->least[side].at[0]);
-    }
-    for (int32_t k = 1; k <= RADII; k++) {
-        pmsm_border_build(all->plane, r, reach * k / RADII, 0, LOCUS_NODES, &ring);
-        if (!extremes_on(all->plane, &ring, extreme))
-            break;
-        for (int32_t side = 0; side < 2; side++) {
-            locus *to = &all->least[side];
-            const double sign = side ? 1.0 : -1.0;
-            if (sign * extreme[side].t > sign * to->at[to->n - 1].t)
-                to->at[to->n++] = extreme[side];
-        }
-    }
-    for (int32_t side = 0; side < 2; side++) { /* the domain's own extreme closes the locus */
-        locus *to = &all->least[side];
-        const double sign = side ? 1.0 : -1.0;
-        if (sign * all->bound[side].t > sign * to->at[to->n - 1].t)
-            to->at[to->n++] = all->bound[side];
-    }
-}
-
-/* From a point outside the domain back along the contour to its edge. */
-static int32_t back_to_edge(const pmsm_curve *curve, pmsm_point *at)
-{
-    const double length = 0.25 * CONTOUR_STEP * curve->plane->I_max;
-    for (int32_t k = 0; k < 2; k++) {
-        pmsm_point from = *at, to;
-        double before = pmsm_plane_outside(curve->plane, curve->rectangle, &from);
-        for (int32_t n = 0; n < CONTOUR_NODES; n++) {
-            double now;
-            if (!pmsm_curve_step(curve, &from, k ? -length : length, &to))
-                break;
-            now = pmsm_plane_outside(curve->plane, curve->rectangle, &to);
-            if (now <= 0.0)
-                return pmsm_curve_root(curve, PMSM_AT_EDGE, &from, &to, at);
-            if (now > before)
-                break;
-            before = now;
-            from = to;
-        }
-    }
-    return 0;
-}
-
-/* Least |i| on the contour near a point of it: bracket the extreme by steps, then the root. */
-static void least_current_near(const pmsm_curve *curve, pmsm_point *at, double spacing)
-{
-    pmsm_point from = *at, to;
-    const double slope = pmsm_curve_indicator(curve, PMSM_AT_CURRENT_EXTREME, &from);
-    const double length = slope > 0.0 ? -spacing : spacing;
-    for (int32_t n = 0; n < CONTOUR_NODES; n++) {
-        double now;
-        if (!pmsm_curve_step(curve, &from, length, &to))
-            return;
-        now = pmsm_curve_indicator(curve, PMSM_AT_CURRENT_EXTREME, &to);
-        if (now * slope <= 0.0) {
-            pmsm_point root;
-            if (pmsm_curve_root(curve, PMSM_AT_CURRENT_EXTREME, &from, &to, &root))
-                *at = root;
-            return;
-        }
-        from = to;
-        if (pmsm_plane_outside(curve->plane, curve->rectangle, &to) > 0.5)
-            return;
-    }
-}
-
-/* Point of least current with torque level T inside the domain. */
-static int32_t least_current(const tables *all, const pmsm_curve *curve, pmsm_point *at)
-{
-    const int32_t side = curve->level >= 0.0;
-    const locus *on = &all->least[side];
-    const double sign = side ? 1.0 : -1.0, T = sign * curve->level;
-    const pmsm_point *a, *b;
-    double x;
-    int32_t k = 1;
-    while (k < on->n - 1 && sign * on->at[k].t < T)
-        k++;
-    if (on->n < 2) {
-        *at = on->at[0];
-        return T == 0.0;
-    }
-    a = &on->at[k - 1];
-    b = &on->at[k];
-    if (T == sign * b->t || T == sign * a->t) {
-        *at = T == sign * b->t ? *b : *a;
-        return 1;
-    }
-    x = (curve->level - a->t) / (b->t - a->t);
-    pmsm_plane_at(all->plane, a->d + x * (b->d - a->d), a->q + x * (b->q - a->q), at);
-    if (!pmsm_curve_correct(curve, at))
-        return 0;
-    least_current_near(curve, at, 0.25 * CONTOUR_STEP * all->plane->I_max);
-    if (pmsm_plane_outside(all->plane, curve->rectangle, at) > 0.0)
-        return back_to_edge(curve, at);
-    return 1;
-}
-
-/* ---- contour --------------------------------------------------------------------------------------- */
-
-static int32_t still_useful(const contour *c, const pmsm_point *at, double length)
-{
-    double tangent[2], dh, dg;
-    pmsm_curve_tangent(&c->curve, at, tangent);
-    dh = length * (at->d * tangent[0] + at->q * tangent[1]);
-    dg = length * (at->g_d * tangent[0] + at->g_q * tangent[1]);
-    return !(dh > 0.0 && dg > 0.0); /* beyond, current and flux both rise: no speed wants that */
-}
-
-static void trace(contour *c, int32_t which, double length)
-{
-    branch *to = &c->side[which];
-    to->traced = 1;
-    to->rising = 1;
-    to->n = 1;
-    to->at[0] = c->start;
-    while (to->n < CONTOUR_NODES) {
-        const pmsm_point *from = &to->at[to->n - 1];
-        pmsm_point *next = &to->at[to->n];
-        if (!pmsm_curve_step(&c->curve, from, length, next))
-            return;
-        if (pmsm_plane_outside(c->curve.plane, c->curve.rectangle, next) > 0.0) {
-            pmsm_point edge;
-            if (to->n > 1 || pmsm_plane_outside(c->curve.plane, c->curve.rectangle, from) < -1e-12)
-                if (pmsm_curve_root(&c->curve, PMSM_AT_EDGE, from, next, &edge)) {
-                    to->at[to->n++] = edge;
-                }
-            return;
-        }
-        to->rising &= next->h >= from->h;
-        to->n++;
-        if (!c->whole && !still_useful(c, next, length))
-            return;
-    }
-}
-
-static int32_t start_contour(const tables *all, double T, contour *c)
-{
-    const double length = CONTOUR_STEP * all->plane->I_max;
-    double tangent[2];
-    c->curve = (pmsm_curve){all->plane, &all->border.rectangle, PMSM_CURVE_TORQUE, T, 0.0, 0.0, T};
-    c->side[0].traced = c->side[1].traced = 0;
-    c->whole = 0;
-    if (!least_current(all, &c->curve, &c->start))
-        return 0;
-    if (!(c->start.t_d * c->start.t_d + c->start.t_q * c->start.t_q > 0.0)) {
-        c->side[0].traced = c->side[1].traced = 1; /* no torque slope: a machine without magnet at rest */
-        c->side[0].n = c->side[1].n = 1;
-        c->side[0].rising = c->side[1].rising = 1;
-        c->side[0].at[0] = c->side[1].at[0] = c->start;
-        return 1;
-    }
-    pmsm_curve_tangent(&c->curve, &c->start, tangent);
-    c->first_length = c->start.g_d * tangent[0] + c->start.g_q * tangent[1] > 0.0 ? -length : length;
-    return 1;
-}
 
 /* ---- cell ------------------------------------------------------------------------------------------ */
 
@@ -280,7 +65,7 @@ static double excess(const demand *want, const pmsm_point *at)
 }
 
 /* First admissible node, or the admissible point between nodes where the voltage is least. */
-static int32_t first_admissible(const demand *want, const pmsm_curve *curve, const branch *on, pmsm_point *inside)
+static int32_t first_admissible(const demand *want, const pmsm_curve *curve, const pmsm_branch *on, pmsm_point *inside)
 {
     int32_t best = 0;
     double least = INFINITY;
@@ -302,11 +87,11 @@ static int32_t first_admissible(const demand *want, const pmsm_curve *curve, con
             return -1 - (side > 0.0 ? best : (best > 0 ? best - 1 : 0)); /* lies behind that node */
         }
     }
-    return CONTOUR_NODES;
+    return PMSM_CONTOUR_NODES;
 }
 
 /* With iron loss the least total loss lies further along the admissible part of the contour. */
-static void least_loss(const demand *want, const pmsm_curve *curve, const branch *on, int32_t from, pmsm_point *at)
+static void least_loss(const demand *want, const pmsm_curve *curve, const pmsm_branch *on, int32_t from, pmsm_point *at)
 {
     pmsm_point a = *at, b;
     double loss = pmsm_plane_loss(want->plane, at, want->omega);
@@ -337,8 +122,8 @@ static void least_loss(const demand *want, const pmsm_curve *curve, const branch
 
 /* The least current of all admissible points of a side: minima and ends of its admissible parts. *at is admissible and
  * to be beaten when have is 1; returns whether there is one. */
-static int32_t least_of_all(const demand *want, const pmsm_curve *curve, const branch *on, int32_t from, int32_t have,
-                            pmsm_point *at)
+static int32_t least_of_all(const demand *want, const pmsm_curve *curve, const pmsm_branch *on, int32_t from,
+                            int32_t have, pmsm_point *at)
 {
     const double slack = FULL_VOLTAGE * want->V2;
     pmsm_point a = have ? *at : on->at[from - 1], best = a, found;
@@ -366,11 +151,11 @@ static int32_t least_of_all(const demand *want, const pmsm_curve *curve, const b
 }
 
 /* Least loss on one side of the contour; 0 when no point of it is admissible. */
-static int32_t solve_side(const demand *want, pmsm_curve *curve, const branch *on, pmsm_point *at)
+static int32_t solve_side(const demand *want, pmsm_curve *curve, const pmsm_branch *on, pmsm_point *at)
 {
     pmsm_point inside;
     int32_t k = first_admissible(want, curve, on, &inside);
-    if (k == CONTOUR_NODES)
+    if (k == PMSM_CONTOUR_NODES)
         return 0;
     if (k == 0) {
         *at = on->at[0];
@@ -392,7 +177,7 @@ static int32_t solve_side(const demand *want, pmsm_curve *curve, const branch *o
     return 1;
 }
 
-static int32_t solve_cell(contour *c, const pmsm_plane *plane, double omega, double V, pmsm_point *at)
+static int32_t solve_cell(pmsm_contour *c, const pmsm_plane *plane, double omega, double V, pmsm_point *at)
 {
     demand want = {plane, omega, V * V, plane->R * plane->R, omega * omega, 0.0};
     want.room = want.V2 - 2.0 * plane->R * omega * c->curve.level;
@@ -400,7 +185,7 @@ static int32_t solve_cell(contour *c, const pmsm_plane *plane, double omega, dou
     c->curve.V2 = want.V2;
     for (int32_t side = 0; side < 2; side++) {
         if (!c->side[side].traced)
-            trace(c, side, side ? -c->first_length : c->first_length);
+            pmsm_contour_trace(c, side, side ? -c->first_length : c->first_length);
         if (solve_side(&want, &c->curve, &c->side[side], at))
             return 1;
     }
@@ -409,9 +194,9 @@ static int32_t solve_cell(contour *c, const pmsm_plane *plane, double omega, dou
 
 /* On an oddly saturated machine the contour may leave the domain and come back, or flux and current may rise and fall
  * again. Torque has no extreme inside, so every part of a contour ends on the border: all of them, from there. */
-static int32_t solve_everywhere(const tables *all, double T, double omega, double V, pmsm_point *at)
+static int32_t solve_everywhere(const pmsm_contours *all, double T, double omega, double V, pmsm_point *at)
 {
-    contour c;
+    pmsm_contour c;
     demand want = {all->plane, omega, V * V, all->plane->R * all->plane->R, omega * omega, 0.0};
     int32_t have = 0;
     want.room = want.V2 - 2.0 * all->plane->R * omega * T;
@@ -429,7 +214,7 @@ static int32_t solve_everywhere(const tables *all, double T, double omega, doubl
                 continue;
             for (int32_t side = 0; side < 2; side++) {
                 pmsm_point found;
-                trace(&c, side, (side ? -CONTOUR_STEP : CONTOUR_STEP) * all->plane->I_max);
+                pmsm_contour_trace(&c, side, (side ? -PMSM_CONTOUR_STEP : PMSM_CONTOUR_STEP) * all->plane->I_max);
                 if (least_of_all(&want, &c.curve, &c.side[side], 1, 0, &found) && pmsm_on_branch(all->plane, &found)
                     && (!have || found.h < at->h)) {
                     *at = found;
@@ -441,7 +226,7 @@ static int32_t solve_everywhere(const tables *all, double T, double omega, doubl
     return have;
 }
 
-static uint8_t touched(const tables *all, const pmsm_point *at, double omega, double V)
+static uint8_t touched(const pmsm_contours *all, const pmsm_point *at, double omega, double V)
 {
     const pmsm_rectangle *r = &all->border.rectangle;
     const double slack = BINDING * all->plane->I_max;
@@ -466,7 +251,7 @@ typedef struct {
     int32_t unsolved;
 } output;
 
-static void store(const tables *all, output *out, ptrdiff_t cell, const pmsm_point *at, double omega, double V,
+static void store(const pmsm_contours *all, output *out, ptrdiff_t cell, const pmsm_point *at, double omega, double V,
                   int32_t extra)
 {
     out->i_d[cell] = at->d;
@@ -483,7 +268,7 @@ static void store_nothing(output *out, ptrdiff_t cell, uint8_t why)
 }
 
 /* Within rounding of the largest torque the contour is a point: that of the limit. */
-static int32_t at_the_limit(const tables *all, double torque, const double *e, pmsm_point *at)
+static int32_t at_the_limit(const pmsm_contours *all, double torque, const double *e, pmsm_point *at)
 {
     const double *nearest = torque - e[0] < e[3] - torque ? e : e + 3;
     if (fabs(torque - nearest[0]) > SAME_TORQUE * (e[3] - e[0]))
@@ -492,7 +277,7 @@ static int32_t at_the_limit(const tables *all, double torque, const double *e, p
     return 1;
 }
 
-static void solve_row(const tables *all, double torque, ptrdiff_t row, contour *c, output *out)
+static void solve_row(const pmsm_contours *all, double torque, ptrdiff_t row, pmsm_contour *c, output *out)
 {
     const double scale = 1.5 * all->plane->pole_pairs, T = torque / scale;
     int32_t started = 0;
@@ -510,7 +295,7 @@ static void solve_row(const tables *all, double torque, ptrdiff_t row, contour *
                       torque == nearest[0] ? 0 : PMSM_LIMIT_TORQUE_CUT);
             } else {
                 if (!started)
-                    started = start_contour(all, T, c) ? 1 : -1;
+                    started = pmsm_contour_start(all, T, c) ? 1 : -1;
                 if (started > 0 && solve_cell(c, all->plane, out->omega[w], out->V[v], &at))
                     store(all, out, cell, &at, out->omega[w], out->V[v], 0);
                 else if (at_the_limit(all, torque, e, &at) || solve_everywhere(all, T, out->omega[w], out->V[v], &at))
@@ -521,7 +306,7 @@ static void solve_row(const tables *all, double torque, ptrdiff_t row, contour *
         }
 }
 
-static void limits_of_speeds(const tables *all, int32_t n_w, const double *omega, int32_t n_V, const double *V,
+static void limits_of_speeds(const pmsm_contours *all, int32_t n_w, const double *omega, int32_t n_V, const double *V,
                              double *extreme)
 {
     const double scale = 1.5 * all->plane->pole_pairs;
@@ -544,16 +329,10 @@ int32_t pmsm_lookup_table(const pmsm_plane *plane, int32_t n_T, const double *to
                           int32_t n_V, const double *V, double *i_d, double *i_q, double *achieved, uint8_t *limits,
                           double *extreme)
 {
-    tables all;
-    contour c;
+    pmsm_contours all;
+    pmsm_contour c;
     output out = {n_w, n_V, omega, V, i_d, i_q, achieved, limits, extreme, 0};
-    const pmsm_rectangle rectangle = pmsm_plane_rectangle(plane);
-    all.plane = plane;
-    pmsm_border_build(plane, &rectangle, plane->I_max, 1, BORDER_NODES, &all.border);
-    if (!extremes_on(plane, &all.border, all.bound)) /* no torque anywhere: a constant machine without magnet or saliency */
-        for (int32_t side = 0; side < 2; side++)
-            pmsm_plane_at(plane, 0.0, 0.0, &all.bound[side]);
-    build_locus(&all);
+    pmsm_contours_prepare(plane, &all);
     limits_of_speeds(&all, n_w, omega, n_V, V, extreme);
     for (int32_t k = 0; k < n_T; k++)
         solve_row(&all, torque[k], k, &c, &out);
