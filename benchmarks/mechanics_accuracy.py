@@ -30,7 +30,7 @@ from benchmarks.identification_coverage import clopper_pearson
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
-from pmsmtool.errors import PmsmtoolError
+from pmsmtool.errors import IdentificationError, PmsmtoolError
 from pmsmtool.estimators.estimate import statistical_half_width
 from pmsmtool.estimators.mechanics import BLOCKS, TORQUE_FLOOR, estimate_mechanics, positions
 from pmsmtool.machine.machine_file import dump_machine_file
@@ -159,13 +159,19 @@ def bound_ratio(count: int, seed: int) -> None:
     """Print the rms of errors over the bound, pooled over realisations."""
     rng = np.random.default_rng(seed)
     ratios: list[list[float]] = []
-    for _ in range(count):
+    refused = Counter[str]()
+    while len(ratios) < count:
         traces, truth, per_a, sigma = realisation(rng)
-        found = estimate_mechanics(traces, lambda i_d, i_q, k=per_a: k * i_q, per_a, sigma, 0.0)  # type: ignore[misc]
+        try:
+            found = estimate_mechanics(traces, lambda i_d, i_q, k=per_a: k * i_q, per_a, sigma, 0.0)  # type: ignore[misc]
+        except IdentificationError as error:
+            refused[error.reason] += 1
+            continue
         values = (found.J.value, found.B.value, found.tau_c.value)
         widened = math.sqrt(max(1.0, found.chi2))
         ratios.append([(v - t) / s * widened for v, t, s in zip(values, truth, found.fit_std, strict=True)])
     table = np.array(ratios)
+    print(f"refused: {dict(refused) or 'none'}")
     rms, mean = np.sqrt(np.mean(table**2, axis=0)), np.mean(table, axis=0)
     for name, r, m in zip(("J", "B", "tau_c"), rms, mean, strict=True):
         print(f"{name:6s} std/bound {r:.3f} +- {r / math.sqrt(2.0 * count):.3f}, mean {m:+.3f} ({count} realisations)")
