@@ -139,7 +139,7 @@ def swinging(trace: Trace, amplitude: float) -> Trace:
 
 
 def test_torque_that_the_model_does_not_know_widens_the_interval() -> None:
-    """A swing of 0.013 N m in one coasting; errors of eight seeds up to 1.7, fits wider by at least 1.3, 7.9 and 107."""
+    """A swing of 0.013 N m in one coasting; errors of 8 seeds up to 1.7, fits wider by at least 1.3, 7.9 and 107."""
     for seed in range(5):
         good = run_of(np.random.default_rng(seed))
         calm, found = estimate(good), estimate([good[0], swinging(good[1], 0.004), *good[2:]])
