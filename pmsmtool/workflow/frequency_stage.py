@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pmsmtool.drive.port import Drive
@@ -13,7 +12,7 @@ from pmsmtool.estimators.frequency_response import FrequencyResponse, estimate_f
 from pmsmtool.experiments import frequency_response
 from pmsmtool.npz_file import npz_bytes
 from pmsmtool.trace import Trace
-from pmsmtool.workflow.mechanics_stage import in_frame, torque_of
+from pmsmtool.workflow.mechanics_stage import in_frame, numbered, torque_of
 from pmsmtool.workflow.run_directory import RunDirectory
 
 if TYPE_CHECKING:
@@ -65,17 +64,7 @@ def measure_frequency_response(
     # the d current of the run over speeds would take part in the torque that the bias is measured for
     drive.write({"field_weakening.i_d_lm_a": 0.0})
     drive.enable()
-    facts = {
-        "offset_rad": drive.read("encoder.offset_rad"),
-        "direction": -1 if drive.read("encoder.reversed") else 1,
-    }
-    count = 0
-
-    def keep_part(trace: Trace) -> None:
-        nonlocal count
-        keep(f"{TRACE}{count}", replace(trace, meta={**trace.meta, **facts}))
-        count += 1
-
+    keep_part = numbered(drive, TRACE, keep)
     abort = ABORT_SHARE * pole_pairs * limits.omega_max_rad_s
     frequency_response.excite_at_speed(drive, plan, pole_pairs, abort, keep_part)
     drive.wait(REST_S)

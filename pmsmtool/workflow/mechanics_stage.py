@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import count
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,6 +43,20 @@ drives with a switched inverter 0.02 to 0.5 % of J went down to at most 0.03 % w
 PLAN_LINE = "pushes turn the shaft both ways, and it coasts with the voltage off"
 
 
+def numbered(drive: Drive, name: str, keep: Callable[[str, Trace], None]) -> Callable[[Trace], None]:
+    """Return what keeps trace after trace as ``name`` 0, 1, ... with offset and direction of the drive's encoder."""
+    frame = {
+        "offset_rad": drive.read("encoder.offset_rad"),
+        "direction": -1 if drive.read("encoder.reversed") else 1,
+    }
+    number = count()
+
+    def keep_part(trace: Trace) -> None:
+        keep(f"{name}{next(number)}", replace(trace, meta={**trace.meta, **frame}))
+
+    return keep_part
+
+
 def measure_mechanics(
     drive: Drive, limits: Limits, keep: Callable[[str, Trace], None], say: Callable[[str], None]
 ) -> None:
@@ -56,15 +71,7 @@ def measure_mechanics(
         f"coasting with the voltage off, {plan.duration_s:.2g} s"
     )
     _come_to_rest(drive, pole_pairs * plan.omega_rad_s)
-    offset, reversed_ = drive.read("encoder.offset_rad"), drive.read("encoder.reversed")
-    facts = {"offset_rad": offset, "direction": -1 if reversed_ else 1}
-    count = 0
-
-    def keep_part(trace: Trace) -> None:
-        nonlocal count
-        keep(f"{TRACE}{count}", replace(trace, meta={**trace.meta, **facts}))
-        count += 1
-
+    keep_part = numbered(drive, TRACE, keep)
     abort = ABORT_SHARE * pole_pairs * limits.omega_max_rad_s
     mechanics_run.push_and_coast(drive, plan, abort, keep_part)
     drive.enable()
