@@ -28,7 +28,7 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """Exit codes of the command line (``interface.md`` section 1)."""
+    """Exit codes of the command line (``pmsmtool help exit-codes``)."""
 
     OK = 0
     CHECK_FAILED = 1

@@ -3,7 +3,7 @@
 The scalars of the catalogue come first, in catalogue order (that is the C struct ``pmsm_params``), then the look-up
 words: axes x, y, z as binary32, then the tables of i_d and i_q, row-major x, y, z, as binary32 (format 1) or as
 int16 multiples of ``lut.lsb_a`` (format 2), each table padded with zeros to four bytes. A cell without an operating
-point is NaN (format 1) or -32768 (format 2). ``pmsm_image.c`` does the same in the drive.
+point is NaN (format 1) or -32768 (format 2). ``firmware/core/image.c`` does the same in the drive.
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ def _symbol(symbol: str) -> tuple[str, float]:
 
 
 def counted_in(text: str, symbol: str) -> float:
-    """Return one count of unit ``text`` in the unit ``symbol`` of ``units.UNITS``, or of :data:`FORMS`.
+    """Return one count of unit ``text`` in the unit ``symbol``: of ``units.UNITS``, or composed (``N m/A``).
 
     Raises
     ------

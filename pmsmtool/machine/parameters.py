@@ -57,7 +57,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class MachineParameters:
-    """Constant-parameter machine (``[machine]`` of a machine file); see ``interface.md`` section 5."""
+    """Constant-parameter machine (``[machine]`` of a machine file); units and bounds in ``machine_keys``."""
 
     pole_pairs: int
     R_s_ohm: float

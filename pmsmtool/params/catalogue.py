@@ -188,7 +188,6 @@ EVERY: tuple[Parameter, ...] = (*CATALOGUE, *CLOSED_DRIVE)
 """Everything a parameter set may hold, in its order."""
 
 BY_NAME: dict[str, Parameter] = {row.name: row for row in EVERY}
-BY_OBJECT: dict[tuple[int, int], Parameter] = {(row.index, row.sub): row for row in CATALOGUE}
 
 LUT_CAPACITY_WORDS = 8192
 """Four-byte words the drive reserves for axes and tables (32 KiB)."""

@@ -14,7 +14,7 @@ from pmsmtool.sim.node.eds import eds_text
 from pmsmtool.sim.node.emergency import Emergency
 from pmsmtool.sim.node.family import Face, Reduced
 from pmsmtool.sim.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from pmsmtool.sim.node.lss import LssSlave
+from pmsmtool.sim.node.lss import ANSWER_ID, REQUEST_ID, LssSlave
 from pmsmtool.sim.node.measurement import Measurement
 from pmsmtool.sim.node.parameter_set import ParameterImage, ParameterSet
 from pmsmtool.sim.node.pdo import ProcessData
@@ -181,7 +181,7 @@ class Session:
             set_pending=self._set_node_id,
             store=self._store_node_id,
             leave=self._lss_left,
-            send=lambda frame: hardware.send(0x7E4, frame),
+            send=lambda frame: hardware.send(ANSWER_ID, frame),
         )
 
     def _set_node_id(self, node_id: int) -> None:
@@ -355,7 +355,7 @@ class Session:
     def receive(self, can_id: int, data: bytes) -> None:
         """Take a frame of the line."""
         if self.nmt is NmtState.INITIALISING:
-            if can_id == 0x7E5:
+            if can_id == REQUEST_ID:
                 self.lss.receive(data)
             return
         if can_id == 0x600 + self.hardware.node_id:
@@ -366,7 +366,7 @@ class Session:
                 self.command_nmt(data[0])
         elif 0x700 < can_id <= 0x77F:
             self.consumer.heard(can_id - 0x700)
-        elif can_id == 0x7E5:
+        elif can_id == REQUEST_ID:
             self.lss.receive(data)
         elif can_id == self.dictionary["sync.cob_id"].integer():
             self.pdo.sync()
