@@ -12,7 +12,7 @@ from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
-from pmsmtool.sim.kernel import Application, Part, Rotor, Simulation, Target
+from pmsmtool.sim.kernel import Application, Part, Rotor, Simulation
 from pmsmtool.sim.scenarios import MODES, SCHEDULES, Scenario
 from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import (
@@ -202,15 +202,3 @@ def _meta(
         "seed": settings["seed"] if seed is None else seed,
         **simulation.counts(),
     }
-
-
-__all__ = [
-    "DRIVE_SIGNALS",
-    "ROWS_MAX",
-    "TRUE_SIGNALS",
-    "Target",
-    "drive_values",
-    "image_of",
-    "open_simulation",
-    "simulate",
-]

@@ -7,7 +7,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import can
 import pytest
 
 from pmsmtool.cli.main import run as program
@@ -37,6 +36,7 @@ from pmsmtool.workflow.track import (
     track_stage,
 )
 from tests.drive.bench import SimBench, sim_bench
+from tests.simulated_bus import settle
 
 POINTS = ((60.0, 2.0), (150.0, 11.0), (-100.0, -6.0), (90.0, 4.0), (-150.0, 11.0), (120.0, 8.0))
 """Speed (rad/s) and load (N m) of the operation that is looked at."""
@@ -125,10 +125,7 @@ def test_the_systematic_part_widens_the_inductance() -> None:
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
-    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+    settle(tmp_path, monkeypatch)
     return tmp_path
 
 
