@@ -120,8 +120,9 @@ def _notes() -> tuple[str, ...]:
         f"with noise ({NOISE_APK:g} A rms, 0.05 A grid) the band is {NOISE_BAND_A:g} A wider",
         "a difference is claimed only where its interval leaves out zero",
         "paper mode: its p95 over 1459 such steps is 1.410 (1.384 to 1.455), over the some 140 of one seed 1.33 to "
-        "1.58 by chance (seeds 1 to 10: 1.35 to 1.52), so the lower end of its bootstrap interval is checked; it is the "
-        "law's own: back-calculation has 1.448, the best mode at the same bandwidth 1.292 (benchmarks/tables/settling_tail.txt)",
+        "1.58 by chance (seeds 1 to 10: 1.35 to 1.52), so the lower end of its bootstrap interval is checked",
+        "that tail is the law's own: back-calculation has 1.448, the best mode at the same bandwidth 1.292 "
+        "(benchmarks/tables/settling_tail.txt)",
     )
 
 
@@ -200,7 +201,7 @@ def _distribution(outcomes: dict[tuple[str, float, str], Outcome], least: Array,
 HOLD_S = 0.1
 UNREACHABLE_P95_MS, CORNER_P95_MS = 6.0, 7.0
 """95th percentile of the settling time that must hold in best mode with the voltage alone in the way (measured 5.1 to
-5.6, seeds 1 to 6), and with the current row at I_max besides (5.6 to 6.2: the way is then bound to the circle of 56 A)."""
+5.6, seeds 1 to 6), and with the current row at I_max besides (5.6 to 6.2: the way is then bound to 56 A)."""
 BAND_LEAST_A = 0.2
 
 
