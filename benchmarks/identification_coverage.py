@@ -3,6 +3,7 @@
     python -m benchmarks.identification_coverage --drives 200 --around jercic-2017 interior-2k2 \
         saturated-pmsyrm measured-map
     python -m benchmarks.identification_coverage --drives 400 --block timing
+    python -m benchmarks.identification_coverage --drives 100 --first 10000 --hard
 
 Drives follow from their seeds (``workflow/random_drives.py``); the tool sees their nameplate only. Printed per
 quantity: error quantiles, how often the statistical and the total (printed) 95 % interval holds the truth, with its
@@ -13,10 +14,12 @@ the share of devices and copper, which no experiment sees, enters ``R_s_ohm`` on
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import multiprocessing
 import tempfile
+import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -35,7 +38,11 @@ from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_o
 from pmsmtool.workflow.measure import Limits, Measurement
 from pmsmtool.workflow.random_drives import draw_around, draw_drive, true_loop_resistance
 
-QUANTITIES = ("R_at_T_ohm", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "offset_rad", "J_kgm2")
+QUANTITIES = ("R_at_T_ohm", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "offset_rad")
+ELECTRICAL = ("R", "L", "psi", "encoder", "poles", "inverter")
+"""What is identified here; mechanics has a program of its own (``benchmarks/mechanics_accuracy.py``)."""
+HARD_RATIO = 3.0
+"""Dead-time voltage over R I_nom from which a drive is of the hard class of the resistance."""
 DRAWN_SPREAD = 0.10
 """Spread of the drives around a profile (standard deviation of the log of each parameter)."""
 
@@ -65,14 +72,23 @@ def drawn(profile: str, seed: int, block: str) -> MachineFile:
     return draw_around(base, seed, block, spread=DRAWN_SPREAD)  # type: ignore[arg-type]
 
 
+def is_hard(drive: MachineFile) -> bool:
+    """Say whether the dead time takes more voltage than three times the winding at rated current."""
+    inverter, I_nom = drive.inverter, drive.machine.I_nom_apk
+    assert I_nom is not None
+    return inverter.U_dc_v * inverter.dead_time_s * inverter.f_s_hz >= HARD_RATIO * drive.machine.R_s_ohm * I_nom
+
+
 def identify_one(job: tuple[str, int, str]) -> dict[str, Any]:
     """Identify one drive; returns errors, half widths and refusal, all JSON."""
     profile, seed, block = job
     drive = drawn(profile, seed, block)
-    row: dict[str, Any] = {"profile": profile, "seed": seed, "block": block}
+    row: dict[str, Any] = {"profile": profile, "seed": seed, "block": block, "hard": is_hard(drive)}
     try:
         traces, nameplate, seconds = measured(drive)
+        start = time.process_time()
         evaluation = evaluated(traces, nameplate)
+        row["offline_s"] = time.process_time() - start
     except PmsmtoolError as error:
         row["refused"] = getattr(error, "reason", type(error).__name__)
         row["text"] = str(error).splitlines()[0]
@@ -82,7 +98,6 @@ def identify_one(job: tuple[str, int, str]) -> dict[str, Any]:
     assert evaluation.resistance is not None
     found["R_at_T_ohm"] = evaluation.resistance.R_measured
     row["seconds"] = seconds
-    row["hardness"] = evaluation.resistance.hardness
     for name in QUANTITIES:
         estimate = found[name]
         off = estimate.value - truth[name]
@@ -125,7 +140,7 @@ def _measured(path: Path) -> tuple[dict[str, Trace], MachineFile, float]:
         )
         start = connection.clock.now()
         with guarded(drive, envelope) as guard:
-            Measurement(guard, limits, traces.__setitem__, lambda text: None).run(request.quantities)
+            Measurement(guard, limits, traces.__setitem__, lambda text: None).run(ELECTRICAL)
         seconds = connection.clock.now() - start
         drive.close()
     return traces, nameplate, seconds
@@ -160,6 +175,8 @@ def summary(rows: list[dict[str, Any]]) -> str:
         )
     times = sorted(row["seconds"] for row in accepted)
     lines.append(f"bus time per drive: median {times[len(times) // 2]:.1f} s, longest {times[-1]:.1f} s")
+    offline = sorted(row["offline_s"] for row in accepted)
+    lines.append(f"processing off-line: median {offline[len(offline) // 2]:.1f} s, longest {offline[-1]:.1f} s (CPU)")
     return "\n".join(lines)
 
 
@@ -171,9 +188,12 @@ def _covered(rows: list[dict[str, Any]], name: str, kind: str) -> str:
 
 def show(rows: list[dict[str, Any]], profiles: list[str]) -> None:
     """Print the table of each profile, and of all together."""
-    for profile in profiles:
-        mine = [row for row in rows if row["profile"] == profile]
-        print(f"== {profile or 'population'}, block {', '.join(sorted({row['block'] for row in mine}))}")
+    for profile, hard in itertools.product(profiles, (False, True)):
+        mine = [row for row in rows if row["profile"] == profile and row["hard"] == hard]
+        if not mine:
+            continue
+        kind = f"dead-time voltage {'>=' if hard else '<'} {HARD_RATIO:g} R I"
+        print(f"== {profile or 'population'}, block {', '.join(sorted({row['block'] for row in mine}))}, {kind}")
         print(summary(mine))
     if len(profiles) > 1:
         print("== all")
@@ -188,6 +208,7 @@ def main() -> None:
     parser.add_argument("--block", choices=["ideal", "timing", "gains"], default="ideal")
     around = "draw around these profiles; measured-map: the map in ../shared/maps"
     parser.add_argument("--around", nargs="*", default=[], metavar="PROFILE", help=around)
+    parser.add_argument("--hard", action="store_true", help="only drives whose dead time takes 3 R I and more")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--rows", type=Path, help="write every drive's result there (JSON lines)")
     parser.add_argument("--tabulate", type=Path, metavar="ROWS", help="only print the table of a file of --rows")
@@ -197,11 +218,13 @@ def main() -> None:
         show(stored, sorted({row["profile"] for row in stored}))
         return
     profiles = options.around or [""]
-    seeds = range(options.first, options.first + options.drives)
-    jobs = [(profiles[k % len(profiles)], seed, options.block) for k, seed in enumerate(seeds)]
+    seeds = itertools.count(options.first)
+    jobs = ((profiles[k % len(profiles)], seed, options.block) for k, seed in enumerate(seeds))
+    if options.hard:
+        jobs = (job for job in jobs if is_hard(drawn(*job)))
     with multiprocessing.Pool(options.processes) as pool:
         rows = []
-        for row in pool.imap_unordered(identify_one, jobs):
+        for row in pool.imap_unordered(identify_one, itertools.islice(jobs, options.drives)):
             rows.append(row)
             if options.rows:
                 with options.rows.open("a", encoding="utf-8") as stream:
