@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.design.matched_filter import matched_filter
 from pmsmtool.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -27,6 +28,12 @@ SCHEMA = "pmsmtool.prediction/1"
 
 MODEL_ALLOWANCE = 1.3
 """Half width over that of the simulated runs, for what the averaged model of the inverter leaves out."""
+QUANTITY_ALLOWANCE = 2.0
+"""The same of a derived quantity, which is weighed against what the drawn machines vary in and nothing else (of three
+random drives, healthy: at most 0.33 of the band then; K_p 20 % off: 2.7 times and more)."""
+LEAST_CHANGE = 0.1
+"""Half width of a derived quantity is never less than this part of the change its two sets of runs differ by: 4.5 % of
+the loop gain, a tenth of a period. No fault is smaller, and no model that precise."""
 FLOOR_SHARE = 0.005
 """Standard deviation that every point has at least, of the scale of its signal: ripple, quantisation, cogging."""
 LEAST_FACTOR = 2.0
@@ -77,7 +84,7 @@ class Band:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A derived quantity: the amplitude of a signature in the deviation, by weighted least squares.
+    """A derived quantity: the amplitude of a signature in the deviation, by generalised least squares.
 
     Attributes
     ----------
@@ -88,7 +95,7 @@ class Quantity:
     low, high : float
         Predicted band.
     signature : mapping of (experiment, signal) to ndarray
-        Deviation per amplitude, already over the variance: the inner product with a deviation is the amplitude.
+        Deviation per amplitude, already over the covariance: the inner product with a deviation is the amplitude.
     below, above : str
         What is wrong when it lies below its band, or above; empty when nothing is known to do that.
     """
@@ -176,6 +183,7 @@ def predict(
     directions: Mapping[str, Direction] | None = None,
     faults: Mapping[str, tuple[str, Runs]] | None = None,
     facts: Mapping[str, Any] | None = None,
+    allowances: Mapping[str, float] | None = None,
 ) -> Prediction:
     """Return the prediction that simulated runs make.
 
@@ -193,37 +201,34 @@ def predict(
         Responses of drives with something wrong.
     facts : mapping, optional
         Kept with it.
+    allowances : mapping of str to float, optional
+        By experiment; :data:`MODEL_ALLOWANCE` where not given.
     """
     floors = {key: FLOOR_SHARE * scale for key, scale in scales.items()}
     spread = {key: _spread(values, floors[key]) for key, values in runs.items()}
     shown = {name: direction for name, direction in (directions or {}).items() if _shows(direction)}
-    signatures = {name: _signature(direction, spread) for name, direction in shown.items()}
-    amplitudes = {
-        name: np.sum([(runs[key] - spread[key][0]) @ weights for key, weights in signature.items()], axis=0)
-        for name, signature in signatures.items()
-    }
+    filters = {name: _filtered(direction, runs, spread) for name, direction in shown.items()}
     largest = {key: _largest_left_out(values, floors[key]) for key, values in runs.items()}
     factors: dict[tuple[str, str], float] = {}
     for name in t_s:
-        factors |= _factors({key: v for key, v in largest.items() if key[0] == name})
-    quantity_factors = _factors({name: np.abs(a - np.median(a)) / _least_std(a) for name, a in amplitudes.items()})
+        allowance = (allowances or {}).get(name, MODEL_ALLOWANCE)
+        factors |= _factors({key: v for key, v in largest.items() if key[0] == name}, allowance)
+    deviations = {name: np.abs(a - np.median(a)) / _least_std(a) for name, (_, a) in filters.items()}
+    quantity_factors = _factors(deviations, QUANTITY_ALLOWANCE)
     return Prediction(
         dict(t_s),
         {key: Band(*spread[key], factors[key]) for key in runs},
-        {
-            name: _quantity(direction, signatures[name], amplitudes[name], quantity_factors[name])
-            for name, direction in shown.items()
-        },
+        {name: _quantity(direction, *filters[name], quantity_factors[name]) for name, direction in shown.items()},
         {name: _fault(text, wrong, floors) for name, (text, wrong) in (faults or {}).items()},
         dict(facts or {}),
     )
 
 
-def _factors(deviations: Mapping[Key, Array]) -> dict[Key, float]:
+def _factors(deviations: Mapping[Key, Array], allowance: float) -> dict[Key, float]:
     """Return half widths over standard deviations such that the band of all signals together holds every run."""
     normal = {key: float(np.quantile(v, NORMALISING_QUANTILE)) for key, v in deviations.items()}
     common = max((float(np.max(v)) / normal[key] for key, v in deviations.items() if normal[key] > 0.0), default=1.0)
-    return {key: max(LEAST_FACTOR, MODEL_ALLOWANCE * common * q) for key, q in normal.items()}
+    return {key: max(LEAST_FACTOR, allowance * common * q) for key, q in normal.items()}
 
 
 def _spread(values: Array, floor: float) -> tuple[Array, Array]:
@@ -252,14 +257,18 @@ def _shows(direction: Direction) -> bool:
     return any(bool(np.any(direction.high[key] != direction.low[key])) for key in direction.high)
 
 
-def _signature(
-    direction: Direction, spread: Mapping[tuple[str, str], tuple[Array, Array]]
-) -> dict[tuple[str, str], Array]:
-    """Return the change per unit over the variance, normalised so that the change itself has amplitude one."""
-    change = direction.at_high - direction.at_low
-    slope = {key: np.mean(direction.high[key] - direction.low[key], axis=0) / change for key in direction.high}
-    power = sum(float(np.sum((s / spread[key][1]) ** 2)) for key, s in slope.items())
-    return {key: s / (spread[key][1] ** 2 * max(power, 1e-300)) for key, s in slope.items()}
+def _filtered(
+    direction: Direction, runs: Runs, spread: Mapping[tuple[str, str], tuple[Array, Array]]
+) -> tuple[dict[tuple[str, str], Array], Array]:
+    """Return the signature, normalised so that the change itself has amplitude one, and the amplitudes of the runs."""
+    keys = list(direction.high)
+    change = np.concatenate([np.mean(direction.high[key] - direction.low[key], axis=0) for key in keys])
+    variance = np.concatenate([spread[key][1] ** 2 for key in keys])
+    weights, amplitudes = matched_filter(
+        change / (direction.at_high - direction.at_low), np.concatenate([runs[key] for key in keys], axis=1), variance
+    )
+    ends = np.cumsum([len(spread[key][0]) for key in keys])
+    return dict(zip(keys, np.split(weights, ends[:-1]), strict=True)), amplitudes
 
 
 def _least_std(values: Array) -> float:
@@ -269,7 +278,8 @@ def _least_std(values: Array) -> float:
 def _quantity(
     direction: Direction, signature: Mapping[tuple[str, str], Array], amplitude: Array, factor: float
 ) -> Quantity:
-    middle, half = direction.nominal + float(np.median(amplitude)), factor * _least_std(amplitude)
+    middle = direction.nominal + float(np.median(amplitude))
+    half = max(factor * _least_std(amplitude), LEAST_CHANGE * abs(direction.at_high - direction.at_low))
     return Quantity(
         direction.nominal, direction.unit, middle - half, middle + half, signature, direction.below, direction.above
     )
@@ -369,14 +379,15 @@ def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> 
 
 
 def _cause_of_quantities(prediction: Prediction, deviation: Mapping[tuple[str, str], Array]) -> str:
-    """Return what puts the only quantity that is outside there; empty when two are."""
-    causes = []
-    for quantity in prediction.quantities.values():
+    """Return what puts the quantity that is clearly the furthest outside there; empty when two are about as far."""
+    shares: list[tuple[float, str]] = []
+    for name, quantity in prediction.quantities.items():
         if set(quantity.signature) <= set(deviation):
             value = quantity.of(deviation)
-            if not quantity.low <= value <= quantity.high:
-                causes.append(quantity.below if value < quantity.low else quantity.above)
-    return causes[0] if len(causes) == 1 else ""
+            cause = quantity.below if value < quantity.low else quantity.above
+            shares.append((_seen_quantity(name, quantity, value).share, cause))
+    (furthest, cause), *others = sorted(shares, reverse=True)
+    return "" if others and others[0][0] > CLEARLY * furthest else cause
 
 
 def _seen_quantity(name: str, quantity: Quantity, value: float) -> Seen:

@@ -190,16 +190,35 @@ def test_a_fault_is_named_with_the_experiment(design: Design, monkeypatch: pytes
     assert stage.status == "fail" and "0x2310" in stage.note and "during speed_step" in stage.note
 
 
-def test_current_that_stays_in_d_is_named(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At full torque 5 A of the design's 12 A all go into i_d on the way to the speed of the unreachable current."""
+def test_a_speed_that_is_not_reached_is_named(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody waits for it here, so it is on its way: named, with a reason, and the machine is stopped."""
     monkeypatch.setattr(measured, "RISE_S", 0.0)
+    monkeypatch.setattr(measured, "REACH_S", 0.0)
     with flashed(design) as drive:
-        run = begin_run(drive, Path("runs"))
-        stage = prove_stage(run, drive, design, replace(FEW, i_max_apk=5.0), lambda shown: None, lambda line: None)
+        _, stage = prove(drive, design)
+        assert is_safe(drive.node.state())
     assert stage.status == "fail"
-    assert "the speed was not reached: " in stage.note and "before unreachable" in stage.note
-    assert "all current stays in i_d" in stage.note
+    assert "the speed was not reached: " in stage.note and "before q_steps" in stage.note
+    assert "rpm after 0 s, with i_d = " in stage.note and "; likely " in stage.note
     assert [line.what for line in stage.acceptance if not line.ok] == ["all experiments are run to their end"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "limited", "reason"),
+    [
+        ({"i_d_a": -4.99, "i_q_a": 0.3}, True, "all current stays in i_d"),
+        ({"i_d_a": -1.0, "i_q_a": 4.9}, True, "torque at the current limit does not suffice"),
+        ({"u_q_lim_v": 311.0}, False, "the voltage is too low: none is left"),
+        ({"U_dc_v": 480.0}, True, "the DC link falls to 480 V, at rest it shows 540 V"),
+        ({}, False, "asks for no more current"),
+    ],
+)
+def test_what_the_drive_shows_tells_why_a_speed_is_not_reached(
+    changed: dict[str, float], limited: bool, reason: str, design: Design
+) -> None:
+    state = {"i_d_a": -0.5, "i_q_a": 1.0, "u_d_lim_v": -20.0, "u_q_lim_v": 100.0, "U_dc_v": 540.0, **changed}
+    at_rest = Conditions(540.0, 25.0, 25.0, 1 << 17, 5.0, 300.0)
+    assert reason in measured._why_not(state, limited, design, at_rest)
 
 
 @pytest.mark.parametrize("slow", [1, 99])

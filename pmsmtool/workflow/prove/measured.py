@@ -131,7 +131,9 @@ def _refuse_other_speed(
     raise SpeedNotReached(
         f"the speed was not reached: {omega / rpm:.4g} of {omega_e_rad_s / rpm:.4g} rpm after {REACH_S:g} s, with "
         f"i_d = {state['i_d_a']:.3g} A and i_q = {state['i_q_a']:.3g} A, before {experiment.name}",
-        likely=_why_not(state, limited, design, conditions),
+        likely=_why_not(state, limited, design, conditions)
+        if abs(omega) < abs(omega_e_rad_s)
+        else "the speed loop has not settled, or something drives the shaft",
     )
 
 
