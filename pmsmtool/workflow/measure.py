@@ -36,8 +36,9 @@ CURVE_SHARES = (0.02, 0.04)
 """Levels for the inverter curve alone: a speed run at small current lives there."""
 TURN_SHARE = 0.15
 """Current that turns the rotor over, of the test current."""
-ROTATION_SHARES = (0.35, 0.18, 0.09)
-"""Above psi/(L_q - L_d) a d current is no stable position: a reluctance machine follows a smaller vector only."""
+ROTATIONS = ((0.35, 0.015), (0.18, 0.03), (0.09, 0.03))
+"""Current, of the test current, and time per step (s) of every try. Above psi/(L_q - L_d) a d current is no stable
+position: a reluctance machine follows a smaller vector only, and swings longer on it."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 BIAS_SHARE = 0.5
 BIAS_TRIES = 4
@@ -299,9 +300,9 @@ class Measurement:
         return resistance
 
     def _rotation(self) -> EncoderResult:
-        """Turn the vector; with less current again when the rotor did not stay on it."""
-        for share in ROTATION_SHARES:
-            plan = rotation.RotationPlan(i_a=share * self.limits.I_test_apk)
+        """Turn the vector; with less current and slower again when the rotor did not stay on it."""
+        for share, dwell_s in ROTATIONS:
+            plan = rotation.RotationPlan(i_a=share * self.limits.I_test_apk, dwell_s=dwell_s)
             self.say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
             forward, backward = rotation.rotate_vector(self.drive, plan)
             self.keep("rotation_forward", forward)
@@ -309,9 +310,9 @@ class Measurement:
             try:
                 return estimate_encoder(forward, backward)
             except IdentificationError as error:
-                if error.reason not in OFF_THE_VECTOR or share == ROTATION_SHARES[-1]:
+                if error.reason not in OFF_THE_VECTOR or (share, dwell_s) == ROTATIONS[-1]:
                     raise
-        raise AssertionError("the last share returns or raises")
+        raise AssertionError("the last try returns or raises")
 
     def _square(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult) -> tuple[float, float]:
         """Record the shots; return rough inductances (H) from ripple and voltage, enough for a current controller."""
