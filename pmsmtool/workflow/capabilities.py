@@ -329,6 +329,8 @@ _FULL = "benchmarks.identification_coverage --drives 12 --first 9000"
 _RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 62 --first 5000"
 _STANDARD_RUN = "benchmarks.tier_intervals standard --drives 76 --first 5000 --speed 1.35"
 
+_VOLTAGE_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --speed 1.35"
+
 
 def _expected(program: str, drives: int, *rows: tuple[str, float, str]) -> tuple[Expected, ...]:
     return tuple(Expected(name, half, unit, drives, program) for name, half, unit in rows)
@@ -348,6 +350,7 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ),
     ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("offset_rad", 1.8, "deg")),
     ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("pole_pairs", 0.3, "%")),
+    ("psi", Method.STANDARD): _expected(_VOLTAGE_RUN, 26, ("psi_f_wb", 3.7, "%")),
     ("mechanics", Method.STANDARD): _expected(
         _STANDARD_RUN, 75, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")
     ),
