@@ -31,8 +31,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     epilog=examples(
         "pmsmtool commission --sim interior-2k2 --yes",
         "pmsmtool commission --sim saturated-pmsyrm --flux-map --i-max 20Apk --yes",
-        "pmsmtool commission -i socketcan -c can0 -n 5 --i-max 12Apk --speed-max 3000rpm --shaft free",
-        "pmsmtool commission drive.toml -i socketcan -c can0 -n 5 --map epos4 --i-max 5Apk --shaft free",
+        "pmsmtool commission drive.toml -i socketcan -c can0 -n 5 --map epos4 --i-max 12Apk --speed-max 3000rpm",
         "pmsmtool commission --resume runs/20260101T120000Z-000055f1",
     ),
 )
