@@ -26,6 +26,40 @@ from pmsmtool.units import UNITS
 _UNITS, _META = "_units", "_meta"
 
 
+class Recorded(dict[str, Any]):
+    """Signals or facts that were read from a file: one that is not there is the file's fault, and said so.
+
+    Parameters
+    ----------
+    found : mapping of str
+        What the file holds.
+    kind : str
+        What it is, in the singular.
+    where : str
+        The file.
+    """
+
+    def __init__(self, found: Mapping[str, Any], kind: str, where: str) -> None:
+        super().__init__(found)
+        self.kind = kind
+        self.where = where
+
+    def __missing__(self, name: str) -> Any:
+        """Name the file and what it has not.
+
+        Raises
+        ------
+        ConfigError
+            Always.
+        """
+        raise ConfigError(
+            f"the record has no {self.kind} {name}",
+            where=self.where,
+            likely="an earlier version wrote it, whose experiment was another one",
+            hint="run the experiment again, or use the version that wrote it (run.json of a run directory names it)",
+        )
+
+
 def write_trace(trace: Trace, path: Path) -> None:
     """Write a trace by suffix, ``.npz`` or ``.csv``, replacing the file at once.
 
@@ -126,7 +160,8 @@ def _trace(columns: dict[str, NDArray[np.float64]], units: dict[str, str], meta:
         violations.append(f"t_s does not increase at sample {int(np.argmax(np.diff(t_s) <= 0)) + 1}")
     if violations:
         raise ConfigError("is not a trace", where=where, violations=violations)
-    return Trace(t_s, columns, {name: units[name] for name in columns}, meta)
+    signals, facts = Recorded(columns, "signal", where), Recorded(meta, "fact", where)
+    return Trace(t_s, signals, {name: units[name] for name in columns}, facts)
 
 
 def _from_csv(path: Path) -> Trace:

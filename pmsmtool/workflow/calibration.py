@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 
 from pmsmtool.errors import ConfigError
@@ -77,7 +78,8 @@ def calibrated_traces(traces: Mapping[str, Trace], tolerance: SensorTolerance) -
 
 
 def _scaled(trace: Trace, tolerance: SensorTolerance) -> Trace:
-    signals = {}
+    signals = copy(trace.signals)  # its own kind: it names its file when something is missing
+    assert isinstance(signals, dict)
     for name, values in trace.signals.items():
         if name.startswith("u_") and name.endswith("_v"):
             values = tolerance.voltage_scale * values

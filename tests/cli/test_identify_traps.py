@@ -52,6 +52,14 @@ def turned(t: Trace) -> Signals:
     return {"u_d_v": c * t["u_d_v"] - s * t["u_q_v"], "u_q_v": s * t["u_d_v"] + c * t["u_q_v"]}
 
 
+def slower(t: Trace, share: float) -> Signals:
+    """A shaft that loses this share of its speed between the halves of each window, and its voltage with it."""
+    first = t["omega_first_rad_s"]
+    second = (1.0 - share) * first
+    w = 0.5 * (first + second)
+    return {"omega_second_rad_s": second, "omega_e_rad_s": w, "u_q_v": t["u_q_v"] * w / t["omega_e_rad_s"]}
+
+
 def one_way(t: Trace) -> Signals:
     return {"omega_e_rad_s": np.abs(t["omega_e_rad_s"])}
 
@@ -90,7 +98,7 @@ TRAPS: dict[str, tuple[str, Spoil, str]] = {
         "E_ROTOR_MOVED",
     ),
     "one direction only": ("speeds", one_way, "E_EXCITATION"),
-    "speed still moves": ("speeds", lambda t: {"omega_second_rad_s": 1.1 * t["omega_second_rad_s"]}, "E_NOT_SETTLED"),
+    "shaft is braked while it coasts": ("speeds", lambda t: slower(t, 0.5), "E_NOT_SETTLED"),
     "voltage limited at a speed": ("speeds", lambda t: {"flagged": np.ones(len(t))}, "E_CLIPPED"),
     "encoder offset far off": ("speeds", turned, "E_NOT_IDENTIFIABLE"),
     "rotor moves in the injection": ("square_q_6", lambda t: ramp(t, "theta_M_rad", 0.1), "E_ROTOR_MOVED"),
@@ -128,3 +136,26 @@ def test_a_trap_is_named_and_no_number_is_given(
     assert f"{reason}: " in printed.err
     assert "likely:" in printed.err and "try:" in printed.err
     assert not (folder / "machine.toml").exists()
+
+
+@pytest.mark.parametrize("name", ["speeds", "levels", "square_q_6"])
+@pytest.mark.parametrize("calibration", [(), ("--cal", "V_dc=540V:537V:0.5V")])
+def test_a_record_of_an_earlier_version_is_named(
+    name: str, calibration: tuple[str, ...], healthy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its experiment recorded something else: ``half_s`` is what the speed runs of early versions have not."""
+    missing = {"speeds": "half_s", "levels": "u_d_first_v", "square_q_6": "u_q_v"}[name]
+    folder = tmp_path / "run"
+    shutil.copytree(healthy, folder)
+    made = (folder / "machine.toml").read_bytes()
+    path = folder / "traces" / f"{name}.npz"
+    trace = read_trace(path)
+    signals = {signal: values for signal, values in trace.signals.items() if signal != missing}
+    path.write_bytes(trace_npz(replace(trace, signals=signals)))
+    capsys.readouterr()
+    code = run(("identify", "--replay", str(folder), *calibration))
+    printed = capsys.readouterr()
+    assert (code, printed.out) == (2, ""), printed.err
+    assert f"the record has no signal {missing}\n" in printed.err and f"where:  {path}\n" in printed.err
+    assert "earlier version" in printed.err and "try:" in printed.err
+    assert (folder / "machine.toml").read_bytes() == made

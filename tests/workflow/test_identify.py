@@ -110,7 +110,7 @@ def test_a_reluctance_machine_follows_a_smaller_and_slower_vector(seed: int, tmp
     path.write_text(dump_machine_file(drive_file, embed_flux_map=True), encoding="utf-8")
     with Connection(PmsmSimBus(f"{path}?nv=:memory:")) as connection:
         drive = CanopenDrive(connection, 1)
-        run, stage = identify(drive, tmp_path, ("poles",))
+        run, _ = identify(drive, tmp_path, ("poles",))
         drive.close()
     found = load_machine_file(run.path / MACHINE)
     assert found.machine.pole_pairs == base.machine.pole_pairs
