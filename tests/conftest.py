@@ -4,7 +4,29 @@ from __future__ import annotations
 
 import signal
 
+import pytest
+from _pytest.runner import runtestprotocol
+
+from tests import wall_clock
+
 # A background job of a shell without job control ignores SIGINT and hands that on to its children; tests of Ctrl-C
 # would wait for ever. A handler of ours is back to the default in children.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    """Repeat a failed test of the wall clock where the computer stood still."""
+    if item.get_closest_marker("wall_clock") is None:
+        return None
+    wall_clock.watch()
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    for _ in range(wall_clock.TRIES):
+        wall_clock.STALLS.clear()
+        reports = runtestprotocol(item, log=False, nextitem=nextitem)
+        if not any(report.failed for report in reports) or not wall_clock.STALLS:
+            break
+    for report in reports:
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True

@@ -90,6 +90,8 @@ class Connection:
         COB-IDs seen.
     sent : dict of int to deque
         The last requests sent per watched COB-ID, to tell our own echo from a second master.
+    deaf_s : float
+        How long the reader thread did not listen because the computer did not run it (s).
     listeners : list of callable
         Given every message received, error frames too.
     """
@@ -99,6 +101,7 @@ class Connection:
         self.clock: Clock = clock_of(bus)
         self.frames_received = 0
         self.error_frames = 0
+        self.deaf_s = 0.0
         self.heard: set[int] = set()
         self.sent: dict[int, deque[bytes]] = {}
         self.listeners: list[Callable[[can.Message], None]] = []
@@ -279,9 +282,13 @@ class Connection:
     # ---- inside ---------------------------------------------------------------------------------
 
     def _read(self) -> None:
+        before = self.clock.now()
         while not self._closing:
             try:
                 message = self.bus.recv(_POLL_S)
+                now = self.clock.now()
+                self.deaf_s += max(0.0, now - before - _POLL_S)
+                before = now
                 if message is not None:
                     self._dispatch(message)
             except PmsmtoolError as error:

@@ -101,6 +101,7 @@ class Supervision:
         self.stop_at_other_master = True
         self._connection = connection
         self._last_heard_s: float | None = None
+        self._deaf_then_s = 0.0
         self._boots_seen = 0
         self._emergencies_seen = 0
         self._foreign_seen = 0
@@ -204,14 +205,17 @@ class Supervision:
                 )
 
     def _overdue(self) -> bool:
+        """Whether the heartbeat stayed away while somebody listened: a stalled computer is no lost node."""
         if self.heartbeat_period_s is None or self._last_heard_s is None:
             return False
-        return self._connection.clock.now() - self._last_heard_s > HEARTBEAT_TOLERANCE * self.heartbeat_period_s
+        silent_s = self._connection.clock.now() - self._last_heard_s - (self._connection.deaf_s - self._deaf_then_s)
+        return silent_s > HEARTBEAT_TOLERANCE * self.heartbeat_period_s
 
     # ---- notes taken ----------------------------------------------------------------------------
 
     def _on_heartbeat(self, cob_id: int, data: bytes, timestamp: float) -> None:
         self._last_heard_s = self._connection.clock.now()
+        self._deaf_then_s = self._connection.deaf_s
         state = data[0] & 0x7F if data else 0x7F
         self.nmt_state = NmtState(state) if state in set(NmtState) else None
         if state == NmtState.BOOT_UP:

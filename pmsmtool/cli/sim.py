@@ -80,7 +80,7 @@ def serve_command(out: Output, profile: str | None, host: str, port: int, speed:
 
     channel = replace(parse_channel(profile), **{name: value for name, value in given.items() if value is not None})
     line = build_line(channel, instant=True)
-    server = SocketcandServer(line, host, port, speed=speed)
+    server = SocketcandServer(line, host, port, speed=speed, say=out.note)
     ids = [node.node_id for node in line.nodes]
     data = {"interface": "socketcand", "host": host, "port": server.port, "profile": channel.name, "node_ids": ids}
     out.result("sim-serve", data, [f"socketcand {host}:{server.port}"])

@@ -33,6 +33,8 @@ class Heartbeat:
         self._connection = connection
         self._period_s = period_s
         self._ticker: Ticker | None = None
+        self._last_s = 0.0
+        self._longest_s = 0.0
 
     def __enter__(self) -> Heartbeat:
         self.start()
@@ -46,6 +48,7 @@ class Heartbeat:
     def start(self) -> None:
         """Send the first heartbeat now and one every period."""
         if self._ticker is None:
+            self._last_s, self._longest_s = self._connection.clock.now(), 0.0
             self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)))
             self._ticker = self._connection.clock.every(self._period_s, self._beat)
 
@@ -55,7 +58,14 @@ class Heartbeat:
         if ticker is not None:
             ticker.stop()
 
+    def longest_gap_s(self) -> float:
+        """Return the longest time (s) without a heartbeat since the start: whether this computer kept the period."""
+        return max(self._longest_s, self._connection.clock.now() - self._last_s)
+
     def _beat(self) -> None:
+        before = self._connection.clock.now()
         # Nobody catches here: the drive notices a lost heartbeat, the next request meets the failed bus.
         with contextlib.suppress(BusError):
             self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)), patience_s=0.0)
+        self._longest_s = max(self._longest_s, self._connection.clock.now() - self._last_s)
+        self._last_s = before

@@ -6,6 +6,9 @@ backend connects with ``host``, ``port`` and any channel name; ``tcp_tune=True``
 Protocol (linux-can/socketcand, ``doc/protocol.md``): ``< hi >``, ``< open NAME >`` and ``< rawmode >`` answered by
 ``< ok >``; then ``< send ID LEN B B ... >`` and ``< frame ID SECONDS DATA >``. That backend reads each answer with one
 ``recv``, so the first frames are held for ``HOLD_S`` behind the last ``< ok >``.
+
+Where the computer does not let this process run, the drives' time stands still too: making up for it in a burst would
+let their supervision miss heartbeats that were sent in time.
 """
 
 from __future__ import annotations
@@ -25,7 +28,11 @@ DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 29536
 HOLD_S = 0.05
 """Frames wait this long behind the handshake; dropping them instead would lose the first answers."""
+PAUSED = "the simulation stood still for"
+WORTH_SAYING_S = 0.1
 _SLICE_NS = 50_000_000
+_BEHIND_S = 0.1
+# Further behind the wall clock than this, beyond an idle time, is not made up for.
 _IDLE_S = 0.1
 _RECEIVE_BYTES = 65536
 _BACKLOG_LIMIT = 4 << 20
@@ -113,7 +120,9 @@ class SocketcandServer:
     host, port
         Where to listen; port 0 chooses a free one.
     speed : float
-        Virtual seconds per second of the wall clock.
+        Virtual seconds per second of the wall clock; fewer where the computer cannot keep up.
+    say : callable
+        Told one line when the drives' time stood still for ``WORTH_SAYING_S`` or more.
 
     Raises
     ------
@@ -121,8 +130,17 @@ class SocketcandServer:
         The address is in use or does not exist.
     """
 
-    def __init__(self, line: Line, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, *, speed: float = 1.0) -> None:
+    def __init__(
+        self,
+        line: Line,
+        host: str = DEFAULT_HOST,
+        port: int = DEFAULT_PORT,
+        *,
+        speed: float = 1.0,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
         self.line = line
+        self._say = say
         self._speed = speed
         self._selector = selectors.DefaultSelector()
         self._clients: list[Client] = []
@@ -161,9 +179,10 @@ class SocketcandServer:
         self._started = time.monotonic() - self.line.clock.now_ns / NS / self._speed
         try:
             while not stopped():
-                for key, events in self._selector.select(self._idle_s()):
+                idle_s = self._idle_s()
+                for key, events in self._selector.select(idle_s):
                     self._ready(key.data, events)
-                self._run()
+                self._run(idle_s)
                 for client in tuple(self._clients):
                     self.flush(client)
         finally:
@@ -181,9 +200,15 @@ class SocketcandServer:
     def _now_ns(self) -> int:
         return round((time.monotonic() - self._started) * self._speed * NS)
 
-    def _run(self) -> None:
+    def _run(self, idle_s: float) -> None:
         """Let the line's time follow the wall clock, in slices so that clients are heard in between."""
         clock = self.line.clock
+        behind_s = (self._now_ns() - clock.now_ns) / NS / self._speed - idle_s
+        if behind_s > _BEHIND_S:
+            paused_s = behind_s - 0.5 * _BEHIND_S
+            self._started += paused_s
+            if paused_s >= WORTH_SAYING_S:
+                self._say(f"{PAUSED} {paused_s:.2f} s: this computer did not run it")
         target = min(self._now_ns(), clock.now_ns + _SLICE_NS)
         with clock.held:
             clock.step(clock.now_ns)

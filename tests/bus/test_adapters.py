@@ -21,6 +21,8 @@ from pmsmtool.bus.supervision import HeartbeatLost, SecondMaster, Supervision
 from pmsmtool.errors import BusError, DriveTimeout
 from tests.bus.scripted import NODE, ScriptedSlave
 
+pytestmark = pytest.mark.wall_clock
+
 A = (0x2010, 2)
 TABLE = (0x2042, 0)
 BODY = bytes(range(250)) * 8

@@ -29,6 +29,8 @@ from pmsmtool.bus.scan import find_nodes
 from pmsmtool.bus.sdo import Mode, SdoChannel
 from pmsmtool.errors import DriveTimeout, SdoAbort
 
+pytestmark = pytest.mark.wall_clock
+
 NODE = 9
 NUMBER, BLOB = (0x2000, 0), (0x2001, 0)
 SIZES = [1, 4, 5, 6, 7, 8, 14, 29, 888, 889, 890, 1778, 16384]

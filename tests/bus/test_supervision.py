@@ -72,6 +72,20 @@ def test_lost_heartbeat_ends_a_download_within_a_second(
     assert bus.clock.now() - gone < 1.0
 
 
+def test_time_in_which_this_computer_did_not_listen_is_no_silence(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision
+) -> None:
+    supervision.heartbeat_period_s = 0.2
+    bus.deliver(0x700 + NODE, b"\x05")
+    connection.wait(0.01)
+    connection.wait(1.0)
+    connection.deaf_s += 0.9
+    supervision.check()
+    connection.wait(0.3)
+    with pytest.raises(HeartbeatLost):
+        supervision.check()
+
+
 def write_often(channel: SdoChannel) -> None:
     for _ in range(300):
         channel.download(0x2010, 2, bytes(4))

@@ -166,6 +166,7 @@ def test_a_run_remembers_its_bus(tool: Tool) -> None:
     assert tool("commission", "--resume", "run")[0] == 0, "nothing is left to do, so nobody is asked"
 
 
+@pytest.mark.wall_clock
 def test_through_another_process_with_the_limits_a_real_drive_needs(
     tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

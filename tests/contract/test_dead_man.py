@@ -29,6 +29,8 @@ from tests.contract.contract import Peer
 from tests.drive.bench import sim_bench
 from tests.drive.served import ROOT, Server, serving
 
+pytestmark = pytest.mark.wall_clock
+
 DECLARED_S = 1e-3 * CONSUMER_MS + REACTION_S
 CONSENT = ("--yes", "--i-max", "3Apk", "--speed-max", "100rpm", "--shaft", "free", "--serial", "22001")
 HEARTBEAT_LOST = b"\x30\x81"

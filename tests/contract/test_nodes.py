@@ -13,6 +13,8 @@ from pmsmtool.sim.bus import PmsmSimBus
 from tests.contract.contract import NODE, DriveNodeContract, NodeContract, Peer
 from tests.drive.served import Server, serving
 
+pytestmark = pytest.mark.wall_clock
+
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Server]:

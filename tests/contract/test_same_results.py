@@ -6,6 +6,8 @@ import math
 import struct
 from collections.abc import Iterator
 
+import pytest
+
 from pmsmtool.bus.connect import Connection
 from pmsmtool.bus.nmt import NmtCommand, reset_node, send_nmt
 from pmsmtool.bus.sdo import Mode
@@ -14,6 +16,8 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.objects import ObjectRow, object_rows
 from tests.contract.contract import NODE, Peer
 from tests.drive.served import serving
+
+pytestmark = pytest.mark.wall_clock
 
 MEASURED = (
     "live.",

@@ -17,6 +17,8 @@ import pytest
 from pmsmtool.resources import data_folder
 from tests.drive.served import ROOT, Server, serving
 
+pytestmark = pytest.mark.wall_clock
+
 CHANNEL = "interior-2k2?nv=:memory:"
 EDS = str(data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds")
 BEAT, REQUEST, ANSWER = 0x701, 0x601, 0x581

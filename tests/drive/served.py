@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pmsmtool.bus.connect import Connection, connect
+from tests.wall_clock import listen
 
 ROOT = Path(__file__).parents[2]
 
@@ -31,9 +32,10 @@ class Server:
 def serving(*arguments: str, profile: str = "interior-2k2") -> Iterator[Server]:
     """Run ``pmsmtool sim serve`` on a free port."""
     command = [sys.executable, "-m", "pmsmtool", "sim", "serve", profile, "--port", "0", "--json", *arguments]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
-        assert process.stdout is not None
+        assert process.stdout is not None and process.stderr is not None
+        listen(process.stderr)
         yield Server(process, json.loads(process.stdout.readline())["port"])
     finally:
         process.terminate()

@@ -14,6 +14,8 @@ from pmsmtool.errors import BusError, StopNotConfirmed
 from tests.drive.contract import ENVELOPE, DriveContract
 from tests.drive.served import Server, serving
 
+pytestmark = pytest.mark.wall_clock
+
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Server]:

@@ -14,13 +14,15 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import WallClock
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cia402 import AbortConnection, State
-from pmsmtool.drive.dead_man import CONSUMER_MS, prove_dead_man
+from pmsmtool.drive.dead_man import CONSUMER_MS, TRIES, prove_dead_man
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.heartbeat import PERIOD_S, TOOL_NODE, Heartbeat
 from pmsmtool.errors import SafetyRefusal
 from pmsmtool.sim.node.dictionary import Refused
 from tests.bus.scripted import ScriptedBus, ScriptedSlave
 from tests.drive.bench import ENVELOPE, SimBench, sim_bench
+
+pytestmark = pytest.mark.wall_clock
 
 
 @pytest.fixture
@@ -68,6 +70,75 @@ def test_drive_without_the_objects_is_refused_before_motion(bench: SimBench, ind
 def test_drive_that_ignores_the_heartbeat_is_refused_and_stopped(bench: SimBench) -> None:
     bench.session.consumer.heard = lambda node: None  # type: ignore[method-assign]
     with pytest.raises(SafetyRefusal, match="still enabled 350 ms after"), guarded(bench.drive, ENVELOPE):
+        pass
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def stalling(bench: SimBench, monkeypatch: pytest.MonkeyPatch, stalls: int) -> list[float]:
+    """Let the computer stand still behind the first question for the state in each of so many measurements."""
+    state, begun = bench.drive.node.state, Heartbeat.stop
+    due: list[float] = []
+    seen: list[float] = []
+
+    def stop(self: Heartbeat) -> None:
+        begun(self)
+        if len(seen) < stalls:
+            due.append(0.5)
+
+    def asked() -> State | None:
+        found = state()
+        if due:
+            seen.append(due.pop())
+            bench.bus.clock.wait(seen[-1])
+        return found
+
+    monkeypatch.setattr(Heartbeat, "stop", stop)
+    monkeypatch.setattr(bench.drive.node, "state", asked)
+    return seen
+
+
+def test_a_measurement_in_which_the_computer_stalled_is_repeated(
+    bench: SimBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = stalling(bench, monkeypatch, TRIES - 1)
+    proof = prove_dead_man(bench.drive, Heartbeat(bench.connection))
+    assert len(seen) == TRIES - 1, "the trap was set"
+    assert 1e-3 * CONSUMER_MS - PERIOD_S < proof.measured_s <= proof.declared_s
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def test_a_computer_that_always_stalls_shows_no_dead_man(bench: SimBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = stalling(bench, monkeypatch, 100)
+    with pytest.raises(SafetyRefusal, match="too busy"), guarded(bench.drive, ENVELOPE):
+        pass
+    assert len(seen) >= TRIES
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def test_a_heartbeat_that_this_computer_held_back_is_no_fault_of_the_drive(bench: SimBench) -> None:
+    heartbeat = Heartbeat(bench.connection)
+    beat, held = heartbeat._beat, [2e-3 * CONSUMER_MS]
+
+    def late() -> None:
+        if not held or bench.bus.clock.now() > started + held[0]:
+            held.clear()
+            beat()
+
+    heartbeat._beat = late  # type: ignore[method-assign]
+    started = bench.bus.clock.now()
+    assert prove_dead_man(bench.drive, heartbeat).measured_s > 1e-3 * CONSUMER_MS - PERIOD_S
+    assert not held, "the trap was set"
+
+
+def test_a_drive_that_reacts_late_is_refused(bench: SimBench) -> None:
+    heard = bench.session.consumer.heard
+
+    def late(node: int) -> None:
+        heard(node)
+        bench.session.consumer._deadline[node] += 200_000_000
+
+    bench.session.consumer.heard = late  # type: ignore[method-assign]
+    with pytest.raises(SafetyRefusal, match="350 ms after"), guarded(bench.drive, ENVELOPE):
         pass
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
 

@@ -16,6 +16,8 @@ from pmsmtool.cia402 import State
 from pmsmtool.drive.drive_node import DriveNode
 from tests.drive.served import ROOT, Server, serving
 
+pytestmark = pytest.mark.wall_clock
+
 DECLARED_S = 0.35
 """Consumer time and reaction of ``drive/dead_man.py``."""
 POLLING_S = 0.3
@@ -26,6 +28,18 @@ POLLING_S = 0.3
 def server() -> Iterator[Server]:
     with serving("--nv", ":memory:") as running:
         yield running
+
+
+STARTED: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def nobody_is_left() -> Iterator[None]:
+    """A jog that a failing test left behind would be a second master for the next one."""
+    yield
+    while STARTED:
+        with STARTED.pop() as process:
+            process.kill()
 
 
 def jogging(server: Server, home: Path) -> subprocess.Popen[str]:
@@ -44,6 +58,7 @@ def jogging(server: Server, home: Path) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
     )
+    STARTED.append(process)
     assert process.stderr is not None
     for line in process.stderr:
         if line.startswith("dead-man proven"):

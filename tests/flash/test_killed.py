@@ -21,6 +21,8 @@ from pmsmtool.params.parameter_set import ParameterSet
 from tests.drive.served import ROOT, Server, serving
 from tests.flash.rig import with_tables
 
+pytestmark = pytest.mark.wall_clock
+
 KILLS = 4
 """The full 50 are run by ``benchmarks/killed_downloads.py``."""
 

@@ -15,6 +15,8 @@ from pmsmtool.sim.line import Frame, Line
 from tests.node.bench import Bench
 from tests.node.conftest import BenchMaker
 
+pytestmark = pytest.mark.wall_clock
+
 
 def message(can_id: int, data: bytes = b"", **more: Any) -> can.Message:
     return can.Message(arbitration_id=can_id, data=data, is_extended_id=more.pop("is_extended_id", False), **more)

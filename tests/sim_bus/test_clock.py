@@ -10,6 +10,8 @@ import pytest
 
 from pmsmtool.bus.clock import NEVER, NS, VirtualClock, WallClock, clock_of
 
+pytestmark = pytest.mark.wall_clock
+
 
 def test_virtual_time_passes_only_by_waiting_and_costs_none() -> None:
     clock = VirtualClock()

@@ -23,8 +23,10 @@ import pytest
 from pmsmtool.errors import BusError
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.channel import build_line, parse_channel
-from pmsmtool.sim.serve import HOLD_S, SocketcandServer
+from pmsmtool.sim.serve import HOLD_S, PAUSED, SocketcandServer
 from tests.node.simple_core import SimpleCore
+
+pytestmark = pytest.mark.wall_clock
 
 READ_SERIAL = bytes.fromhex("4018100400000000")
 EDS = str(data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds")
@@ -86,6 +88,25 @@ def test_time_follows_the_wall_clock_times_speed() -> None:
                 heard = bus.recv(0.1)
                 beats += heard is not None and heard.arbitration_id == 0x701
             assert expected - 1 <= beats <= expected * 0.7 / 0.6 + 2
+
+
+def test_time_in_which_the_computer_did_not_run_the_server_is_not_made_up_for() -> None:
+    line = build_line(parse_channel("interior-2k2?nv=:memory:"), make_core=lambda machine_file, seed: SimpleCore())
+    said: list[str] = []
+    server = SocketcandServer(line, port=0, say=said.append)
+    try:
+        for _ in range(20):
+            server._run(0.0)
+        assert said == [], "nothing has happened yet"
+        before = line.clock.now_ns
+        server._started -= 1.0
+        for _ in range(20):
+            server._run(0.0)
+        assert line.clock.now_ns - before < 500_000_000
+        assert len(said) == 1
+        assert said[0].startswith(f"{PAUSED} 0.9")
+    finally:
+        server.close()
 
 
 def test_frames_behind_the_handshake_are_held_not_lost() -> None:

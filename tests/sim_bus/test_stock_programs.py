@@ -17,6 +17,8 @@ from pmsmtool.sim.node.eds import eds_text
 from tests.node.bench import SERIAL, Bench
 from tests.node.conftest import BenchMaker
 
+pytestmark = pytest.mark.wall_clock
+
 EDS = str(data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds")
 
 
