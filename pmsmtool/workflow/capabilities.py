@@ -326,7 +326,7 @@ def reference_capabilities(identity: Identity) -> Capabilities:
 
 
 _FULL = "benchmarks.identification_coverage --drives 12 --first 9000"
-_RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 62 --first 5000"
+_RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 80 --first 5000"
 _STANDARD_RUN = "benchmarks.tier_intervals standard --drives 76 --first 5000 --speed 1.35"
 
 _VOLTAGE_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --speed 1.35"
@@ -342,11 +342,11 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("psi", Method.INJECT): _expected(_FULL, 12, ("psi_f_wb", 1.1, "%")),
     ("encoder", Method.INJECT): _expected(_FULL, 12, ("offset_rad", 0.11, "deg")),
     ("mechanics", Method.INJECT): _expected(_FULL, 12, ("J_kgm2", 3.0, "%")),
-    ("R", Method.RECORDER): _expected(_RECORDER_RUN, 61, ("R_s_ohm", 6.5, "%")),
-    ("L", Method.RECORDER): _expected(_RECORDER_RUN, 62, ("L_q_app_h", 8.0, "%")),
-    ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 62, ("psi_f_wb", 1.2, "%")),
+    ("R", Method.RECORDER): _expected(_RECORDER_RUN, 79, ("R_s_ohm", 6.8, "%")),
+    ("L", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("L_q_app_h", 8.0, "%")),
+    ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("psi_f_wb", 1.2, "%")),
     ("mechanics", Method.RECORDER): _expected(
-        _RECORDER_RUN, 62, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")
+        _RECORDER_RUN, 80, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")
     ),
     ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("offset_rad", 1.8, "deg")),
     ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("pole_pairs", 0.3, "%")),
