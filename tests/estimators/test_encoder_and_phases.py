@@ -177,6 +177,27 @@ def test_unequal_pairs_and_unequal_sensors_are_told_apart(found: Trace, reason: 
     assert caught.value.reason == reason
 
 
+STEEP = InverterCurve(np.array([1e-3, math.sqrt(0.75), math.sqrt(3.0)]), np.array([4.0, 5.0, 8.0]), 0.0)
+"""An error that still rises by 3.46 V along the vector between the two currents: 4 ohm of slope at 2 ohm of winding."""
+
+
+def through_steep(R: tuple[float, float, float], legs: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Trace:
+    """The pairs with the error of ``STEEP``; that of each pair is as much larger as its legs say."""
+    found = pairs(R)
+    i = found["i_d_a"]
+    error = STEEP.error_v(math.sqrt(0.75) * i) * 2.0 / math.sqrt(3.0) * np.repeat(legs, 2)
+    return trace(**{**found.signals, "u_d_v": found["u_d_v"] - 10.0 / math.sqrt(3.0) + error})
+
+
+def test_legs_that_are_not_alike_are_no_unbalance_of_the_winding() -> None:
+    legs = (1.035, 0.97, 1.0)  # 0.22 ohm of difference, 11 % of the winding
+    check_pairs(through_steep((2.0, 2.0, 2.0), legs), NOISE, STEEP)
+    with pytest.raises(IdentificationError, match="E_UNBALANCED"):
+        check_pairs(through_steep((3.5, 2.0, 2.0), legs), NOISE, STEEP)
+    with pytest.raises(IdentificationError, match="E_UNBALANCED"):
+        check_pairs(through_steep((2.0, 2.0, 1.2), legs), NOISE, STEEP)
+
+
 def test_pairs_under_a_moving_rotor_are_not_judged() -> None:
     assert not check_pairs(pairs((3.0, 2.0, 2.0), moved=1), NOISE, STEP).judged
 
