@@ -60,7 +60,8 @@ CROSSING = 0.433
 U_SHARE = 0.5
 """Largest injection amplitude, of the largest voltage."""
 RUN_BANDWIDTH_RAD_S = 2.0 * math.pi * 120.0
-"""Current bandwidth of the runs that turn the shaft, at most a fifteenth of the sampling rate."""
+"""Current bandwidth of the runs that turn the shaft, at most a fifteenth of the sampling rate; the flux run may have
+more."""
 PUSH_SHARE = 0.5
 PUSH_SPEED_SHARE = 0.12
 PUSH_SAMPLES = 1024
@@ -403,7 +404,7 @@ class Measurement:
         )
         self.drive.enable()
         psi, J = self._pushes(resistance, pole_pairs)
-        self._speeds(psi, J, pole_pairs, L)
+        self._speeds(psi, J, pole_pairs, L, resistance.V_dead_v)
 
     def _pushes(self, resistance: ResistanceResult, pole_pairs: int) -> tuple[float, float]:
         """Push the rotor there and back; return flux linkage (Wb) and inertia (kg m2), good for a speed controller."""
@@ -459,7 +460,7 @@ class Measurement:
         omega_e = 0.9 * pole_pairs * self.limits.omega_max_rad_s
         return speed_run.push_and_record(self.drive, i_q_a, samples, decimation, omega_e)
 
-    def _speeds(self, psi: float, J: float, pole_pairs: int, L: tuple[float, float]) -> None:
+    def _speeds(self, psi: float, J: float, pole_pairs: int, L: tuple[float, float], V_dead_v: float) -> None:
         limits = self.limits
         run_i_d = RUN_I_D_SHARE * limits.I_test_apk
         flux = psi + SATURATED * L[0] * run_i_d
@@ -471,13 +472,20 @@ class Measurement:
         per_ampere = 1.5 * pole_pairs * psi / J
         i_q = min(0.5 * i_run, RUN_I_Q_SPEED_SHARE * largest / (RUN_I_Q_S * per_ampere))
         # a current that is slow because the inverter's error is steep would not be steady in its window
-        alpha = min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s))
-        R_ohm = self.drive.read("motor.R_s_ohm")
-        K_i_d, K_i_q = (max(alpha * R_ohm, 0.25 * alpha**2 * inductance) for inductance in L)
+        loop = speed_run.steady_loop(
+            self.drive.read("motor.R_s_ohm"),
+            L,
+            V_dead_v,
+            min(map(min, speed_run.D_SHARES)) * run_i_d,
+            self.drive.period_s,
+            min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s)),
+        )
         self._off_and_write(
             {
-                "current.K_i_d_v_per_as": K_i_d,
-                "current.K_i_q_v_per_as": K_i_q,
+                "current.K_p_d_v_per_a": loop.K_p_v_per_a[0],
+                "current.K_p_q_v_per_a": loop.K_p_v_per_a[1],
+                "current.K_i_d_v_per_as": loop.K_i_v_per_as[0],
+                "current.K_i_q_v_per_as": loop.K_i_v_per_as[1],
                 "motor.psi_f_wb": psi,
                 "motor.J_kgm2": J,
                 "current.options": 7.0,
@@ -490,7 +498,7 @@ class Measurement:
         self.drive.enable()
         fastest_rpm = largest * 30.0 / math.pi
         self.say(f"psi_f and fine offset: coasting from up to {fastest_rpm:.0f} rpm, i_d up to {run_i_d:.3g} A")
-        plan = speed_run.SpeedPlan(largest, run_i_d, i_q)
+        plan = speed_run.SpeedPlan(largest, run_i_d, i_q, settle_s=loop.settle_s, first_s=2.0 * loop.settle_s)
         rows = speed_run.coast_through(self.drive, plan, pole_pairs)
         speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)
         lag_s = 2.0 / self.drive.read("encoder.pll_bandwidth_rad_s")  # its poles are a double one
