@@ -58,7 +58,7 @@ def run(arguments: Sequence[str]) -> int:
         if isinstance(decisive(error), BrokenPipeError) and _reader_gone():
             return READER_GONE
         code = report(error, _verbosity(context))
-        return READER_GONE if code == 0 and _reader_gone() else code
+        return READER_GONE if _reader_gone() and code == 0 else code
     return 0
 
 
@@ -70,16 +70,20 @@ def _verbosity(context: click.Context | None) -> int:
 
 
 def _reader_gone() -> bool:
-    """Whether nobody reads standard output any more; it is then closed so that Python's own exit stays silent."""
+    """Whether nobody reads standard output any more.
+
+    What could not be written is given up, so that Python's own exit neither tries again nor changes the exit code.
+    """
     try:
-        sys.stdout.flush()
         descriptor = sys.stdout.fileno()
-        gone = _pipe_is_broken(descriptor)
-    except BrokenPipeError:
-        descriptor, gone = sys.stdout.fileno(), True
     except (OSError, ValueError):
         return False  # no file of the system behind it
-    if gone:
+    try:
+        sys.stdout.flush()
+        gone = given_up = _pipe_is_broken(descriptor)
+    except OSError as error:
+        gone, given_up = isinstance(error, BrokenPipeError), True
+    if given_up:
         os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
     return gone
 

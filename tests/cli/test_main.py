@@ -295,7 +295,9 @@ def test_every_exit_code_is_explained() -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pipes of this kind")
-def test_reader_gone_and_full_disk() -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_reader_gone_and_full_disk(unbuffered: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
     command = [sys.executable, "-m", "pmsmtool", "help", "units"]
     reading, writing = os.pipe()
     os.close(reading)
