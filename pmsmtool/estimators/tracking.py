@@ -1,10 +1,10 @@
 """R(T) and psi(T) followed during operation, by an unscented Kalman filter on means of voltage, current and speed.
 
-The model is in ``tracking_model``. R and psi walk at random; the inverter's share and the inductances are constants,
-known within their intervals, so that what they leave open stays in the intervals of R and psi. The noise comes from
-the data (second differences), the walk is the likeliest of a few, and the mean normalised innovation (NIS, 2 is ideal)
-must agree with both: above the gate the noise is inflated, and what would need too much of that is refused. What the
-excitation cannot tell apart is refused by name.
+The model is in ``tracking_model``. R and psi walk at random; size and tail of the inverter's error, the inductances and
+the lag of the drive's speed are constants, known within their intervals, so that what they leave open stays in the
+intervals of R and psi. The noise comes from the data (second differences), the walk is the likeliest of a few, and the
+mean normalised innovation (NIS, 2 is ideal) must agree with both: above the gate the noise is inflated, and what would
+need too much of that is refused. What the excitation cannot tell apart is refused by name.
 
 References
 ----------
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 STAGE = "tracking"
 WALK = {"R_s_ohm": 2e-3, "psi_f_wb": 3e-4}
-"""Relative random walk in one second: 5 K of copper, 2.5 K of magnets."""
+"""Relative random walk in one second: half a kelvin of copper, a quarter of one of magnets."""
 WALK_FACTORS = (1.0, 5.0, 25.0)
 """Factors on it, of which the likeliest is taken."""
 LIMIT = {"R_s_ohm": 0.05, "psi_f_wb": 0.02}
@@ -121,7 +121,7 @@ class Tracker:
             size, 2, 1.0, lambda x, given: model_voltage(x, given, known.scale), lambda x, dt: x, points
         )
         self._noise = np.diag(np.square(noise_v))
-        self._walk = walk * np.array([WALK["R_s_ohm"], WALK["psi_f_wb"], 0.0, 0.0, 0.0])
+        self._walk = walk * np.array([WALK.get(name, 0.0) for name in STATES])
         self._last_s: float | None = None
         self.log_likelihood = 0.0
         self.restarts = 0
@@ -138,7 +138,7 @@ class Tracker:
         ----------
         t_s : float
             Instant (s), not decreasing.
-        given : ndarray, shape (7,)
+        given : ndarray, shape (10,)
             Row of the inputs.
         u_v : ndarray, shape (2,)
             Measured u_d, u_q (V).

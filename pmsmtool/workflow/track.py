@@ -25,7 +25,7 @@ from pmsmtool.drive.process_data import live_values
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import Track, track
-from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, SIGNALS, TRACKED, Known, condense
+from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, RISES, SIGNALS, TRACKED, Known, condense
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
@@ -208,12 +208,12 @@ def joined(parts: Sequence[Trace]) -> Trace:
         times.append(part.t_s - part.t_s[0] + start)
         last = float(times[-1][-1])
     filled = [part for part in parts if len(part)]
-    names = [name for name in (*NAMES, "d_rise_a", "q_rise_a") if all(name in part.signals for part in filled)]
+    names = [name for name in (*NAMES, *RISES) if all(name in part.signals for part in filled)]
     if not filled:
         return Trace(np.zeros(0), {name: np.zeros(0) for name in SIGNALS}, {n: signal_unit(n) for n in SIGNALS}, {})
     windows = {(float(part.meta.get("window_s", 0.0)), int(part.meta.get("rows", 0))) for part in filled}
     if len(windows) > 1:  # rises over windows of different lengths are no common column
-        names = [name for name in names if not name.endswith("_rise_a")]
+        names = [name for name in names if name not in RISES]
     return Trace(
         np.concatenate(times),
         {name: np.concatenate([part[name] for part in filled]) for name in names},

@@ -131,7 +131,7 @@ def test_too_few_observations_are_refused(warming: dict[int, Trace]) -> None:
 def test_what_is_no_number_is_no_observation() -> None:
     tracker = Tracker(known(machine()), (0.1, 0.1))
     with pytest.raises(ValueError, match="not a number"):
-        tracker.update(0.0, np.array([0.0, np.nan, 1.0, 0.0, 0.0, 0.0, 0.0]), np.zeros(2))
+        tracker.update(0.0, np.append([0.0, np.nan], np.ones(8)), np.zeros(2))
 
 
 def test_windows_that_are_limited_or_unsteady_are_left_out() -> None:
