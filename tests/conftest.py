@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
 
 import pytest
 from _pytest.runner import runtestprotocol
@@ -13,6 +14,14 @@ from tests import wall_clock
 # would wait for ever. A handler of ours is back to the default in children.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """No test writes into the home of whoever runs it, who may have none."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PMSMTOOL_HOME", str(tmp_path_factory.mktemp("home")))
+        yield
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:

@@ -26,6 +26,7 @@ from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.params.parameter_set import ParameterSet, default_set, read_parameter_set
 from pmsmtool.workflow.export import image_of
 from pmsmtool.workflow.parameter_source import load_parameters
+from tests.simulated_bus import settle
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 KINDS = {
@@ -35,6 +36,12 @@ KINDS = {
     "flux, int16": ("--axis", "flux", "--stored", "int16"),
     "three voltages, int16": ("--stored", "int16", "--u-dc", "150V", "--u-dc", "160V", "--u-dc", "173V"),
 }
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Journals and backups stay here: where the tests run there may be no home folder."""
+    settle(tmp_path, monkeypatch)
 
 
 def run(*arguments: str | Path) -> tuple[int, str]:
