@@ -32,7 +32,8 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import IdentificationError, PmsmtoolError
 from pmsmtool.estimators.estimate import statistical_half_width
-from pmsmtool.estimators.mechanics import BLOCKS, TORQUE_FLOOR, estimate_mechanics, positions
+from pmsmtool.estimators.mechanics import BLOCKS, TORQUE_FLOOR, estimate_mechanics
+from pmsmtool.estimators.mechanics_motion import positions
 from pmsmtool.machine.machine_file import dump_machine_file
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace import Trace

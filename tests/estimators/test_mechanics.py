@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.mechanics_accuracy import realisation
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.mechanics import MechanicsResult, estimate_mechanics, positions
+from pmsmtool.estimators.mechanics import MechanicsResult, estimate_mechanics
+from pmsmtool.estimators.mechanics_motion import positions
 from pmsmtool.experiments.mechanics_run import UNIT_LEAST_S, UNIT_MOST_S, plan_mechanics
 from pmsmtool.trace import Trace
 
@@ -174,3 +176,14 @@ def test_pushes_are_sized_by_speed_and_time() -> None:
     assert 0.9 * quick.i_q_a * quick.unit_s / 2e-5 == pytest.approx(100.0)
     heavy = plan_mechanics(4.0, 100.0, 2.0, 0.9)
     assert heavy.unit_s == UNIT_MOST_S and heavy.omega_rad_s < 100.0
+
+
+def test_fits_arrive_where_the_encoder_alone_makes_a_narrow_valley() -> None:
+    """A realisation of the bound in which a fit straight from a coarse one made 60 steps without a minimum."""
+    rng = np.random.default_rng(77)
+    for _ in range(12):
+        realisation(rng)
+    traces, truth, per_a, sigma = realisation(rng)
+    found = estimate_mechanics(traces, lambda i_d, i_q: per_a * i_q, per_a, sigma, 0.0)
+    for value, true in zip((found.J, found.B, found.tau_c), truth, strict=True):
+        assert abs(value.value - true) < 4.0 * value.std
