@@ -13,8 +13,8 @@ from typing import IO
 from pmsmtool.sim.serve import PAUSED
 
 TRIES = 3
-LATE_S = 0.1
-"""A sleep of ``NAP_S`` that takes this much longer is a stall; half the heartbeat time a drive leaves the tool."""
+LATE_S = 0.05
+"""A sleep of ``NAP_S`` that takes this much longer is a stall: a heartbeat of the tool would have been left out."""
 NAP_S = 0.02
 STALLS: list[str] = []
 """What was noticed; a test that begins empties it."""

@@ -35,7 +35,7 @@ MEASURED_MAP = Path(__file__).parents[2].parent / "shared" / "maps" / "baldor_40
 TOLERANCE = 0.01
 """Largest deviation of an identified value from the truth with ideal sensor gains; measured 0.2 % (benchmarks/
 commissioning.py)."""
-BUSY_RETRIES = 2
+BUSY_RETRIES = 5
 """The served drive runs in real time; a machine that is busy with other things may starve it."""
 QUANTITIES = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
 
@@ -181,10 +181,10 @@ def test_through_another_process_with_the_limits_a_real_drive_needs(
         limits = ("--i-max", "7.3Apk", "--speed-max", "3000rpm", "--shaft", "free", "--serial", "22001")
         code, out, err = tool("commission", "--yes", *limits)
         for _ in range(BUSY_RETRIES):
-            if code != 3:
+            if code == 0:
                 break
             # This machine was too busy for a heartbeat of 0.2 s: the drive was stopped, the run goes on.
-            assert "heartbeat" in err, err
+            assert (code == 3 and "heartbeat" in err) or (code == 5 and "too busy" in err), err
             code, out, err = tool("commission", "--yes", *limits, "--resume", str(the_run()[0].path))
         assert code == 0, err
         directory, _ = the_run()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 from pathlib import Path
 
 import click
@@ -104,9 +103,8 @@ except BaseException as error:
         os.chdir(ROOT)
         os.execv(sys.executable, [sys.executable, "-c", program])
     seen = b""
-    while b"[y/N]" not in seen:
+    while b"[y/N]: " not in seen:  # the blank is the reader's own: it has taken the terminal
         seen += os.read(terminal, 1024)
-    time.sleep(0.1)  # the prompt is out; reading starts right behind it
     os.write(terminal, key)
     try:
         while chunk := os.read(terminal, 1024):
