@@ -10,6 +10,7 @@ import pytest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import statistical_half_width
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
+from pmsmtool.estimators.flux_linkage_rows import mean_inverter_error
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, curve_points, draw, repeat, run
@@ -107,6 +108,22 @@ def test_psi_and_offset_over_drives(population: Population) -> None:
 def test_the_q_inductance_comes_out_beside(population: Population) -> None:
     errors = [abs(population.estimate(k).L_q_h / population.drives.L_q[k] - 1.0) for k in range(population.drives.n)]
     assert np.median(errors) < 0.05  # a check of L_q, not a measurement: 10 % of I_r only
+
+
+def test_the_q_inductance_is_doubted_by_what_the_inverter_leaves_on_d(population: Population) -> None:
+    """A share of the error at a q current lies on d: L_q is off by it, and within what it claims."""
+    d = population.drives
+    for k in range(d.n):
+        curve = InverterCurve(*curve_points(d, k), 0.0)
+        trace = population.speeds(k)
+        q = np.abs(trace["i_q_a"]) > 0.5 * Q * d.I_r[k]
+        turned = 0.05 * np.abs(mean_inverter_error(curve, (trace["i_d_a"], trace["i_q_a"]))[1])
+        u_d = trace["u_d_v"] - np.where(q, turned * np.sign(trace["omega_e_rad_s"] * trace["i_q_a"]), 0.0)
+        found = estimate_flux_linkage(_changed(trace, u_d_v=u_d), d.R[k], period_s=d.T_s[k], inverter=curve)
+        plain = population.estimate(k)
+        off = float(np.mean(turned[q]) / np.mean(np.abs(trace["omega_e_rad_s"] * trace["i_q_a"])[q]))
+        assert found.L_q_h - plain.L_q_h == pytest.approx(off, rel=0.1)
+        assert found.L_q_h - plain.L_q_h < 0.9 * found.L_q_std_h
 
 
 def test_without_the_sampled_data_correction_psi_is_low(population: Population) -> None:
