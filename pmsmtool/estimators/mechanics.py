@@ -61,6 +61,9 @@ GROWTH_MOST = 2.5
 """Largest growth of the torque's noise from one fit to the next: a fit that has not arrived asks for too much."""
 RIPPLE_MOST = 0.05
 """Largest deviation of a block's torque, of the push's: above, the shaft is not what the model says."""
+UNEXPLAINED = 2.0
+"""Growth of the torque's noise in pushes or coasting from which on a result says so."""
+NOISY_TORQUE = "cogging, a load or a gear on the shaft, an elastic coupling, an encoder that is off centre"
 SCALE_FLOOR = 3e-4
 """Relative deviation of the torque's scale beyond that of the flux linkage and of the samples' displacement."""
 ROUNDING_RAD = 1e-6
@@ -80,6 +83,9 @@ class MechanicsResult:
         Standard deviations of the three by the fit alone, without the torque's scale that they share.
     ripple : float
         Deviation of a block's torque that the residual asked for, of the push's.
+    unexplained : bool
+        Whether that is so much more than the currents' noise and the floor that it widens the intervals notably; the
+        estimates say it as their fallback.
     chi2 : float
         Reduced chi-square of the whitened position.
     condition : float
@@ -93,6 +99,7 @@ class MechanicsResult:
     ripple: float
     chi2: float
     condition: float
+    unexplained: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,7 +159,13 @@ def estimate_mechanics(
     step = _encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, torque_per_a, sigma_a, direction, step) for run in runs]
     start = _start(blocks)
-    fit, chi2, ripple = _fit(blocks, start)
+    fit, chi2, noise = _fit(blocks, start)
+    before = _noise(blocks)
+    unexplained = any(noise[kind] > UNEXPLAINED * max(before[kind], COASTING_FLOOR) for kind in noise)
+    fallback = ""
+    if unexplained:
+        pushed, coasted = (100.0 * noise[coasting] for coasting in (False, True))
+        fallback = f"torque noise of {pushed:.2g} % of the push's, coasting {coasted:.2g} %, assumed: {NOISY_TORQUE}"
     bound, condition = information_bound(fit.jacobian)
     condition_gate(condition, "B and tau_c", STAGE)
     _, widen = chi2_gate(chi2, STAGE)
@@ -169,10 +182,13 @@ def estimate_mechanics(
             n=n,
             chi2=chi2,
             method=METHOD,
+            fallback=fallback,
         )
         for value, std, unit in zip((J, B, tau_c), stds, ("kg m2", "N m s", "N m"), strict=True)
     ]
-    return MechanicsResult(estimates[0], estimates[1], estimates[2], stds, ripple, chi2, condition)
+    return MechanicsResult(
+        estimates[0], estimates[1], estimates[2], stds, max(noise.values()), chi2, condition, unexplained
+    )
 
 
 def _encoder_step(positions: Sequence[Array]) -> float:
@@ -236,8 +252,8 @@ def _start(runs: Sequence[_Run]) -> Array:
     return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
 
 
-def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float, float]:
-    """Return the fit, its reduced chi-square, and the torque's noise that it took, of the largest torque."""
+def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float, dict[bool, float]]:
+    """Return the fit, its reduced chi-square, and the torque's noise that it took."""
     speed = max(float(np.max(np.abs(np.diff(run.theta)))) / run.T for run in runs)
     largest = max(float(np.max(np.abs(run.torque))) for run in runs)
     scale = np.array([1.0, largest / speed, largest, *(value for run in runs for value in (1.0, speed))])
@@ -248,7 +264,8 @@ def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float, float]:
         fit = _minimum(runs, x, scale)
         x = fit.x
         chi2 = fit.cost / fit.dof
-        ripple = max(run.torque_std for run in runs) / largest
+        noise = _noise(runs)
+        ripple = max(noise.values())
         noisier = _noisier(runs, fit.residual, largest)
         if ripple > RIPPLE_MOST:
             raise refuse(
@@ -256,7 +273,7 @@ def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float, float]:
                 f"torque off by {100.0 * ripple:.2g} % of the push's, and more, from one {1e3 * runs[0].T:.2g} ms to "
                 f"the next, limit {100.0 * RIPPLE_MOST:g} %",
                 stage=STAGE,
-                likely="cogging, a load or a gear on the shaft, an elastic coupling, an encoder that is off centre",
+                likely=NOISY_TORQUE,
             )
         if fit.converged:
             if count and noisier is runs:
@@ -264,7 +281,16 @@ def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float, float]:
             runs = noisier  # before a minimum the residual says nothing of the noise
     if not fit.converged:
         raise refuse("E_NOT_CONVERGED", f"{fit.iterations} steps without a minimum", stage=STAGE)
-    return fit, chi2, ripple
+    return fit, chi2, noise
+
+
+def _noise(runs: Sequence[_Run]) -> dict[bool, float]:
+    """Deviation of a block's torque in pushes (False) and coasting (True), of the push's torque."""
+    largest = max(float(np.max(np.abs(run.torque))) for run in runs)
+    return {
+        kind: max((run.torque_std for run in runs if run.coasting is kind), default=0.0) / largest
+        for kind in (False, True)
+    }
 
 
 def _minimum(runs: Sequence[_Run], x: Array, scale: Array) -> Fit:

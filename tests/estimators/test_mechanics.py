@@ -145,6 +145,8 @@ def test_torque_that_the_model_does_not_know_widens_the_interval() -> None:
     for seed in range(5):
         good = run_of(np.random.default_rng(seed))
         calm, found = estimate(good), estimate([good[0], swinging(good[1], 0.004), *good[2:]])
+        assert found.unexplained and "torque noise" in found.J.fallback and "cogging" in found.tau_c.fallback
+        assert not calm.unexplained and calm.J.fallback == ""
         for k, (value, true) in enumerate(((found.J, J), (found.B, B), (found.tau_c, TAU_C))):
             assert found.fit_std[k] > (1.1, 4.0, 20.0)[k] * calm.fit_std[k]
             assert abs(value.value - true) < 4.0 * value.std
