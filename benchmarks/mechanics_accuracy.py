@@ -31,7 +31,7 @@ from pmsmtool.bus.connect import connect
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import IdentificationError, PmsmtoolError
-from pmsmtool.estimators.estimate import statistical_half_width
+from pmsmtool.estimators.estimate import statistical_half_width, total_half_width
 from pmsmtool.estimators.mechanics import BLOCKS, TORQUE_FLOOR, estimate_mechanics
 from pmsmtool.estimators.mechanics_motion import positions
 from pmsmtool.machine.machine_file import dump_machine_file
@@ -77,6 +77,7 @@ def identify_one(seed: int) -> Row:
     own = result.mechanics.fit_std[0] / found["J_kgm2"].value
     row["psi_f_wb"] = (psi_error, abs(psi_error) <= statistical_half_width(found["psi_f_wb"]) / found["psi_f_wb"].value)
     row["J/psi"] = (row["J_kgm2"][0] - psi_error, True)
+    row["total J"] = total_half_width(found["J_kgm2"]) / found["J_kgm2"].value
     row |= {"chi2": result.mechanics.chi2, "ripple": result.mechanics.ripple, "fit_std_J": own}
     return row
 
@@ -103,6 +104,9 @@ def show(rows: Sequence[Row]) -> None:
             low, high = clopper_pearson(hits, len(good))
             line += f"  in 95 % interval {hits}/{len(good)} ({low:.3f} .. {high:.3f})"
         print(line)
+    totals = sorted(100.0 * row["total J"] for row in good if "total J" in row)
+    if totals:
+        print(f"total 95 % half width of J: p90 {totals[round(0.9 * (len(totals) - 1))]:.2f} % of {len(totals)} drives")
     for seed, reason in refused.items():
         print(f"refused: seed {seed}, {reason}")
 
