@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -268,6 +268,10 @@ def follow(observations: Trace, known: Known, machine: MachineFile, wanted: Sequ
             relative = float(found.value[quantity][-1]) / reference - 1.0
             std = math.hypot(float(found.std[quantity][-1]), machine.std.get(quantity, 0.0)) / reference
             temperatures[name] = (values.T_ref_c + relative / alpha, abs(std / alpha))
+    if machine.inverter.voltage_error_i_apk:
+        # the curve was what R_s i had left of the voltage: an error of R_s there is one of the same size here
+        own = np.hypot(found.std["R_s_ohm"], machine.std.get("R_s_ohm", 0.0))
+        found = replace(found, std={**found.std, "R_s_ohm": own})
     sensor = float(np.mean(observations["T_winding_c"])) if "T_winding_c" in observations.signals else math.nan
     systematic = {name: machine.systematic.get(name, 0.0) for name in wanted}
     return Tracked(found, temperatures, systematic, sensor)

@@ -12,6 +12,7 @@ from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import LIMIT, NIS_GATE, Track, Tracker, track
 from pmsmtool.estimators.tracking_model import ACROSS, ALONG, SIGNALS, TRACKED, condense, inputs, ripple_v
 from pmsmtool.trace import Trace
+from pmsmtool.workflow.track import follow
 from tests.tracking.simulated import known, machine, true_values, warming_run
 
 SECONDS = 8.0
@@ -51,6 +52,16 @@ def test_resistance_and_flux_are_followed_while_they_change(warming: dict[int, T
         assert found.nis <= NIS_GATE[1] and found.restarts == 0
     # errors within a run are one draw and not hundreds: the mean over runs is what can be asked for
     assert all(np.mean(values) > 0.8 for values in covered.values()), covered
+
+
+def test_the_doubt_of_the_resistance_behind_the_curve_is_counted(warming: dict[int, Trace]) -> None:
+    drive = machine()
+    identified = replace(drive.inverter, voltage_error_i_apk=(-1.0, 1.0), voltage_error_v=(-1.0, 1.0))
+    observations = condense(warming[1], ROWS)
+    plain = follow(observations, known(drive), drive).track.std["R_s_ohm"]
+    tied = follow(observations, known(drive), replace(drive, inverter=identified)).track.std["R_s_ohm"]
+    assert drive.std["R_s_ohm"] > 0.01
+    assert np.sqrt(tied**2 - plain**2) == pytest.approx(np.full(len(tied), drive.std["R_s_ohm"]))
 
 
 def test_an_inverter_error_that_nobody_told_of_is_refused(warming: dict[int, Trace]) -> None:
