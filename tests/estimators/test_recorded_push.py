@@ -16,6 +16,7 @@ T_S, PAIRS = 1e-4, 4
 R, PSI, L_Q, L_D, AHEAD, V_DEAD = 0.4, 0.12, 3e-3, 2e-3, 0.03, 1.5
 LEVELS = (2.0, 3.0, 4.5, 6.0, 8.0, 10.0)
 SAMPLES, DECIMATION = 1024, 4
+MEAN_OF_SHAPES = 4e-3  # relative; without noise, so no seed decides
 
 
 def push(current: float, *, noise: float = 0.0, seed: int = 0, flagged: float = 0.0, backwards: bool = False) -> Trace:
@@ -54,12 +55,14 @@ def swing(**how: float | bool) -> list[Trace]:
 def test_exact_on_its_own_model(backwards: bool) -> None:
     found = estimate_pushes(swing(backwards=backwards), period_s=T_S, pole_pairs=PAIRS)
     assert found.R is not None
-    # measured: R 2.6e-5, L_q 8.7e-7, psi 3e-8 (relative), angle 1.4e-8 rad
-    assert found.R.value == pytest.approx(R, rel=2e-4)
+    # R is the mean over shapes of the inverter's tail, of which 1/|i| is not this model's: their spread is in its std
+    # measured: R 3.0e-3 at a std of 5.3e-3, V_dead 1.3e-2, L_q 8.7e-7, psi 3e-8 (relative), angle 1.4e-8 rad
+    assert found.R.value == pytest.approx(R, rel=MEAN_OF_SHAPES)
+    assert abs(found.R.value - R) < found.R.std < 2.0 * MEAN_OF_SHAPES * R
     assert found.psi_f.value == pytest.approx(PSI, rel=2e-4)
     assert found.L_q.value == pytest.approx(L_Q, rel=2e-4)
     assert found.frame_offset.value == pytest.approx(AHEAD, abs=1e-4)
-    assert found.V_dead_v == pytest.approx(V_DEAD, rel=1e-3)
+    assert found.V_dead_v == pytest.approx(V_DEAD, rel=0.02)
 
 
 def test_intervals_hold_the_truth_with_noise() -> None:
@@ -74,10 +77,8 @@ def test_an_observer_that_lags_is_not_resistance() -> None:
     """The trap this method was built around: with the drive's own speed R came out 20 to 180 % too large."""
     pushes = swing()
     found = estimate_pushes(pushes, period_s=T_S, pole_pairs=PAIRS)
-    assert found.R is not None and found.R.value == pytest.approx(R, rel=1e-3)
-    lagging = [
-        Trace(p.t_s, {**p.signals, "omega_e_rad_s": p["omega_e_rad_s"] * 0.9}, p.units, p.meta) for p in pushes
-    ]
+    assert found.R is not None and found.R.value == pytest.approx(R, rel=MEAN_OF_SHAPES)
+    lagging = [Trace(p.t_s, {**p.signals, "omega_e_rad_s": p["omega_e_rad_s"] * 0.9}, p.units, p.meta) for p in pushes]
     again = estimate_pushes(lagging, period_s=T_S, pole_pairs=PAIRS)
     assert again.R is not None and again.R.value == found.R.value
 
