@@ -22,8 +22,9 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.closed_loop import image_of
-from pmsmtool.sim.kernel import Part, Seen, Simulation, Target, Truth
+from pmsmtool.sim.kernel import Part, Simulation, Target
 from pmsmtool.sim.scenarios import MODES
+from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import RPM, build_setup, with_simulation
 from pmsmtool.workflow.reproduce.governed_drive import IDEAL, PROFILE
 
@@ -32,8 +33,8 @@ REPEATS = 9
 LIMIT = 6.0
 """Ratio to the bare loop that must hold."""
 RECORDED = (
-    Truth.T, Truth.I_D, Truth.I_Q, Truth.OMEGA_M, Truth.TORQUE, Seen.I_D_REF, Seen.I_Q_REF, Seen.U_D_LIM,
-    Seen.U_Q_LIM, Seen.FLAGS,
+    Truth.T, Truth.I_D, Truth.I_Q, Truth.OMEGA_M, Truth.TORQUE, Signal.I_D_REF, Signal.I_Q_REF, Signal.U_D_LIM,
+    Signal.U_Q_LIM, Signal.FLAGS,
 )  # fmt: skip
 
 CASES: dict[str, TuneRequest] = {

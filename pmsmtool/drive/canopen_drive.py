@@ -163,7 +163,9 @@ class CanopenDrive:
         """Return means over a window of control periods, taken inside the drive."""
         self.recorder.start_average(signals, periods)
         self.wait(periods * self.period_s)
-        return self.recorder.finish_average(signals)
+        means = self.recorder.finish_average(signals)
+        self.check_operating()
+        return means
 
     def record(
         self,
@@ -237,11 +239,31 @@ class CanopenDrive:
     def finish_record(self, signals: Sequence[str], *, decimation: int, excitation: Excitation | None) -> Trace:
         """Wait until the recorder is complete and return its trace, if the drive did not trip meanwhile."""
         trace = self.recorder.fetch(signals, decimation)
-        if self.may_be_energised and self.node.state() in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-            raise self.node.fault_error()
+        self.check_operating()
         if excitation is None:
             return trace
         return replace(trace, meta={**trace.meta, "excitation": _excitation_facts(excitation)})
+
+    def check_operating(self) -> None:
+        """Make sure that a machine that was enabled still is: what a stopped one shows is no measurement.
+
+        Raises
+        ------
+        DriveFault
+            The drive tripped, or left operation by itself.
+        """
+        if not self.may_be_energised:
+            return
+        state = self.node.state()
+        if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            raise self.node.fault_error()
+        if state is not State.OPERATION_ENABLED:
+            raise DriveFault(
+                f"the drive left operation during a measurement: it is in {stop.state_text(state)}",
+                where=f"node {self.node.node}",
+                likely="it missed the tool's heartbeat because this computer was busy, or somebody stopped it",
+                hint="run the command again; nothing of this measurement was used",
+            )
 
     def wait(self, seconds: float) -> None:
         """Let time pass on the bus clock; an alarm of the drive ends it."""

@@ -258,7 +258,9 @@ class GuardedDrive:
         """Return means over a window of control periods, taken inside the drive."""
         self._drive.recorder.start_average(signals, periods)
         self.wait(periods * self.period_s)
-        return self._drive.recorder.finish_average(signals)
+        means = self._drive.recorder.finish_average(signals)
+        self._drive.check_operating()
+        return means
 
     def record(
         self,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pmsmtool.bus.connection import Connection
-from pmsmtool.cia402 import Mode, State
+from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
@@ -96,8 +96,7 @@ class TorqueDrive(StandardDrive):
     def finish_record(self, signals: Sequence[str], *, decimation: int, excitation: Excitation | None) -> Trace:
         """Return what was polled."""
         polled, self._polled = self._polled, ()
-        if self.may_be_energised and self.node.state() in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-            raise self.node.fault_error()
+        self.check_operating()
         table = np.array(self._rows, dtype=np.float64).reshape(len(self._rows), len(polled) + 1)
         units = {name: objects.signal_unit(name) for name in polled}
         return Trace(

@@ -197,6 +197,12 @@ class Capabilities:
                 return tier
         return Tier.VENDOR if self.drive_map.capabilities.auto_tuning else Tier.MANUAL
 
+    @property
+    def unsafe(self) -> bool:
+        """Whether the full tier lacks only what makes motion safe: such a drive is refused, it is no lower tier."""
+        missing = set(dict(_TIERS)[Tier.FULL]) - self.features
+        return bool(missing) and missing <= set(_SAFE)
+
     def rows(self) -> tuple[Row, ...]:
         """Return every quantity by every method."""
         return tuple(self.row(quantity, method) for quantity in QUANTITIES for method in NEEDS[quantity])

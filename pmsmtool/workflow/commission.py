@@ -235,8 +235,8 @@ class Commissioning:
 
     @property
     def tier(self) -> TierStages | None:
-        """The stages of a drive below the full tier, None for one that has everything."""
-        if self.capabilities is None or self.capabilities.tier is Tier.FULL:
+        """The stages of a drive below the full tier; None for one that has everything, safe or (then refused) not."""
+        if self.capabilities is None or self.capabilities.tier is Tier.FULL or self.capabilities.unsafe:
             return None
         return TierStages(self.run, self.drive, self.capabilities, self.nameplate)
 

@@ -64,7 +64,8 @@ def open_tier_drive(connection: Connection, node: int, found: Capabilities) -> C
         Tier.RECORDER: RecorderDrive,
         Tier.STANDARD: StandardDrive,
     }
-    return kinds.get(found.tier, ParameterDrive)(connection, node, drive_map=found.drive_map)
+    kind = CanopenDrive if found.unsafe else kinds.get(found.tier, ParameterDrive)
+    return kind(connection, node, drive_map=found.drive_map)
 
 
 @dataclass(frozen=True, slots=True)

@@ -281,3 +281,19 @@ def test_node_that_boots_in_the_middle_ends_the_experiment_stopped(bench: SimBen
         experiment(guard)
         guard.wait(10.0)
     assert caught.value.exit_code == 3 and bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+@pytest.mark.parametrize("measure", ["average", "record"])
+def test_what_a_stopped_machine_shows_is_no_measurement(bench: SimBench, measure: str) -> None:
+    """The tool's heartbeat stays away and the drive stops by itself: a mean of 0 A would be a wrong number."""
+    with pytest.raises(DriveFault, match="left operation|in fault"), guarded(bench.drive, ENVELOPE) as guard:
+        guard.enable()
+        guard.command_current(2.0, 0.0, fixed_angle_rad=0.0)
+        guard.wait(0.05)
+        assert guard.average(["i_d_a"], 100)["i_d_a"] > 1.0, "the current flows"
+        guard._heartbeat.stop()
+        guard.wait(1.0)
+        if measure == "average":
+            guard.average(["i_d_a"], 100)
+        else:
+            guard.record(["i_d_a"], 100)
