@@ -274,7 +274,9 @@ def _average(
 ) -> AxisFit:
     rows = [(effects, fit, layout, scaled_covariance(fit.jacobian)[0]) for effects, (fit, layout) in tried.items()]
     rows = [row for row in rows if np.isfinite(row[3][0, 0]) and row[1].cost < UNPHYSICAL]
-    rows = [row for row in rows if row[2].responses(row[1].x)[0].motion >= 0.0]  # a rotor cannot push back
+    # a rotor cannot push back: where the data alone decide, such a model fitted something else. A value that other
+    # experiments put near zero scatters to both sides of it, and is in every model
+    rows = [row for row in rows if row[2].motion is not None or row[2].responses(row[1].x)[0].motion >= 0.0]
     if not rows:
         raise refuse("E_NOT_CONVERGED", "no model of the axis could be fitted", stage="inductance")
     weights = information_weights([_criterion(effects, fit, timing) for effects, fit, _, _ in rows])
