@@ -28,9 +28,9 @@ class StageProgress:
         self._task: TaskID | None = None
         self._head = ""
 
-    def skip(self, name: str, number: int, count: int) -> None:
-        """Say that a stage has passed before."""
-        self._out.note(f"[{number}/{count}] {name:<9} PASS  as recorded, not run again")
+    def skip(self, stage: Stage, number: int, count: int) -> None:
+        """Say how a stage ended that was run before."""
+        self._out.note(f"[{number}/{count}] {stage.name:<9} {stage.status.upper()}  as recorded, not run again")
 
     def begin(self, name: str, number: int, count: int) -> None:
         """Show the stage while it runs."""

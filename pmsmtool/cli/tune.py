@@ -13,6 +13,7 @@ from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import FILE, examples, output_options
 from pmsmtool.cli.output import Output, table
 from pmsmtool.cli.output_file import write_file
+from pmsmtool.errors import ConfigError
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
@@ -135,6 +136,7 @@ def _design(source: MachineFile, map_file: Path | None, asked: dict[str, Any]) -
     limits = {name.removeprefix("limit_"): asked.pop(name) for name in _LIMITS}
     bandwidth_hz = asked.pop("drive_bandwidth_hz")
     if drive_map.staging:
+        _refuse_for_reflashed(drive_map.name, {"drive_bandwidth_hz": bandwidth_hz, **limits})
         return tune(source, TuneRequest(**asked))
     from pmsmtool.design.closed_drive import ClosedDrive, tune_closed
 
@@ -143,6 +145,17 @@ def _design(source: MachineFile, map_file: Path | None, asked: dict[str, Any]) -
 
 
 _LIMITS = ("limit_speed_rpm", "limit_rise_s", "limit_acceleration_rpm_per_s")
+
+
+def _refuse_for_reflashed(name: str, closed: dict[str, float | None]) -> None:
+    """Refuse options that only mean something for a drive that keeps its own control."""
+    given = [option for option, value in closed.items() if value is not None and option != "rise_s"]
+    if given:
+        options = ", ".join(f"--{'' if option.startswith('drive') else 'limit_'}{option}" for option in given)
+        raise ConfigError(
+            f"{options.replace('_', '-')}: for a drive that cannot be reflashed, and {name!r} is none",
+            hint="name that drive with --map, e.g. --map copley",
+        )
 
 
 def _params_path(design: Path) -> Path:

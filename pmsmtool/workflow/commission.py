@@ -61,8 +61,8 @@ class Person(Protocol):
 class Progress(Protocol):
     """Who is told how far the chain has come."""
 
-    def skip(self, name: str, number: int, count: int) -> None:
-        """Tell that a stage has passed before."""
+    def skip(self, stage: Stage, number: int, count: int) -> None:
+        """Tell how a stage ended that was run before."""
 
     def begin(self, name: str, number: int, count: int) -> None:
         """Tell that a stage begins."""
@@ -175,8 +175,8 @@ class Commissioning:
             for number, name in enumerate(STAGES, 1):
                 if name in due:
                     self._carry_out(name, number)
-                else:
-                    self.progress.skip(name, number, len(STAGES))
+                elif (ended := record.stage(name)) is not None:
+                    self.progress.skip(ended, number, len(STAGES))
             self._refuse_nothing()
         except KeyboardInterrupt:
             raise Interrupted("the machine is off") from None
@@ -342,7 +342,7 @@ def write_report(run: RunDirectory) -> None:
 class Silent:
     """A progress nobody is told of."""
 
-    def skip(self, name: str, number: int, count: int) -> None:
+    def skip(self, stage: Stage, number: int, count: int) -> None:
         """Say nothing."""
 
     def begin(self, name: str, number: int, count: int) -> None:

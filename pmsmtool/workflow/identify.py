@@ -177,7 +177,7 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest) -> list[str]:
     if "rotation" in steps:
         lines.append("the shaft turns slowly through one turn each way")
     if "speeds" in steps:
-        lines.append("the shaft is pushed both ways; it is brought to four speeds in each direction and coasts with current")
+        lines.append("the shaft is pushed both ways and coasts with current from four speeds in each direction")
     if "coasting" in steps:
         lines.append(mechanics_stage.PLAN_LINE)
     if "response" in steps:

@@ -243,6 +243,8 @@ def test_a_map_without_a_co_energy_is_used_but_not_silently(
         ("machine map nothing.npz", "no such file"),
         ("tune map.csv -o new.toml", "is not TOML"),
         ("tune scenario.toml -o new.toml", "schema"),
+        ("tune machine.toml -o new.toml --drive-bandwidth-hz 95", "for a drive that cannot be reflashed"),
+        ("tune machine.toml -o new.toml --limit-speed-rpm 600", "--limit-speed-rpm: for a drive that"),
         ("simulate machine.toml --scenario machine.toml -o new.npz", "schema"),
         ("simulate machine.toml --scenario scenario.toml -o new.npz --duration 250", "has no unit"),
         ("simulate machine.toml --scenario scenario.toml -o new.npz --duration 250Hz", "of frequency, not of time"),

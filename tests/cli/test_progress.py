@@ -12,6 +12,8 @@ from pmsmtool.cli.progress import StageProgress
 from pmsmtool.workflow.run_directory import Stage
 
 PASSED = Stage("tune", "pass", 0.0, summary="current loops 637 Hz")
+PASSED_BEFORE = Stage("identify", "pass", 1.0)
+NOT_AVAILABLE = Stage("prove", "not available", 0.0, note="needs a loop")
 REFUSED = Stage("identify", "refused", 12.34, note="E_SNR: too little\nlikely: noise", summary="not shown")
 
 
@@ -24,7 +26,8 @@ class Terminal(io.StringIO):
 
 def told(out: Output) -> None:
     progress = StageProgress(out)
-    progress.skip("identify", 1, 6)
+    progress.skip(PASSED_BEFORE, 1, 6)
+    progress.skip(NOT_AVAILABLE, 6, 6)
     progress.begin("tune", 2, 6)
     progress.say("choosing a bandwidth")
     progress.pause()
@@ -37,6 +40,7 @@ def told(out: Output) -> None:
 
 LINES = [
     "[1/6] identify  PASS  as recorded, not run again",
+    "[6/6] prove     NOT AVAILABLE  as recorded, not run again",
     "[2/6] tune      PASS  current loops 637 Hz",
     "[1/6] identify  REFUSED  E_SNR: too little  (12.3 s)",
 ]
@@ -51,7 +55,7 @@ def test_one_line_per_stage_where_nobody_watches(capsys: pytest.CaptureFixture[s
 def test_every_step_with_v_and_nothing_when_quiet(capsys: pytest.CaptureFixture[str]) -> None:
     told(Output(verbosity=1))
     assert [line.strip() for line in capsys.readouterr().err.splitlines()] == [
-        LINES[0], "choosing a bandwidth", "again", *LINES[1:],
+        *LINES[:2], "choosing a bandwidth", "again", *LINES[2:],
     ]  # fmt: skip
     told(Output(verbosity=-1))
     assert capsys.readouterr().err == ""
