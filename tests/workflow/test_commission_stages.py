@@ -56,8 +56,8 @@ class Noted:
         self.skipped: list[str] = []
         self.ended: list[tuple[str, str]] = []
 
-    def skip(self, name: str, number: int, count: int) -> None:
-        self.skipped.append(name)
+    def skip(self, stage: Stage, number: int, count: int) -> None:
+        self.skipped.append(stage.name)
 
     def begin(self, name: str, number: int, count: int) -> None:
         pass

@@ -57,7 +57,7 @@ class Quiet:
     def __init__(self) -> None:
         self.ended: dict[str, str] = {}
 
-    def skip(self, name: str, number: int, count: int) -> None:
+    def skip(self, stage: Stage, number: int, count: int) -> None:
         pass
 
     def begin(self, name: str, number: int, count: int) -> None:
