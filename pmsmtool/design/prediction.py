@@ -1,4 +1,4 @@
-"""The predicted band of a response, the verdict on a measured one, and what a deviation looks most like.
+"""The predicted bands of responses, what is derived from them, and what they look like when something is wrong.
 
 A prediction is made of simulated runs of one design on machines drawn from their intervals. The band of an
 experiment is simultaneous: all its judged signals lie inside at all times. Its width comes from the largest of ``n``
@@ -9,7 +9,6 @@ before the first step is what is judged by.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,12 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.design.matched_filter import matched_filter
-from pmsmtool.errors import ConfigError
 
 Array = NDArray[np.float64]
 Key = TypeVar("Key")
-
-SCHEMA = "pmsmtool.prediction/1"
 
 MODEL_ALLOWANCE = 1.3
 """Half width over that of the simulated runs, for what the averaged model of the inverter leaves out."""
@@ -42,10 +38,6 @@ NORMALISING_QUANTILE = 0.9
 """Quantile of the runs' largest deviations that makes signals comparable before the largest is taken."""
 NEARBY = 128
 """The variance is the largest within this part of a response, either way."""
-EXPLAINED = 0.5
-CLEARLY = 0.7
-"""A fault is named when it leaves at most this share of the squared deviation, and at most this share of what the next
-one leaves (measured on the spoiled drives of the tests: 0.32 and 0.37; on a saturated machine without a map: 0.88)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,8 +142,6 @@ class Prediction:
         """Return the judged signals of an experiment."""
         return tuple(signal for name, signal in self.bands if name == experiment)
 
-
-# ---- making it ------------------------------------------------------------------------------------------------
 
 Runs = Mapping[tuple[str, str], Array]
 """Simulated responses by (experiment, signal), shape (runs, rows)."""
@@ -288,216 +278,3 @@ def _quantity(
 def _fault(text: str, runs: Runs, floors: Mapping[tuple[str, str], float]) -> Fault:
     spread = {key: _spread(values, floors[key]) for key, values in runs.items()}
     return Fault(text, {key: m for key, (m, _) in spread.items()}, {key: s for key, (_, s) in spread.items()})
-
-
-# ---- judging by it ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """One judged signal or quantity.
-
-    Attributes
-    ----------
-    what : str
-        Experiment and signal, or the quantity.
-    share : float
-        Largest deviation over the half width of the band; at most one is inside.
-    where : str
-        Where the largest deviation is, or value and band of a quantity.
-    """
-
-    what: str
-    share: float
-    where: str
-
-    @property
-    def inside(self) -> bool:
-        """Whether all of it lies in the band."""
-        return self.share <= 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Judgement:
-    """The verdict on measured responses: every signal and quantity, and the likely cause when one is outside."""
-
-    seen: tuple[Seen, ...]
-    cause: str = ""
-
-    @property
-    def inside(self) -> bool:
-        """Whether everything lies in its band."""
-        return all(line.inside for line in self.seen)
-
-
-def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> Judgement:
-    """Compare measured responses with the prediction.
-
-    Parameters
-    ----------
-    prediction : Prediction
-        As committed.
-    measured : mapping
-        Response by (experiment, signal); experiments that were not run any more are left out.
-
-    Raises
-    ------
-    ConfigError
-        A response has another length than predicted.
-    """
-    seen = []
-    for (experiment, signal), band in prediction.bands.items():
-        if (experiment, signal) not in measured:
-            continue
-        values = measured[experiment, signal]
-        if values.shape != band.mean.shape:
-            raise ConfigError(f"{experiment}: {len(values)} rows of {signal}, {len(band.mean)} were predicted")
-        share, row = band.largest(values)
-        at = prediction.t_s[experiment][row]
-        seen.append(
-            Seen(
-                f"{experiment}: {signal}",
-                share,
-                f"{values[row]:.4g} at {at:.4g} s, {band.low[row]:.4g} to {band.high[row]:.4g} predicted",
-            )
-        )
-    deviation = {key: measured[key] - prediction.bands[key].mean for key in measured if key in prediction.bands}
-    for name, quantity in prediction.quantities.items():
-        if set(quantity.signature) <= set(deviation):
-            seen.append(_seen_quantity(name, quantity, quantity.of(deviation)))
-    found = Judgement(tuple(seen))
-    if found.inside:
-        return found
-    outside = {line.what for line in seen if not line.inside}
-    keys = {key for key in measured if f"{key[0]}: {key[1]}" in outside}
-    only_quantities = not keys
-    keys |= {key for name, q in prediction.quantities.items() if name in outside for key in q.signature}
-    cause = likely_cause(prediction, {key: measured[key] for key in sorted(keys)})
-    if not cause and only_quantities:  # no response alone is far enough off to tell, but what they tell together is
-        cause = _cause_of_quantities(prediction, deviation)
-    return Judgement(found.seen, cause)
-
-
-def _cause_of_quantities(prediction: Prediction, deviation: Mapping[tuple[str, str], Array]) -> str:
-    """Return what puts the quantity that is clearly the furthest outside there; empty when two are about as far."""
-    shares: list[tuple[float, str]] = []
-    for name, quantity in prediction.quantities.items():
-        if set(quantity.signature) <= set(deviation):
-            value = quantity.of(deviation)
-            cause = quantity.below if value < quantity.low else quantity.above
-            shares.append((_seen_quantity(name, quantity, value).share, cause))
-    (furthest, cause), *others = sorted(shares, reverse=True)
-    return "" if others and others[0][0] > CLEARLY * furthest else cause
-
-
-def _seen_quantity(name: str, quantity: Quantity, value: float) -> Seen:
-    middle, half = 0.5 * (quantity.low + quantity.high), 0.5 * (quantity.high - quantity.low)
-    share = abs(value - middle) / half if math.isfinite(value) else math.inf
-    unit = "" if quantity.unit == "1" else f" {quantity.unit}"
-    return Seen(name, share, f"{value:.3g}{unit}, {quantity.low:.3g} to {quantity.high:.3g} predicted")
-
-
-def likely_cause(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> str:
-    """Return the text of the fault whose signature is clearly nearest; empty when none is.
-
-    ``measured`` are the responses that deviate.
-    """
-    means = {key: prediction.bands[key].mean for key in measured}
-    stds = {key: prediction.bands[key].std for key in measured}
-    healthy = _distance(measured, means, stds)
-    scores: dict[str, float] = {}  # by text: two sizes of the same fault do not compete
-    for fault in prediction.faults.values():
-        widest = {key: np.maximum(fault.std[key], stds[key]) for key in measured}
-        distance = _distance(measured, fault.mean, widest)
-        # minus twice the log-likelihood per point: what may look like anything is not near to everything
-        score = distance + 2.0 * float(np.mean([np.mean(np.log(widest[key] / stds[key])) for key in measured]))
-        scores[fault.text] = min(score, scores.get(fault.text, math.inf))
-    nearest, *others = sorted(scores, key=lambda text: scores[text]) or [""]
-    if not nearest or scores[nearest] > EXPLAINED * healthy:
-        return ""
-    return "" if others and scores[nearest] > CLEARLY * scores[others[0]] else nearest
-
-
-def _distance(
-    measured: Mapping[tuple[str, str], Array],
-    mean: Mapping[tuple[str, str], Array],
-    std: Mapping[tuple[str, str], Array],
-) -> float:
-    """Mean squared deviation over the variance, each signal with the same weight."""
-    shares = [float(np.mean(((values - mean[key]) / std[key]) ** 2)) for key, values in measured.items()]
-    return float(np.mean(shares)) if np.all(np.isfinite(shares)) else math.inf
-
-
-# ---- as arrays, for the file that is committed -------------------------------------------------------------------
-
-
-def to_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
-    """Return the members of the ``.npz`` file; :func:`from_arrays` brings it back."""
-    arrays: dict[str, NDArray[Any]] = {f"time|{name}": t for name, t in prediction.t_s.items()}
-    for (experiment, signal), band in prediction.bands.items():
-        arrays[f"mean|{experiment}|{signal}"], arrays[f"std|{experiment}|{signal}"] = band.mean, band.std
-    for name, quantity in prediction.quantities.items():
-        arrays |= {f"signature|{name}|{e}|{s}": weights for (e, s), weights in quantity.signature.items()}
-    for name, fault in prediction.faults.items():
-        for experiment, signal in fault.mean:
-            key = f"{name}|{experiment}|{signal}"
-            arrays[f"fault_mean|{key}"] = fault.mean[experiment, signal]
-            arrays[f"fault_std|{key}"] = fault.std[experiment, signal]
-    facts = {
-        "schema": SCHEMA,
-        "factor": {f"{e}|{s}": band.factor for (e, s), band in prediction.bands.items()},
-        "quantity": {
-            name: {
-                "nominal": q.nominal,
-                "unit": q.unit,
-                "low": q.low,
-                "high": q.high,
-                "below": q.below,
-                "above": q.above,
-            }
-            for name, q in prediction.quantities.items()
-        },
-        "fault": {name: fault.text for name, fault in prediction.faults.items()},
-        "facts": dict(prediction.facts),
-    }
-    return {**arrays, "_meta": np.array(json.dumps(facts))}
-
-
-def from_arrays(arrays: Mapping[str, NDArray[Any]], *, where: str = "prediction") -> Prediction:
-    """Read what :func:`to_arrays` made.
-
-    Raises
-    ------
-    ConfigError
-        It is not a prediction.
-    """
-    try:
-        facts = json.loads(str(arrays["_meta"]))
-        if facts["schema"] != SCHEMA:
-            raise ConfigError(f"schema is {facts['schema']!r}, expected {SCHEMA!r}", where=where)
-        groups: dict[str, dict[tuple[str, ...], Array]] = {}
-        for name, values in arrays.items():
-            group, *key = name.split("|")
-            groups.setdefault(group, {})[tuple(key)] = np.asarray(values)
-        bands = {
-            (e, s): Band(mean, groups["std"][e, s], float(facts["factor"][f"{e}|{s}"]))
-            for (e, s), mean in groups["mean"].items()
-        }
-        quantities = {
-            name: Quantity(**entry, signature=_under(groups.get("signature", {}), name))
-            for name, entry in facts["quantity"].items()
-        }
-        faults = {
-            name: Fault(text, _under(groups.get("fault_mean", {}), name), _under(groups.get("fault_std", {}), name))
-            for name, text in facts["fault"].items()
-        }
-        times = {name: t for (name,), t in groups["time"].items()}
-        return Prediction(times, bands, quantities, faults, facts["facts"])
-    except (KeyError, ValueError, TypeError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"is no prediction: {error}", where=where) from error
-
-
-def _under(group: Mapping[tuple[str, ...], Array], name: str) -> dict[tuple[str, str], Array]:
-    return {(key[1], key[2]): values for key, values in group.items() if key[0] == name}

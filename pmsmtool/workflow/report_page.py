@@ -17,7 +17,7 @@ import numpy as np
 
 from pmsmtool.design.current_loop import AxisPlant, CurrentGains, Method, axis_loop
 from pmsmtool.design.design_file import Design, load_design
-from pmsmtool.design.prediction import judge
+from pmsmtool.design.judgement import judge
 from pmsmtool.design.sampled_loop import SampledLoop
 from pmsmtool.design.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, speed_loop
 from pmsmtool.errors import IdentificationError

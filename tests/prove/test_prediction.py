@@ -8,15 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pmsmtool.design.prediction import (
-    LEAST_FACTOR,
-    Direction,
-    Prediction,
-    from_arrays,
-    judge,
-    predict,
-    to_arrays,
-)
+from pmsmtool.design.judgement import judge
+from pmsmtool.design.prediction import LEAST_FACTOR, Direction, Prediction, predict
+from pmsmtool.design.prediction_file import from_arrays, to_arrays
 from pmsmtool.errors import ConfigError
 from pmsmtool.npz_file import npz_bytes
 

@@ -20,7 +20,7 @@ from pmsmtool.bus.connect import connect
 from pmsmtool.cia402 import Mode
 from pmsmtool.cli.main import run as program
 from pmsmtool.design.design_file import Design, design_text
-from pmsmtool.design.prediction import judge
+from pmsmtool.design.judgement import judge
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive

@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 
 from pmsmtool.design.design_file import Design
-from pmsmtool.design.prediction import Array, Judgement, Prediction, from_arrays, judge, to_arrays
+from pmsmtool.design.judgement import Judgement, judge
+from pmsmtool.design.prediction import Array, Prediction
+from pmsmtool.design.prediction_file import from_arrays, to_arrays
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft

@@ -1,0 +1,152 @@
+"""The verdict on measured responses by a prediction, and what a deviation looks most like."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pmsmtool.design.prediction import Array, Prediction, Quantity
+from pmsmtool.errors import ConfigError
+
+EXPLAINED = 0.5
+CLEARLY = 0.7
+"""A fault is named when it leaves at most this share of the squared deviation, and at most this share of what the next
+one leaves (measured on the spoiled drives of the tests: 0.32 and 0.37; on a saturated machine without a map: 0.88)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One judged signal or quantity.
+
+    Attributes
+    ----------
+    what : str
+        Experiment and signal, or the quantity.
+    share : float
+        Largest deviation over the half width of the band; at most one is inside.
+    where : str
+        Where the largest deviation is, or value and band of a quantity.
+    """
+
+    what: str
+    share: float
+    where: str
+
+    @property
+    def inside(self) -> bool:
+        """Whether all of it lies in the band."""
+        return self.share <= 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """The verdict on measured responses: every signal and quantity, and the likely cause when one is outside."""
+
+    seen: tuple[Seen, ...]
+    cause: str = ""
+
+    @property
+    def inside(self) -> bool:
+        """Whether everything lies in its band."""
+        return all(line.inside for line in self.seen)
+
+
+def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> Judgement:
+    """Compare measured responses with the prediction.
+
+    Parameters
+    ----------
+    prediction : Prediction
+        As committed.
+    measured : mapping
+        Response by (experiment, signal); experiments that were not run any more are left out.
+
+    Raises
+    ------
+    ConfigError
+        A response has another length than predicted.
+    """
+    seen = []
+    for (experiment, signal), band in prediction.bands.items():
+        if (experiment, signal) not in measured:
+            continue
+        values = measured[experiment, signal]
+        if values.shape != band.mean.shape:
+            raise ConfigError(f"{experiment}: {len(values)} rows of {signal}, {len(band.mean)} were predicted")
+        share, row = band.largest(values)
+        at = prediction.t_s[experiment][row]
+        seen.append(
+            Seen(
+                f"{experiment}: {signal}",
+                share,
+                f"{values[row]:.4g} at {at:.4g} s, {band.low[row]:.4g} to {band.high[row]:.4g} predicted",
+            )
+        )
+    deviation = {key: measured[key] - prediction.bands[key].mean for key in measured if key in prediction.bands}
+    for name, quantity in prediction.quantities.items():
+        if set(quantity.signature) <= set(deviation):
+            seen.append(_seen_quantity(name, quantity, quantity.of(deviation)))
+    found = Judgement(tuple(seen))
+    if found.inside:
+        return found
+    outside = {line.what for line in seen if not line.inside}
+    keys = {key for key in measured if f"{key[0]}: {key[1]}" in outside}
+    only_quantities = not keys
+    keys |= {key for name, q in prediction.quantities.items() if name in outside for key in q.signature}
+    cause = likely_cause(prediction, {key: measured[key] for key in sorted(keys)})
+    if not cause and only_quantities:  # no response alone is far enough off to tell, but what they tell together is
+        cause = _cause_of_quantities(prediction, deviation)
+    return Judgement(found.seen, cause)
+
+
+def _cause_of_quantities(prediction: Prediction, deviation: Mapping[tuple[str, str], Array]) -> str:
+    """Return what puts the quantity that is clearly the furthest outside there; empty when two are about as far."""
+    shares: list[tuple[float, str]] = []
+    for name, quantity in prediction.quantities.items():
+        if set(quantity.signature) <= set(deviation):
+            value = quantity.of(deviation)
+            cause = quantity.below if value < quantity.low else quantity.above
+            shares.append((_seen_quantity(name, quantity, value).share, cause))
+    (furthest, cause), *others = sorted(shares, reverse=True)
+    return "" if others and others[0][0] > CLEARLY * furthest else cause
+
+
+def _seen_quantity(name: str, quantity: Quantity, value: float) -> Seen:
+    middle, half = 0.5 * (quantity.low + quantity.high), 0.5 * (quantity.high - quantity.low)
+    share = abs(value - middle) / half if math.isfinite(value) else math.inf
+    unit = "" if quantity.unit == "1" else f" {quantity.unit}"
+    return Seen(name, share, f"{value:.3g}{unit}, {quantity.low:.3g} to {quantity.high:.3g} predicted")
+
+
+def likely_cause(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> str:
+    """Return the text of the fault whose signature is clearly nearest; empty when none is.
+
+    ``measured`` are the responses that deviate.
+    """
+    means = {key: prediction.bands[key].mean for key in measured}
+    stds = {key: prediction.bands[key].std for key in measured}
+    healthy = _distance(measured, means, stds)
+    scores: dict[str, float] = {}  # by text: two sizes of the same fault do not compete
+    for fault in prediction.faults.values():
+        widest = {key: np.maximum(fault.std[key], stds[key]) for key in measured}
+        distance = _distance(measured, fault.mean, widest)
+        # minus twice the log-likelihood per point: what may look like anything is not near to everything
+        score = distance + 2.0 * float(np.mean([np.mean(np.log(widest[key] / stds[key])) for key in measured]))
+        scores[fault.text] = min(score, scores.get(fault.text, math.inf))
+    nearest, *others = sorted(scores, key=lambda text: scores[text]) or [""]
+    if not nearest or scores[nearest] > EXPLAINED * healthy:
+        return ""
+    return "" if others and scores[nearest] > CLEARLY * scores[others[0]] else nearest
+
+
+def _distance(
+    measured: Mapping[tuple[str, str], Array],
+    mean: Mapping[tuple[str, str], Array],
+    std: Mapping[tuple[str, str], Array],
+) -> float:
+    """Mean squared deviation over the variance, each signal with the same weight."""
+    shares = [float(np.mean(((values - mean[key]) / std[key]) ** 2)) for key, values in measured.items()]
+    return float(np.mean(shares)) if np.all(np.isfinite(shares)) else math.inf
