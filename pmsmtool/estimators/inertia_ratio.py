@@ -17,7 +17,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import CONDITION_LIMIT, SensorTolerance, statistical_half_width
+from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
+from pmsmtool.estimators.push_regression import jackknife_variance, regress
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
@@ -67,8 +68,7 @@ def estimate_ratios(
     sense = math.copysign(1.0, sum(float(p[0][-1] - p[0][0]) * float(p[1][-1]) for p in parts))
     full = _ratios(parts, sense, pole_pairs)
     n = len(parts)
-    without = np.array([_ratios([*parts[:k], *parts[k + 1 :]], sense, pole_pairs) for k in range(n)])
-    std = np.sqrt((n - 1) / n * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
+    std = np.sqrt(jackknife_variance(lambda kept: _ratios(kept, sense, pole_pairs), parts))
     weakest = min(abs(float(p[1][-1]) / float(p[4][-1])) for p in parts)
     floors = (
         full[0] * math.hypot(tolerance.current_gain, MODEL_FLOOR),
@@ -120,14 +120,9 @@ def _ratios(parts: Sequence[tuple[Vector, ...]], sense: float, pole_pairs: int) 
     """Return J/psi and tau_c/psi; the constants of the pushes are projected out."""
     columns = [np.concatenate([part[k] - part[k].mean() for part in parts]) for k in (1, 2, 3)]
     w = np.concatenate([part[0] - part[0].mean() for part in parts])
-    matrix = np.column_stack([sense * columns[0], *columns[1:]])
-    scale = np.sqrt(np.mean(matrix**2, axis=0))
-    if np.any(scale == 0.0):
-        raise refuse("E_NOT_IDENTIFIABLE", "the pushes hold no current or no speed", stage=STAGE)
-    solution, _, _, singular = np.linalg.lstsq(matrix / scale, w, rcond=None)
-    if singular[-1] * CONDITION_LIMIT < singular[0]:
-        raise refuse("E_NOT_IDENTIFIABLE", "current and friction cannot be told apart", stage=STAGE)
-    rise, friction = solution[0] / scale[0], -solution[1] / scale[1]
+    signed = [sense * columns[0], *columns[1:]]
+    rise, slowing = regress(signed, w, what="current and friction", stage=STAGE)[:2]
+    friction = -slowing
     if rise == 0.0:
         raise refuse("E_EXCITATION", "the shaft does not answer the current", stage=STAGE)
     ratio = 1.5 * pole_pairs / rise

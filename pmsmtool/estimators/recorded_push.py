@@ -30,7 +30,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import CONDITION_LIMIT, SensorTolerance, statistical_half_width, total_half_width
+from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width, total_half_width
+from pmsmtool.estimators.push_regression import jackknife_variance, regress
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
@@ -131,10 +132,8 @@ def estimate_pushes(
         raise refuse("E_EXCITATION", f"{len(rows)} pushes, {LEAST_PUSHES} needed", stage=STAGE)
     shapes = np.array([_solve(rows, tail) for tail in TAILS])
     full = shapes.mean(axis=0)
-    without = np.array([_mean([*rows[:k], *rows[k + 1 :]]) for k in range(len(rows))])
     n = len(rows)
-    jackknife = (n - 1) / n * np.sum((without - without.mean(axis=0)) ** 2, axis=0)
-    std = np.sqrt(jackknife + shapes.var(axis=0, ddof=1))
+    std = np.sqrt(jackknife_variance(_mean, rows) + shapes.var(axis=0, ddof=1))
     count = sum(len(push.w) for push in rows)
 
     def estimate(k: int, unit: str, systematic: float) -> Estimate:
@@ -203,20 +202,8 @@ def _solve(rows: Sequence[_Rows], tail: tuple[int, ...]) -> Vector:
     )
     one, sign = np.ones_like(w), np.sign(i_q)
     tails = [sign / np.abs(i_q) ** power for power in tail]
-    R, psi_q, V = _regress([i_q, w, sign, one, w * i_d, w * w * i_q, *tails], u_q)[:3]
+    R, psi_q, V = regress([i_q, w, sign, one, w * i_d, w * w * i_q, *tails], u_q, what="R, psi and V", stage=STAGE)[:3]
     # R is known by now: its own column would take what belongs to L_q, i_d being small and not free of w i_q
-    psi_d, L_q = _regress([w, -w * i_q, one, np.sign(w) * sign, w * sign, w * w], u_d - R * i_d)[:2]
+    columns = [w, -w * i_q, one, np.sign(w) * sign, w * sign, w * w]
+    psi_d, L_q = regress(columns, u_d - R * i_d, what="psi and L_q", stage=STAGE)[:2]
     return np.array([R, math.hypot(psi_q, psi_d) * math.copysign(1.0, psi_q), L_q, math.atan2(psi_d, psi_q), V])
-
-
-def _regress(columns: Sequence[Vector], measured: Vector) -> Vector:
-    """Return the least-squares coefficients; columns are scaled to unit mean square."""
-    matrix = np.column_stack(columns)
-    scale = np.sqrt(np.mean(matrix**2, axis=0))
-    if np.any(scale == 0.0):
-        raise refuse("E_NOT_IDENTIFIABLE", "the pushes hold no speed or no current", stage=STAGE)
-    solution, _, _, singular = np.linalg.lstsq(matrix / scale, measured, rcond=None)
-    condition = float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf
-    if condition > CONDITION_LIMIT:
-        raise refuse("E_NOT_IDENTIFIABLE", f"condition {condition:.3g} of R, psi and V together", stage=STAGE)
-    return np.asarray(solution / scale)

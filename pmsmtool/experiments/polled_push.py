@@ -7,16 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.errors import IdentificationError
+from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
 from pmsmtool.experiments.signals import readable
 from pmsmtool.trace import Trace
 
 SIGNALS = ("theta_m_rad", "i_q_a")
-FIRST_SHARE = 0.08
-FIRST_S = 0.02
 ANSWER_RAD = 0.02
 """Angle that counts as an answer of the shaft: an encoder of 1024 increments has three of them."""
-MOST_TRIES = 10
 LEAST_RAMP_S = 0.04
 CHECK_S = 0.012
 """Speed is looked at this often while the machine runs up to its voltage."""
@@ -67,7 +64,7 @@ def push_both_ways(drive: Drive, plan: PolledPushPlan, keep: Callable[[str, Trac
     IdentificationError
         ``E_EXCITATION``: the shaft does not answer.
     """
-    rate = _rate(drive, plan)
+    rate = acceleration_per_ampere(drive, plan.i_test_a, lambda way, _: way > ANSWER_RAD)
     count = 0
     for share in plan.shares:
         current = share * plan.i_test_a
@@ -132,32 +129,6 @@ def _recorded_top(drive: Drive, command_a: float) -> Trace:
 def _polled(drive: Drive, i_q_a: float, seconds: float) -> Trace:
     drive.command_current(0.0, i_q_a)
     return readable(drive.record(SIGNALS, max(2, round(seconds / drive.period_s))), i_command_a=i_q_a)
-
-
-def _rate(drive: Drive, plan: PolledPushPlan) -> float:
-    """Return the acceleration per ampere (rad/s2/A) from short pushes that grow until the shaft answers."""
-    current, seconds = FIRST_SHARE * plan.i_test_a, FIRST_S
-    for _ in range(MOST_TRIES):
-        before = drive.live("theta_m_rad")
-        drive.command_current(0.0, current)
-        drive.wait(seconds)
-        way = abs(drive.live("theta_m_rad") - before)
-        drive.command_current(0.0, -current)
-        drive.wait(seconds)
-        drive.command_current(0.0, 0.0)
-        if way > ANSWER_RAD:
-            return 2.0 * way / (seconds * seconds * current)
-        if current < 0.5 * plan.i_test_a:
-            current *= 2.0
-        else:
-            seconds *= 1.6
-    raise IdentificationError(
-        "E_EXCITATION",
-        "the shaft does not answer a torque push",
-        where="torque push",
-        likely="a locked shaft or a closed brake, or a drive whose commutation is not set up",
-        hint="free the shaft; run the maker's own set-up first",
-    )
 
 
 def stop_shaft(drive: Drive, current: float, rate: float) -> None:

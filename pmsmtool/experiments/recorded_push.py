@@ -11,16 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.errors import IdentificationError
+from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
 from pmsmtool.experiments.signals import readable
 from pmsmtool.trace import Trace
 
 SIGNALS = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "omega_e_rad_s", "theta_m_rad", "flags")
-FIRST_SHARE = 0.08
-FIRST_S = 0.02
 ANSWER_SHARE = 0.04
 """Speed change, of the wanted one, that counts as an answer of the shaft."""
-MOST_TRIES = 10
 LEAST_RAMP_S = 0.05
 STOP_SLICES = 20
 
@@ -55,7 +52,9 @@ def swing(drive: Drive, plan: PushPlan, keep: Callable[[str, Trace], None]) -> N
     IdentificationError
         ``E_EXCITATION``: the shaft does not answer.
     """
-    rate = _rate(drive, plan)
+    rate = acceleration_per_ampere(
+        drive, plan.i_test_a, lambda way, seconds: 2.0 * way / seconds > ANSWER_SHARE * plan.omega_m_rad_s
+    )
     count = 0
     for share in plan.shares:
         current = share * plan.i_test_a
@@ -75,38 +74,6 @@ def _recorded(drive: Drive, plan: PushPlan, i_q_a: float, seconds: float) -> Tra
     decimation = max(1, round(0.97 * seconds / (plan.samples * drive.period_s)))
     trace = drive.record(SIGNALS, plan.samples, decimation=decimation)
     return readable(trace, i_command_a=i_q_a, decimation=decimation)
-
-
-def _rate(drive: Drive, plan: PushPlan) -> float:
-    """Return the acceleration per ampere (rad/s2/A) from short pushes that grow until the shaft answers."""
-    current, seconds = FIRST_SHARE * plan.i_test_a, FIRST_S
-    for _ in range(MOST_TRIES):
-        before = _turned(drive)
-        drive.command_current(0.0, current)
-        drive.wait(seconds)
-        middle = _turned(drive)
-        drive.command_current(0.0, -current)
-        drive.wait(seconds)
-        drive.command_current(0.0, 0.0)
-        way = abs(middle - before)
-        speed = 2.0 * way / seconds
-        if speed > ANSWER_SHARE * plan.omega_m_rad_s:
-            return speed / (seconds * current)
-        if current < 0.5 * plan.i_test_a:
-            current *= 2.0
-        else:
-            seconds *= 1.6
-    raise IdentificationError(
-        "E_EXCITATION",
-        "the shaft does not answer a torque push",
-        where="recorded push",
-        likely="a locked shaft or a closed brake, or a drive whose commutation is not set up",
-        hint="free the shaft; run the maker's own set-up first",
-    )
-
-
-def _turned(drive: Drive) -> float:
-    return drive.live("theta_m_rad")
 
 
 def _stop(drive: Drive, current: float, ramp_s: float) -> None:
