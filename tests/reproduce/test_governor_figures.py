@@ -97,7 +97,7 @@ def test_only_the_best_mode_shows_a_gain_over_back_calculation() -> None:
     assert all(shown == "less" for name, shown in means.items() if name.startswith("best 7540"))
     p95 = cells(found, "shown", 1, of="p95", difference="paper")
     assert len(p95) == 6
-    assert "less" not in p95 or p95.count("nothing") >= 3
+    assert p95.count("nothing") >= 3  # 4, 6 and 3 of 6 with seeds 1 to 3
 
 
 def test_unreachable_references_lose_back_calculation_and_stall_the_paper() -> None:
