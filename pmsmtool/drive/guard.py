@@ -73,6 +73,7 @@ class GuardedDrive:
         self._node = drive.node
         self._heartbeat = Heartbeat(drive.node.connection)
         self._before: dict[_Object, bytes] = {}
+        self._ended = False
         self._start_rad: float | None = None
         self._pole_pairs = 1.0
         self._R_s_ohm = 0.0
@@ -152,6 +153,7 @@ class GuardedDrive:
         VerifyMismatch
             An object does not hold its old content; each is named.
         """
+        self._ended = True
         self._node.before_write = None
         try:
             with self._node.emergencies_tolerated(), self._node.supervision.other_masters_tolerated():
@@ -219,18 +221,27 @@ class GuardedDrive:
         self._R_s_ohm = values.get("motor.R_s_ohm", self._R_s_ohm)
 
     def enable(self) -> None:
-        """Bring the drive to operation enabled at zero reference.
+        """Bring the drive to operation enabled at zero reference, supervised by the tool's heartbeat.
 
         Raises
         ------
         SafetyRefusal
-            The dead-man was not proven.
+            The dead-man was not proven, or the guard has ended.
+        BusError
+            The heartbeat cannot be sent; nothing is enabled.
         """
+        if self._ended:
+            raise SafetyRefusal(
+                "the guard has ended and the drive is restored, so nothing is enabled",
+                where=f"node {self._node.node}",
+                hint="this is a bug worth reporting",
+            )
         if self.proof is None:
             raise SafetyRefusal(
                 "the dead-man was not proven, so nothing is enabled", where=f"node {self._node.node}",
                 hint="this is a bug worth reporting",
             )  # fmt: skip
+        self._heartbeat.resume()  # after the dead-man ended operation nobody else would watch
         self._drive.enable()
         if self._start_rad is None:
             self._start_rad = self._drive.live("theta_m_rad")

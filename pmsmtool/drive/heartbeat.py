@@ -6,7 +6,6 @@ arithmetic does not stop the machine, and a tool that is killed does.
 
 from __future__ import annotations
 
-import contextlib
 from types import TracebackType
 
 from pmsmtool.bus.clock import Ticker
@@ -18,6 +17,9 @@ TOOL_NODE = 0x7E
 """Node id the tool's heartbeat carries; 0x7F is left to a PLC or configuration tool."""
 PERIOD_S = 0.05
 """Five heartbeats within the drive's consumer time of ``dead_man.CONSUMER_MS``."""
+
+LATE_PERIODS = 2.0
+"""A heartbeat that did not come for so many periods is late."""
 
 
 class Heartbeat:
@@ -35,6 +37,7 @@ class Heartbeat:
         self._ticker: Ticker | None = None
         self._last_s = 0.0
         self._longest_s = 0.0
+        self._failed = False
 
     def __enter__(self) -> Heartbeat:
         self.start()
@@ -50,7 +53,25 @@ class Heartbeat:
         if self._ticker is None:
             self._last_s, self._longest_s = self._connection.clock.now(), 0.0
             self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)))
+            self._failed = False
             self._ticker = self._connection.clock.every(self._period_s, self._beat)
+
+    def resume(self) -> None:
+        """Make sure that the drive is watching: start when stopped, send one at once when the last failed or is late.
+
+        A drive whose supervision has ended operation watches again from the next heartbeat on, not before (CiA 301,
+        section 7.2.8.2.2).
+
+        Raises
+        ------
+        BusError
+            It cannot be sent.
+        """
+        if self._ticker is None:
+            self.start()
+        elif self._failed or self._connection.clock.now() - self._last_s > LATE_PERIODS * self._period_s:
+            self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)))
+            self._failed = False
 
     def stop(self) -> None:
         """Send no more; the drive notices after its consumer time."""
@@ -65,7 +86,10 @@ class Heartbeat:
     def _beat(self) -> None:
         before = self._connection.clock.now()
         # Nobody catches here: the drive notices a lost heartbeat, the next request meets the failed bus.
-        with contextlib.suppress(BusError):
+        try:
             self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)), patience_s=0.0)
+            self._failed = False
+        except BusError:
+            self._failed = True
         self._longest_s = max(self._longest_s, self._connection.clock.now() - self._last_s)
         self._last_s = before

@@ -13,11 +13,12 @@ import pytest
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import WallClock
 from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.nmt import HEARTBEAT_ID
 from pmsmtool.cia402 import AbortConnection, State
 from pmsmtool.drive.dead_man import CONSUMER_MS, TRIES, prove_dead_man
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.heartbeat import PERIOD_S, TOOL_NODE, Heartbeat
-from pmsmtool.errors import SafetyRefusal
+from pmsmtool.errors import BusError, SafetyRefusal
 from pmsmtool.sim.node.dictionary import Refused
 from tests.bus.scripted import ScriptedBus, ScriptedSlave
 from tests.drive.bench import ENVELOPE, SimBench, sim_bench
@@ -200,3 +201,51 @@ def test_heartbeat_carries_the_tools_node_id(bench: SimBench) -> None:
     with Heartbeat(bench.connection):
         bench.bus.clock.wait(0.5)
     assert heard.count(0x700 + TOOL_NODE) in (10, 11)
+
+
+def test_nothing_is_enabled_unwatched_after_the_dead_man_ended_operation(bench: SimBench) -> None:
+    """The drive watches again from the next heartbeat on: enabling sends it, and a tool that then dies is noticed."""
+    with guarded(bench.drive, ENVELOPE) as guard, bench.drive.node.emergencies_tolerated():
+        guard.enable()
+        guard._heartbeat.stop()
+        bench.connection.wait(4e-3 * CONSUMER_MS)
+        assert bench.session.power.state is not State.OPERATION_ENABLED, "the dead-man ended operation"
+        guard.enable()
+        bench.connection.wait(4e-3 * CONSUMER_MS)
+        assert bench.session.power.state is State.OPERATION_ENABLED, "the heartbeat runs again"
+        guard._heartbeat.stop()
+        bench.connection.wait(4e-3 * CONSUMER_MS)
+        assert bench.session.power.state is not State.OPERATION_ENABLED, "and the drive watches it"
+
+
+def test_a_heartbeat_that_could_not_be_sent_is_sent_before_enabling(
+    bench: SimBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send, lost = bench.connection.send, []
+
+    def broken(identifier: int, data: bytes, **options: float) -> None:
+        if identifier == HEARTBEAT_ID + TOOL_NODE and lost:
+            raise BusError("the cable is pulled")
+        send(identifier, data, **options)
+
+    monkeypatch.setattr(bench.connection, "send", broken)
+    heartbeat = Heartbeat(bench.connection)
+    with heartbeat:
+        lost.append(True)
+        bench.connection.wait(1.5 * PERIOD_S)
+        with pytest.raises(BusError, match="cable"):
+            heartbeat.resume()
+        lost.clear()
+        heard: list[int] = []
+        monkeypatch.setattr(bench.connection, "send", lambda identifier, data, **options: heard.append(identifier))
+        heartbeat.resume()
+        heartbeat.resume()
+        assert heard == [HEARTBEAT_ID + TOOL_NODE], "one at once, and none more while it runs"
+
+
+def test_a_guard_that_has_ended_enables_nothing(bench: SimBench) -> None:
+    with guarded(bench.drive, ENVELOPE) as guard:
+        pass
+    with pytest.raises(SafetyRefusal, match="the guard has ended"):
+        guard.enable()
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
