@@ -11,7 +11,7 @@ from pmsmtool.cia402 import Mode, State
 from pmsmtool.drive import objects, stop
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.drive.port import Excitation, Halves, Injection, Shape
 from pmsmtool.drive.recorder import Recorder
 from pmsmtool.errors import ConfigError, DriveFault, NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap
@@ -19,6 +19,7 @@ from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.trace import Trace
 
+PERIOD = "inverter.T_s_ns"
 RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 """The reference drive counts speed in thousandths of a mechanical revolution per minute."""
 
@@ -42,7 +43,7 @@ class CanopenDrive:
     identity : Identity
         As read when the drive was opened.
     period_s : float
-        Control period (s).
+        Control period (s); follows the parameter.
     recorder : Recorder
         Traces and averages.
     may_be_energised : bool
@@ -54,7 +55,7 @@ class CanopenDrive:
         self.parameters = DriveParameters(self.node)
         self.may_be_energised = False
         self.identity = self.node.identity()
-        self.period_s = 1e-9 * self.parameters.read_value("inverter.T_s_ns")
+        self.period_s = 1e-9 * self.parameters.read_value(PERIOD)
         self.recorder = Recorder(self.node, self.period_s)
 
     def close(self) -> None:
@@ -96,7 +97,7 @@ class CanopenDrive:
         if not changed:
             return
         if is_safe(self.node.state()):
-            self.parameters.replace(changed)
+            self.replace(changed)
             return
         fixed = [name for name in changed if not BY_NAME[name].live]
         if fixed:
@@ -106,6 +107,12 @@ class CanopenDrive:
                 hint="disable the drive first",
             )
         self.parameters.write_live(changed)
+
+    def replace(self, changed: Mapping[str, bytes]) -> None:
+        """Write contents by name while the drive is off, and read them back."""
+        self.parameters.replace(changed)
+        if PERIOD in changed:
+            self.period_s = 1e-9 * self.parameters.read_value(PERIOD)
 
     # ---- states ---------------------------------------------------------------------------------
 
@@ -166,6 +173,10 @@ class CanopenDrive:
         means = self.recorder.finish_average(signals)
         self.check_operating()
         return means
+
+    def halves(self, signals: Sequence[str], periods: int) -> Halves:
+        """Return means over two windows, one right after the other."""
+        return self.recorder.halves(lambda count: self.average(signals, count), periods)
 
     def record(
         self,

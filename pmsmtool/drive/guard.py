@@ -20,7 +20,7 @@ from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
-from pmsmtool.drive.port import Excitation, Identity, Injection, Shape
+from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, Shape
 from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import (
     BusError,
@@ -65,7 +65,6 @@ class GuardedDrive:
     def __init__(self, drive: CanopenDrive, envelope: Envelope) -> None:
         self.envelope = envelope
         self.identity: Identity = drive.identity
-        self.period_s = drive.period_s
         self.proof: DeadManProof | None = None
         self.energy_j = 0.0
         self.energised_s = 0.0
@@ -168,7 +167,7 @@ class GuardedDrive:
         changed = {n: data for n, data in parameters.items() if self._drive.parameters.read([n])[n] != data}
         lines = []
         if changed:
-            self._drive.parameters.replace(changed)
+            self._drive.replace(changed)
         back = len(changed)
         # The marks last: every change of another object clears them.
         for (index, sub), data in [
@@ -204,6 +203,11 @@ class GuardedDrive:
         return self._node.sdo.upload(index, sub, mode=Mode.BLOCK if domain else Mode.SEGMENTED).data
 
     # ---- the port -------------------------------------------------------------------------------
+
+    @property
+    def period_s(self) -> float:
+        """Control period (s)."""
+        return self._drive.period_s
 
     def read(self, name: str) -> float:
         """Return one parameter by catalogue name, in SI."""
@@ -272,6 +276,10 @@ class GuardedDrive:
         means = self._drive.recorder.finish_average(signals)
         self._drive.check_operating()
         return means
+
+    def halves(self, signals: Sequence[str], periods: int) -> Halves:
+        """Return means over two windows, one right after the other."""
+        return self._drive.recorder.halves(lambda count: self.average(signals, count), periods)
 
     def record(
         self,

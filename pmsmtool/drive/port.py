@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 if TYPE_CHECKING:  # numpy is not for commands that only read a parameter
     from pmsmtool.trace import Trace
@@ -80,11 +80,22 @@ class Excitation:
     lead_s: float = 0.0
 
 
+class Halves(NamedTuple):
+    """Means of two windows, one right after the other, and how many samples of every signal both hold together."""
+
+    first: Mapping[str, float]
+    second: Mapping[str, float]
+    samples: int
+
+
 class Drive(Protocol):
     """A connected drive. Every method may raise ``BusError``, ``SdoAbort`` or ``DriveFault``."""
 
-    period_s: float
     identity: Identity
+
+    @property
+    def period_s(self) -> float:
+        """Control period (s)."""
 
     def read(self, name: str) -> float:
         """Return one parameter by catalogue name, in SI."""
@@ -109,6 +120,9 @@ class Drive(Protocol):
 
     def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
         """Return means over a window of control periods, taken inside the drive."""
+
+    def halves(self, signals: Sequence[str], periods: int) -> Halves:
+        """Return means over two windows of so many control periods each, one right after the other."""
 
     def record(
         self,
