@@ -3,27 +3,56 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.port import Halves
 from pmsmtool.drive.recorder import Recorder
 from pmsmtool.firmware.drive_map import DriveMap
+from pmsmtool.trace import Trace
 
-AT_REST, TURNING = 1024, 64
-"""Samples of a mean. With the shaft at rest there is time (32 KiB are half a second); a shaft that turns changes its
-speed while a record is uploaded, and 8 signals of 64 samples are 35 ms."""
+LOOK, AT_REST, TURNING = 64, 512, 128
+"""Rows of a mean that only looks, of a window with the shaft at rest, and of one while it turns: a shaft that coasts
+slows down while a record is uploaded, and 6 signals of 128 rows are 57 ms at 1 Mbit/s."""
 REST_RAD_S = 20.0
 """Electrical speed below which a shaft counts as being at rest."""
 ANGLE = "theta_m_rad"
+SLOW = ("T_winding_c", "T_magnet_c")
+"""Signals that do not change in a window: read once, which leaves the record shorter."""
+HARMONICS = (6, 12, 18, 24)
+"""What the inverter's error repeats per electrical turn."""
+BEATS = 2.0
+"""Least number of beats of such a harmonic with the rows in half a window: one that beats slower stays in the mean."""
+
+
+def spacing(periods: int, rows: int, turns_per_period: float) -> int:
+    """Return how many control periods apart rows are taken, so that no harmonic of a turning machine aliases to DC.
+
+    Parameters
+    ----------
+    periods, rows : int
+        Length of the window, and about how many rows are wanted.
+    turns_per_period : float
+        Electrical turns in one control period.
+    """
+    least = max(1, math.ceil(periods / rows))
+    for candidate in range(least, 2 * least):
+        cycles = (harmonic * turns_per_period * candidate for harmonic in HARMONICS)
+        if all(abs(cycle - round(cycle)) * (periods // candidate) / 2.0 >= BEATS for cycle in cycles):
+            return candidate
+    return least
 
 
 class RecordedMeans(Recorder):
-    """Means over a window from a record of it, thinned out to so many samples as there is time to upload."""
+    """Means over a window from a record of it, thinned out to so many rows as there is time to upload."""
 
     _decimation = 1
     _angle_rad = 0.0
+    _looks = True
+    _trace: Trace | None = None
+    _slow: Mapping[str, float] = {}
 
     def start_average(self, signals: Sequence[str], periods: int) -> None:
         """Start recording the next ``periods`` control periods.
@@ -33,17 +62,38 @@ class RecordedMeans(Recorder):
         NotAvailable
             The drive has no recorder, or not these signals.
         """
-        turning = abs(self._node.get(objects.LIVE["omega_e_rad_s"])) > REST_RAD_S
-        self._decimation = max(1, math.ceil(periods / (TURNING if turning else AT_REST)))
-        self.arm(signals, max(1, periods // self._decimation), self._decimation, 0, at_excitation=False)
+        omega_e = abs(self._node.get(objects.LIVE["omega_e_rad_s"]))
+        turning = omega_e > REST_RAD_S
+        rows = LOOK if self._looks else TURNING if turning else AT_REST
+        turns = omega_e * self._period_s / (2.0 * math.pi) if turning else 0.0
+        self._decimation = spacing(periods, rows, turns) if turning else max(1, math.ceil(periods / rows))
+        fast = [name for name in signals if name not in SLOW]
+        self.arm(fast, max(1, periods // self._decimation), self._decimation, 0, at_excitation=False)
 
     def finish_average(self, signals: Sequence[str]) -> Mapping[str, float]:
         """Wait for the record and return its means by signal."""
-        trace = self.fetch(signals, self._decimation)
-        means = {name: float(trace[name].mean()) for name in signals}
+        fast = [name for name in signals if name not in SLOW]
+        self._trace = self.fetch(fast, self._decimation)
+        self._slow = {name: self._node.get(objects.LIVE[name]) for name in signals if name in SLOW}
+        return self._means(self._trace, slice(None))
+
+    def halves(self, take: Callable[[int], Mapping[str, float]], periods: int) -> Halves:
+        """Return means over two windows from one record: a shaft that coasts slows down while one is uploaded."""
+        self._looks = False
+        try:
+            take(2 * periods)
+        finally:
+            self._looks = True
+        assert self._trace is not None
+        half = max(1, len(self._trace) // 2)
+        first, second = (self._means(self._trace, rows) for rows in (slice(0, half), slice(-half, None)))
+        return Halves(first, second, 2 * half)
+
+    def _means(self, trace: Trace, rows: slice) -> Mapping[str, float]:
+        means = {name: float(values[rows].mean()) for name, values in trace.signals.items()}
         if ANGLE in means:
             means[ANGLE] = self.continued(means[ANGLE])
-        return means
+        return {**means, **self._slow}
 
     def continued(self, angle_rad: float) -> float:
         """Return an angle with the turns put back: every record takes whole turns off what is shown afterwards."""

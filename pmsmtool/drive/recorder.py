@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 
 import numpy as np
@@ -13,6 +13,7 @@ from pmsmtool.cia402 import State
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import POLL_S, DriveNode
 from pmsmtool.drive.objects import LIVE, DriveObject, signal_unit
+from pmsmtool.drive.port import Halves
 from pmsmtool.errors import DriveTimeout, NotAvailable, SdoAbort, VerifyMismatch
 from pmsmtool.trace import Trace
 
@@ -190,3 +191,7 @@ class Recorder:
         """Wait for the average and return it by signal."""
         self._await(objects.AVERAGE_STATE, AverageState.COMPLETE, "the average")
         return {name: self._node.get(objects.AVERAGE_MEANS[k]) for k, name in enumerate(signals)}
+
+    def halves(self, take: Callable[[int], Mapping[str, float]], periods: int) -> Halves:
+        """Return means over two windows: ``take`` returns those over so many control periods from now on."""
+        return Halves(take(periods), take(periods), 2 * periods)

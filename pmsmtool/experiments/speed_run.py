@@ -167,7 +167,7 @@ def coast_through(drive: Drive, plan: SpeedPlan, pole_pairs: int) -> Rows:
 
 def _window(drive: Drive, half: int) -> dict[str, float]:
     """Return the means over two halves of a window, one after the other."""
-    first, second = (drive.average(MEANS, half) for _ in range(2))
+    first, second, _ = drive.halves(MEANS, half)
     row = {name: 0.5 * (first[name] + second[name]) for name in MEANS if name != "flags"}
     for name in ("i_d", "i_q"):
         row[f"{name}_first_a"], row[f"{name}_second_a"] = first[f"{name}_a"], second[f"{name}_a"]

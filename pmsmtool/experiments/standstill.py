@@ -120,7 +120,7 @@ def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace
         drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
         for _ in range(TRIES):
             elapsed += settle(drive, i_a, arrival_s=ARRIVAL_LIMIT_S)
-            first, second = (drive.average(names, half) for _ in range(2))
+            first, second, _ = drive.halves(names, half)
             moved = abs(second["theta_m_rad"] - first["theta_m_rad"]) >= REST_RAD
             if not moved:
                 break
@@ -163,7 +163,7 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float) -> Tra
             drive.command_current(share * i_a, 0.0, fixed_angle_rad=angle)
             for _ in range(TRIES):
                 elapsed += settle(drive, share * i_a)
-                first, second = (drive.average(names, half) for _ in range(2))
+                first, second, _ = drive.halves(names, half)
                 moved = abs(second["theta_m_rad"] - first["theta_m_rad"]) >= REST_RAD
                 if not moved:
                     break
@@ -257,7 +257,7 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
         elapsed += plan.settle_s
         for _ in range(TRIES):
             elapsed += settle(drive, abs(level), near_a=NEAR_SHARE * largest)
-            first, second = (drive.average(names, half) for _ in range(2))
+            first, second, samples = drive.halves(names, half)
             times[len(rows) :] = [elapsed]
             elapsed += 2 * half * drive.period_s
             # a rotor that creeps out of an unstable position looks at rest just before it jumps
@@ -280,4 +280,4 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
         if row["flagged"]:
             break  # the estimator refuses it; nothing larger is held
     drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
-    return table(rows, times, samples=2 * half, fixed_angle_rad=plan.angle_rad, i_command_a=list(plan.levels_a))
+    return table(rows, times, samples=samples, fixed_angle_rad=plan.angle_rad, i_command_a=list(plan.levels_a))

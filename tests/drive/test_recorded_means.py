@@ -1,0 +1,61 @@
+"""Means made from records: two windows of one record, and rows that no harmonic of a turning machine folds onto."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from pmsmtool.bus.connect import Connection
+from pmsmtool.drive import objects
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.recorded_means import AT_REST, LOOK, RecordingDrive, spacing
+from pmsmtool.sim.bus import PmsmSimBus
+
+SIGNALS = ("u_d_v", "i_d_a", "theta_m_rad", "T_winding_c")
+
+
+@pytest.fixture
+def drive() -> Iterator[RecordingDrive]:
+    with Connection(PmsmSimBus("interior-2k2?nv=:memory:&tier=inject")) as connection:
+        made = RecordingDrive(connection, 1)
+        yield made
+        made.close()
+
+
+def test_both_halves_of_a_window_come_from_one_record(drive: RecordingDrive) -> None:
+    periods = 800
+    first, second, samples = drive.halves(SIGNALS, periods)
+    assert set(first) == set(second) == set(SIGNALS)
+    assert samples == 2 * periods // math.ceil(2 * periods / AT_REST)
+    assert first["T_winding_c"] == second["T_winding_c"] == pytest.approx(drive.live("T_winding_c"), abs=0.5)
+    assert first["theta_m_rad"] == pytest.approx(second["theta_m_rad"], abs=0.01)
+    assert first["i_d_a"] != second["i_d_a"]  # two windows, each with its own noise
+    drive.average(SIGNALS, periods)
+    assert drive.node.whole(objects.TRACE_DEPTH) <= LOOK
+
+
+def test_a_drive_with_averages_takes_them_one_after_the_other() -> None:
+    with Connection(PmsmSimBus("interior-2k2?nv=:memory:")) as connection:
+        made = CanopenDrive(connection, 1)
+        assert made.halves(("i_d_a",), 64).samples == 128
+        made.close()
+
+
+def left_of_the_sixth(periods: int, step: int, turns_per_period: float) -> float:
+    """Share of the inverter's sixth harmonic in the mean of half a window that is thinned out."""
+    rows = np.arange(periods // step // 2)
+    return float(abs(np.mean(np.exp(2j * math.pi * 6.0 * turns_per_period * step * rows))))
+
+
+@pytest.mark.parametrize("periods", [600, 1260, 4000])
+def test_rows_are_not_taken_in_step_with_a_harmonic(periods: int) -> None:
+    least = math.ceil(periods / 128)
+    speeds = [float(turns) for turns in np.linspace(1e-3, 2e-2, 400) if 6.0 * turns * periods > 8.0]
+    chosen = [spacing(periods, 128, turns) for turns in speeds]
+    assert all(least <= step < 2 * least for step in chosen)
+    assert max(left_of_the_sixth(periods, step, turns) for step, turns in zip(chosen, speeds, strict=True)) < 0.2
+    if least > 8:  # rows so far apart that the sixth folds onto them at some of these speeds
+        assert max(left_of_the_sixth(periods, least, turns) for turns in speeds) > 0.9
