@@ -4,6 +4,7 @@
         saturated-pmsyrm measured-map
     python -m benchmarks.identification_coverage --drives 400 --block timing
     python -m benchmarks.identification_coverage --drives 100 --first 10000 --hard
+    python -m benchmarks.identification_coverage --drives 24 --first 35000 --hard --half-frequency
 
 Drives follow from their seeds (``workflow/random_drives.py``); the tool sees their nameplate only. Printed per
 quantity: error quantiles, how often the statistical and the total (printed) 95 % interval holds the truth, with its
@@ -14,6 +15,7 @@ the share of devices and copper, which no experiment sees, enters ``R_s_ohm`` on
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import json
 import math
@@ -79,13 +81,13 @@ def is_hard(drive: MachineFile) -> bool:
     return inverter.U_dc_v * inverter.dead_time_s * inverter.f_s_hz >= HARD_RATIO * drive.machine.R_s_ohm * I_nom
 
 
-def identify_one(job: tuple[str, int, str]) -> dict[str, Any]:
+def identify_one(job: tuple[str, int, str], half_frequency: bool = False) -> dict[str, Any]:
     """Identify one drive; returns errors, half widths and refusal, all JSON."""
     profile, seed, block = job
     drive = drawn(profile, seed, block)
     row: dict[str, Any] = {"profile": profile, "seed": seed, "block": block, "hard": is_hard(drive)}
     try:
-        traces, nameplate, seconds = measured(drive)
+        traces, nameplate, seconds = measured(drive, half_frequency)
         start = time.process_time()
         evaluation = evaluated(traces, nameplate)
         row["offline_s"] = time.process_time() - start
@@ -112,12 +114,12 @@ def identify_one(job: tuple[str, int, str]) -> dict[str, Any]:
     return row
 
 
-def measured(drive: MachineFile) -> tuple[dict[str, Trace], MachineFile, float]:
+def measured(drive: MachineFile, half_frequency: bool = False) -> tuple[dict[str, Trace], MachineFile, float]:
     """Run the experiments on a simulated drive; return traces, nameplate and time on the bus (s)."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.toml"
         path.write_text(dump_machine_file(drive, embed_flux_map=drive.flux_map is not None), encoding="utf-8")
-        return _measured(path)
+        return _measured(path, half_frequency)
 
 
 def evaluated(traces: dict[str, Trace], nameplate: MachineFile) -> Evaluation:
@@ -125,7 +127,7 @@ def evaluated(traces: dict[str, Trace], nameplate: MachineFile) -> Evaluation:
     return evaluate(traces, nameplate.inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=nameplate.inverter.U_dc_v)
 
 
-def _measured(path: Path) -> tuple[dict[str, Trace], MachineFile, float]:
+def _measured(path: Path, half_frequency: bool) -> tuple[dict[str, Trace], MachineFile, float]:
     traces: dict[str, Trace] = {}
     with connect("pmsmsim", f"{path}?nv=:memory:") as connection:
         drive = CanopenDrive(connection, 1)
@@ -140,7 +142,9 @@ def _measured(path: Path) -> tuple[dict[str, Trace], MachineFile, float]:
         )
         start = connection.clock.now()
         with guarded(drive, envelope) as guard:
-            Measurement(guard, limits, traces.__setitem__, lambda text: None).run(ELECTRICAL)
+            measurement = Measurement(guard, limits, traces.__setitem__, lambda text: None)
+            measurement.half_frequency = half_frequency
+            measurement.run(ELECTRICAL)
         seconds = connection.clock.now() - start
         drive.close()
     return traces, nameplate, seconds
@@ -209,6 +213,8 @@ def main() -> None:
     around = "draw around these profiles; measured-map: the map in ../shared/maps"
     parser.add_argument("--around", nargs="*", default=[], metavar="PROFILE", help=around)
     parser.add_argument("--hard", action="store_true", help="only drives whose dead time takes 3 R I and more")
+    second = "measure R at half the control frequency, too"
+    parser.add_argument("--half-frequency", action="store_true", help=second)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--rows", type=Path, help="write every drive's result there (JSON lines)")
     parser.add_argument("--tabulate", type=Path, metavar="ROWS", help="only print the table of a file of --rows")
@@ -224,7 +230,8 @@ def main() -> None:
         jobs = (job for job in jobs if is_hard(drawn(*job)))
     with multiprocessing.Pool(options.processes) as pool:
         rows = []
-        for row in pool.imap_unordered(identify_one, itertools.islice(jobs, options.drives)):
+        one = functools.partial(identify_one, half_frequency=options.half_frequency)
+        for row in pool.imap_unordered(one, itertools.islice(jobs, options.drives)):
             rows.append(row)
             if options.rows:
                 with options.rows.open("a", encoding="utf-8") as stream:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,8 @@ switched inverter, and models without the tail that is there were preferred; wit
 MEAN_NOISE_FACTOR = 1.05
 """Noise of the mean current seen through R and the slope of the tail."""
 TEMPERATURE_PASSES = 3
+MOVED_SHARE = 0.25
+"""Largest share of levels that may be left out; with more the estimator sees them, and refuses what has not settled."""
 DRIFT_LIMIT = 0.06
 """Largest change of R over the sweep (relative), 15 K of copper; beyond it E_THERMAL_DRIFT."""
 DRIFT_SECOND_ORDER = 0.02
@@ -192,7 +194,7 @@ def estimate_resistance(
     weights = np.array([])
     for _ in range(TEMPERATURE_PASSES if known_T else 1):
         # R at T_w: what the copper part adds at each level's own temperature moves to the left side
-        slope = R_w * share * copper.alpha_per_k / (1.0 + copper.alpha_per_k * (T_w - copper.T_ref_c))
+        slope = _slope_per_k(R_w * share, T_w, copper)
         v_w = v - slope * (T - T_w) * i if known_T else v
         fits = [_fit_tail(levels.t_s, i, v_w, peak, sigma_v, powers) for powers in tail_models()]
         weights = information_weights([_criterion(fit, len(i)) for fit in fits])
@@ -225,7 +227,7 @@ def estimate_resistance(
         dof=math.inf,
     )
     return ResistanceResult(
-        R_s=_normalise(R_measured, copper, tolerance),
+        R_s=normalised(R_measured, copper, tolerance),
         R_measured=R_measured,
         curve=curve_from_levels(i, v_w - R_w * i - v_0, math.sqrt(3.0) / 2.0),
         V_dead_v=V_dead,
@@ -302,6 +304,39 @@ def unsettled(levels: Trace, noise: Noise) -> NDArray[np.bool_]:
     return np.asarray(np.abs(change) > limit)
 
 
+def settled_levels(levels: Trace, noise: Noise) -> tuple[Trace, int]:
+    """Return the levels at which shaft and voltage stood still, and how many were left out: not more than a quarter.
+
+    A reluctance machine has currents at which its rotor leaves the vector so slowly that it never comes to rest.
+    """
+    moved = levels.signals.get("moved", np.zeros(len(levels))) > 0.0
+    flagged = levels.signals.get("flagged", np.zeros(len(levels))) > 0.0
+    if np.any(flagged):
+        moved &= ~flagged  # a limit is no motion: the estimator names it
+    else:
+        moved |= unsettled(levels, noise)
+    left_out = int(np.sum(moved))
+    if not 0 < left_out <= MOVED_SHARE * len(levels):
+        return levels, 0
+    signals = {name: values[~moved] for name, values in levels.signals.items()}
+    return Trace(levels.t_s[~moved], signals, levels.units, levels.meta), left_out
+
+
+def at_one_temperature(levels: Trace, R: Estimate, copper: Copper) -> Trace:
+    """Return levels with the voltage that the winding would take at the temperature of ``R``, where both are known."""
+    T = levels["T_winding_c"]
+    if not (math.isfinite(R.T_c) and np.all(np.isfinite(T))):
+        return levels
+    slope = _slope_per_k(R.value * _copper_share(copper, R.value), R.T_c, copper)
+    warmer = slope * (T - R.T_c) * levels["i_d_a"]
+    return replace(levels, signals={**levels.signals, "u_d_v": levels["u_d_v"] - warmer})
+
+
+def _slope_per_k(R_copper: float, T_c: float, copper: Copper) -> float:
+    """Change per kelvin of a copper resistance that was measured at a temperature (ohm/K)."""
+    return R_copper * copper.alpha_per_k / (1.0 + copper.alpha_per_k * (T_c - copper.T_ref_c))
+
+
 def _copper_share(copper: Copper, R_loop: float) -> float:
     if copper.R_winding_ohm is None:
         return 1.0
@@ -344,8 +379,8 @@ def _check_result(R: float, std: float, half_width_limit: float) -> None:
         )
 
 
-def _normalise(measured: Estimate, copper: Copper, tolerance: SensorTolerance) -> Estimate:
-    """Move the copper part of R from its measured temperature to the reference temperature."""
+def normalised(measured: Estimate, copper: Copper, tolerance: SensorTolerance) -> Estimate:
+    """Return R with its copper part moved from its measured temperature to the reference temperature."""
     if not math.isfinite(measured.T_c):
         return Estimate(
             value=measured.value,

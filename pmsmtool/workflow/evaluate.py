@@ -15,23 +15,23 @@ from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, est
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.flux_map_result import FluxMapResult
+from pmsmtool.estimators.frequency_extrapolation import FrequencySplit
 from pmsmtool.estimators.frequency_response import FrequencyResponse
 from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
 from pmsmtool.estimators.mechanics import MechanicsResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases
-from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance, unsettled
+from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance, settled_levels
 from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_traces
+from pmsmtool.workflow.half_frequency import resistance_at_two_frequencies
 
 RESONANCE = ("resonance_hz", "antiresonance_hz", "resonance_zeta")
 """Keys of a second mass: a response without one takes them out of the machine file."""
-MOVED_SHARE = 0.25
-"""Largest share of levels that may be left out; with more the estimator sees them, and refuses what has not settled."""
 MOTION_STD = 0.2
 """Relative standard deviation of the rotor's answer to an injection as the pushes show it: friction takes part."""
 RELUCTANCE_STD = 0.3
@@ -50,6 +50,7 @@ class Evaluation:
     phases: PhaseCheck | None = None
     pairs: PairCheck | None = None
     resistance: ResistanceResult | None = None
+    split: FrequencySplit | None = None
     encoder: EncoderResult | None = None
     inductance: InductanceResult | None = None
     flux: FluxResult | None = None
@@ -114,8 +115,8 @@ def evaluate(
     ----------
     traces : mapping of str to Trace
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
-        ``phase_pairs``, ``rotation_forward``, ``rotation_backward``, ``square_d_<half period>``,
-        ``square_q_<half period>``, ``speeds``, ``map_<k>``, ``inertia_<k>``, ``frf_<k>``.
+        ``levels_half_frequency``, ``phase_pairs``, ``rotation_forward``, ``rotation_backward``,
+        ``square_d_<half period>``, ``square_q_<half period>``, ``speeds``, ``map_<k>``, ``inertia_<k>``, ``frf_<k>``.
     period_s : float
         Control period (s).
     T_ref_c : float
@@ -142,7 +143,10 @@ def evaluate(
     if "first_turn" in traces:
         check_encoder_counts(traces["first_turn"])
     if "levels" in traces:
-        result = replace(result, resistance=resistance_of(traces["levels"], result.noise, T_ref_c, tolerance))
+        resistance = resistance_of(traces["levels"], result.noise, T_ref_c, tolerance)
+        copper = Copper(T_ref_c, COPPER_ALPHA_PER_K)
+        resistance, split = resistance_at_two_frequencies(traces, result.noise, resistance, copper, tolerance)
+        result = replace(result, resistance=resistance, split=split)
     if "phase_pairs" in traces and result.resistance is not None:
         result = replace(result, pairs=check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve))
     if "rotation_forward" in traces:
@@ -167,26 +171,13 @@ def evaluate(
 def resistance_of(
     levels: Trace, noise: Noise, T_ref_c: float = 20.0, tolerance: SensorTolerance | None = None
 ) -> ResistanceResult:
-    """Return the resistance at a reference temperature; levels at which the shaft moved are left out, and counted.
-
-    A reluctance machine has currents at which its rotor leaves the vector so slowly that it never comes to rest.
-    """
-    moved = levels.signals.get("moved", np.zeros(len(levels))) > 0.0
-    flagged = levels.signals.get("flagged", np.zeros(len(levels))) > 0.0
-    if np.any(flagged):
-        moved &= ~flagged  # a limit is no motion: the estimator names it
-    else:
-        moved |= unsettled(levels, noise)
-    left_out = int(np.sum(moved))
-    note = ""
-    if 0 < left_out <= MOVED_SHARE * len(levels):
-        signals = {name: values[~moved] for name, values in levels.signals.items()}
-        levels = Trace(levels.t_s[~moved], signals, levels.units, levels.meta)
-        note = f"{left_out} levels left out: shaft or voltage moved during them"
+    """Return the resistance at a reference temperature; levels at which the shaft moved are left out, and counted."""
+    levels, left_out = settled_levels(levels, noise)
     copper = Copper(T_ref_c, COPPER_ALPHA_PER_K)
     result = estimate_resistance(levels, noise, tolerance=tolerance, copper=copper)
-    if not note:
+    if not left_out:
         return result
+    note = f"{left_out} levels left out: shaft or voltage moved during them"
     fallback = "; ".join(part for part in (result.R_s.fallback, note) if part)
     return replace(result, R_s=replace(result.R_s, fallback=fallback))
 

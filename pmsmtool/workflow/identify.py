@@ -36,7 +36,7 @@ from pmsmtool.machine.parameters import (
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
 from pmsmtool.units import format_estimate
-from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
+from pmsmtool.workflow import frequency_stage, half_frequency, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
 from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Limits, Measurement, steps_of
@@ -68,6 +68,8 @@ class IdentifyRequest:
         Envelope (A peak, rad/s mechanical).
     shaft, load, brake : str
         What hangs on the shaft and may happen to it.
+    half_frequency : bool
+        Whether R and inverter are measured at half the control frequency, too.
     tolerance : SensorTolerance
         Declared sensor tolerances.
     """
@@ -78,6 +80,7 @@ class IdentifyRequest:
     shaft: Shaft = "free"
     load: Load = "none"
     brake: Brake = "none"
+    half_frequency: bool = False
     tolerance: SensorTolerance = field(default_factory=SensorTolerance)
 
     def check(self) -> None:
@@ -94,6 +97,10 @@ class IdentifyRequest:
         if unknown or not self.quantities:
             raise ConfigError(
                 f"cannot identify {', '.join(unknown) or 'nothing'}", hint=f"choose from {', '.join(NEEDS)}, or all"
+            )
+        if self.half_frequency and self.quantities == ("poles",):
+            raise ConfigError(
+                "pole pairs alone do not measure R", hint="leave --half-frequency out, or identify R, too"
             )
         turning = [name for name in self.quantities if name != "map" and set(NEEDS[name]) & {"rotation", "speeds"}]
         if turning and self.shaft == "locked":
@@ -174,6 +181,8 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest) -> list[str]:
     """Return what a person reads before consenting: the envelope and what will happen inside it."""
     steps = steps_of(request.quantities, request.shaft == "locked")
     lines = [*envelope.lines(), "the rotor aligns with current vectors: it may jump by half an electrical turn"]
+    if request.half_frequency:
+        lines.append(half_frequency.PLAN_LINE)
     if "rotation" in steps:
         lines.append("the shaft turns slowly through one turn each way")
     if "speeds" in steps:
@@ -226,7 +235,8 @@ def identify_stage(
     clock = drive.node.connection.clock
     start = clock.now()
     with guarded(drive, envelope, say=say) as guard:
-        measurement = Measurement(guard, limits, keep, say, held=request.shaft == "locked")
+        locked = request.shaft == "locked"
+        measurement = Measurement(guard, limits, keep, say, held=locked, half_frequency=request.half_frequency)
         measurement.spent = lambda: (guard.energised_s, guard.energy_j)
         measurement.run(request.quantities)
     stage = evaluated_stage(run, nameplate, request)
@@ -252,7 +262,9 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         U_dc_v=nameplate.inverter.U_dc_v,
         tolerance=request.tolerance,
     )
-    machine = machine_of(evaluation, nameplate, _conditions(evaluation, request))
+    U_dc_v = nameplate.inverter.U_dc_v
+    conditions = _conditions(evaluation, request) | half_frequency.split_conditions(evaluation.split, U_dc_v)
+    machine = machine_of(evaluation, nameplate, conditions)
     text = dump_machine_file(machine)
     target, prefix = (run, "") if _may_write(run, text) else (_beside(run), f"{REPLAYED}/")
     made = map_stage.save_map(target, evaluation.flux_map)
@@ -270,12 +282,13 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         acceptance=acceptance,
         fallbacks=[f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback],
         files={**made_files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
-        note="; ".join(warnings_of(evaluation)),
+        note="; ".join(warnings_of(evaluation, request)),
         summary=", ".join(
             f"{name} {format_estimate(found[name].value, total_half_width(found[name]), found[name].unit)}"
             for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
             if name in found
         )
+        + half_frequency.split_summary(evaluation.split, U_dc_v)
         + map_stage.map_summary(evaluation.flux_map)
         + frequency_stage.response_summary(evaluation.frequency_response),
     )
@@ -365,9 +378,11 @@ def stored_traces(run: RunDirectory) -> dict[str, Trace]:
     return {path.stem: read_trace(path) for path in sorted((run.path / "traces").glob("*.npz"))}
 
 
-def warnings_of(evaluation: Evaluation) -> list[str]:
+def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
     """Return what a reader should know about a result that was accepted all the same."""
     lines = []
+    if request.half_frequency and evaluation.split is None:
+        lines.append("R_s is from one control frequency: the drive does not take half of it")
     if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
         lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
     if evaluation.pairs is not None and not evaluation.pairs.judged:

@@ -27,6 +27,7 @@ from pmsmtool.experiments import rotation, speed_run, square_injection, standsti
 from pmsmtool.trace import Trace
 from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
 from pmsmtool.workflow.evaluate import resistance_of, tolerance_on
+from pmsmtool.workflow.half_frequency import measure_at_half_frequency
 
 PHASE_CHECK_SHARE = 0.05
 LEVELS = 12
@@ -181,6 +182,8 @@ class Measurement:
         Ripple of the injection, peak to peak, of the rated current.
     held : bool
         Whether the shaft is locked.
+    half_frequency : bool
+        Whether R is measured at half the control frequency, too.
     spent : callable or None
         Seconds energised and copper loss so far (s, J), told after every stage.
     """
@@ -191,6 +194,7 @@ class Measurement:
     say: Callable[[str], None]
     ripple_share: float = RIPPLE_SHARE
     held: bool = False
+    half_frequency: bool = False
     spent: Callable[[], tuple[float, float]] | None = None
 
     def run(self, quantities: tuple[str, ...]) -> None:
@@ -293,6 +297,7 @@ class Measurement:
         trace = standstill.hold_levels(self.drive, plan)
         self.keep("levels", trace)
         resistance = resistance_of(trace, noise)
+        measure_at_half_frequency(self.drive, plan, resistance, self.half_frequency, self.keep, self.say)
         strongest = max(standstill.PAIR_SHARES) * largest
         self.say(f"pairs of phases: two currents up to {strongest:.3g} A through each")
         pairs = standstill.hold_pairs(self.drive, largest, TURN_SHARE * largest, standstill.DC_ANGLE_RAD)
