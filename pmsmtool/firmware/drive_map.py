@@ -15,6 +15,7 @@ from typing import Literal
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.image import LUT_FORMAT_INT16, LUT_INT16_NO_POINT
+from pmsmtool.firmware.vendor_tuning import VendorTuning
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 
@@ -223,8 +224,6 @@ class Capabilities:
         ``none``, ``current`` or ``voltage`` set-points for d and q.
     averages : bool
         Window averages inside the drive, and a voltage whose acting period is known.
-    auto_tuning : str
-        Empty, or how the vendor's own identification is started.
     """
 
     torque_mode: bool = False
@@ -234,7 +233,6 @@ class Capabilities:
     recorder: Recording = "none"
     injection: Injecting = "none"
     averages: bool = False
-    auto_tuning: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,6 +261,8 @@ class DriveMap:
         What is not mapped and why, by catalogue or signal name.
     sources : mapping of str to str
         Where the facts come from.
+    vendor_tuning : VendorTuning or None
+        How the drive's own identification is started and read.
     """
 
     name: str
@@ -276,6 +276,7 @@ class DriveMap:
     signals: Mapping[str, SignalCell] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     sources: Mapping[str, str] = field(default_factory=dict)
+    vendor_tuning: VendorTuning | None = None
 
     def is_for(self, vendor: int, product: int) -> bool:
         """Whether a drive of this identity belongs to the family."""

@@ -27,6 +27,8 @@ from pmsmtool.firmware.drive_map import (
     Rounding,
     SignalCell,
 )
+from pmsmtool.firmware.vendor_tuning import VendorTuning
+from pmsmtool.firmware.vendor_tuning_file import TABLE, dump_vendor_tuning, parse_vendor_tuning
 from pmsmtool.firmware.wire_units import counted_in, wire_unit
 from pmsmtool.params.catalogue import BY_NAME, EVERY, Parameter
 from pmsmtool.params.parameter_set import TABLE_NAMES
@@ -40,7 +42,7 @@ COMMANDS = frozenset({0x6040, 0x6060, 0x6071, 0x607A, 0x60B1, 0x60B2, 0x60FF})
 """Objects whose writing moves the machine: never a parameter."""
 POLE_PAIRS = "motor.pole_pairs"
 _HEAD = ("schema", "name", "vendor", "product", "more_products", "staging")
-_TABLES = ("capabilities", "objects", "signals", "tables", "left_out", "sources")
+_TABLES = ("capabilities", "objects", "signals", "tables", "left_out", "sources", TABLE)
 _CELL_KEYS = ("index", "sub", "type", "factor", "offset", "unit", "rounding", "form", "gain", "source")
 _TEXT_KEYS = ("type", "unit", "form", "rounding", "gain", "source")
 _SIGNAL_KEYS = ("index", "sub", "type", "unit", "source")
@@ -68,6 +70,7 @@ def dump_drive_map(drive_map: DriveMap) -> str:
         head["more_products"] = drive_map.more_products
     plain = asdict(Capabilities())
     capabilities = {key: value for key, value in asdict(drive_map.capabilities).items() if value != plain[key]}
+    tuning = drive_map.vendor_tuning
     return toml_text(
         {
             **head,
@@ -76,6 +79,7 @@ def dump_drive_map(drive_map: DriveMap) -> str:
             "objects": {name: _cell_row(cell) for name, cell in drive_map.cells.items()},
             "signals": {name: _signal_row(cell) for name, cell in drive_map.signals.items()},
             "tables": {name: {"index": index, "sub": sub} for name, (index, sub) in drive_map.tables.items()},
+            **({} if tuning is None else {TABLE: dump_vendor_tuning(tuning, _cell_row)}),
             "left_out": dict(drive_map.left_out),
             "sources": dict(drive_map.sources),
         }
@@ -193,10 +197,31 @@ def _parse_tables(
         "signals": {name: signal for name, signal in signals.items() if signal is not None},
         "left_out": _parse_left_out(table("left_out"), cells, complain),
         "sources": sources,
+        TABLE: _parse_tuning(document.get(TABLE), cells, sources, complain),
     }
 
 
-def _parse_cell(name: str, row: Any, sources: Mapping[str, str], complain: Complain) -> Cell | None:
+def _parse_tuning(
+    table: Any,
+    cells: Mapping[str, Cell],
+    sources: Mapping[str, str],
+    complain: Callable[[tuple[str, ...], str], None],
+) -> VendorTuning | None:
+    if not isinstance(table, dict):
+        return None
+
+    def row_of(name: str, row: Any, path: tuple[str, ...], anywhere: bool) -> Cell | None:
+        def tell(key: str, what: str) -> None:
+            complain((*path, key) if key else path, f"{path[-1]}: {what}")
+
+        return _parse_cell(name, row, sources, tell, anywhere=anywhere)
+
+    return parse_vendor_tuning(table, cells, sources, complain, row_of)
+
+
+def _parse_cell(
+    name: str, row: Any, sources: Mapping[str, str], complain: Complain, *, anywhere: bool = False
+) -> Cell | None:
     said: list[str] = []
 
     def tell(key: str, what: str) -> None:
@@ -205,7 +230,7 @@ def _parse_cell(name: str, row: Any, sources: Mapping[str, str], complain: Compl
 
     if name not in BY_NAME:
         tell("", "not in the parameter catalogue")
-    if not _check_row(row, _CELL_KEYS, sources, tell):
+    if not _check_row(row, _CELL_KEYS, sources, tell, anywhere=anywhere):
         return None
     form = row.get("form", "time" if "gain" in row else "value")
     if form not in get_args(Form):
@@ -274,7 +299,13 @@ def _parse_signal(name: str, row: Any, sources: Mapping[str, str], complain: Com
 
 
 def _check_row(
-    row: Any, keys: tuple[str, ...], sources: Mapping[str, str], tell: Complain, *, commands: bool = False
+    row: Any,
+    keys: tuple[str, ...],
+    sources: Mapping[str, str],
+    tell: Complain,
+    *,
+    commands: bool = False,
+    anywhere: bool = False,
 ) -> bool:
     """Address, type, unit, source and unknown keys of an object; returns whether the row can be used further."""
     if not isinstance(row, dict) or not _is_address(row):
@@ -284,7 +315,7 @@ def _check_row(
         if key not in keys:
             tell(key, f"unknown key {key}")
     index = row["index"]
-    if not 0x2000 <= index <= 0x9FFF:
+    if not anywhere and not 0x2000 <= index <= 0x9FFF:
         tell("index", f"index 0x{index:04X} is outside 0x2000 .. 0x9FFF, where devices keep their parameters")
     elif index in COMMANDS and not commands:
         tell("index", f"index 0x{index:04X} is a command that moves the machine, not a parameter")

@@ -1,8 +1,9 @@
 """Units in which drives count: what one count of an object is worth, as a person reads it in a data sheet.
 
 ``uV/A``, ``10 mohm line-line``, ``mA rms``, ``0.1 V``, ``rev/s``: an optional number, a unit, and optionally
-``rms`` (sinusoidal current or voltage: times sqrt 2 to the peak) or ``line-line`` (winding data between two
-terminals: half of it per phase). Relative CiA 402 values are ``permille of 0x6075`` and ``permille of 0x6076``.
+``rms`` (sinusoidal current or voltage: times sqrt 2 to the peak; torque over such a current: divided by it) or
+``line-line`` (winding data between two terminals: half of it per phase). Relative CiA 402 values are
+``permille of 0x6075`` and ``permille of 0x6076``.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ _COMPOSITE: dict[str, tuple[str, float]] = {
 
 _PATTERN = re.compile(r"(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?) +)?(\S.*?)(?: +(rms|line-line))?\Z")
 _RELATIVE = {"permille of 0x6075": ("current", 0x6075), "permille of 0x6076": ("torque", 0x6076)}
-_PEAK_OF_RMS = frozenset({"current", "voltage"})
+_OF_RMS = {"current": math.sqrt(2.0), "voltage": math.sqrt(2.0), "torque constant": math.sqrt(0.5)}
 _PER_PHASE = frozenset({"resistance", "inductance"})
 
 
@@ -81,9 +82,9 @@ def wire_unit(text: str) -> WireUnit:
     dimension, scale = _symbol(symbol)
     scale *= float(number or 1.0)
     if kind == "rms":
-        if dimension not in _PEAK_OF_RMS:
+        if dimension not in _OF_RMS:
             raise ValueError(f"{dimension} has no rms value")
-        scale *= math.sqrt(2.0)
+        scale *= _OF_RMS[dimension]
     elif kind == "line-line":
         if dimension not in _PER_PHASE:
             raise ValueError(f"{dimension} is not halved between lines")

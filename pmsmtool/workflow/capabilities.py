@@ -18,6 +18,7 @@ from pmsmtool.drive.port import Identity
 from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.shipped_maps import UNKNOWN_VENDOR, family_of, load_family
+from pmsmtool.firmware.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
 
 GENERIC = "cia402"
 """Family of a drive that no map is known for."""
@@ -58,7 +59,10 @@ FEATURES: Mapping[str, str] = {
     "torque mode": "torque mode (0x6502 bit 3 or 9)",
     "position": "position in increments of a known number per turn (0x6064, 0x608F)",
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
-    "vendor result": "the maker's identification in the drive map",
+    "vendor R": "the maker's identification of R, with its result, in a map that names this drive",
+    "vendor L": "the maker's identification of L, with its result, in a map that names this drive",
+    "vendor psi": "the maker's identification of psi, with its result, in a map that names this drive",
+    "vendor poles": "the maker's identification of the pole pairs, with its result, in a map that names this drive",
     "line voltage": "the DC link (0x6079), or the machine's voltage in the drive map",
     "current": "its current (0x6078)",
 }
@@ -69,29 +73,36 @@ _INJECT = (*_SAFE, "set-points", "excitation", "recorder")
 _RECORD = (*_SAFE, "recorder", "torque mode")
 _STANDARD = (*_SAFE, "position", "commutation angle")
 _PUSH = (*_SAFE, "torque mode", "position", "current")
+_WATCHED = (*_SAFE, "position", "current")
+"""What the guard needs while the drive runs by itself."""
 
 NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
     "R": {
         Method.INJECT: _INJECT,
         Method.RECORDER: _RECORD,
-        Method.VENDOR: ("vendor result",),
+        Method.VENDOR: (*_WATCHED, "vendor R"),
         Method.MANUAL: (),
     },
-    "L": {Method.INJECT: _INJECT, Method.RECORDER: _RECORD, Method.VENDOR: ("vendor result",), Method.MANUAL: ()},
+    "L": {
+        Method.INJECT: _INJECT,
+        Method.RECORDER: _RECORD,
+        Method.VENDOR: (*_WATCHED, "vendor L"),
+        Method.MANUAL: (),
+    },
     "psi": {
         Method.INJECT: _INJECT,
         Method.RECORDER: _RECORD,
         Method.STANDARD: (*_PUSH, "line voltage"),
-        Method.VENDOR: ("vendor result",),
+        Method.VENDOR: (*_WATCHED, "vendor psi"),
         Method.MANUAL: (),
     },
     "map": {Method.INJECT: _INJECT},
     "inverter": {Method.INJECT: _INJECT},
-    "encoder": {Method.INJECT: _INJECT, Method.STANDARD: _STANDARD, Method.VENDOR: ("vendor result",)},
+    "encoder": {Method.INJECT: _INJECT, Method.STANDARD: _STANDARD},
     "poles": {
         Method.INJECT: _INJECT,
         Method.STANDARD: _STANDARD,
-        Method.VENDOR: ("vendor result",),
+        Method.VENDOR: (*_WATCHED, "vendor poles"),
         Method.MANUAL: (),
     },
     "mechanics": {
@@ -111,6 +122,7 @@ NOTES: Mapping[tuple[str, Method], str] = {
     ("psi", Method.STANDARD): "where the voltage limit is within the speed limit, or the drive shows its voltage",
     ("mechanics", Method.RECORDER): "J/psi and tau_c/psi",
     ("mechanics", Method.STANDARD): "J/psi and tau_c/psi; the pole pairs must be known",
+    ("L", Method.VENDOR): "one inductance for both axes, unless the map has a result for each",
 }
 
 
@@ -195,7 +207,7 @@ class Capabilities:
         for tier, needs in _TIERS:
             if self.features >= set(needs):
                 return tier
-        return Tier.VENDOR if self.drive_map.capabilities.auto_tuning else Tier.MANUAL
+        return Tier.VENDOR if any(self.row(name, Method.VENDOR).available for name in NEEDS) else Tier.MANUAL
 
     @property
     def unsafe(self) -> bool:
@@ -258,7 +270,7 @@ class Capabilities:
         return str(method or (best.method if best else ""))
 
 
-_MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD)
+_MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD, Method.VENDOR)
 _TIERS = (
     (Tier.FULL, (*_INJECT, "averages")),
     (Tier.INJECT, _INJECT),
@@ -308,9 +320,25 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
             "averages": node.has(0x2063, 3),
             "recorder": node.has(0x2060, 8),
         }
-    found = frozenset(name for name, there in has.items() if there)
     named = identity.vendor != UNKNOWN_VENDOR and drive_map.is_for(identity.vendor, identity.product)
-    return Capabilities(identity, drive_map, named, found)
+    found = {name for name, there in has.items() if there}
+    if named:  # whatever starts a drive's own identification is not tried on another drive
+        found |= {f"vendor {name}" for name in _vendor_quantities(node, drive_map)}
+    return Capabilities(identity, drive_map, named, frozenset(found))
+
+
+def _vendor_quantities(node: DriveNode, drive_map: DriveMap) -> frozenset[str]:
+    """Return what the drive's own identification tells; an object that is not there tells nothing.
+
+    The answer of an OS command is not read here: reading it acknowledges it.
+    """
+    tuning = drive_map.vendor_tuning
+    if tuning is None:
+        return frozenset()
+    needed = [(OS_COMMAND, 2), (OS_COMMAND_MODE, 0)]
+    if tuning.kind == "mode":
+        needed = [(cell.index, cell.sub) for cell in tuning.results.values()]
+    return tuning.quantities if all(node.has(*address) for address in needed) else frozenset()
 
 
 def _bit(mode: Mode) -> int:
