@@ -17,10 +17,12 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.drive_map import Cell, DriveMap, SignalCell, reference_map
 from pmsmtool.firmware.wire_units import WireUnit, wire_unit
 from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.sim.node import own_identification
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.monitor import Monitor
 from pmsmtool.sim.node.objects import ObjectRow
-from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, Plant
+from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, Plant, PowerDrive
+from pmsmtool.sim.node.schedule import Schedule
 
 OWN = range(0x2000, 0x6000)
 """Indices of the reference drive's own objects."""
@@ -91,14 +93,16 @@ class Face:
             dictionary.hide(index)
         for name, signal in self.drive_map.signals.items():
             dictionary.show(_signal_entry(name, signal, dictionary))
-        for entry in (*_modes(self.modes, dictionary), *_Parameters(self.drive_map, dictionary).entries()):
+        tuning = self.drive_map.vendor_tuning
+        own = () if tuning is None else (tuning.mode,)
+        for entry in (*_modes(self.modes, dictionary, own), *_Parameters(self.drive_map, dictionary).entries()):
             dictionary.show(entry)
 
-
-    def attach(self, dictionary: Dictionary, plant: Plant) -> None:
+    def attach(self, dictionary: Dictionary, plant: Plant, power: PowerDrive, schedule: Schedule) -> None:
         """Put the family's own functions over the running application."""
         if self.drive_map.capabilities.recorder == "index":
             Monitor(self.drive_map, dictionary, plant)
+        own_identification.attach(self.drive_map, dictionary, plant, power, schedule)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,10 +132,11 @@ class Reduced:
                 dictionary.show(entry)
 
 
-def _modes(modes: Sequence[Mode], dictionary: Dictionary) -> Iterator[Entry]:
+def _modes(modes: Sequence[Mode], dictionary: Dictionary, own: Sequence[int] = ()) -> Iterator[Entry]:
     """Yield the objects of the modes of operation, without those the drive does not have.
 
-    Torque with the master's commutation angle is the reference drive's current set-point at a fixed angle.
+    Torque with the master's commutation angle is the reference drive's current set-point at a fixed angle; a mode of
+    the maker's ``own`` is its identification mode without any set-point.
     """
     inner = dictionary["cia402.mode"]
     shown = Entry(_row(0x6060, 0, "INTEGER8", "Modes of operation", "rw", "R", True), 0)
@@ -139,9 +144,9 @@ def _modes(modes: Sequence[Mode], dictionary: Dictionary) -> Iterator[Entry]:
 
     def sink(data: bytes) -> None:
         mode = int.from_bytes(data, "little", signed=True)
-        if mode not in (Mode.NONE, *modes):
+        if mode not in (Mode.NONE, *modes, *own):
             raise Refused(AbortCode.VALUE)
-        behind = Mode.IDENTIFICATION if mode == Mode.CYCLIC_TORQUE_ANGLE else mode
+        behind = Mode.IDENTIFICATION if mode in (Mode.CYCLIC_TORQUE_ANGLE, *own) else mode
         dictionary.write(inner, inner.encode(behind))
         shown.value = data
 

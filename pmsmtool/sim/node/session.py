@@ -115,7 +115,7 @@ class Session:
         self.power = PowerDrive(self.dictionary, schedule, hardware, self.emergency)
         self.measurement = Measurement(self.dictionary, hardware, self.power)
         if isinstance(hardware.face, Face):
-            hardware.face.attach(self.dictionary, hardware)
+            hardware.face.attach(self.dictionary, hardware, self.power, schedule)
         self.sdo = SdoServer(self.dictionary, schedule, self._send_sdo, self._withdraw_sdo)
         self.heartbeat = HeartbeatProducer(self.dictionary, schedule, self.send_state)
         self.consumer = HeartbeatConsumer(

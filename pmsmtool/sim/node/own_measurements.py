@@ -1,0 +1,235 @@
+"""What a simulated drive measures by itself: simple methods of its own, with their own errors, taking their time.
+
+Each measurement is a generator that yields how long it waits (s) while the machine moves, and returns its result. The
+methods are those of an ordinary drive: two levels of current for R, the ripple of a square-wave voltage for L, a vector
+turned slowly for the pole pairs, the voltage at speed for psi. Dead time, sensor lag and saturation stay in the result.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Generator, Mapping, Sequence
+
+from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.sim.node.dictionary import Dictionary
+from pmsmtool.sim.node.drive_core import AverageState, Command, ControlMode, RecorderSetup, RecorderState
+from pmsmtool.sim.node.power_drive import Plant
+from pmsmtool.sim.signals import Signal
+
+Measured = Generator[float, None, float]
+
+CURRENT_SHARE = 0.6
+"""Test current, of the rated one."""
+HEADROOM = 1.2
+"""Smallest distance of the test current from the limit of object 0x6073."""
+NOT_REACHED = 0
+"""Error code of a measurement whose current is not reached."""
+NO_ANSWER = 1
+"""Error code of a shaft that does not answer."""
+REACHED = 0.1
+"""Deviation of a current, of what was asked for, up to which it counts as reached."""
+OPEN_SHARE = 0.05
+"""Current of a phase, of the vector's, below which it counts as open."""
+SETTLE_S = 0.3
+WINDOW_S = 0.05
+REST_S = 0.01
+"""Voltage off between two vectors: a wound-up controller must not throw its voltage on another phase."""
+TICK_S = 0.005
+TURNS, TURN_S = 4, 0.8
+"""Electrical turns of the vector that counts the pole pairs, and the time of one."""
+INTEGER_WITHIN = 0.2
+HALF_PERIOD = 6
+RIPPLE_SHARE = 0.2
+"""Ripple that the inductance is measured with, of the rated current; its amplitude is found in growing steps."""
+FIRST_VOLTAGE_SHARE = 0.005
+RIPPLE_ROWS = 240
+SEARCHES = 6
+SPEED_SHARE = 0.25
+"""Speed at which the voltage is measured, of the largest one."""
+RAMP_S, RUN_UP_S = 3.0, 6.0
+"""Ramp of the speed; longest time to reach it."""
+FULL_CURRENT_AT = 0.1
+"""Speed error, of the target speed, that takes the whole test current."""
+
+
+class MeasurementFailed(Exception):
+    """A measurement that ends without a result.
+
+    Parameters
+    ----------
+    code : int
+        Error code of the drive.
+    """
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"error code {code}")
+        self.code = code
+
+
+class OwnMeasurements:
+    """The measurements of one session.
+
+    Parameters
+    ----------
+    dictionary : Dictionary
+        For the drive's limits.
+    plant : Plant
+        The drive and its machine.
+    one_inductance : bool
+        Whether one inductance stands for both axes: that of the axis the rotor is pulled to.
+    """
+
+    def __init__(self, dictionary: Dictionary, plant: Plant, *, one_inductance: bool) -> None:
+        self._dictionary = dictionary
+        self._plant = plant
+        self._q_axis = not one_inductance
+
+    def measurement(self, name: str) -> Callable[[], Measured]:
+        """Return what measures a result; of any other name the check for open phases."""
+        known: Mapping[str, Callable[[], Measured]] = {
+            "motor.pole_pairs": self._pole_pairs,
+            "motor.R_s_ohm": self._resistance,
+            "motor.L_d_h": lambda: self._inductance(Injection.U_D, Signal.I_D),
+            "motor.L_q_h": self._inductance_q,
+            "motor.psi_f_wb": self._flux_linkage,
+        }
+        return known.get(name, self._open_phase)
+
+    # ---- means ---------------------------------------------------------------------------------
+
+    @property
+    def _current_a(self) -> float:
+        """Test current, within the limit of object 0x6073 (A peak)."""
+        permille = self._dictionary["cia402.max_current"].number()
+        limit = permille * 1e-6 * self._dictionary["cia402.rated_current"].number() * math.sqrt(2.0)
+        return min(CURRENT_SHARE * self._plant.parameter("motor.I_nom_apk"), limit / HEADROOM)
+
+    def _vector(self, length_a: float, angle_rad: float) -> None:
+        command = Command(ControlMode.CURRENT, i_d_a=length_a, fixed_angle_rad=angle_rad)
+        self._plant.core.command(command)
+
+    def _means(self, signals: Sequence[Signal], seconds: float) -> Generator[float, None, Sequence[float]]:
+        core = self._plant.core
+        core.average(signals, max(1, round(seconds * 1e9 / core.period_ns)))
+        while True:
+            yield seconds
+            result = core.averages()
+            if result.state is AverageState.COMPLETE:
+                return result.mean
+            seconds = TICK_S
+
+    # ---- measurements --------------------------------------------------------------------------
+
+    def _open_phase(self) -> Measured:
+        largest = [0.0, 0.0, 0.0]
+        length = 0.5 * self._current_a
+        for k in range(3):
+            self._plant.core.command(Command())
+            yield REST_S
+            self._vector(length, 2.0 * math.pi * k / 3.0)
+            yield SETTLE_S / 3.0
+            means = yield from self._means((Signal.I_A, Signal.I_B, Signal.I_C), WINDOW_S)
+            largest = [max(most, abs(mean)) for most, mean in zip(largest, means, strict=True)]
+        self._plant.core.command(Command())
+        yield REST_S
+        if min(largest) < OPEN_SHARE * length:
+            raise MeasurementFailed(largest.index(min(largest)))
+        return 0.0
+
+    def _pole_pairs(self) -> Measured:
+        self._vector(self._current_a, 0.0)
+        yield SETTLE_S
+        start = self._plant.core.signal(Signal.THETA_M)
+        steps = round(TURNS * TURN_S / TICK_S)
+        for k in range(1, steps + 1):
+            self._vector(self._current_a, 2.0 * math.pi * TURNS * k / steps)
+            yield TICK_S
+        yield SETTLE_S
+        turned = abs(self._plant.core.signal(Signal.THETA_M) - start) / (2.0 * math.pi)
+        count = TURNS / turned if turned > 0.0 else math.inf
+        if not count < 0xFF or abs(count - round(count)) > INTEGER_WITHIN * max(1.0, count / 5.0):
+            raise MeasurementFailed(NO_ANSWER)
+        return float(round(count))
+
+    def _resistance(self) -> Measured:
+        levels = []
+        for share in (0.5, 1.0):
+            self._vector(share * self._current_a, 0.0)
+            yield SETTLE_S
+            means = yield from self._means((Signal.U_D, Signal.I_D), WINDOW_S)
+            if abs(means[1] - share * self._current_a) > REACHED * self._current_a:
+                raise MeasurementFailed(NOT_REACHED)
+            levels.append(means)
+        (u_1, i_1), (u_2, i_2) = levels
+        return (u_2 - u_1) / (i_2 - i_1)
+
+    def _inductance_q(self) -> Measured:
+        point, signal = (Injection.U_Q, Signal.I_Q) if self._q_axis else (Injection.U_D, Signal.I_D)
+        return self._inductance(point, signal)
+
+    def _inductance(self, point: Injection, signal: Signal) -> Measured:
+        core = self._plant.core
+        bias = 0.5 * self._current_a
+        self._vector(bias, 0.0)
+        yield SETTLE_S
+        wanted = RIPPLE_SHARE * self._plant.parameter("motor.I_nom_apk")
+        largest_v = core.signal(Signal.U_DC) / math.sqrt(3.0)
+        amplitude = FIRST_VOLTAGE_SHARE * largest_v
+        for _ in range(SEARCHES):
+            ripple = yield from self._ripple(point, signal, amplitude, bias)
+            if ripple >= 0.5 * wanted:
+                core.excite(None)
+                return amplitude * HALF_PERIOD * 1e-9 * core.period_ns / ripple
+            amplitude = min(largest_v, amplitude * min(4.0, wanted / max(ripple, 1e-9)))
+        core.excite(None)
+        raise MeasurementFailed(NOT_REACHED)
+
+    def _ripple(self, point: Injection, signal: Signal, amplitude_v: float, bias_a: float) -> Measured:
+        """Return the mean swing of a current (A) under a square-wave voltage."""
+        core = self._plant.core
+        core.excite(
+            Excitation(
+                shape=Shape.SQUARE, point=point, amplitude=amplitude_v, bias_d_a=bias_a,
+                bias_bandwidth_rad_s=2.0 * math.pi * 15.0, hold_periods=HALF_PERIOD, fixed_angle_rad=0.0,
+            )
+        )  # fmt: skip
+        yield SETTLE_S / 3.0
+        core.record(RecorderSetup(channels=(signal,), depth=RIPPLE_ROWS))
+        while True:
+            yield TICK_S
+            if core.recorder().state is RecorderState.COMPLETE:
+                break
+        rows = struct.unpack(f"<{RIPPLE_ROWS}f", core.recording())
+        waves = [rows[k : k + 2 * HALF_PERIOD] for k in range(0, RIPPLE_ROWS, 2 * HALF_PERIOD)]
+        return sum(max(wave) - min(wave) for wave in waves) / len(waves)
+
+    def _flux_linkage(self) -> Measured:
+        """Measure the voltage at speed, less the drop at the resistance that the drive is set to."""
+        limit = self._dictionary["cia402.max_speed"].number()
+        target = SPEED_SHARE * min(limit, self._plant.parameter("motor.n_max_rpm")) * math.pi / 30.0
+        pole_pairs = self._plant.parameter("motor.pole_pairs")
+        passed = 0.0
+        while passed < RAMP_S or abs(self._speed(pole_pairs) - target) > FULL_CURRENT_AT * target:
+            if passed > RUN_UP_S:
+                raise MeasurementFailed(NO_ANSWER)
+            yield from self._steer(min(1.0, passed / RAMP_S) * target, target, pole_pairs)
+            passed += TICK_S
+        # without current: the dead time's error would be a tenth of the voltage at this speed
+        self._plant.core.command(Command(ControlMode.CURRENT))
+        yield REST_S
+        signals = (Signal.U_Q, Signal.I_Q, Signal.OMEGA_E)
+        u_q, i_q, omega_e = yield from self._means(signals, WINDOW_S)
+        while passed > 0.0:
+            yield from self._steer(min(1.0, passed / RAMP_S) * target, target, pole_pairs)
+            passed -= TICK_S
+        return (u_q - self._plant.parameter("motor.R_s_ohm") * i_q) / omega_e
+
+    def _speed(self, pole_pairs: float) -> float:
+        return self._plant.core.signal(Signal.OMEGA_E) / max(1.0, pole_pairs)
+
+    def _steer(self, wanted: float, target: float, pole_pairs: float) -> Generator[float, None, None]:
+        error = (wanted - self._speed(pole_pairs)) / (FULL_CURRENT_AT * target)
+        i_q = self._current_a * min(1.0, max(-1.0, error))
+        self._plant.core.command(Command(ControlMode.CURRENT, i_q_a=i_q))
+        yield TICK_S
