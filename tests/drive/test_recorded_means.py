@@ -11,7 +11,9 @@ import pytest
 from pmsmtool.bus.connect import Connection
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.recorded_means import AT_REST, LOOK, RecordingDrive, spacing
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.recorded_means import AT_REST, LOOK, TURNING, RecordingDrive, spacing
 from pmsmtool.sim.bus import PmsmSimBus
 
 SIGNALS = ("u_d_v", "i_d_a", "theta_m_rad", "T_winding_c")
@@ -25,16 +27,28 @@ def drive() -> Iterator[RecordingDrive]:
         made.close()
 
 
-def test_both_halves_of_a_window_come_from_one_record(drive: RecordingDrive) -> None:
-    periods = 800
-    first, second, samples = drive.halves(SIGNALS, periods)
+def test_a_window_at_rest_is_two_runs_of_rows_one_right_after_the_other(drive: RecordingDrive) -> None:
+    first, second, samples = drive.halves(SIGNALS, 800)
     assert set(first) == set(second) == set(SIGNALS)
-    assert samples == 2 * periods // math.ceil(2 * periods / AT_REST)
-    assert first["T_winding_c"] == second["T_winding_c"] == pytest.approx(drive.live("T_winding_c"), abs=0.5)
+    assert samples == 2 * AT_REST and drive.node.whole(objects.TRACE_DECIMATION) == 1
+    assert first["T_winding_c"] == pytest.approx(drive.live("T_winding_c"), abs=0.5)
     assert first["theta_m_rad"] == pytest.approx(second["theta_m_rad"], abs=0.01)
     assert first["i_d_a"] != second["i_d_a"]  # two windows, each with its own noise
-    drive.average(SIGNALS, periods)
-    assert drive.node.whole(objects.TRACE_DEPTH) <= LOOK
+    drive.average(SIGNALS, 800)
+    assert drive.node.whole(objects.TRACE_DEPTH) == LOOK
+
+
+def test_a_window_of_a_turning_shaft_is_one_record(drive: RecordingDrive) -> None:
+    with guarded(drive, Envelope(i_max_apk=5.0, speed_max_rad_s=200.0, duration_s=20.0)) as guard:
+        guard.enable()
+        guard.command_current(0.0, 1.5)
+        guard.wait(0.3)
+        guard.command_current(0.0, 0.0)
+        periods = 1200
+        first, second, samples = guard.halves(("omega_e_rad_s", "i_q_a"), periods)
+        spanned = samples * drive.node.whole(objects.TRACE_DECIMATION)
+    assert TURNING // 2 <= samples <= TURNING and 0.98 * 2 * periods < spanned <= 2 * periods
+    assert first["omega_e_rad_s"] > 20.0 and second["omega_e_rad_s"] > 20.0
 
 
 def test_a_drive_with_averages_takes_them_one_after_the_other() -> None:
