@@ -51,6 +51,11 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     help="What an instrument read while the drive showed SHOWN, and its 95 % tolerance, with units: "
     "V_dc=540V:537V:0.5V, I=5.00Apk:5.02Apk:0.2%; takes that scale out.",
 )
+@click.option(
+    "--half-frequency",
+    is_flag=True,
+    help="Measure R at half the control frequency, too, and extrapolate to zero: takes the dead time out of R.",
+)
 @map_option
 @bus_options
 @motion_options
@@ -65,6 +70,7 @@ def identify_command(
     runs: Path,
     sensor_tol: float | None,
     cal: tuple[str, ...],
+    half_frequency: bool,
     map_file: Path | None,
 ) -> None:
     """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
@@ -78,6 +84,7 @@ def identify_command(
     systematic part; what cannot be trusted is refused by name. The run directory keeps raw traces and machine.toml;
     nothing is stored in the drive.
     """
+    from pmsmtool.errors import NotAvailable
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.workflow.calibration import calibrated_tolerance
     from pmsmtool.workflow.identify import IdentifyRequest
@@ -85,6 +92,8 @@ def identify_command(
 
     declared = None if sensor_tol is None else SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol)
     if replay is not None:
+        if half_frequency:
+            raise click.UsageError("--half-frequency measures; with --replay the traces of the run decide")
         from pmsmtool.workflow.identify import MACHINE, REPLAYED
         from pmsmtool.workflow.identify import replay as recompute
         from pmsmtool.workflow.run_directory import RunDirectory
@@ -107,10 +116,15 @@ def identify_command(
         shaft=motion.shaft or "free",
         load=motion.load,
         brake=motion.brake,
+        half_frequency=half_frequency,
         tolerance=calibrated_tolerance(declared or SensorTolerance(), cal),
     )
     request.check()
     found, how, request = _choose(bus, map_file, method, request, everything=not quantities)
+    if half_frequency and how != "inject":
+        raise NotAvailable(
+            f"the method {how} has no measurement at half the control frequency", hint="leave --half-frequency out"
+        )
     if how == "inject":
         run, stage = _measure(bus, motion, out, request, runs, found)
     else:
