@@ -70,6 +70,7 @@ def write_plan(
         node, identity, plan, marks, JournalFolder(identity), say=out.note,
         progress=lambda done, total: out.status(f"{done}/{total}"),
     )  # fmt: skip
+    job.admit()  # nobody is asked for what would be refused after his consent
     if job.has_work(store=store):
         lines = [*plan.lines(), "the set is stored, and the drive is reset to see it" if store else "not stored"]
         ask_writing(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)

@@ -75,6 +75,8 @@ def flash_fleet(
             if check and different:
                 raise CheckFailed(f"{different} of {len(jobs)} drives differ")
             return
+        for job in jobs:
+            job.admit()
         due = [job for job in jobs if job.has_work(store=store)]
         if due:
             _ask(lines, due, bus, motion, out, store=store)

@@ -37,11 +37,12 @@ def restore_command(
 ) -> None:
     """Bring back what a backup holds, or without FILE what this drive held before its last download.
 
-    The journal is found by the drive's serial number. An interrupted download ends here too. Where the
-    drive holds it all already, nothing is written, stored or reset.
+    The journal is found by the drive's vendor, product and serial number. An interrupted download ends here too. Where
+    the drive holds it all already, nothing is written, stored or reset: a second restore changes nothing.
     """
     from pmsmtool.cli.flash_session import checked_identity, plan_facts, told, write_plan
     from pmsmtool.errors import ConfigError
+    from pmsmtool.flash.download import describe
     from pmsmtool.flash.journal import JournalFolder, read_snapshot
     from pmsmtool.flash.restore import check_snapshot, nothing_written, old_marks, plan_restore
 
@@ -51,7 +52,7 @@ def restore_command(
         snapshot = folder.last() if snapshot_file is None else read_snapshot(snapshot_file)
         if snapshot is None:
             raise ConfigError(
-                f"there is no journal of the drive with serial number {identity.serial}",
+                f"there is no journal of {describe(identity)}",
                 where=str(folder.path),
                 likely="nothing was ever written to this drive from this account",
                 hint="give the file of a backup",
@@ -64,7 +65,8 @@ def restore_command(
             return
         if not plan.changes and snapshot.state != "open":
             outcome = nothing_written(node, plan)
-            text = f"{told(outcome, node)}: nothing to restore, nothing was done"
+            same = "the file says" if snapshot_file is not None else "before its last download"
+            text = f"{told(outcome, node)}: already as {same}, nothing was done"
             out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [text])
             if not outcome.stored:
                 out.warn("whether the drive keeps these values over a reset is not known; flash-params stores a set")

@@ -24,7 +24,7 @@ from pmsmtool.errors import (
     SdoAbort,
     VerifyMismatch,
 )
-from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
+from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot, State
 from pmsmtool.flash.map_gate import check_map, remember_map
 from pmsmtool.flash.plan import Change, Plan, differences
 from pmsmtool.params.catalogue import layout_signature
@@ -112,6 +112,7 @@ class Download:
         self._old_marks: dict[str, bytes] = {}
         self._was_stored = False
         self._crc_before: int | None = None
+        self._rolled_back: State = "restored"
 
     def run(self, *, store: bool = True, restoring: bool = False) -> Outcome:
         """Carry the plan out.
@@ -121,7 +122,8 @@ class Download:
         store : bool
             Also keep it in non-volatile memory; otherwise it acts until the next reset.
         restoring : bool
-            The plan brings a journal's old contents back: that journal is closed, no new one begun.
+            The plan brings the last journal's old contents back: that journal is kept, no new one begun, so that
+            what counts as old stays the same however often it is brought back.
 
         Raises
         ------
@@ -161,6 +163,17 @@ class Download:
         same_marks = self._old_marks.get("design_id") == self._wanted_marks.get("design_id")
         return bool(self.plan.changes) or not same_marks or (store and not self._was_stored)
 
+    def admit(self) -> None:
+        """Refuse what no consent would allow: a map that is not this drive's, a drive that may move; only reads.
+
+        Raises
+        ------
+        ConfigError, SafetyRefusal
+            As ``flash.map_gate.check_map`` and :func:`refuse_while_enabled`.
+        """
+        check_map(self.node.map, self.identity, self.folder)
+        refuse_while_enabled(self.node)
+
     def _gate(self) -> None:
         check_identity(self.node, self.identity)
         check_map(self.node.map, self.identity, self.folder)
@@ -184,7 +197,9 @@ class Download:
 
     def _journal(self, restoring: bool) -> Snapshot:
         last = self.folder.last()
-        if restoring and last is not None and last.state == "open":
+        if restoring and last is not None:
+            self._rolled_back = last.state
+            self.folder.close(last, "open")  # until the old set is back; whoever is killed meanwhile restores again
             return last
         entries = [Entry(e.name, e.index, e.sub, e.old, e.new) for e in self.plan.entries]
         entries += [
@@ -279,7 +294,7 @@ class Download:
                 self._say(f"{_name(error)}: bringing the old set back")
                 with self.node.supervision.expected_reset():
                     self._bring_back()
-                self.folder.close(journal, "restored")
+                self.folder.close(journal, self._rolled_back)
                 state = "the drive holds exactly the old set again"
             except (PmsmtoolError, OSError) as second:
                 state = self._left_behind(second)

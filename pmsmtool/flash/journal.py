@@ -213,7 +213,7 @@ class JournalFolder:
         return snapshot
 
     def close(self, snapshot: Snapshot, state: State) -> None:
-        """Note that the drive holds the new set (``done``) or the old one again (``restored``)."""
+        """Note that the drive holds the new set (``done``), the old one again (``restored``), or neither (``open``)."""
         write_snapshot(self.path, snapshot.with_state(state))
 
     def _archive(self, snapshot: Snapshot) -> None:

@@ -41,8 +41,10 @@ def check_map(drive_map: DriveMap, identity: Identity, folder: JournalFolder) ->
         raise ConfigError(
             f"the map {drive_map.name!r} does not say whose drive it is for (vendor 0): nothing is written through it",
             where=where,
-            hint=f"copy it, write vendor = {identity.vendor:#010x}, product = {identity.product:#010x}, give it "
-            "with --map",
+            hint="this drive names no vendor either: nothing can be written to it"
+            if identity.vendor == UNKNOWN_VENDOR
+            else f"copy it, write vendor = {identity.vendor:#010x}, product = {identity.product:#010x}, give it with "
+            "--map",
         )
     if not drive_map.is_for(identity.vendor, identity.product):
         raise ConfigError(

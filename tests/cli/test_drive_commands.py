@@ -204,6 +204,9 @@ def test_flash_verify_backup_restore(tool: Tool, wanted: str, tmp_path: Path) ->
     assert tool("verify", "before.json")[0] == 0
     code, _, err = tool("verify", wanted)
     assert code == 1 and "motor.R_s_ohm" in err
+    code, out, _ = tool("restore")  # a second one is no redo, and needs no consent
+    assert code == 0 and "already as before its last download, nothing was done" in out
+    assert tool("verify", "before.json")[0] == 0
     outcome = loaded(tool("restore", "before.json", "--json"))["outcome"]  # without --yes: nothing to consent to
     assert outcome["written"] == 0 and outcome["starts"] == 0
     assert "nothing was done" in tool("restore", "before.json", "--yes")[1]
@@ -218,6 +221,14 @@ def test_backup_into_a_spare_part(tool: Tool, wanted: str) -> None:
     assert code == 2 and "serial number 22001" in err and "--other-drive" in err
     assert tool("-n", "2", "restore", "one.json", "--yes", "--other-drive", channel=spare)[0] == 0
     assert tool("-n", "2", "verify", wanted, channel=spare)[0] == 0
+
+
+@pytest.mark.parametrize("command", [("flash-params",), ("flash-params", "--nodes", "1")])
+def test_a_map_that_is_refused_is_refused_before_the_consent(tool: Tool, wanted: str, command: tuple[str, ...]) -> None:
+    channel = "interior-2k2?nv=:memory:&drive=copley"
+    code, _, err = tool(*command, wanted, "--map", "copley", channel=channel)
+    assert code == 2 and "does not say whose drive it is for" in err
+    assert "->" not in err and "consent" not in err, "nothing to consent to was shown"
 
 
 def test_restore_without_a_journal(tool: Tool) -> None:

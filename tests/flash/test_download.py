@@ -10,9 +10,18 @@ import pytest
 
 from pmsmtool.bus.supervision import SecondMaster
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.errors import ConfigError, DriveFault, NotAvailable, PmsmtoolError, SafetyRefusal, VerifyMismatch
+from pmsmtool.drive.port import Identity
+from pmsmtool.errors import (
+    ConfigError,
+    DriveFault,
+    NotAvailable,
+    PmsmtoolError,
+    SafetyRefusal,
+    SdoAbort,
+    VerifyMismatch,
+)
 from pmsmtool.firmware.drive_map import Cell, DriveMap, reference_map
-from pmsmtool.flash.journal import MARKS
+from pmsmtool.flash.journal import MARKS, JournalFolder
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.sim.line import Frame
 from tests.flash.rig import SMALL, Rig, attach, open_rig, with_tables
@@ -83,7 +92,45 @@ def test_restore_brings_back_the_very_bytes(rig: Rig) -> None:
     assert rig.image() == first
     assert rig.node.sdo.read(0x2000, 9) == mark
     journal = rig.folder.last()
-    assert journal is not None and journal.state == "restored" and len(list(rig.folder.path.parent.iterdir())) == 3
+    assert journal is not None and journal.state == "restored" and len(list(rig.folder.path.parent.iterdir())) == 2
+
+
+def test_what_counts_as_old_stays_however_often_it_is_restored(rig: Rig) -> None:
+    first = rig.image()
+    rig.download(SMALL)
+    for _ in range(3):
+        rig.restore()
+        assert rig.image() == first
+    rig.download(with_tables())
+    rig.restore()
+    assert rig.image() == first
+
+
+def test_a_restore_that_fails_leaves_the_journal_as_it_was(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The new set comes back, and the journal still says so: the next restore brings the old one."""
+    first = rig.image()
+    rig.download(SMALL)
+    second, store = rig.image(), rig.node.store
+
+    def refused() -> None:
+        monkeypatch.setattr(rig.node, "store", store)
+        raise SdoAbort(0x08000020, 0x1010, 1, "the store is refused")
+
+    monkeypatch.setattr(rig.node, "store", refused)
+    with pytest.raises(DriveFault, match="exactly the old set again"):
+        rig.restore()
+    journal = rig.folder.last()
+    assert rig.image() == second and journal is not None and journal.state == "done"
+    rig.restore()
+    assert rig.image() == first
+
+
+def test_drives_of_two_makers_with_one_serial_number_have_a_journal_each(tmp_path: Path) -> None:
+    one = Identity(1, 0x147, 1, 1, 22001)
+    folders = [
+        JournalFolder(identity, tmp_path) for identity in (one, replace(one, vendor=0xFB), replace(one, product=2))
+    ]
+    assert len({folder.path for folder in folders}) == len(folders)
 
 
 # ---- refusals before anything is written ---------------------------------------------------------
