@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.estimators.cross_check import driven_flux_linkage
 from pmsmtool.estimators.estimate import SensorTolerance, condition_gate, information_weights
 from pmsmtool.estimators.flux_linkage_rows import STAGE, Corrected, check_speeds, corrected, pairs_of
 from pmsmtool.estimators.inverter_error import InverterCurve
@@ -68,7 +69,11 @@ class FluxResult:
         The same at the temperature of the run (Wb).
     frame_offset : Estimate
         Angle of the frame ahead of the d axis (rad electrical): add it to the stored encoder offset.
-    L_q_h, L_q_std_h : float
+    driven : Estimate or None
+        PM flux linkage at the reference temperature by the run's q currents, a check only (Wb); None without them.
+    voltage_scale_std : float
+        Relative standard deviation that both have from the bridge's thresholds.
+    L_q_app : Estimate
         Apparent L_q at the q currents of the run, a check only: beside a large dead time it says nothing, and its
         standard deviation says so (H).
     angle_delay_s : float
@@ -85,8 +90,9 @@ class FluxResult:
     psi_f: Estimate
     psi_measured: Estimate
     frame_offset: Estimate
-    L_q_h: float
-    L_q_std_h: float
+    driven: Estimate | None
+    voltage_scale_std: float
+    L_q_app: Estimate
     angle_delay_s: float
     curvature: float
     low_wb: float
@@ -188,12 +194,25 @@ def estimate_flux_linkage(
         method="direction of the no-load voltage over speeds in both directions",
         dof=d_dof,
     )
+    L_d = _rough_L_d(rows, np.nonzero(rows.is_d)[0])
+    driven = driven_flux_linkage(rows, L_d, x2, lag_s, tolerance, T)
     return FluxResult(
         psi_f=_normalise(measured, T_ref_c, alpha_psi_per_k, tolerance),
         psi_measured=measured,
         frame_offset=offset,
-        L_q_h=float(d_fit[0]),
-        L_q_std_h=float(d_std[0]),
+        driven=None if driven is None else _normalise(driven, T_ref_c, alpha_psi_per_k, tolerance),
+        voltage_scale_std=tolerance.voltage_scale_std,
+        L_q_app=Estimate(
+            value=float(d_fit[0]),
+            std=float(d_std[0]),
+            systematic=tolerance.impedance * abs(float(d_fit[0])),
+            unit="H",
+            n=int(np.sum(~rows.is_d)),
+            method="d voltage of q currents at speed, apparent",
+            i_d_apk=0.0,
+            i_q_apk=float(np.mean(np.abs(rows.i_q[~rows.is_d]))) if not np.all(rows.is_d) else 0.0,
+            dof=d_dof,
+        ),
         angle_delay_s=float(d_fit[2]) / psi,
         curvature=even.curvature,
         low_wb=math.hypot(even.low_wb, x2),

@@ -11,6 +11,7 @@ import numpy as np
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.axis_layout import Motion
 from pmsmtool.estimators.axis_response import initial_inductance
+from pmsmtool.estimators.cross_check import CrossCheck, cross_check
 from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
@@ -68,6 +69,17 @@ class Evaluation:
             return self.encoder.offset
         fine = self.flux.frame_offset
         return replace(fine, value=wrapped(self.encoder.offset.value + fine.value))
+
+    @property
+    def checks(self) -> list[CrossCheck]:
+        """What second methods say: psi_f by q currents, and L_q, apparent, beside the incremental one."""
+        found = []
+        if self.flux is not None and self.flux.driven is not None:
+            common = self.flux.voltage_scale_std
+            found.append(cross_check("psi_f_wb_driven", "psi_f_wb", self.flux.driven, self.flux.psi_f, common))
+        if self.flux is not None and self.inductance is not None:
+            found.append(cross_check("L_q_h_apparent", "L_q_h", self.flux.L_q_app, self.inductance.L_q))
+        return found
 
     def estimates(self) -> dict[str, Estimate]:
         """Return every estimate by its machine-file key."""
@@ -318,7 +330,7 @@ def machine_of(evaluation: Evaluation, nameplate: MachineFile, conditions: Mappi
         encoder=encoder,
         std={**nameplate.std, **{name: e.std for name, e in measurable.items()}},
         systematic={**nameplate.systematic, **{name: e.systematic for name, e in measurable.items()}},
-        estimates={**nameplate.estimates, **found},
+        estimates={**nameplate.estimates, **found, **{check.name: check.estimate for check in evaluation.checks}},
         conditions=dict(conditions),
         simulation={},
         flux_map=flux_map,

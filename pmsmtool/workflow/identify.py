@@ -18,6 +18,7 @@ from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.estimators.cross_check import CrossCheck
 from pmsmtool.estimators.estimate import (
     SensorTolerance,
     Verdict,
@@ -278,7 +279,10 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         "identify",
         "pass" if all(line.ok for line in acceptance) else "fail",
         0.0,
-        values=[value_facts(name, estimate) for name, estimate in found.items()],
+        values=[
+            *(value_facts(name, estimate) for name, estimate in found.items()),
+            *map(check_facts, evaluation.checks),
+        ],
         acceptance=acceptance,
         fallbacks=[f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback],
         files={**made_files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
@@ -385,6 +389,7 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
         lines.append("R_s is from one control frequency: the drive does not take half of it")
     if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
         lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
+    lines += [f"{check.name} {check.verdict}" for check in evaluation.checks if not check.agrees]
     if evaluation.pairs is not None and not evaluation.pairs.judged:
         lines.append("the phases were not compared: the rotor did not come to rest on the three pairs")
     inductance = evaluation.inductance
@@ -418,6 +423,13 @@ def value_facts(name: str, estimate: Estimate) -> dict[str, Any]:
         facts[key] = number if math.isfinite(number) else None
     halves = {"statistical_95": statistical_half_width(estimate), "total_95": total_half_width(estimate)}
     return {"name": name, **facts, "coverage_factor": coverage_factor(estimate.dof), **halves}
+
+
+def check_facts(check: CrossCheck) -> dict[str, Any]:
+    """Return a second method's estimate as a stage records it, with what it says about the first."""
+    facts = value_facts(check.name, check.estimate)
+    judged = {"of": check.of, "difference": check.difference, "interval_95": check.half_width, "agrees": check.agrees}
+    return {**facts, "method": f"check, {check.estimate.method}: {check.verdict}", "check": judged}
 
 
 def _limit(name: str) -> float | None:

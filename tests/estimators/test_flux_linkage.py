@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.cross_check import cross_check
 from pmsmtool.estimators.estimate import statistical_half_width
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.flux_linkage_rows import mean_inverter_error
@@ -106,7 +107,9 @@ def test_psi_and_offset_over_drives(population: Population) -> None:
 
 
 def test_the_q_inductance_comes_out_beside(population: Population) -> None:
-    errors = [abs(population.estimate(k).L_q_h / population.drives.L_q[k] - 1.0) for k in range(population.drives.n)]
+    errors = [
+        abs(population.estimate(k).L_q_app.value / population.drives.L_q[k] - 1.0) for k in range(population.drives.n)
+    ]
     assert np.median(errors) < 0.05  # a check of L_q, not a measurement: 10 % of I_r only
 
 
@@ -122,8 +125,38 @@ def test_the_q_inductance_is_doubted_by_what_the_inverter_leaves_on_d(population
         found = estimate_flux_linkage(_changed(trace, u_d_v=u_d), d.R[k], period_s=d.T_s[k], inverter=curve)
         plain = population.estimate(k)
         off = float(np.mean(turned[q]) / np.mean(np.abs(trace["omega_e_rad_s"] * trace["i_q_a"])[q]))
-        assert found.L_q_h - plain.L_q_h == pytest.approx(off, rel=0.1)
-        assert found.L_q_h - plain.L_q_h < 0.9 * found.L_q_std_h
+        assert found.L_q_app.value - plain.L_q_app.value == pytest.approx(off, rel=0.1)
+        assert found.L_q_app.value - plain.L_q_app.value < 0.9 * found.L_q_app.std
+
+
+def test_the_q_currents_are_a_second_method_that_agrees(population: Population) -> None:
+    for k in range(population.drives.n):
+        found = population.estimate(k)
+        assert found.driven is not None
+        check = cross_check("psi_f_wb_driven", "psi_f_wb", found.driven, found.psi_f, found.voltage_scale_std)
+        assert check.agrees, check.verdict
+        assert abs(check.difference) < 2e-3
+
+
+def test_a_disagreement_is_reported(population: Population) -> None:
+    """A part of the flux that only shows beside a q current, as of a saturating q axis, or a wrong angle delay."""
+    d = population.drives
+    trace = population.speeds(0)
+    q = np.abs(trace["i_q_a"]) > 0.5 * Q * d.I_r[0]
+    u_q = trace["u_q_v"] - np.where(q, 0.02 * d.psi[0] * trace["omega_e_rad_s"], 0.0)
+    found = estimate_flux_linkage(
+        _changed(trace, u_q_v=u_q), d.R[0], period_s=d.T_s[0], inverter=InverterCurve(*curve_points(d, 0), 0.0)
+    )
+    assert found.driven is not None
+    check = cross_check("psi_f_wb_driven", "psi_f_wb", found.driven, found.psi_f, found.voltage_scale_std)
+    assert not check.agrees and "DISAGREES with psi_f_wb: -2" in check.verdict
+
+
+def test_without_q_currents_there_is_no_second_method(population: Population) -> None:
+    trace = population.speeds(0)
+    rows = np.abs(trace["i_q_a"]) < 0.5 * Q * population.drives.I_r[0]
+    bare = Trace(trace.t_s[rows], {n: v[rows] for n, v in trace.signals.items()}, trace.units, trace.meta)
+    assert estimate_flux_linkage(bare, population.drives.R[0], period_s=population.drives.T_s[0]).driven is None
 
 
 def test_without_the_sampled_data_correction_psi_is_low(population: Population) -> None:
