@@ -92,4 +92,6 @@ def _said(row: Row) -> tuple[str, str]:
         return "-", f"not available: needs {', '.join(row.missing)}"
     if row.method == "manual":
         return "as given", "`pmsmtool machine new`"
+    if row.method == "vendor":
+        return "no interval", "; ".join(filter(None, ("`pmsmtool identify --method vendor`", row.note)))
     return ", ".join(map(str, row.expected)) or "not measured", row.note

@@ -128,7 +128,7 @@ def identify_command(
     if how == "inject":
         run, stage = _measure(bus, motion, out, request, runs, found)
     else:
-        run, stage = _measure_without_injection(bus, motion, out, request, runs, found)
+        run, stage = _measure_without_injection(bus, motion, out, request, runs, found, how)
     _show(run, stage, out)
 
 
@@ -139,13 +139,13 @@ def _choose(
     from dataclasses import replace
 
     from pmsmtool.cli.drive_access import open_node, read_map
-    from pmsmtool.workflow.capabilities import Method, examine
+    from pmsmtool.workflow.capabilities import MEASURING, Method, examine
 
     with open_node(bus) as node:
         found = examine(node, None if map_file is None else read_map(map_file))
     wanted = None if method == "auto" else Method(method)
     if everything:
-        for candidate in (Method.INJECT, Method.RECORDER, Method.STANDARD) if wanted is None else (wanted,):
+        for candidate in MEASURING if wanted is None else (wanted,):
             given = tuple(name for name in request.quantities if found.row(name, candidate).available)
             if given and candidate is not Method.MANUAL:
                 return found, candidate.value, replace(request, quantities=given)
@@ -159,6 +159,7 @@ def _measure_without_injection(
     request: IdentifyRequest,
     runs: Path,
     found: Capabilities,
+    how: str,
 ) -> tuple[RunDirectory, Stage]:
     from dataclasses import asdict
 
@@ -168,6 +169,7 @@ def _measure_without_injection(
     from pmsmtool.workflow.run_directory import RunDirectory, new_record
     from pmsmtool.workflow.tier_identify import tier_stage
     from pmsmtool.workflow.tier_stages import open_tier_drive
+    from pmsmtool.workflow.vendor_identify import vendor_stage
 
     identity = found.identity
     with bus.connect() as connection:
@@ -183,7 +185,8 @@ def _measure_without_injection(
         def allow(lines: Any) -> None:
             ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
 
-        stage = tier_stage(run, drive, found, request, allow, out.note)
+        measure = vendor_stage if how == "vendor" else tier_stage
+        stage = measure(run, drive, found, request, allow, out.note)
         drive.close()
     run.add(stage)
     return run, stage
@@ -236,6 +239,10 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
 
     rows = []
     for value in stage.values:
+        if "std" not in value:
+            told = format_quantity(value["value"], value["unit"])
+            rows.append((value["name"], told, "no interval", "", "", value.get("method", value["source"])))
+            continue
         total = total_interval(value["std"], value["systematic"], value["coverage_factor"])
         rows.append(
             (

@@ -165,7 +165,9 @@ def tolerance_box(
         if value is None or value == 0.0:
             continue
         if name not in source.std:
-            notes.append(f"{name}: no standard deviation is given, {100.0 * ASSUMED_STD[name]:g} % assumed")
+            own = name in source.estimates and source.estimates[name].source == "vendor"
+            why = "the drive's own value has no interval" if own else "no standard deviation is given"
+            notes.append(f"{name}: {why}, {100.0 * ASSUMED_STD[name]:g} % assumed")
         std = source.std.get(name, ASSUMED_STD[name] * value)
         factors[name] = Deviation(std / value, source.systematic.get(name, 0.0) / value)
     limits, machine = source.limits, source.machine

@@ -56,12 +56,15 @@ class VendorAnswer:
         Time it took (s).
     values : dict of str to float
         Results by catalogue name, SI.
+    relative_to : dict of str to float
+        What they were counted relative to.
     """
 
     step: str
     data: bytes
     seconds: float
     values: dict[str, float]
+    relative_to: dict[str, float]
 
 
 class VendorDrive(StandardDrive):
@@ -143,17 +146,17 @@ class VendorDrive(StandardDrive):
         data = run(step, wait, began + step.timeout_s)
         seconds = self.node.connection.clock.now() - began
         if self.tuning.kind == "os_command":
-            return VendorAnswer(step.name, data, seconds, self._answered(step, data, known))
+            return VendorAnswer(step.name, data, seconds, self._answered(step, data, known), dict(known))
         raw, values = b"", dict[str, float]()
-        for name, cell in self.tuning.results.items():
+        for cell in sorted(self.tuning.results.values(), key=lambda cell: bool(cell.gain)):
             found = self.node.sdo.read(cell.index, cell.sub, size=cell.size)
             raw += found
-            values[name] = cell.decode(found, {**known, **values})
-        return VendorAnswer(step.name, raw, seconds, values)
+            values[cell.name] = cell.decode(found, {**known, **values})
+        return VendorAnswer(step.name, raw, seconds, values, {**known, **values})
 
     def _too_long(self, step: VendorStep) -> DriveTimeout:
         return DriveTimeout(
-            f"the drive's own identification ({step.name}) does not end within {step.timeout_s:g} s",
+            f"the drive's own identification ({step.title}) does not end within {step.timeout_s:g} s",
             where=f"node {self.node.node}",
             likely="a shaft that does not turn as it should, or other firmware than the map is for",
             hint="timeout_s in [vendor_tuning] of the map, if this drive needs more time",
@@ -203,7 +206,7 @@ class VendorDrive(StandardDrive):
             known = step.failures.get(code) or self.tuning.failures.get(code)
             text = known or f"its error code {code} is not in the map"
         raise DriveFault(
-            f"the drive's own identification failed ({step.name}): {text}",
+            f"the drive's own identification failed ({step.title}): {text}",
             where=f"node {self.node.node}, 0x1023:03 = {answer.hex(' ')}",
             hint="remove the cause and run the command again; the drive holds what it held before",
         )
@@ -214,7 +217,7 @@ class VendorDrive(StandardDrive):
             return {}
         if answer[0] != DONE_WITH_DATA:
             raise DriveFault(
-                f"the drive's own identification ({step.name}) ended without a result",
+                f"the drive's own identification ({step.title}) ended without a result",
                 where=f"node {self.node.node}, 0x1023:03 = {answer.hex(' ')}",
                 likely="other firmware than the map is for",
             )

@@ -114,6 +114,12 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
         "turn the shaft by hand and watch theta_m in `pmsmtool monitor`",
     ),
     (
+        "E_VENDOR_VALUE",
+        "the drive's own identification gives a number that no machine has",
+        "the drive works with R, L or pole pairs of another machine, or the map reads another firmware",
+        "look at its answers (vendor_tuning.json of the run), and at the parameters it is set to",
+    ),
+    (
         "E_POLE_PAIRS",
         "the number of pole pairs does not come out as an integer",
         "the rotor slips or is loaded, or the encoder resolution is set wrongly",

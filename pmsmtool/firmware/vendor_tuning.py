@@ -72,6 +72,11 @@ class VendorStep:
     uses: tuple[str, ...] = ()
     failures: Mapping[int, str] = field(default_factory=dict)
 
+    @property
+    def title(self) -> str:
+        """Its name as a person reads it."""
+        return self.name.removeprefix("motor.")
+
 
 @dataclass(frozen=True, slots=True)
 class VendorTuning:

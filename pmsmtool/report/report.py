@@ -16,6 +16,9 @@ from pmsmtool.units import format_estimate, format_quantity
 COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
 """Stages of a full commissioning; one that is missing keeps the verdict open."""
 
+VENDOR = "vendor"
+"""Source of a value that the drive measured by itself: without an interval."""
+
 UNAVAILABLE = "not available"
 """Status of a stage that the drive cannot give."""
 
@@ -74,7 +77,12 @@ def render(
         subtitle=f"started {record['started_utc']} by {record['operator']}",
         verdict=verdict_of(latest, complete),
         stages=latest,
-        estimates=[_estimate_row(value) for stage in latest for value in stage.get("values", ()) if "std" in value],
+        estimates=[
+            _estimate_row(value)
+            for stage in latest
+            for value in stage.get("values", ())
+            if "std" in value or value.get("source") == VENDOR
+        ],
         fallbacks=[f"{stage['name']}: {line}" for stage in latest for line in stage.get("fallbacks", ())],
         figures=[{"svg": _trusted_svg(figure.svg), "caption": figure.caption} for figure in figures],
         changes=changes,
@@ -120,14 +128,21 @@ def verdict_of(stages: Sequence[Mapping[str, Any]], complete: Sequence[str] = CO
     criteria = sum(len(stage.get("acceptance", ())) for stage in latest)
     lacking = [stage for stage in latest if stage["status"] == UNAVAILABLE]
     values = [value for stage in latest for value in stage.get("values", ())]
-    given = [str(value["name"]) for value in values if "source" in value and "std" not in value]
-    if lacking or given:
-        return _partial([stage for stage in latest if stage["status"] == "pass"], lacking, given, criteria)
+    bare = [value for value in values if "source" in value and "std" not in value]
+    given = [str(value["name"]) for value in bare if value["source"] != VENDOR]
+    own = [str(value["name"]) for value in bare if value["source"] == VENDOR]
+    if lacking or bare:
+        passed = [stage for stage in latest if stage["status"] == "pass"]
+        return _partial(passed, lacking, given, own, criteria)
     return Verdict("pass", "PASS", (f"{len(latest)} stages, {criteria} criteria, all met",))
 
 
 def _partial(
-    passed: list[Mapping[str, Any]], lacking: list[Mapping[str, Any]], given: list[str], criteria: int
+    passed: list[Mapping[str, Any]],
+    lacking: list[Mapping[str, Any]],
+    given: list[str],
+    own: list[str],
+    criteria: int,
 ) -> Verdict:
     """Return the verdict on a drive that cannot give everything: green for its tier, and what that leaves open."""
     if not passed:
@@ -135,7 +150,8 @@ def _partial(
     names = ", ".join(str(stage["name"]) for stage in passed)
     behaviour = "" if any(stage["name"] == "prove" for stage in passed) else "; its behaviour was not proven"
     head = f"as far as this drive goes: {names}; {criteria} criteria, all met{behaviour}"
-    taken = (f"taken as given, not measured: {', '.join(given)}",) if given else ()
+    lists = (("taken as given, not measured", given), ("the drive's own, without an interval", own))
+    taken = (f"{what}: {', '.join(named)}" for what, named in lists if named)
     missing = (f"{stage['name']}: not available: {stage['note']}" for stage in lacking)
     return Verdict("pass", "PASS FOR ITS TIER", (head, *taken, *missing))
 
@@ -149,6 +165,13 @@ def _failure(stage: Mapping[str, Any]) -> str:
 
 def _estimate_row(value: Mapping[str, Any]) -> dict[str, str]:
     unit = str(value["unit"])
+    method = ", ".join(str(value[key]) for key in ("method", "source") if value.get(key))
+    if "std" not in value:
+        told = format_quantity(float(value["value"]), unit)
+        return {
+            "name": str(value["name"]), "value": told, "std": "none", "systematic": "none", "conditions": "",
+            "method": method,
+        }  # fmt: skip
     total = total_interval(float(value["std"]), float(value["systematic"]), float(value.get("coverage_factor", 1.96)))
     conditions = []
     if _finite(value.get("T_c")):
@@ -162,7 +185,7 @@ def _estimate_row(value: Mapping[str, Any]) -> dict[str, str]:
         "std": format_quantity(float(value["std"]), unit, 2),
         "systematic": format_quantity(float(value["systematic"]), unit, 2),
         "conditions": ", ".join(conditions),
-        "method": ", ".join(str(value[key]) for key in ("method", "source") if value.get(key)),
+        "method": method,
     }
 
 

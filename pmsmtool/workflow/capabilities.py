@@ -232,7 +232,7 @@ class Capabilities:
 
     def best(self, quantity: str) -> Row | None:
         """Return the first measuring method of a quantity that is available."""
-        rows = (self.row(quantity, method) for method in NEEDS[quantity] if method in _MEASURING)
+        rows = (self.row(quantity, method) for method in NEEDS[quantity] if method in MEASURING)
         return next((row for row in rows if row.available), None)
 
     def require(self, quantities: Sequence[str], method: Method | None) -> Method:
@@ -243,8 +243,8 @@ class Capabilities:
         NotAvailable
             None does; for every quantity the message names what is missing.
         """
-        for candidate in _MEASURING if method is None else (method,):
-            if candidate in _MEASURING and all(self.row(name, candidate).available for name in quantities):
+        for candidate in MEASURING if method is None else (method,):
+            if candidate in MEASURING and all(self.row(name, candidate).available for name in quantities):
                 return candidate
         raise NotAvailable(
             "\n  - ".join(["this drive cannot give what was asked", *self._reasons(quantities, method)]),
@@ -256,11 +256,11 @@ class Capabilities:
         lines = []
         for quantity in quantities:
             rows = [self.row(quantity, m) for m in (NEEDS[quantity] if method is None else (method,))]
-            if any(row.available and row.method in _MEASURING for row in rows):
+            if any(row.available and row.method in MEASURING for row in rows):
                 lines.append(f"{quantity}: by itself yes ({self._how(quantity, method)}), together with the others no")
                 continue
             for row in rows:
-                if row.method in _MEASURING or method is not None:
+                if row.method in MEASURING or method is not None:
                     needs = f"not available: needs {', '.join(row.missing)}" if row.missing else "a number you bring"
                     lines.append(f"{quantity} by {row.method}: {needs}")
         return lines
@@ -270,7 +270,8 @@ class Capabilities:
         return str(method or (best.method if best else ""))
 
 
-_MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD, Method.VENDOR)
+MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD, Method.VENDOR)
+"""Methods that measure, the best first."""
 _TIERS = (
     (Tier.FULL, (*_INJECT, "averages")),
     (Tier.INJECT, _INJECT),

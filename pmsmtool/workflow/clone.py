@@ -78,7 +78,7 @@ def clone_drive(node: DriveNode, found: Capabilities, machine_file: MachineFile,
 def drawn_truth(machine_file: MachineFile, draw: int | None) -> dict[str, Value]:
     """Return what the simulated machine really is: the file's values, or a draw around them.
 
-    A quantity without an estimate stays what the file says; it must stay positive where it is a size.
+    A quantity without an interval stays what the file says; it must stay positive where it is a size.
     """
     rng = None if draw is None else np.random.default_rng([20260103, draw])
     truth: dict[str, Value] = {"pole_pairs": machine_file.machine.pole_pairs}
@@ -88,7 +88,7 @@ def drawn_truth(machine_file: MachineFile, draw: int | None) -> dict[str, Value]
         if value is None:
             continue
         estimate = machine_file.estimates.get(name)
-        if rng is not None and estimate is not None:
+        if rng is not None and estimate is not None and math.isfinite(estimate.std):
             drawn = value + total_half_width(estimate) / COVERAGE_FACTOR * float(rng.standard_normal())
             value = math.remainder(drawn, 2.0 * math.pi) if name == "offset_rad" else max(drawn, 0.5 * value)
         truth[key] = float(value)

@@ -202,7 +202,7 @@ class OwnMeasurements:
                 break
         rows = struct.unpack(f"<{RIPPLE_ROWS}f", core.recording())
         waves = [rows[k : k + 2 * HALF_PERIOD] for k in range(0, RIPPLE_ROWS, 2 * HALF_PERIOD)]
-        return sum(max(wave) - min(wave) for wave in waves) / len(waves)
+        return math.fsum(max(wave) - min(wave) for wave in waves) / len(waves)
 
     def _flux_linkage(self) -> Measured:
         """Measure the voltage at speed, less the drop at the resistance that the drive is set to."""
