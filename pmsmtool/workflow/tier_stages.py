@@ -34,6 +34,7 @@ from pmsmtool.workflow.prove.stage import ProofRequest, prove_stage
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 from pmsmtool.workflow.tier_identify import can_measure, tier_stage
 from pmsmtool.workflow.tier_machine import NEEDED, tier_machine
+from pmsmtool.workflow.vendor_identify import chain_stage, vendor_line
 
 DATA_SHEET = "as given"
 SET_UP = "the drive's own set, from its maker's set-up"
@@ -122,6 +123,9 @@ class TierStages:
         if known is not None:
             self.run.save(NAMEPLATE, dump_machine_file(known[0]))
         reason = self._nothing()
+        if self._own_line() and request.shaft != "locked":
+            asked = replace(request, quantities=tuple(self._quantities()))
+            return chain_stage(self.run, self.drive, self.found, asked, allow, say, known=known)
         if not reason and request.shaft == "locked":
             reason = "needs a rotor that may turn, and the shaft is locked"
         if not reason:
@@ -194,7 +198,11 @@ class TierStages:
     def _measurable(self) -> list[str]:
         if self.found.tier is Tier.INJECT:
             return [", ".join(QUANTITIES)]
-        return can_measure(self.drive, self.found)
+        return [*self._own_line(), *can_measure(self.drive, self.found)]
+
+    def _own_line(self) -> list[str]:
+        """Return what the drive's own identification tells; where a recorder measures with intervals, it is not run."""
+        return [] if self.found.tier in (Tier.INJECT, Tier.RECORDER) else vendor_line(self.found)
 
     def _quantities(self) -> list[str]:
         return [
@@ -264,7 +272,8 @@ def _without_base(run: RunDirectory, drive_map: DriveMap) -> list[str]:
 
 
 def _machine_needed(names: Sequence[str]) -> str:
-    return f"needs {', '.join(names)}: give a machine file (`pmsmtool machine new` takes a data sheet or a meter)"
+    what = ", ".join(names) or "ratings and the inverter"
+    return f"needs {what}: give a machine file (`pmsmtool machine new` takes a data sheet or a meter)"
 
 
 def _for_map(run: RunDirectory, stage: Stage, drive_map: DriveMap) -> Stage:
