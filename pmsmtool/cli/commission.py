@@ -50,6 +50,8 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     default="lookup",
     help="Where the drive's current references come from: the table, or an optimisation in the drive.",
 )
+@click.option("--drive-bandwidth-hz", type=click.FloatRange(0.0, min_open=True), metavar="HZ", help="Bandwidth of the "
+              "current control of a drive that takes no gains; its limits are then designed.")  # fmt: skip
 @click.option("--sensor-tol", type=click.FloatRange(0.0, 0.2), default=0.01, help="95 % tolerance of sensor gains.")
 @map_option
 @bus_options
@@ -65,6 +67,7 @@ def commission_command(
     map_file: Path | None,
     sensor_tol: float,
     flux_map: bool,
+    drive_bandwidth_hz: float | None,
     **design: Any,
 ) -> None:
     """Identify the machine, design its control, make the table, judge the margins, flash, verify, prove, report.
@@ -96,10 +99,15 @@ def commission_command(
     with _opened(bus, given) as (drive, found):
         if given is not None:
             checked_identity(drive.node)
+        if drive_bandwidth_hz is not None and found.drive_map.staging:
+            raise ConfigError(
+                f"--drive-bandwidth-hz: for a drive that cannot be reflashed, and {found.drive_map.name!r} is none"
+            )
         run = begun or begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=_recorded(bus), tier=found.tier)
         progress = StageProgress(out)
         person = _Person(run, drive, bus, motion, out, progress)
         chain = Commissioning(run, drive, person, progress, **asked, capabilities=found)
+        chain.drive_bandwidth_hz = drive_bandwidth_hz
         for line in () if chain.tier is None else chain.tier.plan_lines():
             out.note(line)
         with _reported(run, out, fresh=begun is None):

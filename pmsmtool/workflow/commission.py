@@ -144,6 +144,8 @@ class Commissioning:
     capabilities : Capabilities, optional
         What a drive below the full tier has: its stages run as far as that goes, and those that cannot run are
         recorded as not available. Without, everything is expected, and the chain ends where something is missing.
+    drive_bandwidth_hz : float, optional
+        Bandwidth of the current control of a drive that keeps its own.
     """
 
     run: RunDirectory
@@ -157,6 +159,7 @@ class Commissioning:
     margins: MarginRequest = field(default_factory=MarginRequest)
     prove: ProofRequest | None = None
     capabilities: Capabilities | None = None
+    drive_bandwidth_hz: float | None = None
 
     def carry_out(self) -> None:
         """Run what is due.
@@ -238,7 +241,7 @@ class Commissioning:
         """The stages of a drive below the full tier; None for one that has everything, safe or (then refused) not."""
         if self.capabilities is None or self.capabilities.tier is Tier.FULL or self.capabilities.unsafe:
             return None
-        return TierStages(self.run, self.drive, self.capabilities, self.nameplate)
+        return TierStages(self.run, self.drive, self.capabilities, self.nameplate, self.drive_bandwidth_hz)
 
     def _steps(self) -> dict[str, Callable[[], Stage]]:
         say, tier, person = self.progress.say, self.tier, self.person

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import TABLE_BOUNDS, tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
-from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
@@ -35,7 +35,10 @@ SPEED_PHASE_MARGIN_DEG = 40.0
 """Least phase margin of the speed loop: below it a step rings visibly (30 % overshoot)."""
 
 
-def tune_stage(run: RunDirectory, request: TuneRequest) -> Stage:
+Designed = Callable[[MachineFile, TuneRequest], Design]
+
+
+def tune_stage(run: RunDirectory, request: TuneRequest, designed: Designed = tune) -> Stage:
     """Design the control of the identified machine; writes ``design.toml``.
 
     Raises
@@ -43,7 +46,7 @@ def tune_stage(run: RunDirectory, request: TuneRequest) -> Stage:
     DesignInfeasible
         The margins asked for cannot be met.
     """
-    design = tune(load_machine_file(run.path / "machine.toml"), request)
+    design = designed(load_machine_file(run.path / "machine.toml"), request)
     run.save("design.toml", design_text(design))
     criteria = [line for name, loop in design.loops.items() for line in _loop_criteria(name, loop, request)]
     values: list[Mapping[str, Any]] = [

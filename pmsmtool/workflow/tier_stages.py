@@ -26,6 +26,7 @@ from pmsmtool.flash.map_gate import check_map
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.workflow.capabilities import Capabilities, Method, Tier
+from pmsmtool.workflow.closed_stage import LIMITS, closed_stage, guaranteed, why_no_limits
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
 from pmsmtool.workflow.identify import MACHINE, NAMEPLATE, IdentifyRequest, identify_stage, nameplate_of
@@ -47,6 +48,10 @@ RECORDER_STEPS = ("speed_step",)
 """Experiments of a proof that need no excitation: a speed reference while the drive records."""
 PREDICTED = ("speed.K_p_nms_per_rad", "speed.filter_hz")
 """What a predicted speed step stands on besides the gains of the current loops."""
+NOT_SHOWN = (
+    "; the guarantee of its limits bounds a voltage that it does not record (on a simulated node: `pmsmtool reproduce "
+    "closed-drive`)"
+)
 Allow = Callable[[Sequence[str]], None]
 Say = Callable[[str], None]
 
@@ -83,12 +88,15 @@ class TierStages:
         What the drive has.
     nameplate : MachineFile or None
         What is known of the machine.
+    drive_bandwidth_hz : float or None
+        Bandwidth of the current control of a drive that keeps its own, where it is known.
     """
 
     run: RunDirectory
     drive: CanopenDrive
     found: Capabilities
     nameplate: MachineFile | None
+    drive_bandwidth_hz: float | None = None
 
     def plan_lines(self) -> list[str]:
         """Return what the chain will do, one line per stage, before anything moves."""
@@ -99,6 +107,9 @@ class TierStages:
         rest = "what is measured" if known is None else f"what is measured, the rest {known[1]}"
         design = f"on {rest}" if self._complete(known) else f"not available: {_machine_needed(NEEDED)}"
         lines.append(f"tune, lut, margins: {design}")
+        if not drive_map.staging:
+            reason = why_no_limits(drive_map, self.drive_bandwidth_hz)
+            lines.append(f"{LIMITS}: " + (f"not available: {reason}" if reason else "judged by what they guarantee"))
         flash = self._no_writing()
         lines.append("flash, verify: " + (f"not available: {flash}" if flash else "what the map has an object for"))
         proof = self._no_proof()
@@ -138,11 +149,13 @@ class TierStages:
         raise NotAvailable(reason, where=f"node {self.found.identity.node}")
 
     def tune(self, request: TuneRequest) -> Stage:
-        """Design the control; one pair of gains for both axes where the drive has no more."""
+        """Design the control, and the limits of a drive that keeps its own; one pair of gains where it has no more."""
         if not (self.run.path / MACHINE).is_file():
             raise NotAvailable(_machine_needed(self._lacking()))
-        stage = tune_stage(self.run, request)
-        return _for_map(self.run, stage, self.found.drive_map)
+        drive_map = self.found.drive_map
+        if drive_map.staging:
+            return _for_map(self.run, tune_stage(self.run, request), drive_map)
+        return _for_map(self.run, closed_stage(self.run, request, drive_map, self.drive_bandwidth_hz), drive_map)
 
     def lut(self, request: LookupRequest) -> Stage:
         """Make the table of the design."""
@@ -242,8 +255,10 @@ class TierStages:
     def _no_proof(self) -> str:
         if self.found.tier in (Tier.INJECT, Tier.RECORDER):
             return ""
-        lacking = [name for name in PREDICTED if name not in self.found.drive_map.cells]
-        return f"needs a loop that is all ours, to predict its response: the map has no object for {', '.join(lacking)}"
+        lacking = ", ".join(name for name in PREDICTED if name not in self.found.drive_map.cells)
+        reason = f"needs a loop that is all ours, to predict its response: the map has no object for {lacking}"
+        design = self.run.path / "design.toml"
+        return reason + (NOT_SHOWN if design.is_file() and guaranteed(load_design(design)) else "")
 
     def _provable(self) -> str:
         if self.found.tier is Tier.INJECT:

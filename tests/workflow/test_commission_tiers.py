@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from click.testing import CliRunner
 
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
+from pmsmtool.design.closed_drive import RATED, SLOPE, SPEED, TORQUE
 from pmsmtool.design.design_file import load_design
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
@@ -25,10 +27,14 @@ from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.resources import data_folder
 from pmsmtool.sim import channel
 from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
+from pmsmtool.sim.simulated_machine import with_simulation
 from pmsmtool.workflow.capabilities import Capabilities, Tier, examine
+from pmsmtool.workflow.closed_stage import LIMITS, NO_BANDWIDTH, why_no_limits
 from pmsmtool.workflow.commission import Commissioning, begin_run, due_stages
 from pmsmtool.workflow.prove.stage import ProofRequest
 from pmsmtool.workflow.report_page import report_page, verdict
+from pmsmtool.workflow.reproduce.closed_node import ClosedNode
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 from pmsmtool.workflow.tier_stages import SET_UP, open_tier_drive
 
@@ -106,6 +112,8 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "verify": "not available", "prove": "not available",
     }  # fmt: skip
     assert verdict(run.path).word == "PASS FOR ITS TIER"
+    limits = [line for line in run.read().stage("tune").fallbacks if line.startswith(LIMITS)]  # type: ignore[union-attr]
+    assert limits == [f"{LIMITS}: not available: {why_no_limits(found.drive_map, None)}"] and SLOPE in limits[0]
     return run.path
 
 
@@ -177,6 +185,41 @@ def test_one_pair_of_gains_is_the_smaller_of_both_axes(tmp_path: Path) -> None:
     assert "as given: pole_pairs, R_s_ohm" in str(machine.provenance["source"])
     assert any("taken as given, not measured: pole_pairs, R_s_ohm" in line for line in verdict(run.path).lines)
     assert "PASS FOR ITS TIER" in report_page(run.path)
+
+
+def test_a_drive_that_cannot_be_reflashed_is_kept_out_of_saturation_by_its_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Designed, written, read back; and with what the drive then holds no reference saturates it."""
+    drive_map = with_identity(load_family("cia402"))
+    monkeypatch.setattr(channel, "load_family", lambda name: drive_map)
+    sheet = load_machine_file(PROFILE)
+    hertz = SET_UP_BANDWIDTH / sheet.inverter.T_s / (2.0 * math.pi)
+    assert why_no_limits(drive_map, None) == NO_BANDWIDTH
+    with opened("&drive=cia402", drive_map) as (drive, found):
+        run = begin_run(drive, tmp_path, tier=found.tier)
+        progress, person = Quiet(), Told()
+        chain = Commissioning(
+            run, drive, person, progress, sheet, capabilities=found, drive_bandwidth_hz=hertz
+        )  # fmt: skip
+        chain.carry_out()
+        held = {name: DriveParameters(drive.node).read_value(name) for name in drive_map.cells}
+    assert set(progress.ended.values()) == {"pass", "not available"} and progress.ended["prove"] == "not available"
+    design = load_design(run.path / "design.toml")
+    assert set(held) == {RATED, SLOPE, TORQUE, SPEED}
+    for name, value in held.items():
+        assert value == pytest.approx(design[name], rel=2e-3) and any(line.startswith(name) for line in person.shown)
+    stage = run.read().stage("tune")
+    assert stage is not None and {RATED, SLOPE, TORQUE, SPEED} <= {value["name"] for value in stage.values}
+    assert any("Cost: " in line and "nothing is promised" in line for line in stage.fallbacks)
+    assert {"voltage demand within the limits", "current within the limits"} <= {a.what for a in stage.acceptance}
+    assert "a voltage that it does not record" in run.read().stage("prove").note  # type: ignore[union-attr]
+    source, largest = with_simulation(sheet, {"thermal_on": False}), 3.0 * sheet.machine.I_max_apk  # type: ignore[operator]
+    references = [(0.05 * k, (-1.0) ** k * largest) for k in range(8)]
+    speed = ((0.0, held[SPEED]),)
+    assert ClosedNode(source, held, 1).run(speed, references).saturated == 0
+    as_delivered = {**held, SLOPE: 1e4 * held[RATED], TORQUE: 10.0 * held[RATED]}
+    assert ClosedNode(source, as_delivered, 1).run(speed, references).saturated > 0
 
 
 def test_without_a_data_sheet_what_is_missing_is_named(tmp_path: Path) -> None:
