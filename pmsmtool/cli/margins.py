@@ -80,7 +80,8 @@ def margins_command(
     from pmsmtool.design.design_file import load_design
     from pmsmtool.design.margins import MarginRequest, margin_report
     from pmsmtool.design.tolerance import tolerance_box
-    from pmsmtool.errors import CheckFailed
+    from pmsmtool.errors import CheckFailed, NotAvailable
+    from pmsmtool.workflow.held_design import why_not_judged
 
     file = inside(design, "design.toml")
     source = load_design(file)
@@ -117,6 +118,13 @@ def margins_command(
             where=str(file),
             hint="lower the bandwidth, narrow the tolerances by identification, or ask for less",
         )
+    if not report.loops and simulated is None and not any(spread.least for spread in report.headroom):
+        raise NotAvailable(
+            f"loop margins: {why_not_judged(source)}",
+            where=str(file),
+            hint="`pmsmtool tune --map FAMILY --drive-bandwidth-hz HZ` judges the loops that a drive says it has; "
+            "--voltage-headroom, --current-headroom and --thermal-headroom judge the rest",
+        )
 
 
 def _scenario(name: str | None, source: Design) -> Scenario | None:
@@ -135,10 +143,14 @@ def _failed(simulated: SimulatedMargins | None) -> list[str]:
 
 
 def _lines(report: MarginReport, simulated: SimulatedMargins | None) -> Iterator[str]:
-    yield f"loop margins over {report.corners} corners" + (f" and {report.samples} samples" if report.samples else "")
-    yield from _table(report.loops)
-    phase = min((s for s in report.loops if s.name.endswith("_phase")), key=lambda s: s.worst)
-    yield f"worst {phase.name}: {_sample(phase.worst_sample)}"
+    over = f"over {report.corners} corners" + (f" and {report.samples} samples" if report.samples else "")
+    if report.loops:
+        yield f"loop margins {over}"
+        yield from _table(report.loops)
+        phase = min((s for s in report.loops if s.name.endswith("_phase")), key=lambda s: s.worst)
+        yield f"worst {phase.name}: {_sample(phase.worst_sample)}"
+    else:
+        yield f"no loop margins: the drive does not take the gains; headroom {over}"
     yield ""
     yield "limit headroom of the references for the nominal machine (1: nothing needed, 0: at the limit)"
     yield from _table(report.headroom)

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -301,12 +303,42 @@ def _output(ctx: click.Context, verbose: int, quiet: bool, json_output: bool) ->
     return Output(json_output or bool(above.get("json_output")), verbosity)
 
 
+@contextmanager
+def options_named(fields: Mapping[str, str] | None = None) -> Iterator[None]:
+    """Name the options a person typed, where a request refuses the fields they fill in (``eps = 2`` -> ``--eps 2``).
+
+    Parameters
+    ----------
+    fields : mapping of str to str, optional
+        Field to option, where they differ; else a field's option is the one that fills a parameter of its name.
+    """
+    try:
+        yield
+    except ConfigError as error:
+        ctx = click.get_current_context()
+        options = {p.name: p.opts[0] for p in ctx.command.params if isinstance(p, click.Option) and p.name}
+        options |= fields or {}
+        found = tuple(_with_option(text, options) for text in error.violations)
+        if found != error.violations:
+            error.violations = found
+            error.hint = error.hint or f"{ctx.command_path} --help says what each option takes"
+        raise
+
+
+def _with_option(text: str, options: Mapping[str, str]) -> str:
+    match = re.match(r"(\w+)( = | is )", text)
+    if match is None or match[1] not in options:
+        return text
+    return f"{options[match[1]]}{match[2].replace(' = ', ' ')}{text[match.end() :]}"
+
+
 def output_options(function: Function) -> Function:
     """Add ``--json -v -q`` to a command that reads; it receives ``out: Output``."""
 
     @functools.wraps(function)
     def command(*args: Any, verbose: int, quiet: bool, json_output: bool, **kwargs: Any) -> Any:
-        return function(*args, out=_output(click.get_current_context(), verbose, quiet, json_output), **kwargs)
+        with options_named():
+            return function(*args, out=_output(click.get_current_context(), verbose, quiet, json_output), **kwargs)
 
     return _apply(command, _output_parameters(False))
 

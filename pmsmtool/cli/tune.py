@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.drive_access import map_option, read_map
-from pmsmtool.cli.options import FILE, examples, output_options
+from pmsmtool.cli.options import FILE, examples, options_named, output_options
 from pmsmtool.cli.output import Output, table
 from pmsmtool.cli.output_file import write_file
 from pmsmtool.errors import ConfigError
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
+    from pmsmtool.firmware.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
 
 
@@ -97,8 +98,11 @@ def tune_command(
 ) -> None:
     """Design the control of MACHINE (a machine file, a run directory or a profile).
 
-    With --map of a drive that cannot be reflashed: its gains as far as it takes them, and the torque, slope and speed
-    limits that keep its voltage demand within its limit; the guarantee and its cost are said.
+    With --map of a drive that keeps its own control: the torque or current limit, the slope and the speed limit that
+    keep its voltage demand within its limit; the guarantee and its cost are said. The map must have objects for a
+    slope and a limit of the torque or current: of the families that are shipped, cia402 and copley. Loops are judged
+    with the gains the drive will hold, or with those that its --drive-bandwidth-hz stands for. What other drives take
+    of a design, `commission` and `flash-params` write.
 
     Writes the design with the machine embedded and every gain with its unit, method and achieved margin, and beside it
     the parameter set that flash-params sends. Exit code 1 when the margins asked for cannot be met.
@@ -107,7 +111,8 @@ def tune_command(
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.machine.profile import machine_path
 
-    design = _design(load_machine_file(machine_path(machine)), map_file, asked)
+    drive_map = read_map(map_file)
+    design = _design(load_machine_file(machine_path(machine)), drive_map, asked)
     params = design.parameter_set()
     params_path = _params_path(path) if params_path is None else params_path
     write_file(path, design_text(design))
@@ -122,26 +127,28 @@ def tune_command(
         "facts": design.facts,
         "notes": design.notes,
     }
-    out.result("tune", data, lambda: _lines(design))
+    out.result("tune", data, lambda: _lines(design, drive_map))
     for note in design.notes:
         out.note(note)
     out.note(f"wrote {path}, {params_path}")
 
 
-def _design(source: MachineFile, map_file: Path | None, asked: dict[str, Any]) -> Design:
+def _design(source: MachineFile, drive_map: DriveMap, asked: dict[str, Any]) -> Design:
     from pmsmtool.design.tune import tune
     from pmsmtool.design.tune_request import TuneRequest
 
-    drive_map = read_map(map_file)
     limits = {name.removeprefix("limit_"): asked.pop(name) for name in _LIMITS}
     bandwidth_hz = asked.pop("drive_bandwidth_hz")
     if drive_map.staging:
         _refuse_for_reflashed(drive_map.name, {"drive_bandwidth_hz": bandwidth_hz, **limits})
         return tune(source, TuneRequest(**asked))
     from pmsmtool.design.closed_drive import ClosedDrive, tune_closed
+    from pmsmtool.workflow.held_design import held_design
 
-    drive = ClosedDrive(drive_map.name, frozenset(drive_map.cells), bandwidth_hz, **limits)
-    return tune_closed(source, TuneRequest(**asked), drive)[0]
+    options = {name.removeprefix("limit_"): f"--{name.replace('_', '-')}" for name in _LIMITS}
+    with options_named(options | {"bandwidth_hz": "--drive-bandwidth-hz"}):
+        drive = ClosedDrive(drive_map.name, frozenset(drive_map.cells), bandwidth_hz, **limits)
+    return held_design(tune_closed(source, TuneRequest(**asked), drive)[0], drive_map)
 
 
 _LIMITS = ("limit_speed_rpm", "limit_rise_s", "limit_acceleration_rpm_per_s")
@@ -173,20 +180,22 @@ _SHOWN_LIMITS = (
     "field_weakening.h1", "field_weakening.h2", "field_weakening.beta", "field_weakening.sigma",
     "field_weakening.iterations", "field_weakening.i_d_min_a", "field_weakening.i_d_lm_a",
 )  # fmt: skip
-_SHOWN_CLOSED = ("reference.tau_rated_nm", "reference.torque_slope_nm_per_s")
+_SHOWN_CLOSED = (
+    *_SHOWN[4:], "motor.I_max_apk", "reference.tau_rated_nm", "reference.torque_slope_nm_per_s", "motor.n_max_rpm",
+)  # fmt: skip
 _SHOWN_POLAR = (
     "polar.mode", "polar.options", "polar.sigma_phase_rad_s", "polar.sigma_amplitude_rad_s", "polar.tau_s",
     "polar.omega_c_rad_s", "polar.omega_dob_rad_s", "polar.V_ref_ratio", *_SHOWN[4:],
 )  # fmt: skip
 
 
-def _lines(design: Design) -> Iterator[str]:
+def _lines(design: Design, drive_map: DriveMap) -> Iterator[str]:
     from pmsmtool.params.catalogue import BY_NAME
 
     polar = design["polar.mode"] != 0.0
     shown: tuple[str, ...] = _SHOWN_POLAR if polar else (*_SHOWN, *_SHOWN_LIMITS)
-    if any(name in design.values for name in _SHOWN_CLOSED):
-        shown = (*_SHOWN, *_SHOWN_CLOSED, "motor.n_max_rpm")
+    if not drive_map.staging:
+        shown = (*_SHOWN[:4], *(name for name in _SHOWN_CLOSED if name in drive_map.cells))
     rows = [(name, f"{design[name]:.6g}", BY_NAME[name].unit, design.values[name].method) for name in shown]
     yield from table(("parameter", "value", "unit", "method"), rows)
     yield ""

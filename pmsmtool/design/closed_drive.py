@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.lookup_table import RPM, torque_limits
 from pmsmtool.design.minimum_time import TransferProblem, minimum_time
+from pmsmtool.design.open_loops import CURRENT_GAINS, CURRENT_LOOPS, SPEED_LOOP, lacking_gains, one_pair, with_gains
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import Ratings, ratings
 from pmsmtool.design.slope_response import CurrentLoops, MachineBox, SlopeResponse, slope_response
@@ -39,6 +40,8 @@ RATED, SLOPE, TORQUE, CURRENT, SPEED = (
     "reference.tau_rated_nm", "reference.torque_slope_nm_per_s", "speed.tau_max_nm", "motor.I_max_apk",
     "motor.n_max_rpm",
 )  # fmt: skip
+STATED = "drive_bandwidth_hz"
+"""Key of the request under which a design names the bandwidth its current loops stand for."""
 GAINS = ("current.K_p_q_v_per_a", "current.K_i_q_v_per_as")
 SPEEDS = 26
 """Speeds of the responses; the cells between them widen the bound by 1 % of the voltage (measured on interior-2k2)."""
@@ -199,9 +202,10 @@ def tune_closed(source: MachineFile, request: TuneRequest, drive: ClosedDrive) -
     DesignInfeasible
         No torque is admissible, not even at the lowest speeds.
     """
-    design = tune(source, replace(request, controller="pi", governor="off", field_weakening="off"))
+    unheld = tune(source, replace(request, controller="pi", governor="off", field_weakening="off", predictor=False))
+    design = _as_controlled(unheld, drive)
     rated = ratings(source, (1.0 - request.voltage_margin) * source.inverter.V_max_v)
-    loops = current_loops(design, source, drive)
+    loops = current_loops(design, drive)
     found = _Projection(source, rated, request, drive, loops).guarantee()
     how = f"{drive.name}: largest torque x speed whose demand is bounded by the voltage limit"
     rated_nm = TORQUE_FACTOR * source.machine.pole_pairs * source.machine.psi_f_wb * rated.I_nom_apk
@@ -218,35 +222,50 @@ def tune_closed(source: MachineFile, request: TuneRequest, drive: ClosedDrive) -
     if SPEED not in drive.offers:
         notes += (f"{drive.name} has no object for the speed limit: keep {found.n_rpm:.4g} rpm in the application",)
     asked: dict[str, Scalar] = {**design.request, "drive": drive.name}
+    if drive.bandwidth_hz is not None and not _takes_gains(drive):
+        asked[STATED] = drive.bandwidth_hz
     return replace(design, values=values, facts={**design.facts, **found.facts()}, notes=notes, request=asked), found
 
 
 TORQUE_FACTOR = 1.5
 
 
-def current_loops(design: Design, source: MachineFile, drive: ClosedDrive) -> CurrentLoops:
-    """Return the current control: the design's gains where the drive takes them, else what its bandwidth says."""
-    machine, inverter = source.machine, source.inverter
-    if all(name in drive.offers for name in GAINS):
-        own = [name if name in drive.offers else name.replace("_d_", "_q_") for name in _D_GAINS]
-        K_p, K_i = (design[own[0]], design[GAINS[0]]), (design[own[1]], design[GAINS[1]])
+def _takes_gains(drive: ClosedDrive) -> bool:
+    return not lacking_gains(drive.offers)[CURRENT_LOOPS]
+
+
+def _as_controlled(design: Design, drive: ClosedDrive) -> Design:
+    """Return the design with the gains its drive has: those written, else those its bandwidth stands for."""
+    machine = design.machine.machine
+    if _takes_gains(drive):
+        gains = one_pair(design, drive.offers)
     elif drive.bandwidth_hz is not None:
         alpha = 2.0 * math.pi * drive.bandwidth_hz
-        K_p = (alpha * machine.L_d_h, alpha * machine.L_q_h)
-        K_i = (alpha * machine.R_s_ohm, alpha * machine.R_s_ohm)
+        stated = (alpha * machine.L_d_h, alpha * machine.R_s_ohm, alpha * machine.L_q_h, alpha * machine.R_s_ohm)
+        how = f"{drive.name}: what its bandwidth of {drive.bandwidth_hz:.5g} Hz stands for, not written"
+        gains = {name: DesignValue(value, how) for name, value in zip(CURRENT_GAINS, stated, strict=True)}
     else:
         raise ConfigError(
             f"the gains of {drive.name!r} cannot be written, and its current bandwidth is not known",
             where="closed drive",
             hint="give --drive-bandwidth-hz, as the maker's tool or manual says",
         )
+    judged = (CURRENT_LOOPS,) if lacking_gains(drive.offers)[SPEED_LOOP] else (CURRENT_LOOPS, SPEED_LOOP)
+    return with_gains(design, gains, judged)
+
+
+def current_loops(design: Design, drive: ClosedDrive) -> CurrentLoops:
+    """Return the current control that a design of a closed drive holds."""
+    inverter = design.machine.inverter
     whole = max(0, math.ceil(inverter.delay_periods - 0.5 - 1e-9))
     if whole > 1:
-        raise ConfigError(f"{inverter.delay_periods:g} periods of delay are not modelled", where="closed drive")
-    return CurrentLoops(K_p, K_i, inverter.T_s, whole, False, drive.stair_s, drive.filter_s)
-
-
-_D_GAINS = ("current.K_p_d_v_per_a", "current.K_i_d_v_per_as")
+        raise ConfigError(
+            f"{inverter.delay_periods:g} periods of delay are not modelled",
+            where="closed drive",
+            hint="the guarantee covers up to 1.5 periods: correct inverter.delay_periods, or leave --map out",
+        )
+    K_p_d, K_i_d, K_p_q, K_i_q = (design[name] for name in CURRENT_GAINS)
+    return CurrentLoops((K_p_d, K_p_q), (K_i_d, K_i_q), inverter.T_s, whole, False, drive.stair_s, drive.filter_s)
 
 
 def machine_box(source: MachineFile, box: ToleranceBox) -> MachineBox:
@@ -290,7 +309,7 @@ class _Projection:
             raise ConfigError(
                 "neither the inertia J_kgm2 nor the largest acceleration is known",
                 where="closed drive",
-                hint="put J_kgm2 into the machine file, or give --acceleration-rpm-per-s",
+                hint="put J_kgm2 into the machine file, or give --limit-acceleration-rpm-per-s",
             )
         J = tolerance.factors["J_kgm2"].half_width if "J_kgm2" in tolerance.factors else 0.0
         self.least_J = (machine.J_kgm2 or math.inf) * (1.0 - J)
@@ -363,9 +382,7 @@ class _Projection:
                 likely=f"without any torque the demand is bounded by {demand:.4g} V, the limit is {self.limit:.4g} V",
                 hint="ask for a lower speed, a longer rise, or a smaller acceleration",
             )
-        slope_a = _largest(
-            lambda slope: self.holds(I_apk, slope, last + 1), 2.0 * I_apk / self.drive.stair_s
-        )
+        slope_a = _largest(lambda slope: self.holds(I_apk, slope, last + 1), 2.0 * I_apk / self.drive.stair_s)
         demand, deviation = self.demand(I_apk, slope_a, last + 1)
         machine = at_temperature(self.source.machine, self.source.flux_map)
         V = (1.0 - self.margin) * self.source.inverter.V_max_v

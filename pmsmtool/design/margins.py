@@ -315,7 +315,7 @@ def margin_report(
     executor: BlockExecutor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> MarginReport:
-    """Evaluate a design over its tolerance box.
+    """Evaluate a design over its tolerance box; of its loops those that it names (``Design.loops``).
 
     Parameters
     ----------
@@ -346,7 +346,10 @@ def margin_report(
             progress(min(len(blocks) * BLOCK, samples), samples)
     random = {name: np.concatenate([b.values[name] for b in blocks]) for name in nominal.values} if blocks else {}
     spreads = []
+    judged = {"headroom", *(name.partition("_")[0] for name in design.loops)}
     for name in nominal.values:
+        if name.partition("_")[0] not in judged:
+            continue
         row = int(np.argmin(at_corners.values[name]))
         cell = problem.cells.name(int(at_corners.cells[name][row])) if name in at_corners.cells else ""
         shares = {p: float(np.percentile(random[name], p)) for p in PERCENTILES} if blocks else {}

@@ -15,11 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from pmsmtool.design.current_loop import AxisPlant, CurrentGains, Method, axis_loop
-from pmsmtool.design.design_file import Design, load_design
+from pmsmtool.design.design_file import load_design
 from pmsmtool.design.judgement import judge
-from pmsmtool.design.sampled_loop import SampledLoop
-from pmsmtool.design.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, speed_loop
+from pmsmtool.design.open_loops import open_loops
 from pmsmtool.errors import IdentificationError
 from pmsmtool.npz_file import read_npz
 from pmsmtool.report import figures
@@ -111,32 +109,8 @@ def _design_figures(path: Path) -> Iterator[Figure]:
     if path.is_file():
         design = load_design(path)
         loops = open_loops(design)
-        yield figures.bode_figure(loops, {name: design.loops[name] for name in loops})
-
-
-def open_loops(design: Design) -> dict[str, SampledLoop]:
-    """Return the open loops of a design, from the gains that stand in it."""
-    machine, inverter = design.machine.machine, design.machine.inverter
-    alpha = float(design.facts.get("current_bandwidth_rad_s", 0.0))
-    predicts = bool(design.request.get("predictor", False))
-    loops = {}
-    for axis, L in (("d", machine.L_d_h), ("q", machine.L_q_h)):
-        plant = AxisPlant(machine.R_s_ohm, L, inverter.T_s, inverter.delay_periods)
-        gains = CurrentGains(
-            design[f"current.K_p_{axis}_v_per_a"], design[f"current.K_i_{axis}_v_per_as"], alpha, Method.IMC
-        )
-        loops[f"current_{axis}"] = axis_loop(gains, plant, plant if predicts else None)
-    if "speed" in design.loops and machine.J_kgm2 is not None:
-        notch = Notch(design["speed.notch_hz"], design["speed.notch_zeta_num"], design["speed.notch_zeta_den"])
-        path = SpeedPath(
-            machine.J_kgm2, machine.B_nms or 0.0, loops["current_q"], int(design["speed.decimation"]),
-            design["encoder.pll_bandwidth_rad_s"], design["speed.filter_hz"], notch,
-        )  # fmt: skip
-        gain = SpeedGains(
-            design["speed.K_p_nms_per_rad"], design["speed.K_i_nm_per_rad"], 0.0, SpeedMethod.SYMMETRIC_OPTIMUM
-        )
-        loops["speed"] = speed_loop(gain, path)
-    return loops
+        if loops:
+            yield figures.bode_figure(loops, {name: design.loops[name] for name in loops})
 
 
 def _margin_figures(record: RunRecord) -> Iterator[Figure]:

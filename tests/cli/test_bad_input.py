@@ -327,3 +327,25 @@ def test_fresh_process_says_the_same(folder: Path) -> None:
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.splitlines()[0] == "error: 1 thing is wrong in this machine"
     assert not (folder / "new.toml").exists()
+
+
+# ---- what an option may be -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("tune machine.toml -o new.toml --bandwidth-hz -4", "--bandwidth-hz -4.0 is not a positive number"),
+        ("tune machine.toml -o new.toml --phase-margin-deg 95", "--phase-margin-deg 95.0 is not between 0 and 90"),
+        ("tune machine.toml -o new.toml --eps 2", "--eps 2.0 is outside 0..0.5"),
+        ("tune machine.toml -o new.toml --map copley --drive-bandwidth-hz -4", "--drive-bandwidth-hz -4.0 is not a"),
+        ("tune machine.toml -o new.toml --map copley --limit-rise-s 0", "--limit-rise-s 0.0 is not a positive number"),
+        ("lut machine.toml -o new.npz --speed-points 1", "--speed-points 1 is outside 2..4096"),
+        ("commission machine.toml --bandwidth-hz 0", "--bandwidth-hz 0.0 is not a positive number"),
+    ],
+)
+def test_a_value_out_of_range_names_the_option_that_was_typed(
+    folder: Path, command: str, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    err = told(2, command, capsys)
+    assert f"  - {says}" in err and "--help says what each option takes" in err

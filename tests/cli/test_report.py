@@ -12,12 +12,12 @@ import pytest
 
 from pmsmtool.cli.main import run as program
 from pmsmtool.design.lookup_design import LookupRequest
+from pmsmtool.design.open_loops import open_loops
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.resources import data_folder
 from pmsmtool.workflow import report_page
 from pmsmtool.workflow.design_stages import lut_stage, tune_stage
-from pmsmtool.workflow.report_page import open_loops
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage, new_record
 
 

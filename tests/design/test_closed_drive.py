@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from dataclasses import replace
@@ -26,7 +27,7 @@ from pmsmtool.design.closed_drive import (
 from pmsmtool.design.design_file import Design, design_text, parse_design
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, NotAvailable
-from pmsmtool.firmware.shipped_maps import load_family
+from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.resources import data_folder
@@ -208,3 +209,24 @@ def test_from_the_machine_to_the_objects_of_the_drive(tmp_path: Path, monkeypatc
 
 def test_the_shipped_standard_map_offers_the_limits() -> None:
     assert frozenset(load_family("cia402").cells) == OFFERS
+
+
+def test_the_help_of_tune_names_the_shipped_maps_that_it_takes() -> None:
+    able = []
+    for name in family_names():
+        if name != "pmsmsim":
+            with contextlib.suppress(NotAvailable):
+                ClosedDrive(name, frozenset(load_family(name).cells), 100.0)
+                able.append(name)
+    text = " ".join(CliRunner().invoke(cli, ["tune", "--help"]).output.split())
+    assert f"of the families that are shipped, {' and '.join(able)}." in text
+
+
+def test_a_design_of_a_closed_drive_is_judged_by_the_loops_of_its_bandwidth() -> None:
+    source = machine()
+    design, _ = made(source, speed_rpm=600.0)
+    alpha = 2.0 * math.pi * bandwidth(source)
+    assert set(design.loops) == {"current_d", "current_q"}
+    assert design["current.K_p_d_v_per_a"] == pytest.approx(alpha * source.machine.L_d_h)
+    for loop in design.loops.values():
+        assert loop.crossover_rad_s == pytest.approx(alpha, rel=0.02)
