@@ -62,7 +62,10 @@ def truth_of(drive: MachineFile, evaluation: Evaluation) -> dict[str, float]:
     if drive.flux_map is not None and evaluation.inductance is not None:
         for k, (name, found) in enumerate((("L_d_h", evaluation.inductance.L_d), ("L_q_h", evaluation.inductance.L_q))):
             truth[name] = float(drive.flux_map.incremental_inductance(found.i_d_apk, found.i_q_apk)[k, k])
-        truth["psi_f_wb"] = float(drive.flux_map.flux(0.0, 0.0)[0])
+        # the simulated magnets lose alpha of the file's psi_f, which is not the drawn map's; what is printed is what
+        # they have at their temperature, taken to T_ref by alpha
+        loss = drive.machine.alpha_psi_per_k * (values.number("T_magnet_c") - drive.machine.T_ref_c)
+        truth["psi_f_wb"] = (float(drive.flux_map.flux(0.0, 0.0)[0]) + loss * truth["psi_f_wb"]) / (1.0 + loss)
     return truth
 
 

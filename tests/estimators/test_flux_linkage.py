@@ -233,6 +233,17 @@ def test_a_saturating_axis_is_taken_back_to_zero_current(bend: float) -> None:
     assert 0.1 * way < found.psi_measured.std / PSI < 2e-4 + 0.3 * way
 
 
+@pytest.mark.parametrize("bend", [0.0, 3e-3])
+def test_saturation_does_not_turn_the_frame(bend: float) -> None:
+    """A frame ahead of the d axis sees all of psi_d on its q axis, and with it what currents of both axes bend."""
+    eps = 0.01
+    trace = _windows(lambda i: PSI * (1.0 + bend * i * i))
+    w, x = trace["omega_e_rad_s"], 0.5 * trace["omega_e_rad_s"] * T_S
+    flux = PSI * (1.0 + bend * trace["i_d_a"] ** 2 - 2.0 * bend * trace["i_q_a"] ** 2)
+    turned = _changed(trace, u_d_v=trace["u_d_v"] + eps * w * flux * np.sin(x) / x)
+    assert estimate_flux_linkage(turned, R, period_s=T_S).frame_offset.value == pytest.approx(eps, rel=1e-3)
+
+
 def test_a_speed_that_lags_while_the_shaft_slows_down_is_put_right() -> None:
     trace = _windows(lambda i: 0.0 * i + PSI, slope=-0.4)
     wrong = estimate_flux_linkage(trace, R, period_s=T_S).psi_measured.value
