@@ -103,6 +103,9 @@ def _interrupt(number: int, frame: object) -> None:
 
 def main() -> None:
     """Entry point of the program."""
+    # One thread: more add up in another order, and a replay on a host with other processors would differ in the last
+    # digits; to start them takes 50 ms, too.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(_GARBAGE_THRESHOLD)
     atexit.register(gc.freeze)  # what is left at exit goes with the process
     if COMPLETE_VARIABLE in os.environ:

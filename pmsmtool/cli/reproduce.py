@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,7 +50,6 @@ def reproduce_command(
         raise click.UsageError("missing argument FIGURE: a name of --list, or all")
     if figure == "all" and (figure_path is not None or (path is not None and path.suffix.lower() in _SUFFIXES)):
         raise click.UsageError("all figures need a folder: -o DIR")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one thread: small matrices only
     from pmsmtool.cli.output_file import figure_format
     from pmsmtool.errors import CheckFailed
     from pmsmtool.workflow.reproduce.registry import FIGURES, find, reproduce

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,8 +66,6 @@ def simulate_command(
         raise click.UsageError("which --scenario? --list names the built-in ones")
     if path is None and figure_path is None and not out.json:
         raise click.UsageError("nothing to write: give -o, --plot or --json")
-    # numpy's linear algebra starts a thread per core when it is imported: 50 ms that a simulation makes no use of
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from pmsmtool.cli.output_file import figure_format
     from pmsmtool.errors import ConfigError
     from pmsmtool.workflow.simulate import find_drive, find_scenario, run_scenario

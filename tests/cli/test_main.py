@@ -70,6 +70,17 @@ def test_nothing_slow_is_imported(arguments: list[str]) -> None:
     assert done.stderr.splitlines()[-1] == "loaded:"
 
 
+def test_linear_algebra_has_one_thread_whatever_the_processors() -> None:
+    """More threads sum in another order: a flux map was not replayed bit for bit with another number of them."""
+    program = (
+        "import atexit, os, sys\nfrom pmsmtool.cli.main import main\nassert 'numpy' not in sys.modules\n"
+        "atexit.register(lambda: print(os.environ['OPENBLAS_NUM_THREADS']))\nsys.argv[1:] = ['--version']\nmain()"
+    )
+    environment = {name: text for name, text in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, env=environment)
+    assert done.stdout.splitlines()[-1] == "1"
+
+
 def test_help_lists_every_command_under_its_section_without_importing_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lazy_group, "load_command", lambda row: pytest.fail(f"imported {row.name}"))
     text = CliRunner().invoke(main.cli, ["--help"]).output
