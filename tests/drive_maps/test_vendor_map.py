@@ -1,0 +1,160 @@
+"""``[vendor_tuning]`` of map files: read back as written, and every kind of mistake refused with file and line."""
+
+from __future__ import annotations
+
+import pytest
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.drive_map import DriveMap
+from pmsmtool.firmware.drive_map_file import dump_drive_map, map_hash, parse_drive_map
+from pmsmtool.firmware.shipped_maps import family_names, load_family
+from pmsmtool.firmware.vendor_tuning import SET_UP
+from pmsmtool.firmware.wire_units import counted_in
+
+HEAD = """\
+schema = "pmsmtool.drive-map/1"
+name = "mine"
+vendor = 0x123
+product = 7
+[objects]
+"motor.pole_pairs" = { index = 0x2001, sub = 1, type = "UNSIGNED8", unit = "1" }
+"motor.R_s_ohm" = { index = 0x2001, sub = 2, type = "UNSIGNED32", unit = "uohm" }
+[sources]
+doc = "manual, p. 3"
+[vendor_tuning]
+"""
+COMMANDS = (
+    HEAD
+    + """\
+kind = "os_command"
+mode = -2
+order = "big"
+source = "doc"
+failures = { 251 = "not now" }
+[vendor_tuning.steps]
+"cable" = { command = 6, timeout_s = 5, turns = false, moves = "nothing", failures = { 0 = "broken" } }
+"motor.pole_pairs" = { command = 7, type = "UNSIGNED8", unit = "1", timeout_s = 9.5, turns = true, moves = "turns" }
+"motor.R_s_ohm" = { command = 8, type = "UNSIGNED32", unit = "mohm", timeout_s = 5, turns = false, moves = "jerks" }
+"motor.psi_f_wb" = { command = 9, type = "INTEGER32", unit = "mN m/A rms", form = "torque constant", timeout_s = 60, \
+turns = true, moves = "runs up", uses = ["motor.R_s_ohm"] }
+"""
+)
+MODE = (
+    HEAD
+    + """\
+kind = "mode"
+mode = -2
+start_bit = 4
+done_bit = 12
+timeout_s = 30
+turns = true
+moves = "turns"
+[vendor_tuning.results]
+"motor.L_d_h" = { index = 0x2002, sub = 1, type = "UNSIGNED32", unit = "uH", source = "doc" }
+"""
+)
+COMMAND_MISTAKES = [
+    ('kind = "os_command"', "", "kind None is none of os_command, mode", 10),
+    ('kind = "os_command"', 'kind = "manual"', "kind 'manual' is none of", 11),
+    ("mode = -2", "mode = 2", "a maker's own mode of operation", 12),
+    ("mode = -2", 'mode = "-2"', "a maker's own mode of operation", 12),
+    ('order = "big"', 'order = "odd"', "order 'odd' is none of little, big", 13),
+    ('source = "doc"', 'source = "rumour"', "not in [sources]", 14),
+    ("251", "256", "error codes from 0 to 255", 15),
+    ('251 = "not now"', '251 = ""', "each with what it means", 15),
+    ("failures = { 251", "start_bit = 4\nfailures = { 251", "unknown key start_bit of kind os_command", 15),
+    ("command = 6", "command = 256", "command 256 is no number from 0 to 255", 17),
+    ("command = 6, ", "", "command None is no number", 17),
+    ("command = 7", "command = 6", "command 6 is already cable", 18),
+    ("timeout_s = 5, turns = false, moves = \"nothing\"", "turns = false, moves = \"nothing\"", "no time up to 600 s", 17),
+    ("timeout_s = 9.5", "timeout_s = -1", "no time up to 600 s", 18),
+    ("timeout_s = 9.5", "timeout_s = inf", "no time up to 600 s", 18),
+    ("turns = true, moves = \"turns\"", "moves = \"turns\"", "say whether the shaft must be free", 18),
+    ("moves = \"nothing\"", "moves = \"\"", "say what it does to the machine", 17),
+    ("\"cable\" = { command = 6,", "\"cable\" = { command = 6, unit = \"1\",", "so it has no unit", 17),
+    ("\"cable\"", "\"motor.n_max_rpm\"", "no result this program takes", 17),
+    ("\"cable\" = { command = 6,", "\"cable\" = { command = 6, sub = 1,", "unknown key sub", 17),
+    ("type = \"UNSIGNED8\", unit = \"1\", timeout_s = 9.5", "unit = \"1\", timeout_s = 9.5", "type None is none of", 18),
+    ("unit = \"mohm\", ", "", "unit is missing", 19),
+    ("unit = \"mohm\"", "unit = \"mH\"", "inductance, expected resistance", 19),
+    ("form = \"torque constant\"", "form = \"time\"", "needs the gain", 20),
+    ("unit = \"mN m/A rms\"", "unit = \"mohm rms\"", "has no rms value", 20),
+    ("uses = [\"motor.R_s_ohm\"]", "uses = [\"motor.L_q_h\"]", "which no step before it measures", 20),
+    ("uses = [\"motor.R_s_ohm\"]", "uses = \"motor.R_s_ohm\"", "uses must be a list", 20),
+    ("\"motor.R_s_ohm\" = { index = 0x2001", "\"motor.J_kgm2\" = { index = 0x2001", "[objects] does not hold", 20),
+]  # fmt: skip
+MODE_MISTAKES = [
+    ("start_bit = 4", "start_bit = 3", "start_bit 3 is none of 4, 5, 6", 13),
+    ("start_bit = 4\n", "", "start_bit None is none of", 10),
+    ("done_bit = 12", "done_bit = 2", "done_bit 2 is none of", 14),
+    ("timeout_s = 30", "timeout_s = 3000", "no time up to 600 s", 15),
+    ("turns = true", "turns = 1", "say whether the shaft", 16),
+    ('moves = "turns"', 'moves = ""', "say what it does", 17),
+    ("index = 0x2002", "index = 0x1023", "outside 0x2000", 19),
+    ("index = 0x2002, ", "", "needs index", 19),
+    ('source = "doc"', 'source = "rumour"', "not in [sources]", 19),
+    ('"motor.L_d_h"', '"speed.filter_hz"', "no result this program takes", 19),
+    ('unit = "uH"', 'unit = "uH rms"', "has no rms value", 19),
+    ("[vendor_tuning.results]", "[vendor_tuning.steps]", "unknown key steps of kind mode", 18),
+]
+
+
+def parse(text: str) -> DriveMap:
+    return parse_drive_map(text, "mine/map.toml")
+
+
+@pytest.mark.parametrize("text", [COMMANDS, MODE], ids=["os_command", "mode"])
+def test_what_is_written_is_read_back(text: str) -> None:
+    mine = parse(text)
+    assert parse(dump_drive_map(mine)) == mine
+    assert map_hash(mine) != map_hash(parse(text.replace("mode = -2", "mode = -3")))
+
+
+@pytest.mark.parametrize(
+    ("good", "old", "new", "complaint", "line"),
+    [(COMMANDS, *row) for row in COMMAND_MISTAKES] + [(MODE, *row) for row in MODE_MISTAKES],
+)
+def test_a_mistake_is_refused_with_file_and_line(good: str, old: str, new: str, complaint: str, line: int) -> None:
+    assert good.count(old) == 1
+    with pytest.raises(ConfigError) as caught:
+        parse(good.replace(old, new))
+    said = [text for text in caught.value.violations if complaint in text]
+    assert said, caught.value.violations
+    assert said[0].startswith(f"mine/map.toml:{line}: ")
+
+
+def test_a_torque_constant_needs_pole_pairs_from_somewhere() -> None:
+    lines = [line for line in COMMANDS.splitlines(keepends=True) if not line.startswith('"motor.pole_pairs"')]
+    with pytest.raises(ConfigError, match="cannot be used") as caught:
+        parse("".join(lines))
+    assert any("its form needs motor.pole_pairs" in text for text in caught.value.violations)
+
+
+def test_steps_are_chosen_by_what_is_asked_with_what_they_use() -> None:
+    tuning = parse(COMMANDS).vendor_tuning
+    assert tuning is not None
+
+    def names(*quantities: str, turning: bool = True) -> list[str]:
+        return [step.title for step in tuning.steps_for(frozenset(quantities), turning=turning)]
+
+    assert names("psi") == ["cable", "R_s_ohm", "psi_f_wb"]  # the check always, the resistance because psi uses it
+    assert names("poles", "R") == ["cable", "pole_pairs", "R_s_ohm"]
+    assert names("R", "psi", turning=False) == ["cable", "R_s_ohm"]
+    own = parse(MODE).vendor_tuning
+    assert own is not None and [step.name for step in own.steps_for(frozenset("L"), turning=True)] == [SET_UP]
+    assert own.steps_for(frozenset("L"), turning=False) == ()
+
+
+def test_torque_over_an_rms_current_is_smaller_over_its_peak() -> None:
+    """1 N m per A rms flows with a peak of sqrt 2 A."""
+    assert counted_in("mN m/A rms", "N m/A") == pytest.approx(1e-3 / 2.0**0.5, rel=1e-14)
+
+
+def test_shipped_maps_name_the_source_of_what_they_start() -> None:
+    told = {name: load_family(name) for name in family_names() if load_family(name).vendor_tuning is not None}
+    assert set(told) >= {"synapticon", "nanotec"}
+    for drive_map in told.values():
+        tuning = drive_map.vendor_tuning
+        assert tuning is not None and tuning.source in drive_map.sources
+        assert all(cell.source in drive_map.sources for cell in tuning.results.values())
+        assert all(used in drive_map.cells for step in tuning.steps.values() for used in step.uses)
