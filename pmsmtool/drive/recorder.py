@@ -133,12 +133,15 @@ class Recorder:
                     "the drive has no trace recorder", where=f"node {self._node.node}, 0x2060"
                 ) from abort
         if len(signals) > len(objects.TRACE_CHANNELS) or samples * len(signals) * _BYTES > self._capacity:
-            raise NotAvailable(
-                f"{samples} samples of {len(signals)} signals do not fit the recorder "
-                f"({len(objects.TRACE_CHANNELS)} channels, {self._capacity} bytes)",
-                where=f"node {self._node.node}, 0x2060:0B",
-                hint="record fewer signals or samples, or use a decimation",
-            )
+            holds = f"{len(objects.TRACE_CHANNELS)} channels, {self._capacity} bytes"
+            raise self._too_much(signals, samples, holds, "0x2060:0B")
+
+    def _too_much(self, signals: Sequence[str], samples: int, holds: str, where: str) -> NotAvailable:
+        return NotAvailable(
+            f"{samples} samples of {len(signals)} signals do not fit the recorder ({holds})",
+            where=f"node {self._node.node}, {where}",
+            hint="record fewer signals or samples, or use a decimation",
+        )
 
     def _select(self, channels: Sequence[DriveObject], signals: Sequence[str]) -> None:
         """Write mapping words, only those that differ from the last ones."""
@@ -153,17 +156,21 @@ class Recorder:
         self._channels.clear()
 
     def _await(self, item: DriveObject, wanted: int, what: str) -> None:
+        where = f"0x{item.index:04X}:{item.sub:02X}"
+        likely = "its trigger never came: the excitation did not start"
+        self._until(lambda: self._node.whole(item) == wanted, what, where, likely=likely)
+
+    def _until(
+        self, reached: Callable[[], bool], what: str, where: str, *, lasts_s: float = 0.0, likely: str = ""
+    ) -> None:
+        """Poll until ``reached``, which takes ``lasts_s`` by itself."""
         node = self._node
-        deadline = node.connection.clock.now() + PATIENCE_S
-        while node.whole(item) != wanted:
+        deadline = node.connection.clock.now() + PATIENCE_S + lasts_s
+        while not reached():
             if node.state() in (State.FAULT, State.FAULT_REACTION_ACTIVE):
                 raise node.fault_error()
             if node.connection.clock.now() >= deadline:
-                raise DriveTimeout(
-                    f"{what} does not finish",
-                    where=f"node {node.node}, 0x{item.index:04X}:{item.sub:02X}",
-                    likely="its trigger never came: the excitation did not start",
-                )
+                raise DriveTimeout(f"{what} does not finish", where=f"node {node.node}, {where}", likely=likely)
             node.connection.wait(POLL_S)
             node.supervision.check()
 

@@ -15,13 +15,13 @@ from typing import Literal
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.image import LUT_FORMAT_INT16, LUT_INT16_NO_POINT
+from pmsmtool.firmware.recorder_map import RecorderMap, Recording
 from pmsmtool.firmware.vendor_tuning import VendorTuning
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 
 Rounding = Literal["nearest", "down", "up"]
 Form = Literal["value", "time", "rate", "relative", "torque constant"]
-Recording = Literal["none", "element", "index", "domain"]
 Injecting = Literal["none", "current", "voltage"]
 
 LETTERS: dict[str, str] = {
@@ -218,8 +218,7 @@ class Capabilities:
     pdo : bool
         Live quantities as process data.
     recorder : str
-        ``none``; ``element`` (one object per sample), ``index`` (a sample register read again and again) or
-        ``domain`` (one upload).
+        ``none``, or how it is read: one of :data:`~pmsmtool.firmware.recorder_map.Recording`.
     injection : str
         ``none``, ``current`` or ``voltage`` set-points for d and q.
     averages : bool
@@ -257,6 +256,8 @@ class DriveMap:
         What it can do besides.
     signals : mapping of str to SignalCell
         Live quantities and references, by the names of :data:`SIGNALS`.
+    recorder : RecorderMap
+        What its recorder can be told to record, where that is not said by ``signals``.
     left_out : mapping of str to str
         What is not mapped and why, by catalogue or signal name.
     sources : mapping of str to str
@@ -274,6 +275,7 @@ class DriveMap:
     more_products: tuple[int, ...] = ()
     capabilities: Capabilities = Capabilities()
     signals: Mapping[str, SignalCell] = field(default_factory=dict)
+    recorder: RecorderMap = field(default_factory=RecorderMap)
     left_out: Mapping[str, str] = field(default_factory=dict)
     sources: Mapping[str, str] = field(default_factory=dict)
     vendor_tuning: VendorTuning | None = None

@@ -23,10 +23,12 @@ from pmsmtool.firmware.drive_map import (
     DriveMap,
     Form,
     Injecting,
-    Recording,
     Rounding,
     SignalCell,
 )
+from pmsmtool.firmware.recorder_map import Recording
+from pmsmtool.firmware.recorder_map_file import TABLE as RECORDER
+from pmsmtool.firmware.recorder_map_file import dump_recorder, parse_recorder
 from pmsmtool.firmware.vendor_tuning import VendorTuning
 from pmsmtool.firmware.vendor_tuning_file import TABLE, dump_vendor_tuning, parse_vendor_tuning
 from pmsmtool.firmware.wire_units import counted_in, wire_unit
@@ -42,11 +44,12 @@ COMMANDS = frozenset({0x6040, 0x6060, 0x6071, 0x607A, 0x60B1, 0x60B2, 0x60FF})
 """Objects whose writing moves the machine: never a parameter."""
 POLE_PAIRS = "motor.pole_pairs"
 _HEAD = ("schema", "name", "vendor", "product", "more_products", "staging")
-_TABLES = ("capabilities", "objects", "signals", "tables", "left_out", "sources", TABLE)
+_TABLES = ("capabilities", "objects", "signals", RECORDER, "tables", "left_out", "sources", TABLE)
 _CELL_KEYS = ("index", "sub", "type", "factor", "offset", "unit", "rounding", "form", "gain", "source")
 _TEXT_KEYS = ("type", "unit", "form", "rounding", "gain", "source")
 _SIGNAL_KEYS = ("index", "sub", "type", "unit", "source")
 _FORM_UNIT: dict[str, str] = {"time": "s", "rate": "1/s", "relative": "1", "torque constant": "N m/A"}
+_RECORDED = {name: dimension for name, dimension in SIGNALS.items() if not name.startswith("target_")}
 _CHOICES = {"recorder": get_args(Recording), "injection": get_args(Injecting)}
 
 Complain = Callable[[str, str], None]
@@ -70,7 +73,7 @@ def dump_drive_map(drive_map: DriveMap) -> str:
         head["more_products"] = drive_map.more_products
     plain = asdict(Capabilities())
     capabilities = {key: value for key, value in asdict(drive_map.capabilities).items() if value != plain[key]}
-    tuning = drive_map.vendor_tuning
+    tuning, recorder = drive_map.vendor_tuning, dump_recorder(drive_map.recorder)
     return toml_text(
         {
             **head,
@@ -78,6 +81,7 @@ def dump_drive_map(drive_map: DriveMap) -> str:
             "capabilities": capabilities,
             "objects": {name: _cell_row(cell) for name, cell in drive_map.cells.items()},
             "signals": {name: _signal_row(cell) for name, cell in drive_map.signals.items()},
+            **({RECORDER: recorder} if recorder else {}),
             "tables": {name: {"index": index, "sub": sub} for name, (index, sub) in drive_map.tables.items()},
             **({} if tuning is None else {TABLE: dump_vendor_tuning(tuning, _cell_row)}),
             "left_out": dict(drive_map.left_out),
@@ -163,9 +167,7 @@ def _check_head(document: Mapping[str, Any], complain: Callable[[tuple[str, ...]
             complain((key,), f"{key}: not a table")
 
 
-def _parse_tables(
-    document: Mapping[str, Any], complain: Callable[[tuple[str, ...], str], None]
-) -> dict[str, Any]:
+def _parse_tables(document: Mapping[str, Any], complain: Callable[[tuple[str, ...], str], None]) -> dict[str, Any]:
     def table(key: str) -> dict[str, Any]:
         found = document.get(key, {})
         return found if isinstance(found, dict) else {}
@@ -189,12 +191,18 @@ def _parse_tables(
         if cell.gain and cell.gain not in table("objects"):
             about("objects", name)("gain", f"its form needs {cell.gain}, which this map does not hold")
     live = table("signals").items()
+    capabilities = _parse_capabilities(table("capabilities"), complain)
+
+    def check_object(row: Any, keys: tuple[str, ...], tell: Complain) -> bool:
+        return _check_row(row, keys, sources, tell)
+
     signals = {name: _parse_signal(name, row, sources, about("signals", name)) for name, row in live}
     return {
         "cells": {row.name: cells[row.name] for row in EVERY if row.name in cells},
         "tables": {name: _parse_table(name, row, about("tables", name)) for name, row in table("tables").items()},
-        "capabilities": _parse_capabilities(table("capabilities"), complain),
+        "capabilities": capabilities,
         "signals": {name: signal for name, signal in signals.items() if signal is not None},
+        "recorder": parse_recorder(table(RECORDER), capabilities.recorder, _RECORDED, sources, complain, check_object),
         "left_out": _parse_left_out(table("left_out"), cells, complain),
         "sources": sources,
         TABLE: _parse_tuning(document.get(TABLE), cells, sources, complain),
@@ -329,7 +337,7 @@ def _check_row(
         tell("type", f"type {row.get('type')!r} is none of {', '.join(LETTERS)}")
         usable = False
     if not isinstance(row.get("unit"), str) or not row["unit"]:
-        tell("unit", "unit is missing: say what one count is worth, such as \"uV/A\" or \"mA rms\"")
+        tell("unit", 'unit is missing: say what one count is worth, such as "uV/A" or "mA rms"')
         usable = False
     if "source" in row and row["source"] not in sources:
         tell("source", f"source {row['source']!r} is not in [sources]")

@@ -8,23 +8,22 @@ there. Not confirmed, and not used: pre-trigger (0x58C2), edge triggers, and how
 
 from __future__ import annotations
 
-Address = tuple[int, str]
-"""Index (sub-index 0) and ``struct`` letter."""
+from pmsmtool.firmware.recorder_map import Address
 
-STATUS: Address = (0x58B0, "I")
+STATUS: Address = (0x58B0, 0, "I")
 DATA = 0x58B2
-LARGEST_BYTES: Address = (0x58B5, "I")
-BYTES_LEFT: Address = (0x58B7, "I")
-ENABLE: Address = (0x58C0, "H")
-DIVIDER: Address = (0x58C1, "H")
-WINDOW: Address = (0x58C3, "I")
-FIRST_MAP: Address = (0x58D0, "I")
-MAPPED: Address = (0x58E3, "H")
-ROW_BYTES: Address = (0x58E4, "H")
-REMOVE_DATA: Address = (0x58EA, "H")
-TRIGGER_KIND: Address = (0x58F0, "H")
-FORCE_TRIGGER: Address = (0x58F3, "H")
-LOOP_RATE_HZ: Address = (0x2520, "I")
+LARGEST_BYTES: Address = (0x58B5, 0, "I")
+BYTES_LEFT: Address = (0x58B7, 0, "I")
+ENABLE: Address = (0x58C0, 0, "H")
+DIVIDER: Address = (0x58C1, 0, "H")
+WINDOW: Address = (0x58C3, 0, "I")
+FIRST_MAP: Address = (0x58D0, 0, "I")
+MAPPED: Address = (0x58E3, 0, "H")
+ROW_BYTES: Address = (0x58E4, 0, "H")
+REMOVE_DATA: Address = (0x58EA, 0, "H")
+TRIGGER_KIND: Address = (0x58F0, 0, "H")
+FORCE_TRIGGER: Address = (0x58F3, 0, "H")
+LOOP_RATE_HZ: Address = (0x2520, 0, "I")
 """Rate of the position and velocity loops."""
 
 CHANNELS = 16

@@ -85,8 +85,49 @@ MISTAKES = [
     ("product = 7", "product = 7\nproducts = [8]", "products: unknown key", 5),
     ('name = "mine"', "name = 3", "name is missing", 2),
     ("[left_out]", "[capabilities]\ntorque_mode = 1\n[left_out]", "expected a bool", 16),
-    ("[left_out]", '[capabilities]\nrecorder = "paper"\n[left_out]', "expected none, element", 16),
+    ("[left_out]", '[capabilities]\nrecorder = "paper"\n[left_out]', "expected none, domain", 16),
     ("[left_out]", "[capabilities]\nflight = true\n[left_out]", "unknown capability", 16),
+]
+
+ROWS = """[capabilities]
+recorder = "rows"
+[recorder]
+i_q_a = { number = 14, unit = "0.01 A", source = "doc" }
+u_q_v = { number = 20, unit = "0.1 V" }
+[left_out]"""
+RINGS = """[capabilities]
+recorder = "rings"
+[recorder]
+period = { unit = "100 us", source = "doc" }
+i_q_a = { index = 0x6078, sub = 0, type = "INTEGER16", unit = "mA rms", source = "doc" }
+[left_out]"""
+RECORDER_MISTAKES = [
+    # (the table, what is replaced, by what, part of the message, line)
+    (ROWS, "number = 14, ", "", "number must be a trace variable's", 18),
+    (ROWS, "number = 14", "number = 0", "number must be a trace variable's", 18),
+    (ROWS, "number = 14", "number = 70000", "number must be a trace variable's", 18),
+    (ROWS, "number = 14", "number = true", "number must be a trace variable's", 18),
+    (ROWS, "number = 20", "number = 14", "is recorded as i_q_a already", 19),
+    (ROWS, "number = 14", "index = 0x6078", "unknown key index", 18),
+    (ROWS, 'unit = "0.01 A"', 'unit = ""', "unit is missing", 18),
+    (ROWS, 'unit = "0.01 A"', 'unit = "0.01 V"', "voltage, expected current", 18),
+    (ROWS, 'unit = "0.01 A"', 'unit = "permille of 0x6075"', "a record holds no 0x6075", 18),
+    (ROWS, 'unit = "0.01 A"', 'unit = "0 A"', "worth something", 18),
+    (ROWS, 'source = "doc"', 'source = "hearsay"', "not in [sources]", 18),
+    (ROWS, "i_q_a =", "i_x_a =", "no signal of that name", 18),
+    (ROWS, "i_q_a =", "target_torque_nm =", "no signal of that name", 18),
+    (ROWS, 'i_q_a = { number = 14, unit = "0.01 A", source = "doc" }', "i_q_a = 14", "needs number and unit", 18),
+    (ROWS, "u_q_v = {", 'period = { unit = "us" }\nu_q_v = {', "says its period itself", 19),
+    (ROWS, 'recorder = "rows"', 'recorder = "index"', "takes no channels", 17),
+    (RINGS, "index = 0x6078, ", "", "needs index", 19),
+    (RINGS, "index = 0x6078", "index = 0x1018", "outside 0x2000", 19),
+    (RINGS, '"INTEGER16"', '"INTEGER32"', "a ring is read in words", 19),
+    (RINGS, '"INTEGER16"', '"INTEGER17"', "is none of", 19),
+    (RINGS, "index = 0x6078", "number = 14, index = 0x6078", "unknown key number", 19),
+    (RINGS, 'unit = "mA rms"', 'unit = "mV"', "voltage, expected current", 19),
+    (RINGS, 'unit = "100 us"', 'unit = "100 V"', "voltage, expected time", 18),
+    (RINGS, 'unit = "100 us"', 'units = "100 us"', "unknown key units", 18),
+    (RINGS, '"100 us", source = "doc"', '"100 us", source = "hearsay"', "not in [sources]", 18),
 ]
 
 
@@ -102,6 +143,28 @@ def test_a_mistake_is_refused_with_file_and_line(old: str, new: str, complaint: 
     said = [text for text in caught.value.violations if complaint in text]
     assert said, caught.value.violations
     assert said[0].startswith(f"mine/map.toml:{line}: ")
+
+
+@pytest.mark.parametrize(("table", "old", "new", "complaint", "line"), RECORDER_MISTAKES)
+def test_a_mistake_about_the_recorder_is_refused(table: str, old: str, new: str, complaint: str, line: int) -> None:
+    text = GOOD.replace("[left_out]", table)
+    assert text.count(old) >= 1
+    before, place, after = text.partition("[capabilities]")
+    with pytest.raises(ConfigError) as caught:
+        parse(before + place + after.replace(old, new, 1))
+    said = [text for text in caught.value.violations if complaint in text]
+    assert said, caught.value.violations
+    assert said[0].startswith(f"mine/map.toml:{line}: ")
+
+
+@pytest.mark.parametrize("table", [ROWS, RINGS])
+def test_what_a_recorder_takes_is_read_and_written_back(table: str) -> None:
+    found = parse(GOOD.replace("[left_out]", table))
+    assert found.recorder.channels["i_q_a"].source == "doc"
+    assert parse(dump_drive_map(found)) == found
+    assert map_hash(found) != map_hash(parse(GOOD))
+    if table is RINGS:
+        assert (found.recorder.period, found.recorder.period_source) == ("100 us", "doc")
 
 
 def test_all_mistakes_are_listed_at_once() -> None:
@@ -176,7 +239,7 @@ def test_shipped_maps_can_be_used_and_say_where_they_come_from(family: str) -> N
     assert parse_drive_map(dump_drive_map(drive_map)) == drive_map
     if family == "pmsmsim":
         return
-    rows = [*drive_map.cells.values(), *drive_map.signals.values()]
+    rows = [*drive_map.cells.values(), *drive_map.signals.values(), *drive_map.recorder.channels.values()]
     assert all(row.source in drive_map.sources for row in rows)
     # the gains decide whether a design can be sent: mapped, or said why not
     for name in ("current.K_p_q_v_per_a", "current.K_i_q_v_per_as"):

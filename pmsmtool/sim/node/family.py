@@ -8,7 +8,7 @@ does not have are refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from pmsmtool.bus.abort_codes import AbortCode
@@ -22,7 +22,9 @@ from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.monitor import Monitor
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, Plant, PowerDrive
+from pmsmtool.sim.node.rings import Rings
 from pmsmtool.sim.node.schedule import Schedule
+from pmsmtool.sim.node.trace_rows import TraceRows
 
 OWN = range(0x2000, 0x6000)
 """Indices of the reference drive's own objects."""
@@ -48,6 +50,12 @@ COMMUTATION_ANGLE = 0x60EA
 ANGLE_COUNT_RAD = 2.0 * math.pi / 65536.0
 TIER_HIDES = {"inject": (0x2063, 0x2064), "recorder": (0x2050, 0x2051, 0x2052, 0x2063, 0x2064)}
 """What a reduced reference drive does not have: window averages; the excitation and current set-points too."""
+RECORDERS: Mapping[str, Callable[[DriveMap, Dictionary, Plant], object]] = {
+    "index": Monitor,
+    "rows": TraceRows,
+    "rings": Rings,
+}
+"""Makers' recorders by the kind a map says."""
 _TYPES = {
     "UNSIGNED8": "U8", "UNSIGNED16": "U16", "UNSIGNED32": "U32", "INTEGER8": "I8", "INTEGER16": "I16",
     "INTEGER32": "I32", "REAL32": "REAL32",
@@ -100,8 +108,9 @@ class Face:
 
     def attach(self, dictionary: Dictionary, plant: Plant, power: PowerDrive, schedule: Schedule) -> None:
         """Put the family's own functions over the running application."""
-        if self.drive_map.capabilities.recorder == "index":
-            Monitor(self.drive_map, dictionary, plant)
+        kind = RECORDERS.get(self.drive_map.capabilities.recorder)
+        if kind is not None:
+            kind(self.drive_map, dictionary, plant)
         own_identification.attach(self.drive_map, dictionary, plant, power, schedule)
 
 

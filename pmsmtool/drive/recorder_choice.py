@@ -1,0 +1,43 @@
+"""Which recorder a drive has, by what its map says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pmsmtool.drive.commanded_recorder import CommandedRecorder
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.monitor import MonitorRecorder
+from pmsmtool.drive.recorder import Recorder
+from pmsmtool.drive.ring_recorder import RingRecorder
+from pmsmtool.drive.row_recorder import RowRecorder
+from pmsmtool.errors import NotAvailable
+
+COMMANDED: Mapping[str, type[CommandedRecorder]] = {
+    "index": MonitorRecorder,
+    "rows": RowRecorder,
+    "rings": RingRecorder,
+}
+"""Makers' recorders by the kind a map says (``firmware.recorder_map.Recording``)."""
+
+
+def recorder_of(node: DriveNode, period_s: float) -> Recorder:
+    """Return the recorder of a drive.
+
+    Parameters
+    ----------
+    period_s : float
+        Control period, for the reference drive's recorder (s).
+
+    Raises
+    ------
+    NotAvailable
+        It has none that this program reads, or its map does not say enough of it.
+    """
+    if node.map.staging:
+        return Recorder(node, period_s)
+    kind = COMMANDED.get(node.map.capabilities.recorder)
+    if kind is None:
+        raise NotAvailable(
+            f"the drive map {node.map.name!r} has no recorder that this program reads", where=f"node {node.node}"
+        )
+    return kind(node)

@@ -1,0 +1,104 @@
+"""The trace of Copley Controls amplifiers behind the recorder's port: numbered variables, a row of them per sample.
+
+The trace stops by itself when its buffer is full; a shorter record is stopped when it is long enough. Data read while
+it runs may be torn: the trace must stand still before the data are read, and must not have moved afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pmsmtool.drive.commanded_recorder import CommandedRecorder, numbered
+from pmsmtool.errors import NotAvailable, SdoAbort
+from pmsmtool.firmware import trace_objects as objects
+from pmsmtool.trace import Trace
+
+
+class RowRecorder(CommandedRecorder):
+    """Recorder of a drive whose map says ``recorder = "rows"``."""
+
+    what = "trace"
+    start = "0x2508:00"
+    data = "0x2509:00"
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Signals it can take."""
+        return tuple(self._node.map.recorder.channels)
+
+    def _base_period_s(self) -> float:
+        reference_ns = self._get(objects.REFERENCE_PERIOD_NS)
+        self._channels_there = min(self._get(objects.COUNT), objects.CHANNELS)
+        if reference_ns <= 0:
+            raise NotAvailable("the drive says its trace has no period", where=f"node {self._node.node}, 0x2502:00")
+        return 1e-9 * reference_ns
+
+    def arm(
+        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool
+    ) -> None:
+        """Choose the variables and start the trace.
+
+        Raises
+        ------
+        NotAvailable
+            Not these signals, not this much memory, or a trigger it has not.
+        """
+        self._begin_arming(samples, decimation, pretrigger, at_excitation=at_excitation)
+        channels = self._chosen(signals, self._node.map.recorder.channels, self._channels_there)
+        self._stop()
+        for k in range(self._channels_there):
+            number = channels[k].number if k < len(channels) else 0
+            try:
+                self._put(numbered(objects.FIRST_CHANNEL, k), number)
+            except SdoAbort as abort:
+                raise NotAvailable(
+                    f"the drive does not trace variable {number} ({signals[k] if k < len(signals) else 'none'})",
+                    where=abort.where,
+                ) from abort
+        self._put(objects.PERIOD, decimation)
+        self._put(objects.DELAY, 0)
+        self._node.sdo.download(objects.TRIGGER, 0, objects.NO_TRIGGER)
+        largest = self._get(objects.LARGEST)  # follows the channels
+        if samples > largest:
+            raise self._too_much(signals, samples, f"{largest} samples", "0x2504:00")
+        self._put(objects.START, 1)
+
+    def fetch(self, signals: Sequence[str], decimation: int) -> Trace:
+        """Wait until the record is long enough, stop the trace and read it.
+
+        Raises
+        ------
+        DriveFault
+            The drive went into fault meanwhile.
+        DriveTimeout
+            The trace does not fill, or does not stop.
+        VerifyMismatch
+            It holds fewer rows than asked for or more than it can, or it moved while it was read.
+        """
+        channels = self._chosen(signals, self._node.map.recorder.channels, self._channels_there)
+        self._until(
+            lambda: self._get(objects.RECORDED) >= self._samples or not self._running(),
+            "the trace",
+            "0x2503:00",
+            lasts_s=self._lasts_s(decimation),
+        )
+        self._stop()
+        stored, largest = self._get(objects.RECORDED), self._get(objects.LARGEST)
+        if not self._samples <= stored <= largest:
+            raise self._wrong(f"{self._samples} rows were asked for, {stored} of at most {largest} are there")
+        size = stored * len(channels) * objects.NUMBER_BYTES
+        data = self._node.sdo.upload(objects.DATA, 0, size=size).data
+        if self._running() or self._get(objects.RECORDED) != stored:
+            raise self._wrong("the trace ran on while it was read")
+        table = np.frombuffer(data, "<i4").reshape(stored, len(channels))[: self._samples]
+        counts = {name: table[:, k] for k, name in enumerate(signals)}
+        return self._in_si(counts, [channel.unit for channel in channels], decimation)
+
+    def _running(self) -> bool:
+        return bool(self._get(objects.STATUS) & objects.RUNNING_BIT)
+
+    def _stop(self) -> None:
+        self._put(objects.START, 0)
+        self._until(lambda: not self._running(), "stopping the trace", "0x2501:00")

@@ -1,0 +1,116 @@
+"""What the simulated makers' recorders have in common: registers, and the recorder of the drive behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.firmware.recorder_map import Address
+from pmsmtool.firmware.wire_units import wire_unit
+from pmsmtool.sim.node.dictionary import Dictionary, Entry
+from pmsmtool.sim.node.drive_core import RecorderSetup, RecorderState
+from pmsmtool.sim.node.objects import ObjectRow
+from pmsmtool.sim.node.power_drive import Plant
+from pmsmtool.sim.signals import Signal
+
+SIGNALS = {
+    "position_rad": Signal.THETA_M,
+    "omega_M_rad_s": Signal.OMEGA_E,
+    "torque_nm": Signal.TAU,
+    "i_q_a": Signal.I_Q,
+    "i_d_a": Signal.I_D,
+    "u_q_v": Signal.U_Q,
+    "u_d_v": Signal.U_D,
+    "U_dc_v": Signal.U_DC,
+}
+"""Signals of a map, and the core's behind each; the speed is electrical there."""
+_TYPES = {"b": "I8", "B": "U8", "h": "I16", "H": "U16", "i": "I32", "I": "U32"}
+
+
+class RecorderFace:
+    """Registers of one session's recorder.
+
+    Parameters
+    ----------
+    dictionary : Dictionary
+        Dressed as the family's.
+    plant : Plant
+        The drive behind.
+    """
+
+    def __init__(self, dictionary: Dictionary, plant: Plant) -> None:
+        self._dictionary = dictionary
+        self._plant = plant
+        self._entries: dict[Address, Entry] = {}
+
+    def _register(self, *addresses: Address) -> None:
+        for index, sub, letter in addresses:
+            entry = Entry(_row(index, sub, _TYPES[letter]), 0)
+            self._entries[index, sub, letter] = entry
+            self._dictionary.show(entry)
+
+    def _shows(self, address: Address, value: Callable[[], int]) -> None:
+        """Make a register that shows a number of the recorder's own."""
+        self._register(address)
+        entry = self._entries[address]
+        entry.row = _row(address[0], address[1], entry.row.type, "ro")
+        entry.writable = False
+        entry.source = lambda: entry.encode(value())
+
+    def _takes(self, address: Address, sink: Callable[[bytes], None]) -> None:
+        """Make a register whose writing does something; the sink keeps the bytes where they count."""
+        self._register(address)
+        self._entries[address].sink = sink
+
+    def _gives(self, index: int, data: Callable[[], bytes]) -> None:
+        """Make a DOMAIN."""
+        entry = Entry(_row(index, 0, "DOMAIN", "ro"), 0)
+        entry.source = data
+        self._dictionary.show(entry)
+
+    def _number(self, address: Address) -> int:
+        return self._entries[address].integer()
+
+    def _keep(self, address: Address, data: bytes) -> None:
+        self._entries[address].value = data
+
+    # ---- the recorder behind --------------------------------------------------------------------
+
+    def _record(self, names: Sequence[str], depth: int, decimation: int) -> None:
+        self._plant.look()
+        channels = [SIGNALS[name] for name in names]
+        self._plant.core.record(RecorderSetup(channels=channels, depth=depth, decimation=decimation))
+
+    def _forget(self) -> None:
+        self._plant.look()
+        self._plant.core.record(None)
+
+    def _stored(self) -> int:
+        self._plant.look()
+        return self._plant.core.recorder().stored
+
+    def _complete(self) -> bool:
+        self._plant.look()
+        return self._plant.core.recorder().state is RecorderState.COMPLETE
+
+    def _counts(self, names: Sequence[str], units: Sequence[str]) -> NDArray[np.float64]:
+        """Return the rows stored, in counts."""
+        rows = np.frombuffer(self._plant.core.recording(), "<f4").reshape(-1, len(names)).astype(np.float64)
+        for k, (name, unit) in enumerate(zip(names, units, strict=True)):
+            if name == "omega_M_rad_s":
+                rows[:, k] /= max(1.0, self._plant.parameter("motor.pole_pairs"))
+            rows[:, k] /= wire_unit(unit).scale
+        return rows
+
+
+def whole(counts: NDArray[np.float64], kind: str) -> NDArray[np.generic]:
+    """Return counts as whole numbers of a type, cut to its range."""
+    bounds = np.iinfo(np.dtype(kind))
+    return np.clip(np.round(counts), bounds.min, bounds.max).astype(kind)
+
+
+def _row(index: int, sub: int, kind: str, access: str = "rw") -> ObjectRow:
+    default = "0" if kind != "DOMAIN" else ""
+    return ObjectRow(index, sub, "", "Recorder", kind, access, "0", "", default, None, None, False)
