@@ -14,7 +14,7 @@ from pmsmtool.drive.recorder import Recorder
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.trace import Trace
 
-LOOK, AT_REST, TURNING = 32, 256, 128
+LOOK, AT_REST, TURNING = 32, 128, 128
 """Rows of a mean that only looks, of half a window with the shaft at rest, and of both halves while it turns: a shaft
 that coasts slows down while a record is uploaded, and 6 signals of 128 rows are 57 ms at 1 Mbit/s."""
 REST_RAD_S = 20.0
@@ -55,7 +55,8 @@ class RecordedMeans(Recorder):
 
     At rest the rows are one right after the other, from the beginning of the window: what the noise of one current
     does to the voltage the next ones take back, so that thinned out they would carry the noise times the controller's
-    gain (4.7 mV instead of 1.3 mV in a level of interior-2k2). While the shaft turns the rows span the whole turns.
+    gain (400 rows four periods apart scattered by 5 mV in the levels of interior-2k2, and R was refused). While the
+    shaft turns the rows span the whole turns.
     """
 
     _decimation = 1
