@@ -57,8 +57,10 @@ class FrequencySplit:
         Loop resistance at the temperature of the measurement, and its statistical standard deviation.
     chi2, verdict : float, Verdict
         Of the fit.
-    V_device_v : float
-        Plateau of the part that does not depend on the frequency (V).
+    V_device_v, V_device_std_v : float
+        Plateau of the part that does not depend on the frequency, and its statistical standard deviation (V).
+    V_dead_std_v : float
+        Statistical standard deviation of :attr:`V_dead_v` (V).
     curve : InverterCurve
         Part that scales with the frequency, at the drive's own one: dead time and slow edges.
     drift : float
@@ -72,6 +74,8 @@ class FrequencySplit:
     chi2: float
     verdict: Verdict
     V_device_v: float
+    V_device_std_v: float
+    V_dead_std_v: float
     curve: InverterCurve
     drift: float
     periods_s: tuple[float, float]
@@ -150,12 +154,18 @@ def split_by_frequency(
     best = min(fits, key=lambda fit: fit[2] / fit[3])
     verdict, widen = chi2_gate(best[2] / best[3], STAGE)
     condition_gate(best[4], "R_s and the dead time", STAGE)
-    variance = sum(w * (fit[1][0, 0] * widen**2 + (fit[0][0] - R) ** 2) for w, fit in zip(weights, fits, strict=True))
+    stds = [
+        math.sqrt(
+            sum(w * (fit[1][k, k] * widen**2 + (fit[0][k] - x[k]) ** 2) for w, fit in zip(weights, fits, strict=True))
+        )
+        for k in range(len(x))
+    ]
     model = math.hypot(MODEL_STD, DRIFT_SECOND_ORDER * abs(drift), tolerance.voltage_scale_std)
-    std = math.hypot(math.sqrt(float(variance)), model * R)
+    std = math.hypot(stds[0], model * R)
     magnitude = np.array([np.mean(np.abs(rows.i[rows.group == k])) for k in range(int(rows.group.max()) + 1)])
     curve = InverterCurve(phase_factor * magnitude, phase_factor * x[5:], 0.0)
-    return FrequencySplit(R, std, best[2] / best[3], verdict, V_device, curve, drift, periods)
+    V_stds = phase_factor * stds[1], phase_factor * stds[-1]
+    return FrequencySplit(R, std, best[2] / best[3], verdict, V_device, *V_stds, curve, drift, periods)
 
 
 def _matched(levels: Trace, slower: Trace, share: float, least_current: float) -> _Rows:

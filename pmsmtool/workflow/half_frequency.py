@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -22,6 +21,7 @@ from pmsmtool.estimators.resistance import (
 )
 from pmsmtool.experiments.half_frequency import hold_at_half_frequency
 from pmsmtool.experiments.standstill import LevelPlan, calm_sequence
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
 TRACE = "levels_half_frequency"
@@ -38,9 +38,10 @@ def measure_at_half_frequency(
 ) -> None:
     """Hold the levels that R is fitted to at half the control frequency, where that was asked for.
 
-    It takes 7 to 13 s and does not make R itself better by much (24 switched drives of the hard class: p90 of the
-    error 0.19 to 0.18 %, the rest are the bridge's thresholds, which no current shows), but its statistical interval
-    half as wide; so it is not done by itself.
+    It is not done by itself: it takes some 8 s, and on switched drives of the hard class R is as good without, for
+    what is off are the bridge's thresholds, which no current shows (p90 0.12 and 0.13 %, max 0.18 and 0.18 %). What
+    it gives is half the statistical interval of R and the two parts of the inverter's error
+    (``benchmarks/tables/half_frequency.txt``).
     """
     if not asked:
         if resistance.hardness > HARD_RATIO:
@@ -85,24 +86,30 @@ def resistance_at_two_frequencies(
     return extrapolated(result, split, copper, tolerance), split
 
 
-def split_conditions(split: FrequencySplit | None, U_dc_v: float) -> dict[str, Any]:
+def split_estimates(split: FrequencySplit | None, U_dc_v: float, tolerance: SensorTolerance) -> dict[str, Estimate]:
+    """Return both parts as values of a stage: the devices' drop (V), and the dead time that takes the other one (s)."""
+    if split is None:
+        return {}
+    method = "multi-level DC at two control frequencies"
+
+    def estimate(value: float, std: float, unit: str) -> Estimate:
+        return Estimate(value=value, std=std, systematic=tolerance.voltage_gain * abs(value), unit=unit, method=method)
+
+    dead_time_s = split.dead_time_s(U_dc_v)
+    std_s = split.V_dead_std_v * split.periods_s[0] / U_dc_v
+    return {
+        "dead_time_equivalent_s": estimate(dead_time_s, std_s, "s"),
+        "device_drop_v": estimate(split.V_device_v, split.V_device_std_v, "V"),
+    }
+
+
+def split_conditions(split: FrequencySplit | None, parts: Mapping[str, Estimate]) -> dict[str, Any]:
     """Return the inverter's error in its two parts, as a machine file keeps it under ``[conditions]``."""
     if split is None:
         return {}
-    facts: dict[str, Any] = {
+    return {
         "control_frequencies_hz": [1.0 / period for period in split.periods_s],
         "dead_time_error_i_apk": list(map(float, split.curve.i_phase_a)),
         "dead_time_error_v": list(map(float, split.curve.u_error_v)),
-        "device_drop_v": split.V_device_v,
+        **{name: part.value for name, part in parts.items()},
     }
-    if math.isfinite(U_dc_v):
-        facts["dead_time_equivalent_s"] = split.dead_time_s(U_dc_v)
-    return facts
-
-
-def split_summary(split: FrequencySplit | None, U_dc_v: float) -> str:
-    """Return the inverter's error in its two parts, as a line of a summary goes on; empty without them."""
-    if split is None:
-        return ""
-    dead_time_us = 1e6 * split.dead_time_s(U_dc_v)
-    return f", dead time {dead_time_us:.3g} us ({split.V_dead_v:.3g} V), devices {split.V_device_v:.3g} V"

@@ -40,7 +40,8 @@ from pmsmtool.units import format_estimate
 from pmsmtool.workflow import frequency_stage, half_frequency, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
-from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Limits, Measurement, steps_of
+from pmsmtool.workflow.limits import Limits
+from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Measurement, steps_of
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
 MACHINE = "machine.toml"
@@ -263,8 +264,8 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         U_dc_v=nameplate.inverter.U_dc_v,
         tolerance=request.tolerance,
     )
-    U_dc_v = nameplate.inverter.U_dc_v
-    conditions = _conditions(evaluation, request) | half_frequency.split_conditions(evaluation.split, U_dc_v)
+    parts = half_frequency.split_estimates(evaluation.split, nameplate.inverter.U_dc_v, request.tolerance)
+    conditions = _conditions(evaluation, request) | half_frequency.split_conditions(evaluation.split, parts)
     machine = machine_of(evaluation, nameplate, conditions)
     text = dump_machine_file(machine)
     target, prefix = (run, "") if _may_write(run, text) else (_beside(run), f"{REPLAYED}/")
@@ -280,7 +281,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         "pass" if all(line.ok for line in acceptance) else "fail",
         0.0,
         values=[
-            *(value_facts(name, estimate) for name, estimate in found.items()),
+            *(value_facts(name, estimate) for name, estimate in (found | parts).items()),
             *map(check_facts, evaluation.checks),
         ],
         acceptance=acceptance,
@@ -292,7 +293,6 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
             for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
             if name in found
         )
-        + half_frequency.split_summary(evaluation.split, U_dc_v)
         + map_stage.map_summary(evaluation.flux_map)
         + frequency_stage.response_summary(evaluation.frequency_response),
     )

@@ -86,6 +86,7 @@ def test_dead_time_of_any_shape_falls_out(seed: int) -> None:
 def test_the_dead_time_follows_from_voltage_and_period() -> None:
     d, rng = hard(1, 9)
     split, _ = split_of(d, 0, rng)
+    assert 0.0 < split.V_dead_std_v < 1e-3 * split.V_dead_v
     assert split.dead_time_s(d.U_dc[0]) == pytest.approx(split.V_dead_v * PERIOD_S / d.U_dc[0])
 
 
