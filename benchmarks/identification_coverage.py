@@ -37,7 +37,8 @@ from pmsmtool.sim.simulated_machine import Settings, device_slope_ohm
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, evaluate
 from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of
-from pmsmtool.workflow.measure import Limits, Measurement
+from pmsmtool.workflow.limits import Limits
+from pmsmtool.workflow.measure import Measurement
 from pmsmtool.workflow.random_drives import draw_around, draw_drive, true_loop_resistance
 
 QUANTITIES = ("R_at_T_ohm", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "offset_rad")

@@ -44,7 +44,8 @@ from pmsmtool.sim.simulated_machine import Settings, device_slope_ohm
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import evaluate
 from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of
-from pmsmtool.workflow.measure import Limits, Measurement
+from pmsmtool.workflow.limits import Limits
+from pmsmtool.workflow.measure import Measurement
 from pmsmtool.workflow.random_drives import draw_drive
 from pmsmtool.workflow.tier_identify import (
     HEADROOM,

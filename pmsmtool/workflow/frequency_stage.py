@@ -17,7 +17,7 @@ from pmsmtool.workflow.run_directory import RunDirectory
 
 if TYPE_CHECKING:
     from pmsmtool.workflow.evaluate import Evaluation
-    from pmsmtool.workflow.measure import Limits
+    from pmsmtool.workflow.limits import Limits
 
 TRACE = "frf_"
 """Followed by the number of a record."""

@@ -23,7 +23,7 @@ from pmsmtool.workflow.run_directory import Acceptance, RunDirectory
 
 if TYPE_CHECKING:
     from pmsmtool.workflow.evaluate import Evaluation
-    from pmsmtool.workflow.measure import Limits
+    from pmsmtool.workflow.limits import Limits
 
 MAP_FILE = "flux_map.npz"
 MAP_CSV = "flux_map.csv"

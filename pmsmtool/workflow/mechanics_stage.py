@@ -20,7 +20,7 @@ from pmsmtool.trace import Trace
 
 if TYPE_CHECKING:
     from pmsmtool.workflow.evaluate import Evaluation
-    from pmsmtool.workflow.measure import Limits
+    from pmsmtool.workflow.limits import Limits
 
 Array = NDArray[np.float64]
 

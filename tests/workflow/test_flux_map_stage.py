@@ -35,7 +35,7 @@ from pmsmtool.trace import Trace
 from pmsmtool.workflow import map_stage
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, identify_stage, nameplate_of, replay
-from pmsmtool.workflow.measure import Limits
+from pmsmtool.workflow.limits import Limits
 from pmsmtool.workflow.run_directory import RunDirectory, new_record
 
 PROFILE = "saturated-pmsyrm"

@@ -17,7 +17,8 @@ from pmsmtool.sim.simulated_machine import settings_of, with_simulation
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import evaluate
 from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of
-from pmsmtool.workflow.measure import Limits, Measurement
+from pmsmtool.workflow.limits import Limits
+from pmsmtool.workflow.measure import Measurement
 
 LIMIT = {"J_kgm2": 0.02, "tau_c_nm": 0.05, "B_nms": 0.08}
 """Measured: 0.11, 0.4 and 0.5 % (fast-ipm), 0.77, 0.78 and 0.75 % (saturated-pmsyrm without its map, which would be

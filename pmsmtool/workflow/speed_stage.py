@@ -1,0 +1,172 @@
+"""The flux linkage's part of an identification: what turns the shaft, from the first push to coasting with current."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pmsmtool.design.current_loop import imc
+from pmsmtool.drive.port import Drive
+from pmsmtool.estimators.encoder import EncoderResult
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.resistance import ResistanceResult
+from pmsmtool.experiments import speed_run
+from pmsmtool.trace import Trace
+from pmsmtool.workflow.limits import Limits
+
+EMF_SHARE = 0.8
+"""Largest speed of the flux run: back-emf of this share of the largest voltage."""
+RUN_BANDWIDTH_RAD_S = 2.0 * math.pi * 120.0
+"""Current bandwidth of the runs that turn the shaft, at most a fifteenth of the sampling rate; the flux run may have
+more."""
+PUSH_SHARE = 0.5
+PUSH_SPEED_SHARE = 0.12
+PUSH_SAMPLES = 1024
+SPEED_LOOP_RAD_S = 25.0
+RUN_I_D_SHARE = 0.45
+"""Largest d current of the flux run, of the test current: a third of it is still beyond the inverter's knee."""
+SATURATED = 1.5
+"""Largest ratio of the chord of psi_d over the run's i_d to the rough L_d, which is that of a saturated bias."""
+RUN_I_Q_SPEED_SHARE = 0.15
+RUN_I_Q_S = 0.08
+"""A q current of the flux run may change the speed by this share of the largest in this time."""
+REACTANCE_SHARE = 0.25
+"""Voltage that the accelerating current may need at the largest speed, of the largest voltage."""
+REST_SHARE = 0.02
+"""Speed that counts as standstill, of the largest of the flux run."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedStage:
+    """The pushes and the flux run on one drive; the fields are those of ``measure.Measurement``."""
+
+    drive: Drive
+    limits: Limits
+    keep: Callable[[str, Trace], None]
+    say: Callable[[str], None]
+
+    def measure(self, resistance: ResistanceResult, encoder: EncoderResult, L: tuple[float, float]) -> None:
+        """Push the shaft, then coast with current through the speeds, under control by what was found so far."""
+        pole_pairs = round(encoder.pole_pairs.value)
+        alpha = min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s))
+        d, q = (imc(resistance.R_measured.value, inductance, alpha) for inductance in L)
+        self.drive.disable()
+        self.drive.write(
+            {
+                "motor.L_d_h": L[0],
+                "motor.L_q_h": L[1],
+                "motor.L_d_app_h": L[0],
+                "motor.L_q_app_h": L[1],
+                "current.K_p_d_v_per_a": d.K_p,
+                "current.K_i_d_v_per_as": d.K_i,
+                "current.K_p_q_v_per_a": q.K_p,
+                "current.K_i_q_v_per_as": q.K_i,
+            }
+        )
+        self.drive.enable()
+        psi, J = self._pushes(resistance, pole_pairs)
+        self._speeds(psi, J, pole_pairs, L, resistance.V_dead_v)
+
+    def _pushes(self, resistance: ResistanceResult, pole_pairs: int) -> tuple[float, float]:
+        """Push the rotor there and back; return flux linkage (Wb) and inertia (kg m2), good for a speed controller."""
+        limits = self.limits
+        self.say("flux and inertia, roughly: short pushes both ways")
+        target = PUSH_SPEED_SHARE * limits.omega_max_rad_s
+        rate = self._acceleration_per_ampere(target, pole_pairs)
+        current = PUSH_SHARE * limits.I_test_apk
+        decimation = max(1, round(target / (rate * current) / (PUSH_SAMPLES * self.drive.period_s)))
+        pushes = [self._push(sign * current, PUSH_SAMPLES, decimation, pole_pairs) for sign in (1.0, -1.0)]
+        for k, push in enumerate(pushes):
+            self.keep(f"push_{k}", push)
+        fastest = max(pushes, key=lambda trace: float(abs(trace["omega_e_rad_s"][-64:].mean())))
+        tail = slice(-64, None)
+        omega = float(fastest["omega_e_rad_s"][tail].mean())
+        i_q = float(fastest["i_q_a"][tail].mean())
+        error = resistance.V_dead_v * (1.0 if i_q > 0.0 else -1.0) * 4.0 / math.pi
+        psi = (float(fastest["u_q_v"][tail].mean()) - resistance.R_measured.value * i_q - error) / omega
+        if not psi > 0.0:
+            raise refuse(
+                "E_EXCITATION",
+                f"the voltage at {omega:.3g} rad/s shows no flux linkage ({psi:.3g} Wb)",
+                stage="speed run",
+                likely="the pushes were too slow for this inverter's dead time",
+                hint="allow a higher --speed-max",
+            )
+        return psi, 1.5 * pole_pairs * psi / rate
+
+    def _acceleration_per_ampere(self, target: float, pole_pairs: int) -> float:
+        """Return the acceleration per ampere (rad/s2/A), from pushes that grow until the shaft answers."""
+        current, seconds = 0.1 * self.limits.I_test_apk, 0.02
+        for _ in range(8):
+            decimation = max(1, round(seconds / (256 * self.drive.period_s)))
+            push = self._push(current, 256, decimation, pole_pairs)
+            omega = push["omega_e_rad_s"] / pole_pairs
+            change = float(omega[-16:].mean() - omega[:16].mean())
+            self._push(-current, 256, decimation, pole_pairs)
+            if abs(change) > 0.15 * target:
+                # from the current that flowed: a slow loop, or a dead time, lets it rise late
+                return abs(change) / abs(float(np.sum(push["i_q_a"][8:-8])) * push.period_s)
+            if current < 0.4 * self.limits.I_test_apk:
+                current *= 2.0
+            else:
+                seconds *= min(4.0, 0.5 * target / max(abs(change), 1e-3 * target))
+        raise refuse(
+            "E_EXCITATION",
+            "the shaft does not answer a push",
+            stage="speed run",
+            likely="a locked shaft, a brake that is closed, or an encoder that does not count",
+        )
+
+    def _push(self, i_q_a: float, samples: int, decimation: int, pole_pairs: int) -> Trace:
+        omega_e = 0.9 * pole_pairs * self.limits.omega_max_rad_s
+        return speed_run.push_and_record(self.drive, i_q_a, samples, decimation, omega_e)
+
+    def _speeds(self, psi: float, J: float, pole_pairs: int, L: tuple[float, float], V_dead_v: float) -> None:
+        limits = self.limits
+        run_i_d = RUN_I_D_SHARE * limits.I_test_apk
+        flux = psi + SATURATED * L[0] * run_i_d
+        largest = min(limits.omega_max_rad_s / 1.1, EMF_SHARE * limits.V_max_v / (flux * pole_pairs))
+        # the accelerating current must leave voltage for itself: omega_e L_q i_q stands beside the back-emf
+        i_run = min(0.5 * limits.I_test_apk, REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L)))
+        per_ampere = 1.5 * pole_pairs * psi / J
+        i_q = min(0.5 * i_run, RUN_I_Q_SPEED_SHARE * largest / (RUN_I_Q_S * per_ampere))
+        # a current that is slow because the inverter's error is steep would not be steady in its window
+        loop = speed_run.steady_loop(
+            self.drive.read("motor.R_s_ohm"),
+            L,
+            V_dead_v,
+            min(map(min, speed_run.D_SHARES)) * run_i_d,
+            self.drive.period_s,
+            min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s)),
+        )
+        self._off_and_write(
+            {
+                "current.K_p_d_v_per_a": loop.K_p_v_per_a[0],
+                "current.K_p_q_v_per_a": loop.K_p_v_per_a[1],
+                "current.K_i_d_v_per_as": loop.K_i_v_per_as[0],
+                "current.K_i_q_v_per_as": loop.K_i_v_per_as[1],
+                "motor.psi_f_wb": psi,
+                "motor.J_kgm2": J,
+                "current.options": 7.0,
+                "speed.K_p_nms_per_rad": 2.0 * SPEED_LOOP_RAD_S * J,
+                "speed.K_i_nm_per_rad": SPEED_LOOP_RAD_S**2 * J,
+                "speed.tau_max_nm": 1.6 * J * per_ampere * i_run,
+                "speed.acceleration_rpm_per_s": per_ampere * i_run * 30.0 / math.pi,
+            }
+        )
+        self.drive.enable()
+        fastest_rpm = largest * 30.0 / math.pi
+        self.say(f"psi_f and fine offset: coasting from up to {fastest_rpm:.0f} rpm, i_d up to {run_i_d:.3g} A")
+        plan = speed_run.SpeedPlan(largest, run_i_d, i_q, settle_s=loop.settle_s, first_s=2.0 * loop.settle_s)
+        rows = speed_run.coast_through(self.drive, plan, pole_pairs)
+        speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)
+        lag_s = 2.0 / self.drive.read("encoder.pll_bandwidth_rad_s")  # its poles are a double one
+        facts = {"pole_pairs": pole_pairs, "U_dc_v": math.sqrt(3.0) * limits.V_max_v, "speed_lag_s": lag_s}
+        self.keep("speeds", speed_run.speeds_trace(rows, facts))
+
+    def _off_and_write(self, values: Mapping[str, float]) -> None:
+        self.drive.disable()
+        self.drive.write(values)
