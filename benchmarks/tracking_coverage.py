@@ -2,10 +2,10 @@
 
     python -m benchmarks.tracking_coverage --drives 80
 
-Every drive follows from its seed: a profile whose R, L, psi, dead time, inverter shape and knee, noise and temperatures
-are drawn, run for eight seconds through drawn speeds and loads while winding and magnets warm up. What the filter knows
-before is drawn, too, within the deviations that ``track`` gives it: inductances off by 2 %, the inverter's error by
-10 %, R and psi as at the reference temperature. The inverter is the averaged one, so that its curve is known up to that
+Every drive follows from its seed: a profile whose R, L, psi, dead time, device drop, shape and knee of the inverter's
+error and temperatures are drawn, with the profile's own noise; it runs for eight seconds through drawn speeds and loads
+while winding and magnets warm up. What the filter knows before: inductances off by a draw of 2 % standard deviation, the
+inverter's error by one of 10 %, R and psi as they are at the reference temperature. The inverter is the averaged one, so that its curve is known up to that
 factor; how well identification finds the curve is ``identification_coverage``. Errors within a run are one draw: the
 coverage is that of the last value and, beside it, the mean share of the time after the first two seconds.
 

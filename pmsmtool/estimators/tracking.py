@@ -65,7 +65,7 @@ class Track:
     t_s : ndarray, shape (n,)
         Instants of the observations.
     value, std : mapping of str to ndarray, shape (n,)
-        By name of :data:`TRACKED`; the standard deviation contains the inflation.
+        By name of ``tracking_model.TRACKED``; the standard deviation contains the inflation.
     nis : float
         Mean normalised innovation squared, before an inflation.
     inflation : float
@@ -167,7 +167,7 @@ class Tracker:
         return nis
 
     def state(self) -> tuple[Array, Array]:
-        """Return values and standard deviations of :data:`STATES`."""
+        """Return values and standard deviations of ``tracking_model.STATES``."""
         scale = self._known.scale
         return self._filter.x * scale, np.sqrt(np.diag(self._filter.P)) * scale
 
@@ -200,11 +200,11 @@ def track(observations: Trace, known: Known, wanted: Sequence[str] = TRACKED) ->
     Parameters
     ----------
     observations : Trace
-        Signals of :data:`SIGNALS`, one row per window (:func:`condense`).
+        Signals of ``tracking_model.SIGNALS``, one row per window (``tracking_model.condense``).
     known : Known
         What is known before.
     wanted : sequence of str
-        Out of :data:`TRACKED`: what must be identifiable.
+        Out of ``tracking_model.TRACKED``: what must be identifiable.
 
     Raises
     ------

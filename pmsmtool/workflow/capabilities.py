@@ -361,6 +361,7 @@ def reference_capabilities(identity: Identity) -> Capabilities:
 
 
 _FULL = "benchmarks.identification_coverage --drives 12 --first 9000"
+_MECHANICS = "benchmarks.mechanics_accuracy --drives 12 --first 9000"
 _RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 80 --first 5000"
 _STANDARD_RUN = "benchmarks.tier_intervals standard --drives 76 --first 5000 --speed 1.35"
 
@@ -376,7 +377,7 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("L", Method.INJECT): _expected(_FULL, 12, ("L_d_h", 1.4, "%"), ("L_q_h", 1.4, "%")),
     ("psi", Method.INJECT): _expected(_FULL, 12, ("psi_f_wb", 1.1, "%")),
     ("encoder", Method.INJECT): _expected(_FULL, 12, ("offset_rad", 0.11, "deg")),
-    ("mechanics", Method.INJECT): _expected(_FULL, 12, ("J_kgm2", 3.0, "%")),
+    ("mechanics", Method.INJECT): _expected(_MECHANICS, 12, ("J_kgm2", 1.4, "%")),
     ("R", Method.RECORDER): _expected(_RECORDER_RUN, 79, ("R_s_ohm", 6.8, "%")),
     ("L", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("L_q_app_h", 8.0, "%")),
     ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("psi_f_wb", 1.2, "%")),
