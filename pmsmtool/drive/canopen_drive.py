@@ -11,7 +11,7 @@ from pmsmtool.cia402 import Mode, State
 from pmsmtool.drive import objects, stop
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.drive.port import Excitation, Halves, Injection, Shape
+from pmsmtool.drive.port import Excitation, Halves, Injection, Recording, Shape
 from pmsmtool.drive.recorder import Recorder
 from pmsmtool.errors import ConfigError, DriveFault, NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap
@@ -196,14 +196,17 @@ class CanopenDrive:
         DriveFault
             The drive tripped, or the excitation left its abort limits.
         """
+        return self.take(Recording(signals, samples, decimation, excitation, pretrigger), self.wait)
+
+    def take(self, recording: Recording, wait: Callable[[float], None]) -> Trace:
+        """Prepare, begin and finish a record; ``wait`` lets time pass. An excitation ends however this ends."""
+        excitation = recording.excitation
         if excitation is not None:
             self.prepare(excitation)
         try:
-            self.begin_record(
-                signals, samples, decimation=decimation, excitation=excitation, pretrigger=pretrigger, wait=self.wait
-            )
-            self.wait(samples * decimation * self.period_s)
-            return self.finish_record(signals, decimation=decimation, excitation=excitation)
+            self.begin_record(recording, wait)
+            wait(recording.samples * recording.decimation * self.period_s)
+            return self.finish_record(recording)
         finally:
             if excitation is not None:
                 self.end_excitation()
@@ -221,17 +224,9 @@ class CanopenDrive:
             data = b"".join(objects.DriveObject(0, 0, "f").encode(value) for value in excitation.buffer)
             self.node.write_bytes(*objects.EXCITATION_BUFFER, data)
 
-    def begin_record(
-        self,
-        signals: Sequence[str],
-        samples: int,
-        *,
-        decimation: int,
-        excitation: Excitation | None,
-        pretrigger: int,
-        wait: Callable[[float], None],
-    ) -> None:
+    def begin_record(self, recording: Recording, wait: Callable[[float], None]) -> None:
         """Start the (prepared) excitation and the recorder, in the order its ``lead_s`` asks for."""
+        excitation, decimation, pretrigger = recording.excitation, recording.decimation, recording.pretrigger
         lead_s = 0.0 if excitation is None else excitation.lead_s
         in_current_mode = excitation is not None and excitation.point is not Injection.SPEED
         if lead_s > 0.0:
@@ -240,20 +235,20 @@ class CanopenDrive:
             self.node.command(objects.EXCITATION_COMMAND, 2)
             wait(lead_s)
         at_start = excitation is not None and lead_s <= 0.0
-        self.recorder.arm(signals, samples, decimation, pretrigger, at_excitation=at_start)
+        self.recorder.arm(recording.signals, recording.samples, decimation, pretrigger, at_excitation=at_start)
         if at_start:
             if in_current_mode:  # not before: a shaft that turned under speed control coasts from here on
                 self._set_mode(Mode.IDENTIFICATION)
             wait(pretrigger * decimation * self.period_s)
             self.node.command(objects.EXCITATION_COMMAND, 2)
 
-    def finish_record(self, signals: Sequence[str], *, decimation: int, excitation: Excitation | None) -> Trace:
+    def finish_record(self, recording: Recording) -> Trace:
         """Wait until the recorder is complete and return its trace, if the drive did not trip meanwhile."""
-        trace = self.recorder.fetch(signals, decimation)
+        trace = self.recorder.fetch(recording.signals, recording.decimation)
         self.check_operating()
-        if excitation is None:
+        if recording.excitation is None:
             return trace
-        return replace(trace, meta={**trace.meta, "excitation": _excitation_facts(excitation)})
+        return replace(trace, meta={**trace.meta, "excitation": _excitation_facts(recording.excitation)})
 
     def check_operating(self) -> None:
         """Make sure that a machine that was enabled still is: what a stopped one shows is no measurement.

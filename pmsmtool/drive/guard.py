@@ -20,7 +20,7 @@ from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
-from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, Shape
+from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, Recording, Shape
 from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import (
     BusError,
@@ -291,19 +291,8 @@ class GuardedDrive:
         pretrigger: int = 0,
     ) -> Trace:
         """Record signals, with an excitation whose abort limits are at most the envelope's."""
-        seconds = samples * decimation * self.period_s
         within = None if excitation is None else self._within(excitation)
-        if within is not None:
-            self._drive.prepare(within)
-        try:
-            self._drive.begin_record(
-                signals, samples, decimation=decimation, excitation=within, pretrigger=pretrigger, wait=self.wait
-            )
-            self.wait(seconds)
-            return self._drive.finish_record(signals, decimation=decimation, excitation=within)
-        finally:
-            if within is not None:
-                self._drive.end_excitation()
+        return self._drive.take(Recording(signals, samples, decimation, within, pretrigger), self.wait)
 
     def wait(self, seconds: float) -> None:
         """Let time pass, looking at the machine in between."""

@@ -80,6 +80,17 @@ class Excitation:
     lead_s: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One record: signals every ``decimation`` control periods, from ``pretrigger`` samples before the excitation."""
+
+    signals: Sequence[str]
+    samples: int
+    decimation: int = 1
+    excitation: Excitation | None = None
+    pretrigger: int = 0
+
+
 class Halves(NamedTuple):
     """Means of two windows, one right after the other, and how many samples of every signal both hold together."""
 

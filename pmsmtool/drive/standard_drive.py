@@ -19,9 +19,10 @@ from pmsmtool.drive.canopen_drive import RAD_S_PER_MRPM, CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.recorder import Recorder
 from pmsmtool.errors import DriveTimeout, NotAvailable, SdoAbort
+from pmsmtool.estimators.recorded_push import DELAY_DOUBT_PERIODS
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.trace import Trace
 
@@ -37,6 +38,11 @@ SPARE_ROWS = 8
 """Rows a record of a step is longer, to take off the beginning what came before it."""
 QUARTER_TURN = 0.5 * math.pi
 """Torque current flows a quarter turn ahead of the commutation angle; the rotor's d axis settles there."""
+
+
+def rated_apk(node: DriveNode) -> float:
+    """Return the rated current (A peak; 0x6075 taken as rms, the larger of the two readings)."""
+    return 1e-3 * math.sqrt(2.0) * node.get(objects.RATED_CURRENT_MA)
 
 
 class StandardDrive(CanopenDrive):
@@ -62,7 +68,7 @@ class StandardDrive(CanopenDrive):
         self._speed_rad_s = 0.0
         try:
             self.counts_per_turn = self.node.get(ENCODER_COUNTS) / max(1.0, self.node.get(MOTOR_TURNS))
-            self._rated_apk = 1e-3 * math.sqrt(2.0) * self.node.get(objects.RATED_CURRENT_MA)
+            self._rated_apk = rated_apk(self.node)
         except SdoAbort as abort:
             raise NotAvailable(
                 "the drive does not say how many increments its encoder has (0x608F) or what its rated current is "
@@ -165,17 +171,10 @@ class PolledMeans(Recorder):
         return {name: total / self.SAMPLES for name, total in sums.items()}
 
 
-class RecorderDrive(CanopenDrive):
-    """A drive with a recorder and a torque mode, without excitation; the part of ``drive.port.Drive`` that this gives.
+class TorqueCurrent(CanopenDrive):
+    """A drive that takes a q current as torque, in permille of rated: both are taken as proportional."""
 
-    A q current is asked for as torque, in permille of rated: current and torque are taken as proportional, which a
-    recorded current then corrects.
-    """
-
-    def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
-        super().__init__(connection, node_id, drive_map=drive_map)
-        self._rated_apk = 1e-3 * math.sqrt(2.0) * self.node.get(objects.RATED_CURRENT_MA)
-        self._late_s = 0.0
+    _rated_apk: float
 
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero torque."""
@@ -190,39 +189,53 @@ class RecorderDrive(CanopenDrive):
             raise NotAvailable("the drive takes no current set-point, only torque", where=f"node {self.node.node}")
         self.node.put(objects.TARGET_TORQUE_PERMILLE, round(1000.0 * i_q_a / self._rated_apk))
 
+
+class RecorderDrive(TorqueCurrent):
+    """A drive with a recorder and a torque mode, without excitation; the part of ``drive.port.Drive`` that this gives.
+
+    That current and torque are proportional is corrected by the recorded current.
+
+    Attributes
+    ----------
+    delay_doubt_periods : float
+        How far the middle of a recorded voltage may be from where ``estimators.recorded_push`` has it, in control
+        periods.
+    """
+
+    delay_doubt_periods = DELAY_DOUBT_PERIODS
+
+    def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
+        super().__init__(connection, node_id, drive_map=drive_map)
+        self._rated_apk = rated_apk(self.node)
+        self._late_s = 0.0
+
     def prepare(self, excitation: Excitation) -> None:
         """Check that a speed reference is all that is asked for: there is no excitation."""
         if excitation.point is not Injection.SPEED or excitation.shape is not Shape.STEP:
             raise NotAvailable("the drive has no excitation, only references", where=f"node {self.node.node}")
 
-    def begin_record(
-        self,
-        signals: Sequence[str],
-        samples: int,
-        *,
-        decimation: int,
-        excitation: Excitation | None,
-        pretrigger: int,
-        wait: Callable[[float], None],
-    ) -> None:
+    def begin_record(self, recording: Recording, wait: Callable[[float], None]) -> None:
         """Start the recorder, and right behind it the speed step that is asked for."""
-        spare = 0 if excitation is None else SPARE_ROWS
-        self.recorder.arm(signals, samples + spare, decimation, pretrigger, at_excitation=False)
-        if excitation is not None:
+        step = recording.excitation
+        samples = recording.samples + (0 if step is None else SPARE_ROWS)
+        self.recorder.arm(
+            recording.signals, samples, recording.decimation, recording.pretrigger, at_excitation=False
+        )  # fmt: skip
+        if step is not None:
             clock = self.node.connection.clock
             armed = clock.now()
-            self.node.put(objects.TARGET_VELOCITY_MRPM, excitation.amplitude / RAD_S_PER_MRPM)
+            self.node.put(objects.TARGET_VELOCITY_MRPM, step.amplitude / RAD_S_PER_MRPM)
             self._late_s = clock.now() - armed
             self._set_mode(Mode.PROFILE_VELOCITY)
 
-    def finish_record(self, signals: Sequence[str], *, decimation: int, excitation: Excitation | None) -> Trace:
+    def finish_record(self, recording: Recording) -> Trace:
         """Return the record; of a speed step from the instant at which the drive got it.
 
         Recorder and step are commanded one after the other: the transfers last about the same, so the time between
         their answers is the time between their effects.
         """
-        trace = super().finish_record(signals, decimation=decimation, excitation=excitation)
-        if excitation is None:
+        trace = super().finish_record(recording)
+        if recording.excitation is None:
             return trace
         rows = len(trace) - SPARE_ROWS
         if self._late_s > SPARE_ROWS * trace.period_s:

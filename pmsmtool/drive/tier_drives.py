@@ -6,19 +6,18 @@ position and current are polled at up to 1 kHz: all of a drive that knows CiA 40
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from pmsmtool.bus.connection import Connection
-from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.drive.port import Excitation
+from pmsmtool.drive.port import Recording
 from pmsmtool.drive.recorder import Recorder
-from pmsmtool.drive.standard_drive import POLL_PERIOD_S, StandardDrive
+from pmsmtool.drive.standard_drive import POLL_PERIOD_S, StandardDrive, TorqueCurrent
 from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import LETTERS, DriveMap
 from pmsmtool.firmware.wire_units import wire_unit
@@ -39,7 +38,7 @@ class ParameterDrive(CanopenDrive):
         self.recorder = Recorder(self.node, POLL_PERIOD_S)
 
 
-class TorqueDrive(StandardDrive):
+class TorqueDrive(TorqueCurrent, StandardDrive):
     """A drive of which only CiA 402 is known, in torque mode: a q current is asked for as torque.
 
     A record is polled: position and current one after the other, with the time at which each row was begun.
@@ -49,19 +48,6 @@ class TorqueDrive(StandardDrive):
         super().__init__(connection, node_id, drive_map=drive_map)
         self._polled: tuple[str, ...] = ()
         self._rows: list[list[float]] = []
-
-    def enable(self) -> None:
-        """Bring the drive to operation enabled at zero torque."""
-        self.node.put(objects.TARGET_TORQUE_PERMILLE, 0)
-        self._set_mode(Mode.PROFILE_TORQUE)
-        self.may_be_energised = True
-        self.node.enable()
-
-    def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
-        """Ask for the torque of a q current: permille of the rated torque for permille of the rated current."""
-        if i_d_a or fixed_angle_rad is not None:
-            raise NotAvailable("the drive takes no current set-point, only torque", where=f"node {self.node.node}")
-        self.node.put(objects.TARGET_TORQUE_PERMILLE, round(1000.0 * i_q_a / self._rated_apk))
 
     def live(self, name: str) -> float:
         """Return a live value; the DC link (0x6079) and voltages where the drive or its map shows them."""
@@ -78,22 +64,13 @@ class TorqueDrive(StandardDrive):
             raise NotAvailable(f"the drive does not show {name}", where=abort.where) from abort
         raise NotAvailable(f"the drive does not show {name}", where=f"node {self.node.node}")
 
-    def begin_record(
-        self,
-        signals: Sequence[str],
-        samples: int,
-        *,
-        decimation: int,
-        excitation: Excitation | None,
-        pretrigger: int,
-        wait: Callable[[float], None],
-    ) -> None:
+    def begin_record(self, recording: Recording, wait: Callable[[float], None]) -> None:
         """Poll from now on, whenever time passes."""
-        if excitation is not None:
+        if recording.excitation is not None:
             raise NotAvailable("the drive has no excitation", where=f"node {self.node.node}")
-        self._polled, self._rows = tuple(signals), []
+        self._polled, self._rows = tuple(recording.signals), []
 
-    def finish_record(self, signals: Sequence[str], *, decimation: int, excitation: Excitation | None) -> Trace:
+    def finish_record(self, recording: Recording) -> Trace:
         """Return what was polled."""
         polled, self._polled = self._polled, ()
         self.check_operating()
