@@ -4,10 +4,11 @@
 
 Every drive follows from its seed: a profile whose R, L, psi, dead time, device drop, shape and knee of the inverter's
 error and temperatures are drawn, with the profile's own noise; it runs for eight seconds through drawn speeds and loads
-while winding and magnets warm up. What the filter knows before: inductances off by a draw of 2 % standard deviation, the
-inverter's error by one of 10 %, R and psi as they are at the reference temperature. The inverter is the averaged one, so that its curve is known up to that
-factor; how well identification finds the curve is ``identification_coverage``. Errors within a run are one draw: the
-coverage is that of the last value and, beside it, the mean share of the time after the first two seconds.
+while winding and magnets warm up. What the filter knows before: inductances off by a draw of 2 % standard deviation,
+the inverter's error by one of 10 %, R and psi as they are at the reference temperature. The inverter is the averaged
+one, so that its curve is known up to that factor; how well identification finds the curve is
+``identification_coverage``. Errors within a run are one draw: the coverage is that of the last value and, beside it,
+the mean share of the time after the first two seconds.
 
 Results: ``benchmarks/tables/tracking_coverage.txt``.
 """

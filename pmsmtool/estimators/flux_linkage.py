@@ -195,7 +195,7 @@ def estimate_flux_linkage(
         dof=d_dof,
     )
     L_d = _rough_L_d(rows, np.nonzero(rows.is_d)[0])
-    driven = driven_flux_linkage(rows, L_d, x2, lag_s, tolerance, T)
+    driven = driven_flux_linkage(rows, L_d, x2, even.curvature, lag_s, tolerance, T)
     return FluxResult(
         psi_f=_normalise(measured, T_ref_c, alpha_psi_per_k, tolerance),
         psi_measured=measured,

@@ -381,14 +381,10 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("R", Method.RECORDER): _expected(_RECORDER_RUN, 79, ("R_s_ohm", 6.8, "%")),
     ("L", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("L_q_app_h", 8.0, "%")),
     ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("psi_f_wb", 1.2, "%")),
-    ("mechanics", Method.RECORDER): _expected(
-        _RECORDER_RUN, 80, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")
-    ),
+    ("mechanics", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")),
     ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("offset_rad", 1.8, "deg")),
     ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("pole_pairs", 0.3, "%")),
     ("psi", Method.STANDARD): _expected(_VOLTAGE_RUN, 26, ("psi_f_wb", 3.7, "%")),
-    ("mechanics", Method.STANDARD): _expected(
-        _STANDARD_RUN, 75, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")
-    ),
+    ("mechanics", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")),
 }
 """Total 95 % half widths that 90 % of random simulated drives of the tier kept to, with sensors of 1 %."""
