@@ -220,9 +220,11 @@ def chain_stage(
     """
     asked = replace(request, quantities=vendor_quantities(found))
     own = vendor_stage(run, drive, found, asked, allow_motion, say, known=known)
-    reason = "nothing more" if not can_measure(drive, found) else _wrong_set_up(drive, own)
-    if own.status != "pass" or reason:
-        return own if reason == "nothing more" or not reason else replace(own, fallbacks=(*own.fallbacks, reason))
+    if own.status != "pass" or not can_measure(drive, found):
+        return own
+    reason = _wrong_set_up(drive, own)
+    if reason:
+        return replace(own, fallbacks=(*own.fallbacks, reason))
     completed = None if known is None else (load_machine_file(run.path / MACHINE), known[1])
     try:
         rest = tier_stage(run, drive, found, request, allow_motion, say, known=completed)

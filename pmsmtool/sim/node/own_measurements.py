@@ -8,12 +8,11 @@ turned slowly for the pole pairs, the voltage at speed for psi. Dead time, senso
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable, Generator, Mapping, Sequence
 
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.sim.node.dictionary import Dictionary
-from pmsmtool.sim.node.drive_core import AverageState, Command, ControlMode, RecorderSetup, RecorderState
+from pmsmtool.sim.node.drive_core import Averages, AverageState, Command, ControlMode
 from pmsmtool.sim.node.power_drive import Plant
 from pmsmtool.sim.signals import Signal
 
@@ -33,6 +32,9 @@ OPEN_SHARE = 0.05
 """Current of a phase, of the vector's, below which it counts as open."""
 SETTLE_S = 0.3
 WINDOW_S = 0.05
+ALIGN_S = 4.0
+"""Longest time a rotor is given to come to rest on a vector."""
+AT_REST_RAD_S = 0.1
 REST_S = 0.01
 """Voltage off between two vectors: a wound-up controller must not throw its voltage on another phase."""
 TICK_S = 0.005
@@ -43,7 +45,7 @@ HALF_PERIOD = 6
 RIPPLE_SHARE = 0.2
 """Ripple that the inductance is measured with, of the rated current; its amplitude is found in growing steps."""
 FIRST_VOLTAGE_SHARE = 0.005
-RIPPLE_ROWS = 240
+RIPPLE_PERIODS = 20
 SEARCHES = 6
 SPEED_SHARE = 0.25
 """Speed at which the voltage is measured, of the largest one."""
@@ -110,14 +112,27 @@ class OwnMeasurements:
         self._plant.core.command(command)
 
     def _means(self, signals: Sequence[Signal], seconds: float) -> Generator[float, None, Sequence[float]]:
+        return (yield from self._averages(signals, seconds)).mean
+
+    def _averages(self, signals: Sequence[Signal], seconds: float) -> Generator[float, None, Averages]:
         core = self._plant.core
         core.average(signals, max(1, round(seconds * 1e9 / core.period_ns)))
         while True:
             yield seconds
             result = core.averages()
             if result.state is AverageState.COMPLETE:
-                return result.mean
+                return result
             seconds = TICK_S
+
+    def _align(self, length_a: float) -> Generator[float, None, None]:
+        """Hold a vector until the rotor it pulls has come to rest: its voltage would be taken for a drop."""
+        self._vector(length_a, 0.0)
+        passed = quiet = 0.0
+        while passed < ALIGN_S and quiet < SETTLE_S:
+            before = self._plant.core.signal(Signal.THETA_M)
+            yield TICK_S
+            moved = abs(self._plant.core.signal(Signal.THETA_M) - before)
+            passed, quiet = passed + TICK_S, quiet + TICK_S if moved < AT_REST_RAD_S * TICK_S else 0.0
 
     # ---- measurements --------------------------------------------------------------------------
 
@@ -138,8 +153,7 @@ class OwnMeasurements:
         return 0.0
 
     def _pole_pairs(self) -> Measured:
-        self._vector(self._current_a, 0.0)
-        yield SETTLE_S
+        yield from self._align(self._current_a)
         start = self._plant.core.signal(Signal.THETA_M)
         steps = round(TURNS * TURN_S / TICK_S)
         for k in range(1, steps + 1):
@@ -155,8 +169,7 @@ class OwnMeasurements:
     def _resistance(self) -> Measured:
         levels = []
         for share in (0.5, 1.0):
-            self._vector(share * self._current_a, 0.0)
-            yield SETTLE_S
+            yield from self._align(share * self._current_a)
             means = yield from self._means((Signal.U_D, Signal.I_D), WINDOW_S)
             if abs(means[1] - share * self._current_a) > REACHED * self._current_a:
                 raise MeasurementFailed(NOT_REACHED)
@@ -171,8 +184,7 @@ class OwnMeasurements:
     def _inductance(self, point: Injection, signal: Signal) -> Measured:
         core = self._plant.core
         bias = 0.5 * self._current_a
-        self._vector(bias, 0.0)
-        yield SETTLE_S
+        yield from self._align(bias)
         wanted = RIPPLE_SHARE * self._plant.parameter("motor.I_nom_apk")
         largest_v = core.signal(Signal.U_DC) / math.sqrt(3.0)
         amplitude = FIRST_VOLTAGE_SHARE * largest_v
@@ -195,14 +207,10 @@ class OwnMeasurements:
             )
         )  # fmt: skip
         yield SETTLE_S / 3.0
-        core.record(RecorderSetup(channels=(signal,), depth=RIPPLE_ROWS))
-        while True:
-            yield TICK_S
-            if core.recorder().state is RecorderState.COMPLETE:
-                break
-        rows = struct.unpack(f"<{RIPPLE_ROWS}f", core.recording())
-        waves = [rows[k : k + 2 * HALF_PERIOD] for k in range(0, RIPPLE_ROWS, 2 * HALF_PERIOD)]
-        return math.fsum(max(wave) - min(wave) for wave in waves) / len(waves)
+        periods = 2 * HALF_PERIOD * RIPPLE_PERIODS
+        result = yield from self._averages((signal,), periods * 1e-9 * core.period_ns)
+        # a triangle of n samples per half wave has the mean square (1/3 + 2 / (3 n^2)) (swing / 2)^2
+        return 2.0 * float(result.std[0]) / math.sqrt(1.0 / 3.0 + 2.0 / (3.0 * HALF_PERIOD**2))
 
     def _flux_linkage(self) -> Measured:
         """Measure the voltage at speed, less the drop at the resistance that the drive is set to."""
