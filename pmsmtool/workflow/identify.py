@@ -53,7 +53,7 @@ REPLAYED = "replayed"
 _MADE_FROM_MACHINE = ("design.toml", "params.toml")
 
 LIMIT: Mapping[str, float] = {"R_s_ohm": 0.03, "L_d_h": 0.05, "L_q_h": 0.05, "psi_f_wb": 0.03, "J_kgm2": 0.10}
-"""Largest relative 95 % total half width of an accepted value; measured with 1 % sensors: 1.7, 1.4, 1.4, 1.1, 3 %."""
+"""Largest relative 95 % total half width of an accepted value; measured with 1 % sensors: 1.7, 1.4, 1.4, 1.1, 1.4 %."""
 OFFSET_LIMIT_RAD = math.radians(1.0)
 """Largest 95 % half width of the encoder offset (electrical)."""
 
@@ -389,6 +389,13 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
         lines.append("R_s is from one control frequency: the drive does not take half of it")
     if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
         lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
+    if evaluation.encoder is not None:
+        lines += [
+            f"the encoder is off by {math.degrees(error):.2g} deg (mechanical) {often} per turn: mounted off centre? "
+            "J, B and tau_c suffer from it"
+            for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
+            if error > 0.0
+        ]
     lines += [f"{check.name} {check.verdict}" for check in evaluation.checks if not check.agrees]
     if evaluation.pairs is not None and not evaluation.pairs.judged:
         lines.append("the phases were not compared: the rotor did not come to rest on the three pairs")

@@ -62,6 +62,26 @@ def test_a_locked_shaft_is_refused() -> None:
         estimate_encoder(still, still)
 
 
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("swing", [0.0, 0.02])
+def test_an_encoder_off_centre_is_seen_per_turn_and_a_swinging_rotor_is_not(direction: int, swing: float) -> None:
+    """A rotor that swings does so otherwise on the way back."""
+    once, twice = 0.01, 0.006
+    runs = []
+    for sign, run in zip((1.0, -1.0), rotation(4, direction, 0.3, lag=0.1, ripple=0.05), strict=True):
+        theta = run["theta_M_rad"]
+        off = once * np.sin(theta) + twice * np.cos(2.0 * theta) + sign * swing * np.sin(theta)
+        runs.append(trace(theta_imposed_rad=run["theta_imposed_rad"], theta_M_rad=theta + off))
+    found = estimate_encoder(*runs)
+    assert found.pole_pairs.value == 4.0 and found.direction == direction
+    expected = (0.0 if swing else once, twice)
+    assert found.per_turn_rad == pytest.approx(expected, rel=0.1)
+
+
+def test_cogging_and_friction_are_no_error_of_the_encoder() -> None:
+    assert estimate_encoder(*rotation(3, 1, 0.3, lag=0.2, ripple=0.1)).per_turn_rad == (0.0, 0.0)
+
+
 def test_half_a_turn_is_not_enough() -> None:
     with pytest.raises(IdentificationError, match="E_EXCITATION"):
         estimate_encoder(*rotation(4, 1, 0.0, turns=0.5))
