@@ -243,7 +243,7 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
             raise
         try:
             write_report(run)
-            out.note(f"report: {run.path / 'report.html'}; go on with: pmsmtool commission --resume {run.path}")
+            out.note(f"report: {run.path / 'report.html'}; {_next_step(run, error)}")
         except Exception as second:  # whatever it is, what ended the chain outranks it
             out.warn(f"the report could not be written: {type(second).__name__}: {second}")
         raise
@@ -251,12 +251,21 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
     _show(run, out)
 
 
+def _next_step(run: RunDirectory, error: BaseException) -> str:
+    """Say what leads on: a run whose machine was not identified, or that this drive cannot do, begins anew."""
+    from pmsmtool.errors import IdentificationError, NotAvailable
+
+    if isinstance(error, NotAvailable | IdentificationError):
+        return "to go on, remove the cause and begin a new run: this one would end the same way"
+    return f"go on with: pmsmtool commission --resume {run.path}"
+
+
 def _show(run: RunDirectory, out: Output) -> None:
     from pmsmtool.workflow.report_page import verdict
 
     record, found = run.read(), verdict(run.path)
     stages = [
-        {"name": stage.name, "status": stage.status, "summary": stage.summary, "seconds": stage.seconds}
+        {key: getattr(stage, key) for key in ("name", "status", "summary", "note", "seconds")}
         for name in dict.fromkeys(stage.name for stage in record.stages)
         if (stage := record.stage(name)) is not None
     ]

@@ -19,6 +19,9 @@ COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
 VENDOR = "vendor"
 """Source of a value that the drive measured by itself: without an interval."""
 
+AS_GIVEN = "as given"
+"""Source of a value that a person brought in a machine file."""
+
 UNAVAILABLE = "not available"
 """Status of a stage that the drive cannot give."""
 
@@ -81,7 +84,7 @@ def render(
             _estimate_row(value)
             for stage in latest
             for value in stage.get("values", ())
-            if "std" in value or value.get("source") == VENDOR
+            if "std" in value or "source" in value
         ],
         fallbacks=[f"{stage['name']}: {line}" for stage in latest for line in stage.get("fallbacks", ())],
         figures=[{"svg": _trusted_svg(figure.svg), "caption": figure.caption} for figure in figures],
@@ -129,19 +132,16 @@ def verdict_of(stages: Sequence[Mapping[str, Any]], complete: Sequence[str] = CO
     lacking = [stage for stage in latest if stage["status"] == UNAVAILABLE]
     values = [value for stage in latest for value in stage.get("values", ())]
     bare = [value for value in values if "source" in value and "std" not in value]
-    given = [str(value["name"]) for value in bare if value["source"] != VENDOR]
-    own = [str(value["name"]) for value in bare if value["source"] == VENDOR]
     if lacking or bare:
         passed = [stage for stage in latest if stage["status"] == "pass"]
-        return _partial(passed, lacking, given, own, criteria)
+        return _partial(passed, lacking, _bare_lines(bare), criteria)
     return Verdict("pass", "PASS", (f"{len(latest)} stages, {criteria} criteria, all met",))
 
 
 def _partial(
     passed: list[Mapping[str, Any]],
     lacking: list[Mapping[str, Any]],
-    given: list[str],
-    own: list[str],
+    taken: list[str],
     criteria: int,
 ) -> Verdict:
     """Return the verdict on a drive that cannot give everything: green for its tier, and what that leaves open."""
@@ -150,10 +150,20 @@ def _partial(
     names = ", ".join(str(stage["name"]) for stage in passed)
     behaviour = "" if any(stage["name"] == "prove" for stage in passed) else "; its behaviour was not proven"
     head = f"as far as this drive goes: {names}; {criteria} criteria, all met{behaviour}"
-    lists = (("taken as given, not measured", given), ("the drive's own, without an interval", own))
-    taken = (f"{what}: {', '.join(named)}" for what, named in lists if named)
     missing = (f"{stage['name']}: not available: {stage['note']}" for stage in lacking)
     return Verdict("pass", "PASS FOR ITS TIER", (head, *taken, *missing))
+
+
+def _bare_lines(values: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return one line per source of values that were not measured by this program."""
+    names: dict[str, list[str]] = {}
+    for value in values:
+        names.setdefault(str(value["source"]), []).append(str(value["name"]))
+    heads = {VENDOR: "the drive's own, without an interval", AS_GIVEN: "taken as given, not measured"}
+    return [
+        f"{heads.get(source, f'taken from {source}, not measured')}: {', '.join(named)}"
+        for source, named in names.items()
+    ]
 
 
 def _failure(stage: Mapping[str, Any]) -> str:

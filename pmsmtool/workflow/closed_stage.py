@@ -19,11 +19,13 @@ from pmsmtool.design.closed_drive import (
     tune_closed,
 )
 from pmsmtool.design.design_file import Design, load_design
+from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible, NotAvailable
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.workflow.design_stages import tune_stage
+from pmsmtool.workflow.held_design import held_by
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
 LIMITS = "limits that keep the drive out of saturation"
@@ -80,11 +82,11 @@ def closed_stage(run: RunDirectory, request: TuneRequest, drive_map: DriveMap, b
     if not reason:
         drive = ClosedDrive(drive_map.name, frozenset(drive_map.cells), bandwidth_hz)
         try:
-            stage = tune_stage(run, request, partial(_limited, drive))
+            stage = tune_stage(run, request, held_by(drive_map, partial(_limited, drive)))
             return _judged(stage, load_design(run.path / "design.toml"), drive)
         except DesignInfeasible as error:
             reason = "; ".join(text for text in (error.what, error.likely) if text)
-    stage = tune_stage(run, request)
+    stage = tune_stage(run, request, held_by(drive_map, tune))
     return replace(stage, fallbacks=(*stage.fallbacks, f"{LIMITS}: not available: {reason}"))
 
 

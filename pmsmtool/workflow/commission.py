@@ -102,6 +102,15 @@ def due_stages(run: RunDirectory, record: RunRecord) -> tuple[str, ...]:
     return ()
 
 
+NOTHING_GIVEN = (
+    "write a machine file from a data sheet or a meter (`pmsmtool machine new`) and begin anew with it: `pmsmtool "
+    "commission MACHINE`; `pmsmtool caps` lists what this drive can give"
+)
+NOTHING_TAKEN = (
+    "`pmsmtool caps` lists what this drive can give; `pmsmtool tune MACHINE -o design.toml` designs for the machine "
+    "alone"
+)
+"""Next steps after a run of which nothing was available: the same run gives the same again."""
 SETTLED = ("pass", "not available")
 """How a stage may have ended that is not run again."""
 OUTPUTS: Mapping[str, tuple[str, ...]] = {
@@ -194,7 +203,7 @@ class Commissioning:
             raise NotAvailable(
                 "\n  - ".join(["nothing of the chain can be done", *(f"{s.name}: {s.note}" for s in stages)]),
                 where=f"node {self.drive.identity.node}",
-                hint="`pmsmtool caps` lists what this drive can give; a machine file allows a design",
+                hint=NOTHING_GIVEN if self.nameplate is None else NOTHING_TAKEN,
             )
 
     def _check_drive(self, record: RunRecord) -> None:
@@ -228,11 +237,12 @@ class Commissioning:
             raise
         self.run.add(stage)
         self.progress.end(stage, number, len(STAGES))
-        if stage.status != "pass":
+        if stage.status not in SETTLED:
             raise _not_good(stage, self.run)
 
     def _not_available(self, name: str, number: int, error: NotAvailable, seconds: float) -> None:
-        stage = Stage(name, "not available", seconds, note=error.what)
+        files = {file: "" for file in OUTPUTS.get(name, ()) if (self.run.path / file).is_file()}
+        stage = Stage(name, "not available", seconds, note=error.what, files=files)
         self.run.add(stage)
         self.progress.end(stage, number, len(STAGES))
 
@@ -302,7 +312,7 @@ def _not_good(stage: Stage, run: RunDirectory) -> PmsmtoolError:
     what = f"{stage.name}: {'; '.join(broken) or stage.note}"
     where = str(run.path)
     if stage.name == "identify":
-        return IdentificationError("E_NOT_ACCEPTED", what, where=where)
+        return IdentificationError("E_NOT_ACCEPTED", what, where=where, hint=NOT_ACCEPTED)
     if stage.name == "verify":
         return VerifyMismatch(what, where=where, hint="flash again: commission --resume " + where)
     if stage.name == "prove":
@@ -310,6 +320,10 @@ def _not_good(stage: Stage, run: RunDirectory) -> PmsmtoolError:
     return CheckFailed(what, where=where, hint=f"pmsmtool report {where}")
 
 
+NOT_ACCEPTED = (
+    "where it disagrees with the machine file, correct that; where an interval is too wide, allow more (--i-max, "
+    "--speed-max); then begin a new run"
+)
 IDENTITY = ("vendor", "product", "serial")
 """What must agree before a run is resumed."""
 

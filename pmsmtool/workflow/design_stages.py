@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -19,9 +19,10 @@ from pmsmtool.design.sampled_loop import LoopMargins
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import TABLE_BOUNDS, tune
 from pmsmtool.design.tune_request import TuneRequest
-from pmsmtool.errors import DesignInfeasible
-from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.errors import DesignInfeasible, NotAvailable
+from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.workflow.held_design import Designed, why_not_judged
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
 SHOWN = (
@@ -35,11 +36,10 @@ SPEED_PHASE_MARGIN_DEG = 40.0
 """Least phase margin of the speed loop: below it a step rings visibly (30 % overshoot)."""
 
 
-Designed = Callable[[MachineFile, TuneRequest], Design]
-
-
 def tune_stage(run: RunDirectory, request: TuneRequest, designed: Designed = tune) -> Stage:
     """Design the control of the identified machine; writes ``design.toml``.
+
+    Not available where the drive takes no gains: then nothing of the loops is judged.
 
     Raises
     ------
@@ -48,6 +48,10 @@ def tune_stage(run: RunDirectory, request: TuneRequest, designed: Designed = tun
     """
     design = designed(load_machine_file(run.path / "machine.toml"), request)
     run.save("design.toml", design_text(design))
+    if reason := why_not_judged(design):
+        return Stage(
+            "tune", "not available", 0.0, note=reason, files={"design.toml": ""}, fallbacks=design.notes
+        )  # fmt: skip
     criteria = [line for name, loop in design.loops.items() for line in _loop_criteria(name, loop, request)]
     values: list[Mapping[str, Any]] = [
         {"name": n, "value": design[n], "method": design.values[n].method} for n in SHOWN
@@ -137,8 +141,16 @@ def _at_most(what: str, value: float, largest: float) -> Acceptance:
 
 
 def margins_stage(run: RunDirectory, request: MarginRequest) -> Stage:
-    """Judge the design over what the machine may be: interval corners and random samples; writes nothing."""
+    """Judge the design over what the machine may be: interval corners and random samples; writes nothing.
+
+    Raises
+    ------
+    NotAvailable
+        The drive takes no gains, so there is no loop to judge.
+    """
     design = load_design(run.path / "design.toml")
+    if reason := why_not_judged(design):
+        raise NotAvailable(reason)
     report = margin_report(design, tolerance_box(design.machine), request, samples=MARGIN_SAMPLES)
     criteria = [line for spread in report.loops for line in _spread_criteria(spread)]
     criteria += [line for spread in report.headroom for line in _spread_criteria(spread)]

@@ -287,14 +287,22 @@ def tier_envelope(drive: CanopenDrive, request: IdentifyRequest, known: MachineF
     )
 
 
-def can_measure(drive: CanopenDrive, found: Capabilities) -> list[str]:
-    """Return what the tier's experiments tell, one line each; empty when nothing can be measured."""
+def can_measure(drive: CanopenDrive, found: Capabilities, known: MachineFile | None = None) -> list[str]:
+    """Return what the tier's experiments tell, one line each; empty when nothing can be measured.
+
+    Parameters
+    ----------
+    known : MachineFile, optional
+        What is given; torque pushes need the pole pairs from it, from mode 11 or from the drive's map.
+    """
     if isinstance(drive, RecorderDrive):
         return ["R, psi, L_q, J, tau_c from recorded torque pushes"]
     lines = []
-    if found.row("poles", Method.STANDARD).available:
+    turns = found.row("poles", Method.STANDARD).available
+    if turns:
         lines.append("pole pairs, direction, offset from a vector turned by the commutation angle")
-    if found.row("mechanics", Method.STANDARD).available:
+    pole_pairs = turns or known is not None or "motor.pole_pairs" in found.drive_map.cells
+    if pole_pairs and found.row("mechanics", Method.STANDARD).available:
         lines.append("J/psi, tau_c/psi from polled torque pushes, psi from the voltage limit or the coasting machine")
     return lines
 
@@ -325,7 +333,7 @@ def tier_stage(
     Raises
     ------
     NotAvailable
-        The shaft is locked, or nothing of what was asked could be told.
+        The shaft is locked, the pole pairs are not known, or nothing of what was asked could be told.
     Declined
         The person did not consent; nothing was moved.
     IdentificationError, StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
@@ -335,7 +343,9 @@ def tier_stage(
         raise NotAvailable("without injection the rotor must turn, and the shaft is locked", hint="free the shaft")
     envelope = tier_envelope(drive, request, None if known is None else known[0])
     envelope.refuse_gravity()
-    moves = can_measure(drive, found)
+    moves = can_measure(drive, found, None if known is None else known[0])
+    if not moves:
+        raise NotAvailable(NO_POLE_PAIRS, where=f"node {drive.node.node}", hint="give a machine file")
     allow_motion([*envelope.lines(), *moves, "nothing is stored in the drive; every changed object is restored"])
     clock = drive.node.connection.clock
     start = clock.now()

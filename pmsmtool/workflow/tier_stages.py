@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from pmsmtool.bus.connection import Connection
-from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design
+from pmsmtool.design.design_file import load_design
 from pmsmtool.design.lookup_design import LookupRequest
 from pmsmtool.design.margins import MarginRequest
+from pmsmtool.design.open_loops import CURRENT_LOOPS, lacking_gains
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.recorded_means import RecordingDrive
@@ -33,17 +34,12 @@ from pmsmtool.workflow.identify import MACHINE, NAMEPLATE, IdentifyRequest, iden
 from pmsmtool.workflow.measure import QUANTITIES
 from pmsmtool.workflow.prove.stage import ProofRequest, prove_stage
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
-from pmsmtool.workflow.tier_identify import can_measure, tier_stage
+from pmsmtool.workflow.tier_identify import NO_POLE_PAIRS, can_measure, tier_stage
 from pmsmtool.workflow.tier_machine import NEEDED, tier_machine
 from pmsmtool.workflow.vendor_identify import chain_stage, vendor_line
 
 DATA_SHEET = "as given"
 SET_UP = "the drive's own set, from its maker's set-up"
-ONE_PAIR = {
-    "current.K_p_q_v_per_a": "current.K_p_d_v_per_a",
-    "current.K_i_q_v_per_as": "current.K_i_d_v_per_as",
-}
-"""Gains of q that serve both axes on a drive without an object for those of d."""
 RECORDER_STEPS = ("speed_step",)
 """Experiments of a proof that need no excitation: a speed reference while the drive records."""
 PREDICTED = ("speed.K_p_nms_per_rad", "speed.filter_hz")
@@ -52,6 +48,7 @@ NOT_SHOWN = (
     "; the guarantee of its limits bounds a voltage that it does not record (on a simulated node: `pmsmtool reproduce "
     "closed-drive`)"
 )
+FOR_READING = "the drive takes no table: it is for reading"
 Allow = Callable[[Sequence[str]], None]
 Say = Callable[[str], None]
 
@@ -107,6 +104,11 @@ class TierStages:
         rest = "what is measured" if known is None else f"what is measured, the rest {known[1]}"
         design = f"on {rest}" if self._complete(known) else f"not available: {_machine_needed(NEEDED)}"
         lines.append(f"tune, lut, margins: {design}")
+        lacking = lacking_gains(drive_map.cells)[CURRENT_LOOPS]
+        if not drive_map.staging and lacking and self.drive_bandwidth_hz is None and self._complete(known):
+            lines[-1] = f"lut: {design}; {FOR_READING}"
+            needs = f"needs the gains of the current loops: the map has no object for {', '.join(lacking)}"
+            lines.append(f"tune, margins: not available: {needs}")
         if not drive_map.staging:
             reason = why_no_limits(drive_map, self.drive_bandwidth_hz)
             lines.append(f"{LIMITS}: " + (f"not available: {reason}" if reason else "judged by what they guarantee"))
@@ -121,10 +123,13 @@ class TierStages:
     def identify(self, request: IdentifyRequest, allow: Allow, say: Say) -> Stage:
         """Measure what the tier can; the machine file is completed by what was given.
 
+        Where nothing can be measured and a machine file was given, the stage is not available and that file stands in
+        the run, its values as given.
+
         Raises
         ------
         NotAvailable
-            Nothing can be measured; where a machine file was given, it stands in the run all the same.
+            Nothing can be measured, and no machine file was given.
         PmsmtoolError
             As the experiments end.
         """
@@ -146,6 +151,9 @@ class TierStages:
             made = tier_machine(known[0], {}, known[1])
             assert made.machine is not None
             self.run.save(MACHINE, dump_machine_file(made.machine))
+            return Stage(
+                "identify", "not available", 0.0, values=made.given_values(known[1]), files={MACHINE: ""}, note=reason
+            )
         raise NotAvailable(reason, where=f"node {self.found.identity.node}")
 
     def tune(self, request: TuneRequest) -> Stage:
@@ -154,8 +162,8 @@ class TierStages:
             raise NotAvailable(_machine_needed(self._lacking()))
         drive_map = self.found.drive_map
         if drive_map.staging:
-            return _for_map(self.run, tune_stage(self.run, request), drive_map)
-        return _for_map(self.run, closed_stage(self.run, request, drive_map, self.drive_bandwidth_hz), drive_map)
+            return tune_stage(self.run, request)
+        return closed_stage(self.run, request, drive_map, self.drive_bandwidth_hz)
 
     def lut(self, request: LookupRequest) -> Stage:
         """Make the table of the design."""
@@ -163,11 +171,11 @@ class TierStages:
         stage = lut_stage(self.run, request)
         if self.found.drive_map.tables:
             return stage
-        notes = ["the drive takes no table: it is for reading", *_without_base(self.run, self.found.drive_map)]
-        return replace(stage, fallbacks=(*stage.fallbacks, *notes))
+        notes = [FOR_READING, *_without_base(self.run, self.found.drive_map)]
+        return replace(stage, fallbacks=(*stage.fallbacks, *notes), summary=f"{stage.summary}; {FOR_READING}")
 
     def margins(self, request: MarginRequest) -> Stage:
-        """Judge the design over what the machine may be."""
+        """Judge the design over what the machine may be, as far as the drive takes its gains."""
         self._need_design()
         return margins_stage(self.run, request)
 
@@ -211,7 +219,7 @@ class TierStages:
     def _measurable(self) -> list[str]:
         if self.found.tier is Tier.INJECT:
             return [", ".join(QUANTITIES)]
-        return [*self._own_line(), *can_measure(self.drive, self.found)]
+        return [*self._own_line(), *can_measure(self.drive, self.found, self.nameplate)]
 
     def _own_line(self) -> list[str]:
         """Return what the drive's own identification tells; where a recorder measures with intervals, it is not run."""
@@ -228,7 +236,7 @@ class TierStages:
         if self._measurable():
             return ""
         missing = self.found.row("mechanics", Method.STANDARD).missing
-        return f"needs {', '.join(missing)}"
+        return f"needs {', '.join(missing)}" if missing else NO_POLE_PAIRS
 
     def _lacking(self) -> tuple[str, ...]:
         stage = self.run.read().stage("identify")
@@ -289,16 +297,3 @@ def _without_base(run: RunDirectory, drive_map: DriveMap) -> list[str]:
 def _machine_needed(names: Sequence[str]) -> str:
     what = ", ".join(names) or "ratings and the inverter"
     return f"needs {what}: give a machine file (`pmsmtool machine new` takes a data sheet or a meter)"
-
-
-def _for_map(run: RunDirectory, stage: Stage, drive_map: DriveMap) -> Stage:
-    """Choose the gains of a drive that has one pair for both axes: the smaller of each, so that both keep margins."""
-    pairs = {q: d for q, d in ONE_PAIR.items() if q in drive_map.cells and d not in drive_map.cells}
-    if not pairs:
-        return stage
-    design = load_design(run.path / "design.toml")
-    how = "the smaller of both axes: the drive has one pair"
-    values = {name: DesignValue(min(design[q], design[d]), how) for q, d in pairs.items() for name in (q, d)}
-    changed: Design = replace(design, values={**design.values, **values})
-    run.save("design.toml", design_text(changed))
-    return replace(stage, fallbacks=(*stage.fallbacks, "current loops: one pair of gains, the smaller of both axes"))

@@ -220,7 +220,7 @@ def chain_stage(
     """
     asked = replace(request, quantities=vendor_quantities(found))
     own = vendor_stage(run, drive, found, asked, allow_motion, say, known=known)
-    if own.status != "pass" or not can_measure(drive, found):
+    if own.status != "pass" or not can_measure(drive, found, None if known is None else known[0]):
         return own
     reason = _wrong_set_up(drive, own)
     if reason:

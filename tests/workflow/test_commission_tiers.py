@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Iterator, Sequence
@@ -16,10 +17,11 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
 from pmsmtool.design.closed_drive import RATED, SLOPE, SPEED, TORQUE
 from pmsmtool.design.design_file import load_design
+from pmsmtool.design.open_loops import lacking_gains
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.machine.machine_file import load_machine_file
@@ -103,26 +105,30 @@ def chain(run: RunDirectory, drive: CanopenDrive, found: Capabilities, *, sheet:
 
 @pytest.fixture(scope="module")
 def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run up to its margins, made once: what comes after it depends on the drive."""
+    """The run of a drive that takes nothing: its machine file is what was given."""
     with opened("&drive=faulhaber") as (drive, found):
         run = begin_run(drive, tmp_path_factory.mktemp("designed"), tier=found.tier)
         progress, _ = chain(run, drive, found)
     assert progress.ended == {
-        "identify": "not available", "tune": "pass", "lut": "pass", "margins": "pass", "flash": "not available",
-        "verify": "not available", "prove": "not available",
+        "identify": "not available", "tune": "not available", "lut": "pass", "margins": "not available",
+        "flash": "not available", "verify": "not available", "prove": "not available",
     }  # fmt: skip
-    assert verdict(run.path).word == "PASS FOR ITS TIER"
+    found_verdict = verdict(run.path)
+    assert found_verdict.word == "PASS FOR ITS TIER" and "as far as this drive goes: lut;" in found_verdict.lines[0]
+    assert found_verdict.lines[1].startswith(
+        "taken as given, not measured: pole_pairs, R_s_ohm, L_d_h, L_q_h, psi_f_wb"
+    )
     limits = [line for line in run.read().stage("tune").fallbacks if line.startswith(LIMITS)]  # type: ignore[union-attr]
     assert limits == [f"{LIMITS}: not available: {why_no_limits(found.drive_map, None)}"] and SLOPE in limits[0]
     return run.path
 
 
 def continued(designed: Path, folder: Path, drive: CanopenDrive, found: Capabilities) -> RunDirectory:
-    """The designed run as if this drive had been there from its beginning."""
+    """That run from its design on, as if this drive had been there from its beginning."""
     run = begin_run(drive, folder, tier=found.tier)
-    for name in ("machine.toml", "nameplate.toml", "design.toml"):
+    for name in ("machine.toml", "nameplate.toml"):
         shutil.copy(designed / name, run.path)
-    run.write(replace(run.read(), stages=RunDirectory(designed).read().stages[:2]))
+    run.write(replace(run.read(), stages=RunDirectory(designed).read().stages[:1]))
     return run
 
 
@@ -145,6 +151,10 @@ def test_what_a_family_holds_is_shown_before_and_equal_after(
         mapped = bool(set(drive_map.cells) & set(read_parameter_set(run.path / "params.toml").values))
         assert progress.ended["flash"] == progress.ended["verify"] == ("pass" if drive_map.cells else "not available")
         assert progress.ended["prove"] == "not available"
+        judged = "not available" if lacking_gains(drive_map.cells)["current"] else "pass"
+        assert progress.ended["tune"] == progress.ended["margins"] == judged, (
+            "loops of gains the drive takes, no others"
+        )
         if mapped:
             held = drive_map.quantised(read_parameter_set(run.path / "params.toml"))
             assert all(DriveParameters(drive.node).read_value(name) == value for name, value in held.values.items())
@@ -184,7 +194,12 @@ def test_one_pair_of_gains_is_the_smaller_of_both_axes(tmp_path: Path) -> None:
     assert machine.machine.R_s_ohm == truth.R_s_ohm and "R_s_ohm" not in machine.estimates
     assert "as given: pole_pairs, R_s_ohm" in str(machine.provenance["source"])
     assert any("taken as given, not measured: pole_pairs, R_s_ohm" in line for line in verdict(run.path).lines)
-    assert "PASS FOR ITS TIER" in report_page(run.path)
+    page = report_page(run.path)
+    assert "PASS FOR ITS TIER" in page
+    assert page.count("<td>as given</td>") == 4
+    drawn = {value["name"]: value for value in run.read().stage("tune").values}  # type: ignore[union-attr]
+    assert drawn["current.K_p_q_v_per_a"]["value"] == design["current.K_p_q_v_per_a"]
+    assert design.loops["current_q"].phase_margin_deg > design.loops["current_d"].phase_margin_deg + 5.0
 
 
 def test_a_drive_that_cannot_be_reflashed_is_kept_out_of_saturation_by_its_limits(
@@ -253,6 +268,9 @@ def test_recorder_tier_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Pat
     assert {str(value["name"]).split(":")[0] for value in proof.values if "where" in value} == {"speed_step"}
     found_verdict = verdict(run.path)
     assert found_verdict.word == "PASS FOR ITS TIER"
+    assert f"taken from {SET_UP}, not measured: pole_pairs, L_d_h, L_q_h" in found_verdict.lines
+    assert not any("taken as given" in line for line in found_verdict.lines)
+    assert report_page(run.path).count("<td>{}</td>".format(SET_UP.replace("'", "&#39;"))) == 3
     given = next(value for value in run.read().stage("identify").values if value["name"] == "L_d_h")  # type: ignore[union-attr]
     assert given["source"] == SET_UP and "std" not in given
     # the tier does not measure the encoder: its maker's offset must not be overwritten
@@ -289,3 +307,35 @@ def test_the_plan_is_told_before_anything_moves(tmp_path: Path, monkeypatch: pyt
     assert outcome.exit_code != 0 and "tier standard, map cia402" in outcome.stderr
     assert "flash, verify: not available: needs a map" in outcome.stderr
     assert not isinstance(outcome.exception, NotAvailable)
+
+
+def test_what_a_drive_lacks_is_said_before_a_consent_and_leads_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without MACHINE nothing tells the pole pairs: nobody is asked to let it move, and no --resume is advised."""
+    monkeypatch.chdir(tmp_path)
+    bus = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=copley"]
+    outcome = CliRunner().invoke(cli, [*bus, "commission", "--yes"])
+    error = outcome.exception
+    assert isinstance(error, NotAvailable) and "identify: needs the pole pairs" in str(error)
+    assert "Apk" not in outcome.stderr, "no envelope to consent to"
+    assert "--resume" not in outcome.stderr and "begin a new run" in outcome.stderr
+    assert "pmsmtool machine new" in error.hint and "pmsmtool commission MACHINE" in error.hint
+    # and that is the step that works
+    outcome = CliRunner().invoke(cli, [*bus, "commission", str(PROFILE), "--yes", "--json"])
+    assert outcome.exit_code == 0
+    stages = {stage["name"]: stage for stage in json.loads(outcome.stdout)["stages"]}
+    assert stages["tune"]["status"] == "not available" and "'cia402' does not take" in stages["tune"]["note"]
+    assert all(stage["note"] for stage in stages.values() if stage["status"] == "not available")
+
+
+def test_a_measurement_that_is_not_accepted_says_what_to_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = PROFILE.read_text(encoding="utf-8").replace("pole_pairs = 3", "pole_pairs = 4")
+    Path("wrong.toml").write_text(text, encoding="utf-8")
+    bus = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=cia402"]
+    outcome = CliRunner().invoke(cli, [*bus, "commission", "wrong.toml", "--yes"])
+    assert isinstance(outcome.exception, IdentificationError) and "correct that" in outcome.exception.hint
+    assert "--resume" not in outcome.stderr and "begin a new run" in outcome.stderr
