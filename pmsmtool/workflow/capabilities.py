@@ -376,7 +376,7 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("R", Method.INJECT): _expected(_FULL, 12, ("R_s_ohm", 4.7, "%")),
     ("L", Method.INJECT): _expected(_FULL, 12, ("L_d_h", 1.4, "%"), ("L_q_h", 1.4, "%")),
     ("psi", Method.INJECT): _expected(_FULL, 12, ("psi_f_wb", 1.1, "%")),
-    ("encoder", Method.INJECT): _expected(_FULL, 12, ("offset_rad", 0.11, "deg")),
+    ("encoder", Method.INJECT): _expected(_FULL, 12, ("offset_rad", 0.02, "deg")),
     ("mechanics", Method.INJECT): _expected(_MECHANICS, 12, ("J_kgm2", 1.4, "%")),
     ("R", Method.RECORDER): _expected(_RECORDER_RUN, 79, ("R_s_ohm", 6.8, "%")),
     ("L", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("L_q_app_h", 8.0, "%")),
