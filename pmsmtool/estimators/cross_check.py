@@ -35,6 +35,8 @@ around two machines that saturate: the two methods differ by 0.02 to 0.07 of it)
 FLOOR = 1e-4
 """Relative model floor, one standard deviation."""
 LEAST_PAIRS = 2
+JUDGES = 0.3
+"""Interval of the difference, relative, above which agreement says little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +68,10 @@ class CrossCheck:
     def verdict(self) -> str:
         """What a person reads."""
         word = "agrees with" if self.agrees else "DISAGREES with"
+        if self.agrees and self.half_width > JUDGES:
+            word = "too uncertain to judge"
         return (
-            f"{word} {self.of}: {100.0 * self.difference:+.2g} % off, interval of that {100.0 * self.half_width:.2g} %"
+            f"{word} {self.of}: {100.0 * self.difference:+.2g} % off, interval of that {100.0 * self.half_width:.3g} %"
         )
 
 

@@ -13,6 +13,7 @@ from pmsmtool.estimators.estimate import statistical_half_width
 from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
 from pmsmtool.estimators.flux_linkage_rows import mean_inverter_error
 from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, curve_points, draw, repeat, run
 
@@ -150,6 +151,15 @@ def test_a_disagreement_is_reported(population: Population) -> None:
     assert found.driven is not None
     check = cross_check("psi_f_wb_driven", "psi_f_wb", found.driven, found.psi_f, found.voltage_scale_std)
     assert not check.agrees and "DISAGREES with psi_f_wb: -2" in check.verdict
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "word"),
+    [(1.01, 0.01, "agrees with"), (1.05, 0.01, "DISAGREES with"), (1.4, 0.5, "too uncertain to judge")],
+)
+def test_a_check_says_what_it_can(value: float, std: float, word: str) -> None:
+    first = Estimate(1.0, 0.001, 0.0, "H")
+    assert cross_check("L_q_h_apparent", "L_q_h", Estimate(value, std, 0.0, "H"), first).verdict.startswith(word)
 
 
 def test_without_q_currents_there_is_no_second_method(population: Population) -> None:
