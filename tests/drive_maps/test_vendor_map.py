@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from pmsmtool.errors import ConfigError
@@ -10,6 +12,7 @@ from pmsmtool.firmware.drive_map_file import dump_drive_map, map_hash, parse_dri
 from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.firmware.vendor_tuning import SET_UP
 from pmsmtool.firmware.wire_units import counted_in
+from pmsmtool.resources import data_folder
 
 HEAD = """\
 schema = "pmsmtool.drive-map/1"
@@ -158,3 +161,12 @@ def test_shipped_maps_name_the_source_of_what_they_start() -> None:
         assert tuning is not None and tuning.source in drive_map.sources
         assert all(cell.source in drive_map.sources for cell in tuning.results.values())
         assert all(used in drive_map.cells for step in tuning.steps.values() for used in step.uses)
+
+
+def test_the_guide_shows_a_procedure_that_is_accepted() -> None:
+    guide = (data_folder("firmware-params") / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```toml\n(.*?)```", guide, re.DOTALL)
+    (own,) = [block for block in blocks if "[vendor_tuning]" in block]
+    tuning = parse(blocks[0] + own).vendor_tuning
+    assert tuning is not None and tuning.quantities == {"R"}
+    assert tuning.results["motor.R_s_ohm"].factor == pytest.approx(0.5e-3)  # between two terminals

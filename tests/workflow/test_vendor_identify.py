@@ -126,11 +126,12 @@ def test_os_commands_are_started_in_order_read_and_restored(tmp_path: Path) -> N
         answers = identified(drive)
         assert held(session) == before
     values = {name: value for answer in answers for name, value in answer.values.items()}
-    # the drive's own errors, here 2.0, 0.6 (of L_d) and 4.0 %: dead time and devices stay in what it says
+    # the drive's own errors, here 2.1, -1.1 (of L_d) and -1.4 %, within 0.1 % over five seeds of its noise: dead time
+    # and devices stay in what it says
     assert values["motor.pole_pairs"] == TRUTH.pole_pairs
     assert values["motor.R_s_ohm"] == pytest.approx(TRUTH.R_s_ohm, rel=0.05)
     assert values["motor.L_q_h"] == pytest.approx(TRUTH.L_d_h, rel=0.03)
-    assert values["motor.psi_f_wb"] == pytest.approx(TRUTH.psi_f_wb, rel=0.06)
+    assert values["motor.psi_f_wb"] == pytest.approx(TRUTH.psi_f_wb, rel=0.03)
     assert values["motor.R_s_ohm"] != TRUTH.R_s_ohm and values["motor.psi_f_wb"] != TRUTH.psi_f_wb
     commands = [data[0] for index, sub, data in written if (index, sub) == (OS_COMMAND, 1)]
     assert commands == [6, 7, 8, 9, 10]
@@ -152,7 +153,7 @@ def test_a_mode_of_its_own_is_started_waited_for_and_read(tmp_path: Path) -> Non
     assert answer.values["motor.R_s_ohm"] == pytest.approx(TRUTH.R_s_ohm, rel=0.05)
     assert answer.values["motor.L_d_h"] == pytest.approx(TRUTH.L_d_h, rel=0.03)
     assert answer.values["motor.L_q_h"] == pytest.approx(TRUTH.L_q_h, rel=0.03)
-    assert answer.values["motor.psi_f_wb"] == pytest.approx(TRUTH.psi_f_wb, rel=0.06)
+    assert answer.values["motor.psi_f_wb"] == pytest.approx(TRUTH.psi_f_wb, rel=0.03)
 
 
 def faulty(folder: Path, **simulation: str) -> str:

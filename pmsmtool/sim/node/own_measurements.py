@@ -51,6 +51,8 @@ SPEED_SHARE = 0.25
 """Speed at which the voltage is measured, of the largest one."""
 RAMP_S, RUN_UP_S = 3.0, 6.0
 """Ramp of the speed; longest time to reach it."""
+PUSH_S = 0.02
+"""Time over which the voltage is taken while the shaft is driven, and while it is braked."""
 FULL_CURRENT_AT = 0.1
 """Speed error, of the target speed, that takes the whole test current."""
 
@@ -213,7 +215,7 @@ class OwnMeasurements:
         return 2.0 * float(result.std[0]) / math.sqrt(1.0 / 3.0 + 2.0 / (3.0 * HALF_PERIOD**2))
 
     def _flux_linkage(self) -> Measured:
-        """Measure the voltage at speed, less the drop at the resistance that the drive is set to."""
+        """Measure the voltage at speed, driving and braking, less the drop at the resistance that the drive is set to."""
         limit = self._dictionary["cia402.max_speed"].number()
         target = SPEED_SHARE * min(limit, self._plant.parameter("motor.n_max_rpm")) * math.pi / 30.0
         pole_pairs = self._plant.parameter("motor.pole_pairs")
@@ -223,15 +225,16 @@ class OwnMeasurements:
                 raise MeasurementFailed(NO_ANSWER)
             yield from self._steer(min(1.0, passed / RAMP_S) * target, target, pole_pairs)
             passed += TICK_S
-        # without current: the dead time's error would be a tenth of the voltage at this speed
-        self._plant.core.command(Command(ControlMode.CURRENT))
-        yield REST_S
-        signals = (Signal.U_Q, Signal.I_Q, Signal.OMEGA_E)
-        u_q, i_q, omega_e = yield from self._means(signals, WINDOW_S)
+        linkages = []
+        for i_q in (0.5 * self._current_a, -0.5 * self._current_a):  # dead time adds to one and takes from the other
+            self._plant.core.command(Command(ControlMode.CURRENT, i_q_a=i_q))
+            yield REST_S
+            u_q, i_q, omega_e = yield from self._means((Signal.U_Q, Signal.I_Q, Signal.OMEGA_E), PUSH_S)
+            linkages.append((u_q - self._plant.parameter("motor.R_s_ohm") * i_q) / omega_e)
         while passed > 0.0:
             yield from self._steer(min(1.0, passed / RAMP_S) * target, target, pole_pairs)
             passed -= TICK_S
-        return (u_q - self._plant.parameter("motor.R_s_ohm") * i_q) / omega_e
+        return 0.5 * (linkages[0] + linkages[1])
 
     def _speed(self, pole_pairs: float) -> float:
         return self._plant.core.signal(Signal.OMEGA_E) / max(1.0, pole_pairs)
