@@ -102,7 +102,7 @@ def parse_vendor_tuning(
     mode = table.get("mode")
     if type(mode) is not int or not -128 <= mode <= -1:
         tell(("mode",), f"mode {mode!r}: a maker's own mode of operation is a whole number from -128 to -1")
-    if "source" in table and table["source"] not in sources:
+    if not isinstance(table.get("source", ""), str) or ("source" in table and table["source"] not in sources):
         tell(("source",), f"source {table['source']!r} is not in [sources]")
 
     def row_of(name: str, row: Any, path: tuple[str, ...], anywhere: bool) -> Cell | None:
@@ -210,7 +210,7 @@ def _answer(name: str, row: Mapping[str, Any], path: tuple[str, ...], tell: Comp
 def _parse_uses(
     name: str, uses: Any, results: Mapping[str, Cell], cells: Mapping[str, Cell], path: tuple[str, ...], tell: Complain
 ) -> tuple[str, ...]:
-    if not isinstance(uses, list):
+    if not isinstance(uses, list) or not all(isinstance(used, str) for used in uses):
         tell((*path, "uses"), f"{name}: uses must be a list of results")
         return ()
     for used in uses:
@@ -218,7 +218,7 @@ def _parse_uses(
             tell((*path, "uses"), f"{name}: uses {used}, which no step before it measures")
         elif used not in cells:
             tell((*path, "uses"), f"{name}: uses {used}, which [objects] does not hold")
-    return tuple(map(str, uses))
+    return tuple(uses)
 
 
 def _parse_codes(table: Any, path: tuple[str, ...], tell: Complain) -> dict[int, str]:

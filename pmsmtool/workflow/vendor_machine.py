@@ -30,7 +30,7 @@ COARSE = 0.005
 """Half a count, of a value, from which the rounding is told."""
 OTHER_MACHINE = 0.25
 """A flux linkage further than this from the given one is another machine's: a data sheet leaves 15 %, and the simple
-method of a simulated drive was up to 4 % off (``python -m benchmarks.vendor_identification``)."""
+method of simulated drives was up to 14 % off (``benchmarks/tables/vendor_identification.txt``)."""
 
 
 def vendor_estimates(tuning: VendorTuning, answers: Mapping[str, VendorAnswer]) -> dict[str, Estimate]:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+import math
 import re
+import tomllib
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -13,6 +18,7 @@ from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.firmware.vendor_tuning import SET_UP
 from pmsmtool.firmware.wire_units import counted_in
 from pmsmtool.resources import data_folder
+from pmsmtool.toml_text import toml_text
 
 HEAD = """\
 schema = "pmsmtool.drive-map/1"
@@ -170,3 +176,29 @@ def test_the_guide_shows_a_procedure_that_is_accepted() -> None:
     tuning = parse(blocks[0] + own).vendor_tuning
     assert tuning is not None and tuning.quantities == {"R"}
     assert tuning.results["motor.R_s_ohm"].factor == pytest.approx(0.5e-3)  # between two terminals
+
+
+def _leaves(table: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    for key, value in table.items():
+        yield (*path, key)
+        if isinstance(value, dict):
+            yield from _leaves(value, (*path, key))
+
+
+@pytest.mark.parametrize("text", [COMMANDS, MODE], ids=["os_command", "mode"])
+def test_any_value_of_any_kind_is_refused_in_words(text: str) -> None:
+    """Every key and table of the section in turn holds something else: read, or refused, never anything worse."""
+    document = tomllib.loads(text)
+    reasons: list[int] = []
+    for path in _leaves(document["vendor_tuning"]):
+        for other in (True, -1, 3.5, math.inf, "x", "", [], [["x"]], {}, {"x": {"y": []}}):
+            changed = copy.deepcopy(document)
+            table = changed["vendor_tuning"]
+            for key in path[:-1]:
+                table = table[key]
+            table[path[-1]] = other
+            try:
+                parse(toml_text(changed))
+            except ConfigError as error:
+                reasons.append(len(error.violations))
+    assert len(reasons) > 100 and min(reasons) > 0

@@ -215,7 +215,7 @@ class OwnMeasurements:
         return 2.0 * float(result.std[0]) / math.sqrt(1.0 / 3.0 + 2.0 / (3.0 * HALF_PERIOD**2))
 
     def _flux_linkage(self) -> Measured:
-        """Measure the voltage at speed, driving and braking, less the drop at the resistance that the drive is set to."""
+        """Measure the voltage at speed, driving and braking, less the drop at the resistance the drive is set to."""
         limit = self._dictionary["cia402.max_speed"].number()
         target = SPEED_SHARE * min(limit, self._plant.parameter("motor.n_max_rpm")) * math.pi / 30.0
         pole_pairs = self._plant.parameter("motor.pole_pairs")
