@@ -23,7 +23,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from enum import IntEnum
 
 
@@ -98,6 +99,22 @@ class ConfigError(PmsmtoolError, ValueError):
         lines = [super().__str__()]
         lines[1:] = [f"  - {violation}" for violation in self.violations]
         return "\n".join(lines)
+
+
+@contextmanager
+def next_step(hint: str) -> Iterator[None]:
+    """Give what is refused inside a next step, where it names none of its own; also a decorator, of a format's reader.
+
+    Parameters
+    ----------
+    hint : str
+        What to do with a file of this format that cannot be used.
+    """
+    try:
+        yield
+    except ConfigError as error:
+        error.hint = error.hint or hint
+        raise
 
 
 class BusError(PmsmtoolError):
@@ -187,9 +204,7 @@ class IdentificationError(PmsmtoolError):
 
     exit_code = ExitCode.NOT_TRUSTWORTHY
 
-    def __init__(
-        self, reason: str, what: str, *, where: str = "", likely: str = "", hint: str = ""
-    ) -> None:
+    def __init__(self, reason: str, what: str, *, where: str = "", likely: str = "", hint: str = "") -> None:
         super().__init__(f"{reason}: {what}", where=where, likely=likely, hint=hint)
         self.reason = reason
 

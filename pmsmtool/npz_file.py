@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
+
+NEXT_STEP = "give a file that pmsmtool wrote, or numpy.savez without objects"
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time stamp of every member, the oldest a ZIP archive can hold."""
@@ -37,6 +39,7 @@ def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     return out.getvalue()
 
 
+@next_step(NEXT_STEP)
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of an ``.npz`` archive.
 

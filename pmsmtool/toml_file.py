@@ -7,12 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
+
+NEXT_STEP = "correct the text there; https://toml.io shows the format"
 
 LARGEST_WHOLE = 1 << 63
 """Whole numbers of TOML 1.0 have 64 bit; the standard library takes any, which no float holds."""
 
 
+@next_step(NEXT_STEP)
 def parse_toml(text: str, *, where: str) -> dict[str, Any]:
     """Return the tables of a TOML text.
 
@@ -62,7 +65,9 @@ def read_text(path: Path, *, hint: str = "check the path") -> str:
     except FileNotFoundError:
         raise ConfigError("no such file", where=str(path), hint=hint) from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read as text: {error}", where=str(path)) from None
+        raise ConfigError(
+            f"cannot be read as text: {error}", where=str(path), hint="give a text file in UTF-8 that you may read"
+        ) from None
 
 
 def _whole_numbers(value: Any, name: str) -> Iterator[tuple[str, int]]:

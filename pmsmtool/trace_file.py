@@ -18,10 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.trace import Trace
 from pmsmtool.units import UNITS
+
+NEXT_STEP = "give a trace as pmsmtool writes it: .npz, or .csv with names in row 1 and units in row 2"
 
 _UNITS, _META = "_units", "_meta"
 
@@ -83,6 +85,7 @@ def write_trace(trace: Trace, path: Path) -> None:
         ) from None
 
 
+@next_step(NEXT_STEP)
 def read_trace(path: Path) -> Trace:
     """Read a trace by suffix.
 

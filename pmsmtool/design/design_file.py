@@ -11,13 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.design.sampled_loop import LoopMargins
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.key import did_you_mean
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_from_tables, machine_tables
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
+
+NEXT_STEP = "make the design again: `pmsmtool tune MACHINE -o design.toml`"
 
 SCHEMA = "pmsmtool.design/1"
 
@@ -145,6 +147,7 @@ def achieved(loop: LoopMargins) -> str:
     return f"{phase}, {gain}, bandwidth {loop.bandwidth_rad_s / (2.0 * math.pi):.4g} Hz"
 
 
+@next_step(NEXT_STEP)
 def load_design(path: Path) -> Design:
     """Read ``design.toml``; raises ``ConfigError`` naming the file and everything that is wrong."""
     try:
@@ -156,6 +159,7 @@ def load_design(path: Path) -> Design:
     return parse_design(text, where=str(path))
 
 
+@next_step(NEXT_STEP)
 def load_machine_or_design(path: Path) -> tuple[MachineFile, Design | None]:
     """Read a machine file or a design, told apart by their schema; a design brings its own machine."""
     text = ""
@@ -169,6 +173,7 @@ def load_machine_or_design(path: Path) -> tuple[MachineFile, Design | None]:
     return load_machine_file(path), None
 
 
+@next_step(NEXT_STEP)
 def parse_design(text: str, *, where: str = "design.toml") -> Design:
     """Read the text of a design.
 

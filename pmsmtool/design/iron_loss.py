@@ -11,13 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.npz_file import read_npz
+
+NEXT_STEP = "`pmsmtool help files` says what an iron-loss map holds"
 
 _NAMES = ("i_d_a", "i_q_a", "c_h_w_per_hz", "c_e_w_per_hz2")
 
 
+@next_step(NEXT_STEP)
 def load_iron_loss_map(path: Path) -> FluxMap:
     """Read a map; its ``psi_d_wb`` carries c_h (W/Hz), its ``psi_q_wb`` carries c_e (W/Hz^2).
 

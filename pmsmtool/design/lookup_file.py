@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 from pmsmtool.design.lookup_grid import InterpolationError, StoredFormat, int16_step_a
 from pmsmtool.design.lookup_loci import Locus
 from pmsmtool.design.lookup_table import AxisKind, LookupTable
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.npz_file import npz_bytes
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
+
+NEXT_STEP = "make the table again: `pmsmtool lut DESIGN -o lut.npz`"
 
 SCHEMA = "pmsmtool.lut/1"
 
@@ -133,6 +135,7 @@ def lut_words(table: LookupTable, stored: StoredFormat) -> bytes:
     return _words(stored, _arrays(table))
 
 
+@next_step(NEXT_STEP)
 def table_parameters(arrays: Mapping[str, NDArray[Any]], where: str) -> ParameterSet:
     """Return what ``lut.npz`` gives a drive: the ``lut.*`` values, the axes and both tables.
 

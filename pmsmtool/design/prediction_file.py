@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.design.prediction import Array, Band, Fault, Prediction, Quantity
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
+
+NEXT_STEP = "prove again: the prediction beside the traces was damaged"
 
 SCHEMA = "pmsmtool.prediction/1"
 
@@ -47,6 +49,7 @@ def to_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
     return {**arrays, "_meta": np.array(json.dumps(facts))}
 
 
+@next_step(NEXT_STEP)
 def from_arrays(arrays: Mapping[str, NDArray[Any]], *, where: str = "prediction") -> Prediction:
     """Read what :func:`to_arrays` made.
 

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.firmware.eds import (
     COMMISSIONING,
     INTEGER_BITS,
@@ -26,6 +26,8 @@ from pmsmtool.firmware.eds import (
     parse_integer,
     sections_of,
 )
+
+NEXT_STEP = "give the EDS or DCF of the drive's maker as it came, or one that `pmsmtool export` wrote"
 
 Address = tuple[int, int]
 
@@ -42,6 +44,7 @@ class Entry:
     data: bytes
 
 
+@next_step(NEXT_STEP)
 def encode(data_type: int, value: float | str | bytes) -> bytes:
     """Return the bytes of a value on the wire (CiA 301, section 7.1.4, little endian).
 
@@ -70,6 +73,7 @@ def encode(data_type: int, value: float | str | bytes) -> bytes:
         raise ConfigError(f"{int(value)} does not fit {bits} bits") from None
 
 
+@next_step(NEXT_STEP)
 def decode_value(data_type: int, text: str, node_id: int | None = None) -> bytes:
     """Return the bytes of a ``ParameterValue`` or ``DefaultValue`` text.
 
@@ -109,6 +113,7 @@ def value_text(data_type: int, data: bytes) -> str:
     return data.decode("latin-1") if data_type == VISIBLE_STRING else data.hex().upper()
 
 
+@next_step(NEXT_STEP)
 def update_dcf(data: bytes, values: Mapping[Address, bytes], where: str = "DCF") -> bytes:
     """Return the file with new ``ParameterValue`` lines and every other byte kept.
 
@@ -206,6 +211,7 @@ def _require(sheet: Eds, values: Mapping[Address, bytes], where: str) -> None:
         )
 
 
+@next_step(NEXT_STEP)
 def new_dcf(
     eds: bytes, values: Mapping[Address, bytes], *, node_id: int, node_name: str = "", where: str = "EDS"
 ) -> bytes:
@@ -222,6 +228,7 @@ def new_dcf(
     return (text.rstrip("\r\n") + newline + newline.join(section)).encode(encoding, "replace")
 
 
+@next_step(NEXT_STEP)
 def values_of(sheet: Eds) -> dict[Address, bytes]:
     """Return every ``ParameterValue`` of a DCF, encoded; objects without one are not in the result.
 
@@ -244,6 +251,7 @@ def values_of(sheet: Eds) -> dict[Address, bytes]:
     return found
 
 
+@next_step(NEXT_STEP)
 def write_concise(entries: Sequence[Entry]) -> bytes:
     """Return a concise DCF: count, then index, sub, size, data of each (object 0x1F22, CiA 302-2)."""
     parts = [struct.pack("<I", len(entries))]
@@ -251,6 +259,7 @@ def write_concise(entries: Sequence[Entry]) -> bytes:
     return b"".join(parts)
 
 
+@next_step(NEXT_STEP)
 def read_concise(data: bytes, where: str = "concise DCF") -> list[Entry]:
     """Return the entries of a concise DCF.
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.firmware.image import LUT_FORMAT_INT16, LUT_INT16_NO_POINT
 from pmsmtool.firmware.recorder_map import RecorderMap, Recording
 from pmsmtool.firmware.vendor_tuning import VendorTuning
@@ -284,6 +284,7 @@ class DriveMap:
         """Whether a drive of this identity belongs to the family."""
         return vendor == self.vendor and product in (self.product, *self.more_products)
 
+    @next_step("ask for values the drive can hold (`pmsmtool tune`), or correct type and unit in its map")
     def encode(self, wanted: ParameterSet) -> dict[str, bytes]:
         """Return the bytes of every entry the drive has an object for, in the order they are written.
 
@@ -307,6 +308,7 @@ class DriveMap:
                 encoded[name] = encode_table(name, table, wanted.values)
         return encoded
 
+    @next_step("compare type and size in the drive's map with its manual")
     def decode(self, found: Mapping[str, bytes]) -> ParameterSet:
         """Return the set that a drive's bytes mean."""
         values: dict[str, float] = {}

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from typing import Any, get_args
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.firmware.drive_map import (
     LETTERS,
     SIGNALS,
@@ -36,6 +36,8 @@ from pmsmtool.params.catalogue import BY_NAME, EVERY, Parameter
 from pmsmtool.params.parameter_set import TABLE_NAMES
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_text
+
+NEXT_STEP = "firmware-params/README.md says what each key of a map means; the maps beside it are examples"
 
 SCHEMA = "pmsmtool.drive-map/1"
 FACTOR_AGREES = 1e-6
@@ -120,6 +122,7 @@ def _expected_unit(parameter: Parameter, form: str) -> str:
 # ---- reading ----------------------------------------------------------------------------------------
 
 
+@next_step(NEXT_STEP)
 def parse_drive_map(text: str, where: str = "map.toml") -> DriveMap:
     """Read a map file.
 

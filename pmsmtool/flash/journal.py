@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pmsmtool.drive.port import Identity
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.resources import user_folder
+
+NEXT_STEP = "give a file of `pmsmtool backup`, or a journal as it was written"
 
 SCHEMA = "pmsmtool.snapshot/1"
 
@@ -106,6 +108,7 @@ class Snapshot:
         }
 
 
+@next_step(NEXT_STEP)
 def parse_snapshot(text: str, where: str) -> Snapshot:
     """Read a snapshot's text.
 
@@ -140,6 +143,7 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
         ) from error
 
 
+@next_step(NEXT_STEP)
 def read_snapshot(path: Path) -> Snapshot:
     """Read a snapshot file; raises ``ConfigError`` naming it."""
     try:

@@ -126,7 +126,12 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
     """
     violations = wanted.violations()
     if violations:
-        raise ConfigError("the parameter set cannot be written", where=wanted.name, violations=violations)
+        raise ConfigError(
+            "the parameter set cannot be written",
+            where=wanted.name,
+            hint="`pmsmtool param help NAME` shows the bounds of a parameter",
+            violations=violations,
+        )
     encoded = drive_map.encode(wanted)
     held = drive_map.decode(encoded).values
     before = drive_map.decode({name: data for name, data in found.items() if name in drive_map.cells}).values

@@ -132,7 +132,11 @@ def check_snapshot(drive_map: DriveMap, snapshot: Snapshot, identity: Identity, 
         )
     unknown = [e.name for e in snapshot.entries if e.name not in (*drive_map.cells, *drive_map.tables, *_MARK_NAMES)]
     if unknown:
-        raise ConfigError("the drive's map does not know all objects of the snapshot", violations=unknown)
+        raise ConfigError(
+            "the drive's map does not know all objects of the snapshot",
+            hint="give the map that the snapshot was taken through with --map",
+            violations=unknown,
+        )
 
 
 def restore_plan(drive_map: DriveMap, snapshot: Snapshot, found: Mapping[str, bytes]) -> Plan:

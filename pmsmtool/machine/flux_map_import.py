@@ -21,13 +21,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.flux_map import INVERSE_NODES, FluxMap, meta_json
 from pmsmtool.machine.flux_map_cells import Kind
 from pmsmtool.machine.flux_map_repair import FluxGrid, fill_holes
 from pmsmtool.machine.mat_file import read_mat
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.units import parse_quantity
+
+NEXT_STEP = "`pmsmtool machine map FILE` checks and repairs a map; `pmsmtool help files` says what it may be"
 
 Array = NDArray[np.float64]
 
@@ -56,6 +58,7 @@ class RawFluxMap:
     notes: tuple[str, ...]
 
 
+@next_step(NEXT_STEP)
 def load_flux_map(path: Path, *, fill: bool = False) -> FluxMap:
     """Read a flux map.
 
@@ -89,6 +92,7 @@ def load_flux_map(path: Path, *, fill: bool = False) -> FluxMap:
         raise ConfigError(error.what, where=str(path), violations=error.violations) from None
 
 
+@next_step(NEXT_STEP)
 def read_flux_map(path: Path) -> RawFluxMap:
     """Read grids, settings and notes; holes stay NaN (see :func:`load_flux_map` for the errors)."""
     readers = {".npz": read_npz, ".mat": _read_mat, ".csv": _read_csv}

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.flux_map import INVERSE_NODES, FluxMap, meta_json
 from pmsmtool.machine.key import did_you_mean
+
+NEXT_STEP = "make the file again from the machine file: the map in it was edited"
 
 _GRIDS = ("i_d_a", "i_q_a", "psi_d_wb", "psi_q_wb")
 _KEYS = (*_GRIDS, "kind", "inverse_nodes", "meta")
@@ -25,6 +27,7 @@ def flux_map_table(flux_map: FluxMap) -> dict[str, Any]:
     return {**table, **{name: getattr(flux_map, name).tolist() for name in _GRIDS}}
 
 
+@next_step(NEXT_STEP)
 def flux_map_from_table(table: Any) -> FluxMap:
     """Return the map of a table.
 

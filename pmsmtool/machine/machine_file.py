@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_table import flux_map_table
 from pmsmtool.machine.key import Value
@@ -29,6 +29,8 @@ from pmsmtool.machine.parameters import (
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS, resolved_simulation
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
+
+NEXT_STEP = "`pmsmtool help machine-file` lists the keys; `pmsmtool machine new` writes a file from a data sheet"
 
 SCHEMA = "pmsmtool.machine/1"
 
@@ -89,6 +91,7 @@ class MachineFile:
         return hashlib.sha256(text.encode()).hexdigest()
 
 
+@next_step(NEXT_STEP)
 def load_machine_file(path: Path) -> MachineFile:
     """Read a machine file and the flux map it names.
 
@@ -106,6 +109,7 @@ def load_machine_file(path: Path) -> MachineFile:
     return parse_machine(text, where=str(path), folder=Path(path).parent)
 
 
+@next_step(NEXT_STEP)
 def parse_machine(text: str, *, where: str = "machine file", folder: Path | None = None) -> MachineFile:
     """Parse the text of a machine file.
 
@@ -131,6 +135,7 @@ def parse_machine(text: str, *, where: str = "machine file", folder: Path | None
     return machine_from_tables(tables, where=where, folder=folder, lines=toml_lines(text))
 
 
+@next_step(NEXT_STEP)
 def machine_from_tables(
     tables: Record,
     *,

@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
+
+NEXT_STEP = "save it as -v7 or older, or give the map as .csv or .npz"
 
 Content = dict[str, Any]
 """Name -> array, or the content of a structure."""
@@ -45,6 +47,7 @@ class _Element:
     data: bytes
 
 
+@next_step(NEXT_STEP)
 def read_mat(path: Path) -> Content:
     """Return the numeric arrays and the structures of them; texts, cells and objects are left out.
 

@@ -16,10 +16,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY, LUT_CAPACITY_WORDS
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_text
+
+NEXT_STEP = (
+    "`pmsmtool tune` and `pmsmtool export` write such a file; `pmsmtool param help NAME` shows a parameter's bounds"
+)
 
 SCHEMA = "pmsmtool.params/1"
 
@@ -55,9 +59,7 @@ class ParameterSet:
         unknown += [_unknown(key, TABLE_NAMES) for key in self.tables if key not in TABLE_NAMES]
         if unknown:
             raise ConfigError("not in the parameter catalogue", violations=unknown)
-        object.__setattr__(
-            self, "values", {r.name: float(self.values[r.name]) for r in EVERY if r.name in self.values}
-        )
+        object.__setattr__(self, "values", {r.name: float(self.values[r.name]) for r in EVERY if r.name in self.values})
         object.__setattr__(
             self, "tables", {n: tuple(map(float, self.tables[n])) for n in TABLE_NAMES if n in self.tables}
         )
@@ -95,6 +97,7 @@ class ParameterSet:
         return groups
 
 
+@next_step(NEXT_STEP)
 def parse_parameter_set(text: str, where: str = "params.toml") -> ParameterSet:
     """Read the text of a parameter set.
 
@@ -130,6 +133,7 @@ def parse_parameter_set(text: str, where: str = "params.toml") -> ParameterSet:
     return found
 
 
+@next_step(NEXT_STEP)
 def read_parameter_set(path: Path) -> ParameterSet:
     """Read ``params.toml`` from a file; raises ``ConfigError`` naming the file."""
     try:

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.firmware.drive_map_file import parse_drive_map
 from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.profile import machine_path
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from pmsmtool.firmware.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.sim.node.drive_core import DriveCore
+
+NEXT_STEP = "a channel is PROFILE?key=value&key=value; `pmsmtool sim list` names the profiles"
 
 DEFAULT_PROFILE = "interior-2k2"
 """Profile of a channel without a name."""
@@ -118,6 +120,7 @@ _KEYS: dict[str, Callable[[str], Any]] = {
 }
 
 
+@next_step(NEXT_STEP)
 def parse_channel(text: str | None) -> Channel:
     """Return the channel a string describes; None is the default profile.
 
@@ -189,6 +192,7 @@ def _kernel(machine_file: MachineFile, seed: int) -> DriveCore:
     return create(machine_file, seed)
 
 
+@next_step(NEXT_STEP)
 def build_line(
     channel: Channel, *, bitrate: int | None = None, instant: bool = False, make_core: CoreMaker = _kernel
 ) -> Line:

@@ -11,8 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.toml_file import parse_toml
+
+NEXT_STEP = "`pmsmtool sim faults` prints an example with every key"
 
 EXAMPLE = """\
 # Faults on purpose, for pmsmtool sim serve --faults FILE, or -i pmsmsim -c 'NAME?faults=FILE'.
@@ -260,6 +262,7 @@ _STORE: dict[str, Callable[[Any], Any]] = {"factor": _number(0.01, 1e4)}
 _TABLES = ("frame", "drive", "adapter", "refuse", "lie", "absent", "store")
 
 
+@next_step(NEXT_STEP)
 def parse_faults(text: str, where: str = "faults") -> FaultPlan:
     """Return the plan a TOML text describes.
 
@@ -323,6 +326,7 @@ def _plan(reader: _Reader, document: Mapping[str, Any]) -> FaultPlan:
     )
 
 
+@next_step(NEXT_STEP)
 def load_faults(path: Path) -> FaultPlan:
     """Read a faults file.
 

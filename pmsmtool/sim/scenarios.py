@@ -9,12 +9,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.key import Value, did_you_mean
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.sim.kernel import Target
 from pmsmtool.sim.simulated_machine import ROTORS, RPM
 from pmsmtool.toml_file import read_toml
+
+NEXT_STEP = "`pmsmtool help scenario` lists the keys; `pmsmtool simulate --list` names what is built in"
 
 SCHEMA = "pmsmtool.scenario/1"
 
@@ -127,6 +129,7 @@ def _violations(scenario: Scenario) -> list[str]:
 _KEYS = ("name", "duration_s", "mode", "rotor", "start_rpm", "decimation", "schedule", "simulation")
 
 
+@next_step(NEXT_STEP)
 def load_scenario(path: Path) -> Scenario:
     """Read a scenario file.
 

@@ -13,10 +13,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.sim.kernel import Application, Rotor, Setup, library
+
+NEXT_STEP = "`pmsmtool help simulation` lists the keys of [simulation]"
 
 SHAPES = ("none", "sign", "atan", "tanh", "capacitive")
 """``deadtime_shape`` in the order of ``enum pmsm_deadtime_shape``."""
@@ -66,6 +68,7 @@ class Settings:
         return bool(self._values[name])
 
 
+@next_step(NEXT_STEP)
 def settings_of(machine_file: MachineFile) -> Settings:
     """Return the simulation settings; the encoder's kind falls back to ``[encoder]``.
 
@@ -88,6 +91,7 @@ def settings_of(machine_file: MachineFile) -> Settings:
     return Settings(values)
 
 
+@next_step(NEXT_STEP)
 def with_simulation(machine_file: MachineFile, changes: Mapping[str, Value]) -> MachineFile:
     """Return the machine with other simulation keys; they are checked as in a file.
 
@@ -107,6 +111,7 @@ def with_simulation(machine_file: MachineFile, changes: Mapping[str, Value]) -> 
     return replace(machine_file, simulation={**machine_file.simulation, **checked})
 
 
+@next_step(NEXT_STEP)
 def build_setup(
     machine_file: MachineFile,
     *,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pmsmtool.design import design_file
 from pmsmtool.design.design_file import parse_design
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.firmware.dcf import values_of
 from pmsmtool.firmware.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.eds import parse_eds
@@ -14,10 +14,13 @@ from pmsmtool.params import parameter_set
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
 from pmsmtool.toml_file import parse_toml, read_text
 
+NEXT_STEP = "give a parameter set, a design, a DCF, a table of `lut`, or a run directory"
+
 _IN_A_RUN = ("params.toml", "design.toml")
 _DCF_SUFFIXES = (".dcf", ".eds")
 
 
+@next_step(NEXT_STEP)
 def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterSet:
     """Return the parameter set that a file or a run directory holds.
 
