@@ -80,6 +80,8 @@ def identify_command(
     coasting; "frf" measures the mechanical frequency response, and a resonance where the data support one. Without a
     quantity all but map and frf are measured; with "all", all.
 
+    With --method vendor the drive measures by itself, as its map says (`pmsmtool caps`); such values have no interval.
+
     The limits are printed and consent is asked before anything moves. Every number comes with its statistical and its
     systematic part; what cannot be trusted is refused by name. The run directory keeps raw traces and machine.toml;
     nothing is stored in the drive.
@@ -129,6 +131,7 @@ def identify_command(
         run, stage = _measure(bus, motion, out, request, runs, found)
     else:
         run, stage = _measure_without_injection(bus, motion, out, request, runs, found, how)
+        _tell_more(found, request, out)
     _show(run, stage, out)
 
 
@@ -150,6 +153,15 @@ def _choose(
             if given and candidate is not Method.MANUAL:
                 return found, candidate.value, replace(request, quantities=given)
     return found, found.require(request.quantities, wanted).value, request
+
+
+def _tell_more(found: Capabilities, request: IdentifyRequest, out: Output) -> None:
+    """Name what the drive would measure by itself besides."""
+    from pmsmtool.workflow.vendor_identify import vendor_quantities
+
+    more = [name for name in vendor_quantities(found) if name not in request.quantities]
+    if more:
+        out.note(f"{', '.join(more)}: the drive measures them by itself with --method vendor")
 
 
 def _measure_without_injection(

@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
-from pmsmtool.cia402 import State
+from pmsmtool.cia402 import Command, State
 from pmsmtool.cli.main import cli
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.drive import objects
@@ -251,7 +251,7 @@ def test_the_drive_keeps_its_limits_meanwhile(tmp_path: Path) -> None:
 
 
 def test_the_node_answers_as_cia_301_says(tmp_path: Path) -> None:
-    with opened(tmp_path, load_family("synapticon")) as (drive, _):
+    with opened(tmp_path, load_family("synapticon")) as (drive, session):
         node = drive.node
 
         def start(command: int) -> None:
@@ -276,7 +276,13 @@ def test_the_node_answers_as_cia_301_says(tmp_path: Path) -> None:
         assert 100 < node.sdo.read(OS_COMMAND, 2)[0] < 200
         node.sdo.download(OS_COMMAND_MODE, 0, b"\x03")
         assert node.sdo.read(OS_COMMAND, 3)[:3] == bytes((3, 0, 252))
-        node.disable_voltage()
+        node.sdo.download(OS_COMMAND_MODE, 0, b"\x00")
+        start(7)
+        node.connection.wait(0.5)
+        node.go(Command.QUICK_STOP)  # whatever ends operation ends the measurement
+        node.connection.wait(1.0)
+        assert node.sdo.read(OS_COMMAND, 3)[:3] == bytes((3, 0, 252))
+        assert not session.power.state.energised
 
 
 # ---- values -----------------------------------------------------------------------------------------
