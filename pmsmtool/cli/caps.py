@@ -52,6 +52,7 @@ def _facts(found: Capabilities) -> dict[str, Any]:
         "map_is_drives": found.map_is_drives,
         "tier": found.tier.value,
         "features": sorted(found.features),
+        "recorder": found.recorder,
         "quantities": [_row_facts(row) for row in found.rows()],
         "parameters": sorted(found.drive_map.cells),
         "left_out": dict(found.drive_map.left_out),
@@ -80,6 +81,7 @@ def _lines(found: Capabilities) -> list[str]:
         f"node {identity.node}  {identity.name}  vendor {identity.vendor:#010x}  product {identity.product:#x}  "
         f"serial {identity.serial}",
         f"map {found.drive_map.name} ({len(found.drive_map.cells)} parameters)  tier {found.tier}",
+        *([f"recorder: {found.recorder}"] if found.recorder else []),
         "",
     ]
     rows = [(row.quantity, row.method.value, *_said(row)) for row in found.rows()]

@@ -69,6 +69,16 @@ class CommandedRecorder(Recorder):
         return self._period_s
 
     @abstractmethod
+    def room(self, signals: Sequence[str]) -> int:
+        """Return how many samples of signals fit; they are chosen on the drive.
+
+        Raises
+        ------
+        NotAvailable
+            It does not have these signals.
+        """
+
+    @abstractmethod
     def _base_period_s(self) -> float: ...
 
     def start_average(self, signals: Sequence[str], periods: int) -> None:

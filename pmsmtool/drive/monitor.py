@@ -37,6 +37,10 @@ class MonitorRecorder(CommandedRecorder):
             )
         return 1.0 / rate_hz
 
+    def room(self, signals: Sequence[str]) -> int:
+        """Return how many samples of signals fit."""
+        return self._largest // sum(cell.size for cell in self._cells(signals))
+
     def arm(
         self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool
     ) -> None:

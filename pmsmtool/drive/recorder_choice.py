@@ -41,3 +41,17 @@ def recorder_of(node: DriveNode, period_s: float) -> Recorder:
             f"the drive map {node.map.name!r} has no recorder that this program reads", where=f"node {node.node}"
         )
     return kind(node)
+
+
+def described(node: DriveNode) -> str:
+    """Return what a maker's recorder takes and how often, or why it is not read; empty where the map names none."""
+    if node.map.staging or node.map.capabilities.recorder == "none":
+        return ""
+    try:
+        recorder = recorder_of(node, 0.0)
+    except NotAvailable as reason:
+        return f"not read: {reason.what}" + (f" ({reason.hint})" if reason.hint else "")
+    assert isinstance(recorder, CommandedRecorder)
+    if not recorder.signals:
+        return f"{recorder.what}: nothing, the map names no channels"
+    return f"{recorder.what} of {', '.join(recorder.signals)}, every {1e6 * recorder.period_s:.4g} us"

@@ -14,6 +14,7 @@ from pmsmtool.drive.commanded_recorder import CommandedRecorder, numbered
 from pmsmtool.errors import NotAvailable, SdoAbort, VerifyMismatch
 from pmsmtool.firmware import ring_objects as objects
 from pmsmtool.firmware.drive_map import LETTERS
+from pmsmtool.firmware.recorder_map import Channel
 from pmsmtool.firmware.wire_units import wire_unit
 from pmsmtool.trace import Trace
 
@@ -54,11 +55,19 @@ class RingRecorder(CommandedRecorder):
             The drive makes rings that its buffer cannot hold.
         """
         self._begin_arming(samples, decimation, pretrigger, at_excitation=at_excitation)
-        channels = self._chosen(signals, self._node.map.recorder.channels, objects.VARIABLES)
-        self._stop()
+        largest = self.room(signals)
+        if samples > largest:
+            raise self._too_much(signals, samples, f"{largest} samples", "0x2018:00")
         self._put(objects.CONFIGURATION, 0)
         self._put(objects.PERIOD, decimation)
         self._put(objects.PRECEDING, 0)
+        self._put(objects.CONTROL, objects.START)
+        self._put(objects.CONTROL, objects.FORCE_TRIGGER)
+
+    def room(self, signals: Sequence[str]) -> int:
+        """Stop the recorder, choose its variables, and return how many samples of them fit."""
+        channels = self._variables(signals)
+        self._stop()
         for k, channel in enumerate(channels):
             try:
                 self._put(numbered(objects.FIRST_INDEX, k), channel.index)
@@ -69,16 +78,13 @@ class RingRecorder(CommandedRecorder):
                     where=abort.where,
                 ) from abort
         self._put(objects.USED, len(channels))
-        largest = self._get(objects.LARGEST)  # follows the variables
+        largest = self._get(objects.LARGEST)
         if largest * len(channels) > objects.BUFFER_WORDS:
             raise VerifyMismatch(
                 "the data recorder has not taken the variables", where=f"node {self._node.node}, 0x2018:00",
                 differences=[f"{len(channels)} rings of {largest} do not fit {objects.BUFFER_WORDS} words"],
             )  # fmt: skip
-        if samples > largest:
-            raise self._too_much(signals, samples, f"{largest} samples", "0x2018:00")
-        self._put(objects.CONTROL, objects.START)
-        self._put(objects.CONTROL, objects.FORCE_TRIGGER)
+        return largest
 
     def fetch(self, signals: Sequence[str], decimation: int) -> Trace:
         """Wait until the record is long enough, stop the recorder and read its buffer.
@@ -92,7 +98,7 @@ class RingRecorder(CommandedRecorder):
         VerifyMismatch
             It holds fewer samples than asked for or more than it can, or it moved while it was read.
         """
-        channels = self._chosen(signals, self._node.map.recorder.channels, objects.VARIABLES)
+        channels = self._variables(signals)
         self._until(
             lambda: (
                 bool(self._get(objects.STATUS) & objects.TRIGGERED_BIT)
@@ -122,6 +128,9 @@ class RingRecorder(CommandedRecorder):
             )
             counts[name] = np.roll(ring, -first)[: self._samples]
         return self._in_si(counts, [channel.unit for channel in channels], decimation)
+
+    def _variables(self, signals: Sequence[str]) -> list[Channel]:
+        return self._chosen(signals, self._node.map.recorder.channels, objects.VARIABLES)
 
     def _place(self) -> tuple[int, int, int]:
         """Return how many samples there are, how many there may be, and where the oldest is."""

@@ -13,6 +13,7 @@ import numpy as np
 from pmsmtool.drive.commanded_recorder import CommandedRecorder, numbered
 from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.firmware import trace_objects as objects
+from pmsmtool.firmware.recorder_map import Channel
 from pmsmtool.trace import Trace
 
 
@@ -46,7 +47,17 @@ class RowRecorder(CommandedRecorder):
             Not these signals, not this much memory, or a trigger it has not.
         """
         self._begin_arming(samples, decimation, pretrigger, at_excitation=at_excitation)
-        channels = self._chosen(signals, self._node.map.recorder.channels, self._channels_there)
+        largest = self.room(signals)
+        if samples > largest:
+            raise self._too_much(signals, samples, f"{largest} samples", "0x2504:00")
+        self._put(objects.PERIOD, decimation)
+        self._put(objects.DELAY, 0)
+        self._node.sdo.download(objects.TRIGGER, 0, objects.NO_TRIGGER)
+        self._put(objects.START, 1)
+
+    def room(self, signals: Sequence[str]) -> int:
+        """Stop the trace, choose its variables, and return how many rows of them fit."""
+        channels = self._variables(signals)
         self._stop()
         for k in range(self._channels_there):
             number = channels[k].number if k < len(channels) else 0
@@ -57,13 +68,7 @@ class RowRecorder(CommandedRecorder):
                     f"the drive does not trace variable {number} ({signals[k] if k < len(signals) else 'none'})",
                     where=abort.where,
                 ) from abort
-        self._put(objects.PERIOD, decimation)
-        self._put(objects.DELAY, 0)
-        self._node.sdo.download(objects.TRIGGER, 0, objects.NO_TRIGGER)
-        largest = self._get(objects.LARGEST)  # follows the channels
-        if samples > largest:
-            raise self._too_much(signals, samples, f"{largest} samples", "0x2504:00")
-        self._put(objects.START, 1)
+        return self._get(objects.LARGEST)
 
     def fetch(self, signals: Sequence[str], decimation: int) -> Trace:
         """Wait until the record is long enough, stop the trace and read it.
@@ -77,7 +82,7 @@ class RowRecorder(CommandedRecorder):
         VerifyMismatch
             It holds fewer rows than asked for or more than it can, or it moved while it was read.
         """
-        channels = self._chosen(signals, self._node.map.recorder.channels, self._channels_there)
+        channels = self._variables(signals)
         self._until(
             lambda: self._get(objects.RECORDED) >= self._samples or not self._running(),
             "the trace",
@@ -95,6 +100,9 @@ class RowRecorder(CommandedRecorder):
         table = np.frombuffer(data, "<i4").reshape(stored, len(channels))[: self._samples]
         counts = {name: table[:, k] for k, name in enumerate(signals)}
         return self._in_si(counts, [channel.unit for channel in channels], decimation)
+
+    def _variables(self, signals: Sequence[str]) -> list[Channel]:
+        return self._chosen(signals, self._node.map.recorder.channels, self._channels_there)
 
     def _running(self) -> bool:
         return bool(self._get(objects.STATUS) & objects.RUNNING_BIT)

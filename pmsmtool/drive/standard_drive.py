@@ -22,7 +22,6 @@ from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.recorder import Recorder
 from pmsmtool.errors import DriveTimeout, NotAvailable, SdoAbort
-from pmsmtool.estimators.recorded_push import DELAY_DOUBT_PERIODS
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.trace import Trace
 
@@ -194,15 +193,7 @@ class RecorderDrive(TorqueCurrent):
     """A drive with a recorder and a torque mode, without excitation; the part of ``drive.port.Drive`` that this gives.
 
     That current and torque are proportional is corrected by the recorded current.
-
-    Attributes
-    ----------
-    delay_doubt_periods : float
-        How far the middle of a recorded voltage may be from where ``estimators.recorded_push`` has it, in control
-        periods.
     """
-
-    delay_doubt_periods = DELAY_DOUBT_PERIODS
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)

@@ -42,6 +42,8 @@ BLOCK = 16
 DELAY_PERIODS = 1.5
 """From a sample to the middle of the voltage computed from it, in control periods."""
 DELAY_DOUBT_PERIODS = 0.5
+DELAY_DOUBT = "delay_doubt_periods"
+"""Key of a trace's ``meta``: how far that middle may be from there, where less is known of a drive's voltages."""
 SKIP_SHARE = 0.1
 """Beginning of a push that is left out: the current is still rising."""
 LEAST_PUSHES = 6
@@ -113,7 +115,8 @@ def estimate_pushes(
     Parameters
     ----------
     pushes : sequence of Trace
-        ``i_d_a i_q_a u_d_v u_q_v omega_e_rad_s theta_M_rad flagged``.
+        ``i_d_a i_q_a u_d_v u_q_v omega_e_rad_s theta_M_rad flagged``; ``meta["delay_doubt_periods"]`` where it is not
+        :data:`DELAY_DOUBT_PERIODS`.
     period_s : float
         Control period (s).
     pole_pairs : int
@@ -150,7 +153,8 @@ def estimate_pushes(
             stage=STAGE,
             likely="pushes too short or too weak against friction, or a drive that limits its voltage",
         )
-    delay = full[1] * DELAY_DOUBT_PERIODS * period_s * float(np.median([p.rate / abs(p.i_q.mean()) for p in rows]))
+    doubt = max(float(push.meta.get(DELAY_DOUBT, DELAY_DOUBT_PERIODS)) for push in pushes)
+    delay = full[1] * doubt * period_s * float(np.median([p.rate / abs(p.i_q.mean()) for p in rows]))
     R = estimate(0, "ohm", math.hypot(full[0] * math.hypot(tolerance.impedance, R_FLOOR), delay))
     reactance = full[2] * math.sqrt(float(np.mean(np.concatenate([(p.w * p.i_q) ** 2 for p in rows]))))
     floor = math.hypot(L_Q_FLOOR, L_Q_PER_ERROR * full[4] / reactance)

@@ -13,8 +13,10 @@ from enum import StrEnum
 
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.mapped_recorder_drive import records_pushes
 from pmsmtool.drive.objects import SUPPORTED_MODES
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive.recorder_choice import described
 from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.shipped_maps import UNKNOWN_VENDOR, family_of, load_family
@@ -194,12 +196,15 @@ class Capabilities:
         Whether that map names this identity; without, nothing is written through it.
     features : frozenset of str
         Keys of :data:`FEATURES` it has.
+    recorder : str
+        What a maker's recorder takes, or why it is not read; empty where the map names none.
     """
 
     identity: Identity
     drive_map: DriveMap
     map_is_drives: bool
     features: frozenset[str]
+    recorder: str = ""
 
     @property
     def tier(self) -> Tier:
@@ -228,6 +233,8 @@ class Capabilities:
         if method is Method.INJECT and "averages" not in self.features:
             expected = ()  # those were measured on drives that average by themselves
             note = "; ".join(part for part in (note, "means are made from records") if part)
+        if method is Method.RECORDER and not self.drive_map.staging:
+            expected = ()  # those were measured with the reference drive's recorder
         return Row(quantity, method, missing, expected, note)
 
     def best(self, quantity: str) -> Row | None:
@@ -325,7 +332,8 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     found = {name for name, there in has.items() if there}
     if named:  # whatever starts a drive's own identification is not tried on another drive
         found |= {f"vendor {name}" for name in _vendor_quantities(node, drive_map)}
-    return Capabilities(identity, drive_map, named, frozenset(found))
+        found |= {"recorder"} if records_pushes(node) else set()
+    return Capabilities(identity, drive_map, named, frozenset(found), described(node))
 
 
 def _vendor_quantities(node: DriveNode, drive_map: DriveMap) -> frozenset[str]:

@@ -17,6 +17,7 @@ from pmsmtool.design.margins import MarginRequest
 from pmsmtool.design.open_loops import CURRENT_LOOPS, lacking_gains
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
 from pmsmtool.drive.recorded_means import RecordingDrive
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.tier_drives import ParameterDrive
@@ -68,6 +69,8 @@ def open_tier_drive(connection: Connection, node: int, found: Capabilities) -> C
         Tier.STANDARD: StandardDrive,
     }
     kind = CanopenDrive if found.unsafe else kinds.get(found.tier, ParameterDrive)
+    if kind is RecorderDrive and not found.drive_map.staging:
+        kind = MappedRecorderDrive
     return kind(connection, node, drive_map=found.drive_map)
 
 
@@ -261,7 +264,7 @@ class TierStages:
         return ""
 
     def _no_proof(self) -> str:
-        if self.found.tier in (Tier.INJECT, Tier.RECORDER):
+        if self.found.drive_map.staging and self.found.tier in (Tier.INJECT, Tier.RECORDER):
             return ""
         lacking = ", ".join(name for name in PREDICTED if name not in self.found.drive_map.cells)
         reason = f"needs a loop that is all ours, to predict its response: the map has no object for {lacking}"

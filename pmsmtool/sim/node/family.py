@@ -50,7 +50,7 @@ COMMUTATION_ANGLE = 0x60EA
 ANGLE_COUNT_RAD = 2.0 * math.pi / 65536.0
 TIER_HIDES = {"inject": (0x2063, 0x2064), "recorder": (0x2050, 0x2051, 0x2052, 0x2063, 0x2064)}
 """What a reduced reference drive does not have: window averages; the excitation and current set-points too."""
-RECORDERS: Mapping[str, Callable[[DriveMap, Dictionary, Plant], object]] = {
+RECORDERS: Mapping[str, Callable[[DriveMap, Dictionary, Plant, Schedule], object]] = {
     "index": Monitor,
     "rows": TraceRows,
     "rings": Rings,
@@ -110,7 +110,7 @@ class Face:
         """Put the family's own functions over the running application."""
         kind = RECORDERS.get(self.drive_map.capabilities.recorder)
         if kind is not None:
-            kind(self.drive_map, dictionary, plant)
+            kind(self.drive_map, dictionary, plant, schedule)
         own_identification.attach(self.drive_map, dictionary, plant, power, schedule)
 
 

@@ -13,6 +13,8 @@ from pmsmtool.sim.node.dictionary import Dictionary, Entry
 from pmsmtool.sim.node.drive_core import RecorderSetup, RecorderState
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.power_drive import Plant
+from pmsmtool.sim.node.schedule import Schedule
+from pmsmtool.sim.node.whole_turns import WholeTurns
 from pmsmtool.sim.signals import Signal
 
 SIGNALS = {
@@ -36,14 +38,15 @@ class RecorderFace:
     ----------
     dictionary : Dictionary
         Dressed as the family's.
-    plant : Plant
-        The drive behind.
+    plant, schedule : Plant, Schedule
+        The drive behind, and its clock.
     """
 
-    def __init__(self, dictionary: Dictionary, plant: Plant) -> None:
+    def __init__(self, dictionary: Dictionary, plant: Plant, schedule: Schedule) -> None:
         self._dictionary = dictionary
         self._plant = plant
         self._entries: dict[Address, Entry] = {}
+        self._turns = WholeTurns(dictionary, plant, schedule)
 
     def _register(self, *addresses: Address) -> None:
         for index, sub, letter in addresses:
@@ -81,6 +84,7 @@ class RecorderFace:
     def _record(self, names: Sequence[str], depth: int, decimation: int) -> None:
         self._plant.look()
         channels = [SIGNALS[name] for name in names]
+        self._turns.about_to_record()
         self._plant.core.record(RecorderSetup(channels=channels, depth=depth, decimation=decimation))
 
     def _forget(self) -> None:
