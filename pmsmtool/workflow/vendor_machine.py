@@ -151,7 +151,7 @@ def coarse_notes(tuning: VendorTuning, answers: Mapping[str, VendorAnswer]) -> l
         share = 0.5 / max(abs(_counts(tuning.results[name], answer)), 0.5)
         if name != "motor.pole_pairs" and tuning.results[name].wire != "REAL32" and share > COARSE:
             unit = tuning.results[name].unit
-            lines.append(f"{name}: counted in {unit}, which alone makes +-{100.0 * share:.2g} %")
+            lines.append(f"{name.removeprefix('motor.')}: counted in {unit}, which alone makes +-{100.0 * share:.2g} %")
     return lines
 
 

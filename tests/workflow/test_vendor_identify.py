@@ -47,7 +47,7 @@ from pmsmtool.workflow.report_page import report_page, verdict
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 from pmsmtool.workflow.tier_stages import TierStages, open_tier_drive
 from pmsmtool.workflow.vendor_identify import identify_vendor
-from pmsmtool.workflow.vendor_machine import vendor_estimates, vendor_machine
+from pmsmtool.workflow.vendor_machine import coarse_notes, vendor_estimates, vendor_machine
 
 PROFILE = data_folder("profiles") / "interior-2k2.toml"
 TRUTH = load_machine_file(PROFILE).machine
@@ -298,6 +298,14 @@ def test_a_number_that_no_machine_has_is_refused(value: float) -> None:
     assert tuning is not None
     with pytest.raises(IdentificationError, match="E_VENDOR_VALUE: psi_f_wb"):
         vendor_estimates(tuning, {"motor.psi_f_wb": answer_of("motor.psi_f_wb", value)})
+
+
+def test_a_coarse_count_is_told() -> None:
+    tuning = load_family("synapticon").vendor_tuning
+    assert tuning is not None
+    fine, coarse = (answer_of("motor.R_s_ohm", value) for value in (3.6, 0.02))
+    assert coarse_notes(tuning, {"motor.R_s_ohm": fine}) == []
+    assert coarse_notes(tuning, {"motor.R_s_ohm": coarse}) == ["R_s_ohm: counted in mohm, which alone makes +-2.5 %"]
 
 
 def test_one_inductance_stands_for_both_axes_only_without_saliency() -> None:
