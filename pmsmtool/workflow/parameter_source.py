@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from pmsmtool.design import design_file
 from pmsmtool.design.design_file import parse_design
+from pmsmtool.design.open_loops import one_pair
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.firmware.dcf import values_of
 from pmsmtool.firmware.drive_map import DriveMap, reference_map
@@ -30,7 +32,8 @@ def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterS
         ``params.toml``, ``design.toml`` (told apart by their schema), a ``.dcf``, a run directory, or a look-up table
         as ``lut`` writes it (``.npz``): that gives the table alone.
     drive_map : DriveMap, optional
-        What the objects of a DCF mean; the reference drive's when not given.
+        What the objects of a DCF mean, the reference drive's when not given; of a design for a drive with one pair of
+        current gains the smaller of both axes are taken.
 
     Raises
     ------
@@ -48,7 +51,10 @@ def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterS
     text = read_text(path)
     schema = parse_toml(text, where=str(path)).get("schema")
     if schema == design_file.SCHEMA:
-        return parse_design(text, where=str(path)).parameter_set()
+        design = parse_design(text, where=str(path))
+        if drive_map is not None and not drive_map.staging:
+            design = replace(design, values={**design.values, **one_pair(design, drive_map.cells)})
+        return design.parameter_set()
     if schema == parameter_set.SCHEMA:
         return parse_parameter_set(text, str(path))
     raise ConfigError(

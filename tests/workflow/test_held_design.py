@@ -120,3 +120,18 @@ def test_margins_of_a_drive_that_takes_no_gains_are_not_available(
     assert "current_d_phase" not in out and "headroom_voltage" in out
     code, out, error = run("margins", "d.toml", "--thermal-headroom", "-1")
     assert code == 0, "what is asked of the headroom is judged"
+
+
+def test_a_design_goes_to_a_drive_with_one_pair_as_it_was_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also one that was made without a map: the gain of q would be too large for d."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "d.toml").write_text(design_text(designed()), encoding="utf-8")
+    code, out, _ = run(
+        "-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=epos4", "flash-params", "d.toml", "--map", "epos4",
+        "--dry-run", "--json",
+    )  # fmt: skip
+    wanted = {change["name"]: change["wanted"] for change in json.loads(out)["changes"]}
+    assert code == 0
+    assert wanted["current.K_p_q_v_per_a"] == designed()["current.K_p_d_v_per_a"] < designed()["current.K_p_q_v_per_a"]
