@@ -66,7 +66,14 @@ def _row_facts(row: Row) -> dict[str, Any]:
         "available": row.available,
         "needs": list(row.missing),
         "expected": [
-            {"name": e.name, "half_width": e.half_width, "unit": e.unit, "drives": e.drives, "program": e.program}
+            {
+                "name": e.name,
+                "half_width": e.half_width,
+                "unit": e.unit,
+                "drives": e.drives,
+                "program": e.program,
+                "given": e.given,
+            }
             for e in row.expected
         ],
         "note": row.note,

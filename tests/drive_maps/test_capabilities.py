@@ -18,11 +18,15 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
+from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.errors import ConfigError, IdentificationError, Interrupted, NotAvailable
+from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.profile import machine_path
 from pmsmtool.resources import data_folder
 from pmsmtool.workflow.capabilities import (
+    EXPECTED,
     FEATURES,
     NEEDS,
     QUANTITIES,
@@ -33,7 +37,7 @@ from pmsmtool.workflow.capabilities import (
     reference_capabilities,
 )
 from pmsmtool.workflow.random_drives import draw_drive
-from pmsmtool.workflow.tier_identify import HEADROOM, identify_recorder, identify_standard
+from pmsmtool.workflow.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
 
 COMMANDS = (0x604000, 0x206007)
 """Controlword and the recorder's command: nothing a restore would bring back."""
@@ -100,6 +104,19 @@ def test_every_quantity_is_listed_with_every_method() -> None:
     for row in rows:
         for expected in row.expected:  # an interval without a program that measured it is a guess
             assert expected.drives >= 10 and expected.program.startswith("benchmarks.")
+
+
+def test_what_caps_promises_is_what_is_found_without_a_machine_file() -> None:
+    """Torque pushes of the standard tier: without a machine file nothing tells the inverter's voltage."""
+    promised = {expected.given: expected.half_width for expected in EXPECTED["psi", Method.STANDARD]}
+    for given, inverter in (("", None), ("a machine file", load_machine_file(machine_path("interior-2k2")).inverter)):
+        with connect("pmsmsim", "interior-2k2?nv=:memory:&drive=epos4") as connection:
+            drive = TorqueDrive(connection, 1, drive_map=load_family("epos4"))
+            envelope = Envelope(i_max_apk=7.3, speed_max_rad_s=3000.0 * math.pi / 30.0, duration_s=600.0)
+            psi = identify_by_torque(drive, envelope, pole_pairs=3, inverter=inverter).estimates["psi_f_wb"]
+            drive.close()
+        half = 100.0 * total_half_width(psi) / psi.value
+        assert 0.85 * promised[given] < half <= promised[given], "measured: 6.1 of 6.4 %, 3.7 of 3.7 %"
 
 
 def test_require_names_what_is_missing() -> None:
