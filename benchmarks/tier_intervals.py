@@ -47,13 +47,8 @@ from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_o
 from pmsmtool.workflow.limits import Limits
 from pmsmtool.workflow.measure import Measurement
 from pmsmtool.workflow.random_drives import draw_drive
-from pmsmtool.workflow.tier_identify import (
-    HEADROOM,
-    TierResult,
-    identify_by_torque,
-    identify_recorder,
-    identify_standard,
-)
+from pmsmtool.workflow.tier_evaluate import TierResult
+from pmsmtool.workflow.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
 
 CHANNELS = {"standard": "&drive=cia402", "recorder": "&tier=recorder", "inject": "&tier=inject"}
 TOO_NARROW = 1e-3

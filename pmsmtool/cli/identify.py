@@ -97,8 +97,8 @@ def identify_command(
         if half_frequency:
             raise click.UsageError("--half-frequency measures; with --replay the traces of the run decide")
         from pmsmtool.workflow.identify import MACHINE, REPLAYED
-        from pmsmtool.workflow.identify import replay as recompute
         from pmsmtool.workflow.run_directory import RunDirectory
+        from pmsmtool.workflow.tier_evaluate import replay as recompute
 
         run = RunDirectory(replay)
         run.read()

@@ -14,7 +14,7 @@ from pmsmtool.drive.recorder import Recorder
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.trace import Trace
 
-LOOK, AT_REST, TURNING = 32, 128, 128
+LOOK, AT_REST, TURNING = 32, 256, 128
 """Rows of a mean that only looks, of half a window with the shaft at rest, and of both halves while it turns: a shaft
 that coasts slows down while a record is uploaded, and 6 signals of 128 rows are 57 ms at 1 Mbit/s."""
 REST_RAD_S = 20.0
@@ -64,6 +64,24 @@ class RecordedMeans(Recorder):
     _looks = True
     _trace: Trace | None = None
     _slow: Mapping[str, float] = MappingProxyType({})
+    _armed: tuple[object, ...] | None = None
+
+    def arm(
+        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool
+    ) -> None:
+        """Set the recorder up and arm it; only arm it where it is set up like this: hundreds of means are alike."""
+        wanted = (tuple(signals), samples, decimation, pretrigger, at_excitation)
+        if wanted == self._armed:
+            self._node.command(objects.TRACE_COMMAND, 1)
+            return
+        self._armed = None
+        super().arm(signals, samples, decimation, pretrigger, at_excitation=at_excitation)
+        self._armed = wanted
+
+    def forget(self) -> None:
+        """What was written to the drive is no longer known (it was reset or restored)."""
+        super().forget()
+        self._armed = None
 
     def start_average(self, signals: Sequence[str], periods: int) -> None:
         """Start recording the next ``periods`` control periods.

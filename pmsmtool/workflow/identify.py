@@ -268,7 +268,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     conditions = _conditions(evaluation, request) | half_frequency.split_conditions(evaluation.split, parts)
     machine = machine_of(evaluation, nameplate, conditions)
     text = dump_machine_file(machine)
-    target, prefix = (run, "") if _may_write(run, text) else (_beside(run), f"{REPLAYED}/")
+    target, prefix = place_of(run, text)
     made = map_stage.save_map(target, evaluation.flux_map)
     made |= frequency_stage.save_response(target, evaluation.frequency_response)
     target.save(MACHINE, text)
@@ -296,6 +296,11 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         + map_stage.map_summary(evaluation.flux_map)
         + frequency_stage.response_summary(evaluation.frequency_response),
     )
+
+
+def place_of(run: RunDirectory, text: str) -> tuple[RunDirectory, str]:
+    """Return where a machine file goes, and the beginning of its name in the run: beside one a design was made from."""
+    return (run, "") if _may_write(run, text) else (_beside(run), f"{REPLAYED}/")
 
 
 def _may_write(run: RunDirectory, text: str) -> bool:
@@ -336,19 +341,26 @@ def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibrat
     IdentificationError
         A trap is seen in the traces.
     """
-    for name in (NAMEPLATE, REQUEST):
-        if not (run.path / name).is_file():
-            raise ConfigError(f"the run has no {name}", where=str(run.path), hint="it is not a run of identify")
-    request = parse_request((run.path / REQUEST).read_text(encoding="utf-8"), where=str(run.path / REQUEST))
-    if tolerance is not None:
-        request = replace(request, tolerance=tolerance)
-    request = replace(request, tolerance=calibrated_tolerance(request.tolerance, calibration))
+    request = asked_again(run, (NAMEPLATE, REQUEST), tolerance, calibration)
     recorded = run.read().stage("identify")
     stage = evaluated_stage(run, load_machine_file(run.path / NAMEPLATE), request)
     if recorded is not None and MACHINE in stage.files and recorded.files.get(MACHINE) != run.sha256(MACHINE):
         run.save(REQUEST, dump_request(request))
         run.add(replace(stage, seconds=recorded.seconds))
     return stage
+
+
+def asked_again(
+    run: RunDirectory, needed: Sequence[str], tolerance: SensorTolerance | None, calibration: Sequence[str]
+) -> IdentifyRequest:
+    """Return what a run was asked, with the tolerances of its replay; refuse a run without the files this needs."""
+    for name in needed:
+        if not (run.path / name).is_file():
+            raise ConfigError(f"the run has no {name}", where=str(run.path), hint="it is not a run of identify")
+    request = parse_request((run.path / REQUEST).read_text(encoding="utf-8"), where=str(run.path / REQUEST))
+    if tolerance is not None:
+        request = replace(request, tolerance=tolerance)
+    return replace(request, tolerance=calibrated_tolerance(request.tolerance, calibration))
 
 
 def dump_request(request: IdentifyRequest) -> str:

@@ -35,7 +35,8 @@ from pmsmtool.workflow.identify import MACHINE, NAMEPLATE, IdentifyRequest, iden
 from pmsmtool.workflow.measure import QUANTITIES
 from pmsmtool.workflow.prove.stage import ProofRequest, prove_stage
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
-from pmsmtool.workflow.tier_identify import NO_POLE_PAIRS, can_measure, tier_stage
+from pmsmtool.workflow.tier_evaluate import NO_POLE_PAIRS
+from pmsmtool.workflow.tier_identify import can_measure, tier_stage
 from pmsmtool.workflow.tier_machine import NEEDED, tier_machine
 from pmsmtool.workflow.vendor_identify import chain_stage, vendor_line
 

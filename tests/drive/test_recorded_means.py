@@ -51,6 +51,16 @@ def test_a_window_of_a_turning_shaft_is_one_record(drive: RecordingDrive) -> Non
     assert first["omega_e_rad_s"] > 20.0 and second["omega_e_rad_s"] > 20.0
 
 
+def test_a_recorder_that_is_set_up_is_only_armed(drive: RecordingDrive) -> None:
+    drive.average(SIGNALS, 100)
+    drive.node.put(objects.TRACE_DEPTH, 5)
+    drive.average(SIGNALS, 100)
+    assert drive.node.whole(objects.TRACE_DEPTH) == 5  # the same mean again: nothing is written
+    drive.recorder.forget()
+    drive.average(SIGNALS, 100)
+    assert drive.node.whole(objects.TRACE_DEPTH) == LOOK
+
+
 def test_a_drive_with_averages_takes_them_one_after_the_other() -> None:
     with Connection(PmsmSimBus("interior-2k2?nv=:memory:")) as connection:
         made = CanopenDrive(connection, 1)

@@ -1,0 +1,349 @@
+"""What the traces of a tier without injection tell: estimates, the machine file, and the judged stage.
+
+Everything follows from the stored traces, the request and :class:`TierFacts`, so that :func:`replay` gives the same
+bytes years later.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Literal
+
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
+from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
+from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
+from pmsmtool.estimators.inertia_ratio import estimate_ratios
+from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
+from pmsmtool.estimators.rotation_offset import offset_by_turns
+from pmsmtool.estimators.voltage_flux import flux_by_undriven_voltage, flux_by_voltage_limit
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.parameters import Estimate, InverterParameters
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import read_trace
+from pmsmtool.units import format_estimate
+from pmsmtool.workflow.identify import (
+    MACHINE,
+    NAMEPLATE,
+    REQUEST,
+    IdentifyRequest,
+    asked_again,
+    dump_request,
+    place_of,
+    value_facts,
+)
+from pmsmtool.workflow.identify import replay as replay_injection
+from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
+from pmsmtool.workflow.tier_machine import TierMachine, tier_machine
+
+FACTS = "tier.json"
+"""What the estimates depend on besides traces, request and nameplate."""
+UTILISATION = 1.0 / math.sqrt(3.0)
+"""Largest phase voltage amplitude over the DC link where no machine file says it."""
+NO_RESISTANCE = "the inverter's error at running currents hides it on this drive; needs current set-points"
+NO_POWER = "needs a recorder of voltages, or the power of a bench supply at several currents read by a person"
+NO_VOLTAGE = "needs injection, or a recorder of voltages at loop rate"
+NO_POLE_PAIRS = "needs the pole pairs: mode 11, an object in the drive's map, or a machine file"
+NO_LINK = "needs the DC link (0x6079) or the machine's voltage"
+OFFSET_LIMIT_RAD = math.radians(2.5)
+"""Largest total 95 % half width of an accepted encoder offset; measured: 1.7 deg on nine of ten drives."""
+LIMITS: Mapping[str, float] = {
+    "R_s_ohm": 0.15, "psi_f_wb": 0.08, "L_q_app_h": 0.15, "J_per_psi": 0.05, "pole_pairs": 0.05,
+}  # fmt: skip
+"""Largest relative total 95 % half width of an accepted value."""
+TOLD_BY = {
+    "R": "R_s_ohm", "L": "L_q_app_h", "psi": "psi_f_wb", "encoder": "offset_rad", "poles": "pole_pairs",
+    "mechanics": "J_per_psi",
+}  # fmt: skip
+"""Key of the estimate that answers for a quantity."""
+
+
+Voltage = Literal["machine", "link", ""]
+
+
+@dataclass(frozen=True, slots=True)
+class TierResult:
+    """Estimates of a run without injection.
+
+    Attributes
+    ----------
+    estimates : mapping of str to Estimate
+        By the keys of a machine file.
+    missing : mapping of str to str
+        What was asked and cannot be told, with the reason.
+    traces : mapping of str to Trace
+        What was recorded.
+    """
+
+    estimates: Mapping[str, Estimate]
+    missing: Mapping[str, str]
+    traces: Mapping[str, Trace]
+
+
+@dataclass(frozen=True, slots=True)
+class TierFacts:
+    """What a run without injection was, besides its traces.
+
+    Attributes
+    ----------
+    kind : str
+        ``recorder``: recorded pushes; ``standard``: a turned vector, polled pushes.
+    period_s : float
+        Control period of a recorder (s).
+    pole_pairs : int
+        As given, or as the drive's set says; 0 where only the turned vector tells them.
+    T_winding_c, T_magnet_c : float or None
+        What the drive showed (degC).
+    pushed : bool
+        Whether the shaft was pushed by torque.
+    voltage : str
+        What ``psi_f`` is told by: the ``machine`` voltage, the DC ``link`` at the limit, or neither.
+    top_rpm, U_dc_v : float
+        Speed no run-up goes beyond, and the DC link as the drive shows it.
+    source : str
+        Where what completes the values comes from (``nameplate.toml``); empty: nothing does.
+    traces : tuple of str
+        Names of the traces in the order they were taken.
+    """
+
+    kind: Literal["recorder", "standard"]
+    period_s: float = 0.0
+    pole_pairs: int = 0
+    T_winding_c: float | None = None
+    T_magnet_c: float | None = None
+    pushed: bool = False
+    voltage: Voltage = ""
+    top_rpm: float = 0.0
+    U_dc_v: float = 0.0
+    source: str = ""
+    traces: tuple[str, ...] = ()
+
+
+def tier_result(
+    traces: Mapping[str, Trace],
+    facts: TierFacts,
+    tolerance: SensorTolerance | None = None,
+    inverter: InverterParameters | None = None,
+    psi_f_wb: float = 0.0,
+) -> TierResult:
+    """Estimate from traces.
+
+    Parameters
+    ----------
+    traces : mapping of str to Trace
+        In the order they were taken.
+    facts : TierFacts
+        Of the run.
+    tolerance : SensorTolerance, optional
+        Declared sensor tolerances.
+    inverter : InverterParameters, optional
+        Its voltage utilisation and dead time, where known.
+    psi_f_wb : float
+        Flux linkage as given (Wb); 0: none is. It tells how fast a run without voltage limit should have been.
+
+    Raises
+    ------
+    IdentificationError
+        A trap is seen; a single quantity that cannot be told is in ``missing``.
+    """
+    if facts.kind == "recorder":
+        return _by_recorder(traces, facts, tolerance)
+    estimates: dict[str, Estimate] = {}
+    if "rotation_backward" in traces:
+        found = estimate_encoder(traces["rotation_forward"], traces["rotation_backward"])
+        estimates = encoder_estimates(found, traces)
+    missing: dict[str, str] = {}
+    if facts.pushed:
+        pole_pairs = round(estimates["pole_pairs"].value) if "pole_pairs" in estimates else facts.pole_pairs
+        pushed, missing = _by_torque(traces, replace(facts, pole_pairs=pole_pairs), tolerance, inverter, psi_f_wb)
+        estimates |= pushed
+    return TierResult(estimates, missing, traces)
+
+
+def _by_recorder(traces: Mapping[str, Trace], facts: TierFacts, tolerance: SensorTolerance | None) -> TierResult:
+    pushes = list(traces.values())
+    found = estimate_pushes(pushes, period_s=facts.period_s, pole_pairs=facts.pole_pairs, tolerance=tolerance)
+    T_winding_c, T_magnet_c = (math.nan if T is None else T for T in (facts.T_winding_c, facts.T_magnet_c))
+    estimates = push_estimates(found, T_winding_c, T_magnet_c)
+    missing = {} if "R_s_ohm" in estimates else {"R_s_ohm": NO_RESISTANCE}
+    try:
+        estimates |= estimate_ratios(pushes, pole_pairs=facts.pole_pairs, tolerance=tolerance)
+    except IdentificationError as error:
+        missing["J_per_psi"] = error.what
+    return TierResult(estimates, missing, traces)
+
+
+def _by_torque(
+    traces: Mapping[str, Trace],
+    facts: TierFacts,
+    tolerance: SensorTolerance | None,
+    inverter: InverterParameters | None,
+    psi_f_wb: float,
+) -> tuple[dict[str, Estimate], dict[str, str]]:
+    pushes = [trace for name, trace in traces.items() if name.startswith("torque_push")]
+    pole_pairs = facts.pole_pairs
+    estimates = dict(estimate_ratios(pushes, pole_pairs=pole_pairs, tolerance=tolerance))
+    missing = {"R_s_ohm": NO_POWER, "L_d_h, L_q_h": NO_VOLTAGE}
+    utilisation = UTILISATION if inverter is None else inverter.voltage_utilisation
+    try:
+        if facts.voltage == "machine":
+            coasts = [trace for name, trace in traces.items() if name.startswith("coast")]
+            estimates["psi_f_wb"] = flux_by_undriven_voltage(coasts, pole_pairs=pole_pairs, tolerance=tolerance)
+        elif "voltage_limit" in traces:
+            share = None if inverter is None or not inverter.dead_time_s else inverter.dead_time_s / inverter.T_s
+            estimates["psi_f_wb"] = flux_by_voltage_limit(
+                traces["voltage_limit"], pole_pairs=pole_pairs, utilisation=utilisation, dead_time_share=share,
+                tolerance=tolerance,
+            )  # fmt: skip
+        else:
+            missing["psi_f_wb"] = below_voltage(facts, utilisation, psi_f_wb) if facts.voltage else NO_LINK
+    except IdentificationError as error:
+        missing["psi_f_wb"] = error.what
+    return estimates, missing
+
+
+def below_voltage(facts: TierFacts, utilisation: float, psi_f_wb: float) -> str:
+    """Return what the flux linkage needs of a run that did not reach the voltage limit."""
+    text = f"needs a speed at which the voltage ends, and up to {facts.top_rpm:.0f} rpm it did not"
+    if psi_f_wb > 0.0:
+        rpm = 30.0 / math.pi * utilisation * facts.U_dc_v / (psi_f_wb * facts.pole_pairs)
+        text += f" (by the given flux linkage it ends at about {rpm:.0f} rpm with {facts.U_dc_v:.4g} V)"
+    return f"{text}: allow a larger --speed-max, or lower the DC link"
+
+
+def encoder_estimates(found: EncoderResult, traces: Mapping[str, Trace]) -> dict[str, Estimate]:
+    """Return pole pairs, direction and offset by the keys of a machine file."""
+    direction = Estimate(float(found.direction), 0.0, 0.0, "1", n=found.offset.n, method=found.pole_pairs.method)
+    offset = offset_by_turns(found, traces["rotation_forward"], traces["rotation_backward"])
+    return {"pole_pairs": found.pole_pairs, "direction": direction, "offset_rad": offset}
+
+
+def push_estimates(
+    found: PushResult, T_winding_c: float = math.nan, T_magnet_c: float = math.nan
+) -> dict[str, Estimate]:
+    """Return what the pushes told by the keys of a machine file; R only where the inverter's error does not hide it."""
+    told = {
+        "psi_f_wb": replace(found.psi_f, T_c=T_magnet_c),
+        "L_q_app_h": found.L_q,
+        "frame_offset_rad": found.frame_offset,
+    }
+    return told if found.R is None else {"R_s_ohm": replace(found.R, T_c=T_winding_c), **told}
+
+
+# ---- the stage --------------------------------------------------------------------------------------
+
+
+def evaluated_stage(
+    run: RunDirectory, facts: TierFacts, request: IdentifyRequest, known: MachineFile | None = None
+) -> Stage:
+    """Estimate from the stored traces, write the machine file where it is whole, and judge every value.
+
+    Raises
+    ------
+    IdentificationError
+        A trap was seen; no machine file is written.
+    NotAvailable
+        Nothing of what was asked could be told.
+    """
+    traces = {name: read_trace(run.path / f"traces/{name}.npz") for name in facts.traces}
+    inverter, psi = (None, 0.0) if known is None else (known.inverter, known.machine.psi_f_wb)
+    result = tier_result(traces, facts, request.tolerance, inverter, psi)
+    if {"psi", "mechanics"} & set(request.quantities) and facts.kind == "standard" and not facts.pushed:
+        result = replace(result, missing={**result.missing, "J_per_psi, psi_f_wb": NO_POLE_PAIRS})
+    if not any(TOLD_BY.get(name) in result.estimates for name in request.quantities):
+        reasons = [f"{name}: not available: {why}" for name, why in result.missing.items()]
+        raise NotAvailable("\n  - ".join(["nothing of what was asked could be told", *reasons]), where=str(run.path))
+    made = tier_machine(known, result.estimates, facts.source)
+    files = dict.fromkeys((*(f"traces/{name}.npz" for name in traces), REQUEST, FACTS), "")
+    if made.machine is not None:
+        text = dump_machine_file(made.machine)
+        place, prefix = place_of(run, text)
+        place.save(MACHINE, text)
+        files[f"{prefix}{MACHINE}"] = ""
+    return replace(_judged(result, made, facts.source), files=files)
+
+
+def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibration: Sequence[str] = ()) -> Stage:
+    """Recompute every estimate of a run from its traces, whatever its tier; as ``workflow.identify.replay``.
+
+    Raises
+    ------
+    ConfigError
+        The run has no traces, or a file that the estimates depend on is gone or damaged.
+    IdentificationError
+        A trap is seen in the traces.
+    """
+    from pmsmtool.workflow.vendor_identify import ANSWERS  # which runs the stage of this module
+
+    if (run.path / ANSWERS).is_file():
+        raise ConfigError(
+            "the run holds what the drive identified by itself: nothing of that can be recomputed", where=str(run.path)
+        )
+    if not (run.path / FACTS).is_file():
+        return replay_injection(run, tolerance, calibration)
+    facts = parse_facts((run.path / FACTS).read_text(encoding="utf-8"), where=str(run.path / FACTS))
+    request = asked_again(run, (REQUEST, NAMEPLATE) if facts.source else (REQUEST,), tolerance, calibration)
+    known = load_machine_file(run.path / NAMEPLATE) if facts.source else None
+    recorded = run.read().stage("identify")
+    stage = evaluated_stage(run, facts, request, known)
+    beside = MACHINE not in stage.files and any(name.endswith(MACHINE) for name in stage.files)
+    if recorded is not None and not beside and json.dumps(list(recorded.values)) != json.dumps(list(stage.values)):
+        run.save(REQUEST, dump_request(request))
+        run.add(replace(stage, seconds=recorded.seconds))
+    return stage
+
+
+def dump_facts(facts: TierFacts) -> str:
+    """Return facts as JSON."""
+    return json.dumps(asdict(facts), indent=1) + "\n"
+
+
+def parse_facts(text: str, *, where: str) -> TierFacts:
+    """Return the facts of a run.
+
+    Raises
+    ------
+    ConfigError
+        It is not what :func:`dump_facts` writes.
+    """
+    try:
+        facts = json.loads(text)
+        found = TierFacts(**{**facts, "traces": tuple(facts["traces"])})
+        if found.kind not in ("recorder", "standard"):
+            raise ValueError(f"no kind {found.kind!r}")
+    except (ValueError, TypeError, KeyError) as error:
+        raise ConfigError(f"the record of the tier is damaged: {error}", where=where) from error
+    return found
+
+
+def _judged(result: TierResult, made: TierMachine, source: str) -> Stage:
+    criteria = [*(_accepted(name, e) for name, e in result.estimates.items() if _limit(name)), *made.criteria]
+    values = [value_facts(name, estimate) for name, estimate in result.estimates.items()]
+    summary = ", ".join(
+        f"{name} {format_estimate(e.value, total_half_width(e), e.unit)}" for name, e in result.estimates.items()
+    )
+    note = "a part of the machine only, at the temperature of the run: no machine file is written"
+    return Stage(
+        "identify",
+        "pass" if all(line.ok for line in criteria) else "fail",
+        0.0,
+        values=[*values, *made.given_values(source)],
+        acceptance=criteria,
+        fallbacks=[*(f"{name}: not available: {why}" for name, why in result.missing.items()), *made.notes],
+        note=note if made.machine is None else "",
+        summary=summary + (f"; {source}: {', '.join(made.given)}" if made.given else ""),
+    )
+
+
+def _limit(name: str) -> float:
+    return OFFSET_LIMIT_RAD if name == "offset_rad" else LIMITS.get(name, 0.0)
+
+
+def _accepted(name: str, estimate: Estimate) -> Acceptance:
+    half, limit, what = total_half_width(estimate), _limit(name), f"{name}: total 95 % interval"
+    if name == "offset_rad":
+        return Acceptance(what, f"{math.degrees(half):.3g} deg", f"{math.degrees(limit):.3g} deg", half <= limit)
+    share = half / abs(estimate.value)
+    return Acceptance(what, f"{100.0 * share:.2g} %", f"{100.0 * limit:.2g} %", share <= limit)
