@@ -72,10 +72,8 @@ def why_not_judged(design: Design) -> str:
     """Return why no loop of a design is judged; empty when one is."""
     if design.loops:
         return ""
-    return (
-        f"needs the gains of the current loops, which {design.request.get('drive', 'the drive')!r} does not take; what "
-        "the design holds besides stands in it"
-    )
+    drive = design.request.get("drive", "the drive")
+    return f"needs the gains of the current loops, which {drive!r} does not take; they stand in the design for reading"
 
 
 def _quantised(design: Design, drive_map: DriveMap) -> dict[str, DesignValue]:
