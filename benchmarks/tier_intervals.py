@@ -7,8 +7,9 @@
 Drives follow from their seeds (``workflow/random_drives.py``). The simulated node has the objects of its tier only:
 ``drive=cia402`` with the master's commutation angle, or the reference drive without excitation (``tier=recorder``) or
 averages (``tier=inject``). ``--speed`` is the largest speed that is allowed, over the nameplate's: the flux linkage of
-the standard tier needs one at which the voltage ends. Every estimate is printed on stderr as error and half width
-(relative, or in deg); with ``--record FILE`` it goes there too, and a second run goes on behind it.
+the standard tier needs one at which the voltage ends. ``--no-machine``: no machine file tells that tier the inverter.
+Every estimate is printed on stderr as error and half width (relative, or in deg); with ``--record FILE`` it goes there
+too, and a second run goes on behind it.
 
 ``p`` is the probability of at most so many hits if an interval held the truth 95 times in 100; at 0.001 or less the
 intervals are too narrow.
@@ -75,8 +76,8 @@ def truth_of(drive: MachineFile) -> dict[str, float]:
     }
 
 
-def identify(tier: str, drive: MachineFile, path: Path, speed: float) -> TierResult:
-    """Run one drive."""
+def identify(tier: str, drive: MachineFile, path: Path, speed: float, *, given: bool = True) -> TierResult:
+    """Run one drive; the inverter is known where a machine file is given."""
     machine = drive.machine
     envelope = Envelope(
         i_max_apk=HEADROOM * (machine.I_nom_apk or 1.0),
@@ -94,7 +95,9 @@ def identify(tier: str, drive: MachineFile, path: Path, speed: float) -> TierRes
         turning.close()
         pole_pairs = round(found.estimates["pole_pairs"].value)
         pushing = TorqueDrive(connection, 1, drive_map=family)
-        pushed = identify_by_torque(pushing, envelope, pole_pairs=pole_pairs, inverter=drive.inverter)
+        pushed = identify_by_torque(
+            pushing, envelope, pole_pairs=pole_pairs, inverter=drive.inverter if given else None
+        )
         return TierResult({**found.estimates, **pushed.estimates}, pushed.missing, {})
 
 
@@ -114,7 +117,7 @@ def _by_injection(drive: RecordingDrive) -> TierResult:
     return TierResult({name: estimates[name] for name in OF_THE_MACHINE}, {}, {})
 
 
-def judged(tier: str, seed: int, speed: float) -> dict[str, Any]:
+def judged(tier: str, seed: int, speed: float, *, given: bool = True) -> dict[str, Any]:
     """Identify one drive; returns errors and half widths, or the refusal."""
     drive = draw_drive(seed)
     truth = truth_of(drive)
@@ -125,7 +128,7 @@ def judged(tier: str, seed: int, speed: float) -> dict[str, Any]:
         path = Path(folder) / "drive.toml"
         path.write_text(dump_machine_file(drive), encoding="utf-8")
         try:
-            result = identify(tier, drive, path, speed)
+            result = identify(tier, drive, path, speed, given=given)
         except PmsmtoolError as error:
             return {"seed": seed, "refused": getattr(error, "reason", type(error).__name__)}
     row: dict[str, Any] = {"seed": seed, "missing": sorted(result.missing), "found": {}}
@@ -171,6 +174,7 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=40)
     parser.add_argument("--first", type=int, default=100)
     parser.add_argument("--speed", type=float, default=1.0)
+    parser.add_argument("--no-machine", action="store_true")
     parser.add_argument("--record", type=Path)
     options = parser.parse_args()
     rows: list[dict[str, Any]] = []
@@ -180,7 +184,7 @@ def main() -> None:
     for seed in range(options.first, options.first + options.drives):
         if seed in done:
             continue
-        rows.append(judged(options.tier, seed, options.speed))
+        rows.append(judged(options.tier, seed, options.speed, given=not options.no_machine))
         if options.record is not None:
             with options.record.open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(rows[-1]) + "\n")

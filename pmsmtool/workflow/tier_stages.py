@@ -105,7 +105,9 @@ class TierStages:
         known = self._known()
         lines = [f"tier {tier}, map {drive_map.name}: {len(drive_map.cells)} parameters"]
         lines.append("identify: " + ("; ".join(self._measurable()) or f"not available: {self._nothing()}"))
-        rest = "what is measured" if known is None else f"what is measured, the rest {known[1]}"
+        rest = "what is measured"
+        if known is not None:
+            rest = f"{rest}, the rest {known[1]}" if self._measurable() else f"values {known[1]}"
         design = f"on {rest}" if self._complete(known) else f"not available: {_machine_needed(NEEDED)}"
         lines.append(f"tune, lut, margins: {design}")
         lacking = lacking_gains(drive_map.cells)[CURRENT_LOOPS]

@@ -331,6 +331,18 @@ def test_the_plan_is_told_before_anything_moves(tmp_path: Path, monkeypatch: pyt
     assert not isinstance(outcome.exception, NotAvailable)
 
 
+def test_the_plan_of_a_drive_that_takes_nothing_promises_no_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    bus = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=faulhaber"]
+    outcome = CliRunner().invoke(cli, [*bus, "commission", str(PROFILE), "--yes"])
+    assert outcome.exit_code == 0, "what it can give: a table for reading"
+    plan = outcome.stderr.splitlines()
+    assert "lut: on values as given; the drive takes no table: it is for reading" in plan
+    assert any(line.startswith("tune, margins: not available: needs the gains of the current loops") for line in plan)
+
+
 def test_what_a_drive_lacks_is_said_before_a_consent_and_leads_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
