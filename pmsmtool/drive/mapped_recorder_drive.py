@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.commanded_recorder import CommandedRecorder
@@ -35,7 +36,10 @@ RECORDED = {
 }
 """What a recorded push needs, and its name in a map."""
 FLAGS = "flags"
-"""Marks of limited samples: no maker's recorder has them."""
+"""Marks of limited samples: no maker's recorder has them, so they are judged by the DC link."""
+VOLTAGE_LIMITED = 1 << 0
+LINEAR_SHARE = 0.95
+"""Phase voltage, of the DC link over sqrt 3, from which a sample counts as limited."""
 DELAY_DOUBT_PERIODS = 1.5
 """No map says to which control period a maker's recorded voltage belongs: it may be the one before or after."""
 NOT_SHOWN = ("T_winding_c", "T_magnet_c")
@@ -99,12 +103,23 @@ class MappedRecorderDrive(RecorderDrive, TorqueDrive):
         columns = {}
         for name in recording.signals:
             if name == FLAGS:
-                columns[name] = np.zeros(len(trace))
+                columns[name] = self._limited(trace)
             else:
                 scale = self._own_pole_pairs if name == "omega_e_rad_s" else 1.0
                 columns[name] = scale * trace[RECORDED[name]]
         units = {name: signal_unit(name) for name in recording.signals}
         return replace(trace, signals=columns, units=units, meta={**trace.meta, DELAY_DOUBT: DELAY_DOUBT_PERIODS})
+
+    def _limited(self, trace: Trace) -> NDArray[np.float64]:
+        """Return the flag of samples near the largest voltage; none where neither drive nor map shows the DC link."""
+        if not {"u_d_v", "u_q_v"} <= set(trace.signals):
+            return np.zeros(len(trace))
+        try:
+            largest_v = self.live("U_dc_v") / math.sqrt(3.0)
+        except NotAvailable:
+            return np.zeros(len(trace))
+        near = np.hypot(trace["u_d_v"], trace["u_q_v"]) > LINEAR_SHARE * largest_v
+        return np.where(near, float(VOLTAGE_LIMITED), 0.0)
 
     def _names(self, signals: Sequence[str]) -> list[str]:
         unknown = [name for name in signals if name != FLAGS and name not in RECORDED]

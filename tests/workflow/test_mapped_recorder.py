@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.mapped_recorder_drive import DELAY_DOUBT_PERIODS, MappedRecorderDrive
-from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive.tier_drives import ParameterDrive
 from pmsmtool.errors import NotAvailable
@@ -24,6 +25,7 @@ from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.trace import Trace
 from pmsmtool.workflow.capabilities import Capabilities, Method, Tier, examine
 from pmsmtool.workflow.tier_identify import identify_recorder
 from pmsmtool.workflow.tier_stages import open_tier_drive
@@ -138,6 +140,25 @@ def test_that_nobody_says_which_period_a_voltage_belongs_to_widens_the_resistanc
     narrow = estimate_pushes(pushes, period_s=drive.period_s, pole_pairs=3).R
     assert wide is not None and narrow is not None
     assert wide.value == narrow.value and wide.systematic > narrow.systematic
+
+
+def test_samples_at_the_largest_voltage_are_marked(
+    pushed: tuple[MappedRecorderDrive, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The link of 540 V gives 312 V at most: 95 % of them are 296 V."""
+    drive = pushed[0]
+    u_q_v = np.array([0.0, 290.0, -295.0, -297.5, 310.0])
+    columns = {"u_d_v": np.zeros(5), "u_q_v": u_q_v}
+    trace = Trace(1e-4 * np.arange(5), columns, dict.fromkeys(columns, "V"), {})
+    monkeypatch.setattr(drive.traces, "fetch", lambda signals, decimation: trace)
+    taken = drive.finish_record(Recording(("u_d_v", "u_q_v", "flags"), 5))
+    assert taken["flags"].tolist() == [0.0, 0.0, 0.0, 1.0, 1.0]
+    monkeypatch.setattr(drive, "live", _shows_nothing)
+    assert not drive.finish_record(Recording(("u_d_v", "u_q_v", "flags"), 5))["flags"].any()
+
+
+def _shows_nothing(name: str) -> float:
+    raise NotAvailable(f"the drive does not show {name}")
 
 
 def test_what_it_does_not_show_or_take_is_said(pushed: tuple[MappedRecorderDrive, object]) -> None:
