@@ -324,6 +324,7 @@ def _judged(result: TierResult, made: TierMachine, source: str) -> Stage:
     summary = ", ".join(
         f"{name} {format_estimate(e.value, total_half_width(e), e.unit)}" for name, e in result.estimates.items()
     )
+    lost = [f"{name} not told: {why}" for name, why in result.missing.items() if why not in (NO_POWER, NO_VOLTAGE)]
     note = "a part of the machine only, at the temperature of the run: no machine file is written"
     return Stage(
         "identify",
@@ -333,7 +334,7 @@ def _judged(result: TierResult, made: TierMachine, source: str) -> Stage:
         acceptance=criteria,
         fallbacks=[*(f"{name}: not available: {why}" for name, why in result.missing.items()), *made.notes],
         note=note if made.machine is None else "",
-        summary=summary + (f"; {source}: {', '.join(made.given)}" if made.given else ""),
+        summary="; ".join([summary, *lost, *([f"{source}: {', '.join(made.given)}"] if made.given else [])]),
     )
 
 

@@ -89,7 +89,8 @@ def test_a_run_without_a_machine_file_is_replayed_from_the_command_line(tmp_path
     """Slow on purpose: the voltage limit is not reached, and what it needs is said with numbers."""
     run, stage = measured("&drive=cia402", tmp_path, ASKED, speed_max_rad_s=60.0)
     assert not (run.path / MACHINE).exists()
-    assert any("up to 561 rpm it did not: allow a larger --speed-max" in line for line in stage.fallbacks)
+    needed = "up to 561 rpm it did not: allow a larger --speed-max"
+    assert any(needed in line for line in stage.fallbacks) and needed in stage.summary
     outcome = CliRunner().invoke(cli, ["--json", "identify", "--replay", str(run.path)])
     assert outcome.exit_code == 0, outcome.output
     assert json.loads(outcome.stdout)["values"] == json.loads(told(stage))[0]
