@@ -2,7 +2,7 @@
 
     python -m benchmarks.tier_intervals standard --drives 200 --first 5000 --speed 1.35
     python -m benchmarks.tier_intervals recorder --drives 200 --first 5000
-    python -m benchmarks.tier_intervals inject --drives 60 --first 5000
+    python -m benchmarks.tier_intervals inject --drives 200 --first 7200
 
 Drives follow from their seeds (``workflow/random_drives.py``). The simulated node has the objects of its tier only:
 ``drive=cia402`` with the master's commutation angle, or the reference drive without excitation (``tier=recorder``) or
@@ -15,7 +15,7 @@ too, and a second run goes on behind it.
 intervals are too narrow.
 
 Seeds that were looked at while the estimators were made: 0 to 9, 100 to 139, 300 to 329, 2000 to 2019, 3000 to 3019,
-5000 to 5075 (voltage limit).
+5000 to 5075 (voltage limit), 7000 to 7002 and 7100 to 7151 (inject).
 """
 
 from __future__ import annotations
