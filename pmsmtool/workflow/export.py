@@ -15,8 +15,9 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.parameters import SetCommand
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.dcf import Entry, new_dcf, write_concise
-from pmsmtool.firmware.drive_map import DriveMap, encode_table, look_up_words, reference_map
+from pmsmtool.firmware.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.image import crc32, pack_image
+from pmsmtool.firmware.map_tables import encode_table, look_up_words
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
 from pmsmtool.params.diff import table_unit
 from pmsmtool.params.parameter_set import ParameterSet

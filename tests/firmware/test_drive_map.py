@@ -11,17 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.drive_map import (
-    Cell,
-    DriveMap,
-    decode_table,
-    encode_table,
-    look_up_words,
-    reference_map,
-    shortest_binary32,
-)
+from pmsmtool.firmware.drive_map import Cell, DriveMap, reference_map
 from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.firmware.image import lut_size_words, pack_image
+from pmsmtool.firmware.map_tables import decode_table, encode_table, look_up_words, shortest_binary32
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 
@@ -32,8 +25,14 @@ SCALED = DriveMap(
     {
         "current.K_p_d_v_per_a": Cell("current.K_p_d_v_per_a", 0x30A0, 1, "UNSIGNED32", 1e-6, unit="uV/A"),
         "current.K_i_d_v_per_as": Cell(
-            "current.K_i_d_v_per_as", 0x320F, 2, "UNSIGNED16", 1e-6,
-            gain="current.K_p_d_v_per_a", unit="us", form="time",
+            "current.K_i_d_v_per_as",
+            0x320F,
+            2,
+            "UNSIGNED16",
+            1e-6,
+            gain="current.K_p_d_v_per_a",
+            unit="us",
+            form="time",
         ),
         "motor.I_max_apk": Cell(
             "motor.I_max_apk", 0x2031, 0, "UNSIGNED16", math.sqrt(2) / 1000, rounding="down", unit="mA rms"
