@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from pmsmtool.bus.connect import Connection
+from pmsmtool.cli.main import cli
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.mapped_recorder_drive import DELAY_DOUBT_PERIODS, MappedRecorderDrive
@@ -170,3 +172,20 @@ def test_what_it_does_not_show_or_take_is_said(pushed: tuple[MappedRecorderDrive
     step = Excitation(Shape.STEP, Injection.SPEED, 10.0)
     with pytest.raises(NotAvailable, match="only torque pushes"):
         drive.record(("i_q_a",), 10, excitation=step)
+
+
+def test_the_chain_measures_by_it_and_says_what_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
+    path = tmp_path / "map.toml"
+    path.write_text(completed(), encoding="utf-8")
+    bus = ["-i", "pmsmsim", "-c", f"interior-2k2?nv=:memory:&drive={path}"]
+    asked = ["commission", str(machine_path("interior-2k2")), "--map", str(path), "--runs", str(tmp_path / "runs")]
+    result = CliRunner().invoke(cli, [*bus, *asked, "--yes"])
+    assert result.exit_code == 0, result.output
+    assert "recorded torque pushes" in result.output
+    for line in ("identify  PASS", "flash     PASS", "verify    PASS", "prove     NOT AVAILABLE"):
+        assert line in result.output
+    assert "PASS FOR ITS TIER" in result.output
+    machine_file = load_machine_file(next((tmp_path / "runs").glob("*/machine.toml")))
+    measured = machine_file.machine.R_s_ohm
+    assert measured != 3.6 and measured == pytest.approx(3.6, rel=0.05)
