@@ -71,9 +71,7 @@ def _refuse_another_family(node: DriveNode) -> None:
     from pmsmtool.firmware.shipped_maps import family_of
 
     try:
-        vendor, product = (
-            int.from_bytes(node.sdo.read(objects.IDENTITY, sub, size=4), "little") for sub in (1, 2)
-        )
+        vendor, product = (int.from_bytes(node.sdo.read(objects.IDENTITY, sub, size=4), "little") for sub in (1, 2))
     except SdoAbort:
         return
     family = None if node.map.is_for(vendor, product) else family_of(vendor, product)
