@@ -32,7 +32,7 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.simulated_machine import with_simulation
 from pmsmtool.workflow.capabilities import Capabilities, Tier, examine
-from pmsmtool.workflow.closed_stage import LIMITS, NO_BANDWIDTH, why_no_limits
+from pmsmtool.workflow.closed_stage import LIMITS, NO_BANDWIDTH, NO_INERTIA, why_no_limits
 from pmsmtool.workflow.commission import Commissioning, begin_run, due_stages
 from pmsmtool.workflow.identify import REPLAYED
 from pmsmtool.workflow.prove.stage import ProofRequest
@@ -311,6 +311,23 @@ def test_inject_tier_measures_like_the_full_one_with_means_from_records(tmp_path
             angles.append(means["theta_m_rad"])
         assert means["U_dc_v"] == pytest.approx(drive.live("U_dc_v"), rel=0.02)
         assert max(angles) - min(angles) < 0.01  # nothing turned, and no turn was lost
+
+
+def test_limits_need_objects_a_bandwidth_and_the_inertia() -> None:
+    sheet = load_machine_file(PROFILE)
+    without = replace(sheet, machine=replace(sheet.machine, J_kgm2=None))
+    standard = load_family("cia402")
+    assert why_no_limits(standard, None, sheet) == NO_BANDWIDTH and why_no_limits(standard, 95.0, sheet) == ""
+    assert why_no_limits(standard, 95.0, without) == NO_INERTIA
+    assert SLOPE in why_no_limits(load_family("ingenia"), None, sheet)
+
+
+def test_a_bandwidth_is_refused_for_a_drive_that_takes_gains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    asked = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:", "commission", "--drive-bandwidth-hz", "95", "--yes"]
+    outcome = CliRunner().invoke(cli, asked)
+    assert isinstance(outcome.exception, ConfigError) and "cannot be reflashed" in str(outcome.exception)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_map_of_another_drive_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
