@@ -79,6 +79,10 @@ class CommandedRecorder(Recorder):
         """
 
     @abstractmethod
+    def halt(self) -> None:
+        """Stop recording; what was recorded stays."""
+
+    @abstractmethod
     def _base_period_s(self) -> float: ...
 
     def start_average(self, signals: Sequence[str], periods: int) -> None:
@@ -142,6 +146,10 @@ class CommandedRecorder(Recorder):
         return self._node.whole(DriveObject(*address))
 
     def _put(self, address: Address, value: int) -> None:
+        """Write a setting: a guard brings it back."""
+        self._node.put(DriveObject(*address), value)
+
+    def _command(self, address: Address, value: int) -> None:
         self._node.command(DriveObject(*address), value)
 
     def _wrong(self, difference: str) -> VerifyMismatch:

@@ -6,6 +6,7 @@ that the map describes. A recorder that holds fewer rows than asked for takes th
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -21,7 +22,7 @@ from pmsmtool.drive.port import Recording
 from pmsmtool.drive.recorder_choice import recorder_of
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S, RecorderDrive
 from pmsmtool.drive.tier_drives import TorqueDrive
-from pmsmtool.errors import NotAvailable
+from pmsmtool.errors import BusError, NotAvailable, SdoAbort
 from pmsmtool.estimators.recorded_push import DELAY_DOUBT
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.trace import Trace
@@ -74,6 +75,7 @@ class MappedRecorderDrive(RecorderDrive, TorqueDrive):
         self.traces = traces
         self.period_s = traces.period_s
         self._apart = 1
+        self._recording = False
         self._own_pole_pairs = self.parameters.read_value(POLE_PAIRS)
 
     def read(self, name: str) -> float:
@@ -87,6 +89,22 @@ class MappedRecorderDrive(RecorderDrive, TorqueDrive):
         value = super().live(name)
         return value * self._own_pole_pairs if name == "omega_e_rad_s" else value
 
+    def quick_stop(self) -> None:
+        """Stop the machine and confirm it; then the recorder, whose settings cannot be brought back while it runs."""
+        super().quick_stop()
+        self._halt()
+
+    def disable(self) -> None:
+        """Remove the voltage and confirm it; then stop the recorder."""
+        super().disable()
+        self._halt()
+
+    def _halt(self) -> None:
+        if self._recording:
+            with contextlib.suppress(SdoAbort, BusError):  # the bus may be what has failed
+                self.traces.halt()
+            self._recording = False
+
     def begin_record(self, recording: Recording, wait: Callable[[float], None]) -> None:
         """Start the recorder; where it holds fewer rows, they are taken further apart."""
         if recording.excitation is not None:
@@ -94,11 +112,13 @@ class MappedRecorderDrive(RecorderDrive, TorqueDrive):
         names = self._names(recording.signals)
         self._apart = max(1, math.ceil(recording.samples / max(1, self.traces.room(names))))
         rows = max(1, recording.samples // self._apart)
+        self._recording = True
         self.traces.arm(names, rows, self._apart * recording.decimation, recording.pretrigger, at_excitation=False)
 
     def finish_record(self, recording: Recording) -> Trace:
         """Return the record by the names asked for."""
         trace = self.traces.fetch(self._names(recording.signals), self._apart * recording.decimation)
+        self._recording = False
         self.check_operating()
         columns = {}
         for name in recording.signals:

@@ -58,9 +58,9 @@ class MonitorRecorder(CommandedRecorder):
         row_bytes = sum(cell.size for cell in cells)
         if samples * row_bytes > self._largest:
             raise self._too_much(signals, samples, f"{self._largest} bytes", "0x58B5:00")
-        self._put(objects.ENABLE, 0)
+        self.halt()
         self._put(objects.MAPPED, 0)
-        self._put(objects.REMOVE_DATA, 1)
+        self._command(objects.REMOVE_DATA, 1)
         for k, cell in enumerate(cells):
             word = objects.mapping_word(cell.index, cell.wire, cell.size)
             self._put((objects.FIRST_MAP[0] + k, *objects.FIRST_MAP[1:]), word)
@@ -68,7 +68,7 @@ class MonitorRecorder(CommandedRecorder):
         self._put(objects.DIVIDER, decimation)
         self._put(objects.TRIGGER_KIND, objects.FORCED)
         self._put(objects.WINDOW, samples)
-        self._put(objects.ENABLE, 1)
+        self._command(objects.ENABLE, 1)
         said = self._get(objects.ROW_BYTES)
         if said != row_bytes:
             raise VerifyMismatch(
@@ -77,7 +77,7 @@ class MonitorRecorder(CommandedRecorder):
             )  # fmt: skip
         if not self._get(objects.STATUS) & objects.ENABLED_BIT:
             raise NotAvailable("the monitor does not start", where=f"node {self._node.node}, 0x58B0:00")
-        self._put(objects.FORCE_TRIGGER, 1)
+        self._command(objects.FORCE_TRIGGER, 1)
 
     def fetch(self, signals: Sequence[str], decimation: int) -> Trace:
         """Wait until the record is complete and read it.
@@ -101,8 +101,12 @@ class MonitorRecorder(CommandedRecorder):
             lasts_s=self._lasts_s(decimation),
         )
         table = np.frombuffer(self._read(expected), row)
-        self._put(objects.ENABLE, 0)
+        self.halt()
         return self._in_si({name: table[name] for name in signals}, [cell.unit for cell in cells], decimation)
+
+    def halt(self) -> None:
+        """Disable the monitor."""
+        self._command(objects.ENABLE, 0)
 
     def _read(self, expected: int) -> bytes:
         """Read blocks until nothing is left."""

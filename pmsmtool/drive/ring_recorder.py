@@ -61,13 +61,13 @@ class RingRecorder(CommandedRecorder):
         self._put(objects.CONFIGURATION, 0)
         self._put(objects.PERIOD, decimation)
         self._put(objects.PRECEDING, 0)
-        self._put(objects.CONTROL, objects.START)
-        self._put(objects.CONTROL, objects.FORCE_TRIGGER)
+        self._command(objects.CONTROL, objects.START)
+        self._command(objects.CONTROL, objects.FORCE_TRIGGER)
 
     def room(self, signals: Sequence[str]) -> int:
         """Stop the recorder, choose its variables, and return how many samples of them fit."""
         channels = self._variables(signals)
-        self._stop()
+        self.halt()
         for k, channel in enumerate(channels):
             try:
                 self._put(numbered(objects.FIRST_INDEX, k), channel.index)
@@ -108,7 +108,7 @@ class RingRecorder(CommandedRecorder):
             "0x2017:00",
             lasts_s=self._lasts_s(decimation),
         )
-        self._stop()
+        self.halt()
         place = self._place()
         stored, largest, first = place
         if not self._samples <= stored <= largest:
@@ -139,6 +139,7 @@ class RingRecorder(CommandedRecorder):
     def _running(self) -> bool:
         return bool(self._get(objects.STATUS) & objects.RUNNING_BIT)
 
-    def _stop(self) -> None:
-        self._put(objects.CONTROL, objects.STOP)
+    def halt(self) -> None:
+        """Stop the recorder; what was recorded stays."""
+        self._command(objects.CONTROL, objects.STOP)
         self._until(lambda: not self._running(), "stopping the data recorder", "0x2017:00")

@@ -52,13 +52,13 @@ class RowRecorder(CommandedRecorder):
             raise self._too_much(signals, samples, f"{largest} samples", "0x2504:00")
         self._put(objects.PERIOD, decimation)
         self._put(objects.DELAY, 0)
-        self._node.sdo.download(objects.TRIGGER, 0, objects.NO_TRIGGER)
-        self._put(objects.START, 1)
+        self._node.write_bytes(objects.TRIGGER, 0, objects.NO_TRIGGER)
+        self._command(objects.START, 1)
 
     def room(self, signals: Sequence[str]) -> int:
         """Stop the trace, choose its variables, and return how many rows of them fit."""
         channels = self._variables(signals)
-        self._stop()
+        self.halt()
         for k in range(self._channels_there):
             number = channels[k].number if k < len(channels) else 0
             try:
@@ -89,7 +89,7 @@ class RowRecorder(CommandedRecorder):
             "0x2503:00",
             lasts_s=self._lasts_s(decimation),
         )
-        self._stop()
+        self.halt()
         stored, largest = self._get(objects.RECORDED), self._get(objects.LARGEST)
         if not self._samples <= stored <= largest:
             raise self._wrong(f"{self._samples} rows were asked for, {stored} of at most {largest} are there")
@@ -107,6 +107,7 @@ class RowRecorder(CommandedRecorder):
     def _running(self) -> bool:
         return bool(self._get(objects.STATUS) & objects.RUNNING_BIT)
 
-    def _stop(self) -> None:
-        self._put(objects.START, 0)
+    def halt(self) -> None:
+        """Stop the trace; what was recorded stays."""
+        self._command(objects.START, 0)
         self._until(lambda: not self._running(), "stopping the trace", "0x2501:00")

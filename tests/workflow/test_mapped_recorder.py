@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,11 +16,12 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.envelope import Envelope
-from pmsmtool.drive.mapped_recorder_drive import DELAY_DOUBT_PERIODS, MappedRecorderDrive
+from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.mapped_recorder_drive import DELAY_DOUBT_PERIODS, RECORDED, MappedRecorderDrive
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive.tier_drives import ParameterDrive
-from pmsmtool.errors import NotAvailable
+from pmsmtool.errors import Interrupted, NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.recorded_push import DELAY_DOUBT, estimate_pushes
 from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
@@ -189,3 +191,28 @@ def test_the_chain_measures_by_it_and_says_what_is_left(tmp_path: Path, monkeypa
     machine_file = load_machine_file(next((tmp_path / "runs").glob("*/machine.toml")))
     measured = machine_file.machine.R_s_ohm
     assert measured != 3.6 and measured == pytest.approx(3.6, rel=0.05)
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_the_recorder_is_brought_back_as_it_was(tmp_path: Path, interrupted: bool) -> None:
+    """Also after a push that ends in its middle, with the trace still running."""
+    with opened(tmp_path, completed()) as (connection, found):
+        drive = open_tier_drive(connection, 1, found)
+        assert isinstance(drive, MappedRecorderDrive)
+        session = connection.bus.line.nodes[0].session  # type: ignore[attr-defined]
+        places = [*((0x2500, k) for k in range(1, 7)), (0x2505, 0), (0x2506, 0), (0x2507, 0)]
+        session.dictionary.find(0x2500, 1).value = b"\x0e\0"
+        session.dictionary.find(0x2505, 0).value = b"\x09\0"
+        before = [session.dictionary.find(*place).read() for place in places]
+        envelope = Envelope(i_max_apk=5.0, speed_max_rad_s=100.0, duration_s=60.0)
+        with contextlib.suppress(KeyboardInterrupt, Interrupted), guarded(drive, envelope) as guard:
+            guard.enable()
+            guard.record(tuple(RECORDED), 100)
+            assert [session.dictionary.find(*place).read() for place in places] != before
+            if interrupted:
+                drive.begin_record(Recording(tuple(RECORDED), 300, 50), drive.wait)
+                raise KeyboardInterrupt
+        assert is_safe(drive.node.state())
+        assert [session.dictionary.find(*place).read() for place in places] == before
+        assert not session.dictionary.find(0x2501, 0).read()[0] & 1
+        drive.close()
