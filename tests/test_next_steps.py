@@ -194,8 +194,9 @@ def test_every_refused_file_comes_with_a_next_step(name: str, tmp_path: Path) ->
 READERS = (
     "machine/machine_file", "machine/flux_map_import", "machine/flux_map_table", "machine/mat_file", "trace_file",
     "sim/scenarios", "sim/faults", "sim/channel", "sim/simulated_machine", "firmware/dcf", "firmware/eds",
-    "firmware/drive_map_file", "firmware/drive_map", "params/parameter_set", "design/design_file", "design/prediction_file", "design/iron_loss",
-    "design/lookup_file", "npz_file", "toml_file", "flash/journal", "workflow/parameter_source",
+    "firmware/drive_map_file", "firmware/drive_map", "params/parameter_set", "design/design_file",
+    "design/prediction_file", "design/iron_loss", "design/lookup_file", "npz_file", "toml_file", "flash/journal",
+    "workflow/parameter_source",
 )  # fmt: skip
 
 
