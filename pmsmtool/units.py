@@ -187,7 +187,7 @@ def parse_quantity(text: str, dimension: str) -> float:
 
 def _finite(value: float, text: str) -> float:
     if not math.isfinite(value):
-        raise ConfigError(f"{text!r} is too large to be a quantity")
+        raise ConfigError(f"{text!r} is too large to be a quantity", hint="write a smaller number, or a larger unit")
     return value
 
 

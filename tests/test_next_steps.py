@@ -16,13 +16,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pmsmtool import errors
 from pmsmtool.design.design_file import design_text, load_machine_or_design, parse_design
 from pmsmtool.design.iron_loss import load_iron_loss_map
 from pmsmtool.design.lookup_file import table_parameters
 from pmsmtool.design.prediction_file import from_arrays
 from pmsmtool.design.tune import tune
 from pmsmtool.drive.port import Identity
-from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.errors import ConfigError, PmsmtoolError, next_step
 from pmsmtool.firmware.dcf import Entry as Written
 from pmsmtool.firmware.dcf import read_concise, update_dcf, values_of, write_concise
 from pmsmtool.firmware.drive_map import reference_map
@@ -230,6 +231,30 @@ INSIDE = {"encode", "decode"}
 def test_every_reader_adds_a_next_step(module: str) -> None:
     source = (ROOT / "pmsmtool" / f"{module}.py").read_text(encoding="utf-8")
     assert [name for name in bare_functions(source) if not (module == "firmware/drive_map" and name in INSIDE)] == []
+
+
+ERRORS = {name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, PmsmtoolError)}
+ELSEWHERE = {
+    "design/closed_drive", "design/lookup_design", "design/tolerance", "design/tune_request", "machine/flux_map",
+    "machine/machine_reader", "drive/commanded_recorder", "drive/monitor", "drive/recorder", "drive/ring_recorder",
+}  # fmt: skip
+"""Modules whose step is added by the command line (by option), by the reader of the file, or by nobody: a recorder's
+answer is right or wrong, and the sentence says all there is."""
+HAVE_A_STEP = {"NotAvailable", "Interrupted", "PmsmtoolError"}
+"""`pmsmtool caps` is the step of the first; the second says that the machine was stopped; the last is a bug."""
+
+
+def test_every_other_error_names_a_next_step() -> None:
+    bare = []
+    for path in sorted((ROOT / "pmsmtool").rglob("*.py")):
+        module = path.relative_to(ROOT / "pmsmtool").with_suffix("").as_posix()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call) or getattr(node.func, "id", "") not in ERRORS - HAVE_A_STEP:
+                continue
+            behind = module in ELSEWHERE or (module in READERS and ast.unparse(node.func) == "ConfigError")
+            if not behind and not any(keyword.arg in ("hint", None) for keyword in node.keywords):
+                bare.append(f"{module}:{node.lineno}")
+    assert bare == []
 
 
 def test_a_reader_that_adds_none_is_seen() -> None:

@@ -126,7 +126,9 @@ class LssMaster:
         answer = self._await(LssCommand.STORE, STORE_TIMEOUT_S, "storing")
         if answer[1]:
             raise DriveFault(
-                f"the slave does not store its node id (error {answer[1]})", likely="it has no memory for it"
+                f"the slave does not store its node id (error {answer[1]})",
+                likely="it has no memory for it",
+                hint="set the id once more after every power-on, or by the switches of the drive",
             )
 
     @contextmanager

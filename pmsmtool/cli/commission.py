@@ -101,7 +101,8 @@ def commission_command(
             checked_identity(drive.node)
         if drive_bandwidth_hz is not None and found.drive_map.staging:
             raise ConfigError(
-                f"--drive-bandwidth-hz: for a drive that cannot be reflashed, and {found.drive_map.name!r} is none"
+                f"--drive-bandwidth-hz: for a drive that cannot be reflashed, and {found.drive_map.name!r} is none",
+                hint="leave it out: this drive takes the gains that are designed",
             )
         run = begun or begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=_recorded(bus), tier=found.tier)
         progress = StageProgress(out)

@@ -24,5 +24,8 @@ def completion_command(ctx: click.Context, shell: str) -> None:
     """Print the completion script of a SHELL."""
     kind = get_completion_class(shell)
     if kind is None:
-        raise NotAvailable(f"this version of click completes nothing for {shell}")
+        raise NotAvailable(
+            f"this version of click completes nothing for {shell}",
+            hint="update click, or take bash, zsh or fish as `pmsmtool completion --help` shows",
+        )
     click.echo(kind(ctx.find_root().command, {}, "pmsmtool", COMPLETE_VARIABLE).source())

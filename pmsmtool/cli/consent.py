@@ -122,7 +122,10 @@ def _ask(
     except click.Abort:
         agreed = False
     if not agreed:
-        raise Declined(f"consent to {_NAMES[subject]} was not given: nothing was done")
+        raise Declined(
+            f"consent to {_NAMES[subject]} was not given: nothing was done",
+            hint="run the command again and answer y, when all that is shown above is right",
+        )
     return Consent(subject, "prompt", text)
 
 

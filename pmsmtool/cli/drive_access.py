@@ -42,7 +42,11 @@ def read_map(path: Path | None) -> DriveMap:
     try:
         return parse_drive_map(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read: {error}", where=str(path)) from error
+        raise ConfigError(
+            f"cannot be read: {error}",
+            where=str(path),
+            hint="give a map file in UTF-8 that you may read, or the name of a shipped family",
+        ) from error
 
 
 @contextmanager

@@ -86,7 +86,11 @@ def dcf_command(design: Path, into: Path | None, node_id: int, map_file: Path | 
     try:
         base = None if into is None else into.read_bytes()
     except OSError as error:
-        raise ConfigError(f"cannot be read: {error.strerror}", where=str(into)) from None
+        raise ConfigError(
+            f"cannot be read: {error.strerror}",
+            where=str(into),
+            hint="give with --into an EDS or DCF that you may read",
+        ) from None
     wanted = _parameters(design, drive_map, out)
     return dcf_file(wanted, drive_map=drive_map, base=base, node_id=node_id, where=str(into or "EDS"))
 

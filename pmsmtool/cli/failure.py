@@ -16,6 +16,7 @@ from pmsmtool.errors import (
     Declined,
     ExitCode,
     Interrupted,
+    NotAvailable,
     PmsmtoolError,
     StopNotConfirmed,
     VerifyMismatch,
@@ -29,6 +30,9 @@ READER_GONE = 141
 
 _DISK = (errno.ENOSPC, errno.EROFS, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC))
 """Errors of writing that name no file, such as those of standard output."""
+_DISK_HINT = "check the path, your rights there and the space on the disk"
+_WHAT_IT_GIVES = "`pmsmtool caps` shows what this drive gives"
+"""Next step of what a drive cannot give, where none is named."""
 
 
 def related(error: BaseException) -> Iterator[BaseException]:
@@ -88,7 +92,7 @@ def report(error: BaseException, verbosity: int = 0) -> int:
         return int(ExitCode.INTERRUPTED)
     if isinstance(chosen, OSError) and (chosen.filename is not None or chosen.errno in _DISK):
         place = str(chosen.filename) if chosen.filename is not None else "while writing"
-        _tell(ConfigError(chosen.strerror or str(chosen), where=place))
+        _tell(ConfigError(chosen.strerror or str(chosen), where=place, hint=_DISK_HINT))
         return int(ExitCode.USAGE)
     return _tell_bug(error)
 
@@ -116,7 +120,8 @@ def _tell(error: PmsmtoolError) -> None:
     details = error.differences if isinstance(error, VerifyMismatch) else details
     for detail in details:
         _echo(f"  - {detail}")
-    for name, text in (("where", error.where), ("likely", error.likely), ("try", error.hint)):
+    hint = error.hint or (_WHAT_IT_GIVES if isinstance(error, NotAvailable) else "")
+    for name, text in (("where", error.where), ("likely", error.likely), ("try", hint)):
         if text:
             _echo(f"  {name + ':':<8}{text}")
 

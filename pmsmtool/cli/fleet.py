@@ -73,7 +73,10 @@ def flash_fleet(
             out.result("flash-params", {"nodes": plans}, lines)
             different = sum(bool(job.plan.changes) for job in jobs)
             if check and different:
-                raise CheckFailed(f"{different} of {len(jobs)} drives differ")
+                raise CheckFailed(
+                    f"{different} of {len(jobs)} drives differ",
+                    hint="the lists above show them; without --check they are written",
+                )
             return
         for job in jobs:
             job.admit()

@@ -13,6 +13,7 @@ from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, example
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
+    from pmsmtool.cli.consent import Consent
     from pmsmtool.workflow.capabilities import Capabilities
     from pmsmtool.workflow.identify import IdentifyRequest
     from pmsmtool.workflow.run_directory import RunDirectory, Stage
@@ -195,7 +196,8 @@ def _measure_without_injection(
         run = RunDirectory.create(runs, identity.serial, record)
 
         def allow(lines: Any) -> None:
-            ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
+            given = ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
+            _keep(run, given)
 
         measure = vendor_stage if how == "vendor" else tier_stage
         stage = measure(run, drive, found, request, allow, out.note)
@@ -215,19 +217,15 @@ def _measure(
     from dataclasses import asdict
 
     from pmsmtool import __version__
-    from pmsmtool.cli.consent import Consent, ask_motion
+    from pmsmtool.cli.consent import ask_motion
     from pmsmtool.cli.drive_access import choose_node
     from pmsmtool.workflow.identify import identify_stage, nameplate_of
     from pmsmtool.workflow.run_directory import RunDirectory, new_record
     from pmsmtool.workflow.tier_stages import open_tier_drive
 
-    consents: list[Consent] = []
     with bus.connect() as connection:
         drive = open_tier_drive(connection, choose_node(connection, bus.node), found)
         identity = drive.identity
-
-        def allow(lines: Any) -> None:
-            consents.append(ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out))
 
         record = new_record(
             ["pmsmtool", *sys.argv[1:]],
@@ -237,10 +235,23 @@ def _measure(
         )
         nameplate = nameplate_of(drive, identity.name or f"drive {identity.serial:#010x}")
         run = RunDirectory.create(runs, identity.serial, record)
+
+        def allow(lines: Any) -> None:
+            given = ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
+            _keep(run, given)
+
         stage = identify_stage(run, drive, nameplate, request, allow, out.note)
         drive.close()
     run.add(stage)
     return run, stage
+
+
+def _keep(run: RunDirectory, given: Consent) -> None:
+    """Put the consent into the record before anything moves: somebody signs it, however the run ends."""
+    from dataclasses import asdict, replace
+
+    record = run.read()
+    run.write(replace(record, consents=(*record.consents, asdict(given))))
 
 
 def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
@@ -267,14 +278,17 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
             )
         )
     heads = ("quantity", "value, total 95 %", "statistical", "systematic", "at", "method")
-    data = {"run": str(run.path), "values": list(stage.values), "status": stage.status, "warnings": stage.note}
+    warnings = [*stage.fallbacks, *([stage.note] if stage.note else [])]
+    data = {"run": str(run.path), "values": list(stage.values), "status": stage.status, "warnings": warnings}
     out.result("identify", data, table(heads, rows))
-    for line in (*stage.fallbacks, *([stage.note] if stage.note else [])):
+    for line in warnings:
         out.warn(line)
     out.note(stage.summary)
     for name in stage.files:
         if not name.startswith(("traces/", "nameplate", "request")):
             out.note(f"-> {run.path / name}")
     if stage.status != "pass":
+        from pmsmtool.workflow.commission import NOT_ACCEPTED
+
         broken = [f"{line.what}: {line.measured}, limit {line.limit}" for line in stage.acceptance if not line.ok]
-        raise IdentificationError("E_NOT_ACCEPTED", "; ".join(broken), where=str(run.path))
+        raise IdentificationError("E_NOT_ACCEPTED", "; ".join(broken), where=str(run.path), hint=NOT_ACCEPTED)

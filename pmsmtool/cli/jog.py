@@ -62,7 +62,9 @@ def jog_command(
     from pmsmtool.errors import ConfigError
 
     if (current_apk is None) == (speed_rad_s is None):
-        raise ConfigError("give one of --current and --speed")
+        raise ConfigError(
+            "give one of --current and --speed", hint="`pmsmtool jog --current 1A`, or `pmsmtool jog --speed 100rpm`"
+        )
     with open_drive(bus) as drive:
         _refuse_beyond("current", current_apk or 0.0, drive.read("motor.I_max_apk"), "Apk", "motor.I_max_apk")
         rpm = abs(speed_rad_s or 0.0) * 30.0 / math.pi

@@ -70,7 +70,11 @@ def set_command(bus: BusOptions, motion: MotionOptions, out: Output, new_id: int
         there = new_id in [entry.node for entry in find_nodes(connection)]
         master.close()
     if not there:
-        raise BusError(f"the node does not answer as {new_id}", likely="it takes the id after its next power-on")
+        raise BusError(
+            f"the node does not answer as {new_id}",
+            likely="it takes the id after its next power-on",
+            hint="switch the drive off and on, then `pmsmtool scan`",
+        )
     out.result(
         "lss-set-node", {"slave": found, "node": new_id, "stored": store}, [f"serial {found.serial} is node {new_id}"]
     )

@@ -76,7 +76,10 @@ def monitor_command(
     try:
         wanted = re.compile(pattern or "")
     except re.error as error:
-        raise ConfigError(f"-g {pattern!r} is no regular expression: {error}") from error
+        raise ConfigError(
+            f"-g {pattern!r} is no regular expression: {error}",
+            hint="escape what is meant literally, or give a part of a name: -g i_q",
+        ) from error
     period_s = 1.0 / (rate_hz or DEFAULT_RATE_HZ)
     with open_node(bus) as node:
         names = _available(node, wanted)

@@ -151,7 +151,11 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
     out.result("param-diff", {"old": old, "new": new, "differences": differences}, lambda: table(heads, rows))
     out.note(f"{len(differences)} difference(s) among what both hold")
     if check and differences:
-        raise CheckFailed(f"{len(differences)} parameter(s) differ", where=f"{old} and {new}")
+        raise CheckFailed(
+            f"{len(differences)} parameter(s) differ",
+            where=f"{old} and {new}",
+            hint="the table above names them; `pmsmtool flash-params` writes a set",
+        )
 
 
 @param_command.command("help", epilog=examples("pmsmtool param help governor.k_max", "pmsmtool param help 'motor.*'"))
@@ -212,7 +216,7 @@ def _assignment(text: str, drive_map: DriveMap) -> dict[str, float]:
 
     name, equals, value = text.partition("=")
     if not equals:
-        raise ConfigError(f"{text!r} is no NAME=VALUE")
+        raise ConfigError(f"{text!r} is no NAME=VALUE", hint="write it like motor.R_s_ohm=0.1")
     entries = _resolve(name, drive_map)
     if not entries[0][0]:
         raise ConfigError(

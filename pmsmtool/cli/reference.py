@@ -115,7 +115,11 @@ def replaced(readme: str) -> str:
     before, begin, rest = readme.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
-        raise ConfigError("the markers of the command reference are missing", where="README.md")
+        raise ConfigError(
+            "the markers of the command reference are missing",
+            where="README.md",
+            hint="put both markers of pmsmtool/cli/reference.py around the section",
+        )
     return f"{before}{BEGIN}\n\n{reference()}\n{END}{after}"
 
 

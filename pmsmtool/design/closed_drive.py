@@ -305,7 +305,11 @@ class _Projection:
         flux = tolerance.factors["psi_f_wb"].half_width if "psi_f_wb" in tolerance.factors else 0.0
         self.per_ampere = TORQUE_FACTOR * machine.pole_pairs * machine.psi_f_wb * (1.0 - flux)
         if machine.psi_f_wb == 0.0:
-            raise DesignInfeasible("without a magnet there is no torque at i_d = 0", where="closed drive")
+            raise DesignInfeasible(
+                "without a magnet there is no torque at i_d = 0",
+                where="closed drive",
+                hint="leave the limits out: a reluctance machine needs i_d, which such a drive does not take",
+            )
         if machine.J_kgm2 is None and drive.acceleration_rpm_per_s is None:
             raise ConfigError(
                 "neither the inertia J_kgm2 nor the largest acceleration is known",
@@ -334,7 +338,11 @@ class _Projection:
                 if asked is not None:
                     raise
                 top_rpm *= LOWER
-        raise DesignInfeasible("the current loops of the closed drive are unstable", where="closed drive")
+        raise DesignInfeasible(
+            "the current loops of the closed drive are unstable",
+            where="closed drive",
+            hint="give a smaller bandwidth, or a lower speed",
+        )
 
     def demand(self, I_apk: float, slope_a: float, speeds: int) -> tuple[float, float]:
         """Return bounds of the demand (V) and of the current's deviation (A)."""

@@ -77,7 +77,11 @@ def design_field_weakening(source: MachineFile, rated: Ratings, mode: str, margi
         Unknown mode.
     """
     if mode not in MODES:
-        raise ConfigError(f"field-weakening mode {mode!r}, allowed are {', '.join(MODES)}", where="tune")
+        raise ConfigError(
+            f"field-weakening mode {mode!r}, allowed are {', '.join(MODES)}",
+            where="tune",
+            hint="`pmsmtool tune --help` explains each",
+        )
     i_d_lm = loss_minimising_i_d(source, rated)
     K_t = torque_constant(source.machine, i_d_lm)
     periods = max(1, round(source.inverter.f_s_hz / RATE_HZ))

@@ -145,7 +145,11 @@ def design_governor(
         Unknown mode.
     """
     if mode not in MODES:
-        raise ConfigError(f"governor mode {mode!r}, allowed are {', '.join(MODES)}", where="tune")
+        raise ConfigError(
+            f"governor mode {mode!r}, allowed are {', '.join(MODES)}",
+            where="tune",
+            hint="`pmsmtool tune --help` explains each",
+        )
     model = prediction_model(source, gains)
     V_max = source.inverter.V_max_v
     omega = rated.n_max_rpm / RPM * source.machine.pole_pairs

@@ -75,7 +75,10 @@ def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> 
             continue
         values = measured[experiment, signal]
         if values.shape != band.mean.shape:
-            raise ConfigError(f"{experiment}: {len(values)} rows of {signal}, {len(band.mean)} were predicted")
+            raise ConfigError(
+                f"{experiment}: {len(values)} rows of {signal}, {len(band.mean)} were predicted",
+                hint="prove the design again: the record is not of this prediction",
+            )
         share, row = band.largest(values)
         at = prediction.t_s[experiment][row]
         seen.append(

@@ -318,4 +318,6 @@ def _check(machine: OperatingMachine, torque: Array, omega: Array, V: Array, I_m
     if machine.flux_map is None and not (machine.L_d > 0.0 and machine.L_q > 0.0):
         wrong.append("an inductance is not positive")
     if wrong:
-        raise DesignInfeasible("; ".join(wrong), where="look-up table")
+        raise DesignInfeasible(
+            "; ".join(wrong), where="look-up table", hint="correct the machine file or the axes of the table"
+        )

@@ -108,6 +108,7 @@ def minimum_time(
                 f"the current ({end[0]:.4g}, {end[1]:.4g}) A cannot be reached",
                 where="minimum time",
                 likely="its steady-state voltage lies beyond the limit",
+                hint="take a smaller current, a lower speed, or a larger voltage",
             )
     side = 0
     while high - low > TIME_RESOLUTION * high:  # bracketed secant (Illinois)
@@ -255,7 +256,12 @@ def shoot(
     shots = (_newton(miss, angle, T) for angle, T in _starts(problem, start, end))
     found = [T for T in shots if T is not None]
     if not found:
-        raise DesignInfeasible("no time-optimal transfer was found", where="minimum time", likely="out of reach")
+        raise DesignInfeasible(
+            "no time-optimal transfer was found",
+            where="minimum time",
+            likely="out of reach",
+            hint="take a target nearer to the start, or a larger voltage",
+        )
     return min(found)
 
 

@@ -90,7 +90,11 @@ class CanopenDrive:
             raise NotAvailable(f"the drive has no object for {', '.join(missing)}", where=f"node {self.node.node}")
         violations = wanted.violations()
         if violations:
-            raise ConfigError("values cannot be written", violations=violations)
+            raise ConfigError(
+                "values cannot be written",
+                violations=violations,
+                hint="`pmsmtool param help NAME` shows a parameter's bounds",
+            )
         new = self.node.map.encode(wanted)
         old = self.parameters.read(new)
         changed = {name: data for name, data in new.items() if data != old[name]}

@@ -233,6 +233,7 @@ class DriveParameters:
                 where=f"node {self.node.node}",
                 differences=wrong,
                 likely="the drive rounds or limits silently, or its map is wrong",
+                hint="`pmsmtool verify` shows what it holds; compare the map's types with its manual",
             )
 
     def _validate(self) -> None:
@@ -263,4 +264,5 @@ class DriveParameters:
                 "the active set is not the one that was written",
                 where=f"node {self.node.node}, 0x2000:03",
                 differences=[f"CRC-32 {active:#010x} instead of {expected:#010x}"],
+                hint="`pmsmtool verify` shows what it holds; write the set again",
             )

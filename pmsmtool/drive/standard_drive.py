@@ -233,6 +233,7 @@ class RecorderDrive(TorqueCurrent):
             raise DriveTimeout(
                 f"the step came {1e3 * self._late_s:.2g} ms after the recorder was started",
                 where=f"node {self.node.node}", likely="a slow adapter",
+                hint="use a faster adapter, or close what else uses this one",
             )  # fmt: skip
         at = trace.t_s[:rows] + self._late_s
         signals_at = {name: np.interp(at, trace.t_s, values) for name, values in trace.signals.items()}

@@ -100,6 +100,7 @@ class VendorDrive(StandardDrive):
                     f"the drive has no mode of operation {self.tuning.mode}, which its own identification needs",
                     where=abort.where,
                     likely="other firmware than the map is for",
+                    hint="compare mode of [vendor_tuning] in the map with the manual of this firmware",
                 ) from abort
         self.may_be_energised = True
         self.node.enable()
@@ -168,7 +169,11 @@ class VendorDrive(StandardDrive):
         node = self.node
         node.put(COMMAND_MODE, EXECUTE_AT_ONCE)
         if self._read_answer()[0] > FAILED_WITH_CODE:  # reading it also takes an old answer away
-            raise DriveFault("another OS command is running in the drive", where=f"node {node.node}, 0x1023:03")
+            raise DriveFault(
+                "another OS command is running in the drive",
+                where=f"node {node.node}, 0x1023:03",
+                hint="wait until it has ended, or end the program that started it",
+            )
         self._commanded = True
         node.sdo.download(OS_COMMAND, 1, bytes((step.command,)).ljust(COMMAND_BYTES, b"\0"), retry=Retry.NEVER)
         while True:
@@ -188,6 +193,7 @@ class VendorDrive(StandardDrive):
             raise DriveFault(
                 f"the answer to an OS command has {len(answer)} bytes, expected {COMMAND_BYTES}",
                 where=f"node {self.node.node}, 0x1023:03",
+                hint="compare order and data of [vendor_tuning] in the map with the manual of this firmware",
             )
         return answer
 
@@ -220,6 +226,7 @@ class VendorDrive(StandardDrive):
                 f"the drive's own identification ({step.title}) ended without a result",
                 where=f"node {self.node.node}, 0x1023:03 = {answer.hex(' ')}",
                 likely="other firmware than the map is for",
+                hint="compare [vendor_tuning] of the map with the manual of this firmware",
             )
         data = answer[DATA_AT : DATA_AT + cell.size]
         return {step.name: cell.decode(data[::-1] if self.tuning.order == "big" else data, known)}
@@ -234,6 +241,7 @@ class VendorDrive(StandardDrive):
                 f"statusword bit {self.tuning.done_bit} is set before anything was started",
                 where=f"node {node.node}, 0x6041:00",
                 likely="other firmware than the map is for",
+                hint="switch the drive off and on; compare done_bit of the map with the manual of this firmware",
             )
         node.command(objects.CONTROLWORD, Command.ENABLE_OPERATION | start)
         while not node.whole(objects.STATUSWORD) & done:

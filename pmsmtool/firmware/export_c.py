@@ -215,9 +215,14 @@ def image_of_json(text: str) -> bytes:
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"not a configuration that pmsmtool exported: {error}") from error
+        raise ConfigError(
+            f"not a configuration that pmsmtool exported: {error}",
+            hint="export it again from the design or the parameter set",
+        ) from error
     if announced != crc32(image):
         raise ConfigError(
-            f"the content has CRC {crc32(image):#010x}, the file says {announced}", likely="the file was edited"
+            f"the content has CRC {crc32(image):#010x}, the file says {announced}",
+            likely="the file was edited",
+            hint="export it again from the design or the parameter set",
         )
     return image

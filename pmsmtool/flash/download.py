@@ -276,6 +276,7 @@ class Download:
                 "after the reset the drive does not hold what was stored",
                 where=f"node {self.node.node}",
                 differences=wrong,
+                hint="`pmsmtool verify` shows what it holds, `pmsmtool restore` brings back what it held before",
             )
 
     def _start_over(self) -> None:

@@ -74,7 +74,11 @@ def remember_map(drive_map: DriveMap, folder: JournalFolder) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"map": drive_map.name, "sha256": map_hash(drive_map)}) + "\n", encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror or error}", where=str(path)) from error
+        raise ConfigError(
+            f"cannot be written: {error.strerror or error}",
+            where=str(path),
+            hint="check your rights there and the space on the disk",
+        ) from error
 
 
 def _kept(folder: JournalFolder) -> str:

@@ -166,7 +166,7 @@ def _kind(written: str | None, said: Kind | None, text: str) -> Kind:
     if written is not None:
         found = "rms" if written in ("rms", "eff") else "peak"
     if found is not None and said is not None and found != said:
-        raise ConfigError(f"{text!r} says {found}, but {said} was given beside it")
+        raise ConfigError(f"{text!r} says {found}, but {said} was given beside it", hint="leave one of the two out")
     kind = found or said
     if kind is None:
         raise ConfigError(

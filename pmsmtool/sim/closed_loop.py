@@ -177,7 +177,12 @@ def _check(machine_file: MachineFile, params: ParameterSet, scenario: Scenario, 
     if rotor == Rotor.LOCKED and scenario.start_rpm != 0.0:
         wrong.append("a locked rotor does not turn: start_rpm must be 0")
     if wrong:
-        raise ConfigError("the scenario does not fit the drive", where=scenario.name, violations=wrong)
+        raise ConfigError(
+            "the scenario does not fit the drive",
+            where=scenario.name,
+            violations=wrong,
+            hint="correct the scenario, or the parameters it runs with",
+        )
 
 
 def _meta(

@@ -151,7 +151,10 @@ class KernelCore:
             out.command = STOP
             return
         if len(excitation.buffer) > BUFFER_SAMPLES:
-            raise ConfigError(f"{len(excitation.buffer)} samples do not fit the buffer of {BUFFER_SAMPLES}")
+            raise ConfigError(
+                f"{len(excitation.buffer)} samples do not fit the buffer of {BUFFER_SAMPLES}",
+                hint="give a shorter buffer",
+            )
         running = self.excitation_state() is ExcitationState.RUNNING
         out.shape, out.point, out.hold_periods = excitation.shape, excitation.point, excitation.hold_periods
         out.amplitude, out.amplitude_q = excitation.amplitude, excitation.amplitude_q
@@ -189,7 +192,10 @@ class KernelCore:
             out.command = STOP
             return
         if len(setup.channels) > TRACE_CHANNELS or 4 * len(setup.channels) * setup.depth > TRACE_BYTES:
-            raise ConfigError(f"{setup.depth} rows of {len(setup.channels)} channels do not fit the recorder")
+            raise ConfigError(
+                f"{setup.depth} rows of {len(setup.channels)} channels do not fit the recorder",
+                hint="ask for fewer rows or fewer signals",
+            )
         out.decimation, out.depth, out.pretrigger = setup.decimation, setup.depth, setup.pretrigger
         out.trigger, out.trigger_signal, out.trigger_level = setup.trigger, setup.source, setup.level
         out.channel[:] = _padded(setup.channels)
@@ -239,7 +245,7 @@ class KernelCore:
 
 def _padded(signals: Sequence[Signal]) -> list[int]:
     if len(signals) > TRACE_CHANNELS:
-        raise ConfigError(f"{len(signals)} signals do not fit {TRACE_CHANNELS} channels")
+        raise ConfigError(f"{len(signals)} signals do not fit {TRACE_CHANNELS} channels", hint="ask for fewer signals")
     return [*map(int, signals), *[0] * (TRACE_CHANNELS - len(signals))]
 
 

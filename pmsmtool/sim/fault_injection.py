@@ -50,7 +50,11 @@ class Injector:
     def _arm_drive(self, fault: DriveFault) -> None:
         node = self._line.nodes[0] if fault.node is None else self._line.node_by_id(fault.node)
         if node is None:
-            raise ConfigError(f"no drive with node id {fault.node} is on the line", where="[[drive]] node")
+            raise ConfigError(
+                f"no drive with node id {fault.node} is on the line",
+                where="[[drive]] node",
+                hint="give the node id of a drive that is served",
+            )
         if fault.at_store_step is not None:
             _StepCounter(node, fault.at_store_step, lambda: self._strike(node, fault))
         else:

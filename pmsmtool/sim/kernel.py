@@ -352,7 +352,10 @@ class Simulation:
         """Give the drive a parameter image; controller memory is kept."""
         status = self.library.pmsm_drive_load(self.drive, image, len(image))
         if status:
-            raise ConfigError(f"the simulated drive refuses the parameter image (status {status})")
+            raise ConfigError(
+                f"the simulated drive refuses the parameter image (status {status})",
+                hint="`pmsmtool param help NAME` shows the bounds of each value",
+            )
 
     def part(self, part: Part) -> int:
         """Return the address of a part of the drive."""
@@ -414,7 +417,10 @@ class Simulation:
         """
         t, v = np.ascontiguousarray(t_s, dtype=float), np.ascontiguousarray(value, dtype=float)
         if t.shape != v.shape or t.ndim != 1 or not len(t) or np.any(np.diff(t) < 0.0) or not np.all(np.isfinite(v)):
-            raise ConfigError(f"the schedule of {target.name} needs finite values at times that do not decrease")
+            raise ConfigError(
+                f"the schedule of {target.name} needs finite values at times that do not decrease",
+                hint="sort the nodes by time, and leave out what is not finite",
+            )
         self._buffers[target] = (t, v)
         self.library.pmsm_sim_set_schedule(self.sim, int(target), len(t), t.ctypes.data, v.ctypes.data)
 

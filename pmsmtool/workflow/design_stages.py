@@ -150,7 +150,7 @@ def margins_stage(run: RunDirectory, request: MarginRequest) -> Stage:
     """
     design = load_design(run.path / "design.toml")
     if reason := why_not_judged(design):
-        raise NotAvailable(reason)
+        raise NotAvailable(reason, hint="the maker's tool sets and judges the loops of such a drive")
     report = margin_report(design, tolerance_box(design.machine), request, samples=MARGIN_SAMPLES)
     criteria = [line for spread in report.loops for line in _spread_criteria(spread)]
     criteria += [line for spread in report.headroom for line in _spread_criteria(spread)]

@@ -30,7 +30,12 @@ def checked(wanted: ParameterSet) -> ParameterSet:
     """Return the set, or raise ``ConfigError`` listing every value out of bounds."""
     violations = wanted.violations()
     if violations:
-        raise ConfigError("the parameter set cannot be exported", where=wanted.name, violations=violations)
+        raise ConfigError(
+            "the parameter set cannot be exported",
+            where=wanted.name,
+            violations=violations,
+            hint="`pmsmtool param help NAME` shows a parameter's bounds",
+        )
     return wanted
 
 

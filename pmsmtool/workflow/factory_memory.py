@@ -37,5 +37,9 @@ def erase_memory(channel: str | None) -> list[Path]:
         try:
             path.unlink()
         except OSError as error:
-            raise ConfigError(f"cannot be erased: {error.strerror}", where=str(path)) from error
+            raise ConfigError(
+                f"cannot be erased: {error.strerror}",
+                where=str(path),
+                hint="check your rights there, and end a simulated drive that still uses it",
+            ) from error
     return found

@@ -317,7 +317,11 @@ def _beside(run: RunDirectory) -> RunDirectory:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"cannot be made: {error.strerror or error}", where=str(folder)) from error
+        raise ConfigError(
+            f"cannot be made: {error.strerror or error}",
+            where=str(folder),
+            hint="check your rights there and the space on the disk",
+        ) from error
     return RunDirectory(folder)
 
 
@@ -384,7 +388,11 @@ def parse_request(text: str, *, where: str) -> IdentifyRequest:
         tolerance = SensorTolerance(**facts.pop("tolerance"))
         request = IdentifyRequest(tolerance=tolerance, **{**facts, "quantities": tuple(facts["quantities"])})
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ConfigError(f"the recorded request is damaged: {error}", where=where) from error
+        raise ConfigError(
+            f"the recorded request is damaged: {error}",
+            where=where,
+            hint="identify again; or take the file from a copy of the run",
+        ) from error
     request.check()
     return request
 

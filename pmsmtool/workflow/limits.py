@@ -42,7 +42,10 @@ class Limits:
             ("largest voltage", self.V_max_v, "V"),
         ):
             if not value > 0.0:
-                raise ConfigError(f"{what} is {value:.4g} {unit}: nothing can be measured")
+                raise ConfigError(
+                    f"{what} is {value:.4g} {unit}: nothing can be measured",
+                    hint="give --i-max and --speed-max above zero, and ratings above zero in the machine file",
+                )
 
     @property
     def I_test_apk(self) -> float:

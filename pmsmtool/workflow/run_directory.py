@@ -129,7 +129,11 @@ class RunDirectory:
             run = cls(path)
             run.write(record)
             return run
-        raise ConfigError(f"a hundred runs started in the same second under {parent}", where=str(parent))
+        raise ConfigError(
+            f"a hundred runs started in the same second under {parent}",
+            where=str(parent),
+            hint="give another folder with --runs",
+        )
 
     def read(self) -> RunRecord:
         """Return the record.

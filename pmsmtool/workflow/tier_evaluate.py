@@ -279,7 +279,9 @@ def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibrat
 
     if (run.path / ANSWERS).is_file():
         raise ConfigError(
-            "the run holds what the drive identified by itself: nothing of that can be recomputed", where=str(run.path)
+            "the run holds what the drive identified by itself: nothing of that can be recomputed",
+            where=str(run.path),
+            hint="`pmsmtool identify --method vendor` has the drive measure again",
         )
     if not (run.path / FACTS).is_file():
         return replay_injection(run, tolerance, calibration)
@@ -314,7 +316,11 @@ def parse_facts(text: str, *, where: str) -> TierFacts:
         if found.kind not in ("recorder", "standard"):
             raise ValueError(f"no kind {found.kind!r}")
     except (ValueError, TypeError, KeyError) as error:
-        raise ConfigError(f"the record of the tier is damaged: {error}", where=where) from error
+        raise ConfigError(
+            f"the record of the tier is damaged: {error}",
+            where=where,
+            hint="identify again; or take the file from a copy of the run",
+        ) from error
     return found
 
 

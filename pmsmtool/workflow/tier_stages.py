@@ -165,7 +165,9 @@ class TierStages:
     def tune(self, request: TuneRequest) -> Stage:
         """Design the control, and the limits of a drive that keeps its own; one pair of gains where it has no more."""
         if not (self.run.path / MACHINE).is_file():
-            raise NotAvailable(_machine_needed(self._lacking()))
+            raise NotAvailable(
+                _machine_needed(self._lacking()), hint="begin a new run with it: `pmsmtool commission MACHINE`"
+            )
         drive_map = self.found.drive_map
         if drive_map.staging:
             return tune_stage(self.run, request)
@@ -251,7 +253,10 @@ class TierStages:
 
     def _need_design(self) -> None:
         if not (self.run.path / "design.toml").is_file():
-            raise NotAvailable("needs a design, and there is none without a whole machine file")
+            raise NotAvailable(
+                "needs a design, and there is none without a whole machine file",
+                hint="begin a new run with one: `pmsmtool commission MACHINE`",
+            )
 
     def _no_writing(self) -> str:
         """Return why nothing can be written, empty when something can."""

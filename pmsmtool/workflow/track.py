@@ -302,7 +302,9 @@ def load_known(path: Path) -> Known:
         numbers = {name: float(value) for name, value in facts.items()}
         return Known(**numbers, curve=curve, L_std=(L_std_d, L_std_q), error_share=(share, share_std))
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise ConfigError(f"cannot be read: {error}", where=str(path)) from error
+        raise ConfigError(
+            f"cannot be read: {error}", where=str(path), hint="track again; or take the file from a copy of the run"
+        ) from error
 
 
 def track_stage(found: Tracked, wanted: Sequence[str], machine: MachineFile) -> Stage:

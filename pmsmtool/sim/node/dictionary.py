@@ -159,7 +159,9 @@ class Dictionary:
         hidden = [key for key in self._entries if key >> 8 == index and sub in (None, key & 0xFF)]
         if not hidden and index not in self._hidden:
             raise ConfigError(
-                f"the drive has no object 0x{index:04X}" + ("" if sub is None else f":{sub:02X}"), where="[[absent]]"
+                f"the drive has no object 0x{index:04X}" + ("" if sub is None else f":{sub:02X}"),
+                where="[[absent]]",
+                hint="give an object that `pmsmtool export dcf` lists",
             )
         for key in hidden:
             del self._entries[key]

@@ -200,7 +200,11 @@ class _Sizes:
         machine, inverter = design.machine.machine, design.machine.inverter
         I_nom = design["motor.I_nom_apk"]
         if I_nom <= 0.0:
-            raise ConfigError("the design gives no rated current", where="motor.I_nom_apk")
+            raise ConfigError(
+                "the design gives no rated current",
+                where="motor.I_nom_apk",
+                hint="give I_nom_apk in the machine file, then tune again",
+            )
         i_lim = CURRENT_SHARE * min(conditions.i_max_apk, design["motor.I_max_apk"])
         I_test = min(I_nom, i_lim)
         V = inverter.voltage_utilisation * conditions.U_dc_v

@@ -236,7 +236,11 @@ def commit(run: RunDirectory, prediction: Prediction) -> tuple[str, str]:
             stream.flush()
             os.fsync(stream.fileno())
     except OSError as error:
-        raise ConfigError(f"the prediction cannot be committed: {error.strerror}", where=str(path)) from error
+        raise ConfigError(
+            f"the prediction cannot be committed: {error.strerror}",
+            where=str(path),
+            hint="check your rights there and the space on the disk",
+        ) from error
     return digest, folder
 
 
@@ -262,7 +266,10 @@ def responses(traces: Mapping[str, Trace], prediction: Prediction) -> dict[tuple
             repeats = int(trace.meta.get("repeats", 1))
             values = trace[signal]
             if len(values) != repeats * len(band.mean):
-                raise ConfigError(f"{experiment}: the record has {len(values)} rows of {repeats * len(band.mean)}")
+                raise ConfigError(
+                    f"{experiment}: the record has {len(values)} rows of {repeats * len(band.mean)}",
+                    hint="prove the design again: the record is not of this prediction",
+                )
             found[experiment, signal] = np.asarray(values.reshape(repeats, -1).mean(axis=0))
     return found
 

@@ -29,7 +29,9 @@ def figure_of(found: Reproduction) -> Figure:
         It is a table without a plot.
     """
     if not found.panels:
-        raise ConfigError(f"{found.name} is a table, there is nothing to plot", where="reproduce")
+        raise ConfigError(
+            f"{found.name} is a table, there is nothing to plot", where="reproduce", hint="leave --plot out"
+        )
     from matplotlib.figure import Figure
 
     columns = min(found.columns, len(found.panels))
