@@ -125,6 +125,8 @@ class FaultReaction(IntEnum):
     QUICK_STOP_RAMP = 2
 
 
+EXCITATION_ABORTED = 0xFF10
+"""Error code of the reference drive: it ended an excitation by itself."""
 ERROR_TEXTS: dict[int, str] = {
     0x0000: "no error",
     0x2310: "continuous over-current at the output",
@@ -142,7 +144,7 @@ ERROR_TEXTS: dict[int, str] = {
     0x8130: "heartbeat of the master lost",
     0x8210: "PDO not processed: too short",
     0x8480: "over-speed",
-    0xFF10: "excitation left its abort limit",
+    EXCITATION_ABORTED: "excitation left its abort limit",
 }
 """Error codes of object 0x603F and of emergency messages (CiA 301 table 26, CiA 402-2)."""
 

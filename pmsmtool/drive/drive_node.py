@@ -10,7 +10,7 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.nmt import NmtCommand, NmtState, reset_node, send_nmt
 from pmsmtool.bus.sdo import Retry, SdoChannel
 from pmsmtool.bus.supervision import Supervision
-from pmsmtool.cia402 import Command, State, command_towards_enabled, error_text, state_of
+from pmsmtool.cia402 import EXCITATION_ABORTED, Command, State, command_towards_enabled, error_text, state_of
 from pmsmtool.drive import objects
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Identity
@@ -195,10 +195,13 @@ class DriveNode:
     def fault_error(self) -> DriveFault:
         """Return the error that tells the drive's fault."""
         code = self.whole(objects.ERROR_CODE)
+        aborted = code == EXCITATION_ABORTED
+        cause = "allow more (--speed-max, --i-max) or ask for less" if aborted else "remove the cause"
         return DriveFault(
             f"the drive is in fault {code:#06x}: {error_text(code)}",
             where=f"node {self.node}, 0x603F:00",
-            hint=f"remove the cause, then `pmsmtool fault reset -n {self.node}`",
+            likely="current or speed left the limits of the envelope" if aborted else "",
+            hint=f"{cause}, then `pmsmtool fault reset -n {self.node}`",
         )
 
     # ---- reset and store ------------------------------------------------------------------------

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.estimators.axis_layout import Effects, Layout, Motion, Timing
-from pmsmtool.estimators.axis_response import SKIP_SAMPLES, Shot, arx_guess, simulate
+from pmsmtool.estimators.axis_response import SKIP_SAMPLES, Shot, arx_guess, projected, simulate
 from pmsmtool.estimators.estimate import information_weights, scaled_covariance
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt
 from pmsmtool.estimators.output_error import respond
@@ -38,10 +38,15 @@ STEP_TOLERANCE = 1e-7
 """Relative size of the last step."""
 COST_TOLERANCE = 1e-4
 """Fall of the whitened cost below which a fit is done: a hundredth of a standard deviation."""
-PENALTY = 3.0
-"""Price of a parameter in the information criterion (AIC 2; BIC about 8, which drops a lag that still biases L)."""
+PENALTY, DISPERSION_PENALTY = 6.0, 4.0
+"""Prices of a parameter in the information criterion (AIC 2; BIC about 8).
+
+A dispersion that is there and left out biases L by more than a bend or a lag (on a measured map, 0.2 %): it costs less.
+"""
 NEGLIGIBLE_WEIGHT = 1e-6
 """Information weight below which a model does not count."""
+DECIDED = -2.0 * math.log(NEGLIGIBLE_WEIGHT)
+"""Difference of information criteria that makes such a weight."""
 UNPHYSICAL = 1e9
 """Residual outside the region where the model is defined."""
 
@@ -114,8 +119,8 @@ class _Problem:
     def per_shot(self, x: Vector) -> list[Vector]:
         out = []
         for shot, slow, response in zip(self.shots, self.slow, self.layout.responses(x), strict=True):
-            r = (simulate(response, shot, slow) - shot.i_a[SKIP_SAMPLES:]) / self.sigma_a
-            out.append(r - slow @ (slow.T @ r))
+            r = (simulate([response], shot, slow)[0] - shot.i_a[SKIP_SAMPLES:]) / self.sigma_a
+            out.append(projected(r, slow))
         return out
 
     def __call__(self, x: Vector) -> Vector:
@@ -125,27 +130,34 @@ class _Problem:
         return np.concatenate([*self.per_shot(x), prior])
 
     def derivative(self, x: Vector) -> NDArray[np.float64]:
-        """Jacobian: differences for what all shots share, the decay of a starting current in closed form.
+        """Jacobian: differences for what shots share, the decay of a starting current in closed form.
 
-        One-sided: a step of 1e-5 leaves 1e-5 of a column, and central ones would double the time of a fit.
+        One-sided: a step of 1e-5 leaves 1e-5 of a column, and central ones would double the time of a fit. All columns
+        of a shot are simulated at once, and only those that change it.
         """
         shared = len(x) - self.layout.shots
-        here = self(x)
-        sides = []
-        for k in range(shared):
-            aside = x.copy()
-            aside[k] += RELATIVE_STEP
-            sides.append((self(aside) - here) / (aside[k] - x[k]))
-        columns = [np.stack(sides, axis=1)]
+        steps = np.full(shared, RELATIVE_STEP)
+        if math.floor(x[2] + steps[2]) != math.floor(x[2]):
+            steps[2] = -steps[2]  # a whole delay changes the first sample that is modelled
+        asides = x + np.eye(shared, len(x)) * steps[:, None]
+        here, prior = self.layout.responses(x), self.layout.prior(x)
+        moved = [self.layout.responses(aside) for aside in asides]
+        out = np.zeros((self.rows + len(prior), len(x)))
+        for k, aside in enumerate(asides):
+            out[self.rows :, k] = (self.layout.prior(aside) - prior) / steps[k]
         first = 0
-        for shot, slow, response in zip(self.shots, self.slow, self.layout.responses(x), strict=True):
-            decay = respond(response.model, np.zeros(len(shot.u_v)), shot.period_s, 1.0)[-len(slow) - 1 : -1]
-            column = np.zeros((len(columns[0]), 1))
-            scale = self.layout.ripple_a / self.sigma_a
-            column[first : first + len(slow), 0] = scale * (decay - slow @ (slow.T @ decay))
-            columns.append(column)
+        for index, (shot, slow) in enumerate(zip(self.shots, self.slow, strict=True)):
+            changed = [k for k in range(shared) if moved[k][index] != here[index]]
+            at, *others = simulate([here[index], *(moved[k][index] for k in changed)], shot, slow)
+            decay = respond(here[index].model, np.zeros(len(shot.u_v)), shot.period_s, 1.0)[-len(slow) - 1 : -1]
+            columns = [
+                *((other - at) / steps[k] for k, other in zip(changed, others, strict=True)),
+                self.layout.ripple_a * decay,
+            ]
+            rows = slice(first, first + len(slow))
+            out[rows, [*changed, shared + index]] = projected(np.stack(columns) / self.sigma_a, slow).T
             first += len(slow)
-        return np.concatenate(columns, axis=1)
+        return out
 
     def fit(self, x: Vector) -> Fit:
         with np.errstate(over="ignore", invalid="ignore"):  # a step that runs away has no finite cost and is refused
@@ -185,7 +197,8 @@ def fit_axis(
         What other experiments say of it; then it is in every model.
     other : AxisFit or None
         The other axis, fitted before. Delay and lag belong to the drive, and a rotor that follows looks like them; a
-        machine that bends on its d axis saturates on q as well, however little of it the noise leaves to see.
+        machine that bends on its d axis saturates on q as well, however little of it the noise leaves to see: what
+        the bend gains there counts here.
 
     Raises
     ------
@@ -200,17 +213,18 @@ def fit_axis(
     timing = None if other is None else other.timing
     base = Layout(len(shots), Effects(), L_0, R_guess, T_s, ripple, motion_scale, timing, motion, torque)
     problem = _Problem(shots, slow, sigma_a, base)
-    firsts = []
     # a long lag and a longer delay are two valleys: begin in each, on a first guess of L either may look better
-    for lags in LAG_STARTS:
-        starts = [
-            np.array([0.0, 1.0, delay, math.log(lag), *([0.0] * len(shots))]) for delay in DELAY_STARTS for lag in lags
-        ]
+    valleys = [[(delay, math.log(lag)) for delay in DELAY_STARTS for lag in lags] for lags in LAG_STARTS]
+    if timing is not None:  # both axes lie in the same one
+        valleys = [[(max(0.0, timing.total - math.exp(timing.log_lag)), timing.log_lag)]]
+    firsts = []
+    for valley in valleys:
+        starts = [np.array([0.0, 1.0, *place, *([0.0] * len(shots))]) for place in valley]
         firsts.append(problem.fit(min(starts, key=lambda x: float(np.sum(problem(x) ** 2)))))
     first = min(firsts, key=lambda fit: fit.cost)
     # what is there, whether this axis can show it or not
     current = Effects(
-        bend=other is not None and "bend" in other.effects,
+        bend=timing is not None and timing.bend_gain > DECIDED,
         motion=torque and motion is not None,
     )
     optional = {"bend": not current.bend, "motion": torque and motion is None, "dispersion": len(shots) > 1}
@@ -224,34 +238,45 @@ def fit_axis(
             if richer not in tried:
                 new_layout, start = layout.changed(fit.x, richer)
                 tried[richer] = (_Problem(shots, slow, sigma_a, new_layout).fit(start), new_layout)
-        best = min(tried, key=lambda effects: _criterion(effects, tried[effects][0], timing))
+        best = min(tried, key=lambda effects: _criterion(*tried[effects], timing))
         if not set(best.names) > set(current.names):
             break
         current = best
-    fit, layout = tried[current]
-    without_lag, start = layout.changed(fit.x, replace(current, lag=False))
-    tried[without_lag.effects] = (_Problem(shots, slow, sigma_a, without_lag).fit(start), without_lag)
+    criteria = {effects: _criterion(*found, timing) for effects, found in tried.items()}
+    # each without its lag, not the best alone: with one choice made before it, the average over models was none
+    for effects in [e for e, criterion in criteria.items() if criterion - min(criteria.values()) < DECIDED]:
+        fit, layout = tried[effects]
+        without_lag, start = layout.changed(fit.x, replace(effects, lag=False))
+        tried[without_lag.effects] = (_Problem(shots, slow, sigma_a, without_lag).fit(start), without_lag)
     return _average(shots, slow, sigma_a, tried, timing)
 
 
-def _criterion(effects: Effects, fit: Fit, timing: Timing | None) -> float:
+def _criterion(fit: Fit, layout: Layout, timing: Timing | None) -> float:
     """Information criterion; a rotor that follows is free of charge: it is there, whether it can be seen or not.
 
-    With the timing of another axis it is the criterion of both together, which share the lag.
+    With the timing of another axis it is the criterion of both together, which share the lag; and a machine that the
+    other axis shows to saturate does so on this one.
     """
+    effects, lengths = layout.effects, dict(layout.blocks())
+    cheap = lengths.get("dispersion", 0)
+    own = fit.cost + PENALTY * (len(fit.x) - effects.motion - cheap) + DISPERSION_PENALTY * cheap
     if timing is None:
-        return fit.cost + PENALTY * (len(fit.x) - effects.motion)
-    return fit.cost + PENALTY * (len(fit.x) - effects.motion - effects.lag) + timing.criterion(effects.lag)
+        return own
+    return own - PENALTY * effects.lag + timing.criterion(effects.lag) + (0.0 if effects.bend else timing.bend_gain)
 
 
 def _timing(tried: dict[Effects, tuple[Fit, Layout]]) -> Timing:
     """Delay and lag of the best models with and without lag."""
     best: dict[bool, tuple[float, Vector, NDArray[np.float64]]] = {}
-    for effects, (fit, _) in tried.items():
-        criterion = _criterion(effects, fit, None)
+    for effects, (fit, layout) in tried.items():
+        criterion = _criterion(fit, layout, None)
         if effects.lag not in best or criterion < best[effects.lag][0]:
             best[effects.lag] = criterion, fit.x, scaled_covariance(fit.jacobian)[0]
     (with_lag, x, covariance), (without, x_0, covariance_0) = best[True], best[False]
+    straight, bent = (
+        min((_criterion(*found, None) for effects, found in tried.items() if effects.bend == bend), default=math.inf)
+        for bend in (False, True)
+    )
     slope = np.array([1.0, math.exp(float(x[3]))])
     return Timing(
         total=float(x[2] + slope[1]),
@@ -262,6 +287,7 @@ def _timing(tried: dict[Effects, tuple[Fit, Layout]]) -> Timing:
         delay_std=math.sqrt(float(covariance_0[2, 2])),
         lag_criterion=with_lag,
         plain_criterion=without,
+        bend_gain=max(0.0, straight - bent),
     )
 
 
@@ -279,7 +305,7 @@ def _average(
     rows = [row for row in rows if row[2].motion is not None or row[2].responses(row[1].x)[0].motion >= 0.0]
     if not rows:
         raise refuse("E_NOT_CONVERGED", "no model of the axis could be fitted", stage="inductance")
-    weights = information_weights([_criterion(effects, fit, timing) for effects, fit, _, _ in rows])
+    weights = information_weights([_criterion(fit, layout, timing) for _, fit, layout, _ in rows])
     L = float(sum(w * row[2].L_scale * math.exp(row[1].x[0]) for w, row in zip(weights, rows, strict=True)))
     variance = 0.0
     for w, (_, fit, layout, covariance) in zip(weights, rows, strict=True):

@@ -57,6 +57,8 @@ class Timing:
         Delay of the model without lag (T_s).
     lag_criterion, plain_criterion : float
         Information criterion of the best model with lag, and of the one without.
+    bend_gain : float
+        What a bend of the magnetisation curve gained there in the criterion, 0 where it gained nothing.
     """
 
     total: float
@@ -67,6 +69,7 @@ class Timing:
     delay_std: float
     lag_criterion: float
     plain_criterion: float
+    bend_gain: float = 0.0
 
     def criterion(self, lag: bool) -> float:
         """Criterion of the other axis's model with or without lag."""

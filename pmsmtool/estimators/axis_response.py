@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,12 +45,12 @@ class VoltageError:
     early_v: Vector
     late_v: Vector
 
-    def lost_v(self, i_a: Vector) -> Vector:
-        """Mean error in each interval between samples of the current (V), shape (n - 1,)."""
+    def lost_v(self, i_a: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mean error in each interval between samples of currents (V), shape (..., n - 1)."""
         early, late = np.interp(i_a, self.i_a, self.early_v), np.interp(i_a, self.i_a, self.late_v)
         before = EDGE_SHARE * early + (1.0 - EDGE_SHARE) * late
         after = (1.0 - EDGE_SHARE) * early + EDGE_SHARE * late
-        return np.asarray(before[:-1] + after[1:], dtype=np.float64)
+        return np.asarray(before[..., :-1] + after[..., 1:], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,49 +98,71 @@ class Response:
     motion: float
 
 
-def simulate(response: Response, shot: Shot, slow: NDArray[np.float64]) -> Vector:
-    """Modelled current of a shot at the compared samples, without its mean (A), shape (n - SKIP_SAMPLES,)."""
-    model, T_s = response.model, shot.period_s
+def simulate(responses: Sequence[Response], shot: Shot, slow: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Modelled currents of a shot at the compared samples, without their means (A), shape (m, n - SKIP_SAMPLES).
+
+    One row per response; they may differ in everything but the whole part of their delays. Together they cost less than
+    one by one: what projects the slow part out is one product of matrices.
+    """
+    T_s = shot.period_s
     count = len(shot.i_a) - SKIP_SAMPLES
-    linear = respond(model, shot.u_v - np.mean(shot.u_v), T_s, response.start_a)
+    command = shot.u_v - np.mean(shot.u_v)
+    linear = np.stack([respond(response.model, command, T_s, response.start_a) for response in responses])
     centre_a = float(np.mean(shot.i_a))
-    curved = response.c_2 != 0.0 or response.c_3 != 0.0
-    if not curved and response.motion == 0.0 and shot.error is None:
-        return linear[-count - 1 : -1]
-    rate = model.R_ohm * T_s / model.L_h
-    pole = math.exp(-rate)
-    gain = T_s / model.L_h * (-math.expm1(-rate) / rate if abs(rate) > 1e-9 else 1.0)
+    c_2, c_3, motion, R = (
+        np.array(values)[:, None]
+        for values in zip(*((r.c_2, r.c_3, r.motion, r.model.R_ohm) for r in responses), strict=True)
+    )
+    curved, moves = bool(np.any(c_2) or np.any(c_3)), bool(np.any(motion))
+    if not curved and not moves and shot.error is None:
+        return linear[:, -count - 1 : -1]
+    steps = [_step(response.model, T_s) for response in responses]
     # the slow part of the modelled current stands for nothing: the starting current alone decides it
-    i = y = linear
-    for _ in range(PASSES):
-        bent = bend(fast_part(y, slow), response.c_2, response.c_3)
-        i = y + bent
-        lost = model.R_ohm * bent  # the bent part of the current drops R i too
-        if response.motion != 0.0:
-            lost = lost + response.motion * _fast_charge(i, slow, T_s)
-        middle = 0.5 * (lost[1:] + lost[:-1])
+    y = linear
+    fast = fast_part(y, slow)
+    for remaining in reversed(range(PASSES)):
+        bent = bend(fast, c_2, c_3) if curved else np.zeros_like(y)
+        fast_i = fast_part(y + bent, slow) if curved else fast
+        lost = R * bent  # the bent part of the current drops R i too
+        if moves:
+            lost = lost + motion * _fast_charge(fast_i, slow, T_s)
+        middle = 0.5 * (lost[:, 1:] + lost[:, :-1])
         if shot.error is not None:
-            middle = middle + shot.error.lost_v(fast_part(i, slow) + centre_a)
-        y = linear + recursion(pole, -gain * (middle - np.mean(middle)), 0.0)
-    i = y + bend(fast_part(y, slow), response.c_2, response.c_3)
+            middle = middle + shot.error.lost_v(fast_i + centre_a)
+        middle -= np.mean(middle, axis=1, keepdims=True)
+        y = linear + np.stack([recursion(a, -gain * row, 0.0) for (a, gain), row in zip(steps, middle, strict=True)])
+        if curved or remaining:
+            fast = fast_part(y, slow)
+    i = y + bend(fast, c_2, c_3) if curved else y
     # sample n - 1 of the record is the last but one of the response
-    return i[-count - 1 : -1]
+    return i[:, -count - 1 : -1]
 
 
-def fast_part(i: Vector, slow: NDArray[np.float64]) -> Vector:
+def _step(model: AxisModel, T_s: float) -> tuple[float, float]:
+    """Pole of the current over one period, and current per constant voltage (1/ohm)."""
+    rate = model.R_ohm * T_s / model.L_h
+    return math.exp(-rate), T_s / model.L_h * (-math.expm1(-rate) / rate if abs(rate) > 1e-9 else 1.0)
+
+
+def projected(rows: NDArray[np.float64], slow: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What is left of rows of compared samples without their slow part."""
+    return np.asarray(rows - (rows @ slow) @ slow.T, dtype=np.float64)
+
+
+def fast_part(i: NDArray[np.float64], slow: NDArray[np.float64]) -> NDArray[np.float64]:
     """What is faster than the slow cosines of the compared samples; before them only the mean is taken off (A)."""
     rows = slow.shape[0]
-    fast = i - np.mean(i[-rows:])
-    fast[-rows:] -= slow @ (slow.T @ fast[-rows:])
+    fast = i - np.mean(i[..., -rows:], axis=-1, keepdims=True)
+    fast[..., -rows:] = projected(fast[..., -rows:], slow)
     return np.asarray(fast, dtype=np.float64)
 
 
-def _fast_charge(i: Vector, slow: NDArray[np.float64], T_s: float) -> Vector:
-    """Integral of the fast part of a current (A s)."""
+def _fast_charge(fast: NDArray[np.float64], slow: NDArray[np.float64], T_s: float) -> NDArray[np.float64]:
+    """Fast part of the integral of a fast current (A s)."""
     rows = slow.shape[0]
-    fast = fast_part(i, slow)
-    charge = np.concatenate([[0.0], np.cumsum(0.5 * (fast[1:] + fast[:-1]))]) * T_s
-    charge[-rows:] -= slow @ (slow.T @ charge[-rows:])
+    charge = np.zeros_like(fast)
+    np.cumsum(0.5 * T_s * (fast[:, 1:] + fast[:, :-1]), axis=1, out=charge[:, 1:])
+    charge[:, -rows:] = projected(charge[:, -rows:], slow)
     return charge
 
 

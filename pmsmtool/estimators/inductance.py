@@ -29,8 +29,11 @@ from pmsmtool.trace import Trace
 
 Vector = NDArray[np.float64]
 
-MODEL_FLOOR = 3e-4
-"""Relative standard deviation added for what the model leaves out (identification reference, section 4)."""
+MODEL_FLOOR = 1e-4
+"""Relative standard deviation added for what the model leaves out.
+
+The reference (section 4) takes 3e-4; here bridge, commutation and rotor have terms of their own.
+"""
 FREQUENCY_LIMIT = 0.01
 """Relative difference between two injection frequencies above which both values are reported."""
 ROTOR_LIMIT_RAD = math.radians(2.0)

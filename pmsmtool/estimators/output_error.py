@@ -154,6 +154,8 @@ def respond(model: AxisModel, command: Vector, period_s: float, start_a: float) 
     return recursion(e_1 * e_2, forced, start_a)
 
 
-def bend(x: Vector, c_2: float, c_3: float) -> Vector:
+def bend(
+    x: NDArray[np.float64], c_2: float | NDArray[np.float64], c_3: float | NDArray[np.float64]
+) -> NDArray[np.float64]:
     """What saturation adds to a current x about the bias (A)."""
     return np.asarray(x * x * (c_2 + c_3 * x), dtype=np.float64)

@@ -40,7 +40,7 @@ from pmsmtool.units import format_estimate
 from pmsmtool.workflow import frequency_stage, half_frequency, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
-from pmsmtool.workflow.limits import Limits
+from pmsmtool.workflow.limits import Limits, require_speed
 from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Measurement, steps_of
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
@@ -221,6 +221,8 @@ def identify_stage(
     request.check()
     envelope = envelope_of(nameplate, request)
     envelope.refuse_gravity()
+    if "speeds" in steps_of(request.quantities, request.shaft == "locked"):
+        require_speed(envelope.speed_max_rad_s, nameplate.machine.n_max_rpm or 0.0)
     allow_motion(plan_lines(envelope, request))
     run.save(NAMEPLATE, dump_machine_file(nameplate))
     run.save(REQUEST, dump_request(request))

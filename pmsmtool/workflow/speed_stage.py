@@ -25,6 +25,8 @@ more."""
 PUSH_SHARE = 0.5
 PUSH_SPEED_SHARE = 0.12
 PUSH_SAMPLES = 1024
+PUSH_END_SHARE, SLOW_PUSH_SHARE = 0.9, 0.5
+"""Speed at which the drive ends a push by itself, of the speed limit; the speed of one that would get there."""
 SPEED_LOOP_RAD_S = 25.0
 RUN_I_D_SHARE = 0.45
 """Largest d current of the flux run, of the test current: a third of it is still beyond the inverter's knee."""
@@ -78,6 +80,9 @@ class SpeedStage:
         rate = self._acceleration_per_ampere(target, pole_pairs)
         current = PUSH_SHARE * limits.I_test_apk
         decimation = max(1, round(target / (rate * current) / (PUSH_SAMPLES * self.drive.period_s)))
+        reached = rate * current * PUSH_SAMPLES * decimation * self.drive.period_s
+        if reached > PUSH_END_SHARE * limits.omega_max_rad_s:  # within the shortest record
+            current *= SLOW_PUSH_SHARE * limits.omega_max_rad_s / reached
         pushes = [self._push(sign * current, PUSH_SAMPLES, decimation, pole_pairs) for sign in (1.0, -1.0)]
         for k, push in enumerate(pushes):
             self.keep(f"push_{k}", push)
@@ -121,7 +126,7 @@ class SpeedStage:
         )
 
     def _push(self, i_q_a: float, samples: int, decimation: int, pole_pairs: int) -> Trace:
-        omega_e = 0.9 * pole_pairs * self.limits.omega_max_rad_s
+        omega_e = PUSH_END_SHARE * pole_pairs * self.limits.omega_max_rad_s
         return speed_run.push_and_record(self.drive, i_q_a, samples, decimation, omega_e)
 
     def _speeds(self, psi: float, J: float, pole_pairs: int, L: tuple[float, float], V_dead_v: float) -> None:

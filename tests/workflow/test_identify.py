@@ -15,7 +15,7 @@ from pmsmtool.cli.main import run as main
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.errors import ConfigError, ExitCode, Interrupted, NotAvailable
+from pmsmtool.errors import ConfigError, ExitCode, IdentificationError, Interrupted, NotAvailable
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
@@ -94,6 +94,20 @@ def test_ctrl_c_at_any_moment_leaves_a_drive_that_is_off_and_as_before(
         assert state_of(drive) == before
         drive.close()
     assert not list(tmp_path.glob("*/machine.toml"))
+
+
+def test_a_speed_limit_that_tells_nothing_is_refused_before_anybody_is_asked(tmp_path: Path) -> None:
+    asked: list[object] = []
+    request = IdentifyRequest(quantities=("psi",), speed_max_rad_s=math.pi / 30.0)
+    run = RunDirectory.create(tmp_path, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
+    with Connection(PmsmSimBus(CHANNEL)) as connection:
+        drive = CanopenDrive(connection, 1)
+        nameplate = nameplate_of(drive, "bench")
+        with pytest.raises(IdentificationError, match="E_EXCITATION: the speed limit 1 rpm"):
+            identify_stage(run, drive, nameplate, request, asked.append, asked.append)
+        assert not drive.may_be_energised
+        drive.close()
+    assert asked == []
 
 
 # ---- a rotor that leaves the turning vector ------------------------------------------------------------------------

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
-from pmsmtool.errors import ConfigError
-from pmsmtool.workflow.limits import Limits
+from pmsmtool.errors import ConfigError, IdentificationError
+from pmsmtool.workflow.limits import LEAST_SPEED_SHARE, Limits, require_speed
 
 GIVEN = {"I_nom_apk": 5.0, "i_max_apk": 6.0, "omega_max_rad_s": 300.0, "V_max_v": 28.0}
 
@@ -20,3 +22,11 @@ def test_a_limit_that_leaves_nothing_is_refused_before_anything_moves(name: str,
 def test_the_test_current_stays_within_the_envelope() -> None:
     assert Limits(**GIVEN).I_test_apk == 5.0
     assert Limits(**{**GIVEN, "i_max_apk": 4.4}).I_test_apk == pytest.approx(4.0)
+
+
+def test_a_speed_limit_that_no_push_stays_within_is_refused_with_the_least_one() -> None:
+    least_rad_s = LEAST_SPEED_SHARE * 3000.0 * math.pi / 30.0
+    require_speed(1.001 * least_rad_s, 3000.0)
+    with pytest.raises(IdentificationError, match="E_EXCITATION") as caught:
+        require_speed(0.999 * least_rad_s, 3000.0)
+    assert f"--speed-max {LEAST_SPEED_SHARE * 3000.0:.0f}rpm" in caught.value.hint

@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Callable, Sequence
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.cia402 import Mode, State
+from pmsmtool.cia402 import EXCITATION_ABORTED, Mode, State
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.drive_core import (
@@ -26,7 +26,7 @@ from pmsmtool.sim.node.drive_core import (
     RecorderState,
     Trigger,
 )
-from pmsmtool.sim.node.power_drive import EXCITATION_ABORTED, Plant, PowerDrive
+from pmsmtool.sim.node.power_drive import Plant, PowerDrive
 from pmsmtool.sim.signals import Signal
 
 LIVE_SIGNALS: dict[str, Signal] = {

@@ -23,7 +23,6 @@ from pmsmtool.sim.signals import Signal
 RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 HEARTBEAT_LOST = 0x8130
 CONNECTION_ENDED = 0x8100
-EXCITATION_ABORTED = 0xFF10
 STANDSTILL_SHARE = 0.002
 """Share of n_max below which the machine counts as standing."""
 STANDSTILL_FLOOR_RPM = 2.0
