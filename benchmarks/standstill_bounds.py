@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.identification_coverage import drawn, evaluated, measured
+from benchmarks.identification_coverage import Choice, Refusal, drawn, evaluated, kept
 from pmsmtool.estimators.axis_response import SKIP_SAMPLES
 from pmsmtool.estimators.estimate import scaled_covariance
 from pmsmtool.estimators.flux_linkage import LEVEL_RATIO
@@ -136,9 +136,12 @@ def realisation(
     return {**values, "psi_f": psi, "psi_f, curvature free": psi}
 
 
-def deviations_of(seed: int, realisations: int) -> dict[str, Vector]:
-    """Return the deviations of one drive's realisations from their mean, over the bounds."""
-    traces, nameplate, _ = measured(drawn("", seed, "ideal"))
+def deviations_of(seed: int, realisations: int, keep: Path | None) -> dict[str, Vector] | None:
+    """Return the deviations of one drive's realisations from their mean, over the bounds; None of a refused one."""
+    stored = kept(("", seed, "ideal"), drawn("", seed, "ideal"), Choice(keep=keep))
+    if isinstance(stored, Refusal):
+        return None
+    traces, nameplate, _ = stored
     found = evaluated(traces, nameplate)
     assert found.flux is not None
     bounds, clean = bounds_of(traces, found), without_noise(traces, found)
@@ -176,14 +179,17 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=10, help="number of random drives")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--realisations", type=int, default=20, help="realisations of noise per drive")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the traces there, and use what is there")
     parser.add_argument("--write", type=Path, help="write the table there as well")
     options = parser.parse_args()
     drives = []
     for seed in range(options.first, options.first + options.drives):
-        drives.append(deviations_of(seed, options.realisations))
-        print(
-            f"seed {seed}: " + ", ".join(f"{name} {rms(values):.2f}" for name, values in drives[-1].items()), flush=True
-        )
+        found = deviations_of(seed, options.realisations, options.keep)
+        if found is None:
+            print(f"seed {seed}: refused", flush=True)
+            continue
+        drives.append(found)
+        print(f"seed {seed}: " + ", ".join(f"{name} {rms(values):.2f}" for name, values in found.items()), flush=True)
     text = table(drives)
     print(text, end="")
     if options.write:
