@@ -20,6 +20,7 @@ SPEED_GAINS = ("speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad", "speed.filter_hz
 """What the speed loop is made of, besides the current loop, machine and delays."""
 ONE_PAIR = {CURRENT_GAINS[2]: CURRENT_GAINS[0], CURRENT_GAINS[3]: CURRENT_GAINS[1]}
 """Gains of q that serve both axes on a drive without an object for those of d."""
+SMALLER = "the smaller of both axes: the drive has one pair"
 CURRENT_LOOPS, SPEED_LOOP = "current", "speed"
 _FACTS = {
     CURRENT_LOOPS: ("current_bandwidth_rad_s", "maximum_delay_d_periods", "maximum_delay_q_periods"),
@@ -61,15 +62,28 @@ def lacking_gains(offers: Collection[str]) -> dict[str, tuple[str, ...]]:
     return {loop: tuple(name for name in names if name not in served) for loop, names in needs.items()}
 
 
-def one_pair(design: Design, offers: Collection[str]) -> dict[str, DesignValue]:
-    """Return the gains of a drive that has one pair for both axes: the smaller of each, so that both keep margins."""
-    how = "the smaller of both axes: the drive has one pair"
+def smaller_gains(values: Mapping[str, float], offers: Collection[str]) -> dict[str, float]:
+    """Return the gains of a drive that has one pair for both axes: the smaller of each, so that both keep margins.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Gains by catalogue name; where only one axis has one there is nothing to choose.
+    offers : collection of str
+        Catalogue names the drive has an object for.
+    """
     return {
-        name: DesignValue(min(design[q], design[d]), how)
+        name: min(values[q], values[d])
         for q, d in ONE_PAIR.items()
-        if q in offers and d not in offers
+        if q in offers and d not in offers and {q, d} <= set(values)
         for name in (q, d)
     }
+
+
+def one_pair(design: Design, offers: Collection[str]) -> dict[str, DesignValue]:
+    """Return what :func:`smaller_gains` makes of a design's gains."""
+    gains = {name: design[name] for name in CURRENT_GAINS}
+    return {name: DesignValue(value, SMALLER) for name, value in smaller_gains(gains, offers).items()}
 
 
 def with_gains(design: Design, gains: Mapping[str, DesignValue], judged: Collection[str]) -> Design:

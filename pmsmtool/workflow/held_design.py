@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from pmsmtool.design.closed_drive import STATED
+from pmsmtool.design.closed_drive import RATED, STATED
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.open_loops import (
     CURRENT_GAINS,
@@ -50,6 +50,7 @@ def held_design(design: Design, drive_map: DriveMap) -> Design:
     """
     if drive_map.staging:
         return design
+    design = replace(design, values={**design.values, **_rated(design, drive_map)})
     lacking = lacking_gains(drive_map.cells)
     if STATED in design.request:
         lacking[CURRENT_LOOPS] = ()
@@ -74,6 +75,14 @@ def why_not_judged(design: Design) -> str:
         return ""
     drive = design.request.get("drive", "the drive")
     return f"needs the gains of the current loops, which {drive!r} does not take; they stand in the design for reading"
+
+
+def _rated(design: Design, drive_map: DriveMap) -> dict[str, DesignValue]:
+    """Return the rated torque in the drive's counts: a limit relative to it is then held at or below what is asked."""
+    if RATED not in design.values or RATED not in drive_map.cells:
+        return {}
+    held = drive_map.quantised(ParameterSet({RATED: design[RATED]}))
+    return {RATED: replace(design.values[RATED], value=held.values[RATED])}
 
 
 def _quantised(design: Design, drive_map: DriveMap) -> dict[str, DesignValue]:

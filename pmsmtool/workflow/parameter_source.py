@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pmsmtool.design import design_file
 from pmsmtool.design.design_file import parse_design
-from pmsmtool.design.open_loops import one_pair
+from pmsmtool.design.open_loops import SMALLER, smaller_gains
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.firmware.dcf import values_of
 from pmsmtool.firmware.drive_map import DriveMap, reference_map
@@ -32,8 +32,8 @@ def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterS
         ``params.toml``, ``design.toml`` (told apart by their schema), a ``.dcf``, a run directory, or a look-up table
         as ``lut`` writes it (``.npz``): that gives the table alone.
     drive_map : DriveMap, optional
-        What the objects of a DCF mean, the reference drive's when not given; of a design for a drive with one pair of
-        current gains the smaller of both axes are taken.
+        What the objects of a DCF mean, the reference drive's when not given; of a design or a set for a drive with one
+        pair of current gains the smaller of both axes are taken.
 
     Raises
     ------
@@ -51,17 +51,22 @@ def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterS
     text = read_text(path)
     schema = parse_toml(text, where=str(path)).get("schema")
     if schema == design_file.SCHEMA:
-        design = parse_design(text, where=str(path))
-        if drive_map is not None and not drive_map.staging:
-            design = replace(design, values={**design.values, **one_pair(design, drive_map.cells)})
-        return design.parameter_set()
+        return _for_drive(parse_design(text, where=str(path)).parameter_set(), drive_map)
     if schema == parameter_set.SCHEMA:
-        return parse_parameter_set(text, str(path))
+        return _for_drive(parse_parameter_set(text, str(path)), drive_map)
     raise ConfigError(
         f"schema is {schema!r}, expected {design_file.SCHEMA!r} or {parameter_set.SCHEMA!r}",
         where=str(path),
         hint="give design.toml or params.toml as `tune` writes them",
     )
+
+
+def _for_drive(found: ParameterSet, drive_map: DriveMap | None) -> ParameterSet:
+    if drive_map is None or drive_map.staging:
+        return found
+    gains = smaller_gains(found.values, drive_map.cells)
+    provenance = {**found.provenance, **dict.fromkeys(gains, SMALLER)}
+    return replace(found, values={**found.values, **gains}, provenance=provenance)
 
 
 def _file(path: Path) -> Path:

@@ -229,6 +229,7 @@ def test_a_drive_that_cannot_be_reflashed_is_kept_out_of_saturation_by_its_limit
     assert set(held) == {RATED, SLOPE, TORQUE, SPEED}
     for name, value in held.items():
         assert value == pytest.approx(design[name], rel=2e-3) and any(line.startswith(name) for line in person.shown)
+    assert all(held[name] <= design[name] * (1.0 + 1e-14) for name in (SLOPE, TORQUE, SPEED)), "the guarantee's range"
     stage = run.read().stage("tune")
     assert stage is not None and {RATED, SLOPE, TORQUE, SPEED} <= {value["name"] for value in stage.values}
     assert any("Cost: " in line and "nothing is promised" in line for line in stage.fallbacks)

@@ -12,8 +12,8 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.design.closed_drive import STATED
-from pmsmtool.design.design_file import Design, design_text, load_design, parse_design
+from pmsmtool.design.closed_drive import RATED, SLOPE, STATED, TORQUE
+from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design, parse_design
 from pmsmtool.design.margins import margin_report
 from pmsmtool.design.open_loops import CURRENT_GAINS, open_loops
 from pmsmtool.design.sampled_loop import margins
@@ -122,12 +122,14 @@ def test_margins_of_a_drive_that_takes_no_gains_are_not_available(
     assert code == 0, "what is asked of the headroom is judged"
 
 
+@pytest.mark.parametrize("kind", ["design", "set"])
 def test_a_design_goes_to_a_drive_with_one_pair_as_it_was_judged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also one that was made without a map: the gain of q would be too large for d."""
+    """Also one that was made without a map, and its set: the gain of q would be too large for d."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "d.toml").write_text(design_text(designed()), encoding="utf-8")
+    text = design_text(designed()) if kind == "design" else designed().parameter_set().to_toml()
+    (tmp_path / "d.toml").write_text(text, encoding="utf-8")
     code, out, _ = run(
         "-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=epos4", "flash-params", "d.toml", "--map", "epos4",
         "--dry-run", "--json",
@@ -135,3 +137,16 @@ def test_a_design_goes_to_a_drive_with_one_pair_as_it_was_judged(
     wanted = {change["name"]: change["wanted"] for change in json.loads(out)["changes"]}
     assert code == 0
     assert wanted["current.K_p_q_v_per_a"] == designed()["current.K_p_d_v_per_a"] < designed()["current.K_p_q_v_per_a"]
+
+
+@pytest.mark.parametrize("rated_nm", [14.9074, 14.9076, 0.31415, 0.0016])
+def test_limits_are_held_at_or_below_what_is_asked(rated_nm: float) -> None:
+    """They are counted relative to the rated torque, which the drive keeps in whole mN m: rounded up it raised them."""
+    drive_map = load_family("cia402")
+    asked = {RATED: rated_nm, SLOPE: 37.77 * rated_nm, TORQUE: 0.7777 * rated_nm}
+    design = replace(designed(), values={**designed().values, **{n: DesignValue(v, "") for n, v in asked.items()}})
+    held = drive_map.quantised(held_design(design, drive_map).parameter_set()).values
+    assert held[RATED] == pytest.approx(rated_nm, abs=0.5e-3)
+    count = 1e-3 * held[RATED]  # permille, and permille per second
+    for name in (SLOPE, TORQUE):
+        assert asked[name] - 1.001 * count <= held[name] <= asked[name] * (1.0 + 1e-14)
