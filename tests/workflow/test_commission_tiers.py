@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -38,9 +38,10 @@ from pmsmtool.workflow.identify import REPLAYED
 from pmsmtool.workflow.prove.stage import ProofRequest
 from pmsmtool.workflow.report_page import report_page, verdict
 from pmsmtool.workflow.reproduce.closed_node import ClosedNode
-from pmsmtool.workflow.run_directory import RunDirectory, Stage
+from pmsmtool.workflow.run_directory import RunDirectory
 from pmsmtool.workflow.tier_evaluate import replay
 from pmsmtool.workflow.tier_stages import SET_UP, open_tier_drive
+from tests.workflow.audience import Quiet, Told
 
 PROFILE = data_folder("profiles") / "interior-2k2.toml"
 INJECT_OFF = 2e-3
@@ -49,38 +50,6 @@ most 0.09 %, psi_f 0.02 %, J 0.05 %, R 0.21 %."""
 FOREIGN = [name for name in family_names() if name != "pmsmsim"]
 FILLED_IN = (0x1234, 0x5678)
 """Vendor and product a person writes into a map whose maker's numbers are in no source."""
-
-
-class Told:
-    """A person who agrees, and notes what was shown."""
-
-    def __init__(self) -> None:
-        self.shown: list[str] = []
-
-    def allow_motion(self, lines: Sequence[str]) -> None:
-        pass
-
-    def allow_writing(self, lines: Sequence[str]) -> None:
-        self.shown += lines
-
-
-class Quiet:
-    """A progress that notes how the stages ended."""
-
-    def __init__(self) -> None:
-        self.ended: dict[str, str] = {}
-
-    def skip(self, stage: Stage, number: int, count: int) -> None:
-        pass
-
-    def begin(self, name: str, number: int, count: int) -> None:
-        pass
-
-    def say(self, text: str) -> None:
-        pass
-
-    def end(self, stage: Stage, number: int, count: int) -> None:
-        self.ended[stage.name] = stage.status
 
 
 @pytest.fixture(autouse=True)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +12,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Command, State
 from pmsmtool.cli.main import cli
-from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.drive import objects
-from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.vendor_tuning import VendorAnswer, VendorDrive
 from pmsmtool.errors import (
@@ -31,65 +26,17 @@ from pmsmtool.errors import (
     NotAvailable,
     SdoAbort,
 )
-from pmsmtool.firmware.drive_map import DriveMap
-from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
+from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.firmware.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.resources import data_folder
-from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.session import Session
-from pmsmtool.workflow.capabilities import Capabilities, Tier, examine
-from pmsmtool.workflow.commission import Commissioning, begin_run
-from pmsmtool.workflow.identify import IdentifyRequest
-from pmsmtool.workflow.prove.stage import ProofRequest
-from pmsmtool.workflow.report_page import report_page, verdict
-from pmsmtool.workflow.run_directory import RunDirectory, Stage
-from pmsmtool.workflow.tier_stages import TierStages, open_tier_drive
 from pmsmtool.workflow.vendor_identify import identify_vendor
 from pmsmtool.workflow.vendor_machine import coarse_notes, vendor_estimates, vendor_machine
+from tests.workflow.vendor_rig import PROFILE, TRUTH, channel, filled_in, opened, without_torque
 
-PROFILE = data_folder("profiles") / "interior-2k2.toml"
-TRUTH = load_machine_file(PROFILE).machine
 ENVELOPE = Envelope(7.3, 314.0)
 EVERY = frozenset(("R", "L", "psi", "poles"))
-RESULTS = """
-[vendor_tuning.results]
-"motor.pole_pairs" = { index = 0x2030, sub = 0, type = "UNSIGNED32", unit = "1" }
-"motor.R_s_ohm" = { index = 0x3900, sub = 1, type = "UNSIGNED32", unit = "mohm line-line" }
-"motor.L_d_h" = { index = 0x3900, sub = 2, type = "UNSIGNED32", unit = "uH" }
-"motor.L_q_h" = { index = 0x3900, sub = 3, type = "UNSIGNED32", unit = "uH" }
-"motor.psi_f_wb" = { index = 0x3900, sub = 4, type = "UNSIGNED32", unit = "uWb" }
-"""
-"""Rows that a person adds to the map of a drive whose set-up mode is known, and its identity."""
-
-
-def filled_in() -> DriveMap:
-    """The nanotec map as a person has completed it."""
-    text = (data_folder("firmware-params") / "nanotec" / "map.toml").read_text(encoding="utf-8")
-    text = text.replace("\n[left_out]", RESULTS + "\n[left_out]").replace("vendor = 0x00000000", "vendor = 0x1234")
-    return parse_drive_map(text.replace("product = 0x00000000", "product = 0x5678"))
-
-
-def without_torque(drive_map: DriveMap) -> DriveMap:
-    """The same drive without modes that this program pushes it by: what is left is the vendor tier."""
-    return replace(drive_map, capabilities=replace(drive_map.capabilities, torque_mode=False, velocity_mode=False))
-
-
-def channel(folder: Path, drive_map: DriveMap, *, machine: str = "interior-2k2", more: str = "") -> str:
-    path = folder / f"{drive_map.name}.toml"
-    path.write_text(dump_drive_map(drive_map), encoding="utf-8")
-    return f"{machine}?nv=:memory:&drive={path}{more}"
-
-
-@contextmanager
-def opened(folder: Path, drive_map: DriveMap, **more: str) -> Iterator[tuple[VendorDrive, Session]]:
-    with Connection(PmsmSimBus(channel(folder, drive_map, **more))) as connection:
-        drive = VendorDrive(connection, 1, drive_map=drive_map)
-        session = connection.bus.line.nodes[0].session  # type: ignore[attr-defined]
-        yield drive, session
-        assert not session.power.state.energised
-        drive.close()
 
 
 def held(session: Session) -> dict[int, bytes]:
@@ -393,127 +340,3 @@ def test_caps_shows_the_tier(tmp_path: Path) -> None:
     outcome = run("--sim", "interior-2k2?nv=:memory:&drive=nanotec", "caps", "--map", "nanotec", "--json")
     ways = {(row["quantity"], row["method"]): row for row in json.loads(outcome.stdout)["quantities"]}
     assert not ways["R", "vendor"]["available"]  # the procedure is known, the object of its result is not
-
-
-# ---- the chain --------------------------------------------------------------------------------------
-
-
-class Agreeing:
-    """A person who agrees."""
-
-    def allow_motion(self, lines: Sequence[str]) -> None:
-        pass
-
-    def allow_writing(self, lines: Sequence[str]) -> None:
-        pass
-
-
-class Quiet:
-    """A progress that notes how the stages ended."""
-
-    def __init__(self) -> None:
-        self.ended: dict[str, str] = {}
-
-    def skip(self, stage: Stage, number: int, count: int) -> None:
-        pass
-
-    def begin(self, name: str, number: int, count: int) -> None:
-        pass
-
-    def say(self, text: str) -> None:
-        pass
-
-    def end(self, stage: Stage, number: int, count: int) -> None:
-        self.ended[stage.name] = stage.status
-
-
-@contextmanager
-def begun(
-    folder: Path, drive_map: DriveMap, *, set_up: int = 0
-) -> Iterator[tuple[RunDirectory, CanopenDrive, Capabilities]]:
-    """A run on a simulated drive with this map; ``set_up`` leaves other pole pairs in it."""
-    with Connection(PmsmSimBus(channel(folder, drive_map))) as connection:
-        probe = VendorDrive(connection, 1, drive_map=drive_map)
-        if set_up:
-            probe.write({"motor.pole_pairs": set_up})
-        found = examine(probe.node, drive_map)
-        probe.close()
-        drive = open_tier_drive(connection, 1, found)
-        yield begin_run(drive, folder / "runs", tier=found.tier), drive, found
-        drive.close()
-
-
-def first_stage(folder: Path, drive_map: DriveMap, *, set_up: int = 0) -> tuple[Stage, RunDirectory]:
-    """Identification alone, as commission asks for it."""
-    with begun(folder, drive_map, set_up=set_up) as (run, drive, found):
-        stages = TierStages(run, drive, found, load_machine_file(PROFILE))
-        return stages.identify(IdentifyRequest(), lambda lines: None, lambda text: None), run
-
-
-def chain(
-    folder: Path, drive_map: DriveMap, *, sheet: bool = True, pole_pairs: int = 3
-) -> tuple[RunDirectory, Quiet, Tier]:
-    """The whole chain, with a data sheet that may be another machine's."""
-    nameplate = load_machine_file(PROFILE)
-    nameplate = replace(nameplate, machine=replace(nameplate.machine, pole_pairs=pole_pairs))
-    progress = Quiet()
-    with begun(folder, drive_map) as (run, drive, found):
-        Commissioning(
-            run, drive, Agreeing(), progress, nameplate if sheet else None, identify=IdentifyRequest(),
-            prove=ProofRequest(runs=32), capabilities=found,
-        ).carry_out()  # fmt: skip
-    return run, progress, found.tier
-
-
-@pytest.mark.parametrize("kind", ["os_command", "mode"])
-def test_commission_of_the_vendor_tier_ends_green_with_what_it_gives(kind: str, tmp_path: Path) -> None:
-    drive_map = without_torque(load_family("synapticon") if kind == "os_command" else filled_in())
-    run, progress, tier = chain(tmp_path, drive_map)
-    assert tier is Tier.VENDOR
-    assert progress.ended["identify"] == progress.ended["lut"] == "pass"
-    assert set(progress.ended.values()) == {
-        "pass",
-        "not available",
-    }  # what a closed drive leaves open has its own tests
-    found = verdict(run.path)
-    assert found.word == "PASS FOR ITS TIER"
-    assert any("the drive's own, without an interval: pole_pairs, R_s_ohm" in line for line in found.lines)
-    machine = load_machine_file(run.path / "machine.toml")
-    assert machine.estimates["psi_f_wb"].source == "vendor" and "psi_f_wb" not in machine.std
-    assert machine.machine.J_kgm2 == TRUTH.J_kgm2  # given: nothing pushed the shaft
-    assert ("L_d_h" in machine.estimates) == (kind == "mode")
-    notes = tolerance_box(machine).notes
-    assert "R_s_ohm: the drive's own value has no interval, 3 % assumed" in notes
-    page = report_page(run.path)
-    assert "the drive&#39;s own: " in page and '<td class="number">none</td>' in page
-
-
-def test_without_a_data_sheet_the_drives_values_are_told_and_nothing_is_designed(tmp_path: Path) -> None:
-    run, progress, _ = chain(tmp_path, without_torque(filled_in()), sheet=False)
-    assert progress.ended["identify"] == "pass" and progress.ended["tune"] == "not available"
-    assert "needs ratings and the inverter" in run.read().stage("tune").note  # type: ignore[union-attr]
-
-
-def test_measured_values_outrank_the_drives_own(tmp_path: Path) -> None:
-    """Standard tier: J and psi by torque pushes, the rest by the drive; psi of both is compared."""
-    stage, run = first_stage(tmp_path, load_family("synapticon"))
-    assert stage.status == "pass"
-    by_name = {str(value["name"]): value for value in stage.values}
-    assert "std" in by_name["psi_f_wb"] and by_name["R_s_ohm"]["source"] == "vendor"
-    assert any(line.startswith("psi_f_wb: the drive's own value is") for line in stage.fallbacks)
-    machine = load_machine_file(run.path / "machine.toml")
-    assert machine.machine.J_kgm2 == pytest.approx(TRUTH.J_kgm2, rel=0.06)
-    assert machine.estimates["psi_f_wb"].source == "pmsmtool" and machine.estimates["R_s_ohm"].source == "vendor"
-    assert "vendor: R_s_ohm, pole_pairs; as given: L_d_h, L_q_h" in str(machine.provenance["source"])
-
-
-def test_a_drive_set_to_other_pole_pairs_is_not_pushed(tmp_path: Path) -> None:
-    stage, _ = first_stage(tmp_path, load_family("synapticon"), set_up=4)
-    assert stage.status == "pass"
-    assert any("is set to 4 pole pairs and measures 3" in line for line in stage.fallbacks)
-    assert not any("std" in value for value in stage.values)
-
-
-def test_a_data_sheet_of_another_machine_is_seen(tmp_path: Path) -> None:
-    with pytest.raises(IdentificationError, match="pole pairs are those that were given: 3, limit 4"):
-        chain(tmp_path, without_torque(load_family("synapticon")), pole_pairs=4)
