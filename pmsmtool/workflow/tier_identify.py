@@ -288,7 +288,11 @@ def tier_stage(
     envelope.refuse_gravity()
     moves = can_measure(drive, found, None if known is None else known[0])
     if not moves:
-        raise NotAvailable(NO_POLE_PAIRS, where=f"node {drive.node.node}", hint="give a machine file")
+        raise NotAvailable(
+            NO_POLE_PAIRS,
+            where=f"node {drive.node.node}",
+            hint="`pmsmtool commission MACHINE` takes them from a machine file (`pmsmtool machine new` writes one)",
+        )
     allow_motion([*envelope.lines(), *moves, "nothing is stored in the drive; every changed object is restored"])
     clock = drive.node.connection.clock
     start = clock.now()

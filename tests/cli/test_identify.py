@@ -18,6 +18,7 @@ from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow.random_drives import true_loop_resistance
+from pmsmtool.workflow.run_directory import RunDirectory
 from tests.cli.conftest import Tool
 
 TOLERANCE = 0.01
@@ -68,6 +69,9 @@ def test_the_truth_is_found_the_drive_is_as_before_and_the_replay_gives_the_same
     assert found["pole_pairs"] == drive.machine.pole_pairs
 
     (folder,) = Path("runs").iterdir()
+    record = RunDirectory(folder).read()
+    assert [given["subject"] for given in record.consents] == ["motion"]
+    assert data["warnings"] == list(record.stages[-1].fallbacks)
     files = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     (folder / "machine.toml").unlink()
     code, again, err = tool("identify", "--replay", str(folder), "--json")
