@@ -236,10 +236,9 @@ def test_every_reader_adds_a_next_step(module: str) -> None:
 ERRORS = {name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, PmsmtoolError)}
 ELSEWHERE = {
     "design/closed_drive", "design/lookup_design", "design/tolerance", "design/tune_request", "machine/flux_map",
-    "machine/machine_reader", "drive/commanded_recorder", "drive/monitor", "drive/recorder", "drive/ring_recorder",
+    "machine/machine_reader",
 }  # fmt: skip
-"""Modules whose step is added by the command line (by option), by the reader of the file, or by nobody: a recorder's
-answer is right or wrong, and the sentence says all there is."""
+"""Modules whose step is added by the command line (by option) or by the reader of the file."""
 HAVE_A_STEP = {"NotAvailable", "Interrupted", "PmsmtoolError"}
 """`pmsmtool caps` is the step of the first; the second says that the machine was stopped; the last is a bug."""
 

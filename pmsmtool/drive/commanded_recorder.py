@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject, signal_unit
-from pmsmtool.drive.recorder import Recorder
+from pmsmtool.drive.recorder import MEASURE_AGAIN, Recorder
 from pmsmtool.errors import NotAvailable, SdoAbort, VerifyMismatch
 from pmsmtool.firmware.recorder_map import Address
 from pmsmtool.firmware.wire_units import wire_unit
@@ -155,7 +155,7 @@ class CommandedRecorder(Recorder):
     def _wrong(self, difference: str) -> VerifyMismatch:
         return VerifyMismatch(
             f"the record of the {self.what} is damaged", where=f"node {self._node.node}, {self.data}",
-            differences=[difference],
+            differences=[difference], hint=MEASURE_AGAIN,
         )  # fmt: skip
 
 

@@ -74,6 +74,7 @@ class MonitorRecorder(CommandedRecorder):
             raise VerifyMismatch(
                 "the monitor has not taken the signals", where=f"node {self._node.node}, 0x58E4:00",
                 differences=[f"{row_bytes} bytes per row are mapped, the drive says {said}"],
+                hint="compare the types in the map's [signals] with the drive's manual",
             )  # fmt: skip
         if not self._get(objects.STATUS) & objects.ENABLED_BIT:
             raise NotAvailable("the monitor does not start", where=f"node {self._node.node}, 0x58B0:00")

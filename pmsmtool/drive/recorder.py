@@ -19,6 +19,7 @@ from pmsmtool.trace import Trace
 
 PATIENCE_S = 1.0
 """Beyond the time a recording or an average takes by itself."""
+MEASURE_AGAIN = "measure again; if it comes back, `pmsmtool doctor` examines the bus"
 _BYTES = 4  # every channel is recorded as binary32
 
 
@@ -103,7 +104,7 @@ class Recorder:
         if zlib.crc32(data) != crc:
             raise VerifyMismatch(
                 "the trace is damaged", where=f"node {node.node}, 0x2062:00",
-                differences=[f"CRC-32 {zlib.crc32(data):#010x}, the drive says {crc:#010x}"],
+                differences=[f"CRC-32 {zlib.crc32(data):#010x}, the drive says {crc:#010x}"], hint=MEASURE_AGAIN,
             )  # fmt: skip
         period_s = 1e-9 * node.whole(objects.TRACE_PERIOD_NS)
         table = np.frombuffer(data, "<f4").reshape(stored, len(signals)).astype(np.float64)
@@ -170,7 +171,9 @@ class Recorder:
             if node.state() in (State.FAULT, State.FAULT_REACTION_ACTIVE):
                 raise node.fault_error()
             if node.connection.clock.now() >= deadline:
-                raise DriveTimeout(f"{what} does not finish", where=f"node {node.node}, {where}", likely=likely)
+                raise DriveTimeout(
+                    f"{what} does not finish", where=f"node {node.node}, {where}", likely=likely, hint=MEASURE_AGAIN
+                )
             node.connection.wait(POLL_S)
             node.supervision.check()
 

@@ -83,6 +83,7 @@ class RingRecorder(CommandedRecorder):
             raise VerifyMismatch(
                 "the data recorder has not taken the variables", where=f"node {self._node.node}, 0x2018:00",
                 differences=[f"{len(channels)} rings of {largest} do not fit {objects.BUFFER_WORDS} words"],
+                hint="reset the drive: another program may be using its recorder",
             )  # fmt: skip
         return largest
 
