@@ -10,7 +10,8 @@
 Drives follow from their seeds (``workflow/random_drives.py``); the tool sees their nameplate only. Printed per
 quantity: error quantiles, how often the statistical and the total (printed) 95 % interval holds the truth, with its
 Clopper-Pearson interval, and every refusal by name. ``R_at_T_ohm`` is the loop at the temperature of the measurement:
-the share of devices and copper, which no experiment sees, enters ``R_s_ohm`` only.
+the share of devices and copper, which no experiment sees, enters ``R_s_ohm`` only. The thresholds of the bridge's
+devices act as another DC link, which no current shows either: psi_f is told with and without them.
 
 With ``--keep`` the traces are kept, 0.6 MB a drive, and read from there when they are there already: a run that was
 interrupted goes on, and changed estimators are judged in a sixth of the time.
@@ -28,6 +29,7 @@ import pickle
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +54,8 @@ ELECTRICAL = ("R", "L", "psi", "encoder", "poles", "inverter")
 """What is identified here; mechanics has a program of its own (``benchmarks/mechanics_accuracy.py``)."""
 HARD_RATIO = 3.0
 """Dead-time voltage over R I_nom from which a drive is of the hard class of the resistance."""
+BUS_TIME_S = 60.0
+"""Time on the bus that the electrical identification is to keep to."""
 DRAWN_SPREAD = 0.10
 """Spread of the drives around a profile (standard deviation of the log of each parameter)."""
 
@@ -115,6 +119,17 @@ class Refusal:
 
 Measured = tuple[dict[str, Trace], MachineFile, float]
 """Traces, nameplate and time on the bus (s)."""
+
+
+def threshold_share(row: Mapping[str, Any]) -> float:
+    """Return (V_diode - V_switch) / U_dc of a drive: it moves all legs alike, so that no current shows it.
+
+    A bridge of MOSFETs has none: its diodes conduct in the dead time only.
+    """
+    drive = drawn(row["profile"], row["seed"], row["block"])
+    values = Settings(drive.simulation_settings())
+    switch = values.number("device_drop_v")
+    return (values.number("diode_drop_v") - switch) / drive.inverter.U_dc_v if switch > 0.0 else 0.0
 
 
 def identify_one(job: tuple[str, int, str], choice: Choice) -> dict[str, Any]:
@@ -234,8 +249,16 @@ def summary(rows: list[dict[str, Any]]) -> str:
             + " ".join(f"{q:8.4f}{unit:3s}" for q in quantiles)
             + "  ".join(_covered(accepted, name, kind) for kind in ("statistical", "total"))
         )
+    shares = [threshold_share(row) for row in accepted]
+    seen = [100.0 * abs(row["psi_f_wb"]["error"] + share) for row, share in zip(accepted, shares, strict=True)]
+    seen.sort()
+    lines.append(
+        f"psi_f besides the bridge's thresholds: p90 {seen[round(0.9 * (len(seen) - 1))]:.4f}%, max {seen[-1]:.4f}%"
+    )
     times = sorted(row["seconds"] for row in accepted)
-    lines.append(f"bus time per drive: median {times[len(times) // 2]:.1f} s, longest {times[-1]:.1f} s")
+    late = sum(seconds > BUS_TIME_S for seconds in times)
+    middle = times[len(times) // 2]
+    lines.append(f"bus time per drive: median {middle:.1f} s, longest {times[-1]:.1f} s, {late} above {BUS_TIME_S:g} s")
     offline = sorted(row["offline_s"] for row in accepted)
     lines.append(f"processing off-line: median {offline[len(offline) // 2]:.1f} s, longest {offline[-1]:.1f} s (CPU)")
     return "\n".join(lines)

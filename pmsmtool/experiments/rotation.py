@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive
+from pmsmtool.errors import IdentificationError
 from pmsmtool.experiments.signals import table
 from pmsmtool.trace import Trace
 
@@ -15,6 +16,12 @@ MAX_POLE_PAIRS = 32
 ALIGN_S = 0.3
 BACK_AT_MOST = 1.15
 """Steps of the way back, of those of the way there: a rotor that lags or sticks at a turning point needs more."""
+STEP_RAD = math.radians(15.0)
+"""Electrical angle of one step."""
+SWING = 2.0
+"""Largest speed of a rotor that is led by steps, over the mean one."""
+SLOWEST_STEP_S = 0.2
+"""Longest time per step: a machine of twenty pole pairs then takes some three minutes for both ways."""
 LEAD_STEPS = 8
 """Steps before the recorded ones: the rotor's own transient after standstill or reversal."""
 
@@ -36,9 +43,38 @@ class RotationPlan:
     """
 
     i_a: float
-    step_rad: float = math.radians(15.0)
+    step_rad: float = STEP_RAD
     dwell_s: float = 0.015
     turns_mechanical: float = 1.02
+
+
+def dwell_within(dwell_s: float, omega_max_rad_s: float) -> float:
+    """Return a time per step (s) at which the shaft keeps to a speed limit, however few pole pairs it has.
+
+    Parameters
+    ----------
+    dwell_s : float
+        Time per step where the limit allows it (s).
+    omega_max_rad_s : float
+        Largest mechanical speed (rad/s). The pole pairs are what is to be found: one is assumed.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``: the limit is too low for a turn in reasonable time.
+    """
+    least_s = SWING * STEP_RAD / omega_max_rad_s
+    if least_s > SLOWEST_STEP_S:
+        rpm = 30.0 / math.pi
+        raise IdentificationError(
+            "E_EXCITATION",
+            f"the slow turn of the shaft needs a speed limit of {rpm * SWING * STEP_RAD / SLOWEST_STEP_S:.3g} rpm, "
+            f"{rpm * omega_max_rad_s:.3g} are allowed",
+            where="slow turn",
+            likely="pole pairs are not known before it: a machine of one must keep to the limit, too",
+            hint=f"allow at least --speed-max {math.ceil(rpm * SWING * STEP_RAD / SLOWEST_STEP_S)}rpm",
+        )
+    return max(dwell_s, least_s)
 
 
 def rotate_vector(drive: Drive, plan: RotationPlan, *, start_rad: float = 0.0) -> tuple[Trace, Trace]:

@@ -26,6 +26,7 @@ from pmsmtool.estimators.estimate import (
     statistical_half_width,
     total_half_width,
 )
+from pmsmtool.experiments.rotation import dwell_within
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import (
     EncoderParameters,
@@ -221,7 +222,10 @@ def identify_stage(
     request.check()
     envelope = envelope_of(nameplate, request)
     envelope.refuse_gravity()
-    if "speeds" in steps_of(request.quantities, request.shaft == "locked"):
+    steps = steps_of(request.quantities, request.shaft == "locked")
+    if "rotation" in steps:
+        dwell_within(0.0, envelope.speed_max_rad_s)
+    if "speeds" in steps:
         require_speed(envelope.speed_max_rad_s, nameplate.machine.n_max_rpm or 0.0)
     allow_motion(plan_lines(envelope, request))
     run.save(NAMEPLATE, dump_machine_file(nameplate))

@@ -214,7 +214,8 @@ class Measurement:
     def _rotation(self) -> EncoderResult:
         """Turn the vector; with less current and slower again when the rotor did not stay on it."""
         for share, dwell_s in ROTATIONS:
-            plan = rotation.RotationPlan(i_a=share * self.limits.I_test_apk, dwell_s=dwell_s)
+            slow_s = rotation.dwell_within(dwell_s, self.limits.omega_max_rad_s)
+            plan = rotation.RotationPlan(i_a=share * self.limits.I_test_apk, dwell_s=slow_s)
             self.say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
             forward, backward = rotation.rotate_vector(self.drive, plan)
             self.keep("rotation_forward", forward)

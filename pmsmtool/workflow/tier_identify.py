@@ -25,7 +25,7 @@ from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, push_both_ways, run_to_voltage
 from pmsmtool.experiments.recorded_push import PushPlan, swing
-from pmsmtool.experiments.rotation import RotationPlan, rotate_vector
+from pmsmtool.experiments.rotation import RotationPlan, dwell_within, rotate_vector
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import InverterParameters
 from pmsmtool.trace import Trace
@@ -83,10 +83,11 @@ def identify_standard(drive: StandardDrive, envelope: Envelope, say: Say = _quie
 
 def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Say = _quiet) -> TierFacts:
     """Run the experiment of :func:`identify_standard`; raises as it does."""
+    dwell_s = dwell_within(DWELL_S, envelope.speed_max_rad_s)
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
         for share in VECTOR_SHARES:
-            plan = RotationPlan(i_a=share * envelope.i_max_apk / HEADROOM, dwell_s=DWELL_S)
+            plan = RotationPlan(i_a=share * envelope.i_max_apk / HEADROOM, dwell_s=dwell_s)
             say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
             forward, backward = rotate_vector(guard, plan)
             keep("rotation_forward", forward)

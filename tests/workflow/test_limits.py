@@ -7,6 +7,7 @@ import math
 import pytest
 
 from pmsmtool.errors import ConfigError, IdentificationError
+from pmsmtool.experiments.rotation import SLOWEST_STEP_S, STEP_RAD, dwell_within
 from pmsmtool.workflow.limits import LEAST_SPEED_SHARE, Limits, require_speed
 
 GIVEN = {"I_nom_apk": 5.0, "i_max_apk": 6.0, "omega_max_rad_s": 300.0, "V_max_v": 28.0}
@@ -30,3 +31,17 @@ def test_a_speed_limit_that_no_push_stays_within_is_refused_with_the_least_one()
     with pytest.raises(IdentificationError, match="E_EXCITATION") as caught:
         require_speed(0.999 * least_rad_s, 3000.0)
     assert f"--speed-max {LEAST_SPEED_SHARE * 3000.0:.0f}rpm" in caught.value.hint
+
+
+@pytest.mark.parametrize("rpm", [26.0, 60.0, 200.0, 3000.0])
+def test_the_slow_turn_keeps_to_the_speed_limit_even_with_one_pole_pair(rpm: float) -> None:
+    mean_rpm = STEP_RAD / dwell_within(0.015, rpm * math.pi / 30.0) * 30.0 / math.pi
+    assert mean_rpm <= 0.5 * rpm * (1.0 + 1e-12)
+    assert mean_rpm == pytest.approx(min(0.5 * rpm, STEP_RAD / 0.015 * 30.0 / math.pi))
+
+
+def test_a_speed_limit_too_low_for_the_slow_turn_is_refused_with_the_least_one() -> None:
+    with pytest.raises(IdentificationError, match="E_EXCITATION") as caught:
+        dwell_within(0.015, 1.0 * math.pi / 30.0)
+    least = float(caught.value.hint.split("--speed-max ")[1].removesuffix("rpm"))
+    assert dwell_within(0.015, least * math.pi / 30.0) <= SLOWEST_STEP_S
