@@ -223,10 +223,10 @@ def identify_stage(
     envelope = envelope_of(nameplate, request)
     envelope.refuse_gravity()
     steps = steps_of(request.quantities, request.shaft == "locked")
-    if "rotation" in steps:
-        dwell_within(0.0, envelope.speed_max_rad_s)
     if "speeds" in steps:
         require_speed(envelope.speed_max_rad_s, nameplate.machine.n_max_rpm or 0.0)
+    if "rotation" in steps:
+        dwell_within(0.0, envelope.speed_max_rad_s)
     allow_motion(plan_lines(envelope, request))
     run.save(NAMEPLATE, dump_machine_file(nameplate))
     run.save(REQUEST, dump_request(request))
