@@ -280,7 +280,11 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     target.save(MACHINE, text)
     made_files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
     found = evaluation.estimates()
-    acceptance = [_accepted(name, estimate) for name, estimate in found.items() if _limit(name) is not None]
+    # the offset of the slow turn alone, which is for the pole pairs, is coarse, and nobody asked for it
+    coarse = {"offset_rad"} if evaluation.flux is None else set()
+    acceptance = [
+        _accepted(name, estimate) for name, estimate in found.items() if _limit(name) is not None and name not in coarse
+    ]
     acceptance += map_stage.map_acceptance(evaluation.flux_map)
     return Stage(
         "identify",

@@ -7,6 +7,7 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pmsmtool.bus.clock import VirtualClock
@@ -20,6 +21,7 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.trace_file import read_trace
 from pmsmtool.workflow.evaluate import tolerance_on
 from pmsmtool.workflow.identify import (
     MACHINE,
@@ -111,6 +113,20 @@ def test_a_speed_limit_that_tells_nothing_is_refused_before_anybody_is_asked(tmp
 
 
 # ---- a rotor that leaves the turning vector ------------------------------------------------------------------------
+
+
+def test_the_shaft_turns_no_faster_than_allowed_while_its_pole_pairs_are_counted(tmp_path: Path) -> None:
+    allowed = 60.0 * math.pi / 30.0
+    request = IdentifyRequest(quantities=("poles",), speed_max_rad_s=allowed)
+    run = RunDirectory.create(tmp_path, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
+    with Connection(PmsmSimBus(CHANNEL)) as connection:
+        drive = CanopenDrive(connection, 1)
+        stage = identify_stage(run, drive, nameplate_of(drive, "bench"), request, lambda lines: None, lambda text: None)
+        drive.close()
+    assert stage.status == "pass", stage.acceptance  # the coarse offset of the slow turn is not judged
+    turn = read_trace(run.path / "traces" / "rotation_forward.npz")
+    speeds = np.diff(turn["theta_M_rad"]) / np.diff(turn.t_s)
+    assert 0.0 < np.max(np.abs(speeds)) < allowed
 
 
 @pytest.mark.parametrize("seed", [0, 2, 6, 8])
