@@ -274,6 +274,7 @@ def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float, dict[bool, flo
                 f"the next, limit {100.0 * RIPPLE_MOST:g} %",
                 stage=STAGE,
                 likely=NOISY_TORQUE,
+                hint="`identify R L psi encoder poles inverter frf` finds the resonance of an elastic shaft without it",
             )
         if fit.converged:
             if count and noisier is runs:
