@@ -42,13 +42,14 @@ class CommandedRecorder(Recorder):
     ----------
     what : str
         What messages call it.
-    start, data : str
-        Objects that start it and hold its data, for messages.
+    start, data, memory : str
+        Objects that start it, hold its data and say how much that may be, for messages.
     """
 
     what: str
     start: str
     data: str
+    memory: str
 
     def __init__(self, node: DriveNode) -> None:
         super().__init__(node, 0.0)
@@ -84,6 +85,28 @@ class CommandedRecorder(Recorder):
 
     @abstractmethod
     def _base_period_s(self) -> float: ...
+
+    @abstractmethod
+    def _start(self, signals: Sequence[str], samples: int, decimation: int) -> None:
+        """Set what the choice of the signals left open, and record."""
+
+    def arm(
+        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool
+    ) -> None:
+        """Choose the signals and record them from now on.
+
+        Raises
+        ------
+        NotAvailable
+            Not these signals, not this much memory, or a trigger it has not.
+        VerifyMismatch
+            The drive has taken something else.
+        """
+        self._begin_arming(samples, decimation, pretrigger, at_excitation=at_excitation)
+        largest = self.room(signals)
+        if samples > largest:
+            raise self._too_much(signals, samples, f"{largest} samples", self.memory)
+        self._start(signals, samples, decimation)
 
     def start_average(self, signals: Sequence[str], periods: int) -> None:
         """Refuse: it takes no averages."""

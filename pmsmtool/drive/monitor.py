@@ -23,6 +23,7 @@ class MonitorRecorder(CommandedRecorder):
     what = "monitor"
     start = "0x58F0:00"
     data = "0x58B2:00"
+    memory = "0x58B5:00"
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -41,23 +42,9 @@ class MonitorRecorder(CommandedRecorder):
         """Return how many samples of signals fit."""
         return self._largest // sum(cell.size for cell in self._cells(signals))
 
-    def arm(
-        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool
-    ) -> None:
-        """Map the signals and start the monitor.
-
-        Raises
-        ------
-        NotAvailable
-            Not these signals, not this much memory, or a trigger it has not.
-        VerifyMismatch
-            The drive counts another number of bytes per row.
-        """
-        self._begin_arming(samples, decimation, pretrigger, at_excitation=at_excitation)
+    def _start(self, signals: Sequence[str], samples: int, decimation: int) -> None:
         cells = self._cells(signals)
         row_bytes = sum(cell.size for cell in cells)
-        if samples * row_bytes > self._largest:
-            raise self._too_much(signals, samples, f"{self._largest} bytes", "0x58B5:00")
         self.halt()
         self._put(objects.MAPPED, 0)
         self._command(objects.REMOVE_DATA, 1)

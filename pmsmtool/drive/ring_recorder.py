@@ -25,6 +25,7 @@ class RingRecorder(CommandedRecorder):
     what = "data recorder"
     start = "0x2010:00"
     data = "0x201B:00"
+    memory = "0x2018:00"
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -42,22 +43,7 @@ class RingRecorder(CommandedRecorder):
             )
         return wire_unit(unit).scale
 
-    def arm(
-        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool
-    ) -> None:
-        """Choose the variables, start the recorder and trigger it.
-
-        Raises
-        ------
-        NotAvailable
-            Not these signals, not this much memory, or a trigger it has not.
-        VerifyMismatch
-            The drive makes rings that its buffer cannot hold.
-        """
-        self._begin_arming(samples, decimation, pretrigger, at_excitation=at_excitation)
-        largest = self.room(signals)
-        if samples > largest:
-            raise self._too_much(signals, samples, f"{largest} samples", "0x2018:00")
+    def _start(self, signals: Sequence[str], samples: int, decimation: int) -> None:
         self._put(objects.CONFIGURATION, 0)
         self._put(objects.PERIOD, decimation)
         self._put(objects.PRECEDING, 0)

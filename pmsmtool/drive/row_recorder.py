@@ -23,6 +23,7 @@ class RowRecorder(CommandedRecorder):
     what = "trace"
     start = "0x2508:00"
     data = "0x2509:00"
+    memory = "0x2504:00"
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -36,20 +37,7 @@ class RowRecorder(CommandedRecorder):
             raise NotAvailable("the drive says its trace has no period", where=f"node {self._node.node}, 0x2502:00")
         return 1e-9 * reference_ns
 
-    def arm(
-        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool
-    ) -> None:
-        """Choose the variables and start the trace.
-
-        Raises
-        ------
-        NotAvailable
-            Not these signals, not this much memory, or a trigger it has not.
-        """
-        self._begin_arming(samples, decimation, pretrigger, at_excitation=at_excitation)
-        largest = self.room(signals)
-        if samples > largest:
-            raise self._too_much(signals, samples, f"{largest} samples", "0x2504:00")
+    def _start(self, signals: Sequence[str], samples: int, decimation: int) -> None:
         self._put(objects.PERIOD, decimation)
         self._put(objects.DELAY, 0)
         self._node.write_bytes(objects.TRIGGER, 0, objects.NO_TRIGGER)
