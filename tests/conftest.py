@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -30,10 +31,12 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
         return None
     wall_clock.watch()
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    begun = time.monotonic()
     for _ in range(wall_clock.TRIES):
         wall_clock.STALLS.clear()
         reports = runtestprotocol(item, log=False, nextitem=nextitem)
-        if not any(report.failed for report in reports) or not wall_clock.STALLS:
+        hung = time.monotonic() - begun > wall_clock.LONGEST_S
+        if hung or not any(report.failed for report in reports) or not wall_clock.STALLS:
             break
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)

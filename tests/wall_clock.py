@@ -15,6 +15,8 @@ from pmsmtool.sim.serve import PAUSED
 TRIES = 3
 LATE_S = 0.05
 """A sleep of ``NAP_S`` that takes this much longer is a stall: a heartbeat of the tool would have been left out."""
+LONGEST_S = 60.0
+"""No repetition after this: the limit of a test's time counts from its first try, and ends it once."""
 NAP_S = 0.02
 STALLS: list[str] = []
 """What was noticed; a test that begins empties it."""
