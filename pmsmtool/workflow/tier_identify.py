@@ -25,7 +25,8 @@ from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, push_both_ways, run_to_voltage
 from pmsmtool.experiments.recorded_push import PushPlan, swing
-from pmsmtool.experiments.rotation import RotationPlan, dwell_within, rotate_vector
+from pmsmtool.experiments.rotation import STEP_RAD, RotationPlan, dwell_within, rotate_vector
+from pmsmtool.experiments.vector_lead import lead_onto_vector
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import InverterParameters
 from pmsmtool.trace import Trace
@@ -44,10 +45,13 @@ from pmsmtool.workflow.tier_evaluate import (
     tier_result,
 )
 
-VECTOR_SHARES = (0.35, 0.7)
-"""Length of the turned vector, of the test current; the larger one where the rotor does not stay on the first."""
-DWELL_S = 0.03
-"""Time per step of the vector: nothing finer follows, so the rotor is given time to come to rest."""
+TURNS = ((0.35, 0.02), (0.7, 0.08))
+"""Current, of the test current, and time per ``STEP_RAD`` (s) of every try, besides that of looks at the encoder. Six
+times per electrical turn a phase current passes zero, and the inverter's dead time kicks the rotor: at the first try's
+rate, near 7 Hz, it drives a rotor of that swing to 90 degrees. The second turns at a third of that rate, below the
+swing of every one, and friction takes more of a swing that outruns a slower vector."""
+STEP_PARTS = 3
+"""Parts of that step: 15 deg every 36 ms kept rotors of random drives swinging by 10 deg, 5 deg every 12 ms by 4."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 SWING_SHARE = 0.4
 """Speed of the recorded pushes, of the largest one."""
@@ -83,12 +87,13 @@ def identify_standard(drive: StandardDrive, envelope: Envelope, say: Say = _quie
 
 def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Say = _quiet) -> TierFacts:
     """Run the experiment of :func:`identify_standard`; raises as it does."""
-    dwell_s = dwell_within(DWELL_S, envelope.speed_max_rad_s)
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
-        for share in VECTOR_SHARES:
-            plan = RotationPlan(i_a=share * envelope.i_max_apk / HEADROOM, dwell_s=dwell_s)
+        for share, dwell_s in TURNS:
+            part_s = dwell_within(dwell_s, envelope.speed_max_rad_s) / STEP_PARTS
+            plan = RotationPlan(share * envelope.i_max_apk / HEADROOM, STEP_RAD / STEP_PARTS, part_s)
             say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
+            lead_onto_vector(guard, plan.i_a, 0.0)
             forward, backward = rotate_vector(guard, plan)
             keep("rotation_forward", forward)
             keep("rotation_backward", backward)
@@ -96,7 +101,7 @@ def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Sa
                 estimate_encoder(forward, backward)
                 break
             except IdentificationError as error:
-                if error.reason not in OFF_THE_VECTOR or share == VECTOR_SHARES[-1]:
+                if error.reason not in OFF_THE_VECTOR or share == TURNS[-1][0]:
                     raise
     return TierFacts("standard")
 
