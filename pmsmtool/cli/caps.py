@@ -32,13 +32,18 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None) -> None:
     The drive is only read. Without --map the map of its identity is used, and without one what CiA 402 says. The
     intervals were measured on simulated drives of the same tier; where nothing was measured, nothing is promised.
     """
+    from pmsmtool.firmware.shipped_maps import GENERIC
+    from pmsmtool.flash.map_gate import other_drive
     from pmsmtool.workflow.capabilities import examine
 
     given = None if map_file is None else read_map(map_file)
     with open_node(bus) as node:
         found = examine(node, given)
     out.result("caps", _facts(found), lambda: _lines(found))
-    if not found.map_is_drives:
+    if given is not None and given.name != GENERIC and not found.map_is_drives:
+        differ = other_drive(given, found.identity.vendor, found.identity.product)
+        out.warn(f"{differ}: what is listed is that map's, and nothing is written or moved through it")
+    elif not found.map_is_drives:
         out.warn(f"no map names this drive: {found.drive_map.name} was used, and nothing is written through it")
 
 

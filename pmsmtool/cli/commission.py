@@ -82,7 +82,6 @@ def commission_command(
     map go: what it cannot measure is taken from MACHINE and marked so, and a stage that cannot run says what it needs.
     The verdict is then for its tier.
     """
-    from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.errors import ConfigError
     from pmsmtool.workflow.commission import Commissioning, begin_run
     from pmsmtool.workflow.run_directory import RunDirectory
@@ -97,8 +96,6 @@ def commission_command(
         _erase_memory(bus, out)
     given = None if map_file is None else read_map(map_file)
     with _opened(bus, given) as (drive, found):
-        if given is not None:
-            checked_identity(drive.node)
         if drive_bandwidth_hz is not None and found.drive_map.staging:
             raise ConfigError(
                 f"--drive-bandwidth-hz: for a drive that cannot be reflashed, and {found.drive_map.name!r} is none",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.options import FILE, BusOptions
+from pmsmtool.cli.output import Output
 from pmsmtool.errors import BusError, ConfigError
 
 if TYPE_CHECKING:
@@ -70,14 +71,12 @@ def open_node(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[Dr
 
 def _refuse_another_family(node: DriveNode) -> None:
     """Say which map a known drive needs, instead of failing at its first object."""
-    from pmsmtool.drive import objects
-    from pmsmtool.errors import SdoAbort
     from pmsmtool.firmware.shipped_maps import family_of
 
-    try:
-        vendor, product = (int.from_bytes(node.sdo.read(objects.IDENTITY, sub, size=4), "little") for sub in (1, 2))
-    except SdoAbort:
+    shown = _vendor_product(node)
+    if shown is None:
         return
+    vendor, product = shown
     family = None if node.map.is_for(vendor, product) else family_of(vendor, product)
     if family is not None:
         raise ConfigError(
@@ -87,17 +86,41 @@ def _refuse_another_family(node: DriveNode) -> None:
         )
 
 
+def _vendor_product(node: DriveNode) -> tuple[int, int] | None:
+    """Return vendor and product (0x1018), None where the drive shows none."""
+    from pmsmtool.drive import objects
+    from pmsmtool.errors import SdoAbort
+
+    try:
+        vendor, product = (int.from_bytes(node.sdo.read(objects.IDENTITY, sub, size=4), "little") for sub in (1, 2))
+    except SdoAbort:
+        return None
+    return vendor, product
+
+
+def warn_of_other_drive(node: DriveNode, out: Output) -> None:
+    """Say that what is read is read through the map of another drive; writing through it is refused."""
+    from pmsmtool.flash.map_gate import other_drive
+
+    differ = other_drive(node.map, *(_vendor_product(node) or (0, 0)))
+    if differ:
+        out.warn(f"{differ}: what is read may mean something else, and nothing is written or moved through it")
+
+
 @contextmanager
 def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[CanopenDrive]:
     """Open the bus and the drive on it, ready for experiments.
 
     Raises
     ------
+    ConfigError
+        The map is that of another drive: nothing is moved through it.
     NotAvailable
         The drive lacks the reference drive's objects.
     """
     from pmsmtool.drive.canopen_drive import CanopenDrive
     from pmsmtool.errors import NotAvailable, SdoAbort
+    from pmsmtool.flash.map_gate import check_motion
 
     with bus.connect() as connection:
         try:
@@ -109,6 +132,7 @@ def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[C
                 likely="a drive of another family",
                 hint="`pmsmtool caps` lists what it can give and what is missing",
             ) from abort
+        check_motion(drive.node.map, drive.identity)
         yield drive
         drive.close()
 

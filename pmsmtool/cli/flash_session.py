@@ -85,17 +85,10 @@ def checked_identity(node: DriveNode) -> Identity:
     ConfigError
         Vendor or product are not the map's.
     """
-    from pmsmtool.errors import ConfigError
-    from pmsmtool.flash.download import describe
+    from pmsmtool.flash.map_gate import check_family
 
     identity = node.identity()
-    if not node.map.is_for(identity.vendor, identity.product):
-        raise ConfigError(
-            f"the map {node.map.name!r} is for vendor {node.map.vendor:#010x} product {node.map.product:#x}, "
-            f"the drive is {describe(identity)}",
-            where=f"node {node.node}, 0x1018",
-            hint="give the map of this drive with --map; nothing was written",
-        )
+    check_family(node.map, identity)
     return identity
 
 

@@ -143,10 +143,12 @@ def _choose(
     from dataclasses import replace
 
     from pmsmtool.cli.drive_access import open_node, read_map
+    from pmsmtool.flash.map_gate import check_motion
     from pmsmtool.workflow.capabilities import MEASURING, Method, examine
 
     with open_node(bus) as node:
         found = examine(node, None if map_file is None else read_map(map_file))
+    check_motion(found.drive_map, found.identity)
     wanted = None if method == "auto" else Method(method)
     if everything:
         for candidate in MEASURING if wanted is None else (wanted,):

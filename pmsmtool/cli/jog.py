@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import click
 
+from pmsmtool.cli.drive_access import map_option, open_drive, read_map
 from pmsmtool.cli.options import (
     DURATION,
     LARGEST_CURRENT,
@@ -39,6 +41,7 @@ SAMPLE_S = 0.05
 @click.option("--angle", "angle_rad", type=Quantity("angle"), default="0deg", help="Electrical angle of the vector.")
 @click.option("--speed", "speed_rad_s", type=SPEED, help="Run at this speed, e.g. 100rpm.")
 @click.option("--for", "seconds", type=DURATION, default="1s", help="How long.")
+@map_option
 @bus_options
 @motion_options
 @output_options
@@ -50,13 +53,13 @@ def jog_command(
     angle_rad: float,
     speed_rad_s: float | None,
     seconds: float,
+    map_file: Path | None,
 ) -> None:
     """Hold a current vector at a fixed angle, or run at a speed, for a short time; then stop and restore everything.
 
     A speed jog needs a drive that knows its machine: pole pairs, encoder offset, gains.
     """
     from pmsmtool.cli.consent import ask_motion
-    from pmsmtool.cli.drive_access import open_drive
     from pmsmtool.drive.envelope import Envelope
     from pmsmtool.drive.guard import guarded
     from pmsmtool.errors import ConfigError
@@ -65,7 +68,7 @@ def jog_command(
         raise ConfigError(
             "give one of --current and --speed", hint="`pmsmtool jog --current 1A`, or `pmsmtool jog --speed 100rpm`"
         )
-    with open_drive(bus) as drive:
+    with open_drive(bus, read_map(map_file)) as drive:
         _refuse_beyond("current", current_apk or 0.0, drive.read("motor.I_max_apk"), "Apk", "motor.I_max_apk")
         rpm = abs(speed_rad_s or 0.0) * 30.0 / math.pi
         _refuse_beyond("speed", rpm, drive.read("motor.n_max_rpm"), "rpm", "motor.n_max_rpm")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, open_node, read_map
+from pmsmtool.cli.drive_access import map_option, open_node, read_map, warn_of_other_drive
 from pmsmtool.cli.options import (
     FILE,
     BusOptions,
@@ -48,6 +48,8 @@ def get_command(bus: BusOptions, out: Output, names: tuple[str, ...], map_file: 
     drive_map = read_map(map_file)
     wanted = [entry for name in names for entry in _resolve(name, drive_map)]
     with open_node(bus, drive_map) as node:
+        if any(name for name, _ in wanted):
+            warn_of_other_drive(node, out)
         _say_staged(node, out)
         entries = [_read(node, entry) for entry in wanted]
     heads = ("name", "value", "unit", "object")
@@ -108,6 +110,7 @@ def dump_command(bus: BusOptions, out: Output, everything: bool, path: Path | No
     from pmsmtool.cli.output_file import write_file
 
     with open_node(bus, read_map(map_file)) as node:
+        warn_of_other_drive(node, out)
         _say_staged(node, out)
         held = _device_set(node)
     text = (held if everything else _without_defaults(held)).to_toml()
@@ -140,6 +143,7 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
     drive_map = read_map(map_file)
     if "device" in (old, new):
         with open_node(bus, drive_map) as node:
+            warn_of_other_drive(node, out)
             held = _device_set(node)
             sets = [held if side == "device" else _side(side, drive_map) for side in (old, new)]
     else:

@@ -53,7 +53,6 @@ def prove_command(
     from dataclasses import asdict
 
     from pmsmtool.cli.consent import Consent, ask_motion
-    from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.design.design_file import design_text, load_design
     from pmsmtool.workflow.commission import begin_run, write_report
     from pmsmtool.workflow.prove.stage import ProofRequest, not_proven, prove_stage
@@ -66,7 +65,6 @@ def prove_command(
     )
     consents: list[Consent] = []
     with open_drive(bus, read_map(map_file)) as drive:
-        checked_identity(drive.node)
 
         def allow(lines: Any) -> None:
             serial = drive.identity.serial

@@ -134,7 +134,7 @@ def clone_command(
 
     MACHINE is the machine file, run directory or profile that says what is on the drive; the drive is only read.
     """
-    from pmsmtool.cli.drive_access import open_node, read_map
+    from pmsmtool.cli.drive_access import open_node, read_map, warn_of_other_drive
     from pmsmtool.cli.output_file import write_file
     from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
     from pmsmtool.machine.profile import machine_path
@@ -144,6 +144,8 @@ def clone_command(
     machine_file = load_machine_file(machine_path(machine))
     with open_node(bus) as node:
         found = examine(node, None if map_file is None else read_map(map_file))
+        if map_file is not None:
+            warn_of_other_drive(node, out)
         clone = clone_drive(node, found, machine_file, draw)
     embed = machine_file.flux_map is not None
     contents: dict[Path, bytes] = {path: dump_machine_file(clone.machine_file, embed_flux_map=embed).encode()}

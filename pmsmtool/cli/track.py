@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pmsmtool.cli.drive_access import map_option, open_drive, read_map
 from pmsmtool.cli.options import FREQUENCY, TIME, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
     from pmsmtool.estimators.tracking_model import Known
+    from pmsmtool.firmware.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.workflow.run_directory import RunDirectory
     from pmsmtool.workflow.track import Tracked
@@ -37,6 +39,7 @@ QUANTITIES = {"R": "R_s_ohm", "psi": "psi_f_wb"}
 @click.option("--rate", "rate_hz", type=FREQUENCY, default="100Hz", help="Process data per second.")
 @click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="From what an earlier track kept; asks no drive.")
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
+@map_option
 @bus_options
 @output_options
 def track_command(
@@ -49,6 +52,7 @@ def track_command(
     rate_hz: float,
     replay: Path | None,
     runs: Path,
+    map_file: Path | None,
 ) -> None:
     """Follow R(T) and psi(T) while somebody else runs the machine; nothing is commanded.
 
@@ -63,7 +67,9 @@ def track_command(
         observations, known, described, run = _stored(replay, machine)
         found = follow(observations, known, described, wanted)
     else:
-        observations, known, described, run = _observed(bus, out, machine, seconds, by, rate_hz, runs)
+        observations, known, described, run = _observed(
+            bus, out, machine, seconds, by, rate_hz, runs, read_map(map_file)
+        )
         found = follow(observations, known, described, wanted)
         run.add(track_stage(found, wanted, described))
     _show(run, found, wanted, out)
@@ -83,15 +89,21 @@ def _stored(replay: Path, machine: Path | None) -> tuple[Any, Known, MachineFile
 
 
 def _observed(
-    bus: BusOptions, out: Output, machine: Path | None, seconds: float, by: str, rate_hz: float, runs: Path
+    bus: BusOptions,
+    out: Output,
+    machine: Path | None,
+    seconds: float,
+    by: str,
+    rate_hz: float,
+    runs: Path,
+    drive_map: DriveMap,
 ) -> tuple[Any, Known, MachineFile, RunDirectory]:
-    from pmsmtool.cli.drive_access import open_drive
     from pmsmtool.machine.machine_file import dump_machine_file
     from pmsmtool.workflow.commission import begin_run
     from pmsmtool.workflow.identify import nameplate_of
     from pmsmtool.workflow.track import keep, known_of, observe_process_data, observe_recordings
 
-    with open_drive(bus) as drive:
+    with open_drive(bus, drive_map) as drive:
         described = _described(machine) if machine else nameplate_of(drive, drive.identity.name or "drive")
         known = known_of(described, compensated=drive.read("inverter.deadtime_compensation") != 0.0)
         if by == "pdo":

@@ -10,6 +10,8 @@ from pmsmtool.firmware.drive_map_file import parse_drive_map
 from pmsmtool.resources import data_folder
 
 MAP_NAME = "map.toml"
+GENERIC = "cia402"
+"""Family of a drive of which nothing but CiA 402 is known."""
 UNKNOWN_VENDOR = 0
 """Vendor of a map whose maker's number no source confirmed: it fits no real drive until a person fills it in."""
 

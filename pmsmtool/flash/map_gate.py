@@ -1,8 +1,9 @@
-"""The gate before the first write through a map: it must be this drive's, and still the map of last time.
+"""The gate before the first motion and the first write through a map: it must be this drive's.
 
 A parameter set is only as right as the map that scales it. The reference drive shows the layout of its own set
-(0x2000:02); another drive shows nothing but its identity. So its map must name that identity, and the hash of the map a
-drive was last written through is kept with its journals: another map for the same drive is a decision, not an accident.
+(0x2000:02); another drive shows nothing but its identity. So its map must name that identity before anything moves, and
+the hash of the map a drive was last written through is kept with its journals: another map for the same drive is a
+decision, not an accident.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pmsmtool.drive.port import Identity
 from pmsmtool.errors import ConfigError, SafetyRefusal
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.firmware.drive_map_file import map_hash
-from pmsmtool.firmware.shipped_maps import UNKNOWN_VENDOR
+from pmsmtool.firmware.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
 from pmsmtool.flash.journal import JournalFolder
 
 SHOWN = 12
@@ -36,33 +37,74 @@ def check_map(drive_map: DriveMap, identity: Identity, folder: JournalFolder) ->
     SafetyRefusal
         The drive was last written through another map.
     """
-    where = f"node {identity.node}, 0x1018"
     if drive_map.vendor == UNKNOWN_VENDOR:
-        raise ConfigError(
-            f"the map {drive_map.name!r} does not say whose drive it is for (vendor 0): nothing is written through it",
-            where=where,
-            hint="this drive names no vendor either: nothing can be written to it"
-            if identity.vendor == UNKNOWN_VENDOR
-            else f"copy it, write vendor = {identity.vendor:#010x}, product = {identity.product:#010x}, give it with "
-            "--map",
-        )
-    if not drive_map.is_for(identity.vendor, identity.product):
-        raise ConfigError(
-            f"the map {drive_map.name!r} is for vendor {drive_map.vendor:#010x} product {drive_map.product:#x}, the "
-            f"drive is vendor {identity.vendor:#010x} product {identity.product:#x}",
-            where=where,
-            hint="give the map of this drive with --map; nothing was written",
-        )
+        raise _other_drive(drive_map, identity)
+    check_family(drive_map, identity)
     if drive_map.staging:
         return  # the drive itself shows the layout of its set
     kept, now = _kept(folder), map_hash(drive_map)
     if kept not in ("", now):
         raise SafetyRefusal(
             f"this drive was last written through another map: sha256 {kept[:SHOWN]} then, {now[:SHOWN]} now",
-            where=where,
+            where=_where(identity),
             likely="the map was edited, or another family's was given",
             hint=f"compare the maps; to accept the new one delete {memory_of(folder)}",
         )
+
+
+def check_family(drive_map: DriveMap, identity: Identity) -> None:
+    """Refuse a drive of another identity than its map's; raises ``ConfigError``, nothing was moved or written."""
+    if not drive_map.is_for(identity.vendor, identity.product):
+        raise _other_drive(drive_map, identity)
+
+
+def check_motion(drive_map: DriveMap, identity: Identity) -> None:
+    """Refuse to move a drive through the map of another; nothing was moved or written.
+
+    What CiA 402 alone says (the shipped map of :data:`GENERIC`) holds on every drive.
+
+    Raises
+    ------
+    ConfigError
+        The map is for another identity, or is no shipped one and says none.
+    """
+    named = drive_map.vendor != UNKNOWN_VENDOR and drive_map.is_for(identity.vendor, identity.product)
+    if not named and drive_map != load_family(GENERIC):
+        raise _other_drive(drive_map, identity)
+
+
+def other_drive(drive_map: DriveMap, vendor: int, product: int) -> str:
+    """Return how a map and a drive differ, empty when the map names the drive."""
+    if drive_map.vendor == UNKNOWN_VENDOR:
+        return f"the map {drive_map.name!r} does not say whose drive it is for (vendor 0)"
+    if drive_map.is_for(vendor, product):
+        return ""
+    return (
+        f"the map {drive_map.name!r} is for vendor {drive_map.vendor:#010x} product {drive_map.product:#x}, "
+        f"the drive is vendor {vendor:#010x} product {product:#x}"
+    )
+
+
+def _other_drive(drive_map: DriveMap, identity: Identity) -> ConfigError:
+    """Return the refusal, with what leads on."""
+    vendor, product = identity.vendor, identity.product
+    if drive_map.vendor == vendor == UNKNOWN_VENDOR:
+        hint = "this drive names no vendor either: nothing can be written to it"
+    elif drive_map.vendor == UNKNOWN_VENDOR:
+        hint = f"copy it, write vendor = {vendor:#010x}, product = {product:#010x}, give it with --map"
+    else:
+        shipped = family_of(vendor, product)
+        hint = f"give --map {shipped.name}" if shipped else "give the map of this drive with --map"
+    return ConfigError(
+        other_drive(drive_map, vendor, product),
+        where=_where(identity),
+        likely="the map of another drive was given, or another drive answers on this node",
+        hint=f"{hint}; nothing was moved or written",
+    )
+
+
+def _where(identity: Identity) -> str:
+    return f"node {identity.node}, 0x1018"
 
 
 def remember_map(drive_map: DriveMap, folder: JournalFolder) -> None:

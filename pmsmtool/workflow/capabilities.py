@@ -19,11 +19,8 @@ from pmsmtool.drive.port import Identity
 from pmsmtool.drive.recorder_choice import described
 from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap, reference_map
-from pmsmtool.firmware.shipped_maps import UNKNOWN_VENDOR, family_of, load_family
+from pmsmtool.firmware.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
 from pmsmtool.firmware.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
-
-GENERIC = "cia402"
-"""Family of a drive that no map is known for."""
 
 
 class Tier(StrEnum):

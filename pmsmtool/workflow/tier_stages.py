@@ -24,7 +24,7 @@ from pmsmtool.drive.tier_drives import ParameterDrive
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.flash.journal import JournalFolder
-from pmsmtool.flash.map_gate import check_map
+from pmsmtool.flash.map_gate import check_map, check_motion
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.workflow.capabilities import Capabilities, Method, Tier
@@ -60,9 +60,12 @@ def open_tier_drive(connection: Connection, node: int, found: Capabilities) -> C
 
     Raises
     ------
+    ConfigError
+        The map is that of another drive: nothing is moved or written through it.
     NotAvailable
         It lacks what even its tier needs.
     """
+    check_motion(found.drive_map, found.identity)
     kinds: dict[Tier, type[CanopenDrive]] = {
         Tier.FULL: CanopenDrive,
         Tier.INJECT: RecordingDrive,

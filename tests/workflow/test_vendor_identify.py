@@ -18,6 +18,7 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.vendor_tuning import VendorAnswer, VendorDrive
 from pmsmtool.errors import (
+    ConfigError,
     DriveFault,
     DriveTimeout,
     IdentificationError,
@@ -329,7 +330,9 @@ def test_nothing_is_started_on_a_drive_that_the_map_does_not_name(tmp_path: Path
     path = tmp_path / "other.toml"
     path.write_text(dump_drive_map(other), encoding="utf-8")
     outcome = run("--sim", SYNAPTICON, "--yes", "identify", "R", "--method", "vendor", "--map", str(path))
-    assert isinstance(outcome.exception, NotAvailable) and "in a map that names this drive" in str(outcome.exception)
+    assert isinstance(outcome.exception, ConfigError) and "is for vendor 0x00000999" in str(outcome.exception)
+    without = ["--sim", SYNAPTICON.replace("synapticon", "nanotec"), "--yes", "identify", "R", "--method", "vendor"]
+    assert "in a map that names this drive" in str(run(*without).exception)
 
 
 def test_caps_shows_the_tier(tmp_path: Path) -> None:
