@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.prove_verdicts import Shared
 from pmsmtool.bus.connect import Connection
 from pmsmtool.design.margins import MarginRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -24,12 +25,15 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow import commission
 from pmsmtool.workflow.commission import STAGES, Commissioning, begin_run, due_stages
 from pmsmtool.workflow.export import image_of
+from pmsmtool.workflow.prove import stage as proof_stage
 from pmsmtool.workflow.prove.stage import ProofRequest
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
 PROFILE = "interior-2k2"
 FEW_MACHINES = ProofRequest(runs=32)
 """The proof's own tests draw as many as the tool; here it is one of the stages."""
+SHARED = Shared()
+"""Every chain here ends at the same design, and needs its prediction once."""
 
 
 class Told:
@@ -82,12 +86,35 @@ def drive_on(channel: str) -> Iterator[CanopenDrive]:
 @pytest.fixture(autouse=True)
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(proof_stage, "predict_proof", SHARED.predict)
 
 
 @pytest.fixture
 def drive(tmp_path: Path) -> Iterator[CanopenDrive]:
     with drive_on(f"{PROFILE}?nv={tmp_path / 'drive.nv'}") as found:
         yield found
+
+
+@pytest.fixture(scope="module")
+def ended_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """Folder of a chain that has ended: ``run``, and the drive's memory; and the frames the chain took."""
+    folder = tmp_path_factory.mktemp("ended")
+    with pytest.MonkeyPatch.context() as patch, drive_on(f"{PROFILE}?nv={folder / 'drive.nv'}") as drive:
+        patch.setenv("PMSMTOOL_HOME", str(folder / "home"))
+        patch.setattr(proof_stage, "predict_proof", SHARED.predict)
+        run = identified(folder, drive)
+        frames = _frames(run, drive, patch, None)
+    run.path.rename(folder / "run")
+    return folder, frames
+
+
+@pytest.fixture
+def ended(ended_once: tuple[Path, int], tmp_path: Path) -> Iterator[tuple[RunDirectory, CanopenDrive]]:
+    """A copy of that chain, and a drive with its memory."""
+    shutil.copytree(ended_once[0] / "run", tmp_path / "run")
+    shutil.copy(ended_once[0] / "drive.nv", tmp_path / "drive.nv")
+    with drive_on(f"{PROFILE}?nv={tmp_path / 'drive.nv'}") as found:
+        yield RunDirectory(tmp_path / "run"), found
 
 
 def identified(folder: Path, drive: CanopenDrive) -> RunDirectory:
@@ -157,26 +184,24 @@ def test_a_chain_that_ended_goes_on_where_it_ended(
 
 @pytest.mark.parametrize("lost", ["machine.toml", "design.toml", "lut.npz", "params.toml"])
 def test_a_lost_file_has_its_stage_and_all_later_ones_run_again(
-    lost: str, tmp_path: Path, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch
+    lost: str, ended: tuple[RunDirectory, CanopenDrive]
 ) -> None:
-    run = identified(tmp_path, drive)
-    finish(run, drive)
+    run, _ = ended
+    assert due_stages(run, run.read()) == ()
     (run.path / lost).unlink()
     first = {"machine.toml": "identify", "design.toml": "tune"}.get(lost, "lut")
     assert due_stages(run, run.read()) == STAGES[STAGES.index(first) :]
 
 
-def test_a_stage_that_ran_again_makes_the_later_ones_stale(tmp_path: Path, drive: CanopenDrive) -> None:
-    run = identified(tmp_path, drive)
-    finish(run, drive)
+def test_a_stage_that_ran_again_makes_the_later_ones_stale(ended: tuple[RunDirectory, CanopenDrive]) -> None:
+    run, _ = ended
     run.add(run.read().stage("tune"))  # type: ignore[arg-type]
     assert due_stages(run, run.read()) == STAGES[2:]
 
 
 @pytest.mark.parametrize("name", ["machine.toml", "design.toml", "params.toml", "lut.csv"])
-def test_an_edited_file_is_named_and_nothing_is_done(name: str, tmp_path: Path, drive: CanopenDrive) -> None:
-    run = identified(tmp_path, drive)
-    finish(run, drive)
+def test_an_edited_file_is_named_and_nothing_is_done(name: str, ended: tuple[RunDirectory, CanopenDrive]) -> None:
+    run, drive = ended
     crc = active_crc(drive)
     with (run.path / name).open("a") as file:
         file.write("# mine\n")
@@ -204,9 +229,8 @@ def test_the_chain_ends_at_the_first_criterion_that_is_not_met(tmp_path: Path, d
     assert run.read().stages[-1].name == "margins" and run.read().stages[-1].status == "fail"
 
 
-def test_verify_finds_a_byte_that_somebody_changed(tmp_path: Path, drive: CanopenDrive) -> None:
-    run = identified(tmp_path, drive)
-    finish(run, drive)
+def test_verify_finds_a_byte_that_somebody_changed(ended: tuple[RunDirectory, CanopenDrive]) -> None:
+    run, drive = ended
     record = run.read()
     run.write(replace(record, stages=[stage for stage in record.stages if stage.name != "verify"]))
     drive.write({"motor.R_s_ohm": 2.0})
@@ -226,10 +250,10 @@ def test_another_drive_is_refused(tmp_path: Path, drive: CanopenDrive) -> None:
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.4, 0.6, 0.8, 0.97])
 def test_ctrl_c_in_the_middle_leaves_old_or_new_and_goes_on(
-    share: float, tmp_path: Path, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch
+    share: float, tmp_path: Path, ended_once: tuple[Path, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A signal while a frame is awaited, at a share of all the frames that the chain takes."""
-    total = _frames(identified(tmp_path / "count", drive), drive, monkeypatch, None)
+    total = ended_once[1]
     with drive_on(f"{PROFILE}?nv={tmp_path / 'second.nv'}") as second:
         run, crc = identified(tmp_path / "cut", second), active_crc(second)
         with pytest.raises(Interrupted) as caught:
