@@ -104,10 +104,15 @@ class Plan:
         ]
         equal = len(self.entries) - len(rows)
         lines.append(f"{len(rows)} of {len(self.entries)} objects change, {equal} hold their value already")
-        lines += [
-            f"this drive has no object for {name}" + (f": {self.reasons[name]}" if name in self.reasons else "")
-            for name in self.missing
-        ]
+        return [*lines, *self.left_out()]
+
+    def left_out(self) -> list[str]:
+        """Return what of the set is not written: by name where the map says why, the rest as a number."""
+        named = [name for name in self.missing if name in self.reasons]
+        lines = [f"not written: {name}: {self.reasons[name]}" for name in named]
+        others = len(self.missing) - len(named)
+        if others:
+            lines.append(f"not written: {others} entries of the set that the drive's map has no object for")
         return lines
 
 

@@ -45,12 +45,11 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
         Acceptance("objects read back as written, after a reset", f"{total} of {total}", "all", True),
         Acceptance("the set is stored", "yes" if outcome.stored else "no", "yes", outcome.stored),
     ]
-    missing = (f"this drive has no object for {', '.join(plan.missing)}",) if plan.missing else ()
     values = [_change(change) for change in plan.changes]
     good = all(line.ok for line in criteria)
     return Stage(
         "flash", "pass" if good else "fail", 0.0, values=values, acceptance=criteria,
-        note="" if good else "the drive does not keep the set", fallbacks=missing,
+        note="" if good else "the drive does not keep the set", fallbacks=tuple(plan.left_out()),
         summary=f"{outcome.written} of {total} objects written, stored, read back after a reset",
     )  # fmt: skip
 

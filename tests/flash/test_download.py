@@ -394,6 +394,21 @@ def test_drive_without_staging_is_written_read_back_and_rolled_back(tmp_path: Pa
     assert rig.image()[:12] == before[:12]
 
 
+def test_the_consent_names_what_the_map_has_and_counts_the_rest(rig: Rig) -> None:
+    told = "speed.K_p_nms_per_rad"
+    drive_map = replace(unstaged(), left_out={told: "unit unclear"})
+    rig.node.map = drive_map
+    wanted = default_set()
+    plan = rig.plan(wanted)
+    lines, others = plan.lines(), len(wanted.values) - len(drive_map.cells) - 1
+    assert others > 40 and plan.missing == drive_map.missing(wanted)  # the machine-readable plan names all
+    assert lines[-2:] == [
+        f"not written: {told}: unit unclear",
+        f"not written: {others} entries of the set that the drive's map has no object for",
+    ]
+    assert len(lines) == len(plan.changes) + 3 and not any("current." in line for line in lines)
+
+
 def test_quantised_values_are_shown_in_the_plan(rig: Rig) -> None:
     cell = Cell("motor.I_max_apk", 0x2010, 6, "UNSIGNED32", 0.25)
     scaled = DriveMap("scaled", rig.identity.vendor, rig.identity.product, {cell.name: cell})
