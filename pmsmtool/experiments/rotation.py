@@ -8,22 +8,28 @@ from dataclasses import dataclass
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError
 from pmsmtool.experiments.signals import table
+from pmsmtool.experiments.vector_turn import RAMP_S, come_to_rest, rising, turn_vector
 from pmsmtool.trace import Trace
 
 MAX_POLE_PAIRS = 32
 """A machine with more is not found by turning its vector; the run ends with E_POLE_PAIRS."""
 
-ALIGN_S = 0.3
 BACK_AT_MOST = 1.15
 """Steps of the way back, of those of the way there: a rotor that lags or sticks at a turning point needs more."""
 STEP_RAD = math.radians(15.0)
 """Electrical angle of one step."""
+QUICK_STEP_RAD = math.radians(20.0)
+QUICK_DWELL_S = 0.008
+"""A vector of some 25 rad/s, with the time of a step on the bus. The dead time pulls at the rotor six times a turn of
+the vector: 150 rad/s is above the swing of 500 random drives on 0.35 of the test current (19 .. 106 rad/s), and 75 was
+in the midst of them. There a rotor swung by 20 to 40 degrees whatever its ramp, beside a large dead time most."""
 SWING = 2.0
 """Largest speed of a rotor that is led by steps, over the mean one."""
 SLOWEST_STEP_S = 0.2
 """Longest time per step: a machine of twenty pole pairs then takes some three minutes for both ways."""
-LEAD_STEPS = 8
-"""Steps before the recorded ones: the rotor's own transient after standstill or reversal."""
+ROW_S = 0.002
+"""Time over which the encoder is averaged after every step."""
+LEAST_RAMP_STEPS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +46,20 @@ class RotationPlan:
         Time per step (s).
     turns_mechanical : float
         Mechanical turns in each direction.
+    ramp_s : float
+        Time in which the vector comes to its speed, and to rest again (s).
     """
 
     i_a: float
     step_rad: float = STEP_RAD
     dwell_s: float = 0.015
     turns_mechanical: float = 1.02
+    ramp_s: float = RAMP_S
+
+    @property
+    def ramp(self) -> tuple[float, ...]:
+        """Return the steps of the ramp, of a whole step; none is larger, so the shaft keeps to its speed limit."""
+        return rising(max(LEAST_RAMP_STEPS, round(self.ramp_s / (self.dwell_s + ROW_S))))
 
 
 def dwell_within(dwell_s: float, omega_max_rad_s: float) -> float:
@@ -77,10 +91,33 @@ def dwell_within(dwell_s: float, omega_max_rad_s: float) -> float:
     return max(dwell_s, least_s)
 
 
+def step_within(step_rad: float, dwell_s: float, omega_max_rad_s: float) -> tuple[float, float]:
+    """Return angle (rad electrical) and time (s) of a step that keep the shaft to a speed limit.
+
+    A limit shortens the step, to half of ``STEP_RAD`` at the least, and then makes it longer in time
+    (:func:`dwell_within`).
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``, as there.
+    """
+    shorter = min(step_rad, omega_max_rad_s * (dwell_s + ROW_S) / SWING)
+    if shorter >= min(step_rad, 0.5 * STEP_RAD):
+        return shorter, dwell_s
+    return STEP_RAD, dwell_within(dwell_s, omega_max_rad_s)
+
+
 def rotate_vector(drive: Drive, plan: RotationPlan, *, start_rad: float = 0.0) -> tuple[Trace, Trace]:
     """Turn the vector until the shaft has made its turns, then back; return the two runs.
 
-    The drive is enabled on entry; the vector stands where it started, at zero current, on return.
+    The drive is enabled on entry. On return the current is zero, and the rotor rests where the vector stood last: at a
+    whole electrical turn, from where the next one takes it without a jump.
+
+    Parameters
+    ----------
+    start_rad : float
+        Electrical angle of the vector that was held last: the rotor is near it.
 
     Returns
     -------
@@ -88,18 +125,21 @@ def rotate_vector(drive: Drive, plan: RotationPlan, *, start_rad: float = 0.0) -
         ``theta_imposed_rad`` (electrical, unwrapped) and ``theta_M_rad`` (mechanical, unwrapped), one row per step.
     """
     drive.command_current(plan.i_a, 0.0, fixed_angle_rad=start_rad)
-    drive.wait(ALIGN_S)
+    come_to_rest(drive)
     angle, forward = _run(drive, plan, start_rad, plan.step_rad, None)
-    drive.wait(ALIGN_S)
+    come_to_rest(drive)
     angle, backward = _run(drive, plan, angle, -plan.step_rad, len(forward))
-    drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
+    whole = 2.0 * math.pi * round(angle / (2.0 * math.pi))
+    turn_vector(drive, plan.i_a, angle, whole)
+    come_to_rest(drive)
+    drive.command_current(0.0, 0.0, fixed_angle_rad=whole)
     return forward, backward
 
 
 def _run(drive: Drive, plan: RotationPlan, angle: float, step: float, count: int | None) -> tuple[float, Trace]:
-    """Turn in one direction: a lead-in that brings the rotor to speed, then the turns, and ``count`` steps."""
-    for _ in range(LEAD_STEPS):
-        angle += step
+    """Turn in one direction: a ramp that brings the rotor to speed, the turns, ``count`` steps at least, a ramp."""
+    for share in plan.ramp:
+        angle += share * step
         _step(drive, plan, angle)
     rows = [_row(drive, angle)]
     limit = round(2.0 * math.pi * MAX_POLE_PAIRS * plan.turns_mechanical / plan.step_rad)
@@ -111,6 +151,9 @@ def _run(drive: Drive, plan: RotationPlan, angle: float, step: float, count: int
         way = abs(rows[-1]["theta_M_rad"] - rows[0]["theta_M_rad"])
         if way >= 2.0 * math.pi * plan.turns_mechanical and len(rows) >= (count or 0):
             break
+    for share in reversed(plan.ramp):
+        angle += share * step
+        _step(drive, plan, angle)
     return angle, table(rows, [k * plan.dwell_s for k in range(len(rows))], i_command_a=plan.i_a)
 
 
@@ -121,5 +164,5 @@ def _step(drive: Drive, plan: RotationPlan, angle: float) -> dict[str, float]:
 
 
 def _row(drive: Drive, angle: float) -> dict[str, float]:
-    measured = drive.average(("theta_m_rad",), max(1, round(0.002 / drive.period_s)))
+    measured = drive.average(("theta_m_rad",), max(1, round(ROW_S / drive.period_s)))
     return {"theta_imposed_rad": angle, "theta_M_rad": measured["theta_m_rad"]}

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.experiments.signals import readable, table
+from pmsmtool.experiments.vector_turn import turn_vector
 from pmsmtool.trace import Trace
 
 NOISE_SAMPLES = 2048
@@ -38,8 +39,6 @@ REST_LIMIT_S = 3.0
 """A rotor that has not come to rest by then stays as it is; the estimator sees it in the halves of the window."""
 NEAR_SHARE = 0.002
 """The same distance of a small level, of the largest: noise and offsets of the converter."""
-TURN_STEP_RAD = math.radians(15.0)
-TURN_DWELL_S = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +179,7 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float) -> Tra
 
 
 def turn_and_look(drive: Drive, i_a: float, start_rad: float, end_rad: float) -> Trace:
-    """Turn a current vector in small steps and return where the encoder stood before and after."""
+    """Turn a current vector slowly and return where the encoder stood before and after."""
     drive.command_current(i_a, 0.0, fixed_angle_rad=start_rad)
     settle(drive, i_a)
     periods = max(1, round(0.01 / drive.period_s))
@@ -193,19 +192,6 @@ def turn_and_look(drive: Drive, i_a: float, start_rad: float, end_rad: float) ->
         for angle, row in ((start_rad, before), (end_rad, after))
     ]
     return table(rows, [0.0, seconds], i_command_a=i_a)
-
-
-def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float) -> float:
-    """Turn a current vector in small steps, so that the rotor follows instead of jumping; return the time (s).
-
-    A rotor left half an electrical turn off its vector stands on a top: friction holds it there until the current is
-    large, and then it falls over with all of it.
-    """
-    steps = max(1, math.ceil(abs(end_rad - start_rad) / TURN_STEP_RAD))
-    for k in range(1, steps + 1):
-        drive.command_current(i_a, 0.0, fixed_angle_rad=start_rad + (end_rad - start_rad) * k / steps)
-        drive.wait(TURN_DWELL_S)
-    return steps * TURN_DWELL_S
 
 
 def settle(

@@ -20,6 +20,7 @@ from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phase
 from pmsmtool.estimators.prediction import check_prediction, predict
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
+from pmsmtool.experiments.vector_turn import RAMP_S
 from pmsmtool.trace import Trace
 from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
 from pmsmtool.workflow.evaluate import resistance_of, tolerance_on
@@ -36,9 +37,14 @@ CURVE_SHARES = (0.02, 0.04)
 """Levels for the inverter curve alone: a speed run at small current lives there."""
 TURN_SHARE = 0.15
 """Current that turns the rotor over, of the test current."""
-ROTATIONS = ((0.35, 0.015), (0.18, 0.03), (0.09, 0.03))
-"""Current, of the test current, and time per step (s) of every try. Above psi/(L_q - L_d) a d current is no stable
-position: a reluctance machine follows a smaller vector only, and swings longer on it."""
+ROTATIONS = (
+    (0.35, rotation.QUICK_STEP_RAD, rotation.QUICK_DWELL_S, RAMP_S),
+    (0.18, rotation.STEP_RAD, 0.03, 3.0 * RAMP_S),
+    (0.09, rotation.STEP_RAD, 0.03, 4.0 * RAMP_S),
+)
+"""Current, of the test current, largest step (rad), time per step and ramp (s) of every try. Above psi/(L_q - L_d) a d
+current is no stable position: a reluctance machine follows a smaller vector only, and swings longer on it. The next two
+have another speed and longer ramps, too, for a rotor that swings with the first."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 RIPPLE_SHARE = 0.25
 
@@ -123,7 +129,8 @@ class Measurement:
             start = standstill.DC_ANGLE_RAD
         resistance = self._levels(noise, start) if "levels" in steps else None
         self._tell_spent()
-        encoder = self._rotation() if "rotation" in steps else None
+        last = standstill.DC_ANGLE_RAD + (standstill.PHASE_ANGLES_RAD[-1] if "levels" in steps else 0.0)
+        encoder = self._rotation(last) if "rotation" in steps else None
         self._tell_spent()
         if resistance is not None and encoder is not None:
             square = SquareStage(self.drive, self.limits, self.keep, self.say, self.ripple_share)
@@ -211,18 +218,19 @@ class Measurement:
         check_pairs(pairs, noise, resistance.curve)
         return resistance
 
-    def _rotation(self) -> EncoderResult:
-        """Turn the vector; with less current and slower again when the rotor did not stay on it."""
-        for share, dwell_s in ROTATIONS:
-            slow_s = rotation.dwell_within(dwell_s, self.limits.omega_max_rad_s)
-            plan = rotation.RotationPlan(i_a=share * self.limits.I_test_apk, dwell_s=slow_s)
+    def _rotation(self, start_rad: float) -> EncoderResult:
+        """Turn the vector from where it was last; with less current and slower again when the rotor was not on it."""
+        for share, step_rad, dwell_s, ramp_s in ROTATIONS:
+            step, dwell = rotation.step_within(step_rad, dwell_s, self.limits.omega_max_rad_s)
+            plan = rotation.RotationPlan(share * self.limits.I_test_apk, step, dwell, ramp_s=ramp_s)
             self.say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
-            forward, backward = rotation.rotate_vector(self.drive, plan)
+            forward, backward = rotation.rotate_vector(self.drive, plan, start_rad=start_rad)
             self.keep("rotation_forward", forward)
             self.keep("rotation_backward", backward)
+            start_rad = 0.0  # where a turn ends
             try:
                 return estimate_encoder(forward, backward)
             except IdentificationError as error:
-                if error.reason not in OFF_THE_VECTOR or (share, dwell_s) == ROTATIONS[-1]:
+                if error.reason not in OFF_THE_VECTOR or share == ROTATIONS[-1][0]:
                     raise
         raise AssertionError("the last try returns or raises")

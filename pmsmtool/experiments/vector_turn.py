@@ -1,0 +1,59 @@
+"""Turn a current vector so that the rotor goes with it, and does not swing on it afterwards.
+
+On a current vector a rotor is a mass on a spring, and only friction damps it: of ``Omega``, by which the speed of the
+vector jumps, ``Omega / w_swing`` stays as a swing, 40 degrees for many a rotor of large inertia. What comes as a
+half sine of acceleration over ``T`` leaves |cos(x)| / |1 - (2 x / pi)^2| of that, x = w_swing T / 2: nothing at one and
+a half swings, and never more than 7 % beyond.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from pmsmtool.drive.port import Drive
+
+RAMP_S = 0.5
+"""Time in which the vector comes to speed: one and a half swings of the slowest rotor of 500 random drives (19 rad/s
+on 0.35 of the test current). Without it 28 of these swing by 35 degrees and more."""
+TURN_S = 0.6
+"""Time of a turn from standstill to standstill: as much at 0.15 of the test current, of all but the slowest."""
+TURN_DWELL_S = 0.015
+LOOK_S = 0.03
+LOOKS = 4
+"""Looks at the encoder over which a shaft at rest does not move: two alone also find the end of a swing at rest."""
+REST_SPAN_RAD = 2e-3
+"""Motion of the shaft (mechanical) over these that still is rest: one step of a 12-bit encoder."""
+REST_LIMIT_S = 3.0
+"""A rotor that has not come to rest by then swings on: the ramps add next to nothing to it."""
+
+
+def rising(steps: int) -> tuple[float, ...]:
+    """Return the speed of a vector in the steps of a ramp, of its final one: half a cosine, between 0 and 1."""
+    return tuple(0.5 - 0.5 * math.cos(math.pi * (k + 0.5) / steps) for k in range(steps))
+
+
+def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float) -> float:
+    """Turn a current vector along half a cosine, so that the rotor follows instead of jumping; return the time (s).
+
+    A rotor left half an electrical turn off its vector stands on a top: friction holds it there until the current is
+    large, and then it falls over with all of it.
+    """
+    steps = round(TURN_S / TURN_DWELL_S)
+    for k in range(1, steps + 1):
+        way = 0.5 - 0.5 * math.cos(math.pi * k / steps)
+        drive.command_current(i_a, 0.0, fixed_angle_rad=start_rad + (end_rad - start_rad) * way)
+        drive.wait(TURN_DWELL_S)
+    return steps * TURN_DWELL_S
+
+
+def come_to_rest(drive: Drive) -> float:
+    """Wait until the encoder shows a shaft at rest, or a limit is over; return the time (s)."""
+    periods = max(1, round(0.25 * LOOK_S / drive.period_s))
+    seen: deque[float] = deque(maxlen=LOOKS)
+    waited = 0.0
+    while waited < REST_LIMIT_S and (len(seen) < LOOKS or max(seen) - min(seen) > REST_SPAN_RAD):
+        drive.wait(LOOK_S)
+        waited += LOOK_S
+        seen.append(drive.average(("theta_m_rad",), periods)["theta_m_rad"])
+    return waited
