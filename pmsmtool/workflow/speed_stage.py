@@ -180,6 +180,7 @@ class SpeedStage:
         speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)
         lag_s = 2.0 / self.drive.read("encoder.pll_bandwidth_rad_s")  # its poles are a double one
         facts = {"pole_pairs": pole_pairs, "U_dc_v": math.sqrt(3.0) * limits.V_max_v, "speed_lag_s": lag_s}
+        facts["delay_periods"] = self.drive.read("inverter.delay_periods")
         self.keep("speeds", speed_run.speeds_trace(rows, facts))
 
     def _off_and_write(self, values: Mapping[str, float]) -> None:
