@@ -260,3 +260,41 @@ class Interrupted(PmsmtoolError):
     """Interrupted by the person, after a confirmed safe stop."""
 
     exit_code = ExitCode.INTERRUPTED
+
+
+def related(error: BaseException) -> Iterator[BaseException]:
+    """Yield an error, what it was raised from or during, and the members of groups, each once."""
+    seen: set[int] = set()
+    waiting: list[BaseException | None] = [error]
+    while waiting:
+        current = waiting.pop(0)
+        if current is None or id(current) in seen:
+            continue
+        seen.add(id(current))
+        yield current
+        if isinstance(current, BaseExceptionGroup):
+            waiting.extend(current.exceptions)
+        waiting.extend((current.__cause__, current.__context__))
+
+
+def decisive(error: BaseException) -> BaseException:
+    """Return the error that decides the exit code.
+
+    A stop that was not confirmed outranks whatever was raised before, after or because of it. Of a group, the
+    first error of our own decides.
+    """
+    for candidate in related(error):
+        if isinstance(candidate, StopNotConfirmed):
+            return candidate
+    if isinstance(error, BaseExceptionGroup):
+        members = (member for member in related(error) if isinstance(member, (PmsmtoolError, KeyboardInterrupt)))
+        return next(members, error)
+    return error
+
+
+def exit_code_of(error: BaseException) -> ExitCode:
+    """Return the exit code of a program that an error ends; an error that is not ours is a bug."""
+    chosen = decisive(error)
+    if isinstance(chosen, PmsmtoolError):
+        return chosen.exit_code
+    return ExitCode.INTERRUPTED if isinstance(chosen, KeyboardInterrupt) else ExitCode.INTERNAL

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import sys
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import click
@@ -20,6 +19,8 @@ from pmsmtool.errors import (
     PmsmtoolError,
     StopNotConfirmed,
     VerifyMismatch,
+    decisive,
+    related,
 )
 
 if TYPE_CHECKING:
@@ -33,36 +34,6 @@ _DISK = (errno.ENOSPC, errno.EROFS, errno.EIO, getattr(errno, "EDQUOT", errno.EN
 _DISK_HINT = "check the path, your rights there and the space on the disk"
 _WHAT_IT_GIVES = "`pmsmtool caps` shows what this drive gives"
 """Next step of what a drive cannot give, where none is named."""
-
-
-def related(error: BaseException) -> Iterator[BaseException]:
-    """Yield an error, what it was raised from or during, and the members of groups, each once."""
-    seen: set[int] = set()
-    waiting: list[BaseException | None] = [error]
-    while waiting:
-        current = waiting.pop(0)
-        if current is None or id(current) in seen:
-            continue
-        seen.add(id(current))
-        yield current
-        if isinstance(current, BaseExceptionGroup):
-            waiting.extend(current.exceptions)
-        waiting.extend((current.__cause__, current.__context__))
-
-
-def decisive(error: BaseException) -> BaseException:
-    """Return the error that decides the exit code.
-
-    A stop that was not confirmed outranks whatever was raised before, after or because of it. Of a group, the
-    first error of our own decides.
-    """
-    for candidate in related(error):
-        if isinstance(candidate, StopNotConfirmed):
-            return candidate
-    if isinstance(error, BaseExceptionGroup):
-        members = (member for member in related(error) if isinstance(member, (PmsmtoolError, KeyboardInterrupt)))
-        return next(members, error)
-    return error
 
 
 def report(error: BaseException, verbosity: int = 0) -> int:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -202,9 +205,10 @@ def _measure_without_injection(
             _keep(run, given)
 
         measure = vendor_stage if how == "vendor" else tier_stage
-        stage = measure(run, drive, found, request, allow, out.note)
+        with _accounted(run, out) as say:
+            stage = measure(run, drive, found, request, allow, say)
+            run.add(stage)
         drive.close()
-    run.add(stage)
     return run, stage
 
 
@@ -242,10 +246,28 @@ def _measure(
             given = ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
             _keep(run, given)
 
-        stage = identify_stage(run, drive, nameplate, request, allow, out.note)
+        with _accounted(run, out) as say:
+            stage = identify_stage(run, drive, nameplate, request, allow, say)
+            run.add(stage)
         drive.close()
-    run.add(stage)
     return run, stage
+
+
+@contextmanager
+def _accounted(run: RunDirectory, out: Output) -> Iterator[Callable[[str], None]]:
+    """Have the run say how it ended, whatever ends it; one that was declined before anything moved leaves no trace."""
+    from pmsmtool.errors import Declined
+    from pmsmtool.workflow.run_account import accounted
+
+    try:
+        with accounted(run, "identify", out.note) as say:
+            yield say
+    except Declined:
+        shutil.rmtree(run.path, ignore_errors=True)
+        raise
+    except BaseException:
+        out.note(f"how it ended, and what is complete: pmsmtool report {run.path}")
+        raise
 
 
 def _keep(run: RunDirectory, given: Consent) -> None:

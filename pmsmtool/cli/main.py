@@ -15,9 +15,10 @@ from typing import Any
 import click
 
 from pmsmtool import __version__
-from pmsmtool.cli.failure import READER_GONE, decisive, report
+from pmsmtool.cli.failure import READER_GONE, report
 from pmsmtool.cli.lazy_group import COMPLETE_VARIABLE, LazyGroup
 from pmsmtool.cli.options import VERBOSITY, examples, global_options
+from pmsmtool.errors import decisive
 
 PROGRAM = "pmsmtool"
 

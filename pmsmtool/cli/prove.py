@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,7 +78,9 @@ def prove_command(
         else:
             run = begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=recorded)
             run.save("design.toml", design_text(made))
-        stage = _proven(run, lambda: prove_stage(run, drive, made, asked, allow, out.note), fresh=not design.is_dir())
+        stage = _proven(
+            run, out, lambda say: prove_stage(run, drive, made, asked, allow, say), fresh=not design.is_dir()
+        )
     record = run.read()
     run.write(_with_consents(record, [asdict(given) for given in consents]))
     write_report(run)
@@ -98,23 +101,23 @@ def _same_drive(run: RunDirectory, serial: int) -> None:
         )
 
 
-def _proven(run: RunDirectory, prove: Any, *, fresh: bool) -> Stage:
+def _proven(
+    run: RunDirectory, out: Output, prove: Callable[[Callable[[str], None]], Stage], *, fresh: bool
+) -> Stage:
     """Carry the proof out and record it; a run that was made for it and saw no prediction leaves no trace."""
     import shutil
-    from dataclasses import replace
 
     from pmsmtool.workflow.prove.stage import FOLDER as PROOFS
-    from pmsmtool.workflow.run_directory import Stage
+    from pmsmtool.workflow.run_account import accounted
 
     try:
-        stage: Stage = prove()
-    except BaseException as error:
+        with accounted(run, "prove", out.note) as say:
+            stage = prove(say)
+            run.add(stage)
+    except BaseException:
         if fresh and not (run.path / PROOFS).exists():
             shutil.rmtree(run.path, ignore_errors=True)
-        else:
-            run.add(Stage("prove", "fail", 0.0, note=str(error) or type(error).__name__))
         raise
-    run.add(replace(stage))
     return stage
 
 

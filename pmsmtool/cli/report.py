@@ -28,10 +28,11 @@ def report_command(run: Path, path: Path | None, out: Output) -> None:
     Every figure is drawn again from the files of the run. The exit code says whether the page was written, not whether
     the run was good.
     """
-    from pmsmtool.workflow.report_page import report_page, verdict
+    from pmsmtool.workflow.report_page import how_it_ended, report_page, verdict
 
     path = run / "report.html" if path is None else path
     write_file(path, report_page(run))
-    found = verdict(run)
-    out.result("report", {"file": path, "verdict": found.word, "reasons": found.lines}, [found.word, *found.lines])
+    found, ended = verdict(run), how_it_ended(run)
+    data = {"file": path, "verdict": found.word, "reasons": found.lines, "ended": ended}
+    out.result("report", data, [found.word, *found.lines, *ended])
     out.note(f"wrote {path}")

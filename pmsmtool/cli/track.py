@@ -60,6 +60,7 @@ def track_command(
     operating points do not show is refused by name (exit code 6): R needs current, psi needs speed, both need change.
     --replay takes a run of track; runs of identify and commission hold no such observations (exit code 9).
     """
+    from pmsmtool.workflow.run_account import accounted
     from pmsmtool.workflow.track import follow, track_stage
 
     wanted = tuple(QUANTITIES[name] for name in dict.fromkeys(quantities or QUANTITIES))
@@ -70,8 +71,9 @@ def track_command(
         observations, known, described, run = _observed(
             bus, out, machine, seconds, by, rate_hz, runs, read_map(map_file)
         )
-        found = follow(observations, known, described, wanted)
-        run.add(track_stage(found, wanted, described))
+        with accounted(run, "track", out.note):
+            found = follow(observations, known, described, wanted)
+            run.add(track_stage(found, wanted, described))
     _show(run, found, wanted, out)
 
 

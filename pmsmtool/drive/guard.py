@@ -47,6 +47,8 @@ _Object = tuple[int, int]
 _MARKS: tuple[_Object, ...] = tuple(
     (mark.index, mark.sub) for mark in (objects.CONFIGURATION_DATE, objects.CONFIGURATION_TIME)
 )
+RESTORED = "voltage off, drive restored"
+"""What is said when a drive that was lent is off and holds again what it held before."""
 
 
 class GuardedDrive:
@@ -436,7 +438,7 @@ def guarded(
         interrupted = guard.stop() or interrupted
         with interrupts_deferred() as noted:
             count = _restored(guard)
-        say(f"voltage off, drive restored ({count} objects)")
+        say(f"{RESTORED} ({count} objects)")
         interrupted = interrupted or bool(noted)
     if interrupted:
         raise Interrupted("interrupted: the machine is stopped, voltage off, and the drive restored")

@@ -52,6 +52,7 @@ def render(
     changes: Sequence[Change] = (),
     not_checked: Sequence[str] = (),
     complete: Sequence[str] = COMPLETE,
+    ended: Sequence[str] = (),
 ) -> str:
     """Return the report as HTML.
 
@@ -67,6 +68,8 @@ def render(
         What a reader must not assume; printed as it is.
     complete : sequence of str
         Stages that a green verdict needs.
+    ended : sequence of str
+        How a run ended that did not come to its end.
     """
     import jinja2
 
@@ -79,6 +82,7 @@ def render(
         title=f"Commissioning of {name}, serial {int(drive.get('serial', 0)):#010x}",
         subtitle=f"started {record['started_utc']} by {record['operator']}",
         verdict=verdict_of(latest, complete),
+        ended=list(ended),
         stages=latest,
         estimates=[
             _estimate_row(value)
@@ -125,7 +129,7 @@ def verdict_of(stages: Sequence[Mapping[str, Any]], complete: Sequence[str] = CO
     done = {stage["name"] for stage in latest}
     missing = [name for name in complete if name not in done]
     if failed:
-        return Verdict("fail", "FAIL", tuple(f"{stage['name']}: {_failure(stage)}" for stage in failed))
+        return Verdict("fail", "FAIL", tuple(f"{_with_status(stage)}: {_failure(stage)}" for stage in failed))
     if missing:
         return Verdict("open", "NOT COMPLETE", (f"not run yet: {', '.join(missing)}",))
     criteria = sum(len(stage.get("acceptance", ())) for stage in latest)
@@ -164,6 +168,11 @@ def _bare_lines(values: Sequence[Mapping[str, Any]]) -> list[str]:
         f"{heads.get(source, f'taken from {source}, not measured')}: {', '.join(named)}"
         for source, named in names.items()
     ]
+
+
+def _with_status(stage: Mapping[str, Any]) -> str:
+    """Return the name of a stage, with how it ended where that says more than that it failed."""
+    return str(stage["name"]) if stage["status"] == "fail" else f"{stage['name']} {stage['status']}"
 
 
 def _failure(stage: Mapping[str, Any]) -> str:

@@ -25,7 +25,6 @@ from pmsmtool.drive.stop import quick_stop
 from pmsmtool.errors import (
     CheckFailed,
     ConfigError,
-    Declined,
     IdentificationError,
     Interrupted,
     NotAvailable,
@@ -40,7 +39,8 @@ from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
 from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplate_of
 from pmsmtool.workflow.prove.stage import ProofRequest, not_proven, prove_stage
 from pmsmtool.workflow.report_page import report_page
-from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, Status, new_record
+from pmsmtool.workflow.run_account import RunAccount, status_of, text_of
+from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, new_record
 from pmsmtool.workflow.tier_stages import TierStages
 
 FROM_TABLE = TuneRequest(field_weakening="lookup")
@@ -169,6 +169,7 @@ class Commissioning:
     prove: ProofRequest | None = None
     capabilities: Capabilities | None = None
     drive_bandwidth_hz: float | None = None
+    _account: RunAccount | None = field(default=None, init=False)
 
     def carry_out(self) -> None:
         """Run what is due.
@@ -182,18 +183,24 @@ class Commissioning:
         """
         record = self.run.read()
         self._check_drive(record)
+        self._account = account = RunAccount(self.run, self.progress.say)
+        with account.kept():
+            try:
+                self._carry_out_due(record, account)
+            except KeyboardInterrupt:
+                raise Interrupted("the machine is off") from None
+            finally:
+                self._make_sure()
+
+    def _carry_out_due(self, record: RunRecord, account: RunAccount) -> None:
         due = due_stages(self.run, record)
-        try:
-            for number, name in enumerate(STAGES, 1):
-                if name in due:
-                    self._carry_out(name, number)
-                elif (ended := record.stage(name)) is not None:
-                    self.progress.skip(ended, number, len(STAGES))
-            self._refuse_nothing()
-        except KeyboardInterrupt:
-            raise Interrupted("the machine is off") from None
-        finally:
-            self._make_sure()
+        for number, name in enumerate(STAGES, 1):
+            if name in due:
+                account.begin(name)
+                self._carry_out(name, number)
+            elif (ended := record.stage(name)) is not None:
+                self.progress.skip(ended, number, len(STAGES))
+        self._refuse_nothing()
 
     def _refuse_nothing(self) -> None:
         """Refuse a run of which nothing was available: it is not green."""
@@ -229,7 +236,7 @@ class Commissioning:
             if isinstance(error, NotAvailable) and self.tier is not None:
                 self._not_available(name, number, error, clock.now() - start)
                 return
-            failed = Stage(name, _status(error), clock.now() - start, note=_text(error))
+            failed = Stage(name, status_of(error), clock.now() - start, note=text_of(error))
             # The error that ended the stage outranks a record that cannot be written.
             with contextlib.suppress(ConfigError):
                 self.run.add(failed)
@@ -253,8 +260,12 @@ class Commissioning:
             return None
         return TierStages(self.run, self.drive, self.capabilities, self.nameplate, self.drive_bandwidth_hz)
 
+    def _say(self, line: str) -> None:
+        """Tell a line, and the account of the run what it is about."""
+        (self.progress if self._account is None else self._account).say(line)
+
     def _steps(self) -> dict[str, Callable[[], Stage]]:
-        say, tier, person = self.progress.say, self.tier, self.person
+        say, tier, person = self._say, self.tier, self.person
         if tier is not None:
             asked = self.prove or proof_within(self.identify)
             return {
@@ -279,31 +290,17 @@ class Commissioning:
     def _identify(self) -> Stage:
         identity = self.drive.identity
         known = self.nameplate or nameplate_of(self.drive, identity.name or f"drive {identity.serial:#010x}")
-        return identify_stage(self.run, self.drive, known, self.identify, self.person.allow_motion, self.progress.say)
+        return identify_stage(self.run, self.drive, known, self.identify, self.person.allow_motion, self._say)
 
     def _prove(self) -> Stage:
         design = load_design(self.run.path / "design.toml")
         asked = self.prove or proof_within(self.identify)
-        return prove_stage(self.run, self.drive, design, asked, self.person.allow_motion, self.progress.say)
+        return prove_stage(self.run, self.drive, design, asked, self.person.allow_motion, self._say)
 
     def _make_sure(self) -> None:
         """Leave the machine off, confirmed, where this program may have energised it."""
         if self.drive.may_be_energised:
             quick_stop(self.drive.node)
-
-
-def _status(error: BaseException) -> Status:
-    if isinstance(error, KeyboardInterrupt | Interrupted):
-        return "interrupted"
-    if isinstance(error, SafetyRefusal | Declined | IdentificationError | NotAvailable):
-        return "refused"
-    return "fail"
-
-
-def _text(error: BaseException) -> str:
-    if isinstance(error, KeyboardInterrupt):
-        return "interrupted"
-    return str(error) or type(error).__name__
 
 
 def _not_good(stage: Stage, run: RunDirectory) -> PmsmtoolError:

@@ -26,6 +26,7 @@ from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, shots_of
 from pmsmtool.workflow.identify import stored_traces
 from pmsmtool.workflow.prove.stage import read_proof, responses
+from pmsmtool.workflow.run_account import account_lines
 from pmsmtool.workflow.run_directory import RunDirectory, RunRecord
 
 NOT_CHECKED = (
@@ -60,12 +61,18 @@ def report_page(path: Path) -> str:
     not_checked = NOT_CHECKED[1:] if record.passed("prove") else NOT_CHECKED
     if not any(record.passed(stage) for stage in ("flash", "verify", "prove")):
         not_checked = (NOTHING_COMPARED, *NOT_CHECKED[1:])
-    return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=not_checked)
+    return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=not_checked,
+                  ended=account_lines(record.account))  # fmt: skip
 
 
 def verdict(path: Path) -> Verdict:
     """Return the verdict of a run; raises ``ConfigError`` when there is none in the folder."""
     return verdict_of([asdict(stage) for stage in RunDirectory(path).read().stages])
+
+
+def how_it_ended(path: Path) -> list[str]:
+    """Return how a run ended that did not come to its end; raises ``ConfigError`` when there is none in the folder."""
+    return account_lines(RunDirectory(path).read().account)
 
 
 def _identification_figures(run: RunDirectory, record: RunRecord) -> Iterator[Figure]:

@@ -23,6 +23,8 @@ from pmsmtool.errors import ConfigError
 
 SCHEMA = "pmsmtool.run/1"
 RECORD = "run.json"
+PART = ".part"
+"""Suffix of a file that is being written: without it, all of the file is there."""
 _OTHER_RUN = "this run cannot be read or continued: give another one, or begin anew"
 
 Status = Literal["pass", "fail", "refused", "interrupted", "not available"]
@@ -77,7 +79,10 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class RunRecord:
-    """Content of ``run.json``; it is signed off by a person, so it carries date and operator."""
+    """Content of ``run.json``; it is signed off by a person, so it carries date and operator.
+
+    ``account`` says how the run ended (:class:`pmsmtool.workflow.run_account.Account`).
+    """
 
     started_utc: str
     operator: str
@@ -90,6 +95,7 @@ class RunRecord:
     instruments: Sequence[str] = ()
     stages: Sequence[Stage] = ()
     request: Mapping[str, Any] = field(default_factory=dict)
+    account: Mapping[str, Any] = field(default_factory=dict)
     schema: str = SCHEMA
 
     def stage(self, name: str) -> Stage | None:
@@ -163,7 +169,7 @@ class RunDirectory:
     def write(self, record: RunRecord) -> None:
         """Replace the record in one step (write beside it, sync, rename)."""
         text = json.dumps(asdict(record), indent=1, allow_nan=True) + "\n"
-        part = self.path / f".{RECORD}.part"
+        part = self.path / f".{RECORD}{PART}"
         try:
             with part.open("w", encoding="utf-8", newline="\n") as stream:
                 stream.write(text)
@@ -177,7 +183,7 @@ class RunDirectory:
         """Put a file into the run, in one step; raises ``ConfigError`` when it cannot be written."""
         data = content.encode() if isinstance(content, str) else content
         target = self.path / name
-        part = target.with_name(f".{target.name}.part")
+        part = target.with_name(f".{target.name}{PART}")
         try:
             part.write_bytes(data)
             os.replace(part, target)

@@ -176,10 +176,16 @@ def test_a_chain_that_ended_goes_on_where_it_ended(
     monkeypatch.setattr(Commissioning, "_steps", ending)
     with pytest.raises(Interrupted):
         finish(run, drive)
-    assert run.read().stages[-1].status == "interrupted"
+    record = run.read()
+    assert record.stages[-1].status == "interrupted"
+    assert {key: record.account[key] for key in ("state", "stage", "exit_code")} == {
+        "state": "interrupted", "stage": later[0], "exit_code": 130
+    }  # fmt: skip
+    assert record.account["files"]["machine.toml"] == run.sha256("machine.toml")
     monkeypatch.setattr(Commissioning, "_steps", steps)
     progress = finish(run, drive)
     assert progress.ended == [(name, "pass") for name in later]
+    assert run.read().account["state"] == "complete"
 
 
 @pytest.mark.parametrize("lost", ["machine.toml", "design.toml", "lut.npz", "params.toml"])
