@@ -25,6 +25,7 @@ from pmsmtool.estimators.estimate import information_weights, scaled_covariance
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt
 from pmsmtool.estimators.output_error import respond
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.sampling_instant import ShownInstant
 
 Vector = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ STEP_TOLERANCE = 1e-7
 """Relative size of the last step."""
 COST_TOLERANCE = 1e-4
 """Fall of the whitened cost below which a fit is done: a hundredth of a standard deviation."""
-PENALTY, DISPERSION_PENALTY = 6.0, 4.0
+PENALTY, DISPERSION_PENALTY = 7.0, 4.0
 """Prices of a parameter in the information criterion (AIC 2; BIC about 8).
 
 A dispersion that is there and left out biases L by more than a bend or a lag (on a measured map, 0.2 %): it costs less.
@@ -83,6 +84,8 @@ class AxisFit:
         Condition number of its scaled Jacobian.
     timing : Timing
         What the axis says about delay and lag, for the other one.
+    places : tuple of (float, float, float)
+        Information weight, delay (T_s) and lag (s) of every model that counts.
     """
 
     L_h: float
@@ -101,6 +104,7 @@ class AxisFit:
     effects: tuple[str, ...]
     condition: float
     timing: Timing
+    places: tuple[tuple[float, float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +184,7 @@ def fit_axis(
     torque: bool,
     motion: Motion | None = None,
     other: AxisFit | None = None,
+    instant: ShownInstant | None = None,
 ) -> AxisFit:
     """Fit one axis jointly over its shots.
 
@@ -199,6 +204,8 @@ def fit_axis(
         The other axis, fitted before. Delay and lag belong to the drive, and a rotor that follows looks like them; a
         machine that bends on its d axis saturates on q as well, however little of it the noise leaves to see: what
         the bend gains there counts here.
+    instant : ShownInstant or None
+        What a turning machine shows of delay and lag.
 
     Raises
     ------
@@ -211,7 +218,7 @@ def fit_axis(
     T_s = shots[0].period_s
     motion_scale = 0.01 * L_0 / (shots[0].half_period * T_s) ** 2
     timing = None if other is None else other.timing
-    base = Layout(len(shots), Effects(), L_0, R_guess, T_s, ripple, motion_scale, timing, motion, torque)
+    base = Layout(len(shots), Effects(), L_0, R_guess, T_s, ripple, motion_scale, timing, motion, torque, instant)
     problem = _Problem(shots, slow, sigma_a, base)
     # a long lag and a longer delay are two valleys: begin in each, on a first guess of L either may look better
     valleys = [[(delay, math.log(lag)) for delay in DELAY_STARTS for lag in lags] for lags in LAG_STARTS]
@@ -339,4 +346,10 @@ def _average(
         effects=effects.names,
         condition=condition,
         timing=_timing(tried),
+        places=tuple(
+            (float(w), model.delay, model.lag_s)
+            for w, (_, fit, layout, _) in zip(weights, rows, strict=True)
+            if w > NEGLIGIBLE_WEIGHT
+            for model in [layout.responses(fit.x)[0].model]
+        ),
     )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.estimators.axis_response import SKIP_SAMPLES, Response
 from pmsmtool.estimators.output_error import AxisModel
+from pmsmtool.estimators.sampling_instant import ShownInstant
 
 Vector = NDArray[np.float64]
 
@@ -104,7 +105,8 @@ class Effects:
 class Layout:
     """Where each parameter sits in the vector, and its typical size.
 
-    ``symmetric`` is an axis without bias: its magnetisation curve bends alike on both sides.
+    ``symmetric`` is an axis without bias: its magnetisation curve bends alike on both sides. ``instant`` is what a
+    turning machine shows of delay and lag.
     """
 
     shots: int
@@ -117,6 +119,7 @@ class Layout:
     timing: Timing | None = None
     motion: Motion | None = None
     symmetric: bool = False
+    instant: ShownInstant | None = None
 
     def blocks(self) -> Iterator[tuple[str, int]]:
         """Names and lengths of the parts of the vector."""
@@ -171,6 +174,9 @@ class Layout:
             rows += self.timing.prior(parts["main"][2], parts["lag"][0] if self.effects.lag else None)
         elif self.effects.lag:
             rows.append((parts["lag"][0] - math.log(LAG_CENTRE)) / LAG_PRIOR_STD)
+        if self.instant is not None:
+            lag = math.exp(parts["lag"][0]) if self.effects.lag else 0.0
+            rows.append(self.instant.distance(parts["main"][2], lag * self.period_s))
         rows += [value / BEND_PRIOR_STD for value in parts.get("bend", [])]
         for value in parts.get("motion", []):
             if self.motion is None:

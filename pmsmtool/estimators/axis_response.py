@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.output_error import AxisModel, bend, recursion, respond
+from pmsmtool.estimators.output_error import AxisModel, Pulses, bend, recursion, respond
 from pmsmtool.estimators.refusals import refuse
 
 Vector = NDArray[np.float64]
@@ -20,6 +20,8 @@ SLOW_FRACTION = 4.0
 """Injection frequency over the highest frequency that is projected out."""
 PASSES = 2
 """Passes of the small non-linear terms; each shrinks what is left by R T/L, the bend or K (h T_s)^2/L."""
+SMALLEST_SHARE = 1e-4
+"""Shortest pulse (T_s): a command of zero has a height, too."""
 EDGE_SHARE = 0.75
 """Weight of the nearer sample at the edge where a leg's error depends on its current: a quarter of a period away."""
 
@@ -69,6 +71,8 @@ class Shot:
         Control period (s).
     error : VoltageError or None
         Inverter error from the DC levels.
+    pulse_v : float
+        Voltage of the bridge's pulses along the axis (V); infinite: the mean voltage is taken for all of the period.
     """
 
     u_v: Vector
@@ -77,6 +81,15 @@ class Shot:
     half_period: int
     period_s: float
     error: VoltageError | None = None
+    pulse_v: float = math.inf
+
+    @property
+    def pulses(self) -> Pulses | None:
+        """The commands as the bridge applies them, None where its pulses are not known."""
+        if math.isinf(self.pulse_v):
+            return None
+        share = np.clip(np.abs(self.u_v) / self.pulse_v, SMALLEST_SHARE, 1.0)
+        return Pulses(share, self.u_v / share, -float(np.mean(self.u_v)))
 
     def slow_basis(self) -> NDArray[np.float64]:
         """Orthonormal cosines slower than the injection, shape (n - SKIP_SAMPLES, j)."""
@@ -106,8 +119,8 @@ def simulate(responses: Sequence[Response], shot: Shot, slow: NDArray[np.float64
     """
     T_s = shot.period_s
     count = len(shot.i_a) - SKIP_SAMPLES
-    command = shot.u_v - np.mean(shot.u_v)
-    linear = np.stack([respond(response.model, command, T_s, response.start_a) for response in responses])
+    command, pulses = shot.u_v - np.mean(shot.u_v), shot.pulses
+    linear = np.stack([respond(response.model, command, T_s, response.start_a, pulses) for response in responses])
     centre_a = float(np.mean(shot.i_a))
     c_2, c_3, motion, R = (
         np.array(values)[:, None]

@@ -30,6 +30,8 @@ COVERAGE_FACTOR = 1.959963984540054
 SENSOR_GAIN_TOLERANCE = 0.01
 """Default tolerance of the current and the voltage scale (95 % half width, relative)."""
 
+ENCODER_LATENCY_S = 2e-6
+"""Default tolerance of the encoder angle's age (95 %, s): reading and transfer beyond what the drive compensates."""
 BRIDGE_THRESHOLD_V = 0.35
 """Diode minus switch threshold, one standard deviation (V): IGBT data sheets put either at 0.3 to 1.2 V."""
 
@@ -57,6 +59,8 @@ class SensorTolerance:
         Standard deviation of diode minus switch threshold (V; 0 for a bridge of MOSFETs) and the DC link it acts on: a
         conducting leg swings by U_dc + V_diode - V_switch, which no experiment tells from a voltage gain. It is a model
         error that differs from drive to drive, so it belongs to the statistical part. Infinite link: not counted.
+    encoder_latency_s : float
+        Age of the encoder's angle at the period's start (s): looks like a late current sample.
     current_scale, voltage_scale : float
         True over shown, where an instrument said so; the gains are then the instrument's tolerances.
     """
@@ -67,6 +71,7 @@ class SensorTolerance:
     device_share_max: float = 0.3
     bridge_threshold_v: float = BRIDGE_THRESHOLD_V
     U_dc_v: float = math.inf
+    encoder_latency_s: float = ENCODER_LATENCY_S
     current_scale: float = 1.0
     voltage_scale: float = 1.0
 

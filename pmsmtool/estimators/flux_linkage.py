@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,14 +29,16 @@ from pmsmtool.estimators.flux_linkage_rows import STAGE, Corrected, check_speeds
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.sampling_instant import CoastingPairs, Sampling, ShownInstant, shown_instant
 from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
 Vector = NDArray[np.float64]
 
-RELATIVE_FLOOR = 5e-5
-"""Relative model floor of psi, one standard deviation."""
+RELATIVE_FLOOR = 1e-4
+"""Relative model floor of psi, one standard deviation: 24 drives with samples in time are 0.020 % off in the
+mean beside the thresholds of their bridges, those of 24 and 48 V 0.008 % (largest 0.014 %)."""
 OFFSET_FLOOR_RAD = 1e-4
 OFFSET_LIMIT_RAD = math.radians(30.0)
 """Offset above which the speed run cannot have been what it claims; the coarse offset comes first."""
@@ -53,6 +55,8 @@ LAG_STD = 0.03
 D_SHARE_DOUBT = 0.07
 """Standard deviation of the d part of the inverter's error at a q current, of its q part (measured on 11 drives: 0.01
 to 0.13, rms 0.068, always of the sign that makes L_q too large)."""
+INSTANT_STEP = 0.01
+"""Step of the derivative by the sampling instant (T_s)."""
 LEVEL_RATIO = 1.2
 """Ratio of d currents above which they are different levels."""
 
@@ -85,6 +89,8 @@ class FluxResult:
         extrapolated.
     omega_rad_s, residual_wb : ndarray, shape (n,)
         Electrical speed of every pair of d currents, and what its flux linkage is off (rad/s, Wb).
+    shown : ShownInstant or None
+        What the d voltage says about the instant at which currents are sampled; None without a modulation.
     """
 
     psi_f: Estimate
@@ -100,6 +106,7 @@ class FluxResult:
     low_i_d_a: float
     omega_rad_s: Vector
     residual_wb: Vector
+    shown: ShownInstant | None = None
 
 
 def estimate_flux_linkage(
@@ -110,6 +117,7 @@ def estimate_flux_linkage(
     inverter: InverterCurve | None = None,
     modulation: Modulation | None = None,
     lag_s: float = 0.0,
+    sampling: Sampling | None = None,
     tolerance: SensorTolerance | None = None,
     T_ref_c: float = 20.0,
     alpha_psi_per_k: float = -0.0012,
@@ -132,6 +140,8 @@ def estimate_flux_linkage(
         What the ripple at the switching edges makes of that error; None: nothing.
     lag_s : float
         Delay of the drive's speed behind the rotor's while it accelerates: 2/omega of its estimate's double pole (s).
+    sampling : Sampling or None
+        When and how the currents are sampled, as the inductances' fit has it; None: at the period's start.
     tolerance : SensorTolerance
         Declared sensor tolerances.
     T_ref_c, alpha_psi_per_k : float
@@ -145,7 +155,7 @@ def estimate_flux_linkage(
     tolerance = tolerance or SensorTolerance()
     pairs = pairs_of(speeds)
     check_speeds(speeds, pairs)
-    rows = corrected(speeds, R_ohm, period_s, inverter, modulation, lag_s)
+    rows = corrected(speeds, R_ohm, period_s, inverter, modulation, lag_s, sampling)
     d_fit, d_std, d_dof = _fit_d(rows)
     even = _fit_even(rows, pairs)
     x1, x2 = even.flux_wb, float(d_fit[1])
@@ -160,11 +170,20 @@ def estimate_flux_linkage(
             likely="wrong encoder offset, direction or pole pairs",
             hint="identify poles and encoder first",
         )
+    shown, per_instant = None, 0.0
+    if modulation is not None:
+        coasting = CoastingPairs(rows.w, rows.u_d, rows.i_d, rows.i_q, speeds["u_d_v"], speeds["u_q_v"], pairs)
+        shown = shown_instant(coasting, R_ohm, psi, modulation, float(speeds.meta.get("delay_periods", 1.5)) - 0.5)
+        if sampling is not None:
+            later = replace(sampling, instant_s=sampling.instant_s + INSTANT_STEP * period_s)
+            moved = corrected(speeds, R_ohm, period_s, inverter, modulation, lag_s, later)
+            per_instant = even.change(moved.u_q - rows.u_q) / (INSTANT_STEP * period_s)
     model_std = math.hypot(
         RIPPLE_DOUBT * even.change(rows.ripple_q_v),
         CURVE_DOUBT * even.change(rows.curve_q_v),
         CURVATURE_DOUBT * (even.low_wb - even.flux_wb),
         LAG_STD * lag_s * even.change(psi * rows.acceleration_rad_s2),
+        0.0 if shown is None else per_instant * shown.std_s,
         RELATIVE_FLOOR * psi,
         tolerance.voltage_scale_std * psi,
     )
@@ -174,7 +193,7 @@ def estimate_flux_linkage(
     measured = Estimate(
         value=psi,
         std=std,
-        systematic=tolerance.flux * psi,
+        systematic=math.hypot(tolerance.flux * psi, per_instant * tolerance.encoder_latency_s),
         unit="Wb",
         n=len(rows.w),
         chi2=math.nan,
@@ -220,6 +239,7 @@ def estimate_flux_linkage(
         low_i_d_a=even.low_i_d_a,
         omega_rad_s=even.w,
         residual_wb=even.residual_wb,
+        shown=shown,
     )
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.sampling_instant import Sampling, course_s2, sampled_ripple
 from pmsmtool.estimators.switching_ripple import Modulation, rippled_error_dq_v
 from pmsmtool.trace import Trace
 
@@ -48,7 +49,7 @@ class Corrected:
     u_d, u_q : ndarray, shape (n,)
         Voltage of the flux linkages (V).
     ripple_q_v, curve_q_v : ndarray, shape (n,)
-        q parts of the error that was taken off: of the ripple, and of the mean current (V).
+        q parts of the error that was taken off: of the ripple, and of the sampled current (V).
     is_d : ndarray of bool, shape (n,)
         Rows with a d current.
     """
@@ -86,17 +87,39 @@ def corrected(
     inverter: InverterCurve | None,
     modulation: Modulation | None,
     lag_s: float,
+    sampling: Sampling | None = None,
 ) -> Corrected:
-    """Take off what is known: lag of the speed, resistance, inverter error, and sampling."""
+    """Take off what is known: lag of the speed, resistance, inverter error, and sampling.
+
+    Resistance and error follow the mean current and the one at the period's start; the flux linkages are those of the
+    start, at which the rotor's angle is read. Without a ``sampling`` the samples are taken for those of the start.
+    """
     i_d, i_q = speeds["i_d_a"], speeds["i_q_a"]
     acceleration = (speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / speeds["half_s"]
     w = speeds["omega_e_rad_s"] + (lag_s + DELAY_PERIODS * period_s) * acceleration
     voltage = (speeds["u_d_v"], speeds["u_q_v"])
-    plain = rippled = np.zeros((2, len(w)))
+    mean = np.stack([i_d, i_q])
+    at_start = np.zeros((2, len(w)))
+    course_wb = np.zeros_like(w)
+    flux = float(np.median(voltage[1] / w))
+    # the drive turns the voltage by the delay times a speed that is old
+    turned_rad = DELAY_PERIODS * period_s * lag_s * acceleration
+    if modulation is not None:
+        sampling = sampling or Sampling()
+        course = 0.5 * w**2 * flux * course_s2(sampling, period_s)
+        course_at_start = 0.5 * w**2 * flux * course_s2(Sampling(), period_s)
+        course_wb = course - course_at_start
+        mean = mean - sampled_ripple(voltage, (i_d, i_q), modulation, sampling)
+        mean[0] -= course / modulation.L_h[0]
+        at_start = sampled_ripple(voltage, (i_d, i_q), modulation, Sampling())
+        at_start[0] += course_at_start / modulation.L_h[0]
+    plain = shifted = rippled = np.zeros((2, len(w)))
     if inverter is not None:
-        plain = rippled = mean_inverter_error(inverter, (i_d, i_q))
+        plain = shifted = rippled = mean_inverter_error(inverter, (i_d, i_q))
         if modulation is not None:
-            rippled = mean_inverter_error(inverter, (i_d, i_q), voltage, modulation)
+            start = mean + at_start
+            shifted = mean_inverter_error(inverter, (start[0], start[1]))
+            rippled = mean_inverter_error(inverter, (start[0], start[1]), voltage, modulation)
     x = 0.5 * w * period_s
     correction = x / np.sin(x)
     return Corrected(
@@ -104,9 +127,9 @@ def corrected(
         acceleration_rad_s2=acceleration,
         i_d=i_d,
         i_q=i_q,
-        u_d=(voltage[0] - rippled[0] - R_ohm * i_d) * correction,
-        u_q=(voltage[1] - rippled[1] - R_ohm * i_q) * correction,
-        ripple_q_v=rippled[1] - plain[1],
+        u_d=(voltage[0] - rippled[0] - R_ohm * mean[0]) * correction + turned_rad * w * flux,
+        u_q=(voltage[1] - rippled[1] - R_ohm * mean[1]) * correction + w * course_wb,
+        ripple_q_v=rippled[1] - shifted[1],
         curve_q_v=plain[1],
         is_d=np.abs(i_q) < Q_SHARE * np.abs(i_d),
     )

@@ -24,6 +24,8 @@ from pmsmtool.estimators.estimate import SensorTolerance, Verdict, chi2_gate, co
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.sampling_instant import Sampling, ShownInstant
+from pmsmtool.estimators.switching_ripple import LEG_ANGLES
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
@@ -88,6 +90,10 @@ class InductanceResult:
         Ljung-Box p-value of the residual of each axis.
     verdict : Verdict
         ``warn`` above the chi-square limit or when frequency dependent.
+    sampling : Sampling or None
+        When and how currents are sampled, by the best model; None where the flux run did not show the instant.
+    samplings : tuple of (float, Sampling)
+        The same by every model that counts, with its weight.
     """
 
     L_d: Estimate
@@ -101,6 +107,8 @@ class InductanceResult:
     axis_angle_std_rad: float
     whiteness: Mapping[str, float]
     verdict: Verdict
+    sampling: Sampling | None = None
+    samplings: tuple[tuple[float, Sampling], ...] = ()
 
 
 def estimate_inductances(
@@ -112,6 +120,8 @@ def estimate_inductances(
     frame: FrameAhead | None = None,
     inverter: InverterCurve | None = None,
     motion: Motion | None = None,
+    instant: ShownInstant | None = None,
+    U_dc_v: float = math.inf,
     tolerance: SensorTolerance | None = None,
 ) -> InductanceResult:
     """Incremental inductances from square-wave shots.
@@ -133,6 +143,10 @@ def estimate_inductances(
         Voltage error from the DC levels.
     motion : Motion or None
         How the rotor follows an injection on q, from the flux run and the pushes; None: free in the fit.
+    instant : ShownInstant or None
+        What the flux run shows of the instant at which currents are sampled.
+    U_dc_v : float
+        DC link (V): height of the bridge's pulses; infinite: the mean voltage is taken for all of a period.
     tolerance : SensorTolerance
         Declared sensor tolerances.
 
@@ -148,7 +162,8 @@ def estimate_inductances(
     traces = {"d": d_shots, "q": q_shots}
     for axis, records in traces.items():
         stage = f"inductance, {axis} axis"
-        shots[axis] = sorted((_shot(record, axis, inverter, stage) for record in records), key=lambda s: s.half_period)
+        found = (_shot(record, axis, inverter, U_dc_v, stage) for record in records)
+        shots[axis] = sorted(found, key=lambda shot: shot.half_period)
         fits[axis] = fit_axis(
             shots[axis],
             noise.sigma_a,
@@ -156,6 +171,7 @@ def estimate_inductances(
             torque=axis == "q",
             motion=motion,
             other=fits.get("d"),
+            instant=instant,
         )
         condition_gate(fits[axis].condition, f"L_{axis} and the delay", stage)
         cross[axis] = _cross_response(shots[axis][0], fits[axis], noise.sigma_a)
@@ -190,7 +206,9 @@ def estimate_inductances(
                 tolerance.voltage_scale_std * values[axis],
                 _commutation_std(shots[axis]),
             ),
-            systematic=tolerance.impedance * values[axis],
+            systematic=math.hypot(
+                tolerance.impedance * values[axis], R_ohm * tolerance.encoder_latency_s * (instant is not None)
+            ),
             unit="H",
             n=fits[axis].n,
             chi2=fits[axis].chi2,
@@ -215,6 +233,11 @@ def estimate_inductances(
         axis_angle_std_rad=angle_std,
         whiteness={axis: min(ljung_box(residual) for residual in fit.residuals) for axis, fit in fits.items()},
         verdict=Verdict.WARN if warned else Verdict.PASS,
+        # the q axis was fitted with what the d axis says
+        sampling=None if instant is None else instant.sampling(fits["q"].delay, fits["q"].lag_s),
+        samplings=()
+        if instant is None
+        else tuple((weight, instant.sampling(delay, lag)) for weight, delay, lag in fits["q"].places),
     )
 
 
@@ -249,7 +272,7 @@ def bare_shot(trace: Trace, axis: str) -> Shot:
     return Shot(*signals, int(trace.meta["half_period"]), trace.period_s)
 
 
-def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, stage: str) -> Shot:
+def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, U_dc_v: float, stage: str) -> Shot:
     half_period = int(trace.meta["half_period"])
     if len(trace) < SKIP_SAMPLES + 2 * half_period * MINIMUM_PERIODS:
         raise refuse(
@@ -268,7 +291,14 @@ def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, stage: str) -
         grid = np.linspace(float(np.min(i)) - margin, float(np.max(i)) + margin, CURVE_POINTS)
         frame = float(trace.meta["fixed_angle_rad"])
         error = VoltageError(grid, *inverter.along_axis(frame, axis, grid, float(np.mean(cross)), float(np.mean(i))))
-    return Shot(trace[f"u_{axis}_v"], i, cross, half_period, trace.period_s, error)
+    height_v = _pulse_height(float(trace.meta["fixed_angle_rad"]), axis, U_dc_v)
+    return Shot(trace[f"u_{axis}_v"], i, cross, half_period, trace.period_s, error, height_v)
+
+
+def _pulse_height(frame_rad: float, axis: str, U_dc_v: float) -> float:
+    """Mean voltage along an axis while the legs differ (V): a command u makes pulses of the share u over this."""
+    legs = np.cos(frame_rad + (0.0 if axis == "d" else 0.5 * math.pi) - LEG_ANGLES)
+    return U_dc_v / float(np.ptp(legs))
 
 
 def _check_rotor(theta_e: Vector, stage: str) -> None:

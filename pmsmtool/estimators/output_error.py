@@ -2,7 +2,9 @@
 
     L di/dt = u - v0 - R i,    tau dy/dt = i - y,    u(t) = v[k] on [t_k + D T_s, t_k+1 + D T_s)
 
-sampled at t_k. Computation delay and sampling instant enter only through D, so one number covers both; with D = 1 and
+sampled at t_k. A bridge applies v[k] as two pulses around a quarter and three quarters of its period with nothing
+between them (``Pulses``): a sample that is late inside the zero vector sees no voltage, where a mean voltage would move
+it by u d T_s/L. Computation delay and sampling instant enter only through D, so one number covers both; with D = 1 and
 tau = 0 this is i[k+1] = a i[k] + (1 - a)/R (v[k-1] - v0), a = exp(-R T_s/L) (identification reference, 3.2 and its
 addendum). The model runs free: no measured current enters it.
 
@@ -25,6 +27,15 @@ BLOCK_LOSS = 7.0
 """Decay over one block of a slow pole (nepers): three decimal digits of the running sum."""
 FIRST_SAMPLE = 3
 """First sample that is modelled."""
+PULSE_CENTRES = (0.25, 0.75)
+PULSES_EACH = 0.5
+"""Middles of the two pulses in a period of centre-aligned modulation, and the part of the command that each carries."""
+WIDTH_NODES = np.cos(math.pi * (np.arange(5) + 0.5) / 5.0)
+WIDTHS_TO_POWERS = np.linalg.inv(np.vander(WIDTH_NODES, increasing=True))
+"""Widths in -1 ... 1 at which the effect of a pulse is calculated, and what makes a polynomial of it (measured: 1e-9 of
+the effect)."""
+LEAST_SPREAD = 1e-6
+"""Spread of the widths below which they are calculated one by one (1)."""
 SMALLEST_RATE = 1e-9
 """R T_s/L below which the limit of a pure inductance is used."""
 
@@ -47,6 +58,25 @@ class AxisModel:
     R_ohm: float
     delay: float
     lag_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pulses:
+    """The commands as the bridge applies them.
+
+    Attributes
+    ----------
+    share : ndarray, shape (n,)
+        Part of the period during which the command's two pulses stand (1).
+    height_v : ndarray, shape (n,)
+        Their voltage (V).
+    rest_v : float
+        Constant voltage beside them (V): minus the mean of the commands.
+    """
+
+    share: Vector
+    height_v: Vector
+    rest_v: float
 
 
 def recursion(pole: float, drive: Vector, start: float) -> Vector:
@@ -128,7 +158,9 @@ def _advance(model: AxisModel, h: float) -> tuple[float, float, float, float, fl
     return a, b, e, c, (1.0 - e - c) * conductance_ratio
 
 
-def respond(model: AxisModel, command: Vector, period_s: float, start_a: float) -> Vector:
+def respond(
+    model: AxisModel, command: Vector, period_s: float, start_a: float, pulses: Pulses | None = None
+) -> Vector:
     """Measured current from the first modelled sample on, shape (n - first + 1,), in equilibrium at ``start_a``.
 
     Parameters
@@ -141,7 +173,11 @@ def respond(model: AxisModel, command: Vector, period_s: float, start_a: float) 
         Control period (s).
     start_a : float
         Current and sensor output at the first modelled sample (A).
+    pulses : Pulses or None
+        How the bridge applies the commands; None: as their mean.
     """
+    if pulses is not None:
+        return _respond_to_pulses(model, pulses, period_s, start_a)
     early, late, fraction = acting_voltages(command, model.delay)
     a_1, b_1, e_1, c_1, d_1 = _advance(model, fraction * period_s)
     a_2, b_2, e_2, c_2, d_2 = _advance(model, (1.0 - fraction) * period_s)
@@ -152,6 +188,67 @@ def respond(model: AxisModel, command: Vector, period_s: float, start_a: float) 
     inside = a_1 * current[:-1] + b_1 * early
     forced = e_2 * (c_1 * current[:-1] + d_1 * early) + c_2 * inside + d_2 * late
     return recursion(e_1 * e_2, forced, start_a)
+
+
+def _respond_to_pulses(model: AxisModel, pulses: Pulses, period_s: float, start_a: float) -> Vector:
+    """As :func:`respond`, every edge of a pulse at its own time."""
+    early_v, late_v, fraction = acting_voltages(pulses.height_v, model.delay)
+    early_w, late_w, _ = acting_voltages(pulses.share, model.delay)
+    begun = 1.0 - fraction  # of the early command's period, at the sample
+    a, b, e, c, d = _advance(model, period_s)
+    forced = np.full((2, len(early_v)), pulses.rest_v) * np.array([[b], [d]])
+    for height, share, gone in ((early_v, early_w, begun), (late_v, late_w, begun - 1.0)):
+        forced += height * _charged(model, share, gone, period_s)
+    current = recursion(a, forced[0], start_a)
+    if model.lag_s <= 0.0:
+        return current
+    return recursion(e, c * current[:-1] + forced[1], start_a)
+
+
+def _charged(model: AxisModel, share: Vector, gone: float, period_s: float) -> NDArray[np.float64]:
+    """Current and sensor output at an interval's end per volt of two pulses, shape (2, n).
+
+    The interval begins ``gone`` periods after the pulses' own period. What a pulse does depends smoothly on its width
+    as long as it lies inside the interval whole: a polynomial through a few widths then serves all of them.
+    """
+    low, high = float(np.min(share)), float(np.max(share))
+    reach = 0.5 * PULSES_EACH * high
+    whole = [0.0 <= centre - reach - gone and centre + reach - gone <= 1.0 for centre in PULSE_CENTRES]
+    outside = [centre + reach - gone <= 0.0 or centre - reach - gone >= 1.0 for centre in PULSE_CENTRES]
+    if all(outside):
+        return np.zeros((2, len(share)))
+    if not all(inside or out for inside, out in zip(whole, outside, strict=True)) or high - low < LEAST_SPREAD:
+        return _charged_exactly(model, share, gone, period_s)
+    middle, half = 0.5 * (high + low), 0.5 * (high - low)
+    coefficients = WIDTHS_TO_POWERS @ _charged_exactly(model, middle + half * WIDTH_NODES, gone, period_s).T
+    x = (share - middle) / half
+    out = np.tile(coefficients[-1][:, None], (1, len(x)))
+    for row in coefficients[-2::-1]:
+        out *= x
+        out += row[:, None]
+    return out
+
+
+def _charged_exactly(model: AxisModel, share: Vector, gone: float, period_s: float) -> NDArray[np.float64]:
+    out = np.zeros((2, len(share)))
+    for centre in PULSE_CENTRES:
+        # from the sample on, in periods: the interval is 0 ... 1
+        first, last = centre - 0.5 * PULSES_EACH * share - gone, centre + 0.5 * PULSES_EACH * share - gone
+        out += _stepped(model, (1.0 - np.clip(first, 0.0, 1.0)) * period_s)
+        out -= _stepped(model, (1.0 - np.clip(last, 0.0, 1.0)) * period_s)
+    return out
+
+
+def _stepped(model: AxisModel, t_s: Vector) -> NDArray[np.float64]:
+    """Current and sensor output a time after a voltage of 1 V began, shape (2, n)."""
+    rate = model.R_ohm / model.L_h
+    current = -np.expm1(-rate * t_s) / model.R_ohm if abs(rate) * t_s.max() > SMALLEST_RATE else t_s / model.L_h
+    if model.lag_s <= 0.0:
+        return np.stack([current, current])
+    mu = 1.0 / model.lag_s
+    behind = -np.expm1(-mu * t_s) / mu
+    # i and the lag's own exponential make y: (mu i - rate of a pure lag) / (mu - rate)
+    return np.stack([current, (mu * current - mu * behind / model.L_h) / (mu - rate)])
 
 
 def bend(

@@ -73,6 +73,11 @@ def phases_of(d: Vector, q: Vector, theta_rad: Vector) -> NDArray[np.float64]:
     return np.asarray(np.cos(angle) * d - np.sin(angle) * q)
 
 
+def duties(v: NDArray[np.float64], U_dc_v: float) -> NDArray[np.float64]:
+    """Duties of the legs for phase voltages, shape (3, n), both zero vectors of one length."""
+    return np.asarray(np.clip(0.5 + (v - 0.5 * (np.max(v, axis=0) + np.min(v, axis=0))) / U_dc_v, 0.0, 1.0))
+
+
 def edge_curve(curve: InverterCurve, modulation: Modulation) -> InverterCurve:
     """Return the curve over the current at the edge, with its course below the smallest level.
 
@@ -135,7 +140,7 @@ def rippled_error_dq_v(
     curve : InverterCurve
         Error of one phase as standstill shows it.
     current, voltage : (ndarray, ndarray)
-        d and q values (A, V), shape (n,).
+        d and q values (A, V), shape (n,): the current at the period's start.
     theta_rad : ndarray, shape (n,)
         Angle of the frame (rad electrical).
     modulation : Modulation
@@ -143,8 +148,7 @@ def rippled_error_dq_v(
     """
     U_dc, T_s = modulation.U_dc_v, modulation.period_s
     v, i = phases_of(*voltage, theta_rad), phases_of(*current, theta_rad)
-    duty = np.clip(0.5 + (v - 0.5 * (np.max(v, axis=0) + np.min(v, axis=0))) / U_dc, 0.0, 1.0)
-    edge = (1.0 - duty) * 0.5 * T_s
+    edge = (1.0 - duties(v, U_dc)) * 0.5 * T_s
     sharp = edge_curve(curve, modulation)
 
     def late(i_own: NDArray[np.float64]) -> NDArray[np.float64]:

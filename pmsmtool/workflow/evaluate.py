@@ -23,6 +23,7 @@ from pmsmtool.estimators.mechanics import MechanicsResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases
 from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance, settled_levels
+from pmsmtool.estimators.sampling_instant import Sampling, ShownInstant
 from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
@@ -30,6 +31,7 @@ from pmsmtool.trace import Trace
 from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_traces
 from pmsmtool.workflow.half_frequency import resistance_at_two_frequencies
+from pmsmtool.workflow.sampling_stage import resistance_as_sampled
 
 RESONANCE = ("resonance_hz", "antiresonance_hz", "resonance_zeta")
 """Keys of a second mass: a response without one takes them out of the machine file."""
@@ -69,6 +71,11 @@ class Evaluation:
             return self.encoder.offset
         fine = self.flux.frame_offset
         return replace(fine, value=wrapped(self.encoder.offset.value + fine.value))
+
+    @property
+    def shown(self) -> ShownInstant | None:
+        """What the speed run shows of the instant at which currents are sampled."""
+        return None if self.flux is None else self.flux.shown
 
     @property
     def checks(self) -> list[CrossCheck]:
@@ -168,7 +175,8 @@ def evaluate(
         flux = flux_of(traces, result.resistance, period_s, T_ref_c, tolerance)
         result = replace(result, flux=flux)
     if result.resistance is not None and result.encoder is not None and any(k.startswith("square_d") for k in traces):
-        result = replace(result, inductance=inductance_of(traces, result, tolerance))
+        result = replace(result, inductance=inductance_of(traces, result, tolerance, U_dc_v))
+        result = as_sampled(traces, result, period_s, T_ref_c, tolerance)
     flux_map = map_stage.flux_map_of(traces, result, tolerance)
     if flux_map is not None:
         result = replace(result, flux_map=flux_map, map_estimates=map_stage.map_estimates(result, flux_map, traces))
@@ -194,31 +202,60 @@ def resistance_of(
     return replace(result, R_s=replace(result.R_s, fallback=fallback))
 
 
+def as_sampled(
+    traces: Mapping[str, Trace], result: Evaluation, period_s: float, T_ref_c: float, tolerance: SensorTolerance
+) -> Evaluation:
+    """Return resistance and flux linkage for the mean current, once the inductances and the instant are known."""
+    resistance, flux, inductance = result.resistance, result.flux, result.inductance
+    assert resistance is not None and inductance is not None
+    if flux is None or flux.shown is None or inductance.sampling is None:
+        return result
+    L = (inductance.L_d.value, inductance.L_q.value)
+    modulation = modulation_of(traces["speeds"], resistance, L, period_s)
+    assert modulation is not None
+    copper = Copper(T_ref_c, COPPER_ALPHA_PER_K)
+    resistance = resistance_as_sampled(resistance, inductance, flux.shown, modulation, copper, tolerance)
+    again = flux_of(traces, resistance, period_s, T_ref_c, tolerance, L, inductance.sampling)
+    return replace(result, resistance=resistance, flux=replace(again, shown=flux.shown))
+
+
+def modulation_of(
+    speeds: Trace, resistance: ResistanceResult, L_h: tuple[float, float], period_s: float
+) -> Modulation | None:
+    """Return what the ripple of the speed run depends on; None where DC link or inductances are not known."""
+    U_dc_v = float(speeds.meta.get("U_dc_v", math.inf))
+    if not all(L > 0.0 for L in L_h) or not math.isfinite(U_dc_v):
+        return None
+    return Modulation(U_dc_v, L_h, period_s, max(0.0, resistance.V_dead_v) * period_s / U_dc_v)
+
+
 def flux_of(
     traces: Mapping[str, Trace],
     resistance: ResistanceResult,
     period_s: float,
     T_ref_c: float,
     tolerance: SensorTolerance | None,
+    L_h: tuple[float, float] | None = None,
+    sampling: Sampling | None = None,
 ) -> FluxResult:
-    """Return the flux linkage, with the resistance at the temperature of the speed run."""
+    """Return the flux linkage, with the resistance at the temperature of the speed run.
+
+    Before the inductances are known (H), rough ones from the ripple serve, and currents count as sampled in time.
+    """
     speeds = traces["speeds"]
     R = resistance.R_measured
     T = float(np.mean(speeds["T_winding_c"]))
     warmer = COPPER_ALPHA_PER_K * (T - R.T_c) if math.isfinite(T) and math.isfinite(R.T_c) else 0.0
-    modulation = None
-    rough = [_rough_inductance(traces, axis) for axis in "dq"]
-    U_dc_v = float(speeds.meta.get("U_dc_v", math.inf))
-    if all(L > 0.0 for L in rough) and math.isfinite(U_dc_v):
-        dead_time = max(0.0, resistance.V_dead_v) * period_s / U_dc_v
-        modulation = Modulation(U_dc_v, (rough[0], rough[1]), period_s, dead_time)
     return estimate_flux_linkage(
         speeds,
         R.value * (1.0 + warmer),
         period_s=period_s,
         inverter=resistance.curve,
-        modulation=modulation,
+        modulation=modulation_of(
+            speeds, resistance, L_h or (_rough_inductance(traces, "d"), _rough_inductance(traces, "q")), period_s
+        ),
         lag_s=float(speeds.meta.get("speed_lag_s", 0.0)),
+        sampling=sampling,
         tolerance=tolerance,
         T_ref_c=T_ref_c,
     )
@@ -231,7 +268,7 @@ def _rough_inductance(traces: Mapping[str, Trace], axis: str) -> float:
 
 
 def inductance_of(
-    traces: Mapping[str, Trace], result: Evaluation, tolerance: SensorTolerance | None = None
+    traces: Mapping[str, Trace], result: Evaluation, tolerance: SensorTolerance | None = None, U_dc_v: float = math.inf
 ) -> InductanceResult:
     """Return the incremental inductances, with the frame's angle from the encoder."""
     assert result.resistance is not None and result.encoder is not None
@@ -250,6 +287,8 @@ def inductance_of(
         frame=frame,
         inverter=result.resistance.curve,
         motion=None if result.flux is None else motion_of(traces, result.flux.psi_measured.value, shots["q"]),
+        instant=None if result.flux is None else result.flux.shown,
+        U_dc_v=U_dc_v,
         tolerance=tolerance,
     )
 

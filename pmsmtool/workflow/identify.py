@@ -44,6 +44,7 @@ from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
 from pmsmtool.workflow.limits import Limits, require_speed
 from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Measurement, steps_of
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
+from pmsmtool.workflow.sampling_stage import timing_estimates, timing_warnings
 
 MACHINE = "machine.toml"
 NAMEPLATE = "nameplate.toml"
@@ -271,6 +272,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         tolerance=request.tolerance,
     )
     parts = half_frequency.split_estimates(evaluation.split, nameplate.inverter.U_dc_v, request.tolerance)
+    timing = timing_estimates(evaluation.inductance, evaluation.shown, request.tolerance)
     conditions = _conditions(evaluation, request) | half_frequency.split_conditions(evaluation.split, parts)
     machine = machine_of(evaluation, nameplate, conditions)
     text = dump_machine_file(machine)
@@ -291,7 +293,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         "pass" if all(line.ok for line in acceptance) else "fail",
         0.0,
         values=[
-            *(value_facts(name, estimate) for name, estimate in (found | parts).items()),
+            *(value_facts(name, estimate) for name, estimate in (found | parts | timing).items()),
             *map(check_facts, evaluation.checks),
         ],
         acceptance=acceptance,
@@ -426,6 +428,7 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
             for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
             if error > 0.0
         ]
+    lines += timing_warnings(evaluation.inductance, evaluation.shown)
     lines += [f"{check.name} {check.verdict}" for check in evaluation.checks if not check.agrees]
     if evaluation.pairs is not None and not evaluation.pairs.judged:
         lines.append("the phases were not compared: the rotor did not come to rest on the three pairs")

@@ -1,0 +1,89 @@
+"""What the instant at which currents are sampled does to the other estimates of a run, and how it is told."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.inductance import InductanceResult
+from pmsmtool.estimators.resistance import Copper, ResistanceResult, normalised
+from pmsmtool.estimators.sampling_instant import ShownInstant, standstill_instant_s
+from pmsmtool.estimators.switching_ripple import Modulation
+from pmsmtool.machine.parameters import Estimate
+
+TOLD_PERIODS = 0.03
+"""Sampling instant from which on a reader is told that an old encoder angle looks the same (T_s)."""
+
+
+def resistance_as_sampled(
+    resistance: ResistanceResult,
+    inductance: InductanceResult,
+    shown: ShownInstant,
+    modulation: Modulation,
+    copper: Copper,
+    tolerance: SensorTolerance,
+) -> ResistanceResult:
+    """Return R for the mean current: what is sampled late in the zero vector is less by R t/L of it.
+
+    Parameters
+    ----------
+    resistance : ResistanceResult
+        From the sampled currents.
+    inductance, shown : InductanceResult, ShownInstant
+        When and how currents are sampled by all models that count, and how well that is known.
+    modulation : Modulation
+        Link, inductances, period and dead time.
+    copper : Copper
+        Temperature coefficient and reference.
+    tolerance : SensorTolerance
+        Declared sensor tolerances.
+    """
+    measured = resistance.R_measured
+    rate = measured.value / modulation.L_h[0]
+    weights = np.array([weight for weight, _ in inductance.samplings])
+    late = np.array([standstill_instant_s(sampling, modulation) for _, sampling in inductance.samplings])
+    mean_s = float(np.average(late, weights=weights))
+    instant_std_s = math.hypot(shown.std_s, math.sqrt(float(np.average((late - mean_s) ** 2, weights=weights))))
+    value = measured.value / (1.0 + rate * mean_s)
+    at_mean = replace(
+        measured,
+        value=value,
+        std=math.hypot(measured.std, value * rate * instant_std_s),
+        systematic=math.hypot(measured.systematic, value * rate * tolerance.encoder_latency_s),
+    )
+    normal = replace(normalised(at_mean, copper, tolerance), fallback=resistance.R_s.fallback)
+    return replace(resistance, R_measured=at_mean, R_s=normal)
+
+
+def timing_estimates(
+    inductance: InductanceResult | None, shown: ShownInstant | None, tolerance: SensorTolerance
+) -> dict[str, Estimate]:
+    """Return sampling instant and lag of the current sensors (s), by their names in the machine file."""
+    if inductance is None or inductance.sampling is None or shown is None:
+        return {}
+    return {
+        "sampling_instant_s": Estimate(
+            inductance.sampling.instant_s,
+            shown.std_s,
+            tolerance.encoder_latency_s,
+            "s",
+            method="d voltage of a coasting machine, square waves",
+        ),
+        "current_lag_s": Estimate(
+            inductance.sampling.lag_s, shown.std_s, tolerance.encoder_latency_s, "s", method="square waves"
+        ),
+    }
+
+
+def timing_warnings(inductance: InductanceResult | None, shown: ShownInstant | None) -> list[str]:
+    """Return what a reader should know about the instant."""
+    sampling = None if inductance is None else inductance.sampling
+    if sampling is None or shown is None or abs(sampling.instant_s) < TOLD_PERIODS * shown.period_s:
+        return []
+    return [
+        f"the currents are sampled {1e6 * sampling.instant_s:+.2g} us beside the middle of the zero vector, or the "
+        "encoder's angle is that old: both look the same, and values are corrected for a late sample"
+    ]
