@@ -30,6 +30,7 @@ FIRST_SAMPLE = 3
 PULSE_CENTRES = (0.25, 0.75)
 PULSES_EACH = 0.5
 """Middles of the two pulses in a period of centre-aligned modulation, and the part of the command that each carries."""
+PULSE_EDGES = np.array([[c, 0.5 * side * PULSES_EACH] for c in PULSE_CENTRES for side in (-1.0, 1.0)])
 WIDTH_NODES = np.cos(math.pi * (np.arange(5) + 0.5) / 5.0)
 WIDTHS_TO_POWERS = np.linalg.inv(np.vander(WIDTH_NODES, increasing=True))
 """Widths in -1 ... 1 at which the effect of a pulse is calculated, and what makes a polynomial of it (measured: 1e-9 of
@@ -230,25 +231,25 @@ def _charged(model: AxisModel, share: Vector, gone: float, period_s: float) -> N
 
 
 def _charged_exactly(model: AxisModel, share: Vector, gone: float, period_s: float) -> NDArray[np.float64]:
-    out = np.zeros((2, len(share)))
-    for centre in PULSE_CENTRES:
-        # from the sample on, in periods: the interval is 0 ... 1
-        first, last = centre - 0.5 * PULSES_EACH * share - gone, centre + 0.5 * PULSES_EACH * share - gone
-        out += _stepped(model, (1.0 - np.clip(first, 0.0, 1.0)) * period_s)
-        out -= _stepped(model, (1.0 - np.clip(last, 0.0, 1.0)) * period_s)
-    return out
+    # rising and falling edges from the sample on, in periods: the interval is 0 ... 1
+    edges = PULSE_EDGES[:, :1] + PULSE_EDGES[:, 1:] * share - gone
+    risen = _stepped(model, (1.0 - np.clip(edges, 0.0, 1.0)) * period_s)
+    return np.asarray(risen[:, 0] - risen[:, 1] + risen[:, 2] - risen[:, 3])
 
 
-def _stepped(model: AxisModel, t_s: Vector) -> NDArray[np.float64]:
-    """Current and sensor output a time after a voltage of 1 V began, shape (2, n)."""
+def _stepped(model: AxisModel, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Current and sensor output a time after a voltage of 1 V began, shape (2, ...)."""
+    out = np.empty((2, *t_s.shape))
     rate = model.R_ohm / model.L_h
-    current = -np.expm1(-rate * t_s) / model.R_ohm if abs(rate) * t_s.max() > SMALLEST_RATE else t_s / model.L_h
+    slow = abs(rate) * float(np.max(t_s)) <= SMALLEST_RATE
+    out[0] = t_s / model.L_h if slow else -np.expm1(-rate * t_s) / model.R_ohm
     if model.lag_s <= 0.0:
-        return np.stack([current, current])
+        out[1] = out[0]
+        return out
     mu = 1.0 / model.lag_s
-    behind = -np.expm1(-mu * t_s) / mu
-    # i and the lag's own exponential make y: (mu i - rate of a pure lag) / (mu - rate)
-    return np.stack([current, (mu * current - mu * behind / model.L_h) / (mu - rate)])
+    # i and the lag's own exponential make y
+    out[1] = (mu * out[0] + np.expm1(-mu * t_s) / model.L_h) / (mu - rate)
+    return out
 
 
 def bend(

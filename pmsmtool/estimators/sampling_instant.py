@@ -14,6 +14,7 @@ declared.
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ FLOOR_PERIODS = 0.0015
 """Standard deviation of the shown instant beside its noise (T_s); see :func:`shown_instant`."""
 RISE = 0.05
 """Slope of the prediction by the instant where it has none: a fit is not to run away there."""
-INSTANTS = tuple(np.linspace(-0.06, 0.24, 11))
+INSTANTS = tuple(float(x) for x in np.linspace(-0.06, 0.24, 11))
 LAGS = (0.0, 0.02, 0.05, 0.08, 0.12, 0.17, 0.23, 0.3, 0.4, 0.55, 0.75, 1.0, 1.5)
 """Grid of the prediction (T_s)."""
 
@@ -151,9 +152,17 @@ class ShownInstant:
     def distance(self, delay: float, lag_s: float) -> float:
         """Whitened distance of a delay (T_s) and a lag from what is shown."""
         place = self.sampling(delay, lag_s)
-        by_lag = [np.interp(place.instant_s / self.period_s, INSTANTS, column) for column in self.predicted_s.T]
-        predicted = float(np.interp(lag_s / self.period_s, LAGS, by_lag))
-        return (predicted - self.value_s) / self.std_s
+        j, x = _place(INSTANTS, place.instant_s / self.period_s)
+        k, y = _place(LAGS, lag_s / self.period_s)
+        (a, b), (c, d) = self.predicted_s[j : j + 2, k : k + 2].tolist()
+        predicted = (1.0 - x) * ((1.0 - y) * a + y * b) + x * ((1.0 - y) * c + y * d)
+        return float(predicted - self.value_s) / self.std_s
+
+
+def _place(grid: tuple[float, ...], value: float) -> tuple[int, float]:
+    """Interval of a grid and the place in it, 0 to 1; the ends beyond it."""
+    k = min(max(bisect.bisect_right(grid, value) - 1, 0), len(grid) - 2)
+    return k, min(max((value - grid[k]) / (grid[k + 1] - grid[k]), 0.0), 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
