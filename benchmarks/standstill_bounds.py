@@ -27,6 +27,7 @@ from pmsmtool.estimators.estimate import scaled_covariance
 from pmsmtool.estimators.flux_linkage import LEVEL_RATIO
 from pmsmtool.estimators.flux_linkage_rows import pairs_of
 from pmsmtool.estimators.resistance import FIT_FROM, MEAN_NOISE_FACTOR
+from pmsmtool.machine.parameters import InverterParameters
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, flux_of, inductance_of, resistance_of
 
@@ -112,7 +113,11 @@ def without_noise(traces: dict[str, Trace], found: Evaluation) -> dict[str, Trac
 
 
 def realisation(
-    clean: dict[str, Trace], found: Evaluation, coasting: Coasting, period_s: float, rng: np.random.Generator
+    clean: dict[str, Trace],
+    found: Evaluation,
+    coasting: Coasting,
+    inverter: InverterParameters,
+    rng: np.random.Generator,
 ) -> dict[str, float]:
     """Return the estimates of one realisation of the noise."""
     noisy = dict(clean)
@@ -125,13 +130,15 @@ def realisation(
     levels = clean["levels"]
     u = levels["u_d_v"] + level_noise(clean, found) * rng.standard_normal(len(levels))
     resistance = resistance_of(replace(levels, signals={**levels.signals, "u_d_v": u}), found.noise)
-    inductance = inductance_of(noisy, found)
-    assert found.resistance is not None
+    inductance = inductance_of(noisy, found, None, inverter.U_dc_v)
+    assert found.resistance is not None and found.inductance is not None
+    L = (found.inductance.L_d.value, found.inductance.L_q.value)
     speeds = clean["speeds"]
     u_q = speeds["u_q_v"].copy()
     u_q[coasting.pairs] += coasting.sigma_v[:, None] * rng.standard_normal(coasting.pairs.shape)
     rows = {**clean, "speeds": replace(speeds, signals={**speeds.signals, "u_q_v": u_q})}
-    psi = flux_of(rows, found.resistance, period_s, 20.0, None).psi_measured.value
+    flux = flux_of(rows, found.resistance, inverter.T_s, 20.0, None, L, found.inductance.sampling)
+    psi = flux.psi_measured.value
     values = {"R": resistance.R_measured.value, "L_d": inductance.L_d.value, "L_q": inductance.L_q.value}
     return {**values, "psi_f": psi, "psi_f, curvature free": psi}
 
@@ -147,7 +154,7 @@ def deviations_of(seed: int, realisations: int, keep: Path | None) -> dict[str, 
     bounds, clean = bounds_of(traces, found), without_noise(traces, found)
     coasting = coasting_of(traces["speeds"], found.flux.residual_wb)
     rng = np.random.default_rng([20261121, seed])
-    rows = [realisation(clean, found, coasting, nameplate.inverter.T_s, rng) for _ in range(realisations)]
+    rows = [realisation(clean, found, coasting, nameplate.inverter, rng) for _ in range(realisations)]
     free = math.sqrt(realisations / (realisations - 1))  # the mean is taken from the same values
     out = {}
     for name in ASKED:

@@ -36,7 +36,7 @@ from pmsmtool.trace import Trace
 
 Vector = NDArray[np.float64]
 
-RELATIVE_FLOOR = 1e-4
+RELATIVE_FLOOR = 7e-5
 """Relative model floor of psi, one standard deviation: 24 drives with samples in time are 0.020 % off in the
 mean beside the thresholds of their bridges, those of 24 and 48 V 0.008 % (largest 0.014 %)."""
 OFFSET_FLOOR_RAD = 1e-4
@@ -55,6 +55,9 @@ LAG_STD = 0.03
 D_SHARE_DOUBT = 0.07
 """Standard deviation of the d part of the inverter's error at a q current, of its q part (measured on 11 drives: 0.01
 to 0.13, rms 0.068, always of the sign that makes L_q too large)."""
+PENALTY = 7.0
+"""Price of a parameter in the information criterion, as for L (``axis_fit``): with ln n, 2.8 for 16 pairs, a curvature
+that is not there made psi_f scatter by three times its bound."""
 INSTANT_STEP = 0.01
 """Step of the derivative by the sampling instant (T_s)."""
 LEVEL_RATIO = 1.2
@@ -314,7 +317,7 @@ def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
     chi = np.array([float(np.sum((weight * residual) ** 2)) for residual in residuals])
     dof = n - 1.0 - np.array(orders)
     variance = max(float(chi[-1] / dof[-1]), (np.finfo(np.float64).eps * float(np.max(np.abs(y)))) ** 2)
-    share = information_weights([float(c / variance + (n - d) * math.log(n)) for c, d in zip(chi, dof, strict=True)])
+    share = information_weights([float(c / variance + PENALTY * (n - d)) for c, d in zip(chi, dof, strict=True)])
     values = np.array([float(hat[0] @ y) for hat in hats])
     value = float(share @ values)
     within = chi / dof * np.array([float(np.sum((hat[0] / weight) ** 2)) for hat in hats])
