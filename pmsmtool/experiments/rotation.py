@@ -21,8 +21,9 @@ STEP_RAD = math.radians(15.0)
 QUICK_STEP_RAD = math.radians(20.0)
 QUICK_DWELL_S = 0.008
 """A vector of some 25 rad/s, with the time of a step on the bus. The dead time pulls at the rotor six times a turn of
-the vector: 150 rad/s is above the swing of 500 random drives on 0.35 of the test current (19 .. 106 rad/s), and 75 was
-in the midst of them. There a rotor swung by 20 to 40 degrees whatever its ramp, beside a large dead time most."""
+the vector: 150 rad/s is above the swing of 400 random drives on 0.35 of the test current (21 .. 105 rad/s), and 75 was
+in the midst of them. There rotors swung by 14 to 36 degrees in spite of the ramp, beside a large dead time
+most; with 150 rad/s by 5 to 14."""
 SWING = 2.0
 """Largest speed of a rotor that is led by steps, over the mean one."""
 SLOWEST_STEP_S = 0.2
