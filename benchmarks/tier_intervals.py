@@ -1,12 +1,14 @@
 """Identify random drives at the tiers below the full one and say how wide and how true the printed intervals are.
 
     python -m benchmarks.tier_intervals standard --drives 200 --first 5000 --speed 1.35
+    python -m benchmarks.tier_intervals supply --drives 60 --first 65000
     python -m benchmarks.tier_intervals recorder --drives 200 --first 5000
     python -m benchmarks.tier_intervals inject --drives 200 --first 7200
 
 Drives follow from their seeds (``workflow/random_drives.py``). The simulated node has the objects of its tier only:
 ``drive=cia402`` with the master's commutation angle, or the reference drive without excitation (``tier=recorder``) or
-averages (``tier=inject``). ``--speed`` is the largest speed that is allowed, over the nameplate's: the flux linkage of
+averages (``tier=inject``). ``supply``: R of the standard tier from the readings of the simulated bench supply
+(``sim/bench_supply.py``). ``--speed`` is the largest speed that is allowed, over the nameplate's: the flux linkage of
 the standard tier needs one at which the voltage ends. ``--no-machine``: no machine file tells that tier the inverter.
 Every estimate is printed on stderr as error and half width (relative, or in deg); with ``--record FILE`` it goes there
 too, and a second run goes on behind it.
@@ -38,6 +40,7 @@ from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.experiments.supply_levels import ReadSupply
 from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate
@@ -48,10 +51,16 @@ from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_o
 from pmsmtool.workflow.limits import Limits
 from pmsmtool.workflow.measure import Measurement
 from pmsmtool.workflow.random_drives import draw_drive
-from pmsmtool.workflow.tier_evaluate import TierResult
+from pmsmtool.workflow.supply_reading import hold_for_supply
+from pmsmtool.workflow.tier_evaluate import TierFacts, TierResult, tier_result
 from pmsmtool.workflow.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
 
-CHANNELS = {"standard": "&drive=cia402", "recorder": "&tier=recorder", "inject": "&tier=inject"}
+CHANNELS = {
+    "standard": "&drive=cia402",
+    "supply": "&drive=cia402",
+    "recorder": "&tier=recorder",
+    "inject": "&tier=inject",
+}
 TOO_NARROW = 1e-3
 OF_THE_MACHINE = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2", "offset_rad")
 """What is judged at tier inject, at the reference temperature."""
@@ -91,6 +100,8 @@ def identify(tier: str, drive: MachineFile, path: Path, speed: float, *, given: 
             return identify_recorder(RecorderDrive(connection, 1), envelope)
         family = load_family("cia402")
         turning = StandardDrive(connection, 1, drive_map=family)
+        if tier == "supply":
+            return _by_supply(turning, envelope, lambda i_a: connection.bus.read_supply(1))  # type: ignore[attr-defined]
         found = identify_standard(turning, envelope)
         turning.close()
         pole_pairs = round(found.estimates["pole_pairs"].value)
@@ -99,6 +110,13 @@ def identify(tier: str, drive: MachineFile, path: Path, speed: float, *, given: 
             pushing, envelope, pole_pairs=pole_pairs, inverter=drive.inverter if given else None
         )
         return TierResult({**found.estimates, **pushed.estimates}, pushed.missing, {})
+
+
+def _by_supply(drive: StandardDrive, envelope: Envelope, read: ReadSupply) -> TierResult:
+    traces: dict[str, Trace] = {}
+    hold_for_supply(drive, envelope, envelope.i_max_apk / HEADROOM, read, traces.__setitem__, lambda text: None)
+    drive.close()
+    return tier_result(traces, TierFacts("standard"))
 
 
 def _by_injection(drive: RecordingDrive) -> TierResult:

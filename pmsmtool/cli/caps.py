@@ -102,6 +102,8 @@ def _lines(found: Capabilities) -> list[str]:
 
 
 def _said(row: Row) -> tuple[str, str]:
+    if row.waits_for_person:
+        return ", ".join(map(str, row.expected)), f"needs {', '.join(row.missing)}"
     if not row.available:
         return "-", f"not available: needs {', '.join(row.missing)}"
     if row.method == "manual":

@@ -60,6 +60,11 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     is_flag=True,
     help="Measure R at half the control frequency, too, and extrapolate to zero: takes the dead time out of R.",
 )
+@click.option(
+    "--supply",
+    is_flag=True,
+    help="R of a drive that shows no voltage: a person reads the bench supply's power at several currents.",
+)
 @map_option
 @bus_options
 @motion_options
@@ -75,6 +80,7 @@ def identify_command(
     sensor_tol: float | None,
     cal: tuple[str, ...],
     half_frequency: bool,
+    supply: bool,
     map_file: Path | None,
 ) -> None:
     """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
@@ -126,31 +132,35 @@ def identify_command(
         tolerance=calibrated_tolerance(declared or SensorTolerance(), cal),
     )
     request.check()
-    found, how, request = _choose(bus, map_file, method, request, everything=not quantities)
+    found, how, request = _choose(bus, map_file, method, request, everything=not quantities, supply=supply)
     if half_frequency and how != "inject":
         raise NotAvailable(
             f"the method {how} has no measurement at half the control frequency", hint="leave --half-frequency out"
         )
+    if supply and not (how == "standard" and "R" in request.quantities):
+        raise NotAvailable(f"the method {how} reads no bench supply", hint="leave --supply out, or ask for R")
     if how == "inject":
         run, stage = _measure(bus, motion, out, request, runs, found)
     else:
-        run, stage = _measure_without_injection(bus, motion, out, request, runs, found, how)
+        run, stage = _measure_without_injection(bus, motion, out, request, runs, found, how, supply=supply)
         _tell_more(found, request, out)
     _show(run, stage, out)
 
 
 def _choose(
-    bus: BusOptions, map_file: Path | None, method: str, request: IdentifyRequest, *, everything: bool
+    bus: BusOptions, map_file: Path | None, method: str, request: IdentifyRequest, *, everything: bool, supply: bool
 ) -> tuple[Capabilities, str, IdentifyRequest]:
     """Ask the drive what it can; return the method, and without a choice of quantities those it gives."""
     from dataclasses import replace
 
     from pmsmtool.cli.drive_access import open_node, read_map
     from pmsmtool.flash.map_gate import check_motion
-    from pmsmtool.workflow.capabilities import MEASURING, Method, examine
+    from pmsmtool.workflow.capabilities import MEASURING, Method, examine, with_supply
 
     with open_node(bus) as node:
         found = examine(node, None if map_file is None else read_map(map_file))
+    if supply:
+        found = with_supply(found)
     check_motion(found.drive_map, found.identity)
     wanted = None if method == "auto" else Method(method)
     if everything:
@@ -178,12 +188,15 @@ def _measure_without_injection(
     runs: Path,
     found: Capabilities,
     how: str,
+    *,
+    supply: bool,
 ) -> tuple[RunDirectory, Stage]:
     from dataclasses import asdict
 
     from pmsmtool import __version__
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.cli.drive_access import choose_node
+    from pmsmtool.cli.supply_prompt import supply_reader
     from pmsmtool.workflow.run_directory import RunDirectory, new_record
     from pmsmtool.workflow.tier_identify import tier_stage
     from pmsmtool.workflow.tier_stages import open_tier_drive
@@ -192,6 +205,7 @@ def _measure_without_injection(
     identity = found.identity
     with bus.connect() as connection:
         drive = open_tier_drive(connection, choose_node(connection, bus.node), found)
+        reader = supply_reader(connection, identity.node, simulated=bus.simulated()) if supply else None
         record = new_record(
             ["pmsmtool", *sys.argv[1:]],
             drive=asdict(identity),
@@ -204,9 +218,11 @@ def _measure_without_injection(
             given = ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
             _keep(run, given)
 
-        measure = vendor_stage if how == "vendor" else tier_stage
         with _accounted(run, out) as say:
-            stage = measure(run, drive, found, request, allow, say)
+            if how == "vendor":
+                stage = vendor_stage(run, drive, found, request, allow, say)
+            else:
+                stage = tier_stage(run, drive, found, request, allow, say, read_supply=reader)
             run.add(stage)
         drive.close()
     return run, stage

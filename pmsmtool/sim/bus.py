@@ -30,7 +30,9 @@ from can.broadcastmanager import (
 from pmsmtool.bus.clock import NEVER, NS, Ticker, VirtualClock
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.profile import profile_names
+from pmsmtool.sim.bench_supply import BenchSupply
 from pmsmtool.sim.channel import build_line, parse_channel
+from pmsmtool.sim.drive_kernel import KernelCore
 from pmsmtool.sim.line import EXTENDED, REMOTE, Frame, Line
 
 POLL_NS = 10_000
@@ -105,6 +107,7 @@ class PmsmSimBus(can.BusABC):
         self._unacknowledged = 0
         self._drivers = {threading.get_ident()}
         self._pace: _Pace | None = None
+        self._supplies: dict[int, BenchSupply] = {}
         self._pulled = False
         self._recv_raises = False
         try:
@@ -121,6 +124,15 @@ class PmsmSimBus(can.BusABC):
         with self.clock.held:
             self.line.attach(self)
         super().__init__(channel=self._key, can_filters=can_filters)
+
+    def read_supply(self, node_id: int) -> tuple[float, float]:
+        """Return voltage (V) and current (A) of the bench supply that feeds one drive, as its display shows them."""
+        with self.clock.held:
+            node = next(node for node in self.line.nodes if node.node_id == node_id)
+            if node_id not in self._supplies:
+                assert isinstance(node.core, KernelCore)
+                self._supplies[node_id] = BenchSupply(node.core, seed=node.identity[-1])
+            return self._supplies[node_id].read()
 
     # ---- sending -------------------------------------------------------------------------------
 

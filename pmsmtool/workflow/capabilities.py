@@ -8,7 +8,7 @@ nothing is said.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from pmsmtool.cia402 import Mode
@@ -64,6 +64,7 @@ FEATURES: Mapping[str, str] = {
     "vendor poles": "the maker's identification of the pole pairs, with its result, in a map that names this drive",
     "line voltage": "the DC link (0x6079), or the machine's voltage in the drive map",
     "current": "its current (0x6078)",
+    "bench supply": "a bench supply whose power a person reads (`pmsmtool identify R --supply`)",
 }
 """What methods need, as a person reads it."""
 
@@ -79,6 +80,7 @@ NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
     "R": {
         Method.INJECT: _INJECT,
         Method.RECORDER: _RECORD,
+        Method.STANDARD: (*_STANDARD, "bench supply"),
         Method.VENDOR: (*_WATCHED, "vendor R"),
         Method.MANUAL: (),
     },
@@ -116,6 +118,7 @@ NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
 
 NOTES: Mapping[tuple[str, Method], str] = {
     ("R", Method.RECORDER): "where the inverter's error does not hide it",
+    ("R", Method.STANDARD): "the loop, at the temperature of the run",
     ("L", Method.RECORDER): "L_q at running currents only",
     ("psi", Method.RECORDER): "the drive must commutate already",
     ("psi", Method.STANDARD): "where the voltage limit is within the speed limit, or the drive shows its voltage",
@@ -181,6 +184,11 @@ class Row:
     def available(self) -> bool:
         """Whether the drive gives it."""
         return not self.missing
+
+    @property
+    def waits_for_person(self) -> bool:
+        """Whether it lacks only what a person brings."""
+        return self.missing == (FEATURES["bench supply"],)
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,6 +296,11 @@ _TIERS = (
 )
 
 
+def with_supply(found: Capabilities) -> Capabilities:
+    """Return what a drive gives when a person reads its bench supply."""
+    return replace(found, features=found.features | {"bench supply"})
+
+
 def choose_map(identity: Identity, given: DriveMap | None) -> DriveMap:
     """Return the map for a drive: the one given, the shipped one for its identity, else what CiA 402 says."""
     return given or family_of(identity.vendor, identity.product) or load_family(GENERIC)
@@ -374,6 +387,7 @@ _MECHANICS = "benchmarks.mechanics_accuracy --drives 12 --first 9000"
 _RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 80 --first 5000"
 _STANDARD_RUN = "benchmarks.tier_intervals standard --drives 76 --first 5000 --speed 1.35"
 
+_SUPPLY_RUN = "benchmarks.tier_intervals supply --drives 60 --first 65000"
 _VOLTAGE_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --speed 1.35"
 
 
@@ -391,6 +405,7 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("L", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("L_q_app_h", 8.0, "%")),
     ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("psi_f_wb", 1.2, "%")),
     ("mechanics", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")),
+    ("R", Method.STANDARD): _expected(_SUPPLY_RUN, 60, ("R_s_ohm", 3.0, "%")),
     ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("offset_rad", 1.8, "deg")),
     ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("pole_pairs", 0.3, "%")),
     ("psi", Method.STANDARD): (

@@ -18,6 +18,7 @@ from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
 from pmsmtool.estimators.inertia_ratio import estimate_ratios
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
 from pmsmtool.estimators.rotation_offset import offset_by_turns
+from pmsmtool.estimators.supply_power import resistance_by_supply
 from pmsmtool.estimators.voltage_flux import flux_by_undriven_voltage, flux_by_voltage_limit
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters
@@ -43,7 +44,9 @@ FACTS = "tier.json"
 UTILISATION = 1.0 / math.sqrt(3.0)
 """Largest phase voltage amplitude over the DC link where no machine file says it."""
 NO_RESISTANCE = "the inverter's error at running currents hides it on this drive; needs current set-points"
-NO_POWER = "needs a recorder of voltages, or the power of a bench supply at several currents read by a person"
+NO_POWER = "needs a recorder of voltages, or a bench supply whose power a person reads (`identify R --supply`)"
+SUPPLY_LEVELS = "supply_levels"
+"""Name of the trace of a bench supply's readings."""
 NO_VOLTAGE = "needs injection, or a recorder of voltages at loop rate"
 NO_POLE_PAIRS = "needs the pole pairs: mode 11, an object in the drive's map, or a machine file"
 NO_LINK = "needs the DC link (0x6079) or the machine's voltage"
@@ -151,14 +154,17 @@ def tier_result(
     if facts.kind == "recorder":
         return _by_recorder(traces, facts, tolerance)
     estimates: dict[str, Estimate] = {}
+    if SUPPLY_LEVELS in traces:
+        estimates["R_s_ohm"] = resistance_by_supply(traces[SUPPLY_LEVELS], tolerance=tolerance)
     if "rotation_backward" in traces:
         found = estimate_encoder(traces["rotation_forward"], traces["rotation_backward"])
-        estimates = encoder_estimates(found, traces)
+        estimates |= encoder_estimates(found, traces)
     missing: dict[str, str] = {}
     if facts.pushed:
         pole_pairs = round(estimates["pole_pairs"].value) if "pole_pairs" in estimates else facts.pole_pairs
         pushed, missing = _by_torque(traces, replace(facts, pole_pairs=pole_pairs), tolerance, inverter, psi_f_wb)
         estimates |= pushed
+        missing = {name: why for name, why in missing.items() if name not in estimates}
     return TierResult(estimates, missing, traces)
 
 

@@ -26,14 +26,16 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, push_both_ways, run_to_voltage
 from pmsmtool.experiments.recorded_push import PushPlan, swing
 from pmsmtool.experiments.rotation import STEP_RAD, RotationPlan, dwell_within, rotate_vector
+from pmsmtool.experiments.supply_levels import LEVELS, ReadSupply
 from pmsmtool.experiments.vector_lead import lead_onto_vector
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import InverterParameters
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
-from pmsmtool.workflow.capabilities import Capabilities, Method
+from pmsmtool.workflow.capabilities import QUANTITIES, Capabilities, Method
 from pmsmtool.workflow.identify import REQUEST, IdentifyRequest, dump_request
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
+from pmsmtool.workflow.supply_reading import hold_for_supply
 from pmsmtool.workflow.tier_evaluate import (
     FACTS,
     NO_POLE_PAIRS,
@@ -45,11 +47,11 @@ from pmsmtool.workflow.tier_evaluate import (
     tier_result,
 )
 
-TURNS = ((0.35, 0.02), (0.7, 0.08))
+TURNS = ((0.35, 0.035), (0.7, 0.08))
 """Current, of the test current, and time per ``STEP_RAD`` (s) of every try, besides that of looks at the encoder. Six
-times per electrical turn a phase current passes zero, and the inverter's dead time kicks the rotor: at the first try's
-rate, near 7 Hz, it drives a rotor of that swing to 90 degrees. The second turns at a third of that rate, below the
-swing of every one, and friction takes more of a swing that outruns a slower vector."""
+times per electrical turn a phase current passes zero, and the inverter's dead time kicks the rotor: a vector turned at
+a sixth of a rotor's swing drives it to 90 degrees. The first try kicks at 5 Hz, below the swing of most (3 to 17 Hz),
+the second at 3 Hz, where that of every one is above 4: friction takes more of a swing that outruns a slower vector."""
 STEP_PARTS = 3
 """Parts of that step: 15 deg every 36 ms kept rotors of random drives swinging by 10 deg, 5 deg every 12 ms by 4."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
@@ -236,22 +238,30 @@ def tier_envelope(drive: CanopenDrive, request: IdentifyRequest, known: MachineF
     )
 
 
-def can_measure(drive: CanopenDrive, found: Capabilities, known: MachineFile | None = None) -> list[str]:
+def can_measure(
+    drive: CanopenDrive,
+    found: Capabilities,
+    known: MachineFile | None = None,
+    asked: Sequence[str] = QUANTITIES,
+) -> list[str]:
     """Return what the tier's experiments tell, one line each; empty when nothing can be measured.
 
     Parameters
     ----------
     known : MachineFile, optional
         What is given; torque pushes need the pole pairs from it, from mode 11 or from the drive's map.
+    asked : sequence of str
+        Quantities.
     """
     if isinstance(drive, RecorderDrive):
         return ["R, psi, L_q, J, tau_c from recorded torque pushes"]
     lines = []
     turns = found.row("poles", Method.STANDARD).available
-    if turns:
+    if turns and {"poles", "encoder"} & set(asked):
         lines.append("pole pairs, direction, offset from a vector turned by the commutation angle")
     pole_pairs = turns or known is not None or "motor.pole_pairs" in found.drive_map.cells
-    if pole_pairs and found.row("mechanics", Method.STANDARD).available:
+    pushes = found.row("mechanics", Method.STANDARD).available and bool({"psi", "mechanics"} & set(asked))
+    if pole_pairs and pushes:
         lines.append("J/psi, tau_c/psi from polled torque pushes, psi from the voltage limit or the coasting machine")
     return lines
 
@@ -265,6 +275,7 @@ def tier_stage(
     say: Callable[[str], None],
     *,
     known: tuple[MachineFile, str] | None = None,
+    read_supply: ReadSupply | None = None,
 ) -> Stage:
     """Run the tier's experiments, keep their traces, and write the machine file where it is whole.
 
@@ -278,6 +289,8 @@ def tier_stage(
         ``poles`` or ``encoder`` asks for the turned vector, ``psi`` or ``mechanics`` for torque pushes.
     known : MachineFile and its source, optional
         What completes the measured values.
+    read_supply : ReadSupply, optional
+        Reads the bench supply where R was asked for at the standard tier.
 
     Raises
     ------
@@ -292,7 +305,9 @@ def tier_stage(
         raise NotAvailable("without injection the rotor must turn, and the shaft is locked", hint="free the shaft")
     envelope = tier_envelope(drive, request, None if known is None else known[0])
     envelope.refuse_gravity()
-    moves = can_measure(drive, found, None if known is None else known[0])
+    moves = can_measure(drive, found, None if known is None else known[0], request.quantities)
+    if read_supply is not None and found.row("R", Method.STANDARD).available:
+        moves.append(f"R from the power of a bench supply, read {len(LEVELS)} times")
     if not moves:
         raise NotAvailable(
             NO_POLE_PAIRS,
@@ -311,7 +326,7 @@ def tier_stage(
     if isinstance(drive, RecorderDrive):
         facts = swing_and_record(drive, envelope, keep, say)
     else:
-        facts = _standard(drive, found, request, envelope, known, keep, say)
+        facts = _standard(drive, found, request, envelope, known, keep, say, read_supply)
     facts = replace(facts, source="" if known is None else known[1], traces=tuple(names))
     run.save(REQUEST, dump_request(request))
     run.save(FACTS, dump_facts(facts))
@@ -327,15 +342,20 @@ def _standard(
     known: tuple[MachineFile, str] | None,
     keep: Keep,
     say: Say,
+    read_supply: ReadSupply | None,
 ) -> TierFacts:
     """Turn the vector where the drive takes an angle, then push by torque where the pole pairs are then known."""
     connection, node = drive.node.connection, drive.node.node
     facts = TierFacts("standard", pole_pairs=_given_pole_pairs(drive, known))
     asked = set(request.quantities)
     turns = bool(asked & {"poles", "encoder"}) and found.row("poles", Method.STANDARD).available
-    if turns:
+    reads = "R" in asked and found.row("R", Method.STANDARD).available
+    if reads or turns:
         turning = drive if type(drive) is StandardDrive else StandardDrive(connection, node, drive_map=found.drive_map)
-        turn_both_ways(turning, envelope, keep, say)
+        if reads and read_supply is not None:
+            hold_for_supply(turning, envelope, envelope.i_max_apk / HEADROOM, read_supply, keep, say)
+        if turns:
+            turn_both_ways(turning, envelope, keep, say)
     pushes = bool(asked & {"psi", "mechanics"}) and found.row("mechanics", Method.STANDARD).available
     if not pushes or not (turns or facts.pole_pairs):
         return facts
