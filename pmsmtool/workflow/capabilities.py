@@ -385,10 +385,10 @@ def reference_capabilities(identity: Identity) -> Capabilities:
 _FULL = "benchmarks.identification_coverage --drives 400 --first 40000"
 _MECHANICS = "benchmarks.mechanics_accuracy --drives 12 --first 9000"
 _RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 80 --first 5000"
-_STANDARD_RUN = "benchmarks.tier_intervals standard --drives 76 --first 5000 --speed 1.35"
+_STANDARD_RUN = "benchmarks.tier_intervals standard --drives 42 --first 64000 --speed 1.35"
 
 _SUPPLY_RUN = "benchmarks.tier_intervals supply --drives 60 --first 65000"
-_VOLTAGE_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --speed 1.35"
+_BLIND_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --speed 1.35 --no-machine"
 
 
 def _expected(program: str, drives: int, *rows: tuple[str, float, str], given: str = "") -> tuple[Expected, ...]:
@@ -406,13 +406,13 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("psi_f_wb", 1.2, "%")),
     ("mechanics", Method.RECORDER): _expected(_RECORDER_RUN, 80, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")),
     ("R", Method.STANDARD): _expected(_SUPPLY_RUN, 60, ("R_s_ohm", 3.0, "%")),
-    ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("offset_rad", 1.8, "deg")),
-    ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("pole_pairs", 0.3, "%")),
+    ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 42, ("offset_rad", 0.5, "deg")),
+    ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 42, ("pole_pairs", 0.1, "%")),
     ("psi", Method.STANDARD): (
-        *_expected(f"{_VOLTAGE_RUN} --no-machine", 26, ("psi_f_wb", 6.4, "%")),
-        *_expected(_VOLTAGE_RUN, 26, ("psi_f_wb", 3.7, "%"), given="a machine file"),
+        *_expected(_BLIND_RUN, 26, ("psi_f_wb", 6.4, "%")),
+        *_expected(_STANDARD_RUN, 42, ("psi_f_wb", 3.7, "%"), given="a machine file"),
     ),
-    ("mechanics", Method.STANDARD): _expected(_STANDARD_RUN, 75, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")),
+    ("mechanics", Method.STANDARD): _expected(_STANDARD_RUN, 42, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 31.0, "%")),
 }
 """Total 95 % half widths that 90 % of random simulated drives of the tier kept to, with sensors of 1 %."""
 
