@@ -12,6 +12,8 @@ from pmsmtool.estimators.least_squares import levenberg_marquardt
 
 Vector = NDArray[np.float64]
 
+KNEE_RANGE = 10.0
+"""Ratio by which a knee may lie below the smallest level, or above the largest."""
 SAME_LEVEL = 1.1
 """Ratio of currents above which two points are different levels."""
 
@@ -86,14 +88,18 @@ class InverterCurve:
         if V_plateau_v == 0.0:
             return float(x[0])
 
+        # an inverter without an error has a plateau and a curve of noise, which fit with no knee at all
+        low, high = math.log(x[0] / KNEE_RANGE), math.log(x[-1] * KNEE_RANGE)
+
         def residual(log_knee: Vector) -> Vector:
-            return np.asarray(y / V_plateau_v - np.minimum(1.0, x / math.exp(float(log_knee[0]))), dtype=np.float64)
+            knee = math.exp(min(max(float(log_knee[0]), low), high))
+            return np.asarray(y / V_plateau_v - np.minimum(1.0, x / knee), dtype=np.float64)
 
         # the cost has kinks at the points: start from the best of a coarse scan
         starts = np.log(np.geomspace(0.2 * x[0], x[-1], 40))
         best = min(starts, key=lambda s: float(np.sum(residual(np.array([s])) ** 2)))
         fit = levenberg_marquardt(residual, np.array([best]), np.array([1.0]))
-        return math.exp(float(fit.x[0]))
+        return math.exp(min(max(float(fit.x[0]), low), high))
 
 
 def curve_from_levels(i_vector_a: Vector, u_vector_v: Vector, phase_factor: float) -> InverterCurve:

@@ -9,6 +9,7 @@ import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, total_half_width
+from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import (
     Copper,
@@ -251,3 +252,12 @@ def test_the_low_levels_may_settle_more_slowly_than_those_that_make_R() -> None:
         else:
             with pytest.raises(IdentificationError, match="E_NOT_SETTLED"):
                 estimate_resistance(slow, noise_of(d, 0))
+
+
+def test_an_inverter_without_an_error_has_a_knee_within_its_levels() -> None:
+    """A plateau and a curve of noise: the fit must not run away (it overflowed)."""
+    rng = np.random.default_rng(5)
+    i = np.geomspace(0.1, 10.0, 12)
+    for _ in range(50):
+        curve = InverterCurve(i, 1e-6 * rng.standard_normal(len(i)), 0.0)
+        assert 0.01 <= curve.knee_a(10.0 ** rng.uniform(-9.0, -5.0)) <= 100.0
