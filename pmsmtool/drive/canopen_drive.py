@@ -203,13 +203,16 @@ class CanopenDrive:
         return self.take(Recording(signals, samples, decimation, excitation, pretrigger), self.wait)
 
     def take(self, recording: Recording, wait: Callable[[float], None]) -> Trace:
-        """Prepare, begin and finish a record; ``wait`` lets time pass. An excitation ends however this ends."""
+        """Prepare, begin and finish a record; ``wait`` lets time pass. An excitation ends however this ends.
+
+        A buffer is played to its end, also where it is longer than the record: so a speed comes back by its levels.
+        """
         excitation = recording.excitation
         if excitation is not None:
             self.prepare(excitation)
         try:
             self.begin_record(recording, wait)
-            wait(recording.samples * recording.decimation * self.period_s)
+            wait(max(recording.samples * recording.decimation, _buffer_periods(excitation)) * self.period_s)
             return self.finish_record(recording)
         finally:
             if excitation is not None:
@@ -279,6 +282,11 @@ class CanopenDrive:
         """Let time pass on the bus clock; an alarm of the drive ends it."""
         self.node.connection.wait(seconds)
         self.node.supervision.check()
+
+
+def _buffer_periods(excitation: Excitation | None) -> int:
+    """Return how many control periods the buffer of an excitation takes, 0 without one."""
+    return 0 if excitation is None else len(excitation.buffer) * excitation.hold_periods
 
 
 def _excitation_facts(excitation: Excitation) -> dict[str, object]:

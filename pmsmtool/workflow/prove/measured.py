@@ -46,7 +46,8 @@ RISE_SHARE = 0.25
 RISE_S = 3.0
 """A speed is approached in this many steps, on average with this share of the design's slope, but within this time (s):
 at full torque a current limit below the design's leaves no i_q beside the i_d that the look-up tables ask for, and the
-machine stays where it is (interior-2k2 at 5 A: at 375 of 474 rad/s with i_d = -4.99 A)."""
+machine stays where it is (interior-2k2 at 5 A: at 375 of 474 rad/s with i_d = -4.99 A). It is left as gently: braking
+with full torque feeds the DC link, which nobody may have made for it."""
 
 Keep = Callable[[Experiment, Trace], bool]
 """Told every record as soon as it is there; returns whether to go on."""
@@ -87,7 +88,7 @@ def run_experiments(
         if not keep(experiment, replace(trace, meta={**trace.meta, **_facts(experiment)})):
             break
     if any(e.base_rad_s for e in plan.experiments):
-        drive.command_speed(0.0)
+        _approach(drive, 0.0, design.machine.machine.pole_pairs)
         _come_to_rest(drive)
 
 
@@ -154,14 +155,14 @@ def _why_not(state: Mapping[str, float], limited: bool, design: Design, conditio
 
 
 def _approach(drive: Drive, speed_rad_s: float, pole_pairs: int) -> None:
-    """Ask for a mechanical speed (rad/s), for one above the present in small steps."""
+    """Ask for a mechanical speed (rad/s) in small steps, up and down: full torque either way may be too much."""
     present = drive.live("omega_e_rad_s") / pole_pairs
-    rise = speed_rad_s - present
+    change = speed_rad_s - present
     slope = RISE_SHARE * drive.read("speed.acceleration_rpm_per_s") * RPM
-    if present >= 0.0 and rise > 0.0 and slope > 0.0:
+    if present >= 0.0 and slope > 0.0:
         for k in range(1, RISE_STEPS):
-            drive.command_speed(present + rise * k / RISE_STEPS)
-            drive.wait(min(rise / slope, RISE_S) / RISE_STEPS)
+            drive.command_speed(present + change * k / RISE_STEPS)
+            drive.wait(min(abs(change) / slope, RISE_S) / RISE_STEPS)
     drive.command_speed(speed_rad_s)
 
 

@@ -302,6 +302,11 @@ def _unreachable(s: _Sizes) -> Experiment | str:
     return Experiment("unreachable", text, omega / s.p, excitation, rows, 1, scale_a=current)
 
 
+def _back(levels: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the levels of a staircase in reverse, down to none; what it held at its top is not held again."""
+    return (*(level for level in reversed(levels) if level < levels[-1]), 0.0)
+
+
 def _speed_of_voltage(s: _Sizes, i_q: float, V: float) -> float:
     """Electrical speed at which i_d = 0 and i_q take the voltage V."""
     a, b, c = (s.L_q * i_q) ** 2 + s.psi**2, s.psi * s.R * i_q, (s.R * i_q) ** 2 - V**2
@@ -328,9 +333,10 @@ def _weakening(s: _Sizes) -> Experiment | str:
     settle = SPEED_SETTLE / float(s.design.facts.get("speed_crossover_rad_s", 50.0))
     levels, hold = rows // WEAKENING_HOLD, WEAKENING_HOLD * decimation
     rise = slope * hold * s.T_s
-    # one level more than the record has, so that the reference falls back only after its last row
+    # one level more than the record has; then down by the levels it came, unrecorded: from there in one step, the
+    # drive would brake with all its torque while the flux is weakened
     ramp = tuple(min(step, rise * k) for k in range(1, levels + 2))
-    excitation = Excitation(Shape.BUFFER, Injection.SPEED, step, hold_periods=hold, buffer=ramp)
+    excitation = Excitation(Shape.BUFFER, Injection.SPEED, step, hold_periods=hold, buffer=(*ramp, *_back(ramp)))
     text = f"speed ramp from {start / RPM:.4g} to {end / s.p / RPM:.4g} rpm, into field weakening"
     return Experiment("weakening", text, start, excitation, rows, decimation,
                       judged=("i_d_a", "i_q_a", "omega_e_rad_s"), scale_a=s.I_test, scale_rad_s=end,

@@ -1,6 +1,7 @@
 """The Monte Carlo prediction: the drive's own firmware on machines drawn from their intervals.
 
-What varies: the machine's parameters (statistical and systematic part), the encoder offset, temperatures about what
+What varies: the machine's parameters (statistical and systematic part; a machine that saturates has its flux map scaled
+by those of its inductances and of its magnet), the encoder offset, temperatures about what
 the drive measures, the DC link, friction, the inverter's error, sensor offsets and mismatch, lag, the angle at the
 start. What is the same: the set the drive holds, cut to the envelope as the drive cuts it.
 """
@@ -19,6 +20,7 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.design.prediction import Array, Direction, Prediction, Runs, predict
 from pmsmtool.design.tolerance import Samples, tolerance_box
 from pmsmtool.drive.port import Excitation, Injection
+from pmsmtool.machine.flux_map_scaled import FluxScale, ScalableMap
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
@@ -88,6 +90,9 @@ class SimulatedDrives:
         self._design, self._plan = design, plan
         machine = _simulated(design.machine, conditions)
         base, self._keep = build_setup(machine, seed=seed)
+        self._nominal = Setup.from_buffer_copy(base)
+        flux_map = machine.flux_map
+        self._map = None if flux_map is None else ScalableMap.of(flux_map, machine.machine.psi_f_wb)
         self._image = image_of(machine, _cut(design, conditions))
         self._T_s = design.machine.inverter.T_s
         self._base_speed: list[float] = []
@@ -140,17 +145,27 @@ class SimulatedDrives:
         share = 0.0 if speed else self._base_speed[row]
         setup.omega_M = (1.0 + share) * experiment.base_rad_s
         params = Params()
-        simulation = Simulation(setup, self._image, self._keep)
+        simulation = Simulation(setup, self._image, self._scaled(setup))
         if defect is not None:
             params = simulation.params
             defect.change(setup, params)
             kept = bytes(params)
-            simulation = Simulation(setup, self._image, self._keep)
+            simulation = Simulation(setup, self._image, self._scaled(setup))
             ctypes.memmove(ctypes.addressof(simulation.params), kept, len(kept))
         simulation.reference.mode = MODES["speed" if speed else "current"]
         simulation.reference.omega_M_ref = experiment.base_rad_s
         simulation.word(Part.ENABLED).value = 1
         return simulation
+
+    def _scaled(self, setup: Setup) -> object:
+        """Give a machine that saturates the map of its inductances and its magnet; returns what must live as long."""
+        if self._map is None:
+            return self._keep
+        drawn, nominal = setup.machine, self._nominal.machine
+        psi_f = drawn.psi_f / nominal.psi_f if nominal.psi_f else 1.0
+        struct = self._map.struct(FluxScale(drawn.L_d / nominal.L_d, drawn.L_q / nominal.L_q, psi_f))
+        drawn.map = ctypes.pointer(struct)
+        return struct
 
 
 def averaged(signals: NDArray[np.float64], experiment: Experiment) -> Array:
