@@ -12,6 +12,8 @@ from pmsmtool.cli.options import BITRATE, FILE, BusOptions, WholeNumber, bus_opt
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
+    from pmsmtool.sim.channel import Channel
+    from pmsmtool.sim.line import Line
     from pmsmtool.sim.serve import SocketcandServer
 
 _PORT = WholeNumber("port", 0, 65535)
@@ -49,6 +51,7 @@ def sim_command() -> None:
         "pmsmtool sim serve                          # then: pmsmtool -i socketcand -c vcan0 scan",
         "pmsmtool sim serve jercic-2017 --port 0 --json",
         "pmsmtool sim serve --nodes 3 --faults lossy.toml --bitrate 500000",
+        "pmsmtool sim serve --scenario operation     # then: pmsmtool -i socketcand -c vcan0 track --for 30s",
     ),
 )
 @click.argument("profile", required=False)
@@ -66,8 +69,16 @@ def sim_command() -> None:
 @click.option("--seed", type=_SEED, help="Seed of noise and faults.")
 @click.option("--nv", metavar="FILE", help="File of the non-volatile memory, or :memory:.")
 @click.option("--faults", type=FILE, help="File of faults on purpose; `sim faults` prints an example.")
+@click.option(
+    "--scenario",
+    type=click.Choice(["operation"]),
+    help="operation: each drive holds a design for its machine and runs through speeds and loads by itself, until it "
+    "is stopped; its memory is volatile. To try `track` and `monitor` on.",
+)
 @output_options
-def serve_command(out: Output, profile: str | None, host: str, port: int, speed: float, **given: Any) -> None:
+def serve_command(
+    out: Output, profile: str | None, host: str, port: int, speed: float, scenario: str | None, **given: Any
+) -> None:
     """Serve simulated drives on a socketcand server until Ctrl-C.
 
     PROFILE is a profile (`pmsmtool sim list`), a machine file, or a channel string NAME?key=value&...; the options
@@ -79,14 +90,46 @@ def serve_command(out: Output, profile: str | None, host: str, port: int, speed:
     from pmsmtool.sim.serve import SocketcandServer
 
     channel = replace(parse_channel(profile), **{name: value for name, value in given.items() if value is not None})
+    if scenario is not None:
+        channel = _without_memory(channel)
     line = build_line(channel, instant=True)
+    if scenario is not None:
+        _operate(line, channel, out)
     server = SocketcandServer(line, host, port, speed=speed, say=out.note)
     ids = [node.node_id for node in line.nodes]
     data = {"interface": "socketcand", "host": host, "port": server.port, "profile": channel.name, "node_ids": ids}
     out.result("sim-serve", data, [f"socketcand {host}:{server.port}"])
     out.note(f"simulating {channel.name} as node {', '.join(map(str, ids))}; Ctrl-C ends it")
     out.note(_how_to_join(host, server.port))
+    if scenario is not None:
+        out.note("in operation: look at it with `monitor` or `track`; `stop` ends it")
     _serve(server)
+
+
+def _without_memory(channel: Channel) -> Channel:
+    """Return the channel of drives whose memory forgets: a stored set would outrank that of the scenario."""
+    from dataclasses import replace
+
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.sim.channel import VOLATILE
+
+    if channel.nv not in (None, VOLATILE):
+        raise ConfigError(
+            "--scenario gives the drive a set of its own, and --nv another one",
+            where=f"nv={channel.nv}",
+            hint="leave one of them out",
+        )
+    return replace(channel, nv=VOLATILE)
+
+
+def _operate(line: Line, channel: Channel, out: Output) -> None:
+    from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.machine.profile import machine_path
+    from pmsmtool.sim.operation import Operation
+
+    machine_file = load_machine_file(machine_path(channel.name))
+    for node in line.nodes:
+        Operation(node, machine_file, out.note)
 
 
 def _how_to_join(host: str, port: int) -> str:
