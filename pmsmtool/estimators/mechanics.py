@@ -27,7 +27,8 @@ from pmsmtool.estimators.estimate import (
     information_bound,
 )
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt, linear_solve
-from pmsmtool.estimators.mechanics_motion import positions
+from pmsmtool.estimators.mechanics_model import Problem, Run, whitener
+from pmsmtool.estimators.mechanics_position import encoder_step, position_std
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
@@ -41,8 +42,6 @@ BLOCKS = 250
 """Positions of a trace in the fit; the currents between two are averaged."""
 TRACES_LEAST = 4
 """A push and a coasting in each direction."""
-ENCODER_STEPS_LEAST = 200
-"""Way of the shaft in encoder steps below which the run says nothing."""
 REST_SHARE = 0.005
 """Way of the shaft, of a trace's whole, from which on it is fitted."""
 STEP_SHARE = 0.1
@@ -66,8 +65,6 @@ UNEXPLAINED = 2.0
 NOISY_TORQUE = "cogging, a load or a gear on the shaft, an elastic coupling, an encoder that is off centre"
 SCALE_FLOOR = 3e-4
 """Relative deviation of the torque's scale beyond that of the flux linkage and of the samples' displacement."""
-ROUNDING_RAD = 1e-6
-"""Of a position recorded in binary32."""
 METHOD = "pushes and coasting, output error on position, whitened"
 
 
@@ -100,18 +97,6 @@ class MechanicsResult:
     chi2: float
     condition: float
     unexplained: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Run:
-    """Blocks of one run: positions (n + 1,), mean torques (n,), period, and the deviations of both."""
-
-    theta: Array
-    torque: Array
-    T: float
-    theta_std: float
-    torque_std: float
-    coasting: bool
 
 
 def estimate_mechanics(
@@ -156,7 +141,7 @@ def estimate_mechanics(
     flagged = sum(int(np.sum(run["flagged"] > 0.0)) for run in runs if not run.meta["coasting"])
     if flagged:
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
-    step = _encoder_step([run["theta_M_rad"] for run in runs])
+    step = encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, torque_per_a, sigma_a, direction, step) for run in runs]
     start = _start(blocks)
     fit, chi2, noise = _fit(blocks, start)
@@ -191,23 +176,6 @@ def estimate_mechanics(
     )
 
 
-def _encoder_step(positions: Sequence[Array]) -> float:
-    """Return one step of the encoder (rad), from second differences: of a turning shaft every first one is many."""
-    seconds = [np.abs(np.diff(theta, 2)) for theta in positions]
-    limits = [ROUNDING_RAD * max(1.0, float(np.max(np.abs(theta)))) for theta in positions]
-    steps = np.concatenate([second[second > limit] for second, limit in zip(seconds, limits, strict=True)])
-    step = float(np.min(steps)) if len(steps) else 0.0
-    way = min(float(np.ptp(theta)) for theta in positions)
-    if step == 0.0 or way < ENCODER_STEPS_LEAST * step:
-        raise refuse(
-            "E_EXCITATION",
-            f"the shaft turned by {way:.3g} rad during a trace, {ENCODER_STEPS_LEAST} steps of the encoder are needed",
-            stage=STAGE,
-            likely="a held shaft, much friction, or a speed limit that leaves no motion",
-        )
-    return step
-
-
 def _window(run: Trace) -> Trace:
     """Return a trace from where the shaft moves and the step of the current is over.
 
@@ -221,19 +189,20 @@ def _window(run: Trace) -> Trace:
     return replace(run, t_s=run.t_s[first:], signals={name: values[first:] for name, values in run.signals.items()})
 
 
-def _blocks(run: Trace, torque: Torque, torque_per_a: float, sigma_a: float, direction: int, step: float) -> _Run:
+def _blocks(run: Trace, torque: Torque, torque_per_a: float, sigma_a: float, direction: int, step: float) -> Run:
     rows = max(1, (len(run) - 1) // BLOCKS)
     count = (len(run) - 1) // rows
     theta = direction * run["theta_M_rad"][: count * rows + 1 : rows]
+    theta_std = position_std(theta, step)
     if run.meta["coasting"]:
-        return _Run(theta, np.zeros(count), rows * run.period_s, step / math.sqrt(12.0), 0.0, True)
+        return Run(theta, np.zeros(count), rows * run.period_s, theta_std, 0.0, True)
     tau = torque(run["i_d_a"], run["i_q_a"])
     mean = (0.5 * (tau[:-1] + tau[1:]))[: count * rows].reshape(count, rows).mean(axis=1)
     noise = math.hypot(abs(torque_per_a) * sigma_a / math.sqrt(rows), TORQUE_FLOOR * float(np.max(np.abs(mean))))
-    return _Run(theta, mean, rows * run.period_s, step / math.sqrt(12.0), noise, False)
+    return Run(theta, mean, rows * run.period_s, theta_std, noise, False)
 
 
-def _start(runs: Sequence[_Run]) -> Array:
+def _start(runs: Sequence[Run]) -> Array:
     """Return ln J, B, tau_c and each trace's first position and speed, from a regression of torque on motion."""
     rows, torques, states = [], [], []
     for run in runs:
@@ -252,7 +221,7 @@ def _start(runs: Sequence[_Run]) -> Array:
     return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
 
 
-def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float, dict[bool, float]]:
+def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, dict[bool, float]]:
     """Return the fit, its reduced chi-square, and the torque's noise that it took."""
     speed = max(float(np.max(np.abs(np.diff(run.theta)))) / run.T for run in runs)
     largest = max(float(np.max(np.abs(run.torque))) for run in runs)
@@ -274,7 +243,7 @@ def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float, dict[bool, flo
                 f"the next, limit {100.0 * RIPPLE_MOST:g} %",
                 stage=STAGE,
                 likely=NOISY_TORQUE,
-                hint="`identify R L psi encoder poles inverter frf` finds the resonance of an elastic shaft without it",
+                hint="`identify R L psi encoder poles inverter frf` finds the resonance of an elastic shaft, and J",
             )
         if fit.converged:
             if count and noisier is runs:
@@ -285,7 +254,7 @@ def _fit(runs: Sequence[_Run], start: Array) -> tuple[Fit, float, dict[bool, flo
     return fit, chi2, noise
 
 
-def _noise(runs: Sequence[_Run]) -> dict[bool, float]:
+def _noise(runs: Sequence[Run]) -> dict[bool, float]:
     """Deviation of a block's torque in pushes (False) and coasting (True), of the push's torque."""
     largest = max(float(np.max(np.abs(run.torque))) for run in runs)
     return {
@@ -294,71 +263,27 @@ def _noise(runs: Sequence[_Run]) -> dict[bool, float]:
     }
 
 
-def _minimum(runs: Sequence[_Run], x: Array, scale: Array) -> Fit:
-    problem = _Problem(runs, [_whitener(run, math.exp(float(x[0]))) for run in runs], RELATIVE_STEP * scale)
+def _minimum(runs: Sequence[Run], x: Array, scale: Array) -> Fit:
+    problem = Problem(runs, [whitener(run, math.exp(float(x[0]))) for run in runs], RELATIVE_STEP * scale)
     return levenberg_marquardt(problem.residual, x, scale, cost_tolerance=1e-4, derivative=problem.jacobian)
 
 
-def _noisier(runs: Sequence[_Run], residual: Array, largest: float) -> Sequence[_Run]:
-    """Return the runs with as much more noise of the torque as the residual asks for; the same where it agrees."""
+def _noisier(runs: Sequence[Run], residual: Array, largest: float) -> Sequence[Run]:
+    """Return the runs with as much more noise of the torque as the residual asks for; the same where it agrees.
+
+    Every push by itself, one through standstill asks for more than one from rest; coasting together.
+    """
     ends = np.cumsum([len(run.theta) for run in runs])
     parts = np.split(residual, ends[:-1])
-    more = {False: 1.0, True: 1.0}
-    for coasting in more:
-        own = np.concatenate([part for part, run in zip(parts, runs, strict=True) if run.coasting is coasting])
-        chi2 = float(own @ own) / len(own)
-        if chi2 > CHI2_WARN:
-            more[coasting] = min(math.sqrt(chi2), GROWTH_MOST)
-    if max(more.values()) == 1.0:
+    coasting = np.concatenate([part for part, run in zip(parts, runs, strict=True) if run.coasting])
+    own = [coasting if run.coasting else part for part, run in zip(parts, runs, strict=True)]
+    more = [
+        min(math.sqrt(chi2), GROWTH_MOST) if (chi2 := float(part @ part) / len(part)) > CHI2_WARN else 1.0
+        for part in own
+    ]
+    if max(more) == 1.0:
         return runs
     return [
-        run
-        if more[run.coasting] == 1.0
-        else replace(run, torque_std=more[run.coasting] * max(run.torque_std, COASTING_FLOOR * largest))
-        for run in runs
+        run if factor == 1.0 else replace(run, torque_std=factor * max(run.torque_std, COASTING_FLOOR * largest))
+        for run, factor in zip(runs, more, strict=True)
     ]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
-    """Whitened residual of all traces; a trace knows the three common parameters and its own two."""
-
-    runs: Sequence[_Run]
-    factors: Sequence[Array]
-    step: Array
-
-    def of_run(self, k: int, x: Array) -> Array:
-        """Whitened residual of one trace."""
-        run = self.runs[k]
-        own = np.append(x[:3], x[3 + 2 * k : 5 + 2 * k])
-        return np.asarray(self.factors[k] @ (positions(run.torque, run.T, own) - run.theta))
-
-    def residual(self, x: Array) -> Array:
-        """Whitened residual, shape (n,)."""
-        return np.concatenate([self.of_run(k, x) for k in range(len(self.runs))])
-
-    def jacobian(self, x: Array) -> Array:
-        """Its derivative by central differences, shape (n, k)."""
-        blocks = []
-        for k, run in enumerate(self.runs):
-            block = np.zeros((len(run.theta), len(x)))
-            for column in (0, 1, 2, 3 + 2 * k, 4 + 2 * k):
-                plus, minus = x.copy(), x.copy()
-                plus[column] += self.step[column]
-                minus[column] -= self.step[column]
-                change = self.of_run(k, plus) - self.of_run(k, minus)
-                block[:, column] = change / (plus[column] - minus[column])
-            blocks.append(block)
-        return np.concatenate(blocks)
-
-
-def _whitener(run: _Run, J: float) -> Array:
-    """Return the inverse of the Cholesky factor of the position residual's covariance."""
-    n = len(run.theta)
-    if run.torque_std == 0.0:
-        return np.eye(n) / run.theta_std
-    lag = np.arange(n)[:, None] - np.arange(n - 1)[None, :] - 0.5
-    G = np.where(lag > 0.0, lag, 0.0) * run.T**2 / J
-    covariance = run.theta_std**2 * np.eye(n) + run.torque_std**2 * (G @ G.T)
-    factor = np.linalg.cholesky(covariance)
-    return np.asarray(np.linalg.inv(factor))
