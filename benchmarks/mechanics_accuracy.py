@@ -5,7 +5,8 @@
 
 Drives follow from their seeds (``workflow/random_drives.py``, switched inverter, ideal gains and timing); the tool sees
 their nameplate only. An error of the flux linkage goes into all three values one to one; ``J/psi`` is the error without
-it. ``--rows FILE`` keeps a line per drive and goes on from there; without drives the table is made of what it holds.
+it. Every standard deviation is compared with the one that was said before the machine moved for it. ``--rows FILE``
+keeps a line per drive and goes on from there; without drives the table is made of what it holds.
 
 ``--bound`` draws realisations of the noise that the fit assumes (encoder steps, current noise, torque ripple) around
 random shafts and compares the scatter with the Cramer-Rao bound of the whitened model.
@@ -44,7 +45,10 @@ from pmsmtool.workflow.measure import Measurement
 from pmsmtool.workflow.random_drives import draw_drive
 
 KEYS = ("J_kgm2", "tau_c_nm", "B_nms")
+PREDICTED_KEYS = (*KEYS, "psi_f_wb", "R_s_ohm", "L_d_h", "L_q_h")
 ROWS_PER_BLOCK = 4
+TWICE = 2.0
+"""Factor within which a predicted deviation is called right."""
 Row = dict[str, Any]
 
 
@@ -62,8 +66,11 @@ def identify_one(seed: int) -> Row:
             envelope = envelope_of(nameplate, request)
             I_nom = nameplate.machine.I_nom_apk or envelope.i_max_apk
             limits = Limits(I_nom, envelope.i_max_apk, envelope.speed_max_rad_s, nameplate.inverter.V_max_v)
+            said: dict[str, Row] = {}
             with guarded(drive, envelope) as guard:
-                Measurement(guard, limits, traces.__setitem__, lambda text: None).run(request.quantities)
+                measurement = Measurement(guard, limits, traces.__setitem__, lambda text: None)
+                measurement.predicted = lambda prediction: said.__setitem__(prediction["before"], prediction)
+                measurement.run(request.quantities)
             drive.close()
     inverter = nameplate.inverter
     result = evaluate(traces, inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=inverter.U_dc_v)
@@ -79,6 +86,9 @@ def identify_one(seed: int) -> Row:
     row["psi_f_wb"] = (psi_error, abs(psi_error) <= statistical_half_width(found["psi_f_wb"]) / found["psi_f_wb"].value)
     row["J/psi"] = (row["J_kgm2"][0] - psi_error, True)
     row["total J"] = total_half_width(found["J_kgm2"]) / found["J_kgm2"].value
+    predicted = said["levels"]["relative_std"] | said["mechanics"]["relative_std"]
+    row["std"] = {key: found[key].std / abs(found[key].value) for key in predicted}
+    row["predicted"] = predicted
     row |= {"chi2": result.mechanics.chi2, "ripple": result.mechanics.ripple, "fit_std_J": own}
     return row
 
@@ -108,6 +118,12 @@ def show(rows: Sequence[Row]) -> None:
     totals = sorted(100.0 * row["total J"] for row in good if "total J" in row)
     if totals:
         print(f"total 95 % half width of J: p90 {totals[round(0.9 * (len(totals) - 1))]:.2f} % of {len(totals)} drives")
+    for key in PREDICTED_KEYS:
+        ratios = sorted(row["std"][key] / row["predicted"][key] for row in good if key in row.get("predicted", ()))
+        if ratios:
+            n, within = len(ratios), sum(1.0 / TWICE <= ratio <= TWICE for ratio in ratios)
+            ends = ", ".join(f"{ratios[round(share * (n - 1))]:.2f}" for share in (0.05, 0.5, 0.95))
+            print(f"{key:9s} std over the predicted one: 5, 50, 95 % of drives {ends}; within a factor 2: {within}/{n}")
     for seed, reason in refused.items():
         print(f"refused: seed {seed}, {reason}")
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import CHI2_REFUSE, information_bound
+from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, information_bound, scaled_covariance
 from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
@@ -63,6 +63,9 @@ ZETA_LEAST = 0.002
 ZETA_FLOOR = 0.01
 """Relative deviation of the damping beyond the fit's: rows do not show the current between them. Measured on one
 simulated drive: 0.014 too much, 0.005 by the fit."""
+INERTIA_FLOOR = 1e-3
+"""Relative deviation of the inertia beyond the fit's and the torque's: see ``tests/workflow/test_frequency_stage``."""
+INERTIA_FALLBACK = "from the frequency response, without pushes and coasting; friction is not known"
 METHOD = "random torque at speed, maximum likelihood in the frequency domain"
 
 
@@ -90,6 +93,9 @@ class FrequencyResponse:
         ``resonance_hz``, ``antiresonance_hz``, ``resonance_zeta`` where a second mass is supported, else nothing.
     reason : str
         Why a second mass is claimed, or is not.
+    inertia : Estimate or None
+        All that turns, of the model that explains the response: 1/J of a rigid shaft, the low-frequency end
+        J_M w_r^2/w_a^2 of two masses (kg m2); None where neither explains it.
     """
 
     frequency_hz: Array
@@ -102,6 +108,7 @@ class FrequencyResponse:
     information_gain: float
     found: dict[str, Estimate] = field(default_factory=dict)
     reason: str = ""
+    inertia: Estimate | None = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the table that is kept as a file."""
@@ -128,9 +135,14 @@ class _Lines:
 
 
 def estimate_frequency_response(
-    runs: Sequence[Trace], torque: Callable[[Array, Array], Array], *, direction: int = 1
+    runs: Sequence[Trace],
+    torque: Callable[[Array, Array], Array],
+    *,
+    direction: int = 1,
+    scale_std: float = 0.0,
+    tolerance: SensorTolerance | None = None,
 ) -> FrequencyResponse:
-    """Estimate the response, and the resonance where there is one.
+    """Estimate the response, the inertia, and the resonance where there is one.
 
     Parameters
     ----------
@@ -140,6 +152,10 @@ def estimate_frequency_response(
         Torque (N m) of arrays of i_d, i_q (A).
     direction : int
         Sign of the encoder's count along the phase order.
+    scale_std : float
+        Relative standard deviation of the torque's scale, which goes into the inertia one to one.
+    tolerance : SensorTolerance
+        Declared sensor tolerances.
 
     Raises
     ------
@@ -169,9 +185,12 @@ def estimate_frequency_response(
     rigid = _fit(lines, _rigid, np.array([math.log(float(np.median(np.abs(G[coherent])))), 0.0]))
     chi2_rigid = rigid.cost / rigid.dof
     facts = (frequency, G, std, coherence, highest, chi2_rigid)
+    scale = (scale_std, tolerance or SensorTolerance())
+    one = _inertia(rigid, chi2_rigid, (-1.0, 0.0), *scale)
     start = _start(omega, G, std)
     if start is None:
-        return FrequencyResponse(*facts, math.nan, 0.0, reason=f"rigid up to {highest:.3g} Hz: no pair of poles fits")
+        reason = f"rigid up to {highest:.3g} Hz: no pair of poles fits"
+        return FrequencyResponse(*facts, math.nan, 0.0, reason=reason, inertia=one)
     two = _fit(lines, _two_mass, start)
     chi2 = two.cost / two.dof
     penalty = (len(start) - len(rigid.x) + 2 * len(runs)) * math.log(len(rigid.residual))
@@ -180,10 +199,11 @@ def estimate_frequency_response(
     against = _against(two, chi2, gain, estimates, frequency, coherence, highest)
     if against:
         reason = f"no resonance is claimed up to {highest:.3g} Hz: {against}"
-        return FrequencyResponse(*facts, chi2, gain, reason=reason)
+        return FrequencyResponse(*facts, chi2, gain, reason=reason, inertia=one)
     resonance, antiresonance = estimates["resonance_hz"].value, estimates["antiresonance_hz"].value
     reason = f"two masses, J_load/J_motor {(resonance / antiresonance) ** 2 - 1.0:.3g}, over {highest:.3g} Hz"
-    return FrequencyResponse(*facts, chi2, gain, estimates, reason)
+    both = _inertia(two, chi2, (-1.0, 0.0, 2.0, 0.0, -2.0, 0.0), *scale)
+    return FrequencyResponse(*facts, chi2, gain, estimates, reason, both)
 
 
 # ---- lines ------------------------------------------------------------------------------------------------------
@@ -313,6 +333,28 @@ def _estimates(fit: Fit, chi2: float) -> dict[str, Estimate]:
         )
         for name, k, per, floor, unit in rows
     }
+
+
+def _inertia(
+    fit: Fit, chi2: float, log_weights: tuple[float, ...], scale_std: float, tolerance: SensorTolerance
+) -> Estimate | None:
+    """Return the inertia whose logarithm is that sum of a fit's parameters; None where the fit is no explanation."""
+    if not fit.converged or chi2 > CHI2_REFUSE:
+        return None
+    weights = np.array(log_weights)
+    covariance, _ = scaled_covariance(fit.jacobian)
+    value = math.exp(float(weights @ fit.x))
+    own = math.sqrt(max(1.0, chi2) * float(weights @ covariance @ weights))
+    return Estimate(
+        value,
+        value * math.hypot(own, scale_std, INERTIA_FLOOR),
+        tolerance.inertia * value,
+        "kg m2",
+        n=len(fit.residual),
+        chi2=chi2,
+        method=METHOD,
+        fallback=INERTIA_FALLBACK,
+    )
 
 
 def _against(

@@ -8,7 +8,7 @@ of an accepted value refuses the run while nothing larger than the small vectors
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +31,20 @@ LIMIT = 0.03
 """Relative 95 % half width of an accepted value."""
 
 
+NAMES: Mapping[str, str] = {
+    "R_s_ohm": "R_s",
+    "L_d_h": "L_d",
+    "L_q_h": "L_q",
+    "psi_f_wb": "psi_f",
+    "J_kgm2": "J",
+    "B_nms": "B",
+    "tau_c_nm": "tau_c",
+}
+"""Machine-file keys as a person reads them."""
+STEPS: Mapping[str, tuple[str, ...]] = {"levels": ("R_s_ohm",), "square": ("L_d_h", "L_q_h"), "speeds": ("psi_f_wb",)}
+"""What each experiment gives that the first small shot predicts."""
+
+
 @dataclass(frozen=True, slots=True)
 class Prediction:
     """Relative standard deviations of the run to come (1)."""
@@ -39,10 +53,21 @@ class Prediction:
     L: float
     psi_f: float
 
-    def line(self) -> str:
-        """Return them as a person reads them."""
-        named = (("R_s", self.R_s), ("L_d, L_q", self.L), ("psi_f", self.psi_f))
-        return "predicted standard deviation: " + ", ".join(f"{name} {100 * value:.2g} %" for name, value in named)
+    def values(self, steps: Iterable[str] = tuple(STEPS)) -> dict[str, float]:
+        """Return those that a run of these experiments gives, by machine-file key."""
+        known = {"R_s_ohm": self.R_s, "L_d_h": self.L, "L_q_h": self.L, "psi_f_wb": self.psi_f}
+        run = set(steps)
+        return {key: known[key] for step, keys in STEPS.items() if step in run for key in keys}
+
+
+def line_of(values: Mapping[str, float]) -> str:
+    """Return predictions as a person reads them; neighbours of one value share it."""
+    parts: list[str] = []
+    keys = list(values)
+    for k, key in enumerate(keys):
+        alike = k + 1 < len(keys) and values[keys[k + 1]] == values[key]
+        parts.append(NAMES[key] if alike else f"{NAMES[key]} {100 * values[key]:.2g} %")
+    return "predicted standard deviation: " + ", ".join(parts)
 
 
 def predict(
@@ -87,18 +112,24 @@ def predict(
     )
 
 
-def check_prediction(prediction: Prediction) -> None:
+def check_prediction(values: Mapping[str, float]) -> None:
     """Refuse a run whose intervals would be wider than an accepted value's.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Relative standard deviations of what the run is to give.
 
     Raises
     ------
     IdentificationError
         ``E_SNR``.
     """
-    for name, value in (("R_s", prediction.R_s), ("L", prediction.L), ("psi_f", prediction.psi_f)):
+    for key, value in values.items():
         if COVERAGE_FACTOR * value > LIMIT:
             raise refuse(
                 "E_SNR",
-                f"the 95 % interval of {name} would be {100 * COVERAGE_FACTOR * value:.2g} %, limit {100 * LIMIT:g} %",
+                f"the 95 % interval of {NAMES[key]} would be {100 * COVERAGE_FACTOR * value:.2g} %, limit "
+                f"{100 * LIMIT:g} %",
                 stage=STAGE,
             )

@@ -105,6 +105,8 @@ class Evaluation:
             found |= {"J_kgm2": self.mechanics.J, "B_nms": self.mechanics.B, "tau_c_nm": self.mechanics.tau_c}
         if self.frequency_response is not None:
             found |= self.frequency_response.found
+            if self.mechanics is None and self.frequency_response.inertia is not None:
+                found["J_kgm2"] = self.frequency_response.inertia
         found.update((name, estimate) for name, estimate in self.map_estimates.items() if name not in found)
         return found
 
@@ -185,7 +187,9 @@ def evaluate(
         dead_time_s = max(0.0, result.resistance.V_dead_v) * period_s / U_dc_v
     mechanics = mechanics_stage.mechanics_of(traces, result, tolerance, dead_time_s)
     result = replace(result, mechanics=mechanics)
-    return replace(result, frequency_response=frequency_stage.frequency_response_of(traces, result))
+    return replace(
+        result, frequency_response=frequency_stage.frequency_response_of(traces, result, tolerance, dead_time_s)
+    )
 
 
 def resistance_of(

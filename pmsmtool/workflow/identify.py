@@ -43,6 +43,7 @@ from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
 from pmsmtool.workflow.limits import Limits, require_speed
 from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Measurement, steps_of
+from pmsmtool.workflow.predicted_file import PREDICTED, dump_predicted
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 from pmsmtool.workflow.sampling_stage import timing_estimates, timing_warnings
 
@@ -247,6 +248,13 @@ def identify_stage(
         locked = request.shaft == "locked"
         measurement = Measurement(guard, limits, keep, say, held=locked, half_frequency=request.half_frequency)
         measurement.spent = lambda: (guard.energised_s, guard.energy_j)
+        predictions: list[dict[str, Any]] = []
+
+        def predicted(prediction: dict[str, Any]) -> None:
+            predictions.append(prediction)
+            run.save(PREDICTED, dump_predicted(predictions))
+
+        measurement.predicted = predicted
         measurement.run(request.quantities)
     stage = evaluated_stage(run, nameplate, request)
     return replace(stage, seconds=clock.now() - start)
@@ -281,6 +289,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     made |= frequency_stage.save_response(target, evaluation.frequency_response)
     target.save(MACHINE, text)
     made_files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
+    made_files |= {name: "" for name in (PREDICTED,) if (run.path / name).is_file()}
     found = evaluation.estimates()
     # the offset of the slow turn alone, which is for the pole pairs, is coarse, and nobody asked for it
     coarse = {"offset_rad"} if evaluation.flux is None else set()

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError
@@ -17,15 +18,19 @@ from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, est
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phases
-from pmsmtool.estimators.prediction import check_prediction, predict
+from pmsmtool.estimators.prediction import check_prediction, line_of, predict
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
+from pmsmtool.experiments.frequency_response import FrequencyPlan
+from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.experiments.vector_turn import RAMP_S
 from pmsmtool.trace import Trace
-from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
+from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage, shaft_forecast
 from pmsmtool.workflow.evaluate import resistance_of, tolerance_on
 from pmsmtool.workflow.half_frequency import measure_at_half_frequency
 from pmsmtool.workflow.limits import Limits
+from pmsmtool.workflow.predicted_file import entry
+from pmsmtool.workflow.shaft_forecast import ShaftForecast, forecast_of
 from pmsmtool.workflow.speed_stage import EMF_SHARE, SpeedStage
 from pmsmtool.workflow.square_stage import SquareStage
 
@@ -97,6 +102,8 @@ class Measurement:
         Whether R is measured at half the control frequency, too.
     spent : callable or None
         Seconds energised and copper loss so far (s, J), told after every stage.
+    predicted : callable or None
+        Told every prediction (``workflow/predicted_file``) before the machine moves for it.
     """
 
     drive: Drive
@@ -107,6 +114,8 @@ class Measurement:
     held: bool = False
     half_frequency: bool = False
     spent: Callable[[], tuple[float, float]] | None = None
+    predicted: Callable[[dict[str, Any]], None] | None = None
+    _kept: dict[str, Trace] = field(default_factory=dict)
 
     def run(self, quantities: tuple[str, ...]) -> None:
         """Run what the quantities need.
@@ -133,20 +142,64 @@ class Measurement:
         encoder = self._rotation(last) if "rotation" in steps else None
         self._tell_spent()
         if resistance is not None and encoder is not None:
-            square = SquareStage(self.drive, self.limits, self.keep, self.say, self.ripple_share)
+            square = SquareStage(self.drive, self.limits, self._keep_for_later, self.say, self.ripple_share)
             inductances = square.measure(noise, resistance, encoder) if "square" in steps else None
             self._tell_spent()
             if inductances is not None and "speeds" in steps:
-                SpeedStage(self.drive, self.limits, self.keep, self.say).measure(resistance, encoder, inductances)
+                SpeedStage(self.drive, self.limits, self._keep_for_later, self.say).measure(
+                    resistance, encoder, inductances
+                )
                 self._tell_spent()
-                if "coasting" in steps:
-                    mechanics_stage.measure_mechanics(self.drive, self.limits, self.keep, self.say)
-                    self._tell_spent()
-                if "response" in steps:
-                    frequency_stage.measure_frequency_response(self.drive, self.limits, self.keep, self.say)
-                    self._tell_spent()
+                if steps & set(shaft_forecast.LATER):
+                    self._shaft(noise, resistance, encoder, steps)
         if resistance is not None and "map" in steps:
             map_stage.measure_map(self.drive, self.limits, noise, resistance, self.held, self.keep, self.say)
+
+    def _shaft(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> None:
+        """Run what measures the shaft, and say before each how well."""
+        forecast = self._forecast(noise, resistance, encoder)
+        if "coasting" in steps:
+
+            def pushes(plan: MechanicsPlan) -> None:
+                if forecast is not None:
+                    values = forecast.mechanics(plan)
+                    self.say(shaft_forecast.mechanics_line(values))
+                    self._tell(entry("mechanics", values, rough=forecast.rough))
+
+            mechanics_stage.measure_mechanics(self.drive, self.limits, self.keep, self.say, pushes)
+            self._tell_spent()
+        if "response" in steps:
+
+            def sequence(plan: FrequencyPlan) -> None:
+                if forecast is not None:
+                    found = forecast.response(plan, self.drive.period_s)
+                    self.say(shaft_forecast.response_line(found))
+                    at = {f"response_{hz:g}_hz": found.at(hz) for hz in shaft_forecast.AT_HZ}
+                    values = {"J_kgm2": found.J, **at}
+                    self._tell(entry("frequency response", values, coherent_to_hz=found.highest_hz))
+
+            frequency_stage.measure_frequency_response(self.drive, self.limits, self.keep, self.say, sequence)
+            self._tell_spent()
+
+    def _forecast(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult) -> ShaftForecast | None:
+        """Return what is known of the shaft so far; None, and said, where its traces are refused."""
+        try:
+            return forecast_of(self.drive, self._kept, noise, resistance, encoder, self._tolerance())
+        except IdentificationError as error:
+            self.say(shaft_forecast.not_predicted(error))
+            self._tell(entry("mechanics", {}, reason=str(error)))
+            return None
+
+    def _tolerance(self) -> SensorTolerance:
+        return tolerance_on(SensorTolerance(), math.sqrt(3.0) * self.limits.V_max_v)
+
+    def _tell(self, prediction: dict[str, Any]) -> None:
+        if self.predicted is not None:
+            self.predicted(prediction)
+
+    def _keep_for_later(self, name: str, trace: Trace) -> None:
+        self._kept[name] = trace
+        self.keep(name, trace)
 
     def _zero_current(self) -> Noise:
         self.say("noise: currents of the drive at rest")
@@ -172,10 +225,17 @@ class Measurement:
             2 * square_injection.SHOT_SAMPLES,
             max(abs(z * i) for z, i in zip(phases.impedance_ohm, phases.currents_a, strict=True)),
             EMF_SHARE * limits.V_max_v * speed_run.SHARES[1],
-            tolerance_on(SensorTolerance(), math.sqrt(3.0) * limits.V_max_v),
+            self._tolerance(),
         )
-        self.say(prediction.line())
-        check_prediction(prediction)
+        values = prediction.values(steps)
+        self.say(line_of(values))
+        later = shaft_forecast.later_line(steps)
+        if later:
+            self.say(later)
+        self._tell(
+            entry("levels", values, later=[what for step, what in shaft_forecast.LATER.items() if step in steps])
+        )
+        check_prediction(values)
 
     def _magnitudes(self) -> list[float]:
         """DC levels that are held with both signs (A)."""

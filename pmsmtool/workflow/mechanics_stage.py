@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.flux_linkage import FluxResult
 from pmsmtool.estimators.mechanics import MechanicsResult, Torque, estimate_mechanics
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.experiments import mechanics_run, speed_run
+from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.trace import Trace
 
 if TYPE_CHECKING:
@@ -58,9 +60,16 @@ def numbered(drive: Drive, name: str, keep: Callable[[str, Trace], None]) -> Cal
 
 
 def measure_mechanics(
-    drive: Drive, limits: Limits, keep: Callable[[str, Trace], None], say: Callable[[str], None]
+    drive: Drive,
+    limits: Limits,
+    keep: Callable[[str, Trace], None],
+    say: Callable[[str], None],
+    planned: Callable[[MechanicsPlan], None] | None = None,
 ) -> None:
-    """Run the steps; the drive holds current gains, flux linkage and rough inertia of the runs before."""
+    """Run the steps; the drive holds current gains, flux linkage and rough inertia of the runs before.
+
+    ``planned`` is told the plan before anything of it moves the shaft.
+    """
     pole_pairs = drive.read("motor.pole_pairs")
     psi, J, L_q = (drive.read(f"motor.{name}") for name in ("psi_f_wb", "J_kgm2", "L_q_h"))
     current = I_SHARE * limits.I_test_apk
@@ -70,6 +79,8 @@ def measure_mechanics(
         f"J, B, tau_c: pushes of {plan.i_q_a:.3g} A up to about {plan.omega_rad_s * 30.0 / math.pi:.0f} rpm and "
         f"coasting with the voltage off, {plan.duration_s:.2g} s"
     )
+    if planned is not None:
+        planned(plan)
     _come_to_rest(drive, pole_pairs * plan.omega_rad_s)
     keep_part = numbered(drive, TRACE, keep)
     abort = ABORT_SHARE * pole_pairs * limits.omega_max_rad_s
@@ -128,16 +139,31 @@ def mechanics_of(
             parts[k] = _between_samples(sampled, direction * pole_pairs, result, dead_time_s)
             moved = float(np.mean(np.abs(parts[k]["i_q_a"] - sampled["i_q_a"])))
             displaced = max(displaced, moved / float(np.mean(np.abs(sampled["i_q_a"]))))
-    unseen = 0.0 if result.flux_map is not None else SATURATION_DOUBT * result.flux.curvature
     return estimate_mechanics(
         parts,
         torque_of(result, pole_pairs),
         1.5 * pole_pairs * psi.value,
         result.noise.sigma_a,
-        math.hypot(psi.std / psi.value, SAMPLE_DOUBT * displaced, unseen),
+        torque_doubt(result.flux, displaced, mapped=result.flux_map is not None),
         direction=direction,
         tolerance=tolerance,
     )
+
+
+def torque_doubt(flux: FluxResult, displaced: float = 0.0, *, mapped: bool = False) -> float:
+    """Return the relative standard deviation of the torque's scale.
+
+    Parameters
+    ----------
+    flux : FluxResult
+        Flux linkage, and how the d axis saturates.
+    displaced : float
+        Displacement of the current's samples, of the current.
+    mapped : bool
+        Whether a flux map gives the torque.
+    """
+    unseen = 0.0 if mapped else SATURATION_DOUBT * flux.curvature
+    return math.hypot(flux.psi_measured.std / flux.psi_measured.value, SAMPLE_DOUBT * displaced, unseen)
 
 
 def _between_samples(trace: Trace, pole_pairs: int, result: Evaluation, dead_time_s: float) -> Trace:

@@ -8,7 +8,7 @@ import pytest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.prediction import Prediction, check_prediction, predict
+from pmsmtool.estimators.prediction import Prediction, check_prediction, line_of, predict
 
 LEVELS = [sign * k / 12.0 for k in range(1, 13) for sign in (1.0, -1.0)] * 2
 EXACT = SensorTolerance(bridge_threshold_v=0.0)
@@ -21,7 +21,7 @@ def of(sigma_a: float, *, dead_time_v: float = 2.0, tolerance: SensorTolerance =
 def test_a_usual_drive_is_predicted_below_a_third_of_a_percent() -> None:
     usual = of(0.002)
     assert usual.R_s < 3e-3 and usual.L < 2e-3 and usual.psi_f == pytest.approx(5e-4)  # 1.9e-3, 0.9e-3
-    check_prediction(usual)
+    check_prediction(usual.values())
 
 
 def test_noise_reaches_R_and_L_and_dead_time_reaches_psi() -> None:
@@ -36,6 +36,16 @@ def test_noise_reaches_R_and_L_and_dead_time_reaches_psi() -> None:
 @pytest.mark.parametrize("name", ["R_s", "L", "psi_f"])
 def test_what_cannot_become_good_enough_is_not_begun(name: str) -> None:
     with pytest.raises(IdentificationError) as caught:
-        check_prediction(replace(of(0.002), **{name: 0.02}))
+        check_prediction(replace(of(0.002), **{name: 0.02}).values())
     assert caught.value.reason == "E_SNR"
     assert name in str(caught.value)
+    others = {"levels", "square", "speeds"} - {{"R_s": "levels", "L": "square", "psi_f": "speeds"}[name]}
+    check_prediction(replace(of(0.002), **{name: 0.02}).values(others))  # what is not measured refuses nothing
+
+
+def test_only_what_a_run_measures_is_predicted() -> None:
+    usual = of(0.002)
+    assert set(usual.values({"levels", "rotation"})) == {"R_s_ohm"}
+    assert set(usual.values()) == {"R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb"}
+    line = line_of(usual.values({"levels", "square"}))
+    assert "R_s" in line and "L_d, L_q" in line and "psi_f" not in line
