@@ -17,7 +17,7 @@ too, and a second run goes on behind it.
 intervals are too narrow.
 
 Seeds that were looked at while the estimators were made: 0 to 9, 100 to 139, 300 to 329, 2000 to 2019, 3000 to 3019,
-5000 to 5075 (voltage limit), 7000 to 7002 and 7100 to 7151 (inject).
+5000 to 5075 (voltage limit), 7000 to 7002 and 7100 to 7151 (inject), 8000 to 8041 and 65000 to 65076 (recorder).
 """
 
 from __future__ import annotations
@@ -64,6 +64,8 @@ CHANNELS = {
 TOO_NARROW = 1e-3
 OF_THE_MACHINE = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2", "offset_rad")
 """What is judged at tier inject, at the reference temperature."""
+AT_REFERENCE = {"inject": OF_THE_MACHINE, "recorder": ("R_s_ohm", "psi_f_wb")}
+"""What a tier tells at the reference temperature; the ratios to psi are at the temperature of the run."""
 
 
 def truth_of(drive: MachineFile) -> dict[str, float]:
@@ -139,9 +141,8 @@ def judged(tier: str, seed: int, speed: float, *, given: bool = True) -> dict[st
     """Identify one drive; returns errors and half widths, or the refusal."""
     drive = draw_drive(seed)
     truth = truth_of(drive)
-    if tier == "inject":
-        values = Settings(drive.simulation_settings())
-        truth |= {name: values.number(name) for name in OF_THE_MACHINE if not name.endswith("_rad")}
+    values = Settings(drive.simulation_settings())
+    truth |= {name: values.number(name) for name in AT_REFERENCE.get(tier, ()) if not name.endswith("_rad")}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.toml"
         path.write_text(dump_machine_file(drive), encoding="utf-8")

@@ -219,10 +219,10 @@ def estimate_flux_linkage(
     L_d = _rough_L_d(rows, np.nonzero(rows.is_d)[0])
     driven = driven_flux_linkage(rows, L_d, x2, even.curvature, lag_s, tolerance, T)
     return FluxResult(
-        psi_f=_normalise(measured, T_ref_c, alpha_psi_per_k, tolerance),
+        psi_f=normalised(measured, T_ref_c, alpha_psi_per_k, tolerance),
         psi_measured=measured,
         frame_offset=offset,
-        driven=None if driven is None else _normalise(driven, T_ref_c, alpha_psi_per_k, tolerance),
+        driven=None if driven is None else normalised(driven, T_ref_c, alpha_psi_per_k, tolerance),
         voltage_scale_std=tolerance.voltage_scale_std,
         L_q_app=Estimate(
             value=float(d_fit[0]),
@@ -343,7 +343,8 @@ def _rough_L_d(rows: Corrected, which: NDArray[np.int64]) -> float:
     return float(np.linalg.lstsq(columns, rows.u_q[which], rcond=None)[0][1])
 
 
-def _normalise(measured: Estimate, T_ref_c: float, alpha: float, tolerance: SensorTolerance) -> Estimate:
+def normalised(measured: Estimate, T_ref_c: float, alpha: float, tolerance: SensorTolerance) -> Estimate:
+    """Return psi moved from its measured temperature to the reference temperature."""
     known = math.isfinite(measured.T_c)
     factor = 1.0 + alpha * (measured.T_c - T_ref_c) if known else 1.0
     value = measured.value / factor

