@@ -32,8 +32,8 @@ HIGH_LEVEL = 0.6
 """d currents that count here, of the largest: beside the ripple's own size the error of a small one is not odd."""
 FLOOR_PERIODS = 0.0015
 """Standard deviation of the shown instant beside its noise (T_s); see :func:`shown_instant`."""
-RISE = 0.05
-"""Slope of the prediction by the instant where it has none: a fit is not to run away there."""
+LATEST, RISE = 0.12, 0.05
+"""Instant past which the prediction keeps rising (T_s), and its least slope there."""
 INSTANTS = tuple(float(x) for x in np.linspace(-0.06, 0.24, 11))
 LAGS = (0.0, 0.02, 0.05, 0.08, 0.12, 0.17, 0.23, 0.3, 0.4, 0.55, 0.75, 1.0, 1.5)
 """Grid of the prediction (T_s)."""
@@ -242,8 +242,10 @@ def shown_instant(
             u = rows.w[use] * L_q * ripple - R_ohm * 0.5 * rows.w[use] ** 2 * psi_wb / L_d * course
             table[j, k] = functional[0] @ (0.5 * (u[:count] + u[count:]))
     # past the end of the zero vectors the ripple turns back; a second instant with the same value is not meant
-    table = np.maximum.accumulate(table, axis=0)
-    table += RISE * T_s * (np.asarray(INSTANTS) - INSTANTS[0])[:, None] * (table >= np.max(table, axis=0))
+    for j in range(1, len(INSTANTS)):
+        if INSTANTS[j] > LATEST:
+            least = table[j - 1] + RISE * T_s * (INSTANTS[j] - INSTANTS[j - 1])
+            table[j] = np.maximum(table[j], least)
     return ShownInstant(
         value_s=float(found[0]),
         std_s=math.hypot(noise, FLOOR_PERIODS * T_s),

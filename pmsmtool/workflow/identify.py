@@ -437,7 +437,7 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
             for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
             if error > 0.0
         ]
-    lines += timing_warnings(evaluation.inductance, evaluation.shown)
+    lines += timing_warnings(evaluation.shown)
     lines += [f"{check.name} {check.verdict}" for check in evaluation.checks if not check.agrees]
     if evaluation.pairs is not None and not evaluation.pairs.judged:
         lines.append("the phases were not compared: the rotor did not come to rest on the three pairs")

@@ -78,12 +78,11 @@ def timing_estimates(
     }
 
 
-def timing_warnings(inductance: InductanceResult | None, shown: ShownInstant | None) -> list[str]:
+def timing_warnings(shown: ShownInstant | None) -> list[str]:
     """Return what a reader should know about the instant."""
-    sampling = None if inductance is None else inductance.sampling
-    if sampling is None or shown is None or abs(sampling.instant_s) < TOLD_PERIODS * shown.period_s:
+    if shown is None or abs(shown.value_s) < TOLD_PERIODS * shown.period_s:
         return []
     return [
-        f"the currents are sampled {1e6 * sampling.instant_s:+.2g} us beside the middle of the zero vector, or the "
-        "encoder's angle is that old: both look the same, and values are corrected for a late sample"
+        f"the d voltage at speed shows currents sampled {1e6 * shown.value_s:+.2g} us beside the middle of the zero vector "
+        "or an encoder angle that is so old; the values are corrected for the former"
     ]

@@ -13,6 +13,7 @@ from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance
 from pmsmtool.estimators.inductance import EDGE_STD, FrameAhead, InductanceResult, estimate_inductances
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
+from pmsmtool.estimators.sampling_instant import INSTANTS, LAGS, ShownInstant
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, Run, curve_points, draw, repeat, run
 
@@ -329,3 +330,25 @@ def test_what_depends_on_the_current_acts_at_one_edge_of_each_leg(plain: Shots) 
     )
     assert with_slope.value - without.value == pytest.approx(slope * d.T_s[k] / 4.0, rel=0.2)
     assert with_slope.std > EDGE_STD * slope * d.T_s[k]
+
+
+def test_square_waves_that_contradict_the_turning_machine_are_refused(plain: Shots) -> None:
+    """As iron loss does, which looks like a sample that is early by a third of a period."""
+    d, k = plain.drives, 0
+    table = np.tile(np.linspace(-0.06, 0.24, len(INSTANTS))[:, None] * d.T_s[k], (1, len(LAGS)))
+    fits = plain.estimate(k)
+
+    def shown(late_periods: float) -> ShownInstant:
+        return ShownInstant(late_periods * d.T_s[k], 0.002 * d.T_s[k], d.T_s[k], 0.0, 1.0, table)
+
+    def estimate(instant: ShownInstant) -> InductanceResult:
+        shots = {axis: [plain.trace(k, axis, half) for half in HALF_PERIODS] for axis in "dq"}
+        noise = Noise(d.sigma_dq[k], 0, 0, 2048)
+        return estimate_inductances(shots["d"], shots["q"], noise, d.R[k], frame=_ahead(d, k), instant=instant)
+
+    agrees = estimate(shown(1.0 - fits.delay))
+    assert agrees.sampling is not None
+    assert agrees.L_d.value == pytest.approx(fits.L_d.value, rel=5e-3)  # measured below
+    with pytest.raises(IdentificationError, match="sampled") as refusal:
+        estimate(shown(-0.3))
+    assert refusal.value.reason == "E_MODEL_MISMATCH"

@@ -43,7 +43,7 @@ def test_the_instant_is_told() -> None:
     # only instant less lag is known where the lag is far below a period
     difference = instant.value - found["current_lag_s"].value
     assert difference == pytest.approx(INSTANT_S - LAG_S, abs=2.0 * instant.std + 0.1e-6)
-    (line,) = timing_warnings(evaluation.inductance, evaluation.shown)
+    (line,) = timing_warnings(evaluation.shown)
     assert "sampled +" in line and "old" in line
 
 
@@ -61,7 +61,7 @@ def test_a_drive_that_samples_in_time_is_not_warned_of() -> None:
     drive = drawn("", 40012, "ideal")
     traces, nameplate, _ = measured(drive)
     evaluation = evaluated(traces, nameplate)
-    assert timing_warnings(evaluation.inductance, evaluation.shown) == []
+    assert timing_warnings(evaluation.shown) == []
     instant = timing_estimates(evaluation.inductance, evaluation.shown, SensorTolerance())["sampling_instant_s"]
     assert abs(instant.value) < 2.0 * instant.std
     assert evaluation.inductance is not None and evaluation.resistance is not None
