@@ -83,6 +83,6 @@ def timing_warnings(shown: ShownInstant | None) -> list[str]:
     if shown is None or abs(shown.value_s) < TOLD_PERIODS * shown.period_s:
         return []
     return [
-        f"the d voltage at speed shows currents sampled {1e6 * shown.value_s:+.2g} us beside the middle of the zero vector "
-        "or an encoder angle that is so old; the values are corrected for the former"
+        f"the d voltage at speed shows currents sampled {1e6 * shown.value_s:+.2g} us beside the middle of the "
+        "zero vector or an encoder angle that is so old; the values are corrected for the former"
     ]
