@@ -197,8 +197,8 @@ def shown_instant(
     """Read the sampling instant off the d voltage of pairs of d currents; None with fewer than five pairs.
 
     The sum over a pair has no part of i_d or of the inverter's error; what is left is the frame's offset (w), the
-    instant (w^2) and a constant. It was 0.0006 T_s rms from what the simulated instants should show on 16 random switched
-    drives that sample in time, 0.0024 on 36 that do not. Where the ripple is as large as the d currents it is blurred.
+    instant (w^2) and a constant. It was 0.0006 T_s rms from what the simulated instants should show on 16 random
+    switched drives that sample in time, 0.0024 on 36 that do not. A ripple as large as the d currents blurs it.
 
     Parameters
     ----------
