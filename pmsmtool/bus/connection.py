@@ -94,6 +94,8 @@ class Connection:
         How long the reader thread did not listen because the computer did not run it (s).
     listeners : list of callable
         Given every message received, error frames too.
+    at_close : list of callable
+        Called, the last first, before the bus is shut down.
     """
 
     def __init__(self, bus: can.BusABC, *, writer: Any = None) -> None:
@@ -105,6 +107,7 @@ class Connection:
         self.heard: set[int] = set()
         self.sent: dict[int, deque[bytes]] = {}
         self.listeners: list[Callable[[can.Message], None]] = []
+        self.at_close: list[Callable[[], None]] = []
         self._writer = writer
         self._subscribers: dict[int, tuple[Callback, ...]] = {}
         self._failure: PmsmtoolError | None = None
@@ -128,7 +131,13 @@ class Connection:
         self.close()
 
     def close(self) -> None:
-        """Shut the bus and the trace down; harmless when it has failed already."""
+        """End what is still open on the bus, shut it and the trace down; harmless when it has failed already."""
+        with contextlib.ExitStack() as last:
+            last.callback(self._shut)
+            for close in self.at_close:
+                last.callback(close)
+
+    def _shut(self) -> None:
         self._closing = True
         if self._reader is not None and self._reader is not threading.current_thread():
             self._reader.join(2 * _POLL_S)

@@ -50,6 +50,8 @@ class DriveNode:
         Heartbeat, emergencies, other masters.
     before_write : callable or None
         Told of every object that :meth:`put` and :meth:`write_bytes` are about to change.
+    before_close : list of callable
+        Called, the last first, by :meth:`close`, while the node can still be talked to.
     """
 
     def __init__(self, connection: Connection, node: int, *, drive_map: DriveMap | None = None) -> None:
@@ -60,11 +62,16 @@ class DriveNode:
         self.sdo = SdoChannel(connection, node, check=self.supervision.check)
         self.sdo.slow_objects[objects.STORE_ALL] = STORE_TIMEOUT_S
         self.before_write: Watcher | None = None
+        self.before_close: list[Callable[[], object]] = []
+        connection.at_close.append(self.close)
 
     def close(self) -> None:
-        """Stop listening to the node."""
-        self.sdo.close()
-        self.supervision.close()
+        """Stop listening to the node; whoever closes the bus does it, too. Once."""
+        with contextlib.ExitStack() as last:
+            last.callback(self.supervision.close)
+            last.callback(self.sdo.close)
+            while self.before_close:
+                last.callback(self.before_close.pop(0))
 
     # ---- objects --------------------------------------------------------------------------------
 

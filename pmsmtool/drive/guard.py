@@ -62,6 +62,8 @@ class GuardedDrive:
         Of the dead-man, once it was shown.
     energy_j, energised_s : float
         Copper loss and time spent so far.
+    over : bool
+        Whether the drive was given back, restored or with an error that says what is not.
     """
 
     def __init__(self, drive: CanopenDrive, envelope: Envelope) -> None:
@@ -74,6 +76,7 @@ class GuardedDrive:
         self._node = drive.node
         self._heartbeat = Heartbeat(drive.node.connection)
         self._before: dict[_Object, bytes] = {}
+        self.over = False
         self._ended = False
         self._start_rad: float | None = None
         self._pole_pairs = 1.0
@@ -421,6 +424,8 @@ def guarded(
         The dead-man could not be shown.
     """
     guard = GuardedDrive(drive, envelope)
+    # A signal on the way into or out of the `with` block leaves this generator where it is: closing the node ends it.
+    drive.node.before_close.append(lambda: _end(guard, say))
     interrupted = False
     try:
         try:
@@ -434,14 +439,26 @@ def guarded(
         finally:
             interrupted = guard.stop() or interrupted
     finally:
-        # Again: a signal in the wrong microsecond may have ended the first one. It does nothing when that succeeded.
-        interrupted = guard.stop() or interrupted
-        with interrupts_deferred() as noted:
-            count = _restored(guard)
-        say(f"{RESTORED} ({count} objects)")
-        interrupted = interrupted or bool(noted)
+        interrupted = _end(guard, say) or interrupted
     if interrupted:
         raise Interrupted("interrupted: the machine is stopped, voltage off, and the drive restored")
+
+
+def _end(guard: GuardedDrive, say: Callable[[str], None]) -> bool:
+    """Stop, restore and say so, once; return whether there was a Ctrl-C meanwhile."""
+    if guard.over:
+        return False
+    try:
+        # Again: a signal in the wrong microsecond may have ended the first stop. It does nothing when that succeeded.
+        interrupted = guard.stop()
+        with interrupts_deferred() as noted:
+            count = _restored(guard)
+            guard.over = True
+    except PmsmtoolError:
+        guard.over = True  # it is told what is left, and would fail again
+        raise
+    say(f"{RESTORED} ({count} objects)")
+    return interrupted or bool(noted)
 
 
 def _restored(guard: GuardedDrive) -> int:

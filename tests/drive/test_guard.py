@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 import random
 import signal
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from types import FrameType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +17,7 @@ import pytest
 from pmsmtool.cia402 import State
 from pmsmtool.drive import objects
 from pmsmtool.drive.envelope import Envelope
-from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive, guarded
+from pmsmtool.drive.guard import OVERSHOOT, RESTORED, GuardedDrive, guarded
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.errors import (
     DriveFault,
@@ -297,3 +300,52 @@ def test_what_a_stopped_machine_shows_is_no_measurement(bench: SimBench, measure
             guard.average(["i_d_a"], 100)
         else:
             guard.record(["i_d_a"], 100)
+
+
+class InterruptAtBytecode:
+    """Ctrl-C at the n-th bytecode after :meth:`arm`, in whatever frame of this package, these tests or contextlib."""
+
+    def __init__(self, number: int) -> None:
+        self.left = number
+
+    def arm(self) -> None:
+        frame = sys._getframe(1)
+        while frame is not None:
+            frame.f_trace, frame.f_trace_opcodes = self.trace, True
+            frame = frame.f_back
+        sys.settrace(self.trace)
+
+    def trace(self, frame: FrameType, event: str, argument: object) -> Any:
+        frame.f_trace_opcodes = True
+        if event == "opcode":
+            self.left -= 1
+            if self.left < 0:
+                sys.settrace(None)
+                raise KeyboardInterrupt
+        return self.trace
+
+
+@pytest.mark.parametrize("number", range(24))
+def test_ctrl_c_between_the_guard_and_its_block_restores_too(number: int) -> None:
+    """A `with` statement that is interrupted before its block has begun calls no exit: closing the bus has to do it."""
+    said: list[str] = []
+    moment = InterruptAtBytecode(number)
+
+    def say(text: str) -> None:
+        said.append(text)
+        if text.startswith("dead-man"):
+            moment.arm()
+
+    bench = None
+    try:
+        with pytest.raises((Interrupted, KeyboardInterrupt)), sim_bench() as bench:
+            before = bench.memory()
+            with guarded(bench.drive, ENVELOPE, say=say) as guard:
+                guard.enable()
+                guard.wait(10.0)
+    finally:
+        sys.settrace(None)
+    assert bench is not None and moment.left < 0, "the interrupt came"
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+    assert bench.memory() == before
+    assert sum(RESTORED in text for text in said) == 1
