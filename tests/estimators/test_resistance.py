@@ -32,16 +32,24 @@ SAMPLES = 1600
 
 
 def levels_of(
-    d: Drives, k: int, rng: np.random.Generator, *, heating_k: float = 0.0, sensor: bool = True, offset_v: float = 0.0
+    d: Drives,
+    k: int,
+    rng: np.random.Generator,
+    *,
+    heating_k: float = 0.0,
+    sensor: bool = True,
+    offset_v: float = 0.0,
+    zero_a: float = 0.0,
 ) -> Trace:
-    """Means of alternating DC levels along 90 degrees, where phase a is idle."""
+    """Means of alternating DC levels along 90 degrees, where phase a is idle; what is shown is ``zero_a`` too much."""
     i = np.array(level_sequence([fraction * d.I_r[k] for fraction in LEVELS]))
     n = len(i)
     T = 20.0 + heating_k * np.linspace(0.0, 1.0, n)
-    phase = 0.5 * math.sqrt(3.0) * i
+    flows = i - zero_a
+    phase = 0.5 * math.sqrt(3.0) * flows
     error = d.dV[k] * inverter_shape(np.full(n, d.shape[k]), phase / d.knee[k])
     error += d.drop[k] * np.tanh(phase / (0.3 * d.knee[k]))
-    v = d.R[k] * (1.0 + ALPHA * (T - 20.0)) * i + 2.0 / math.sqrt(3.0) * error + offset_v
+    v = d.R[k] * (1.0 + ALPHA * (T - 20.0)) * flows + 2.0 / math.sqrt(3.0) * error + offset_v
     halves = [i + d.sigma_dq[k] * rng.standard_normal(n) / math.sqrt(SAMPLES / 2) for _ in range(2)]
     signals = {
         "i_d_a": 0.5 * (halves[0] + halves[1]),
@@ -152,6 +160,19 @@ def test_five_tail_models_that_begin_with_one_over_the_current() -> None:
     assert len(tail_models()) == 5
     assert len(set(tail_models())) == 5
     assert all(powers[0] == 1 for powers in tail_models())
+
+
+def test_zeros_of_the_current_sensors_are_no_model_mismatch() -> None:
+    """A hard drive like seed 76660: its tail is 0.13 R I at the largest level, its zeros are off by 1.5e-3 of it."""
+    rng = np.random.default_rng(8)
+    d = draw(1, rng)
+    d.shape[:], d.drop[:], d.dV[:], d.knee[:] = 2.0, 0.0, 4.0 * d.R * d.I_r, 0.05 * d.I_r
+    true = estimate_resistance(levels_of(d, 0, rng), noise_of(d, 0))
+    for zero_a in (1.5e-3 * d.I_r[0], -1.5e-3 * d.I_r[0]):
+        off = estimate_resistance(levels_of(d, 0, rng, zero_a=zero_a), noise_of(d, 0))
+        assert off.R_measured.chi2 < 1.25  # measured 0.17; 5.6 to 6.1 without the even tail
+        assert off.R_s.value == pytest.approx(true.R_s.value, rel=1e-3)  # measured 3e-4
+        assert abs(off.R_s.value / d.R[0] - 1.0) < COVERAGE_FACTOR * off.R_s.std / d.R[0]
 
 
 def test_efficiency_against_the_bound_of_the_same_tail_terms() -> None:
