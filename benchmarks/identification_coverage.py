@@ -6,12 +6,14 @@
     python -m benchmarks.identification_coverage --drives 100 --first 10000 --hard
     python -m benchmarks.identification_coverage --drives 24 --first 35000 --hard --half-frequency
     python -m benchmarks.identification_coverage --drives 400 --keep FOLDER --measure-only
+    python -m benchmarks.identification_coverage --drives 400 --keep FOLDER --bridge 0.2
 
 Drives follow from their seeds (``workflow/random_drives.py``); the tool sees their nameplate only. Printed per
 quantity: error quantiles, how often the statistical and the total (printed) 95 % interval holds the truth, with its
 Clopper-Pearson interval, and every refusal by name. ``R_at_T_ohm`` is the loop at the temperature of the measurement:
 the share of devices and copper, which no experiment sees, enters ``R_s_ohm`` only. The thresholds of the bridge's
-devices act as another DC link, which no current shows either: psi_f is told with and without them.
+devices act as another DC link, which no current shows either: psi_f is told with and without them. ``--bridge`` has
+their data sheet say so (``identify --cal bridge=...``), off by what its tolerance says.
 
 With ``--keep`` the traces are kept, 0.6 MB a drive, and read from there when they are there already: a run that was
 interrupted goes on, and changed estimators are judged in a sixth of the time.
@@ -34,12 +36,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.commissioning import drive_of
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.estimators.estimate import statistical_half_width, total_half_width
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, statistical_half_width, total_half_width
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.sim.simulated_machine import Settings, device_slope_ohm
 from pmsmtool.trace import Trace
@@ -56,6 +60,8 @@ HARD_RATIO = 3.0
 """Dead-time voltage over R I_nom from which a drive is of the hard class of the resistance."""
 BUS_TIME_S = 60.0
 """Time on the bus that the electrical identification is to keep to."""
+DATA_SHEET = 1
+"""Beside the seed of a drive: what its data sheet is off by."""
 DRAWN_SPREAD = 0.10
 """Spread of the drives around a profile (standard deviation of the log of each parameter)."""
 
@@ -102,6 +108,7 @@ class Choice:
     half_frequency: bool = False
     keep: Path | None = None
     measure_only: bool = False
+    bridge_v: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -127,9 +134,26 @@ def threshold_share(row: Mapping[str, Any]) -> float:
     A bridge of MOSFETs has none: its diodes conduct in the dead time only.
     """
     drive = drawn(row["profile"], row["seed"], row["block"])
+    return threshold_difference_v(drive) / drive.inverter.U_dc_v
+
+
+def threshold_difference_v(drive: MachineFile) -> float:
+    """Return V_diode - V_switch of a drive (V)."""
     values = Settings(drive.simulation_settings())
     switch = values.number("device_drop_v")
-    return (values.number("diode_drop_v") - switch) / drive.inverter.U_dc_v if switch > 0.0 else 0.0
+    return values.number("diode_drop_v") - switch if switch > 0.0 else 0.0
+
+
+def data_sheet(drive: MachineFile, seed: int, tolerance_v: float) -> SensorTolerance | None:
+    """Return what a data sheet says of the bridge, off by what its tolerance (V, 95 %) says; None without one."""
+    if not tolerance_v:
+        return None
+    std_v = tolerance_v / COVERAGE_FACTOR
+    off_v = std_v * float(np.random.default_rng([seed, DATA_SHEET]).standard_normal())
+    difference_v = threshold_difference_v(drive)
+    if not difference_v:
+        return None
+    return SensorTolerance(bridge_difference_v=difference_v + off_v, bridge_threshold_v=std_v)
 
 
 def identify_one(job: tuple[str, int, str], choice: Choice) -> dict[str, Any]:
@@ -145,7 +169,7 @@ def identify_one(job: tuple[str, int, str], choice: Choice) -> dict[str, Any]:
     traces, nameplate, seconds = found_traces
     start = time.process_time()
     try:
-        evaluation = evaluated(traces, nameplate)
+        evaluation = evaluated(traces, nameplate, data_sheet(drive, seed, choice.bridge_v))
     except PmsmtoolError as error:
         return {**row, **asdict(Refusal.of(error))}
     row["offline_s"] = time.process_time() - start
@@ -153,7 +177,7 @@ def identify_one(job: tuple[str, int, str], choice: Choice) -> dict[str, Any]:
     found = evaluation.estimates()
     assert evaluation.resistance is not None
     found["R_at_T_ohm"] = evaluation.resistance.R_measured
-    row["seconds"] = seconds
+    row["seconds"], row["bridge_v"] = seconds, choice.bridge_v
     for name in QUANTITIES:
         estimate = found[name]
         off = estimate.value - truth[name]
@@ -194,9 +218,12 @@ def measured(drive: MachineFile, half_frequency: bool = False) -> Measured:
         return _measured(path, half_frequency)
 
 
-def evaluated(traces: dict[str, Trace], nameplate: MachineFile) -> Evaluation:
+def evaluated(
+    traces: dict[str, Trace], nameplate: MachineFile, tolerance: SensorTolerance | None = None
+) -> Evaluation:
     """Estimate from the traces of :func:`measured`."""
-    return evaluate(traces, nameplate.inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=nameplate.inverter.U_dc_v)
+    T_ref_c, inverter = nameplate.machine.T_ref_c, nameplate.inverter
+    return evaluate(traces, inverter.T_s, T_ref_c=T_ref_c, U_dc_v=inverter.U_dc_v, tolerance=tolerance)
 
 
 def _measured(path: Path, half_frequency: bool) -> Measured:
@@ -249,12 +276,15 @@ def summary(rows: list[dict[str, Any]]) -> str:
             + " ".join(f"{q:8.4f}{unit:3s}" for q in quantiles)
             + "  ".join(_covered(accepted, name, kind) for kind in ("statistical", "total"))
         )
-    shares = [threshold_share(row) for row in accepted]
-    seen = [100.0 * abs(row["psi_f_wb"]["error"] + share) for row, share in zip(accepted, shares, strict=True)]
-    seen.sort()
-    lines.append(
-        f"psi_f besides the bridge's thresholds: p90 {seen[round(0.9 * (len(seen) - 1))]:.4f}%, max {seen[-1]:.4f}%"
-    )
+    if bridge_v := accepted[0].get("bridge_v"):
+        lines.append(f"the thresholds of the bridge were told, within {bridge_v:g} V (95 %)")
+    else:
+        shares = [threshold_share(row) for row in accepted]
+        seen = [100.0 * abs(row["psi_f_wb"]["error"] + share) for row, share in zip(accepted, shares, strict=True)]
+        seen.sort()
+        lines.append(
+            f"psi_f besides the bridge's thresholds: p90 {seen[round(0.9 * (len(seen) - 1))]:.4f}%, max {seen[-1]:.4f}%"
+        )
     times = sorted(row["seconds"] for row in accepted)
     late = sum(seconds > BUS_TIME_S for seconds in times)
     middle = times[len(times) // 2]
@@ -299,6 +329,7 @@ def main() -> None:
     parser.add_argument("--rows", type=Path, help="write every drive's result there (JSON lines)")
     parser.add_argument("--tabulate", type=Path, metavar="ROWS", help="only print the table of a file of --rows")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the traces there, and use what is there")
+    parser.add_argument("--bridge", type=float, default=0.0, metavar="V", help="tell its thresholds, to this tolerance")
     parser.add_argument("--measure-only", action="store_true", help="with --keep: estimate nothing yet")
     options = parser.parse_args()
     if options.measure_only and not options.keep:
@@ -316,7 +347,7 @@ def main() -> None:
         jobs = (job for job in jobs if is_hard(drawn(*job)))
     with multiprocessing.Pool(options.processes) as pool:
         rows = []
-        choice = Choice(options.half_frequency, options.keep, options.measure_only)
+        choice = Choice(options.half_frequency, options.keep, options.measure_only, options.bridge)
         one = functools.partial(identify_one, choice=choice)
         for row in pool.imap_unordered(one, itertools.islice(jobs, options.drives)):
             rows.append(row)

@@ -53,7 +53,8 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     multiple=True,
     metavar="V_dc|I=SHOWN:TRUE:TOL",
     help="What an instrument read while the drive showed SHOWN, and its 95 % tolerance, with units: "
-    "V_dc=540V:537V:0.5V, I=5.00Apk:5.02Apk:0.2%; takes that scale out.",
+    "V_dc=540V:537V:0.5V, I=5.00Apk:5.02Apk:0.2%; takes that scale out. So does bridge=SWITCH:DIODE:TOL, the "
+    "thresholds in the data sheet of the bridge's devices: bridge=0.9V:1.1V:0.2V.",
 )
 @click.option(
     "--half-frequency",

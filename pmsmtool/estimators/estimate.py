@@ -63,6 +63,8 @@ class SensorTolerance:
         Age of the encoder's angle at the period's start (s): looks like a late current sample.
     current_scale, voltage_scale : float
         True over shown, where an instrument said so; the gains are then the instrument's tolerances.
+    bridge_difference_v : float or None
+        Diode minus switch threshold, where the devices' data sheet said so (V); the standard deviation is then its.
     """
 
     current_gain: float = SENSOR_GAIN_TOLERANCE
@@ -74,6 +76,12 @@ class SensorTolerance:
     encoder_latency_s: float = ENCODER_LATENCY_S
     current_scale: float = 1.0
     voltage_scale: float = 1.0
+    bridge_difference_v: float | None = None
+
+    @property
+    def applied_scale(self) -> float:
+        """True over shown of the applied voltage: of the DC-link measurement, and of what a leg swings by beyond it."""
+        return self.voltage_scale * (1.0 + (self.bridge_difference_v or 0.0) / self.U_dc_v)
 
     @property
     def voltage_scale_std(self) -> float:

@@ -200,9 +200,10 @@ def shown_instant(
     """Read the sampling instant off the d voltage of pairs of d currents; None with fewer than five pairs.
 
     The sum over a pair has no part of i_d or of the inverter's error; what is left is the frame's offset (w), the
-    instant (w^2) and a constant. Of 736 random switched drives, half of them with late samples, it was off from what the
-    simulated instants should show by 0.0007 T_s rms where the dead time is 0.003 T_s, and 0.0039 where it is 0.05: 0.66 of
-    the standard deviation, 0.90 in the class of large dead times. A ripple as large as the d currents blurs it.
+    instant (w^2) and a constant. Of 736 random switched drives, half of them with late samples, it was off from what
+    the simulated instants should show by 0.0007 T_s rms where the dead time is 0.003 T_s, and by 0.0039 where it is
+    0.05: 0.66 of the standard deviation, 0.90 in the class of large dead times. A ripple as large as the d currents
+    blurs it.
 
     Parameters
     ----------

@@ -118,7 +118,8 @@ def wrapped(angle: float) -> float:
 
 def tolerance_on(tolerance: SensorTolerance, U_dc_v: float) -> SensorTolerance:
     """Return the tolerances with the DC link on which the thresholds of the bridge act (V)."""
-    threshold_v = 0.0 if U_dc_v < MOSFET_LINK_V else tolerance.bridge_threshold_v
+    without = U_dc_v < MOSFET_LINK_V and tolerance.bridge_difference_v is None
+    threshold_v = 0.0 if without else tolerance.bridge_threshold_v
     return replace(tolerance, U_dc_v=U_dc_v, bridge_threshold_v=threshold_v)
 
 

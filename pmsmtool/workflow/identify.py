@@ -459,6 +459,8 @@ def _conditions(evaluation: Evaluation, request: IdentifyRequest) -> dict[str, A
         "voltage_scale": request.tolerance.voltage_scale,
         "noise_apk": evaluation.noise.sigma_a,
     }
+    if request.tolerance.bridge_difference_v is not None:
+        conditions["bridge_difference_v"] = request.tolerance.bridge_difference_v
     if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
         conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
     return conditions

@@ -14,7 +14,7 @@ from typing import Literal
 
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
-from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
+from pmsmtool.estimators.estimate import SENSOR_GAIN_TOLERANCE, SensorTolerance, total_half_width
 from pmsmtool.estimators.flux_linkage import normalised as flux_at_reference
 from pmsmtool.estimators.inertia_ratio import estimate_ratios
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
@@ -28,6 +28,8 @@ from pmsmtool.machine.parameters import Estimate, InverterParameters, MachinePar
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 from pmsmtool.units import format_estimate
+from pmsmtool.workflow.calibration import calibrated_traces
+from pmsmtool.workflow.evaluate import tolerance_on
 from pmsmtool.workflow.identify import (
     MACHINE,
     NAMEPLATE,
@@ -162,8 +164,13 @@ def tier_result(
     IdentificationError
         A trap is seen; a single quantity that cannot be told is in ``missing``.
     """
+    tolerance = tolerance or SensorTolerance()
+    if tolerance.bridge_difference_v is not None:
+        tolerance = tolerance_on(tolerance, facts.U_dc_v or math.inf)
+    recorded, traces = traces, calibrated_traces(traces, tolerance)
     if facts.kind == "recorder":
-        return _by_recorder(traces, facts, tolerance or SensorTolerance(), copper or Copper(), alpha_psi_per_k)
+        result = _by_recorder(traces, facts, tolerance, copper or Copper(), alpha_psi_per_k)
+        return replace(result, traces=recorded)
     estimates: dict[str, Estimate] = {}
     if SUPPLY_LEVELS in traces:
         estimates["R_s_ohm"] = resistance_by_supply(traces[SUPPLY_LEVELS], tolerance=tolerance)
@@ -176,7 +183,7 @@ def tier_result(
         pushed, missing = _by_torque(traces, replace(facts, pole_pairs=pole_pairs), tolerance, inverter, psi_f_wb)
         estimates |= pushed
         missing = {name: why for name, why in missing.items() if name not in estimates}
-    return TierResult(estimates, missing, traces)
+    return TierResult(estimates, missing, recorded)
 
 
 def _by_recorder(
@@ -202,7 +209,7 @@ def _by_recorder(
 def _by_torque(
     traces: Mapping[str, Trace],
     facts: TierFacts,
-    tolerance: SensorTolerance | None,
+    tolerance: SensorTolerance,
     inverter: InverterParameters | None,
     psi_f_wb: float,
 ) -> tuple[dict[str, Estimate], dict[str, str]]:
@@ -214,7 +221,10 @@ def _by_torque(
     try:
         if facts.voltage == "machine":
             coasts = [trace for name, trace in traces.items() if name.startswith("coast")]
-            estimates["psi_f_wb"] = flux_by_undriven_voltage(coasts, pole_pairs=pole_pairs, tolerance=tolerance)
+            # another sensor than the DC link's: an instrument there says nothing of it
+            gain = tolerance.voltage_gain if tolerance.voltage_scale == 1.0 else SENSOR_GAIN_TOLERANCE
+            own = replace(tolerance, voltage_gain=gain)
+            estimates["psi_f_wb"] = flux_by_undriven_voltage(coasts, pole_pairs=pole_pairs, tolerance=own)
         elif "voltage_limit" in traces:
             share = None if inverter is None or not inverter.dead_time_s else inverter.dead_time_s / inverter.T_s
             estimates["psi_f_wb"] = flux_by_voltage_limit(

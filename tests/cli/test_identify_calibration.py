@@ -16,6 +16,7 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.workflow.calibration import calibrated_tolerance
+from pmsmtool.workflow.evaluate import tolerance_on
 from pmsmtool.workflow.random_drives import true_loop_resistance
 from tests.simulated_bus import settle
 
@@ -70,13 +71,14 @@ def test_a_scale_is_taken_out_and_its_tolerance_takes_the_sensors_place(
     [
         "U=1V:1V:0.1V", "V_dc=48V", "V_dc=48V:0V:0.1V", "V_dc=0V:48V:0.1V", "V_dc=48V:48V:0V", "V_dc=48V:480V:1V",
         "V_dc=a:b:c", "V_dc=48:48:0.1", "V_dc=48V:48V:0.1", "V_dc=48V:48V:0.1A", "V_dc=48V:48V:1V:1V", "I=5:5:0.1",
-        "I=5A:5A:0.1A", "I=5Apk:5Apk:0.1", "I=5Apk:5Apk:0%",
+        "I=5A:5A:0.1A", "I=5Apk:5Apk:0.1", "I=5Apk:5Apk:0%", "bridge=1V", "bridge=1V:1V:0V", "bridge=1:1:0.1",
+        "bridge=-1V:1V:0.1V", "bridge=1V:4V:0.1V", "bridge=1A:1A:0.1A",
     ],
 )  # fmt: skip
 def test_what_is_no_calibration_is_a_usage_error(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(("identify", "-i", "virtual", "-c", "nothing", "--yes", "--cal", text)) == 2
     err = capsys.readouterr().err
-    assert "instrument" in err or "cannot be calibrated" in err
+    assert "instrument" in err or "cannot be calibrated" in err or "thresholds of switch and diode" in err
 
 
 def test_a_calibration_carries_its_units() -> None:
@@ -91,3 +93,34 @@ def test_a_calibration_carries_its_units() -> None:
         calibrated_tolerance(bare, ["V_dc=540:537:0.5"])
     with pytest.raises(ConfigError, match="peak or an rms"):
         calibrated_tolerance(bare, ["I=5A:5A:0.1A"])
+
+
+def test_the_data_sheet_of_the_bridge_takes_its_threshold_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A leg swings by U_dc + V_diode - V_switch, which no current shows; whoever says so gets R without it."""
+    settle(tmp_path, monkeypatch)
+    base = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
+    bridge = {"inverter_model": "switched", "device_drop_v": 0.3, "diode_drop_v": 2.3}
+    changed = {**bridge, "rotor": "locked", "T_winding_c": 20.0, "thermal_on": False}
+    drive = replace(base, simulation={**base.simulation, **changed})
+    Path("drive.toml").write_text(dump_machine_file(drive), encoding="utf-8")
+    swing = 1.0 + 2.0 / drive.inverter.U_dc_v
+    shown = answer(capsys, "-i", "pmsmsim", "-c", "drive.toml?nv=:memory:", "--yes", "--shaft", "locked", "R")
+    (folder,) = Path("runs").iterdir()
+    true = answer(capsys, "--replay", str(folder), "--cal", "bridge=0.3V:2.3V:0.1V")
+    assert true["value"] / shown["value"] == pytest.approx(swing, rel=1e-6)
+    R = true_loop_resistance(drive)
+    assert abs(true["value"] - R) < 0.5 * abs(shown["value"] - R), (true, shown, R)
+    assert true["std"] < shown["std"]
+    kept = tomllib.loads((folder / "machine.toml").read_text(encoding="utf-8"))
+    assert kept["conditions"]["bridge_difference_v"] == pytest.approx(2.0)
+    assert answer(capsys, "--replay", str(folder)) == true
+
+
+def test_a_bridge_is_told_on_a_low_link_too() -> None:
+    told = calibrated_tolerance(SensorTolerance(), ["bridge=0V:0.7V:0.2V"])
+    low = tolerance_on(told, 48.0)
+    assert low.applied_scale == pytest.approx(1.0 + 0.7 / 48.0)
+    assert low.voltage_scale_std == pytest.approx(0.2 / 1.96 / 48.0, rel=1e-3)
+    assert tolerance_on(SensorTolerance(), 48.0).applied_scale == 1.0

@@ -14,7 +14,7 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
@@ -110,3 +110,16 @@ def test_what_the_flux_linkage_needs_is_a_speed_in_numbers() -> None:
     text = below_voltage(facts, 0.5, 0.5)
     assert "up to 1000 rpm it did not" in text and "it ends at about 1719 rpm with 540 V" in text  # 540 / 2 / 0.5 / 3
     assert "given flux linkage" not in below_voltage(facts, 0.5, 0.0)
+
+
+def test_an_instrument_scales_what_a_recorder_told(tmp_path: Path) -> None:
+    """Voltage and current as the instruments have them: psi goes with the voltage, R and L_q with their ratio."""
+    run, stage = measured("&tier=recorder", tmp_path, ("R", "psi", "L"), load_machine_file(PROFILE))
+    plain = {row["name"]: row for row in stage.values}
+    again = replay(run, None, ["V_dc=560V:554.4V:0.5V", "I=5Apk:5.05Apk:0.1%"])
+    scaled = {row["name"]: row for row in again.values}
+    assert scaled["psi_f_wb"]["value"] / plain["psi_f_wb"]["value"] == pytest.approx(0.99, rel=1e-3)
+    assert scaled["R_s_ohm"]["value"] / plain["R_s_ohm"]["value"] == pytest.approx(0.99 / 1.01, rel=1e-3)
+    assert scaled["psi_f_wb"]["systematic"] < 0.8 * plain["psi_f_wb"]["systematic"]
+    with pytest.raises(NotAvailable, match="does not know"):
+        replay(run, None, ["bridge=1V:1.2V:0.2V"])
