@@ -384,8 +384,8 @@ def reference_capabilities(identity: Identity) -> Capabilities:
 
 _FULL = "benchmarks.identification_coverage --drives 400 --first 40000"
 _MECHANICS = "benchmarks.mechanics_accuracy --drives 12 --first 9000"
-_RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 25 --first 65077"
-_STANDARD_RUN = "benchmarks.tier_intervals standard --drives 42 --first 64000 --speed 1.35"
+_RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 200 --first 65102"
+_STANDARD_RUN = "benchmarks.tier_intervals standard --drives 200 --first 64200 --speed 1.35"
 
 _SUPPLY_RUN = "benchmarks.tier_intervals supply --drives 60 --first 65000"
 _BLIND_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --speed 1.35 --no-machine"
@@ -401,18 +401,18 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("psi", Method.INJECT): _expected(_FULL, 398, ("psi_f_wb", 1.1, "%")),
     ("encoder", Method.INJECT): _expected(_FULL, 398, ("offset_rad", 0.04, "deg")),
     ("mechanics", Method.INJECT): _expected(_MECHANICS, 12, ("J_kgm2", 1.4, "%")),
-    ("R", Method.RECORDER): _expected(_RECORDER_RUN, 25, ("R_s_ohm", 6.7, "%")),
-    ("L", Method.RECORDER): _expected(_RECORDER_RUN, 25, ("L_q_app_h", 4.6, "%")),
-    ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 25, ("psi_f_wb", 1.2, "%")),
-    ("mechanics", Method.RECORDER): _expected(_RECORDER_RUN, 25, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")),
+    ("R", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("R_s_ohm", 6.1, "%")),
+    ("L", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("L_q_app_h", 4.8, "%")),
+    ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("psi_f_wb", 1.2, "%")),
+    ("mechanics", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")),
     ("R", Method.STANDARD): _expected(_SUPPLY_RUN, 60, ("R_s_ohm", 3.0, "%")),
-    ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 42, ("offset_rad", 0.5, "deg")),
-    ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 42, ("pole_pairs", 0.1, "%")),
+    ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("offset_rad", 0.4, "deg")),
+    ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("pole_pairs", 0.1, "%")),
     ("psi", Method.STANDARD): (
         *_expected(_BLIND_RUN, 26, ("psi_f_wb", 6.4, "%")),
-        *_expected(_STANDARD_RUN, 42, ("psi_f_wb", 3.7, "%"), given="a machine file"),
+        *_expected(_STANDARD_RUN, 194, ("psi_f_wb", 3.7, "%"), given="a machine file"),
     ),
-    ("mechanics", Method.STANDARD): _expected(_STANDARD_RUN, 42, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 31.0, "%")),
+    ("mechanics", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")),
 }
 """Total 95 % half widths that 90 % of random simulated drives of the tier kept to, with sensors of 1 %."""
 
