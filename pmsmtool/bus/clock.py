@@ -105,6 +105,7 @@ class _Held:
     """Context of a virtual clock: its lock, and Ctrl-C put off until the simulated world is consistent again.
 
     A Ctrl-C meant for the tool must not stop the drive in the middle of a frame: a real drive would not notice it.
+    Other signals that end a program are put off, too, where their handlers ask the one of SIGINT (``cli.main``).
     """
 
     __slots__ = ("_depth", "_lock", "_pending", "_previous")
@@ -112,11 +113,11 @@ class _Held:
     def __init__(self, lock: threading.RLock) -> None:
         self._lock = lock
         self._depth = 0
-        self._pending = False
+        self._pending = 0
         self._previous: Any = None
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
-        self._pending = True
+        self._pending = number
 
     def __enter__(self) -> None:
         if threading.get_ident() == _MAIN_THREAD:
@@ -136,8 +137,8 @@ class _Held:
                 previous = self._previous
                 _signal.signal(_SIGINT, _signal.SIG_DFL if previous is None else previous)
                 if self._pending:
-                    self._pending = False
-                    _signal.raise_signal(_SIGINT)
+                    number, self._pending = self._pending, 0
+                    _signal.raise_signal(number)
 
 
 class _VirtualTicker:

@@ -10,7 +10,7 @@ import select
 import signal
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,6 +19,9 @@ from pmsmtool.cli.failure import READER_GONE, report
 from pmsmtool.cli.lazy_group import COMPLETE_VARIABLE, LazyGroup
 from pmsmtool.cli.options import VERBOSITY, examples, global_options
 from pmsmtool.errors import decisive
+
+if TYPE_CHECKING:
+    from types import FrameType
 
 PROGRAM = "pmsmtool"
 
@@ -98,8 +101,12 @@ def _pipe_is_broken(descriptor: int) -> bool:
     return any(event & select.POLLERR for _, event in question.poll(0))
 
 
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    # Whoever puts Ctrl-C off puts this off, too; SIGINT itself may be ignored, in a background job of a shell.
+    handler = signal.getsignal(signal.SIGINT)
+    if not callable(handler):
+        raise KeyboardInterrupt
+    handler(number, frame)
 
 
 def main() -> None:

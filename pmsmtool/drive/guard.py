@@ -441,7 +441,7 @@ def guarded(
     finally:
         interrupted = _end(guard, say) or interrupted
     if interrupted:
-        raise Interrupted("interrupted: the machine is stopped, voltage off, and the drive restored")
+        raise Interrupted("the machine is stopped, voltage off, and the drive restored")
 
 
 def _end(guard: GuardedDrive, say: Callable[[str], None]) -> bool:

@@ -394,7 +394,7 @@ def _name(error: BaseException) -> str:
 def _told(error: BaseException, state: str) -> BaseException:
     """Return the error with the drive's state in it."""
     if isinstance(error, KeyboardInterrupt):
-        return Interrupted(f"interrupted; {state}")
+        return Interrupted(state)
     if isinstance(error, PmsmtoolError):
         error.what = f"{error.what}; {state}"
         error.args = (error.what,)

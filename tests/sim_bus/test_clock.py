@@ -5,10 +5,12 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from typing import Any
 
 import pytest
 
 from pmsmtool.bus.clock import NEVER, NS, VirtualClock, WallClock, clock_of
+from pmsmtool.cli.main import _interrupt as end_by_system
 
 pytestmark = pytest.mark.wall_clock
 
@@ -93,6 +95,29 @@ def test_ctrl_c_is_put_off_until_the_action_is_complete() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     clock.wait(1.0)
     assert steps == ["begun", "complete", "later"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("keyboard", [signal.default_int_handler, signal.SIG_IGN])
+def test_the_program_is_ended_by_the_system_after_the_action(number: signal.Signals, keyboard: Any) -> None:
+    """A simulated node that was left in the middle of a frame hung the tool; SIGINT is ignored in background jobs."""
+    clock = VirtualClock()
+    steps: list[str] = []
+
+    def action() -> None:
+        signal.raise_signal(number)
+        steps.append("complete")
+
+    previous = {number: signal.signal(number, end_by_system), signal.SIGINT: signal.signal(signal.SIGINT, keyboard)}
+    try:
+        clock.at(10, action)
+        with pytest.raises(KeyboardInterrupt):
+            clock.wait(1.0)
+        assert steps == ["complete"]
+        assert signal.getsignal(signal.SIGINT) == keyboard
+    finally:
+        for which, handler in previous.items():
+            signal.signal(which, handler)
 
 
 def test_a_handler_of_the_program_gets_the_ctrl_c_that_was_put_off() -> None:
