@@ -31,6 +31,8 @@ COAST_LIMIT_S = 3.0
 that friction takes back slowly cost up to 8 s per speed with the narrow band."""
 SETTLE_S, SETTLE_MOST_S = 0.025, 0.1
 """Shortest and longest time between a current's command and its window (s)."""
+Q_WINDOW_S = 0.03
+"""Shortest window of a q current, which accelerates the shaft."""
 LOOP_PERIODS = 6.0
 """Shortest time constant of the run's current loop, in periods: a voltage acts one and a half of them late."""
 NEAR = 0.005
@@ -69,7 +71,7 @@ class SpeedPlan:
     first_s: float = 0.05
     window_s: float = 0.06
     longest_s: float = 0.2
-    q_window_s: float = 0.03
+    q_window_s: float = Q_WINDOW_S
 
     def stations(self) -> list[tuple[float, list[tuple[float, float]]]]:
         """Return the mechanical speeds in the order they are reached, and the vectors that are held at each."""

@@ -38,12 +38,19 @@ RUN_I_D_SHARE = 0.45
 SATURATED = 1.5
 """Largest ratio of the chord of psi_d over the run's i_d to the rough L_d, which is that of a saturated bias."""
 RUN_I_Q_SPEED_SHARE = 0.15
-RUN_I_Q_S = 0.08
-"""A q current of the flux run may change the speed by this share of the largest in this time."""
+RUN_I_Q_LATE_S = 0.025
+"""A q current of the flux run may change the speed by this share of the largest until its window is over and the bus
+has answered, this late. Without the time in which currents settle, which a large dead time makes three times as long,
+one of 1005 drives was braked to a ninth of its speed, by half in one window (seed 70189)."""
 REACTANCE_SHARE = 0.25
 """Voltage that the accelerating current may need at the largest speed, of the largest voltage."""
 REST_SHARE = 0.02
 """Speed that counts as standstill, of the largest of the flux run."""
+
+
+def q_current_s(settle_s: float) -> float:
+    """Return how long a q current of the flux run accelerates the shaft (s)."""
+    return settle_s + speed_run.Q_WINDOW_S + RUN_I_Q_LATE_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +154,6 @@ class SpeedStage:
         # the accelerating current must leave voltage for itself: omega_e L_q i_q stands beside the back-emf
         i_run = min(0.5 * limits.I_test_apk, REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L)))
         per_ampere = 1.5 * pole_pairs * psi / J
-        i_q = min(0.5 * i_run, RUN_I_Q_SPEED_SHARE * largest / (RUN_I_Q_S * per_ampere))
         # a current that is slow because the inverter's error is steep would not be steady in its window
         loop = speed_run.steady_loop(
             self.drive.read("motor.R_s_ohm"),
@@ -157,6 +163,7 @@ class SpeedStage:
             self.drive.period_s,
             min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s)),
         )
+        i_q = min(0.5 * i_run, RUN_I_Q_SPEED_SHARE * largest / (q_current_s(loop.settle_s) * per_ampere))
         self._off_and_write(
             {
                 "current.K_p_d_v_per_a": loop.K_p_v_per_a[0],
