@@ -17,7 +17,7 @@
 #define DIODE_SUBSTEPS 4u       /* with gates off */
 #define REST_SHARE 0.8          /* of the DC link, for the line back-EMF of an idle machine */
 #define COMMUTATION_STEP 0.3    /* substep of a floating node, in sqrt(L C) */
-#define COMMUTATION_STEPS_MAX 64
+#define COMMUTATION_STEPS_MAX 128 /* 70 for 3 us of dead time, 86 pF and 0.24 mH */
 #define FIRM_CURRENT 4.0        /* a current this many times what a dead time can change keeps its sign */
 
 /* ---- averaged error --------------------------------------------------------------------------------- */
