@@ -55,7 +55,7 @@ def test_a_slow_drive_waits_longer_but_not_for_ever() -> None:
 
 
 SLOW_AND_LIGHT = 70189
-"""325 V, 0.25 mH: currents settle in 83 ms, in which 0.17 of the rated current as i_q braked it from 990 to 204 rad/s."""
+"""325 V, 0.25 mH: in the 83 ms in which currents settle, 0.17 of the rated one braked it from 990 to 204 rad/s."""
 
 
 def test_a_q_current_that_settles_slowly_does_not_stop_the_shaft() -> None:
