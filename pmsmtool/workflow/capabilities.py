@@ -383,11 +383,12 @@ def reference_capabilities(identity: Identity) -> Capabilities:
 
 
 _FULL = "benchmarks.identification_coverage --drives 400 --first 40000"
-_MECHANICS = "benchmarks.mechanics_accuracy --drives 12 --first 9000"
+_MECHANICS = "benchmarks.mechanics_accuracy --drives 40 --first 66000"
 _RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 200 --first 65102"
 _STANDARD_RUN = "benchmarks.tier_intervals standard --drives 200 --first 64200 --speed 1.35"
 
 _SUPPLY_RUN = "benchmarks.tier_intervals supply --drives 60 --first 65000"
+_DEAD_TIME = "a machine file that names the dead time"
 _BLIND_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --speed 1.35 --no-machine"
 
 
@@ -400,7 +401,7 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("L", Method.INJECT): _expected(_FULL, 398, ("L_d_h", 1.4, "%"), ("L_q_h", 1.4, "%")),
     ("psi", Method.INJECT): _expected(_FULL, 398, ("psi_f_wb", 1.1, "%")),
     ("encoder", Method.INJECT): _expected(_FULL, 398, ("offset_rad", 0.04, "deg")),
-    ("mechanics", Method.INJECT): _expected(_MECHANICS, 12, ("J_kgm2", 1.4, "%")),
+    ("mechanics", Method.INJECT): _expected(_MECHANICS, 23, ("J_kgm2", 1.5, "%")),
     ("R", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("R_s_ohm", 6.1, "%")),
     ("L", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("L_q_app_h", 4.8, "%")),
     ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("psi_f_wb", 1.2, "%")),
@@ -410,7 +411,7 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("pole_pairs", 0.1, "%")),
     ("psi", Method.STANDARD): (
         *_expected(_BLIND_RUN, 26, ("psi_f_wb", 6.4, "%")),
-        *_expected(_STANDARD_RUN, 194, ("psi_f_wb", 3.7, "%"), given="a machine file"),
+        *_expected(_STANDARD_RUN, 194, ("psi_f_wb", 3.7, "%"), given=_DEAD_TIME),
     ),
     ("mechanics", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")),
 }

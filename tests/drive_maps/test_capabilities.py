@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -106,10 +107,16 @@ def test_every_quantity_is_listed_with_every_method() -> None:
             assert expected.drives >= 10 and expected.program.startswith("benchmarks.")
 
 
-def test_what_caps_promises_is_what_is_found_without_a_machine_file() -> None:
-    """Torque pushes of the standard tier: without a machine file nothing tells the inverter's voltage."""
+def test_what_caps_promises_is_what_is_found_without_a_dead_time() -> None:
+    """Torque pushes of the standard tier: without a machine file that names the dead time nothing tells the voltage."""
     promised = {expected.given: expected.half_width for expected in EXPECTED["psi", Method.STANDARD]}
-    for given, inverter in (("", None), ("a machine file", load_machine_file(machine_path("interior-2k2")).inverter)):
+    known = load_machine_file(machine_path("interior-2k2")).inverter
+    assert known is not None
+    for given, inverter in (
+        ("", None),
+        ("", replace(known, dead_time_s=0.0)),  # as `machine new` without --dead-time leaves it
+        ("a machine file that names the dead time", known),
+    ):
         with connect("pmsmsim", "interior-2k2?nv=:memory:&drive=epos4") as connection:
             drive = TorqueDrive(connection, 1, drive_map=load_family("epos4"))
             envelope = Envelope(i_max_apk=7.3, speed_max_rad_s=3000.0 * math.pi / 30.0, duration_s=600.0)
