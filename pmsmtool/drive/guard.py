@@ -39,6 +39,12 @@ from pmsmtool.trace import Trace
 WATCH_S = 0.05
 """The machine is looked at this often while time passes."""
 LOCKED_TRAVEL_RAD = math.radians(20.0)
+_TURNS = "the shaft turns, though it is said to be locked"
+_NEXT_STEP = {
+    "current": "raise the limit knowingly (--i-max), or ask for less",
+    "speed": "raise the limit knowingly (--speed-max), or ask for less",
+    "travel": "clamp the shaft, or say --shaft free where it may turn",
+}
 """A clamp and its coupling give by a few degrees; a shaft that goes further is not locked."""
 OVERSHOOT = 1.25
 """Measured current or speed over its limit that ends an experiment: regulation overshoots, noise peaks."""
@@ -389,7 +395,8 @@ class GuardedDrive:
                 limit,
                 unit,
                 where=f"node {self._node.node}",
-                hint="raise the limit knowingly (--i-max, --speed-max), or ask for less",
+                likely=_TURNS if quantity == "travel" and self.envelope.shaft == "locked" else "",
+                hint=_NEXT_STEP.get(quantity, "ask for less"),
             )
 
 

@@ -71,7 +71,7 @@ def clone_drive(node: DriveNode, found: Capabilities, machine_file: MachineFile,
     parameters = DriveParameters(node)
     held = node.map.decode(parameters.read(node.map.cells))
     truth: dict[str, Value] = {**machine_file.simulation, **drawn_truth(machine_file, draw)}
-    truth |= {"serial": found.identity.serial, "seed": 0 if draw is None else draw}
+    truth |= _noise(machine_file) | {"serial": found.identity.serial, "seed": 0 if draw is None else draw}
     return Clone(replace(machine_file, simulation=truth), held, _data_sheet(node), found.drive_map.name)
 
 
@@ -93,6 +93,18 @@ def drawn_truth(machine_file: MachineFile, draw: int | None) -> dict[str, Value]
             value = math.remainder(drawn, 2.0 * math.pi) if name == "offset_rad" else max(drawn, 0.5 * value)
         truth[key] = float(value)
     return truth
+
+
+def _noise(machine_file: MachineFile) -> dict[str, Value]:
+    """Return the noise of the clone's current sensors: one step of their converter where the file says none.
+
+    Without noise all samples at rest are equal, and identification of the clone is refused (E_SNR).
+    """
+    settings = machine_file.simulation_settings()
+    bits, full_scale = settings["adc_bits"], settings.get("adc_full_scale_apk")
+    if "sensor_noise_apk" in machine_file.simulation or not (isinstance(bits, int) and isinstance(full_scale, float)):
+        return {}
+    return {"sensor_noise_apk": full_scale / 2 ** (bits - 1)} if bits else {}
 
 
 def _data_sheet(node: DriveNode) -> bytes:

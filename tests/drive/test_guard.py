@@ -99,12 +99,13 @@ def test_a_shaft_said_to_be_locked_is_not_turned(bench: SimBench) -> None:
 
 def test_a_shaft_that_turns_though_said_to_be_locked_is_stopped(bench: SimBench) -> None:
     locked = replace(ENVELOPE, shaft="locked", travel_rad=math.inf)
-    with pytest.raises(LimitExceeded, match="travel"), guarded(bench.drive, locked) as guard:
+    with pytest.raises(LimitExceeded, match="travel") as caught, guarded(bench.drive, locked) as guard:
         guard.enable()
         for angle in np.arange(0.0, 12.0, 0.2):  # a vector that turns takes the free rotor with it
             guard.command_current(2.0, 0.0, fixed_angle_rad=float(angle))
             guard.wait(0.05)
     assert bench.drive.node.state() is State.SWITCH_ON_DISABLED
+    assert "said to be locked" in caught.value.likely and "clamp the shaft" in caught.value.hint
 
 
 @pytest.mark.parametrize("moment", range(INTERRUPTIONS))

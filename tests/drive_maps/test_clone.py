@@ -57,6 +57,16 @@ def test_the_clone_of_the_reference_drive(identified: Path) -> None:
     run("--sim", "twin.toml?nv=twin.nv", "verify", "twin.params.toml")
 
 
+def test_the_clone_can_be_identified(identified: Path) -> None:
+    """Its current sensors are noisy, although nothing in the machine file says so; without noise it was refused."""
+    run("--sim", "interior-2k2?nv=:memory:", "sim", "clone", str(identified), "-o", "twin.toml")
+    settings = load_machine_file(Path("twin.toml")).simulation_settings()
+    assert settings["sensor_noise_apk"] == 18.0 / 2048  # 1.5 I_max over half the counts of 12 bits
+    outcome = run("--sim", "twin.toml?nv=:memory:", "--yes", "identify", "R", "--json")
+    (R,) = (value for value in json.loads(outcome.stdout)["values"] if value["name"] == "R_s_ohm")
+    assert R["value"] == pytest.approx(1.23, abs=R["total_95"])
+
+
 def test_the_clone_of_another_family_shows_its_dictionary(identified: Path) -> None:
     family = load_family("epos4")
     with connect("pmsmsim", "interior-2k2?nv=real.nv&drive=epos4") as connection:
