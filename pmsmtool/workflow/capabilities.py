@@ -405,7 +405,9 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("R", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("R_s_ohm", 6.1, "%")),
     ("L", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("L_q_app_h", 4.8, "%")),
     ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("psi_f_wb", 1.2, "%")),
-    ("mechanics", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")),
+    ("mechanics", Method.RECORDER): _expected(
+        _RECORDER_RUN, 199, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")
+    ),
     ("R", Method.STANDARD): _expected(_SUPPLY_RUN, 60, ("R_s_ohm", 3.0, "%")),
     ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("offset_rad", 0.4, "deg")),
     ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("pole_pairs", 0.1, "%")),
@@ -413,7 +415,9 @@ EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
         *_expected(_BLIND_RUN, 26, ("psi_f_wb", 6.4, "%")),
         *_expected(_STANDARD_RUN, 194, ("psi_f_wb", 3.7, "%"), given=_DEAD_TIME),
     ),
-    ("mechanics", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")),
+    ("mechanics", Method.STANDARD): _expected(
+        _STANDARD_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")
+    ),
 }
 """Total 95 % half widths that 90 % of random simulated drives of the tier kept to, with sensors of 1 %."""
 
