@@ -125,11 +125,9 @@ def _without_memory(channel: Channel) -> Channel:
 def _operate(line: Line, channel: Channel, out: Output) -> None:
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.machine.profile import machine_path
-    from pmsmtool.sim.operation import Operation
+    from pmsmtool.sim.operation import operate
 
-    machine_file = load_machine_file(machine_path(channel.name))
-    for node in line.nodes:
-        Operation(node, machine_file, out.note)
+    operate(line, load_machine_file(machine_path(channel.name)), out.note)
 
 
 def _how_to_join(host: str, port: int) -> str:
