@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +15,14 @@ from pmsmtool.cli.options import FREQUENCY, TIME, BusOptions, bus_options, examp
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pmsmtool.drive.canopen_drive import CanopenDrive
+    from pmsmtool.errors import Interrupted
     from pmsmtool.estimators.tracking_model import Known
     from pmsmtool.firmware.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
+    from pmsmtool.trace import Trace
     from pmsmtool.workflow.run_directory import RunDirectory
     from pmsmtool.workflow.track import Tracked
 
@@ -60,21 +67,24 @@ def track_command(
     operating points do not show is refused by name (exit code 6): R needs current, psi needs speed, both need change.
     --replay takes a run of track; runs of identify and commission hold no such observations (exit code 9).
     """
-    from pmsmtool.workflow.run_account import accounted
-    from pmsmtool.workflow.track import follow, track_stage
+    from pmsmtool.workflow.track import follow
 
     wanted = tuple(QUANTITIES[name] for name in dict.fromkeys(quantities or QUANTITIES))
     if replay is not None:
         observations, known, described, run = _stored(replay, machine)
         found = follow(observations, known, described, wanted)
     else:
-        observations, known, described, run = _observed(
-            bus, out, machine, seconds, by, rate_hz, runs, read_map(map_file)
-        )
-        with accounted(run, "track", out.note):
-            found = follow(observations, known, described, wanted)
-            run.add(track_stage(found, wanted, described))
+        run, found = _live(bus, out, wanted, machine, Watch(seconds, by, rate_hz), runs, read_map(map_file))
     _show(run, found, wanted, out)
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """How long (s), by what and how often (Hz) is observed."""
+
+    seconds: float
+    by: str
+    rate_hz: float
 
 
 def _stored(replay: Path, machine: Path | None) -> tuple[Any, Known, MachineFile, RunDirectory]:
@@ -90,33 +100,87 @@ def _stored(replay: Path, machine: Path | None) -> tuple[Any, Known, MachineFile
     return replay_observations(run), known, described, run
 
 
-def _observed(
+def _live(
     bus: BusOptions,
     out: Output,
+    wanted: tuple[str, ...],
     machine: Path | None,
-    seconds: float,
-    by: str,
-    rate_hz: float,
+    watch: Watch,
     runs: Path,
     drive_map: DriveMap,
-) -> tuple[Any, Known, MachineFile, RunDirectory]:
+) -> tuple[RunDirectory, Tracked]:
+    """Observe the drive and follow what it showed; the run keeps what was seen, whatever ends it."""
+    from pmsmtool.errors import PmsmtoolError
     from pmsmtool.machine.machine_file import dump_machine_file
     from pmsmtool.workflow.commission import begin_run
     from pmsmtool.workflow.identify import nameplate_of
-    from pmsmtool.workflow.track import keep, known_of, observe_process_data, observe_recordings
+    from pmsmtool.workflow.run_account import accounted
+    from pmsmtool.workflow.track import follow, known_of, track_stage
 
-    with open_drive(bus, drive_map) as drive:
+    with ExitStack() as bus_open:
+        drive = bus_open.enter_context(open_drive(bus, drive_map))
         described = _described(machine) if machine else nameplate_of(drive, drive.identity.name or "drive")
         known = known_of(described, compensated=drive.read("inverter.deadtime_compensation") != 0.0)
-        if by == "pdo":
-            observations = observe_process_data(drive.node, seconds, rate_hz, out.detail)
-        else:
-            observations = observe_recordings(drive, seconds, out.detail)
         recorded = {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate}
         run = begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=recorded)
-    run.save("machine.toml", dump_machine_file(described))
-    keep(run, observations, known)
-    return observations, known, described, run
+        run.save("machine.toml", dump_machine_file(described))
+        with accounted(run, "track", out.note) as say:
+            try:
+                observations = _observed(drive, watch, run, known, out, say)
+                bus_open.close()
+                found = follow(observations, known, described, wanted)
+            except KeyboardInterrupt:
+                raise _interrupted(run) from None
+            except PmsmtoolError:
+                if _kept(run):
+                    out.note(f"what was observed: {_replay(run)}")
+                raise
+            run.add(track_stage(found, wanted, described))
+    return run, found
+
+
+def _observed(
+    drive: CanopenDrive, watch: Watch, run: RunDirectory, known: Known, out: Output, say: Callable[[str], None]
+) -> Trace:
+    """Observe, and have the run keep it also when something ends it early."""
+    from pmsmtool.drive.interruption import interrupts_deferred
+    from pmsmtool.workflow.observe import GIVEN_BACK, Observations, observe_process_data, observe_recordings
+    from pmsmtool.workflow.track import keep
+
+    seen = Observations()
+    try:
+        if watch.by == "pdo":
+            observe_process_data(drive.node, watch.seconds, watch.rate_hz, seen, out.detail)
+        else:
+            observe_recordings(drive, watch.seconds, seen, out.detail)
+        say(GIVEN_BACK)
+    except KeyboardInterrupt:
+        say(GIVEN_BACK)
+        raise
+    finally:
+        with interrupts_deferred():
+            observations = seen.trace()
+            if len(seen):
+                keep(run, observations, known)
+    return observations
+
+
+def _interrupted(run: RunDirectory) -> Interrupted:
+    from pmsmtool.errors import Interrupted
+
+    if not _kept(run):
+        return Interrupted("interrupted before anything was observed", where=str(run.path), hint="observe for longer")
+    return Interrupted("interrupted: what was observed until then is kept", where=str(run.path), hint=_replay(run))
+
+
+def _kept(run: RunDirectory) -> bool:
+    from pmsmtool.workflow.track import OBSERVATIONS
+
+    return (run.path / f"traces/{OBSERVATIONS}.npz").is_file()
+
+
+def _replay(run: RunDirectory) -> str:
+    return f"pmsmtool track --replay {run.path}"
 
 
 def _described(path: Path) -> MachineFile:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from pmsmtool.bus.nmt import NmtCommand, NmtState, send_nmt
@@ -35,11 +35,15 @@ class LiveValues:
         By name; a name is there from its first PDO on.
     received : int
         PDOs received.
+    on_set : callable
+        Called with the bus's time stamp when every PDO has come once more; may only take notes.
     """
 
     def __init__(self) -> None:
         self.values: dict[str, float] = {}
         self.received = 0
+        self.on_set: Callable[[float], None] = lambda stamp_s: None
+        self._fresh: set[int] = set()
         self._layout: dict[int, list[tuple[str, struct.Struct]]] = {}
 
     def expect(self, cob_id: int, names: Sequence[str]) -> None:
@@ -55,6 +59,11 @@ class LiveValues:
             self.values[name] = float(code.unpack_from(data, position)[0])
             position += code.size
         self.received += 1
+        self._fresh.add(cob_id)
+        if cob_id == max(self._layout):  # the drive sends the lowest identifier first
+            if len(self._fresh) == len(self._layout):
+                self.on_set(timestamp)
+            self._fresh.clear()
 
 
 @contextmanager
@@ -93,6 +102,11 @@ def live_values(node: DriveNode, names: Sequence[str], period_s: float) -> Itera
             _bring_back(node, before)
         if noted:
             raise KeyboardInterrupt
+
+
+def sent_every_s(period_s: float) -> float:
+    """Return the period (s) nearest to the one wanted that an event timer holds, in whole milliseconds."""
+    return 1e-3 * min(max(1, round(1000.0 * period_s)), 0xFFFF)
 
 
 def _groups(names: Sequence[str]) -> list[list[str]]:
@@ -138,7 +152,7 @@ def _map(node: DriveNode, number: int, cob_id: int, names: Sequence[str], period
         write(mapping, sub, LIVE[name].mapping_word.to_bytes(4, "little"))
     write(mapping, 0, bytes((len(names),)))
     write(communication, 2, bytes((EVENT_DRIVEN,)))
-    write(communication, 5, max(1, round(1000.0 * period_s)).to_bytes(2, "little"))
+    write(communication, 5, round(1000.0 * sent_every_s(period_s)).to_bytes(2, "little"))
     write(communication, 1, (cob_id | _NO_RTR).to_bytes(4, "little"))
 
 

@@ -13,7 +13,7 @@ h; a resistance is nearest to it. omega is that of the drive and lags: omega + t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,8 @@ TRACKED = ("R_s_ohm", "psi_f_wb")
 
 RISES = {"d_rise_a": ("i_d_a", "A"), "q_rise_a": ("i_q_a", "A"), "omega_rise_rad_s": ("omega_e_rad_s", "rad/s")}
 """Rises over a window, of what and in what."""
+LIMITED = "limited"
+"""Column of :func:`windows`: 1 where a voltage or a current was limited."""
 
 PRIOR = {"R_s_ohm": 0.30, "psi_f_wb": 0.10}
 """Relative standard deviation at the start: what the temperature may have done since identification."""
@@ -107,34 +109,78 @@ def condense(trace: Trace, rows: int) -> Trace:
     ValueError
         The trace lacks a signal of :data:`SIGNALS`.
     """
+    return steady([windows(trace, rows)])[0]
+
+
+def windows(trace: Trace, rows: int, period_s: float | None = None) -> Trace:
+    """Return means and rises over all windows of ``rows``; :data:`LIMITED` tells in which something was limited.
+
+    Parameters
+    ----------
+    trace : Trace
+        Rows without a gap.
+    rows : int
+        Length of a window.
+    period_s : float, optional
+        Time from row to row; default: the trace's.
+
+    Raises
+    ------
+    ValueError
+        The trace lacks a signal of :data:`SIGNALS`.
+    """
     missing = [name for name in SIGNALS if name not in trace.signals]
     if missing:
         raise ValueError(f"the trace has no {', '.join(missing)}")
     count = len(trace) // rows
+
+    def blocks(column: Array) -> Array:
+        return column[: count * rows].reshape(count, rows)
+
     names = [*SIGNALS, *(["T_winding_c"] if "T_winding_c" in trace.signals else [])]
-    blocks = {name: trace[name][: count * rows].reshape(count, rows) for name in names}
-    keep = np.ones(count, dtype=bool)
-    if "flags" in trace.signals:
-        keep &= ~np.any(trace["flags"][: count * rows].reshape(count, rows) != 0.0, axis=1)
-    keep &= _steady(blocks)
-    means = {name: block.mean(axis=1)[keep] for name, block in blocks.items()}
-    means |= {name: _rise(blocks[signal])[keep] for name, (signal, _) in RISES.items()}
-    times = trace.t_s[: count * rows].reshape(count, rows).mean(axis=1)[keep]
+    flags = trace.signals.get("flags", np.zeros(len(trace)))
+    columns = {name: blocks(trace[name]).mean(axis=1) for name in names}
+    columns |= {name: _rise(blocks(trace[signal])) for name, (signal, _) in RISES.items()}
+    columns[LIMITED] = np.any(blocks(flags) != 0.0, axis=1).astype(float)
     units = {name: trace.units[name] for name in names} | {name: unit for name, (_, unit) in RISES.items()}
-    return Trace(times, means, units, {**trace.meta, "window_s": rows * trace.period_s, "rows": rows})
+    window_s = rows * (trace.period_s if period_s is None else period_s)
+    meta = {**trace.meta, "window_s": window_s, "rows": rows}
+    return Trace(blocks(trace.t_s).mean(axis=1), columns, {**units, LIMITED: "1"}, meta)
 
 
-def _steady(blocks: Mapping[str, Array]) -> NDArray[np.bool_]:
-    """Whether currents and speed changed little within each window, and from the window before."""
-    largest = float(np.max(np.abs(np.hypot(blocks["i_d_a"].mean(axis=1), blocks["i_q_a"].mean(axis=1))), initial=0.0))
-    fastest = float(np.max(np.abs(blocks["omega_e_rad_s"].mean(axis=1)), initial=0.0))
-    calm = np.ones(len(blocks["i_d_a"]), dtype=bool)
-    for name, scale in (("i_d_a", largest), ("i_q_a", largest), ("omega_e_rad_s", fastest)):
-        change = np.abs(_rise(blocks[name]))
-        limit = max(STEADY * scale, NOISY * float(np.median(change)) if len(change) else 0.0)
-        calm &= change <= limit
-        calm[1:] &= change[:-1] <= limit
+def steady(parts: Sequence[Trace]) -> list[Trace]:
+    """Return of each part the windows in which nothing was limited and the machine ran steadily.
+
+    What is steady is measured by the largest current and speed of all parts: a part alone may hold nothing but a
+    transient, whose noise it would be taken for.
+
+    Parameters
+    ----------
+    parts : sequence of Trace
+        As :func:`windows` returns them, each without a gap.
+    """
+    size = {name: np.concatenate([np.zeros(0), *(part[name] for part in parts)]) for name in SIGNALS}
+    rise = {name: np.concatenate([np.zeros(0), *(np.abs(part[name]) for part in parts)]) for name in RISES}
+    largest = float(np.max(np.hypot(size["i_d_a"], size["i_q_a"]), initial=0.0))
+    fastest = float(np.max(np.abs(size["omega_e_rad_s"]), initial=0.0))
+    scale = {"d_rise_a": largest, "q_rise_a": largest, "omega_rise_rad_s": fastest}
+    limit = {n: max(STEADY * scale[n], NOISY * float(np.median(r)) if len(r) else 0.0) for n, r in rise.items()}
+    return [_kept(part, _calm(part, limit) & (part[LIMITED] == 0.0)) for part in parts]
+
+
+def _calm(part: Trace, limit: Mapping[str, float]) -> NDArray[np.bool_]:
+    """Whether currents and speed changed little within each window, and within the one before."""
+    calm = np.ones(len(part), dtype=bool)
+    for name in RISES:
+        small = np.abs(part[name]) <= limit[name]
+        calm &= small
+        calm[1:] &= small[:-1]
     return calm
+
+
+def _kept(part: Trace, keep: NDArray[np.bool_]) -> Trace:
+    names = [name for name in part.signals if name != LIMITED]
+    return Trace(part.t_s[keep], {n: part[n][keep] for n in names}, {n: part.units[n] for n in names}, part.meta)
 
 
 def _rise(block: Array) -> Array:

@@ -28,6 +28,7 @@ from pmsmtool.errors import (
     decisive,
     exit_code_of,
 )
+from pmsmtool.workflow.observe import GIVEN_BACK
 from pmsmtool.workflow.run_directory import PART, RECORD, RunDirectory, Stage, Status
 
 WRITTEN_AFTER = (RECORD, "report.html")
@@ -93,8 +94,8 @@ class RunAccount:
         self._restored: list[str] = []
 
     def say(self, line: str) -> None:
-        """Pass a line on; what it says of a drive that is off and restored is kept."""
-        if line.startswith(RESTORED):
+        """Pass a line on; what it says of a drive that is off and restored, or was only looked at, is kept."""
+        if line.startswith((RESTORED, GIVEN_BACK)):
             self._restored.append(line)
         self._tell(line)
 

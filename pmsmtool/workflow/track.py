@@ -1,50 +1,31 @@
 """Follow R(T) and psi(T) of a machine in operation: observations from the drive or from stored traces, then the filter.
 
-Tracking commands nothing. By process data it borrows transmit PDOs, by trace it uses the drive's recorder; what either
-of them was is brought back. A run keeps the observations and what was known, so that a replay gives the same numbers.
+A run keeps the observations and what was known, so that a replay gives the same numbers.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pmsmtool.drive import objects
-from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.interruption import interrupts_deferred
-from pmsmtool.drive.objects import signal_unit
-from pmsmtool.drive.process_data import live_values
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import Track, track
-from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, RISES, SIGNALS, TRACKED, Known, condense
+from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, TRACKED, Known
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
 from pmsmtool.workflow.identify import stored_traces
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 
-NAMES = (*SIGNALS, "T_winding_c")
-"""What is asked of the drive: as much as three process data objects hold."""
 OBSERVATIONS, KNOWN = "track", "track.json"
-SAMPLES_PER_WINDOW = 4
-"""Process data that make one observation."""
-RECORD_ROWS, RECORD_WINDOWS = 1024, 4
-"""Rows of one recording, and observations that it makes."""
-RECORD_S = 0.2
-"""Time of one recording (s)."""
-SAY_S = 1.0
 KNEE_POINTS = 64
-
-Say = Callable[[str], None]
 
 
 def known_of(machine: MachineFile, *, compensated: bool) -> Known:
@@ -90,87 +71,6 @@ def _curve(machine: MachineFile) -> tuple[InverterCurve | None, float]:
     return InverterCurve(i, plateau * np.tanh(i / knee), 0.0), doubt
 
 
-# ---- observations from the drive -----------------------------------------------------------------------------
-
-
-def observe_process_data(node: DriveNode, seconds: float, rate_hz: float, say: Say = lambda text: None) -> Trace:
-    """Collect what the drive sends by itself, ``rate_hz`` times a second.
-
-    Raises
-    ------
-    NotAvailable
-        The drive cannot send these quantities.
-    ConfigError
-        Nothing arrived.
-    """
-    clock = node.connection.clock
-    rows: list[tuple[float, ...]] = []
-    with live_values(node, NAMES, 1.0 / rate_hz) as live:
-        start, told = clock.now(), 0.0
-        while (t := clock.now() - start) < seconds:
-            node.connection.wait(1.0 / rate_hz)
-            node.supervision.check()
-            if len(live.values) == len(NAMES):
-                rows.append((clock.now() - start, *(live.values[name] for name in NAMES)))
-            if t - told >= SAY_S:
-                told = t
-                say(f"{t:.0f} s, {len(rows)} samples")
-    if not rows:
-        raise ConfigError("no process data arrived", hint="a lower --rate, or --by trace")
-    table = np.array(rows).T
-    _, first = np.unique(table[0], return_index=True)
-    columns = {name: table[k][first] for k, name in enumerate(NAMES, 1)}
-    sampled = Trace(table[0][first], columns, {name: signal_unit(name) for name in NAMES}, {})
-    return condense(sampled, SAMPLES_PER_WINDOW)
-
-
-def observe_recordings(drive: CanopenDrive, seconds: float, say: Say = lambda text: None) -> Trace:
-    """Collect recordings of the drive's trace recorder, one after the other; its set-up is brought back.
-
-    Raises
-    ------
-    NotAvailable
-        The drive has no recorder, or not these signals.
-    """
-    clock = drive.node.connection.clock
-    decimation = max(1, round(RECORD_S / (RECORD_ROWS * drive.period_s)))
-    parts: list[Trace] = []
-    with _recorder_kept(drive):
-        start, told = clock.now(), 0.0
-        while (t := clock.now() - start) < seconds:
-            record = drive.record((*NAMES, "flags"), RECORD_ROWS, decimation=decimation)
-            shifted = Trace(record.t_s - record.t_s[0] + t, record.signals, record.units, record.meta)
-            parts.append(condense(shifted, RECORD_ROWS // RECORD_WINDOWS))
-            if t - told >= SAY_S:
-                told = t
-                say(f"{t:.0f} s, {sum(map(len, parts))} observations")
-    return joined(parts)
-
-
-@contextmanager
-def _recorder_kept(drive: CanopenDrive) -> Iterator[None]:
-    """Note the recorder's set-up and bring it back."""
-    kept = (
-        *objects.TRACE_CHANNELS,
-        objects.TRACE_DECIMATION,
-        objects.TRACE_PRETRIGGER,
-        objects.TRACE_DEPTH,
-        objects.TRACE_TRIGGER,
-    )
-    drive.recorder.forget()
-    before = [(item, drive.node.whole(item)) for item in kept]
-    try:
-        yield
-    finally:
-        with interrupts_deferred() as noted:
-            drive.node.put(objects.TRACE_PRETRIGGER, 0)
-            for item, value in sorted(before, key=lambda pair: pair[0] is objects.TRACE_PRETRIGGER):
-                drive.node.put(item, value)
-            drive.recorder.forget()
-        if noted:
-            raise KeyboardInterrupt
-
-
 # ---- observations from stored traces ----------------------------------------------------------------------------
 
 
@@ -195,31 +95,6 @@ def replay_observations(run: RunDirectory) -> Trace:
             hint="`pmsmtool track` while the machine is operated records what a replay needs",
         )
     return traces[OBSERVATIONS]
-
-
-def joined(parts: Sequence[Trace]) -> Trace:
-    """Return observations one after the other, each part from where the last one ended, unless it starts later."""
-    times, last = [], -math.inf
-    for part in parts:
-        if not len(part):
-            continue
-        step = part.period_s if len(part) > 1 else 1.0
-        start = max(float(part.t_s[0]), last + step) if math.isfinite(last) else float(part.t_s[0])
-        times.append(part.t_s - part.t_s[0] + start)
-        last = float(times[-1][-1])
-    filled = [part for part in parts if len(part)]
-    names = [name for name in (*NAMES, *RISES) if all(name in part.signals for part in filled)]
-    if not filled:
-        return Trace(np.zeros(0), {name: np.zeros(0) for name in SIGNALS}, {n: signal_unit(n) for n in SIGNALS}, {})
-    windows = {(float(part.meta.get("window_s", 0.0)), int(part.meta.get("rows", 0))) for part in filled}
-    if len(windows) > 1:  # rises over windows of different lengths are no common column
-        names = [name for name in names if name not in RISES]
-    return Trace(
-        np.concatenate(times),
-        {name: np.concatenate([part[name] for part in filled]) for name in names},
-        {name: filled[0].units[name] for name in names},
-        dict(zip(("window_s", "rows"), windows.pop(), strict=True)) if len(windows) == 1 else {},
-    )
 
 
 # ---- the result ------------------------------------------------------------------------------------------------

@@ -22,19 +22,9 @@ from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
 from pmsmtool.workflow.commission import begin_run
+from pmsmtool.workflow.observe import Observations, joined, observe_process_data, observe_recordings
 from pmsmtool.workflow.run_directory import RunDirectory
-from pmsmtool.workflow.track import (
-    dump_known,
-    follow,
-    joined,
-    keep,
-    known_of,
-    load_known,
-    observe_process_data,
-    observe_recordings,
-    replay_observations,
-    track_stage,
-)
+from pmsmtool.workflow.track import dump_known, follow, keep, known_of, load_known, replay_observations, track_stage
 from tests.drive.bench import SimBench, sim_bench
 from tests.simulated_bus import settle
 
@@ -61,10 +51,12 @@ def operated(bench: SimBench, by: str) -> tuple[Trace, float]:
             core.simulation.library.pmsm_sim_set_load(core.simulation.sim, load)
             guard.command_speed(speed)
             guard.wait(0.4)
+            seen = Observations()
             if by == "pdo":
-                parts.append(observe_process_data(bench.drive.node, 1.0, 100.0))
+                observe_process_data(bench.drive.node, 1.0, 100.0, seen)
             else:
-                parts.append(observe_recordings(bench.drive, 1.0))
+                observe_recordings(bench.drive, 1.0, seen)
+            parts.append(seen.trace())
         devices = device_slope_ohm(settings_of(load_machine_file(data_folder("profiles") / "interior-2k2.toml")))
         truth = core.simulation.signal(Truth.R) + devices
     assert bench.memory() == before, "what tracking borrowed is brought back"
@@ -97,7 +89,7 @@ def test_the_recorder_is_brought_back(tmp_path: Path) -> None:
         node.put(objects.TRACE_PRETRIGGER, 7)
         node.put(objects.TRACE_CHANNELS[0], objects.LIVE["i_a_a"].mapping_word)
         before = bench.memory()
-        observe_recordings(bench.drive, 0.3)
+        observe_recordings(bench.drive, 0.3, Observations())
         assert bench.memory() == before
 
 

@@ -10,8 +10,19 @@ import pytest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import LIMIT, NIS_GATE, Track, Tracker, track
-from pmsmtool.estimators.tracking_model import ACROSS, ALONG, SIGNALS, TRACKED, condense, inputs, ripple_v
+from pmsmtool.estimators.tracking_model import (
+    ACROSS,
+    ALONG,
+    SIGNALS,
+    TRACKED,
+    condense,
+    inputs,
+    ripple_v,
+    steady,
+    windows,
+)
 from pmsmtool.trace import Trace
+from pmsmtool.workflow.observe import NAMES, without_gaps
 from pmsmtool.workflow.track import follow
 from tests.tracking.simulated import known, machine, true_values, warming_run
 
@@ -157,3 +168,29 @@ def test_windows_that_are_limited_or_unsteady_are_left_out() -> None:
     found = condense(trace, 40)
     assert len(found) == 7  # of ten: one is limited, one unsteady, and the one after it
     assert np.all((found["i_q_a"] == 1.0) | (found["i_q_a"] == 3.0))
+
+
+def test_a_recording_of_a_transient_is_measured_by_all_of_them() -> None:
+    """Alone it shows nothing else, and its slopes would pass for its noise: 220 instead of 2 in served operation."""
+    flat, rising = np.full(400, 5.0), np.linspace(0.0, 5.0, 400)
+    parts = []
+    for current in (flat, flat, rising):
+        signals = {name: np.zeros(400) for name in ("u_d_v", "u_q_v", "i_d_a")}
+        signals |= {"i_q_a": current, "omega_e_rad_s": np.full(400, 100.0)}
+        parts.append(windows(Trace(1e-3 * np.arange(400), signals, dict.fromkeys(signals, "1")), 100))
+    assert [len(part) for part in steady(parts)] == [4, 4, 0]
+    assert len(steady(parts[2:])[0]) == 4, "nothing else to measure it by"
+
+
+def test_process_data_are_cut_where_some_are_missing() -> None:
+    """100 Hz, one sent besides at 35 ms, three lost behind 60 ms; read in bunches."""
+    stamps = np.array([0.0, 10.0, 20.0, 30.0, 35.0, 40.0, 50.0, 60.0, 100.0, 110.0, 120.0]) / 1e3
+    rows = np.column_stack([100.0 + stamps, np.round(stamps, 1), *[stamps] * len(NAMES)])
+    period_s, parts = without_gaps(rows, 0.01)
+    assert period_s == pytest.approx(0.01)
+    assert [np.round(1e3 * part.t_s).tolist() for part in parts] == [[0, 10, 20, 30, 40, 50, 60], [100, 110, 120]]
+    assert parts[1]["omega_e_rad_s"] == pytest.approx(stamps[-3:])
+    unstamped = rows.copy()
+    unstamped[:, 0], unstamped[:, 1] = 0.0, stamps
+    assert [len(part) for part in without_gaps(unstamped, 0.01)[1]] == [7, 3], "then the instants of reading count"
+    assert without_gaps(rows[:0], 0.01) == (0.01, [])
