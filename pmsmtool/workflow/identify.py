@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -18,34 +18,20 @@ from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import ConfigError, NotAvailable
-from pmsmtool.estimators.cross_check import CrossCheck
-from pmsmtool.estimators.estimate import (
-    SensorTolerance,
-    Verdict,
-    coverage_factor,
-    statistical_half_width,
-    total_half_width,
-)
+from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.experiments.rotation import dwell_within
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
-from pmsmtool.machine.parameters import (
-    EncoderParameters,
-    Estimate,
-    InverterParameters,
-    MachineLimits,
-    MachineParameters,
-)
+from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, MachineLimits, MachineParameters
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
-from pmsmtool.units import format_estimate
-from pmsmtool.workflow import frequency_stage, half_frequency, map_stage, mechanics_stage
+from pmsmtool.workflow import frequency_stage, half_frequency, identify_verdict, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_tolerance
-from pmsmtool.workflow.evaluate import Evaluation, evaluate, machine_of
+from pmsmtool.workflow.evaluate import evaluate, machine_of
 from pmsmtool.workflow.limits import Limits, require_speed
 from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Measurement, steps_of
 from pmsmtool.workflow.predicted_file import PREDICTED, dump_predicted
-from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
-from pmsmtool.workflow.sampling_stage import timing_estimates, timing_warnings
+from pmsmtool.workflow.run_directory import RunDirectory, Stage
+from pmsmtool.workflow.sampling_stage import timing_estimates
 
 MACHINE = "machine.toml"
 NAMEPLATE = "nameplate.toml"
@@ -54,11 +40,6 @@ REQUEST = "request.json"
 REPLAYED = "replayed"
 """Folder of a run for what a replay makes of it once a design stands on its machine file."""
 _MADE_FROM_MACHINE = ("design.toml", "params.toml")
-
-LIMIT: Mapping[str, float] = {"R_s_ohm": 0.03, "L_d_h": 0.05, "L_q_h": 0.05, "psi_f_wb": 0.03, "J_kgm2": 0.10}
-"""Largest relative 95 % total half width of an accepted value; measured with 1 % sensors: 1.7, 1.4, 1.4, 1.1, 1.4 %."""
-OFFSET_LIMIT_RAD = math.radians(1.0)
-"""Largest 95 % half width of the encoder offset (electrical)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,7 +262,9 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     )
     parts = half_frequency.split_estimates(evaluation.split, nameplate.inverter.U_dc_v, request.tolerance)
     timing = timing_estimates(evaluation.inductance, evaluation.shown, request.tolerance)
-    conditions = _conditions(evaluation, request) | half_frequency.split_conditions(evaluation.split, parts)
+    conditions = identify_verdict.conditions_of(evaluation, request) | half_frequency.split_conditions(
+        evaluation.split, parts
+    )
     machine = machine_of(evaluation, nameplate, conditions)
     text = dump_machine_file(machine)
     target, prefix = place_of(run, text)
@@ -291,31 +274,20 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     made_files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
     made_files |= {name: "" for name in (PREDICTED,) if (run.path / name).is_file()}
     found = evaluation.estimates()
-    # the offset of the slow turn alone, which is for the pole pairs, is coarse, and nobody asked for it
-    coarse = {"offset_rad"} if evaluation.flux is None else set()
-    acceptance = [
-        _accepted(name, estimate) for name, estimate in found.items() if _limit(name) is not None and name not in coarse
-    ]
-    acceptance += map_stage.map_acceptance(evaluation.flux_map)
+    acceptance = identify_verdict.acceptance_of(evaluation, found)
     return Stage(
         "identify",
         "pass" if all(line.ok for line in acceptance) else "fail",
         0.0,
         values=[
-            *(value_facts(name, estimate) for name, estimate in (found | parts | timing).items()),
-            *map(check_facts, evaluation.checks),
+            *(identify_verdict.value_facts(name, estimate) for name, estimate in (found | parts | timing).items()),
+            *map(identify_verdict.check_facts, evaluation.checks),
         ],
         acceptance=acceptance,
         fallbacks=[f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback],
         files={**made_files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
-        note="; ".join(warnings_of(evaluation, request)),
-        summary=", ".join(
-            f"{name} {format_estimate(found[name].value, total_half_width(found[name]), found[name].unit)}"
-            for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
-            if name in found
-        )
-        + map_stage.map_summary(evaluation.flux_map)
-        + frequency_stage.response_summary(evaluation.frequency_response),
+        note="; ".join(identify_verdict.warnings_of(evaluation, request)),
+        summary=identify_verdict.summary_of(evaluation, found),
     )
 
 
@@ -421,78 +393,3 @@ def parse_request(text: str, *, where: str) -> IdentifyRequest:
 def stored_traces(run: RunDirectory) -> dict[str, Trace]:
     """Return the traces of a run by name."""
     return {path.stem: read_trace(path) for path in sorted((run.path / "traces").glob("*.npz"))}
-
-
-def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
-    """Return what a reader should know about a result that was accepted all the same."""
-    lines = []
-    if request.half_frequency and evaluation.split is None:
-        lines.append("R_s is from one control frequency: the drive does not take half of it")
-    if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
-        lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
-    if evaluation.encoder is not None:
-        lines += [
-            f"the encoder is off by {math.degrees(error):.2g} deg (mechanical) {often} per turn: mounted off centre? "
-            "J, B and tau_c suffer from it"
-            for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
-            if error > 0.0
-        ]
-    lines += timing_warnings(evaluation.shown)
-    lines += [f"{check.name} {check.verdict}" for check in evaluation.checks if not check.agrees]
-    if evaluation.pairs is not None and not evaluation.pairs.judged:
-        lines.append("the phases were not compared: the rotor did not come to rest on the three pairs")
-    inductance = evaluation.inductance
-    if inductance is not None and inductance.verdict is Verdict.WARN:
-        dependent = ", ".join(inductance.frequency_dependent)
-        lines.append(f"L: {'depends on frequency on ' + dependent if dependent else 'chi-square above its limit'}")
-    if evaluation.flux_map is not None:
-        lines += evaluation.flux_map.notes
-    return lines
-
-
-def _conditions(evaluation: Evaluation, request: IdentifyRequest) -> dict[str, Any]:
-    conditions: dict[str, Any] = {
-        "shaft": request.shaft,
-        "current_gain_tolerance": request.tolerance.current_gain,
-        "voltage_gain_tolerance": request.tolerance.voltage_gain,
-        "current_scale": request.tolerance.current_scale,
-        "voltage_scale": request.tolerance.voltage_scale,
-        "noise_apk": evaluation.noise.sigma_a,
-    }
-    if request.tolerance.bridge_difference_v is not None:
-        conditions["bridge_difference_v"] = request.tolerance.bridge_difference_v
-    if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
-        conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
-    return conditions
-
-
-def value_facts(name: str, estimate: Estimate) -> dict[str, Any]:
-    """Return an estimate as a stage records it; numbers that are not finite as None."""
-    facts = {key: getattr(estimate, key) for key in ("value", "std", "systematic", "unit", "n", "method", "source")}
-    for key in ("chi2", "T_c", "i_d_apk", "i_q_apk"):
-        number = getattr(estimate, key)
-        facts[key] = number if math.isfinite(number) else None
-    halves = {"statistical_95": statistical_half_width(estimate), "total_95": total_half_width(estimate)}
-    return {"name": name, **facts, "coverage_factor": coverage_factor(estimate.dof), **halves}
-
-
-def check_facts(check: CrossCheck) -> dict[str, Any]:
-    """Return a second method's estimate as a stage records it, with what it says about the first."""
-    facts = value_facts(check.name, check.estimate)
-    judged = {"of": check.of, "difference": check.difference, "interval_95": check.half_width, "agrees": check.agrees}
-    return {**facts, "method": f"check, {check.estimate.method}: {check.verdict}", "check": judged}
-
-
-def _limit(name: str) -> float | None:
-    return OFFSET_LIMIT_RAD if name == "offset_rad" else LIMIT.get(name)
-
-
-def _accepted(name: str, estimate: Estimate) -> Acceptance:
-    limit = _limit(name)
-    assert limit is not None
-    half = total_half_width(estimate)
-    what = f"{name}: total 95 % interval"
-    if name == "offset_rad":
-        return Acceptance(what, f"{math.degrees(half):.3g} deg", f"{math.degrees(limit):.3g} deg", half <= limit)
-    relative = half / abs(estimate.value)
-    return Acceptance(what, f"{100.0 * relative:.2g} %", f"{100.0 * limit:.2g} %", relative <= limit)

@@ -38,9 +38,9 @@ from pmsmtool.workflow.identify import (
     asked_again,
     dump_request,
     place_of,
-    value_facts,
 )
 from pmsmtool.workflow.identify import replay as replay_injection
+from pmsmtool.workflow.identify_verdict import value_facts
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 from pmsmtool.workflow.tier_machine import TierMachine, tier_machine
 

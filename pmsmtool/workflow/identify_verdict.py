@@ -1,0 +1,119 @@
+"""What is recorded of an identification: values with their intervals, whether they are accepted, and what to know."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from pmsmtool.estimators.cross_check import CrossCheck
+from pmsmtool.estimators.estimate import Verdict, coverage_factor, statistical_half_width, total_half_width
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.units import format_estimate
+from pmsmtool.workflow import frequency_stage, map_stage
+from pmsmtool.workflow.evaluate import Evaluation
+from pmsmtool.workflow.run_directory import Acceptance
+from pmsmtool.workflow.sampling_stage import timing_warnings
+
+if TYPE_CHECKING:
+    from pmsmtool.workflow.identify import IdentifyRequest
+
+LIMIT: Mapping[str, float] = {"R_s_ohm": 0.03, "L_d_h": 0.05, "L_q_h": 0.05, "psi_f_wb": 0.03, "J_kgm2": 0.10}
+"""Largest relative 95 % total half width of an accepted value; measured with 1 % sensors: 1.7, 1.4, 1.4, 1.1, 1.4 %."""
+OFFSET_LIMIT_RAD = math.radians(1.0)
+"""Largest 95 % half width of the encoder offset (electrical)."""
+
+
+def acceptance_of(evaluation: Evaluation, found: Mapping[str, Estimate]) -> list[Acceptance]:
+    """Return what every value that has a limit is judged by."""
+    # the offset of the slow turn alone, which is for the pole pairs, is coarse, and nobody asked for it
+    coarse = {"offset_rad"} if evaluation.flux is None else set()
+    judged = [name for name in found if _limit(name) is not None and name not in coarse]
+    return [*(_accepted(name, found[name]) for name in judged), *map_stage.map_acceptance(evaluation.flux_map)]
+
+
+def summary_of(evaluation: Evaluation, found: Mapping[str, Estimate]) -> str:
+    """Return the one line of the stage."""
+    values = ", ".join(
+        f"{name} {format_estimate(found[name].value, total_half_width(found[name]), found[name].unit)}"
+        for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
+        if name in found
+    )
+    more = map_stage.map_summary(evaluation.flux_map) + frequency_stage.response_summary(evaluation.frequency_response)
+    return values + more
+
+
+def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
+    """Return what a reader should know about a result that was accepted all the same."""
+    lines = []
+    if request.half_frequency and evaluation.split is None:
+        lines.append("R_s is from one control frequency: the drive does not take half of it")
+    if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
+        lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
+    if evaluation.encoder is not None:
+        lines += [
+            f"the encoder is off by {math.degrees(error):.2g} deg (mechanical) {often} per turn: mounted off centre? "
+            "J, B and tau_c suffer from it"
+            for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
+            if error > 0.0
+        ]
+    lines += timing_warnings(evaluation.shown)
+    lines += [f"{check.name} {check.verdict}" for check in evaluation.checks if not check.agrees]
+    if evaluation.pairs is not None and not evaluation.pairs.judged:
+        lines.append("the phases were not compared: the rotor did not come to rest on the three pairs")
+    inductance = evaluation.inductance
+    if inductance is not None and inductance.verdict is Verdict.WARN:
+        dependent = ", ".join(inductance.frequency_dependent)
+        lines.append(f"L: {'depends on frequency on ' + dependent if dependent else 'chi-square above its limit'}")
+    if evaluation.flux_map is not None:
+        lines += evaluation.flux_map.notes
+    return lines
+
+
+def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str, Any]:
+    """Return under what the machine was identified, as its file says it."""
+    conditions: dict[str, Any] = {
+        "shaft": request.shaft,
+        "current_gain_tolerance": request.tolerance.current_gain,
+        "voltage_gain_tolerance": request.tolerance.voltage_gain,
+        "current_scale": request.tolerance.current_scale,
+        "voltage_scale": request.tolerance.voltage_scale,
+        "noise_apk": evaluation.noise.sigma_a,
+    }
+    if request.tolerance.bridge_difference_v is not None:
+        conditions["bridge_difference_v"] = request.tolerance.bridge_difference_v
+    if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
+        conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
+    return conditions
+
+
+def value_facts(name: str, estimate: Estimate) -> dict[str, Any]:
+    """Return an estimate as a stage records it; numbers that are not finite as None."""
+    facts = {key: getattr(estimate, key) for key in ("value", "std", "systematic", "unit", "n", "method", "source")}
+    for key in ("chi2", "T_c", "i_d_apk", "i_q_apk"):
+        number = getattr(estimate, key)
+        facts[key] = number if math.isfinite(number) else None
+    halves = {"statistical_95": statistical_half_width(estimate), "total_95": total_half_width(estimate)}
+    return {"name": name, **facts, "coverage_factor": coverage_factor(estimate.dof), **halves}
+
+
+def check_facts(check: CrossCheck) -> dict[str, Any]:
+    """Return a second method's estimate as a stage records it, with what it says about the first."""
+    facts = value_facts(check.name, check.estimate)
+    judged = {"of": check.of, "difference": check.difference, "interval_95": check.half_width, "agrees": check.agrees}
+    return {**facts, "method": f"check, {check.estimate.method}: {check.verdict}", "check": judged}
+
+
+def _limit(name: str) -> float | None:
+    return OFFSET_LIMIT_RAD if name == "offset_rad" else LIMIT.get(name)
+
+
+def _accepted(name: str, estimate: Estimate) -> Acceptance:
+    limit = _limit(name)
+    assert limit is not None
+    half = total_half_width(estimate)
+    what = f"{name}: total 95 % interval"
+    if name == "offset_rad":
+        return Acceptance(what, f"{math.degrees(half):.3g} deg", f"{math.degrees(limit):.3g} deg", half <= limit)
+    relative = half / abs(estimate.value)
+    return Acceptance(what, f"{100.0 * relative:.2g} %", f"{100.0 * limit:.2g} %", relative <= limit)
