@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import open_node
+from pmsmtool.cli.drive_access import open_node, warn_of_other_drive
 from pmsmtool.cli.options import FREQUENCY, TIME, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
 
@@ -82,6 +82,7 @@ def monitor_command(
         ) from error
     period_s = 1.0 / (rate_hz or DEFAULT_RATE_HZ)
     with open_node(bus) as node:
+        warn_of_other_drive(node, out)
         names = _available(node, wanted)
         if as_csv:
             click.echo(",".join(["t_s", *names]))

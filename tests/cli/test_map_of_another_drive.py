@@ -15,6 +15,7 @@ from pmsmtool.firmware.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.sim.node import node
 from tests.cli.conftest import Result, Tool
 
 EPOS4 = "interior-2k2?nv=:memory:&drive=epos4"
@@ -137,6 +138,21 @@ def test_what_is_read_through_it_is_marked(
     assert code == 0, err
     assert "warning: the map" in err and "is for vendor" in err and "nothing is written or moved through it" in err
     assert written == []
+
+
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize("more", [(), ("--pdo",)])
+def test_what_is_monitored_through_it_is_marked(
+    more: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another product of the same maker, with something at the same indexes."""
+    command = ("monitor", "--for", "0.1s", "-g", "U_dc_v", "--rate", "50Hz", *more)
+    code, out, err = on(REFERENCE, capsys, *command)
+    assert code == 0 and "U_dc_v" in out and "warning" not in err, err
+    monkeypatch.setattr(node, "PRODUCT", 0x777)
+    code, out, err = on(REFERENCE, capsys, *command)
+    assert code == 0 and "U_dc_v" in out, err
+    assert "warning: the map 'pmsmsim' is for vendor" in err and "what is read may mean something else" in err
 
 
 @pytest.mark.usefixtures("files")
