@@ -39,13 +39,13 @@ from pmsmtool.trace import Trace
 WATCH_S = 0.05
 """The machine is looked at this often while time passes."""
 LOCKED_TRAVEL_RAD = math.radians(20.0)
+"""A clamp and its coupling give by a few degrees; a shaft that goes further is not locked."""
 _TURNS = "the shaft turns, though it is said to be locked"
 _NEXT_STEP = {
     "current": "raise the limit knowingly (--i-max), or ask for less",
     "speed": "raise the limit knowingly (--speed-max), or ask for less",
     "travel": "clamp the shaft, or say --shaft free where it may turn",
 }
-"""A clamp and its coupling give by a few degrees; a shaft that goes further is not locked."""
 OVERSHOOT = 1.25
 """Measured current or speed over its limit that ends an experiment: regulation overshoots, noise peaks."""
 _ROUNDING = 1e-9
