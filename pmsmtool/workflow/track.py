@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import Track, track
 from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, TRACKED, Known
@@ -111,7 +112,7 @@ class Tracked:
     temperatures : mapping of str to (value, std)
         ``T_winding_c`` from R and ``T_magnet_c`` from psi at the end (degC), with the doubt of the identified values.
     systematic : mapping of str to float
-        95 % half widths that the sensors' scales leave, as identification states them.
+        95 % half widths that the sensors' scales leave (:func:`systematic_of`).
     sensor_c : float
         Mean reading of the winding's sensor (degC); NaN without one.
     """
@@ -148,8 +149,19 @@ def follow(observations: Trace, known: Known, machine: MachineFile, wanted: Sequ
         own = np.hypot(found.std["R_s_ohm"], machine.std.get("R_s_ohm", 0.0))
         found = replace(found, std={**found.std, "R_s_ohm": own})
     sensor = float(np.mean(observations["T_winding_c"])) if "T_winding_c" in observations.signals else math.nan
-    systematic = {name: machine.systematic.get(name, 0.0) for name in wanted}
-    return Tracked(found, temperatures, systematic, sensor)
+    return Tracked(found, temperatures, {name: systematic_of(machine, name) for name in wanted}, sensor)
+
+
+def systematic_of(machine: MachineFile, name: str) -> float:
+    """Return the 95 % half width of R or psi that the sensors' scales leave.
+
+    As the machine file states it; without a statement, as of a drive's own values or a data sheet, with sensors of the
+    tolerance that ``identify`` takes by default.
+    """
+    if name in machine.systematic:
+        return machine.systematic[name]
+    sensors = SensorTolerance()
+    return {"R_s_ohm": sensors.impedance, "psi_f_wb": sensors.flux}[name] * float(getattr(machine.machine, name))
 
 
 def keep(run: RunDirectory, observations: Trace, known: Known) -> None:

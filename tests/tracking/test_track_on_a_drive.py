@@ -24,7 +24,16 @@ from pmsmtool.trace_file import trace_npz
 from pmsmtool.workflow.commission import begin_run
 from pmsmtool.workflow.observe import Observations, joined, observe_process_data, observe_recordings
 from pmsmtool.workflow.run_directory import RunDirectory
-from pmsmtool.workflow.track import dump_known, follow, keep, known_of, load_known, replay_observations, track_stage
+from pmsmtool.workflow.track import (
+    dump_known,
+    follow,
+    keep,
+    known_of,
+    load_known,
+    replay_observations,
+    systematic_of,
+    track_stage,
+)
 from tests.drive.bench import SimBench, sim_bench
 from tests.simulated_bus import settle
 
@@ -110,6 +119,14 @@ def test_what_is_known_survives_its_file(tmp_path: Path) -> None:
 def test_the_systematic_part_widens_the_inductance() -> None:
     machine = replace(identified(), std={}, systematic={"L_q_h": 0.1 * 0.051})
     assert known_of(machine, compensated=False).L_std == pytest.approx((0.02, 0.1 / 1.96))
+
+
+def test_a_machine_that_states_no_systematic_part_gets_that_of_usual_sensors() -> None:
+    """It was counted as none: a track on the values that the drive holds claimed psi without its sensors' 1 %."""
+    machine = replace(identified(), systematic={"R_s_ohm": 0.01})
+    assert systematic_of(machine, "R_s_ohm") == 0.01
+    assert systematic_of(machine, "psi_f_wb") == pytest.approx(0.01 * 0.545)
+    assert systematic_of(replace(machine, systematic={}), "R_s_ohm") == pytest.approx(2**0.5 * 0.01 * 3.6)
 
 
 # ---- the command line -----------------------------------------------------------------------------------------
