@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 _SOURCE = click.argument("design", type=click.Path(path_type=Path))
 _OUTPUT = click.option("-o", "--output", "path", type=FILE, help="File to write.  [default: standard output]")
 _PREFIX = click.option("--prefix", default="pmsm", help="C identifier in front of every name.")
+SHOWN = 5
+"""Parameters that a warning names."""
 
 
 @click.group("export")
@@ -57,7 +59,11 @@ def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
     wanted = load_parameters(design, drive_map)
     missing = drive_map.missing(wanted)
     if missing:
-        out.warn(f"drive family {drive_map.name} has no object for {', '.join(missing)}")
+        few = ", ".join(missing[:SHOWN]) + (", ... (-v names all)" if len(missing) > SHOWN else "")
+        count = f"{len(missing)} of {len(wanted.values) + len(wanted.tables)} parameters"
+        out.warn(f"drive family {drive_map.name} has no object for {count}: {few}")
+        if len(missing) > SHOWN:
+            out.detail(f"no object for {', '.join(missing)}")
     return wanted
 
 

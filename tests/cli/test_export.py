@@ -159,7 +159,12 @@ def test_csv_through_another_drives_map(folder: Path, tmp_path: Path) -> None:
     K_p, K_i = (float(rows[name]["value"]) for name in cells)
     assert int.from_bytes(bytes.fromhex(rows["current.K_i_d_v_per_as"]["bytes"]), "little") == round(1e5 * K_p / K_i)
     assert rows["motor.R_s_ohm"]["object"] == ""
-    assert "has no object for" in outcome.stderr and "motor.R_s_ohm" in outcome.stderr
+    (warning,) = outcome.stderr.splitlines()
+    assert "has no object for" in warning and "motor.R_s_ohm, " in warning and "... (-v names all)" in warning
+    assert len(warning) < 240 and "polar.V_ref_ratio" not in warning, "dozens of names are no reading"
+    outcome = CliRunner().invoke(cli, ["export", "csv", str(folder), "--map", str(tmp_path / "map.toml"), "-v"])
+    every = outcome.stderr.splitlines()[1].removeprefix("no object for ").split(", ")
+    assert f" {len(every)} of {len(every) + len(cells)} parameters" in warning and "polar.V_ref_ratio" in every
 
 
 def test_a_users_file_keeps_its_other_bytes(folder: Path, tmp_path: Path) -> None:
