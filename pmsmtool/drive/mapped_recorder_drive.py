@@ -117,6 +117,7 @@ class MappedRecorderDrive(RecorderDrive, TorqueDrive):
 
     def finish_record(self, recording: Recording) -> Trace:
         """Return the record by the names asked for."""
+        self.coast()
         trace = self.traces.fetch(self._names(recording.signals), self._apart * recording.decimation)
         self._recording = False
         self.check_operating()

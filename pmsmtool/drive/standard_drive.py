@@ -225,9 +225,10 @@ class RecorderDrive(TorqueCurrent):
         Recorder and step are commanded one after the other: the transfers last about the same, so the time between
         their answers is the time between their effects.
         """
-        trace = super().finish_record(recording)
         if recording.excitation is None:
-            return trace
+            self.coast()
+            return super().finish_record(recording)
+        trace = super().finish_record(recording)
         rows = len(trace) - SPARE_ROWS
         if self._late_s > SPARE_ROWS * trace.period_s:
             raise DriveTimeout(
@@ -238,6 +239,10 @@ class RecorderDrive(TorqueCurrent):
         at = trace.t_s[:rows] + self._late_s
         signals_at = {name: np.interp(at, trace.t_s, values) for name, values in trace.signals.items()}
         return Trace(trace.t_s[:rows], signals_at, trace.units, {**trace.meta, "late_s": self._late_s})
+
+    def coast(self) -> None:
+        """Take the torque away before a record is read: reading may last longer than the push, which would go on."""
+        self.command_current(0.0, 0.0)
 
     def end_excitation(self) -> None:
         """Leave the speed where it is: the next command takes it back."""

@@ -41,6 +41,7 @@ from pmsmtool.workflow.identify import (
 )
 from pmsmtool.workflow.identify import replay as replay_injection
 from pmsmtool.workflow.identify_verdict import value_facts
+from pmsmtool.workflow.push_limits import not_told, without
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 from pmsmtool.workflow.tier_machine import TierMachine, tier_machine
 
@@ -203,7 +204,8 @@ def _by_recorder(
         estimates |= estimate_ratios(pushes, pole_pairs=facts.pole_pairs, tolerance=tolerance)
     except IdentificationError as error:
         missing["J_per_psi"] = error.what
-    return TierResult(estimates, missing, traces)
+    reasons = not_told(estimates, pushes, LIMITS["L_q_app_h"])
+    return TierResult(without(estimates, reasons), missing | reasons, traces)
 
 
 def _by_torque(

@@ -18,7 +18,7 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, rated_apk
+from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent, rated_apk
 from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
@@ -162,7 +162,7 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say 
     )  # fmt: skip
 
 
-def _link_v(drive: TorqueDrive) -> float:
+def _link_v(drive: TorqueCurrent) -> float:
     """Return the DC link (V), 0 where the drive does not show it."""
     try:
         return drive.live("U_dc_v")
@@ -193,7 +193,13 @@ def identify_recorder(
 def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: Say = _quiet) -> TierFacts:
     """Run the experiment of :func:`identify_recorder`; raises as it does."""
     pole_pairs = round(drive.read("motor.pole_pairs"))
-    plan = PushPlan(envelope.i_max_apk / HEADROOM, SWING_SHARE * envelope.speed_max_rad_s)
+    U_dc = _link_v(drive)
+    plan = PushPlan(
+        envelope.i_max_apk / HEADROOM,
+        SWING_SHARE * envelope.speed_max_rad_s,
+        u_max_v=U_dc / math.sqrt(3.0) if U_dc > 0.0 else math.inf,
+        i_max_a=envelope.i_max_apk,
+    )
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
         say(f"R, psi, L_q, J: {4 * len(plan.shares)} recorded torque pushes up to {plan.i_test_a:.3g} A")
