@@ -170,7 +170,7 @@ def _interrupted(run: RunDirectory) -> Interrupted:
 
     if not _kept(run):
         return Interrupted("interrupted before anything was observed", where=str(run.path), hint="observe for longer")
-    return Interrupted("interrupted: what was observed until then is kept", where=str(run.path), hint=_replay(run))
+    return Interrupted("what was observed until then is kept", where=str(run.path), hint=_replay(run))
 
 
 def _kept(run: RunDirectory) -> bool:

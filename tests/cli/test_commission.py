@@ -245,6 +245,7 @@ def test_ctrl_c_while_the_machine_moves(command: str, wait: int, tool: Tool, mon
         assert count >= wait, "the moment was never reached"
         assert code == 130 and out == "", err
         assert "interrupted: the machine is stopped, voltage off, and the drive restored" in err
+        assert "interrupted: interrupted" not in err
         assert backup(channel) == before
 
 
