@@ -382,8 +382,8 @@ def reference_capabilities(identity: Identity) -> Capabilities:
     return Capabilities(identity, reference_map(), True, every)
 
 
-_FULL = "benchmarks.identification_coverage --drives 400 --first 40000"
-_MECHANICS = "benchmarks.mechanics_accuracy --drives 40 --first 66000"
+_FULL = "benchmarks.identification_coverage --drives 400 --first 70000"
+_MECHANICS = "benchmarks.mechanics_accuracy --drives 240 --first 67000"
 _RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 200 --first 65102"
 _STANDARD_RUN = "benchmarks.tier_intervals standard --drives 200 --first 64200 --speed 1.35"
 
@@ -397,11 +397,11 @@ def _expected(program: str, drives: int, *rows: tuple[str, float, str], given: s
 
 
 EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
-    ("R", Method.INJECT): _expected(_FULL, 398, ("R_s_ohm", 4.5, "%")),
-    ("L", Method.INJECT): _expected(_FULL, 398, ("L_d_h", 1.4, "%"), ("L_q_h", 1.4, "%")),
-    ("psi", Method.INJECT): _expected(_FULL, 398, ("psi_f_wb", 1.1, "%")),
-    ("encoder", Method.INJECT): _expected(_FULL, 398, ("offset_rad", 0.04, "deg")),
-    ("mechanics", Method.INJECT): _expected(_MECHANICS, 23, ("J_kgm2", 1.5, "%")),
+    ("R", Method.INJECT): _expected(_FULL, 400, ("R_s_ohm", 4.5, "%")),
+    ("L", Method.INJECT): _expected(_FULL, 400, ("L_d_h", 1.4, "%"), ("L_q_h", 1.4, "%")),
+    ("psi", Method.INJECT): _expected(_FULL, 400, ("psi_f_wb", 1.1, "%")),
+    ("encoder", Method.INJECT): _expected(_FULL, 400, ("offset_rad", 0.04, "deg")),
+    ("mechanics", Method.INJECT): _expected(_MECHANICS, 70, ("J_kgm2", 1.5, "%")),
     ("R", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("R_s_ohm", 6.1, "%")),
     ("L", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("L_q_app_h", 4.8, "%")),
     ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 199, ("psi_f_wb", 1.2, "%")),

@@ -44,10 +44,10 @@ MEASURED = Path(__file__).parents[3] / "shared" / "maps" / "baldor_400rpm_map.np
 
 FREE_RMS, FREE_MAX = 0.0025, 0.010
 HELD_RMS, HELD_MAX = 0.0015, 0.006
-"""Of the flux range. Measured: 0.0003 and 0.0039 with the profile and a free rotor; 0.0005 and 0.0022 with the measured
-machine, held (0.0005 and 0.0025 with a free rotor)."""
+"""Of the flux range. Measured: 0.0005 and 0.0078 with the profile and a free rotor; 0.0004 and 0.0023 with the measured
+machine, held (0.0004 and 0.0030 with a free rotor)."""
 INDUCTANCE_MEDIAN = 0.015
-"""Measured: 0.0014 (d) and 0.0029 (q) with the profile; 0.0054 and 0.0057 with the measured machine."""
+"""Measured, the larger of d and q: 0.0028 with the profile; 0.0054 with the measured machine (0.0060, free)."""
 
 
 def errors(found: FluxMap, known: np.ndarray, L: dict[str, np.ndarray], truth: FluxMap) -> tuple[float, float, float]:
