@@ -17,6 +17,7 @@ from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.firmware.map_tables import decode_table, encode_table, shortest_binary32
 from pmsmtool.firmware.recorder_map import RecorderMap, Recording
 from pmsmtool.firmware.vendor_tuning import VendorTuning
+from pmsmtool.firmware.wire_units import as_peak
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 
@@ -355,8 +356,8 @@ REFERENCE_CAPABILITIES = Capabilities(
 REFERENCE_SIGNALS = {
     "omega_M_rad_s": SignalCell(0x606C, 0, "INTEGER32", "mrpm"),
     "torque_nm": SignalCell(0x6077, 0, "INTEGER16", "permille of 0x6076"),
-    "i_q_a": SignalCell(0x2070, 2, "REAL32", "A"),
-    "i_d_a": SignalCell(0x2070, 1, "REAL32", "A"),
+    "i_q_a": SignalCell(0x2070, 2, "REAL32", "A peak"),
+    "i_d_a": SignalCell(0x2070, 1, "REAL32", "A peak"),
     "u_q_v": SignalCell(0x2070, 6, "REAL32", "V"),
     "u_d_v": SignalCell(0x2070, 5, "REAL32", "V"),
     "U_dc_v": SignalCell(0x2070, 8, "REAL32", "V"),
@@ -367,7 +368,7 @@ REFERENCE_SIGNALS = {
 
 def reference_map() -> DriveMap:
     """Return the map of the reference drive, which is the parameter catalogue itself."""
-    cells = {row.name: Cell(row.name, row.index, row.sub, row.wire, unit=row.unit) for row in CATALOGUE}
+    cells = {row.name: Cell(row.name, row.index, row.sub, row.wire, unit=as_peak(row.unit)) for row in CATALOGUE}
     return DriveMap(
         "pmsmsim", REFERENCE_VENDOR, REFERENCE_PRODUCT, cells, REFERENCE_TABLES, staging=True,
         capabilities=REFERENCE_CAPABILITIES, signals=REFERENCE_SIGNALS,

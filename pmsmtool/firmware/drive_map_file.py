@@ -31,7 +31,7 @@ from pmsmtool.firmware.recorder_map_file import TABLE as RECORDER
 from pmsmtool.firmware.recorder_map_file import dump_recorder, parse_recorder
 from pmsmtool.firmware.vendor_tuning import VendorTuning
 from pmsmtool.firmware.vendor_tuning_file import TABLE, dump_vendor_tuning, parse_vendor_tuning
-from pmsmtool.firmware.wire_units import counted_in, wire_unit
+from pmsmtool.firmware.wire_units import as_peak, counted_in, wire_unit
 from pmsmtool.params.catalogue import BY_NAME, EVERY, Parameter
 from pmsmtool.params.parameter_set import TABLE_NAMES
 from pmsmtool.toml_file import parse_toml
@@ -93,7 +93,7 @@ def dump_drive_map(drive_map: DriveMap) -> str:
 
 
 def _cell_row(cell: Cell) -> dict[str, Any]:
-    unit = cell.unit or f"{abs(cell.factor):.17g} {_expected_unit(BY_NAME[cell.name], cell.form)}"
+    unit = cell.unit or f"{abs(cell.factor):.17g} {as_peak(_expected_unit(BY_NAME[cell.name], cell.form))}"
     row: dict[str, Any] = {"index": cell.index, "sub": cell.sub, "type": cell.wire, "unit": unit}
     row |= {"factor": cell.factor} if cell.factor != _unit_factor(cell) else {}
     row |= {"offset": cell.offset} if cell.offset else {}

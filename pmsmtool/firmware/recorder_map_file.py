@@ -134,7 +134,7 @@ def _usable(row: Any, keys: tuple[str, ...], sources: Mapping[str, str], tell: C
     if "source" in row and (not isinstance(row["source"], str) or row["source"] not in sources):
         tell("source", f"source {row['source']!r} is not in [sources]")
     if not isinstance(row.get("unit"), str) or not row["unit"]:
-        tell("unit", 'unit is missing: say what one count is worth, such as "0.01 A"')
+        tell("unit", 'unit is missing: say what one count is worth, such as "0.01 A peak"')
         return False
     return True
 

@@ -1,9 +1,10 @@
 """Units in which drives count: what one count of an object is worth, as a person reads it in a data sheet.
 
-``uV/A``, ``10 mohm line-line``, ``mA rms``, ``0.1 V``, ``rev/s``: an optional number, a unit, and optionally
-``rms`` (sinusoidal current or voltage: times sqrt 2 to the peak; torque over such a current: divided by it) or
-``line-line`` (winding data between two terminals: half of it per phase). Relative CiA 402 values are
-``permille of 0x6075`` and ``permille of 0x6076``.
+``uV/A``, ``10 mohm line-line``, ``mA rms``, ``0.1 V``, ``rev/s``: an optional number, a unit, and its kind:
+``peak`` or ``rms`` (sinusoidal current or voltage: rms times sqrt 2 is the peak; torque over such a current: divided
+by it) or ``line-line`` (winding data between two terminals: half of it per phase). A current must say its kind: an
+object in rms taken as peak would get a limit 41 % too high. Relative CiA 402 values are ``permille of 0x6075`` and
+``permille of 0x6076``.
 """
 
 from __future__ import annotations
@@ -58,9 +59,10 @@ _COMPOSITE: dict[str, tuple[str, float]] = {
 }
 """Units that are more than a prefix before one of ``units.UNITS``."""
 
-_PATTERN = re.compile(r"(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?) +)?(\S.*?)(?: +(rms|line-line))?\Z")
-_RELATIVE = {"permille of 0x6075": ("current", 0x6075), "permille of 0x6076": ("torque", 0x6076)}
-_OF_RMS = {"current": math.sqrt(2.0), "voltage": math.sqrt(2.0), "torque constant": math.sqrt(0.5)}
+CURRENT = "current"
+_PATTERN = re.compile(r"(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?) +)?(\S.*?)(?: +(peak|rms|line-line))?\Z")
+_RELATIVE = {"permille of 0x6075": (CURRENT, 0x6075), "permille of 0x6076": ("torque", 0x6076)}
+_OF_RMS = {CURRENT: math.sqrt(2.0), "voltage": math.sqrt(2.0), "torque constant": math.sqrt(0.5)}
 _PER_PHASE = frozenset({"resistance", "inductance"})
 
 
@@ -70,7 +72,7 @@ def wire_unit(text: str) -> WireUnit:
     Raises
     ------
     ValueError
-        It is none; the message says why.
+        It is none, or a current that says neither ``peak`` nor ``rms``; the message says why.
     """
     if text in _RELATIVE:
         dimension, base = _RELATIVE[text]
@@ -81,10 +83,12 @@ def wire_unit(text: str) -> WireUnit:
     number, symbol, kind = match.groups()
     dimension, scale = _symbol(symbol)
     scale *= float(number or 1.0)
-    if kind == "rms":
+    if dimension == CURRENT and kind is None:
+        raise ValueError(f"peak or rms? They differ by 41 %: write {f'{text} peak'!r} or {f'{text} rms'!r}")
+    if kind in ("peak", "rms"):
         if dimension not in _OF_RMS:
-            raise ValueError(f"{dimension} has no rms value")
-        scale *= _OF_RMS[dimension]
+            raise ValueError(f"{dimension} has no {kind} value")
+        scale *= _OF_RMS[dimension] if kind == "rms" else 1.0
     elif kind == "line-line":
         if dimension not in _PER_PHASE:
             raise ValueError(f"{dimension} is not halved between lines")
@@ -102,6 +106,11 @@ def _symbol(symbol: str) -> tuple[str, float]:
     if base is not None and base.prefixable and symbol[0] in PREFIXES:
         return base.dimension, base.factor * 10.0 ** (base.exponent + PREFIXES[symbol[0]])
     raise ValueError(f"unknown unit {symbol!r}")
+
+
+def as_peak(symbol: str) -> str:
+    """Return how a map spells a unit of ``units.UNITS`` in which amplitudes are given: ``A peak`` for ``A``."""
+    return f"{symbol} peak" if _symbol(symbol)[0] == CURRENT else symbol
 
 
 def counted_in(text: str, symbol: str) -> float:

@@ -64,9 +64,10 @@ MISTAKES = [
     ("factor = 1e-3", 'factor = "1e-3"', "finite", 8),
     ('unit = "mV/A", ', "", "unit is missing", 8),
     ('unit = "mV/A"', 'unit = ""', "unit is missing", 8),
-    ('unit = "mV/A"', 'unit = "mA"', "current, expected gain V/A", 8),
+    ('unit = "mV/A"', 'unit = "mA rms"', "current, expected gain V/A", 8),
     ('unit = "mV/A"', 'unit = "bananas"', "unknown unit", 8),
     ('unit = "mV/A"', 'unit = "mV/A rms"', "no rms value", 8),
+    ('unit = "mV/A"', 'unit = "mV/A peak"', "no peak value", 8),
     ('unit = "us"', 'unit = "V/(A s)"', "expected time", 9),
     ('gain = "current.K_p_q_v_per_a"', 'gain = "current.K_p_d_v_per_a"', "does not hold", 9),
     ('gain = "current.K_p_q_v_per_a"', 'gain = "K_p"', "not in the parameter catalogue", 9),
@@ -93,7 +94,7 @@ MISTAKES = [
 ROWS = """[capabilities]
 recorder = "rows"
 [recorder]
-i_q_a = { number = 14, unit = "0.01 A", source = "doc" }
+i_q_a = { number = 14, unit = "0.01 A peak", source = "doc" }
 u_q_v = { number = 20, unit = "0.1 V" }
 [left_out]"""
 RINGS = """[capabilities]
@@ -110,14 +111,14 @@ RECORDER_MISTAKES = [
     (ROWS, "number = 14", "number = true", "number must be a trace variable's", 18),
     (ROWS, "number = 20", "number = 14", "is recorded as i_q_a already", 19),
     (ROWS, "number = 14", "index = 0x6078", "unknown key index", 18),
-    (ROWS, 'unit = "0.01 A"', 'unit = ""', "unit is missing", 18),
-    (ROWS, 'unit = "0.01 A"', 'unit = "0.01 V"', "voltage, expected current", 18),
-    (ROWS, 'unit = "0.01 A"', 'unit = "permille of 0x6075"', "a record holds no 0x6075", 18),
-    (ROWS, 'unit = "0.01 A"', 'unit = "0 A"', "worth something", 18),
+    (ROWS, 'unit = "0.01 A peak"', 'unit = ""', "unit is missing", 18),
+    (ROWS, 'unit = "0.01 A peak"', 'unit = "0.01 V"', "voltage, expected current", 18),
+    (ROWS, 'unit = "0.01 A peak"', 'unit = "permille of 0x6075"', "a record holds no 0x6075", 18),
+    (ROWS, 'unit = "0.01 A peak"', 'unit = "0 A peak"', "worth something", 18),
     (ROWS, 'source = "doc"', 'source = "hearsay"', "not in [sources]", 18),
     (ROWS, "i_q_a =", "i_x_a =", "no signal of that name", 18),
     (ROWS, "i_q_a =", "target_torque_nm =", "no signal of that name", 18),
-    (ROWS, 'i_q_a = { number = 14, unit = "0.01 A", source = "doc" }', "i_q_a = 14", "needs number and unit", 18),
+    (ROWS, 'i_q_a = { number = 14, unit = "0.01 A peak", source = "doc" }', "i_q_a = 14", "needs number and unit", 18),
     (ROWS, "u_q_v = {", 'period = { unit = "us" }\nu_q_v = {', "says its period itself", 19),
     (ROWS, 'recorder = "rows"', 'recorder = "index"', "takes no channels", 17),
     (RINGS, "index = 0x6078, ", "", "needs index", 19),
@@ -168,6 +169,45 @@ def test_what_a_recorder_takes_is_read_and_written_back(table: str) -> None:
         assert (found.recorder.period, found.recorder.period_source) == ("100 us", "doc")
 
 
+LIMIT = '"motor.I_max_apk" = {{ index = 0x2001, sub = 5, type = "UNSIGNED16", unit = "{0}", rounding = "down" }}'
+SIGNAL = 'i_q_a = {{ index = 0x6078, sub = 0, type = "INTEGER16", unit = "{0}" }}'
+WITH_CURRENT = [
+    # (the table the row is added to, the row, its line)
+    ("[signals]\n", LIMIT + "\n\n[signals]\n", 12),
+    ("[left_out]\n", SIGNAL + "\n\n[left_out]\n", 15),
+    ("[left_out]\n", ROWS.replace("0.01 A peak", "{0}").replace("{ ", "{{ ").replace(" }", " }}") + "\n", 18),
+    ("[left_out]\n", RINGS.replace("mA rms", "{0}").replace("{ ", "{{ ").replace(" }", " }}") + "\n", 19),
+]
+
+
+@pytest.mark.parametrize("bare", ["A", "mA", "0.01 A"])
+@pytest.mark.parametrize(("table", "row", "line"), WITH_CURRENT)
+def test_a_current_says_whether_it_is_peak_or_rms(table: str, row: str, line: int, bare: str) -> None:
+    assert GOOD.count(table) == 1
+    for kind in ("peak", "rms"):
+        parse(GOOD.replace(table, row.format(f"{bare} {kind}")))
+    with pytest.raises(ConfigError) as caught:
+        parse(GOOD.replace(table, row.format(bare)))
+    (said,) = caught.value.violations
+    assert said.startswith(f"mine/map.toml:{line}: ")
+    assert f"write '{bare} peak' or '{bare} rms'" in said
+
+
+def test_a_limit_in_rms_is_written_41_percent_lower_than_one_in_peak() -> None:
+    limit = "motor.I_max_apk"
+    raw = {
+        kind: parse(GOOD.replace("[signals]", LIMIT.format(f"mA {kind}") + "\n[signals]")).cells[limit].encode(10.0, {})
+        for kind in ("peak", "rms")
+    }
+    assert {kind: int.from_bytes(data, "little") for kind, data in raw.items()} == {"peak": 10_000, "rms": 7_071}
+
+
+def test_a_current_without_a_unit_of_its_own_is_written_as_peak() -> None:
+    cell = Cell("motor.I_max_apk", 0x2001, 5, "UNSIGNED16", 1e-3)
+    found = parse(dump_drive_map(DriveMap("mine", 1, 2, {cell.name: cell}))).cells[cell.name]
+    assert (found.factor, found.unit) == (1e-3, "0.001 A peak")
+
+
 def test_all_mistakes_are_listed_at_once() -> None:
     text = GOOD.replace("factor = 1e-3", "factor = -1e-3").replace('"UNSIGNED8"', '"REAL64"').replace('"deg"', '""')
     with pytest.raises(ConfigError) as caught:
@@ -211,6 +251,9 @@ def test_forms_of_an_integral_gain_and_of_a_torque_constant() -> None:
         ("uV/(A ms)", "V/(A s)", 1e-3),
         ("10 mohm line-line", "ohm", 5e-3),
         ("mA rms", "A", 1.4142135623730951e-3),
+        ("mA peak", "A", 1e-3),
+        ("0.01 A peak", "A", 0.01),
+        ("V rms", "V", 1.4142135623730951),
         ("0.1 V", "V", 0.1),
         ("us", "ns", 1000.0),
         ("rpm", "rpm", 1.0),
