@@ -276,6 +276,12 @@ def summary(rows: list[dict[str, Any]]) -> str:
             + " ".join(f"{q:8.4f}{unit:3s}" for q in quantiles)
             + "  ".join(_covered(accepted, name, kind) for kind in ("statistical", "total"))
         )
+    widths = []
+    for name in QUANTITIES:
+        totals = sorted(row[name]["total"] for row in accepted)
+        unit, scale = ("deg", 180.0 / math.pi) if name == "offset_rad" else ("%", 100.0)
+        widths.append(f"{name} {totals[round(0.9 * (len(totals) - 1))] * scale:.3g} {unit}")
+    lines.append(f"total 95 % half width, p90: {', '.join(widths)}")
     if bridge_v := accepted[0].get("bridge_v"):
         lines.append(f"the thresholds of the bridge were told, within {bridge_v:g} V (95 %)")
     else:

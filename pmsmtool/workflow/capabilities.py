@@ -398,7 +398,7 @@ def _expected(program: str, drives: int, *rows: tuple[str, float, str], given: s
 
 EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
     ("R", Method.INJECT): _expected(_FULL, 400, ("R_s_ohm", 4.5, "%")),
-    ("L", Method.INJECT): _expected(_FULL, 400, ("L_d_h", 1.4, "%"), ("L_q_h", 1.4, "%")),
+    ("L", Method.INJECT): _expected(_FULL, 400, ("L_d_h", 1.5, "%"), ("L_q_h", 1.5, "%")),
     ("psi", Method.INJECT): _expected(_FULL, 400, ("psi_f_wb", 1.1, "%")),
     ("encoder", Method.INJECT): _expected(_FULL, 400, ("offset_rad", 0.04, "deg")),
     ("mechanics", Method.INJECT): _expected(_MECHANICS, 70, ("J_kgm2", 1.5, "%")),
