@@ -100,7 +100,8 @@ def _slower(trace: Trace, times: float, current_a: float, plan: PushPlan) -> flo
     voltage_v = float(np.quantile(np.hypot(times * trace["u_d_v"], trace["u_q_v"]), USUAL))
     kick_a = times * float(np.max(np.abs(trace["i_d_a"])))
     room_a = math.sqrt(max(0.0, plan.i_max_a**2 - current_a**2))
-    return min(VOLTAGE_SHARE * plan.u_max_v / voltage_v, room_a / kick_a)
+    by_current = room_a / kick_a if kick_a > 0.0 else math.inf
+    return min(VOLTAGE_SHARE * plan.u_max_v / voltage_v, by_current)
 
 
 def _recorded(drive: Drive, plan: PushPlan, i_q_a: float, seconds: float) -> Trace:
