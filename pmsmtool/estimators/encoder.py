@@ -126,7 +126,7 @@ def estimate_encoder(forward: Trace, backward: Trace) -> EncoderResult:
                 f"limit {math.degrees(LINEARITY_LIMIT_RAD):g} deg",
                 stage=STAGE,
                 likely="cogging or a load stronger than the holding torque",
-                hint="raise the holding current or free the shaft",
+                hint="raise the current (--i-max) or free the shaft",
             )
         offsets.append((centre, float(np.std(_wrap(deviation - centre)))))
     lag = 0.5 * float(_wrap(np.array([offsets[0][0] - offsets[1][0]]))[0])

@@ -171,7 +171,7 @@ def estimate_flux_linkage(
             f"limit {math.degrees(OFFSET_LIMIT_RAD):g} deg",
             stage=STAGE,
             likely="wrong encoder offset, direction or pole pairs",
-            hint="identify poles and encoder first",
+            hint="check the coupling of the encoder and its increments per turn, then identify poles and encoder, too",
         )
     shown, per_instant = None, 0.0
     if modulation is not None:

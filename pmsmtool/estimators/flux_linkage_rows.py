@@ -32,6 +32,8 @@ SETTLE_LIMIT = 0.4
 """Relative change of the speed between the halves of a window: the shaft coasts, but slowly."""
 DELAY_PERIODS = 1.5
 """Periods from the samples of a row to the middle of its voltage."""
+STOPPED = "a speed limit too low for the shaft to coast through a window, or a load or friction that stops it"
+STOPPED_STEP = "allow more speed (--speed-max), or take away what brakes the shaft; R, L and inverter do without it"
 ANGLES = 60
 """Angles over which an error is averaged: a sixth of a turn, after which three equal phases repeat."""
 
@@ -185,14 +187,15 @@ def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]]) -> None:
         count = int(np.sum(speeds["flagged"] > 0.0))
         raise refuse("E_CLIPPED", f"voltage or current limited in {count} windows", stage=STAGE)
     change = np.abs(speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / np.abs(w)
-    likely = "a load or friction that stops a coasting shaft at once"
-    _check_settled(w, 100.0 * change, 100.0 * SETTLE_LIMIT, "the speed", "%", likely)
+    _check_settled(w, 100.0 * change, 100.0 * SETTLE_LIMIT, "the speed", "%", STOPPED, STOPPED_STEP)
     limit = CURRENT_SETTLE_LIMIT * float(np.max(np.hypot(speeds["i_d_a"], speeds["i_q_a"])))
     for axis in ("i_d", "i_q"):
         _check_settled(w, np.abs(speeds[f"{axis}_second_a"] - speeds[f"{axis}_first_a"]), limit, axis, "A")
 
 
-def _check_settled(w: Vector, moved: Vector, limit: float, what: str, unit: str, likely: str = "") -> None:
+def _check_settled(
+    w: Vector, moved: Vector, limit: float, what: str, unit: str, likely: str = "", hint: str = ""
+) -> None:
     worst = int(np.argmax(moved))
     if moved[worst] > limit:
         raise refuse(
@@ -201,4 +204,5 @@ def _check_settled(w: Vector, moved: Vector, limit: float, what: str, unit: str,
             f"limit {limit:.2g} {unit}",
             stage=STAGE,
             likely=likely,
+            hint=hint,
         )

@@ -379,7 +379,7 @@ def _unmix(
             f"the frame is {math.degrees(eps):.3g} deg off the d axis: L_d and L_q cannot be told apart",
             stage="inductance",
             likely="wrong encoder offset",
-            hint="store the coarse offset of the rotation test first",
+            hint="check the coupling of the encoder and its increments per turn, then repeat",
         )
     L = {axis: fit.L_h for axis, fit in fits.items()}
     std = {axis: fit.std_h * widen[axis] for axis, fit in fits.items()}

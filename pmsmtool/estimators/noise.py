@@ -69,6 +69,6 @@ def estimate_noise(trace: Trace) -> Noise:
             f"{n} samples at zero current are all equal: the noise is below the converter's step",
             stage="noise",
             likely="a converter coarser than its noise, or a current measurement that is switched off",
-            hint="check that the current measurement works; add dither if it does",
+            hint="check that the current measurement works, and the range of its converter",
         )
     return Noise(sigma, means[0], means[1], n)

@@ -184,6 +184,7 @@ def observation_noise(observations: Trace, known: Known) -> tuple[float, float]:
         raise refuse(
             "E_EXCITATION", f"{len(observations)} usable observations, {MINIMUM} are needed", stage=STAGE,
             likely="a short record, or a machine that was limited or off most of the time",
+            hint="track for longer (--for), while the machine runs",
         )  # fmt: skip
     given = inputs(observations, known)
     model = np.array([model_voltage(known.start, row, known.scale) for row in given])

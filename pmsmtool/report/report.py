@@ -91,6 +91,10 @@ def render(
             if "std" in value or "source" in value
         ],
         fallbacks=[f"{stage['name']}: {line}" for stage in latest for line in stage.get("fallbacks", ())],
+        # the table of stages has the note only where there are no criteria
+        notes=[
+            f"{stage['name']}: {stage['note']}" for stage in latest if stage.get("acceptance") and stage.get("note")
+        ],
         figures=[{"svg": _trusted_svg(figure.svg), "caption": figure.caption} for figure in figures],
         changes=changes,
         not_checked=list(not_checked),
@@ -139,7 +143,9 @@ def verdict_of(stages: Sequence[Mapping[str, Any]], complete: Sequence[str] = CO
     if lacking or bare:
         passed = [stage for stage in latest if stage["status"] == "pass"]
         return _partial(passed, lacking, _bare_lines(bare), criteria)
-    return Verdict("pass", "PASS", (f"{len(latest)} stages, {criteria} criteria, all met",))
+    head = f"{latest[0]['name']} alone" if len(latest) == 1 else f"{len(latest)} stages"
+    met = {0: "no criteria", 1: "1 criterion, met"}.get(criteria, f"{criteria} criteria, all met")
+    return Verdict("pass", "PASS", (f"{head}, {met}",))
 
 
 def _partial(

@@ -27,7 +27,7 @@ from pmsmtool.trace_file import read_trace, trace_npz
 from pmsmtool.workflow import frequency_stage, half_frequency, identify_verdict, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.evaluate import evaluate, machine_of
-from pmsmtool.workflow.limits import Limits, require_speed
+from pmsmtool.workflow.limits import HEADROOM, Limits, require_speed, unused_current
 from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Measurement, steps_of
 from pmsmtool.workflow.predicted_file import PREDICTED, dump_predicted
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
@@ -151,7 +151,7 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
     machine = nameplate.machine
     if machine.I_nom_apk is None or machine.n_max_rpm is None:
         raise ConfigError("rated current and largest speed must be known", hint="give --i-max and --speed-max")
-    i_max = 1.2 * machine.I_nom_apk if request.i_max_apk is None else request.i_max_apk
+    i_max = HEADROOM * machine.I_nom_apk if request.i_max_apk is None else request.i_max_apk
     speed = machine.n_max_rpm * math.pi / 30.0 if request.speed_max_rad_s is None else request.speed_max_rad_s
     return Envelope(
         i_max_apk=i_max,
@@ -163,10 +163,11 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
     )
 
 
-def plan_lines(envelope: Envelope, request: IdentifyRequest) -> list[str]:
+def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineFile) -> list[str]:
     """Return what a person reads before consenting: the envelope and what will happen inside it."""
     steps = steps_of(request.quantities, request.shaft == "locked")
-    lines = [*envelope.lines(), "the rotor aligns with current vectors: it may jump by half an electrical turn"]
+    allowed = [*envelope.lines(), *unused_current(envelope.i_max_apk, nameplate, pulses="map" in steps)]
+    lines = [*allowed, "the rotor aligns with current vectors: it may jump by half an electrical turn"]
     if request.half_frequency:
         lines.append(half_frequency.PLAN_LINE)
     if "rotation" in steps:
@@ -210,7 +211,7 @@ def identify_stage(
         require_speed(envelope.speed_max_rad_s, nameplate.machine.n_max_rpm or 0.0)
     if "rotation" in steps:
         dwell_within(0.0, envelope.speed_max_rad_s)
-    allow_motion(plan_lines(envelope, request))
+    allow_motion(plan_lines(envelope, request, nameplate))
     run.save(NAMEPLATE, dump_machine_file(nameplate))
     run.save(REQUEST, dump_request(request))
     limits = Limits(

@@ -57,6 +57,8 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
             for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
             if error > 0.0
         ]
+    if evaluation.mechanics is not None and evaluation.mechanics.note:
+        lines.append(evaluation.mechanics.note)
     lines += timing_warnings(evaluation.shown)
     lines += [f"{check.name} {check.verdict}" for check in evaluation.checks if not check.agrees]
     if evaluation.pairs is not None and not evaluation.pairs.judged:

@@ -7,11 +7,41 @@ from dataclasses import dataclass
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.units import format_current
 
 LEAST_SPEED_SHARE = 0.03
 """Least speed limit for what turns the shaft, of the drive's largest speed: the first push, a tenth of the rated
 current for 20 ms, brings a drive with an acceleration time of 50 ms to 2.7 % of it; and the back-emf there is as small
 as an inverter's error."""
+
+HEADROOM = 1.2
+"""Largest current of an envelope, of the rated one, where none is asked for."""
+TRIP_SHARE = 0.85
+"""Current that the pulses of a flux map aim at, of the drive's overcurrent trip."""
+
+
+def unused_current(i_max_apk: float, nameplate: MachineFile, *, pulses: bool) -> list[str]:
+    """Return what to tell of a current limit above what the experiments use, which is what the machine is rated for.
+
+    Parameters
+    ----------
+    i_max_apk : float
+        Largest current of the envelope (A peak).
+    nameplate : MachineFile
+        Ratings of machine and drive.
+    pulses : bool
+        Whether the pulses of a flux map are asked for, which exceed the rated current.
+    """
+    rated, trip = nameplate.machine.I_nom_apk, nameplate.limits.i_trip_apk
+    if rated is None or i_max_apk <= HEADROOM * rated:
+        return []
+    lines = [f"the current limit is above what is used: {format_current(rated)}, the rated current"]
+    if pulses:
+        least = None if trip is None else min(i_max_apk, TRIP_SHARE * trip)
+        size = "the drive's overcurrent trip" if least is None else format_current(least)
+        lines.append(f"only pulses of the flux map go beyond it, up to {size}")
+    return lines
 
 
 def require_speed(omega_max_rad_s: float, n_max_rpm: float) -> None:

@@ -19,6 +19,7 @@ from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz
 from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.npz_file import npz_bytes
 from pmsmtool.trace import Trace
+from pmsmtool.workflow.limits import TRIP_SHARE
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory
 
 if TYPE_CHECKING:
@@ -31,8 +32,6 @@ MAP_INTERVALS = "flux_map_intervals.npz"
 
 REACH_SHARE = 0.97
 """Current the pulses aim at, of the envelope's: they overshoot by up to 3 %."""
-TRIP_SHARE = 0.85
-"""The same, of the drive's overcurrent trip."""
 U_SHARE = 0.9
 """Largest voltage vector, of the largest."""
 SPEED_SHARE = 0.9

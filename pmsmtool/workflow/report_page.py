@@ -21,7 +21,7 @@ from pmsmtool.design.open_loops import open_loops
 from pmsmtool.errors import IdentificationError
 from pmsmtool.npz_file import read_npz
 from pmsmtool.report import figures
-from pmsmtool.report.report import Change, Figure, Verdict, render, verdict_of
+from pmsmtool.report.report import COMPLETE, Change, Figure, Verdict, render, verdict_of
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, shots_of
 from pmsmtool.workflow.identify import stored_traces
@@ -38,6 +38,10 @@ NOT_CHECKED = (
     "Saturation beyond the bias points that are named, cogging and slot harmonics, iron losses.",
 )
 """What a reader of a green report must not assume."""
+ONE_STAGE = ("identify", "track", "prove")
+"""Commands whose run is one stage of the same name."""
+CHAINS = ("commission", "fleet")
+"""Commands whose run is a full commissioning."""
 NOTHING_COMPARED = "What the drive holds and how it behaves: neither was compared with the design."
 
 
@@ -62,12 +66,20 @@ def report_page(path: Path) -> str:
     if not any(record.passed(stage) for stage in ("flash", "verify", "prove")):
         not_checked = (NOTHING_COMPARED, *NOT_CHECKED[1:])
     return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=not_checked,
-                  ended=account_lines(record.account))  # fmt: skip
+                  complete=_complete(record), ended=account_lines(record.account))  # fmt: skip
 
 
 def verdict(path: Path) -> Verdict:
     """Return the verdict of a run; raises ``ConfigError`` when there is none in the folder."""
-    return verdict_of([asdict(stage) for stage in RunDirectory(path).read().stages])
+    record = RunDirectory(path).read()
+    return verdict_of([asdict(stage) for stage in record.stages], _complete(record))
+
+
+def _complete(record: RunRecord) -> Sequence[str]:
+    """Return the stages that a run must have: of a command of one stage that one, else those of a commissioning."""
+    command = next((word for word in record.command if word in (*ONE_STAGE, *CHAINS)), "")
+    others = {stage.name for stage in record.stages} - {command}
+    return (command,) if command in ONE_STAGE and not others else COMPLETE
 
 
 def how_it_ended(path: Path) -> list[str]:

@@ -15,6 +15,7 @@ from pmsmtool.design.lookup_design import LookupRequest
 from pmsmtool.design.open_loops import open_loops
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import IdentificationError
+from pmsmtool.report.report import Verdict
 from pmsmtool.resources import data_folder
 from pmsmtool.workflow import report_page
 from pmsmtool.workflow.design_stages import lut_stage, tune_stage
@@ -71,6 +72,26 @@ def test_json_gives_the_verdict_on_stdout_alone(made: Path, tmp_path: Path, caps
     found = json.loads(capsys.readouterr().out)
     assert found["schema"] == "pmsmtool.report/1"
     assert found["verdict"] == "NOT COMPLETE"
+
+
+@pytest.mark.parametrize("name", ["track", "identify", "prove"])
+def test_a_run_of_one_stage_is_complete_with_that_stage(name: str, tmp_path: Path) -> None:
+    command = ["pmsmtool", "-i", "pmsmsim", name, "psi"]
+    run = RunDirectory.create(tmp_path, 7, new_record(command, drive={}, bus={}, versions={}, operator="A. Engineer"))
+    assert report_page.verdict(run.path).lines == (f"not run yet: {name}",)
+    run.add(Stage(name, "pass", 1.0, note="worth a note", acceptance=[Acceptance("width", "1 %", "3 %", True)]))
+    assert report_page.verdict(run.path) == Verdict("pass", "PASS", (f"{name} alone, 1 criterion, met",))
+    page = page_of(run.path)
+    assert "NOT COMPLETE" not in page and f"<li>{name}: worth a note</li>" in page
+    run.add(Stage("tune", "pass", 1.0))
+    assert report_page.verdict(run.path).word == "NOT COMPLETE", "somebody went on towards a commissioning"
+
+
+def test_a_commissioning_of_one_stage_so_far_is_not_complete(tmp_path: Path) -> None:
+    command = ["pmsmtool", "commission", "--runs", "identify"]
+    run = RunDirectory.create(tmp_path, 7, new_record(command, drive={}, bus={}, versions={}, operator="A. Engineer"))
+    run.add(Stage("identify", "pass", 1.0))
+    assert report_page.verdict(run.path).word == "NOT COMPLETE"
 
 
 def test_a_failed_stage_makes_the_verdict(made: Path, tmp_path: Path) -> None:

@@ -213,6 +213,14 @@ def test_refusals(population: Population, change: Change, reason: str) -> None:
         )
 
 
+def test_a_shaft_that_stops_asks_for_more_speed(population: Population) -> None:
+    trace = population.speeds(0)
+    stops = _changed(trace, omega_second_rad_s=1.5 * trace["omega_first_rad_s"])
+    with pytest.raises(IdentificationError, match="E_NOT_SETTLED") as caught:
+        estimate_flux_linkage(stops, population.drives.R[0], period_s=population.drives.T_s[0])
+    assert "speed limit too low" in caught.value.likely and "--speed-max" in caught.value.hint
+
+
 PSI, R, T_S = 0.3, 0.4, 1e-4
 
 

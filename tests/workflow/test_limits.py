@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.experiments.rotation import SLOWEST_STEP_S, STEP_RAD, dwell_within
-from pmsmtool.workflow.limits import LEAST_SPEED_SHARE, Limits, require_speed
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.parameters import MachineLimits
+from pmsmtool.resources import data_folder
+from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, plan_lines
+from pmsmtool.workflow.limits import LEAST_SPEED_SHARE, Limits, require_speed, unused_current
 
 GIVEN = {"I_nom_apk": 5.0, "i_max_apk": 6.0, "omega_max_rad_s": 300.0, "V_max_v": 28.0}
 
@@ -31,6 +36,26 @@ def test_a_speed_limit_that_no_push_stays_within_is_refused_with_the_least_one()
     with pytest.raises(IdentificationError, match="E_EXCITATION") as caught:
         require_speed(0.999 * least_rad_s, 3000.0)
     assert f"--speed-max {LEAST_SPEED_SHARE * 3000.0:.0f}rpm" in caught.value.hint
+
+
+def rated(i_nom_apk: float | None, i_trip_apk: float | None) -> MachineFile:
+    own = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
+    return replace(own, limits=MachineLimits(i_trip_apk=i_trip_apk), machine=replace(own.machine, I_nom_apk=i_nom_apk))
+
+
+def test_a_current_limit_above_the_machines_own_says_what_is_used() -> None:
+    """As `identify all --i-max 500Apk` uses it: levels up to 6.08 A, and pulses up to 13.2 A."""
+    own = rated(6.08, 15.5)
+    request = IdentifyRequest(i_max_apk=500.0)
+    above = [line for line in plan_lines(envelope_of(own, request), request, own) if "6.08 Apk" in line]
+    assert above == ["the current limit is above what is used: 6.08 Apk (4.299 Arms), the rated current"]
+    for given in (None, 7.0):
+        request = IdentifyRequest(i_max_apk=given)
+        assert not any("above" in line for line in plan_lines(envelope_of(own, request), request, own))
+    assert "up to 13.1" in unused_current(500.0, own, pulses=True)[1]
+    assert "up to 10 Apk" in unused_current(10.0, own, pulses=True)[1]
+    assert unused_current(500.0, rated(6.08, None), pulses=True)[1].endswith("overcurrent trip")
+    assert unused_current(500.0, rated(None, None), pulses=True) == []
 
 
 @pytest.mark.parametrize("rpm", [26.0, 60.0, 200.0, 3000.0])
