@@ -148,3 +148,24 @@ def test_a_held_rotor_allows_the_map_and_nothing_that_turns() -> None:
     IdentifyRequest(("R", "map"), shaft="locked").check()
     with pytest.raises(NotAvailable, match="psi"):
         IdentifyRequest(("map", "psi"), shaft="locked").check()
+
+
+@pytest.mark.skipif(not MEASURED.is_file(), reason="the measured map is not at hand")
+def test_the_measured_machine_with_a_free_rotor(tmp_path: Path) -> None:
+    held = measured_machine()
+    machine = replace(held, simulation={**held.simulation, "rotor": "free"})
+    path = tmp_path / "measured.toml"
+    path.write_text(dump_machine_file(machine, embed_flux_map=True))
+    with Connection(PmsmSimBus(f"{path}?nv=:memory:")) as connection:
+        drive = CanopenDrive(connection, 1)
+        record = new_record(["test"], drive={}, bus={}, versions={}, operator="nobody")
+        run = RunDirectory.create(tmp_path, drive.identity.serial, record)
+        request = IdentifyRequest(("map",), i_max_apk=20.0)
+        stage = identify_stage(run, drive, nameplate_of(drive, "bench"), request, lambda lines: None, lambda text: None)
+        run.add(stage)
+        drive.close()
+    found = load_machine_file(run.path / "machine.toml").flux_map
+    assert found is not None and machine.flux_map is not None
+    with np.load(run.path / map_stage.MAP_INTERVALS) as intervals:
+        rms, largest, inductance = errors(found, intervals["identified"], dict(intervals), machine.flux_map)
+    assert rms < FREE_RMS and largest < FREE_MAX and inductance < INDUCTANCE_MEDIAN
