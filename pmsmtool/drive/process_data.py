@@ -80,6 +80,20 @@ def live_values(node: DriveNode, names: Sequence[str], period_s: float) -> Itera
     before: list[tuple[int, int, bytes]] = []
     cob_ids = [0x80 + 0x100 * number + node.node for number in BORROWED[: len(groups)]]
     state = node.supervision.nmt_state
+    brought_back = False
+
+    def bring_back() -> None:
+        nonlocal brought_back
+        if brought_back:
+            return
+        for cob_id in cob_ids:
+            node.connection.unsubscribe(cob_id, live.take)
+        if state is not NmtState.OPERATIONAL:
+            send_nmt(node.connection, NmtCommand.PRE_OPERATIONAL, node.node)
+        brought_back = True
+        _bring_back(node, before)
+
+    node.before_close.append(bring_back)  # a signal between two bytecodes of a `with` statement calls no exit
     try:
         for number, cob_id, group in zip(BORROWED, cob_ids, groups, strict=False):
             before += _contents(node, number)
@@ -95,11 +109,7 @@ def live_values(node: DriveNode, names: Sequence[str], period_s: float) -> Itera
         ) from abort
     finally:
         with interrupts_deferred() as noted:
-            for cob_id in cob_ids:
-                node.connection.unsubscribe(cob_id, live.take)
-            if state is not NmtState.OPERATIONAL:
-                send_nmt(node.connection, NmtCommand.PRE_OPERATIONAL, node.node)
-            _bring_back(node, before)
+            bring_back()
         if noted:
             raise KeyboardInterrupt
 

@@ -38,3 +38,16 @@ def test_more_than_fits_is_refused_before_anything_changes() -> None:
         with pytest.raises(NotAvailable, match="do not fit"), live_values(bench.drive.node, ["i_d_a"] * 7, 0.01):
             pass
         assert bench.memory() == before
+
+
+def test_a_block_that_was_never_begun_is_undone_when_the_node_is_closed() -> None:
+    """As a Ctrl-C between two bytecodes of the `with` statement leaves it."""
+    with sim_bench() as bench:
+        before = bench.memory()
+        borrowed = live_values(bench.drive.node, ["i_d_a"], 0.01)
+        borrowed.__enter__()
+        assert bench.memory() != before
+        bench.drive.close()
+        assert bench.memory() == before
+        del borrowed  # its own end finds nothing left to do
+        assert bench.memory() == before
