@@ -14,6 +14,7 @@
     +-- Declined                        7  the person said no, or nobody could be asked
     +-- StopNotConfirmed                8  the machine may be energised; outranks every other error
     +-- NotAvailable                    9  this drive cannot give that; what is missing is named
+    +-- Partial                        10  what ran is good, but something asked for could not be had; it is named
     +-- CheckFailed                     1  checked and not good (margin, compare, prove)
         +-- VerifyMismatch              1  read back differs from what was written
         +-- DesignInfeasible            1  no design satisfies the request
@@ -41,6 +42,7 @@ class ExitCode(IntEnum):
     DECLINED = 7
     STOP_NOT_CONFIRMED = 8
     NOT_AVAILABLE = 9
+    PARTIAL = 10
     INTERNAL = 70
     INTERRUPTED = 130
 
@@ -225,6 +227,27 @@ class NotAvailable(PmsmtoolError):
     """This drive cannot give what was asked; the message names what is missing."""
 
     exit_code = ExitCode.NOT_AVAILABLE
+
+
+class Partial(PmsmtoolError):
+    """What ran is good, but something asked for could not be had; ``missing`` has one line each."""
+
+    exit_code = ExitCode.PARTIAL
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        likely: str = "",
+        hint: str = "",
+        missing: Sequence[str] = (),
+    ) -> None:
+        super().__init__(what, where=where, likely=likely, hint=hint)
+        self.missing = tuple(missing)
+
+    def __str__(self) -> str:
+        return "\n".join([super().__str__(), *(f"  - {line}" for line in self.missing)])
 
 
 class CheckFailed(PmsmtoolError):

@@ -27,6 +27,7 @@ EXIT_CODES: dict[ExitCode, str] = {
     ExitCode.DECLINED: "declined at a prompt, or nobody could be asked; nothing was done",
     ExitCode.STOP_NOT_CONFIRMED: "STOP NOT CONFIRMED: the machine may be energised, use the hardware stop",
     ExitCode.NOT_AVAILABLE: "this drive cannot give that; what is missing is named",
+    ExitCode.PARTIAL: "partial: what ran is good, but something asked for could not be had; it is named",
     ExitCode.INTERNAL: "a bug in pmsmtool; the traceback is kept in the file that is named",
     ExitCode.INTERRUPTED: "interrupted; a machine that moved was stopped, and the stop confirmed",
 }
