@@ -83,9 +83,7 @@ def _with_bridge(tolerance: SensorTolerance, text: str, numbers: str) -> SensorT
             likely="a drop at rated current instead of the threshold, where the characteristic begins",
             hint=BRIDGE_EXAMPLE,
         )
-    return replace(
-        tolerance, bridge_difference_v=diode - switch, bridge_threshold_v=tolerated / COVERAGE_FACTOR
-    )
+    return replace(tolerance, bridge_difference_v=diode - switch, bridge_threshold_v=tolerated / COVERAGE_FACTOR)
 
 
 def _readings(text: str, name: str, numbers: str) -> tuple[float, float, float]:

@@ -33,6 +33,8 @@ from pmsmtool.workflow.calibration import calibrated_traces
 from pmsmtool.workflow.half_frequency import resistance_at_two_frequencies
 from pmsmtool.workflow.sampling_stage import resistance_as_sampled
 
+R_MEASURED = "R_s_ohm_measured"
+"""Name of the resistance at the temperature of the test: what no normalisation widens."""
 RESONANCE = ("resonance_hz", "antiresonance_hz", "resonance_zeta")
 """Keys of a second mass: a response without one takes them out of the machine file."""
 MOTION_STD = 0.2
@@ -93,6 +95,8 @@ class Evaluation:
         found: dict[str, Estimate] = {}
         if self.resistance is not None:
             found["R_s_ohm"] = self.resistance.R_s
+            if math.isfinite(self.resistance.R_s.T_c):
+                found[R_MEASURED] = self.resistance.R_measured
         if self.inductance is not None:
             found["L_d_h"], found["L_q_h"] = self.inductance.L_d, self.inductance.L_q
         if self.flux is not None:

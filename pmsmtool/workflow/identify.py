@@ -275,7 +275,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     made_files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
     made_files |= {name: "" for name in (PREDICTED,) if (run.path / name).is_file()}
     found = evaluation.estimates()
-    acceptance = identify_verdict.acceptance_of(evaluation, found)
+    acceptance = identify_verdict.acceptance_of(evaluation, found, machine)
     return Stage(
         "identify",
         "pass" if all(line.ok for line in acceptance) else "fail",

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from pmsmtool.design.interval_needs import JUDGED, OFFSET, Need, interval_needs
 from pmsmtool.estimators.cross_check import CrossCheck
 from pmsmtool.estimators.estimate import Verdict, coverage_factor, statistical_half_width, total_half_width
+from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.units import format_estimate
 from pmsmtool.workflow import frequency_stage, map_stage
@@ -18,18 +20,22 @@ from pmsmtool.workflow.sampling_stage import timing_warnings
 if TYPE_CHECKING:
     from pmsmtool.workflow.identify import IdentifyRequest
 
-LIMIT: Mapping[str, float] = {"R_s_ohm": 0.03, "L_d_h": 0.05, "L_q_h": 0.05, "psi_f_wb": 0.03, "J_kgm2": 0.10}
-"""Largest relative 95 % total half width of an accepted value; measured with 1 % sensors: 1.7, 1.4, 1.4, 1.1, 1.4 %."""
-OFFSET_LIMIT_RAD = math.radians(1.0)
-"""Largest 95 % half width of the encoder offset (electrical)."""
 
-
-def acceptance_of(evaluation: Evaluation, found: Mapping[str, Estimate]) -> list[Acceptance]:
-    """Return what every value that has a limit is judged by."""
+def acceptance_of(evaluation: Evaluation, found: Mapping[str, Estimate], machine: MachineFile) -> list[Acceptance]:
+    """Return what every value is judged by: what its interval leaves of the design's margins and limits."""
     # the offset of the slow turn alone, which is for the pole pairs, is coarse, and nobody asked for it
-    coarse = {"offset_rad"} if evaluation.flux is None else set()
-    judged = [name for name in found if _limit(name) is not None and name not in coarse]
-    return [*(_accepted(name, found[name]) for name in judged), *map_stage.map_acceptance(evaluation.flux_map)]
+    coarse = {OFFSET} if evaluation.flux is None else set()
+    judged = [name for name in JUDGED if name in found and name not in coarse]
+    return [
+        *judged_values({name: found[name] for name in judged}, machine),
+        *map_stage.map_acceptance(evaluation.flux_map),
+    ]
+
+
+def judged_values(found: Mapping[str, Estimate], machine: MachineFile) -> list[Acceptance]:
+    """Return the criterion of every value: what binds the design of the machine first over its interval."""
+    needs = interval_needs(machine, {name: total_half_width(estimate) for name, estimate in found.items()})
+    return [_accepted(name, estimate, needs.get(name, ())) for name, estimate in found.items()]
 
 
 def summary_of(evaluation: Evaluation, found: Mapping[str, Estimate]) -> str:
@@ -106,16 +112,21 @@ def check_facts(check: CrossCheck) -> dict[str, Any]:
     return {**facts, "method": f"check, {check.estimate.method}: {check.verdict}", "check": judged}
 
 
-def _limit(name: str) -> float | None:
-    return OFFSET_LIMIT_RAD if name == "offset_rad" else LIMIT.get(name)
-
-
-def _accepted(name: str, estimate: Estimate) -> Acceptance:
-    limit = _limit(name)
-    assert limit is not None
+def _accepted(name: str, estimate: Estimate, needs: Sequence[Need]) -> Acceptance:
     half = total_half_width(estimate)
+    relative = half / abs(estimate.value) if estimate.value else math.inf
+    width = f"{math.degrees(half):.3g} deg" if name == OFFSET else f"{100.0 * relative:.2g} %"
     what = f"{name}: total 95 % interval"
-    if name == "offset_rad":
-        return Acceptance(what, f"{math.degrees(half):.3g} deg", f"{math.degrees(limit):.3g} deg", half <= limit)
-    relative = half / abs(estimate.value)
-    return Acceptance(what, f"{100.0 * relative:.2g} %", f"{100.0 * limit:.2g} %", relative <= limit)
+    if not needs:  # no design, or nothing of it depends on the value
+        return Acceptance(what, width, "100 %, no design depends on it", name == OFFSET or relative < 1.0)
+    binding = min(needs, key=lambda need: need.reserve)
+    return Acceptance(
+        what,
+        f"{width}, over it {binding.what} {_number(binding.worst, binding.unit)}",
+        _number(binding.least, binding.unit),
+        all(need.ok for need in needs),
+    )
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value:.3g}" if unit == "1" else f"{value:.3g} {unit}"

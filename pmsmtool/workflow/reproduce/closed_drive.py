@@ -44,9 +44,7 @@ def design(request: TuneRequest, speed_rpm: float = SPEED_RPM) -> tuple[Design, 
     file = source()
     bandwidth = SET_UP_BANDWIDTH / file.inverter.T_s / (2.0 * np.pi)
     offers = frozenset(load_family(STANDARD).cells)
-    return tune_closed(
-        file, request, ClosedDrive(STANDARD, offers, bandwidth, RISE_S, speed_rpm, ACCELERATION)
-    )
+    return tune_closed(file, request, ClosedDrive(STANDARD, offers, bandwidth, RISE_S, speed_rpm, ACCELERATION))
 
 
 def closed_drive(seed: int) -> Reproduction:

@@ -1,0 +1,46 @@
+"""A winding that is not at the reference temperature: R is accepted, at the temperature of the test and at T_ref."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.bus.connect import Connection
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.resources import data_folder
+from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.workflow.identify import MACHINE, IdentifyRequest, identify_stage, nameplate_of
+from pmsmtool.workflow.random_drives import true_loop_resistance
+from pmsmtool.workflow.run_directory import RunDirectory, new_record
+
+MEASURED_HALF_WIDTH = 0.016
+"""Largest total 95 % half width of R at the temperature of the test: two 1 % gains are 1.42 %; measured 1.48 %."""
+
+
+@pytest.mark.parametrize(("name", "T_c"), [("fast-ipm", 90.0), ("interior-2k2", 60.0), ("saturated-pmsyrm", 5.0)])
+def test_resistance_is_accepted_and_true_at_the_reference(name: str, T_c: float, tmp_path: Path) -> None:
+    """60 degC made 4.9 % of R at T_ref, 90 degC 8.4 %: above the fixed 3 % all of them were refused."""
+    base = load_machine_file(data_folder("profiles") / f"{name}.toml")
+    path = tmp_path / "drive.toml"
+    warm = replace(base, simulation={**base.simulation, "T_winding_c": T_c})
+    path.write_text(dump_machine_file(warm, embed_flux_map=True), encoding="utf-8")
+    run = RunDirectory.create(tmp_path, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
+    with Connection(PmsmSimBus(f"{path}?nv=:memory:")) as connection:
+        drive = CanopenDrive(connection, 1)
+        nameplate = nameplate_of(drive, "bench")
+        request = IdentifyRequest(quantities=("R",))
+        stage = identify_stage(run, drive, nameplate, request, lambda lines: None, lambda text: None)
+        drive.close()
+    assert stage.status == "pass", stage.acceptance
+    values = {value["name"]: value for value in stage.values}
+    at_reference, measured = values["R_s_ohm"], values["R_s_ohm_measured"]
+    assert abs(at_reference["value"] - true_loop_resistance(warm)) < at_reference["total_95"]
+    assert measured["total_95"] < MEASURED_HALF_WIDTH * measured["value"]
+    assert measured["T_c"] == pytest.approx(T_c, abs=3.0)
+    assert (measured["value"] > at_reference["value"]) is (T_c > 20.0)
+    written = load_machine_file(run.path / MACHINE)
+    assert written.estimates["R_s_ohm_measured"].value == measured["value"]
+    assert written.machine.R_s_ohm == at_reference["value"]
