@@ -85,6 +85,7 @@ class GuardedDrive:
         self.over = False
         self._ended = False
         self._start_rad: float | None = None
+        self._looked_s = -math.inf
         self._pole_pairs = 1.0
         self._R_s_ohm = 0.0
 
@@ -105,9 +106,20 @@ class GuardedDrive:
             self._note(*mark)
         self._pole_pairs = self._drive.read("motor.pole_pairs")
         self._R_s_ohm = self._drive.read("motor.R_s_ohm")
+        self._refuse_unwatched()
         self._limit_in_drive()
         if prove:
             self.proof = prove_dead_man(self._drive, self._heartbeat)
+
+    def _refuse_unwatched(self) -> None:
+        """Refuse a limit that cannot be watched on this drive."""
+        if math.isfinite(self.envelope.energy_j) and not self._R_s_ohm > 0.0:
+            raise SafetyRefusal(
+                f"the energy limit {self.envelope.energy_j:.4g} J cannot be watched: the resistance is not known",
+                where=f"node {self._node.node}",
+                likely="this drive has no object for the winding's resistance",
+                hint="limit the current and the duration instead",
+            )
 
     def _limit_in_drive(self) -> None:
         """Make the drive itself keep current and speed (0x6073, 0x6080), where it can."""
@@ -226,6 +238,7 @@ class GuardedDrive:
 
     def live(self, name: str) -> float:
         """Return one live quantity."""
+        self._look_when_due()
         return self._drive.live(name)
 
     def write(self, values: Mapping[str, float]) -> None:
@@ -258,6 +271,7 @@ class GuardedDrive:
             )  # fmt: skip
         self._heartbeat.resume()  # after the dead-man ended operation nobody else would watch
         self._drive.enable()
+        self._looked_s = self._node.connection.clock.now()
         if self._start_rad is None:
             self._start_rad = self._drive.live("theta_m_rad")
 
@@ -314,7 +328,7 @@ class GuardedDrive:
             step = min(left, WATCH_S)
             self._drive.wait(max(step, 0.0))
             if self._drive.may_be_energised:
-                self._watch(step)
+                self._watch()
             if left <= WATCH_S:
                 return
 
@@ -354,8 +368,23 @@ class GuardedDrive:
                 hint="unlock the shaft and say --shaft free or coupled",
             )
 
-    def _watch(self, seconds: float) -> None:
+    def _look_when_due(self) -> None:
+        """Look at the machine where time has passed since, whatever it passed with."""
+        if self._drive.may_be_energised and self._node.connection.clock.now() - self._looked_s > WATCH_S:
+            self._watch()
+
+    def _watch(self) -> None:
+        """Look at the machine once: still in operation, and every limit kept.
+
+        Raises
+        ------
+        LimitExceeded, DriveFault
+            A limit is exceeded, after a confirmed stop; or the drive has left operation by itself.
+        """
+        self._drive.check_operating()
         current = self._current()
+        now = self._node.connection.clock.now()
+        seconds, self._looked_s = now - self._looked_s, now
         self.energised_s += seconds
         self.energy_j += 1.5 * self._R_s_ohm * current * current * seconds
         envelope = self.envelope
@@ -371,7 +400,7 @@ class GuardedDrive:
             way = abs(self._drive.live("theta_m_rad") - self._start_rad)
             checks.append(("travel", way, travel, "rad"))
         for quantity, value, limit, unit in checks:
-            if value > limit:
+            if not value <= limit:  # a value that is no number keeps no limit
                 self.stop()
                 self._check(quantity, value, limit, unit)
 
@@ -388,7 +417,7 @@ class GuardedDrive:
         return math.hypot(i_d, i_q)
 
     def _check(self, quantity: str, value: float, limit: float, unit: str) -> None:
-        if value > limit * (1.0 + _ROUNDING):
+        if not value <= limit * (1.0 + _ROUNDING):
             raise LimitExceeded(
                 quantity,
                 value,
