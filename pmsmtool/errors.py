@@ -16,6 +16,7 @@
     +-- NotAvailable                    9  this drive cannot give that; what is missing is named
     +-- Partial                        10  what ran is good, but something asked for could not be had; it is named
     +-- CheckFailed                     1  checked and not good (margin, compare, prove)
+        +-- Contradiction               1  machine file, drive and measurement contradict each other
         +-- VerifyMismatch              1  read back differs from what was written
         +-- DesignInfeasible            1  no design satisfies the request
 
@@ -254,6 +255,10 @@ class CheckFailed(PmsmtoolError):
     """Checked and not good."""
 
     exit_code = ExitCode.CHECK_FAILED
+
+
+class Contradiction(CheckFailed):
+    """Machine file, drive and measurement contradict each other; nothing was written."""
 
 
 class VerifyMismatch(CheckFailed):

@@ -53,6 +53,8 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 @click.option("--drive-bandwidth-hz", type=click.FloatRange(0.0, min_open=True), metavar="HZ", help="Bandwidth of the "
               "current control of a drive that takes no gains; its limits are then designed.")  # fmt: skip
 @click.option("--sensor-tol", type=click.FloatRange(0.0, 0.2), default=0.01, help="95 % tolerance of sensor gains.")
+@click.option("--accept-contradiction", "accept", multiple=True, metavar="NAME", help="Go on although MACHINE states "
+              "another R_s_ohm, L_q_h or J_kgm2 than was measured or the drive holds; never with --yes.")  # fmt: skip
 @map_option
 @bus_options
 @motion_options
@@ -66,6 +68,7 @@ def commission_command(
     runs: Path,
     map_file: Path | None,
     sensor_tol: float,
+    accept: tuple[str, ...],
     flux_map: bool,
     drive_bandwidth_hz: float | None,
     **design: Any,
@@ -84,8 +87,12 @@ def commission_command(
     """
     from pmsmtool.errors import ConfigError
     from pmsmtool.workflow.commission import Commissioning, begin_run
+    from pmsmtool.workflow.compared_stage import check_accepted
     from pmsmtool.workflow.run_directory import RunDirectory
 
+    if accept and motion.yes:
+        raise click.UsageError("--accept-contradiction is a person's decision: not together with --yes")
+    check_accepted(accept)
     begun = RunDirectory(resume) if resume is not None else None
     if begun is not None and machine is not None:
         raise ConfigError("MACHINE and --resume exclude each other", hint="a run keeps the machine it began with")
@@ -106,6 +113,7 @@ def commission_command(
         person = _Person(run, drive, bus, motion, out, progress)
         chain = Commissioning(run, drive, person, progress, **asked, capabilities=found)
         chain.drive_bandwidth_hz = drive_bandwidth_hz
+        chain.accept_contradictions = accept
         for line in () if chain.tier is None else chain.tier.plan_lines():
             out.note(line)
         with _reported(run, out, fresh=begun is None):
@@ -251,9 +259,9 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
 
 def _next_step(run: RunDirectory, error: BaseException) -> str:
     """Say what leads on: a run whose machine was not identified, or that this drive cannot do, begins anew."""
-    from pmsmtool.errors import IdentificationError, NotAvailable
+    from pmsmtool.errors import Contradiction, IdentificationError, NotAvailable
 
-    if isinstance(error, NotAvailable | IdentificationError):
+    if isinstance(error, NotAvailable | IdentificationError | Contradiction):
         return "to go on, remove the cause and begin a new run: this one would end the same way"
     return f"go on with: pmsmtool commission --resume {run.path}"
 
@@ -274,6 +282,7 @@ def _show(run: RunDirectory, out: Output) -> None:
         "verdict": found.word,
         "stages": stages,
         "values": [] if identified is None else list(identified.values),
+        "comparison": [] if identified is None else list(identified.comparison),
     }
     lines = [f"{found.word}: {'; '.join(found.lines)}", f"report: {run.path / 'report.html'}"]
     out.result("commission", data, lines)

@@ -94,9 +94,15 @@ class Plan:
         """Entries that must be written."""
         return tuple(entry for entry in self.entries if entry.changes)
 
-    def lines(self) -> list[str]:
-        """Return the difference list a person consents to."""
-        rows = [_row(change) for change in self.changes]
+    def lines(self, marks: Mapping[str, str] | None = None) -> list[str]:
+        """Return the difference list a person consents to.
+
+        Parameters
+        ----------
+        marks : mapping of str to str, optional
+            What to say behind an entry, by its name.
+        """
+        rows = [_row(change, (marks or {}).get(change.name, "")) for change in self.changes]
         widths = [max((len(row[k]) for row in rows), default=0) for k in range(4)]
         lines = [
             f"{r[0]:<{widths[0]}}  {r[1]:>{widths[1]}} -> {r[2]:>{widths[2]}} {r[3]:<{widths[3]}}  {r[4]}".rstrip()
@@ -171,13 +177,13 @@ def _hex(data: bytes) -> str:
     return data.hex(" ") if len(data) <= 8 else f"{data[:4].hex(' ')} .. ({len(data)} bytes)"
 
 
-def _row(change: Change) -> tuple[str, str, str, str, str]:
+def _row(change: Change, mark: str = "") -> tuple[str, str, str, str, str]:
     if math.isnan(change.wanted):
-        return change.name, f"{len(change.old)} B", f"{len(change.new)} B", "", _cells(change)
+        return change.name, f"{len(change.old)} B", f"{len(change.new)} B", "", f"{_cells(change)}  {mark}".strip()
     relative = "" if math.isnan(change.relative) else f"{100.0 * change.relative:+.3g} %"
     held = f"(asked for {change.wanted:.9g})" if change.quantised else ""
     unit = "" if change.unit == "1" else change.unit
-    return change.name, f"{change.old_value:.7g}", f"{change.held:.7g}", unit, f"{relative}  {held}".strip()
+    return change.name, f"{change.old_value:.7g}", f"{change.held:.7g}", unit, f"{relative}  {held}  {mark}".strip()
 
 
 def _cells(change: Change) -> str:

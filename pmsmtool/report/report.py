@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from typing import Any
 
+from pmsmtool.report.comparison import HEADS, headline, table_cells, unchecked
 from pmsmtool.units import format_estimate, format_quantity
 
 COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
@@ -90,6 +91,7 @@ def render(
             for value in stage.get("values", ())
             if "std" in value or "source" in value
         ],
+        comparison=[HEADS, *table_cells(_comparison(latest))] if _comparison(latest) else [],
         fallbacks=[f"{stage['name']}: {line}" for stage in latest for line in stage.get("fallbacks", ())],
         # the table of stages has the note only where there are no criteria
         notes=[
@@ -129,6 +131,18 @@ def verdict_of(stages: Sequence[Mapping[str, Any]], complete: Sequence[str] = CO
         Stages that a green verdict needs.
     """
     latest = _latest(stages)
+    rows = _comparison(latest)
+    first, left = headline(rows)
+    found = _verdict_of(latest, complete, unchecked(rows))
+    return replace(found, lines=(*first, *found.lines, *left))
+
+
+def _comparison(latest: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the rows *data sheet | drive | measured* of a run."""
+    return [row for stage in latest for row in stage.get("comparison", ())]
+
+
+def _verdict_of(latest: list[Mapping[str, Any]], complete: Sequence[str], not_checked: Mapping[str, str]) -> Verdict:
     failed = [stage for stage in latest if stage["status"] not in ("pass", UNAVAILABLE)]
     done = {stage["name"] for stage in latest}
     missing = [name for name in complete if name not in done]
@@ -139,8 +153,8 @@ def verdict_of(stages: Sequence[Mapping[str, Any]], complete: Sequence[str] = CO
     criteria = sum(len(stage.get("acceptance", ())) for stage in latest)
     lacking = [stage for stage in latest if stage["status"] == UNAVAILABLE]
     values = [value for stage in latest for value in stage.get("values", ())]
-    bare = [value for value in values if "source" in value and "std" not in value]
-    if lacking or bare:
+    bare = [value for value in values if "source" in value and "std" not in value and value["name"] not in not_checked]
+    if lacking or bare or not_checked:
         passed = [stage for stage in latest if stage["status"] == "pass"]
         return _partial(passed, lacking, _bare_lines(bare), criteria)
     head = f"{latest[0]['name']} alone" if len(latest) == 1 else f"{len(latest)} stages"

@@ -34,6 +34,7 @@ from pmsmtool.errors import (
 )
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.workflow.capabilities import Capabilities, Tier
+from pmsmtool.workflow.compared_stage import check_accepted, compared, refusal
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
 from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplate_of
@@ -155,6 +156,8 @@ class Commissioning:
         recorded as not available. Without, everything is expected, and the chain ends where something is missing.
     drive_bandwidth_hz : float, optional
         Bandwidth of the current control of a drive that keeps its own.
+    accept_contradictions : tuple of str
+        Quantities of the machine file whose contradiction a person accepts.
     """
 
     run: RunDirectory
@@ -169,6 +172,7 @@ class Commissioning:
     prove: ProofRequest | None = None
     capabilities: Capabilities | None = None
     drive_bandwidth_hz: float | None = None
+    accept_contradictions: tuple[str, ...] = ()
     _account: RunAccount | None = field(default=None, init=False)
 
     def carry_out(self) -> None:
@@ -181,6 +185,7 @@ class Commissioning:
         StopNotConfirmed
             The machine may be energised; outranks whatever ended the chain.
         """
+        check_accepted(self.accept_contradictions)
         record = self.run.read()
         self._check_drive(record)
         self._account = account = RunAccount(self.run, self.progress.say)
@@ -232,6 +237,8 @@ class Commissioning:
         start = clock.now()
         try:
             stage = replace(self._steps()[name](), seconds=clock.now() - start)
+            if name == "identify":
+                stage = self._compared(stage)
         except BaseException as error:
             if isinstance(error, NotAvailable) and self.tier is not None:
                 self._not_available(name, number, error, clock.now() - start)
@@ -246,6 +253,14 @@ class Commissioning:
         self.progress.end(stage, number, len(STAGES))
         if stage.status not in SETTLED:
             raise _not_good(stage, self.run)
+
+    def _compared(self, stage: Stage) -> Stage:
+        """Return the stage with data sheet, drive and measurement side by side: the gate before anything is written."""
+        known = None if self.nameplate is None else (self.nameplate, "data sheet")
+        if known is None and self.tier is not None and self.tier.found.tier is not Tier.INJECT:
+            known = self.tier.known()
+        loaded = self.identify.shaft == "coupled"
+        return compared(stage, self.drive, known, loaded=loaded, accept=self.accept_contradictions)
 
     def _not_available(self, name: str, number: int, error: NotAvailable, seconds: float) -> None:
         files = {file: "" for file in OUTPUTS.get(name, ()) if (self.run.path / file).is_file()}
@@ -308,6 +323,8 @@ def _not_good(stage: Stage, run: RunDirectory) -> PmsmtoolError:
     broken = [f"{line.what}: {line.measured}, limit {line.limit}" for line in stage.acceptance if not line.ok]
     what = f"{stage.name}: {'; '.join(broken) or stage.note}"
     where = str(run.path)
+    if (contradicted := refusal(stage, run)) is not None:
+        return contradicted
     if stage.name == "identify":
         return IdentificationError("E_NOT_ACCEPTED", what, where=where, hint=NOT_ACCEPTED)
     if stage.name == "verify":

@@ -15,6 +15,7 @@ from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.plan import Change
 from pmsmtool.flash.restore import marks_of, plan_download
 from pmsmtool.params.parameter_set import read_parameter_set
+from pmsmtool.report.comparison import marks
 from pmsmtool.workflow.export import image_of
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
@@ -38,7 +39,12 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
     marks = marks_of(wanted.content_hash(), datetime.datetime.now())
     download = Download(drive.node, drive.identity, plan, marks, JournalFolder(drive.identity), say=say)
     if download.has_work(store=True):
-        consent([*plan.lines(), "the set is stored, and the drive is reset to see it"])
+        consent(
+            [
+                *plan.lines(_unchecked_marks(run, [change.name for change in plan.changes])),
+                "the set is stored, and the drive is reset to see it",
+            ]
+        )
     outcome = download.run()
     total = len(plan.entries)
     criteria = [
@@ -52,6 +58,12 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
         note="" if good else "the drive does not keep the set", fallbacks=tuple(plan.left_out()),
         summary=f"{outcome.written} of {total} objects written, stored, read back after a reset",
     )  # fmt: skip
+
+
+def _unchecked_marks(run: RunDirectory, names: Sequence[str]) -> dict[str, str]:
+    """Return what of a download follows from values that this run did not check."""
+    identified = run.read().stage("identify")
+    return {} if identified is None else marks(names, identified.comparison)
 
 
 def _change(change: Change) -> dict[str, Any]:

@@ -64,6 +64,8 @@ class Stage:
         The error text of a stage that did not pass.
     summary : str
         What a person reads in the one line of the stage.
+    comparison : sequence of mapping
+        Rows *data sheet | drive | measured* (``workflow/contradiction.py``).
     """
 
     name: str
@@ -75,6 +77,7 @@ class Stage:
     files: Mapping[str, str] = field(default_factory=dict)
     note: str = ""
     summary: str = ""
+    comparison: Sequence[Mapping[str, Any]] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -366,7 +366,7 @@ def parse_facts(text: str, *, where: str) -> TierFacts:
 
 
 def _judged(result: TierResult, made: TierMachine, source: str) -> Stage:
-    criteria = [*(_accepted(name, e) for name, e in result.estimates.items() if _limit(name)), *made.criteria]
+    criteria = [_accepted(name, e) for name, e in result.estimates.items() if _limit(name)]
     values = [value_facts(name, estimate) for name, estimate in result.estimates.items()]
     summary = ", ".join(
         f"{name} {format_estimate(e.value, total_half_width(e), e.unit)}" for name, e in result.estimates.items()

@@ -14,7 +14,6 @@ from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.machine_keys import MEASURABLE
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.workflow.run_directory import Acceptance
 
 NEEDED = ("pole_pairs", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
 """Keys of a machine that a design stands on."""
@@ -22,8 +21,6 @@ ALSO = ("J_kgm2", "tau_c_nm")
 """Keys it uses where they are known."""
 UNKNOWN_TEMPERATURE_K = 20.0
 """A magnet whose temperature nothing tells is taken within this of the reference temperature (95 %)."""
-AGREEMENT = 0.15
-"""A flux linkage further than this from the given one, beyond its own interval, is another machine's."""
 PER_PSI = {"J_per_psi": "J_kgm2", "tau_c_per_psi": "tau_c_nm"}
 """Ratios to the flux linkage, and what they are with it."""
 
@@ -40,8 +37,6 @@ class TierMachine:
         Keys by where their values come from.
     lacking : tuple of str
         Keys that nothing tells.
-    criteria : tuple of Acceptance
-        Whether what was measured agrees with what was given.
     notes : tuple of str
         What was done to the values.
     """
@@ -50,7 +45,6 @@ class TierMachine:
     measured: tuple[str, ...]
     given: tuple[str, ...]
     lacking: tuple[str, ...]
-    criteria: tuple[Acceptance, ...] = ()
     notes: tuple[str, ...] = ()
 
     def given_values(self, source: str) -> list[Mapping[str, Any]]:
@@ -102,7 +96,7 @@ def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], sourc
         provenance={"source": f"measured: {', '.join(measured) or 'nothing'}; {source}: {', '.join(given)}"},
         simulation={},
     )
-    return TierMachine(machine, measured, given, (), _agreement(known, values), (*notes, *more))
+    return TierMachine(machine, measured, given, (), (*notes, *more))
 
 
 def _at_reference(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[dict[str, Estimate], tuple[str, ...]]:
@@ -152,17 +146,3 @@ def _encoder(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[Any, tu
         text = f"encoder offset corrected: the frame is {math.degrees(frame.value):.2g} deg ahead of the d axis"
         return replace(known.encoder, offset_rad=offset), (text,)
     return known.encoder, ()
-
-
-def _agreement(known: MachineFile, values: Mapping[str, Estimate]) -> tuple[Acceptance, ...]:
-    lines = []
-    if "pole_pairs" in values:
-        measured, given = round(values["pole_pairs"].value), known.machine.pole_pairs
-        lines.append(Acceptance("pole pairs are those that were given", str(measured), str(given), measured == given))
-    if "psi_f_wb" in values and known.machine.psi_f_wb > 0.0:
-        estimate, given_psi = values["psi_f_wb"], known.machine.psi_f_wb
-        off = abs(estimate.value / given_psi - 1.0)
-        limit = AGREEMENT + total_half_width(estimate) / estimate.value
-        what = "flux linkage is the given one, as far as a data sheet goes"
-        lines.append(Acceptance(what, f"{100.0 * off:.2g} % off", f"<= {100.0 * limit:.2g} %", off <= limit))
-    return tuple(lines)

@@ -105,7 +105,7 @@ class TierStages:
     def plan_lines(self) -> list[str]:
         """Return what the chain will do, one line per stage, before anything moves."""
         drive_map, tier = self.found.drive_map, self.found.tier
-        known = self._known()
+        known = self.known()
         lines = [f"tier {tier}, map {drive_map.name}: {len(drive_map.cells)} parameters"]
         lines.append("identify: " + ("; ".join(self._measurable()) or f"not available: {self._nothing()}"))
         rest = "what is measured"
@@ -142,7 +142,7 @@ class TierStages:
         PmsmtoolError
             As the experiments end.
         """
-        known = self._known()
+        known = self.known()
         if self.found.tier is Tier.INJECT:
             return self._by_injection(request, allow, say)
         if known is not None:
@@ -212,7 +212,7 @@ class TierStages:
 
     # ---- what there is --------------------------------------------------------------------------
 
-    def _known(self) -> tuple[MachineFile, str] | None:
+    def known(self) -> tuple[MachineFile, str] | None:
         """Return what completes the measured values; the encoder is the drive's own where its set can be read."""
         known = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
         if not self.found.drive_map.staging:

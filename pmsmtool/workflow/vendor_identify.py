@@ -180,7 +180,7 @@ def _judged(
     source: str,
 ) -> Stage:
     ended = Acceptance("the drive's own steps that ended without an error", str(len(answers)), str(len(answers)), True)
-    criteria = [ended, *made.criteria]
+    criteria = [ended]
     table = None if made.machine is None else made.machine.machine
     given = [
         {"name": key, "value": getattr(table, key), "unit": MEASURABLE[key].unit, "source": source}

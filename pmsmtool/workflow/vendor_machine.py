@@ -7,7 +7,7 @@ deviation that it assumes instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +19,6 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.machine_keys import MEASURABLE
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.units import format_quantity
-from pmsmtool.workflow.run_directory import Acceptance
 from pmsmtool.workflow.tier_machine import ALSO, NEEDED
 
 SOURCE = "vendor"
@@ -28,9 +27,6 @@ PHASE_INDUCTANCE = "L_phase_h"
 NO_INTERVAL = "the drive's own, without an interval: its maker states none"
 COARSE = 0.005
 """Half a count, of a value, from which the rounding is told."""
-OTHER_MACHINE = 0.25
-"""A flux linkage further than this from the given one is another machine's: a data sheet leaves 15 %, and the simple
-method of simulated drives was up to 14 % off (``benchmarks/tables/vendor_identification.txt``)."""
 
 
 def vendor_estimates(tuning: VendorTuning, answers: Mapping[str, VendorAnswer]) -> dict[str, Estimate]:
@@ -81,15 +77,12 @@ class VendorMachine:
         None without one to complete.
     given : tuple of str
         Keys that stay as they were given.
-    criteria : tuple of Acceptance
-        Whether the values agree with what was given.
     notes : tuple of str
         What was done to the values.
     """
 
     machine: MachineFile | None
     given: tuple[str, ...]
-    criteria: tuple[Acceptance, ...]
     notes: tuple[str, ...]
 
 
@@ -102,7 +95,7 @@ def vendor_machine(known: tuple[MachineFile, str] | None, found: Mapping[str, Es
         What completes them.
     """
     if known is None:
-        return VendorMachine(None, (), (), ("no machine file is written: it needs ratings and the inverter, too",))
+        return VendorMachine(None, (), ("no machine file is written: it needs ratings and the inverter, too",))
     given_file, source = known
     table = {key: e for key, e in found.items() if key != PHASE_INDUCTANCE}
     notes = []
@@ -131,17 +124,7 @@ def vendor_machine(known: tuple[MachineFile, str] | None, found: Mapping[str, Es
         provenance={"source": f"{SOURCE}: {', '.join(table) or 'nothing'}; {source}: {', '.join(given)}"},
         simulation={},
     )
-    return VendorMachine(machine, given, tuple(_agreement(given_file, found)), tuple(notes))
-
-
-def _agreement(given: MachineFile, found: Mapping[str, Estimate]) -> Iterator[Acceptance]:
-    if "pole_pairs" in found:
-        own, told = round(found["pole_pairs"].value), given.machine.pole_pairs
-        yield Acceptance("pole pairs are those that were given", str(own), str(told), own == told)
-    if "psi_f_wb" in found and given.machine.psi_f_wb > 0.0:
-        off = abs(found["psi_f_wb"].value / given.machine.psi_f_wb - 1.0)
-        what = "flux linkage is the given one, as far as data sheet and drive go"
-        yield Acceptance(what, f"{100.0 * off:.2g} % off", f"<= {100.0 * OTHER_MACHINE:.2g} %", off <= OTHER_MACHINE)
+    return VendorMachine(machine, given, tuple(notes))
 
 
 def coarse_notes(tuning: VendorTuning, answers: Mapping[str, VendorAnswer]) -> list[str]:

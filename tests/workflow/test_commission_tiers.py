@@ -89,9 +89,8 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }  # fmt: skip
     found_verdict = verdict(run.path)
     assert found_verdict.word == "PASS FOR ITS TIER" and "as far as this drive goes: lut;" in found_verdict.lines[0]
-    assert found_verdict.lines[1].startswith(
-        "taken as given, not measured: pole_pairs, R_s_ohm, L_d_h, L_q_h, psi_f_wb"
-    )
+    unchecked = ("pole pairs", "R", "L_d", "L_q", "psi", "J")
+    assert all(f"{name}: data sheet, NOT CHECKED" in found_verdict.lines[-1] for name in unchecked)
     limits = [line for line in run.read().stage("tune").fallbacks if line.startswith(LIMITS)]  # type: ignore[union-attr]
     assert limits == [f"{LIMITS}: not available: {why_no_limits(found.drive_map, None)}"] and SLOPE in limits[0]
     return run.path
@@ -232,7 +231,7 @@ def test_a_data_sheet_of_another_machine_is_seen(tmp_path: Path) -> None:
     with opened("&drive=cia402") as (drive, found):
         run = begin_run(drive, tmp_path, tier=found.tier)
         running = Commissioning(run, drive, Told(), Quiet(), wrong, capabilities=found)
-        with pytest.raises(Exception, match="pole pairs are those that were given: 3, limit 4"):
+        with pytest.raises(Exception, match="pole_pairs: the data sheet states 4, measured 3"):
             running.carry_out()
         assert is_safe(drive.node.state())
     assert verdict(run.path).word == "FAIL"
@@ -248,7 +247,7 @@ def test_recorder_tier_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Pat
     assert {str(value["name"]).split(":")[0] for value in proof.values if "where" in value} == {"speed_step"}
     found_verdict = verdict(run.path)
     assert found_verdict.word == "PASS FOR ITS TIER"
-    assert f"taken from {SET_UP}, not measured: pole_pairs, L_d_h, L_q_h" in found_verdict.lines
+    assert found_verdict.lines[-1] == f"pole pairs: {SET_UP}, NOT CHECKED; L_d: {SET_UP}, NOT CHECKED"
     assert not any("taken as given" in line for line in found_verdict.lines)
     assert report_page(run.path).count("<td>{}</td>".format(SET_UP.replace("'", "&#39;"))) == 3
     given = next(value for value in run.read().stage("identify").values if value["name"] == "L_d_h")  # type: ignore[union-attr]

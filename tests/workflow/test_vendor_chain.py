@@ -123,5 +123,5 @@ def test_a_drive_set_to_other_pole_pairs_is_not_pushed(tmp_path: Path) -> None:
 
 
 def test_a_data_sheet_of_another_machine_is_seen(tmp_path: Path) -> None:
-    with pytest.raises(IdentificationError, match="pole pairs are those that were given: 3, limit 4"):
+    with pytest.raises(IdentificationError, match="pole_pairs: the data sheet states 4, measured 3"):
         chain(tmp_path, without_torque(load_family("synapticon")), pole_pairs=4)
