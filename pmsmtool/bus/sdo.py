@@ -12,6 +12,7 @@ Protocol: CiA 301, section 7.2.4.3.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -58,6 +59,8 @@ class SdoChannel:
         None until a block transfer was tried.
     retries, discarded : int
         Sums over the life of the channel.
+    active_s : float
+        When (s, bus clock) the caller's thread last was at work in a transfer.
     """
 
     def __init__(
@@ -76,6 +79,7 @@ class SdoChannel:
         self.retries = 0
         self.discarded = 0
         self._check = check
+        self.active_s = -math.inf
         self._cancelled: BaseException | None = None
         self._request_id = 0x600 + node
         self._mailbox = connection.mailbox(0x580 + node)
@@ -166,6 +170,7 @@ class SdoChannel:
     def receive(self, timeout_s: float) -> bytes | None:
         """Return the next frame of the node, or None after ``timeout_s`` on the bus clock."""
         while True:
+            self.active_s = self.connection.clock.now()
             frame = self._mailbox.get(min(timeout_s, CHECK_INTERVAL_S))
             if frame is not None:
                 return frame if len(frame) == 8 else frame.ljust(8, b"\0")

@@ -13,7 +13,7 @@ from pmsmtool.bus.sdo import Retry
 from pmsmtool.cia402 import AbortConnection, QuickStop, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.heartbeat import TOOL_NODE, Heartbeat
+from pmsmtool.drive.heartbeat import PERIOD_S, TOOL_NODE, Heartbeat
 from pmsmtool.errors import SafetyRefusal, SdoAbort
 
 CONSUMER_MS = 250
@@ -105,8 +105,10 @@ def _try(
     node = drive.node
     heartbeat.start()
     drive.enable()
-    node.connection.wait(2e-3 * CONSUMER_MS)
-    if node.state() is not State.OPERATION_ENABLED:
+    for _ in range(round(2e-3 * CONSUMER_MS / PERIOD_S)):  # asked meanwhile: the heartbeat is sent while it is watched
+        node.connection.wait(PERIOD_S)
+        state = node.state()
+    if state is not State.OPERATION_ENABLED:
         late = heartbeat.longest_gap_s() > LATE_S
         heartbeat.stop()
         drive.quick_stop()

@@ -38,6 +38,11 @@ from pmsmtool.trace import Trace
 
 WATCH_S = 0.05
 """The machine is looked at this often while time passes."""
+FRESH_S = 0.1
+"""The tool's heartbeat is sent while the machine was looked at within this time: two looks.
+
+So a main thread that hangs lets the drive stop after at most this time, one heartbeat period and the drive's own
+declared time, together 0.5 s."""
 LOCKED_TRAVEL_RAD = math.radians(20.0)
 """A clamp and its coupling give by a few degrees; a shaft that goes further is not locked."""
 _TURNS = "the shaft turns, though it is said to be locked"
@@ -80,7 +85,7 @@ class GuardedDrive:
         self.energised_s = 0.0
         self._drive = drive
         self._node = drive.node
-        self._heartbeat = Heartbeat(drive.node.connection)
+        self._heartbeat = Heartbeat(drive.node.connection, is_watched=self._is_watched)
         self._before: dict[_Object, bytes] = {}
         self.over = False
         self._ended = False
@@ -367,6 +372,17 @@ class GuardedDrive:
                 where=f"node {self._node.node}",
                 hint="unlock the shaft and say --shaft free or coupled",
             )
+
+    def _is_watched(self) -> bool:
+        """Whether the machine is off, or was looked at a moment ago; asked by the heartbeat's thread.
+
+        A transfer under way counts: its channel is busy, so that nothing else can be asked, and each of its frames
+        shows that tool and drive are alive. It ends with its time-out.
+        """
+        if not self._drive.may_be_energised:
+            return True
+        latest = max(self._looked_s, self._node.sdo.active_s)
+        return self._node.connection.clock.now() - latest <= FRESH_S
 
     def _look_when_due(self) -> None:
         """Look at the machine where time has passed since, whatever it passed with."""

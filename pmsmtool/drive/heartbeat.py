@@ -1,11 +1,13 @@
 """The tool's own heartbeat: the drive stops when it stays away.
 
-It runs on the bus clock as a job of its own (a thread on a real bus), so a main thread busy with
-arithmetic does not stop the machine, and a tool that is killed does.
+It runs on the bus clock as a job of its own (a thread on a real bus), so that its period does not depend on what the
+main thread does. It is sent only while somebody watches the machine: a tool that is killed stops the machine, and so
+does one whose main thread hangs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import TracebackType
 
 from pmsmtool.bus.clock import Ticker
@@ -29,10 +31,15 @@ class Heartbeat:
     ----------
     connection : Connection
         The bus.
+    is_watched : callable
+        Whether the machine is watched, or off; while it says no, no heartbeat is sent.
     """
 
-    def __init__(self, connection: Connection, *, period_s: float = PERIOD_S) -> None:
+    def __init__(
+        self, connection: Connection, *, period_s: float = PERIOD_S, is_watched: Callable[[], bool] = lambda: True
+    ) -> None:
         self._connection = connection
+        self._is_watched = is_watched
         self._period_s = period_s
         self._ticker: Ticker | None = None
         self._last_s = 0.0
@@ -84,6 +91,8 @@ class Heartbeat:
         return max(self._longest_s, self._connection.clock.now() - self._last_s)
 
     def _beat(self) -> None:
+        if not self._is_watched():
+            return
         before = self._connection.clock.now()
         # Nobody catches here: the drive notices a lost heartbeat, the next request meets the failed bus.
         try:

@@ -17,7 +17,7 @@ import pytest
 from pmsmtool.cia402 import State
 from pmsmtool.drive import objects
 from pmsmtool.drive.envelope import Envelope
-from pmsmtool.drive.guard import OVERSHOOT, RESTORED, GuardedDrive, guarded
+from pmsmtool.drive.guard import FRESH_S, OVERSHOOT, RESTORED, GuardedDrive, guarded
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.errors import (
     DriveFault,
@@ -210,7 +210,7 @@ def test_a_vector_that_turns_between_two_reads_is_no_excess(bench: SimBench, mon
     def slowly(name: str) -> float:
         if name == "i_q_a":
             bench.drive.command_current(0.0, 2.9, fixed_angle_rad=0.0)
-            bench.drive.wait(1.0)
+            bench.drive.wait(FRESH_S)
         value = read(name)
         seen.get(name, []).append(value)
         return value
