@@ -41,7 +41,7 @@ Nothing moves and nothing is written without a consent, and there are two of the
 the serial number must be that of the drive that answers. It cannot be set by an environment variable. Where nobody can
 be asked (no terminal) and --yes does not hold, nothing is done: exit 7.
 
-Every way out of a command that moved the machine is the same: quick stop, zero current, parameters restored, and the
+Every way out of a command that moved the machine is the same: voltage off, zero current, parameters restored, and the
 stop confirmed from the statusword. If the drive does not confirm it, the exit code is 8 whatever else went wrong: use
 the hardware stop. Ctrl-C, SIGTERM and a closed terminal take that way too; a second Ctrl-C removes the voltage at once.
 

@@ -48,7 +48,11 @@ class CanopenDrive:
         Traces and averages.
     may_be_energised : bool
         From an attempt to enable until a confirmed stop.
+    stops_by_ramp : bool
+        Whether a stop may use the drive's quick stop ramp, which runs its speed loop; else it removes the voltage.
     """
+
+    stops_by_ramp = True
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         self.node = DriveNode(connection, node_id, drive_map=drive_map)
@@ -134,7 +138,7 @@ class CanopenDrive:
 
     def quick_stop(self) -> None:
         """Quick stop, voltage off, zero references, confirmed from the statusword, else ``StopNotConfirmed``."""
-        stop.quick_stop(self.node)
+        stop.quick_stop(self.node, ramp=self.stops_by_ramp)
         self.may_be_energised = False
 
     def disable_at_once(self) -> None:

@@ -1,19 +1,22 @@
 """Proof of the dead-man: the drive stops by itself when the tool dies.
 
-Nothing moves before this was shown: consumer heartbeat 0x1016, abort connection option 0x6007 and
-quick stop option 0x605A are read (and set where they say "do nothing"), the drive is enabled at
-zero current, the tool's heartbeat is stopped, and operation must be left within the declared time.
+Nothing moves before this was shown: the consumer heartbeat time 0x1016 is set, abort connection option 0x6007 and quick
+stop option 0x605A are set to remove the voltage where the drive takes that (a ramp runs a speed loop which nobody has
+proven yet), the drive is enabled at zero current, the tool's heartbeat is stopped, and the voltage must be off within
+the declared time: by the state, as bit 4 of the statusword shows the supply, not the power stage (CiA 402-2).
 """
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
-from pmsmtool.bus.sdo import Retry
 from pmsmtool.cia402 import AbortConnection, QuickStop, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.heartbeat import PERIOD_S, TOOL_NODE, Heartbeat
+from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import SafetyRefusal, SdoAbort
 
 CONSUMER_MS = 250
@@ -29,6 +32,7 @@ ROUND_S = 0.02
 STALLED_S = 0.05
 """Polling that took longer than it should by more than this, in all, measures nothing."""
 _POLL_S = 0.005
+_STOPPING = (AbortConnection.FAULT, AbortConnection.DISABLE_VOLTAGE, AbortConnection.QUICK_STOP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +44,13 @@ class DeadManProof:
     consumer_s : float
         Consumer heartbeat time of the drive (s).
     declared_s : float
-        Operation must be left within this time after the last heartbeat (s).
+        The voltage must be off within this time after the last heartbeat (s).
     measured_s : float
         Time it took (s).
-    abort_connection, quick_stop : int
-        Option codes 0x6007 and 0x605A in force.
+    abort_connection : AbortConnection
+        Option code 0x6007 in force.
+    quick_stop : int or None
+        Option code 0x605A in force; None where the drive has none.
     left_for : State
         State the drive went to.
     """
@@ -53,12 +59,12 @@ class DeadManProof:
     declared_s: float
     measured_s: float
     abort_connection: AbortConnection
-    quick_stop: QuickStop
+    quick_stop: int | None
     left_for: State
 
     def __str__(self) -> str:
         return (
-            f"dead-man proven: heartbeat stopped, operation left after {1000 * self.measured_s:.0f} ms "
+            f"dead-man proven: heartbeat stopped, voltage off after {1000 * self.measured_s:.0f} ms "
             f"(declared {1000 * self.declared_s:.0f} ms), to {self.left_for.name.replace('_', ' ')}"
         )
 
@@ -79,7 +85,7 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
     node = drive.node
     _set_consumer(drive)
     abort_option = _abort_option(drive)
-    quick_stop = QuickStop(node.whole(objects.QUICK_STOP_OPTION))
+    quick_stop = set_quick_stop(node, QuickStop.DISABLE)
     with node.emergencies_tolerated():
         for _ in range(TRIES):
             proof = _try(drive, heartbeat, abort_option, quick_stop)
@@ -99,7 +105,7 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
 
 
 def _try(
-    drive: CanopenDrive, heartbeat: Heartbeat, abort_option: AbortConnection, quick_stop: QuickStop
+    drive: CanopenDrive, heartbeat: Heartbeat, abort_option: AbortConnection, quick_stop: int | None
 ) -> DeadManProof | None:
     """Enable, stop the heartbeat and measure; None where this computer stalled, so that nothing is shown."""
     node = drive.node
@@ -119,7 +125,7 @@ def _try(
 
 
 def _stop_and_measure(
-    drive: CanopenDrive, heartbeat: Heartbeat, abort_option: AbortConnection, quick_stop: QuickStop
+    drive: CanopenDrive, heartbeat: Heartbeat, abort_option: AbortConnection, quick_stop: int | None
 ) -> DeadManProof | None:
     clock = drive.node.connection.clock
     stopped = clock.now()
@@ -135,16 +141,20 @@ def _stop_and_measure(
         state = drive.node.state()
         passed = clock.now() - stopped
         stalled += max(0.0, passed - before - ROUND_S)
-        left = state is not None and state is not State.OPERATION_ENABLED
-        if state is not None and left and passed <= declared:
+        off = is_safe(state)
+        if state is not None and off and passed <= declared:
             return DeadManProof(1e-3 * CONSUMER_MS, declared, passed, abort_option, quick_stop, state)
-        if left or asked > declared:
-            if not left:
+        if off or asked > declared:
+            if not off:
                 drive.quick_stop()
             if stalled > STALLED_S:
                 return None
-            late = "was enabled until" if left else "is still enabled"
-            raise _refused(f"the drive {late} {1000 * declared:.0f} ms after the last heartbeat", drive)
+            what = (
+                "the drive was still enabled"
+                if state is State.OPERATION_ENABLED or off
+                else (f"the drive had left operation for {state_text(state)}, but was still energised,")
+            )
+            raise _refused(f"{what} {1000 * declared:.0f} ms after the last heartbeat", drive)
         drive.node.connection.wait(_POLL_S)
 
 
@@ -169,16 +179,31 @@ def _set_consumer(drive: CanopenDrive) -> None:
         ) from abort
 
 
+def set_quick_stop(node: DriveNode, option: int) -> int | None:
+    """Set what a quick stop does (0x605A) where the drive takes it; return what is in force, None where it has none."""
+    with contextlib.suppress(SdoAbort):
+        if node.whole(objects.QUICK_STOP_OPTION) != option:
+            node.put(objects.QUICK_STOP_OPTION, option)
+    with contextlib.suppress(SdoAbort):
+        return node.whole(objects.QUICK_STOP_OPTION)
+    return None
+
+
 def _abort_option(drive: CanopenDrive) -> AbortConnection:
+    """Make the drive remove the voltage when the connection is lost, else stop in another way."""
     node = drive.node
     try:
         option = node.whole(objects.ABORT_CONNECTION)
+        if option != AbortConnection.DISABLE_VOLTAGE:
+            with contextlib.suppress(SdoAbort):
+                node.put(objects.ABORT_CONNECTION, AbortConnection.DISABLE_VOLTAGE)
+            option = node.whole(objects.ABORT_CONNECTION)
         if option == AbortConnection.NO_ACTION:
-            node.put(objects.ABORT_CONNECTION, AbortConnection.QUICK_STOP, retry=Retry.READ_BACK)
+            node.put(objects.ABORT_CONNECTION, AbortConnection.QUICK_STOP)
             option = node.whole(objects.ABORT_CONNECTION)
     except SdoAbort as abort:
         raise _refused("the drive does not say what it does when the connection is lost (0x6007)", drive) from abort
-    if option not in (AbortConnection.FAULT, AbortConnection.DISABLE_VOLTAGE, AbortConnection.QUICK_STOP):
+    if option not in _STOPPING:
         raise _refused(f"abort connection option code {option} does not stop the machine", drive)
     return AbortConnection(option)
 

@@ -62,6 +62,7 @@ class Envelope:
             f"travel    {travel}",
             f"energy    {energy} in the winding",
             f"duration  at most {self.duration_s:.4g} s",
+            "stop      voltage off, the shaft coasts; by the drive's ramp only once its speed loop has kept a speed",
             f"shaft     {self.shaft}: {_MAY[self.shaft]}; load {self.load}, brake {self.brake}",
         ]
 

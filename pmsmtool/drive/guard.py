@@ -13,9 +13,10 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from pmsmtool.bus.sdo import Mode
+from pmsmtool.cia402 import QuickStop
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.dead_man import DeadManProof, prove_dead_man
+from pmsmtool.drive.dead_man import DeadManProof, prove_dead_man, set_quick_stop
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
@@ -53,6 +54,10 @@ _NEXT_STEP = {
 }
 OVERSHOOT = 1.25
 """Measured current or speed over its limit that ends an experiment: regulation overshoots, noise peaks."""
+KEPT_SHARE, KEPT_S = 0.1, 0.5
+"""A commanded speed kept this closely for so long proves encoder sign and speed loop: a wrong sign runs away."""
+UNPROVEN_BY = ("motor.", "encoder.", "current.", "speed.", "inverter.")
+"""Parameters after whose change a proven speed loop is proven no more."""
 _ROUNDING = 1e-9
 _Object = tuple[int, int]
 _MARKS: tuple[_Object, ...] = tuple(
@@ -91,6 +96,8 @@ class GuardedDrive:
         self._ended = False
         self._start_rad: float | None = None
         self._looked_s = -math.inf
+        self._asked_rad_s = 0.0
+        self._kept_since_s: float | None = None
         self._pole_pairs = 1.0
         self._R_s_ohm = 0.0
 
@@ -113,6 +120,7 @@ class GuardedDrive:
         self._R_s_ohm = self._drive.read("motor.R_s_ohm")
         self._refuse_unwatched()
         self._limit_in_drive()
+        self._drive.stops_by_ramp = False
         if prove:
             self.proof = prove_dead_man(self._drive, self._heartbeat)
 
@@ -181,6 +189,7 @@ class GuardedDrive:
             An object does not hold its old content; each is named.
         """
         self._ended = True
+        self._drive.stops_by_ramp = True
         self._node.before_write = None
         try:
             with self._node.emergencies_tolerated(), self._node.supervision.other_masters_tolerated():
@@ -248,6 +257,8 @@ class GuardedDrive:
 
     def write(self, values: Mapping[str, float]) -> None:
         """Write parameters; they are restored when the guard ends."""
+        if self._drive.stops_by_ramp and any(name.startswith(UNPROVEN_BY) for name in values):
+            self._stop_without_ramp()
         self._drive.write(values)
         # speed and loss are judged with what the drive now takes for its motor
         self._pole_pairs = values.get("motor.pole_pairs", self._pole_pairs)
@@ -291,12 +302,14 @@ class GuardedDrive:
     def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
         """Hold a current vector (A peak) within the envelope."""
         self._check("current", math.hypot(i_d_a, i_q_a), self.envelope.i_max_apk, "A")
+        self._asked_rad_s = 0.0
         self._drive.command_current(i_d_a, i_q_a, fixed_angle_rad=fixed_angle_rad)
 
     def command_speed(self, omega_m_rad_s: float) -> None:
         """Run at a mechanical speed (rad/s) within the envelope."""
         self._check("speed", abs(omega_m_rad_s), self.envelope.speed_max_rad_s, "rad/s")
         self._refuse_turning()
+        self._asked_rad_s, self._kept_since_s = omega_m_rad_s, None
         self._drive.command_speed(omega_m_rad_s)
 
     def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
@@ -404,7 +417,8 @@ class GuardedDrive:
         self.energised_s += seconds
         self.energy_j += 1.5 * self._R_s_ohm * current * current * seconds
         envelope = self.envelope
-        speed = abs(self._drive.live("omega_e_rad_s")) / self._pole_pairs
+        omega = self._drive.live("omega_e_rad_s") / self._pole_pairs
+        speed = abs(omega)
         checks = [
             ("current", current, OVERSHOOT * envelope.i_max_apk, "A"),
             ("speed", speed, OVERSHOOT * envelope.speed_max_rad_s, "rad/s"),
@@ -419,6 +433,28 @@ class GuardedDrive:
             if not value <= limit:  # a value that is no number keeps no limit
                 self.stop()
                 self._check(quantity, value, limit, unit)
+        self._prove_speed_loop(omega)
+
+    def _prove_speed_loop(self, omega_m_rad_s: float) -> None:
+        """Allow the quick stop ramp once commanded speeds are kept: until then every stop removes the voltage."""
+        if self._drive.stops_by_ramp or self._asked_rad_s == 0.0:
+            return
+        if abs(omega_m_rad_s - self._asked_rad_s) > KEPT_SHARE * abs(self._asked_rad_s):
+            self._kept_since_s = None
+            return
+        if self._kept_since_s is None:
+            self._kept_since_s = self._looked_s
+        if self._looked_s - self._kept_since_s < KEPT_S:
+            return
+        option = objects.QUICK_STOP_OPTION
+        before = self._before.get((option.index, option.sub))
+        if before is not None:
+            set_quick_stop(self._node, int(option.decode(before)))
+        self._drive.stops_by_ramp = True
+
+    def _stop_without_ramp(self) -> None:
+        self._drive.stops_by_ramp, self._kept_since_s = False, None
+        set_quick_stop(self._node, QuickStop.DISABLE)
 
     def _current(self) -> float:
         """Return the length of the current vector (A) from two objects, which are read one after the other.

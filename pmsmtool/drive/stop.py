@@ -18,8 +18,13 @@ STANDSTILL_MRPM = 5_000.0
 """Speed (thousandths of rpm) below which a drive that stays in quick stop counts as standing."""
 
 
-def quick_stop(node: DriveNode) -> State:
+def quick_stop(node: DriveNode, *, ramp: bool = True) -> State:
     """Quick stop, voltage off, references to zero; return the state the statusword then shows.
+
+    Parameters
+    ----------
+    ramp : bool
+        Whether the drive may brake by its quick stop ramp; without it the voltage is removed and the shaft coasts.
 
     Raises
     ------
@@ -30,7 +35,7 @@ def quick_stop(node: DriveNode) -> State:
     for _ in range(STOP_TRIES):
         try:
             with node.emergencies_tolerated(), node.supervision.other_masters_tolerated():
-                return _stop_once(node)
+                return _stop_once(node, ramp=ramp)
         except StopNotConfirmed:
             raise
         except NodeReset as reset:
@@ -99,11 +104,11 @@ def state_text(state: State | None) -> str:
     return "an undefined state" if state is None else state.name.replace("_", " ")
 
 
-def _stop_once(node: DriveNode) -> State:
+def _stop_once(node: DriveNode, *, ramp: bool) -> State:
     state = node.state()
-    if not is_safe(state):
+    if ramp and not is_safe(state):
         node.go(Command.QUICK_STOP)
-        stays = QuickStop(node.whole(objects.QUICK_STOP_OPTION)).stays if _has_option(node) else False
+        stays = node.whole(objects.QUICK_STOP_OPTION) >= QuickStop.SLOW_DOWN_AND_STAY if _has_option(node) else False
         node.wait_for_state(lambda now: _has_stopped(node, now, stays), _stop_time_s(node))
     state = disable(node)
     zero_references(node)

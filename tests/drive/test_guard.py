@@ -40,6 +40,8 @@ RUNNING = {
     "speed.K_i_nm_per_rad": 0.5,
 }
 """What the profile's machine needs to run; a drive fresh from the factory does not know it."""
+STIFF = {"speed.K_p_nms_per_rad": 0.5, "speed.K_i_nm_per_rad": 2.0}
+"""A speed loop that keeps a speed within 0.5 s; the one above swings by half of it for six seconds."""
 
 
 @pytest.fixture
@@ -137,16 +139,36 @@ def test_second_ctrl_c_removes_the_voltage_at_once(bench: SimBench) -> None:
     """A quick stop ramp of seconds is cut short."""
     with guarded(bench.drive, Envelope(i_max_apk=5.0, speed_max_rad_s=150.0)) as guard:
         bench.drive.node.put(DECELERATION, 60)
-        guard.write(RUNNING)
+        guard.write({**RUNNING, **STIFF})
         guard.enable()
         guard.command_speed(80.0)
-        guard.wait(2.0)
-        assert guard.live("omega_e_rad_s") > 100.0
+        guard.wait(4.0)
+        assert guard.live("omega_e_rad_s") > 200.0 and bench.drive.stops_by_ramp
         started = bench.bus.clock.now()
         bench.bus.clock.after(0.1, lambda: signal.raise_signal(signal.SIGINT))
         guard.stop()
         assert 0.1 <= bench.bus.clock.now() - started < 0.2
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def test_a_kept_speed_proves_the_ramp_and_a_new_parameter_takes_that_back(bench: SimBench) -> None:
+    """A stop removes the voltage until commanded speeds were kept; the ramp takes longer than no ramp."""
+    option = bench.session.dictionary["cia402.quick_stop"]
+    before, states = option.number(), []
+    bench.session.power.on_state = lambda: states.append(bench.session.power.state)
+    for proven in (False, True):
+        with guarded(bench.drive, Envelope(i_max_apk=5.0, speed_max_rad_s=150.0)) as guard:
+            guard.write({**RUNNING, **STIFF})
+            guard.enable()
+            guard.command_speed(40.0)
+            guard.wait(1.5 if proven else 0.4)
+            assert bench.drive.stops_by_ramp is proven and option.number() == (before if proven else 0)
+            states.clear()
+            guard.stop()
+            assert (State.QUICK_STOP_ACTIVE in states) is proven
+            guard.write({"speed.K_p_nms_per_rad": 0.06})
+            assert not bench.drive.stops_by_ramp and option.number() == 0
+        assert bench.drive.stops_by_ramp and option.number() == before
 
 
 @pytest.mark.parametrize("moment", [0.8, 0.95, 1.1])

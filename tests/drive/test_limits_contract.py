@@ -16,7 +16,9 @@ from pathlib import Path
 import can
 import pytest
 
+from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
+from pmsmtool.cia402 import AbortConnection, QuickStop, State
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
 from pmsmtool.drive.envelope import Envelope
@@ -31,6 +33,7 @@ from pmsmtool.errors import DriveFault, Interrupted, LimitExceeded, PmsmtoolErro
 from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.session import Session
 from tests.drive.bench import COMMANDS
 from tests.workflow.test_mapped_recorder import completed
@@ -95,9 +98,12 @@ class Rig:
         self.kind, self.drive, self.session = kind, drive, session
         self.clock = drive.node.connection.clock
         self.off_since: float | None = None
+        self.states: list[State] = []
+        self._angle: float | None = None
         session.power.on_state = self._changed
 
     def _changed(self) -> None:
+        self.states.append(self.session.power.state)
         if not self.session.power.state.energised:
             self.off_since = self.off_since if self.off_since is not None else self.clock.now()
         else:
@@ -131,14 +137,22 @@ class Rig:
         if not self.kind.standard:
             self._show(0x2070, 7, lambda: POLE_PAIRS * rad_s)
 
+    def set_angle(self, rad: float) -> None:
+        """Show a shaft that stands at an angle (rad), before anything is enabled."""
+        self._show_angle(lambda: rad)
+        self.drive.live("theta_m_rad")
+        self._angle = rad
+
     def show_angle(self, rad: float) -> None:
         """Show a shaft that creeps to an angle (rad): no speed of its own counts."""
-        began, at = self.clock.now(), self.drive.live("theta_m_rad")
+        began, at = self.clock.now(), self.drive.live("theta_m_rad") if self._angle is None else self._angle
+        self._angle = rad
         self._show_angle(lambda: at + (rad - at) * min(1.0, (self.clock.now() - began) / CREEP_S))
 
     def _show_angle(self, angle: Callable[[], float]) -> None:
         if isinstance(self.drive, StandardDrive):
-            per_rad = self.drive.counts_per_turn / (2.0 * math.pi)
+            counts, turns = (self.session.dictionary.find(0x608F, sub).number() for sub in (1, 2))
+            per_rad = counts / turns / (2.0 * math.pi)
             self._show(0x6064, 0, lambda: (round(angle() * per_rad) + 2**31) % 2**32 - 2**31)
         else:
             self._show(0x2070, 0x14, angle)
@@ -213,6 +227,20 @@ def test_travel(rig: Rig, sign: float) -> None:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_position_that_wraps_is_no_motion(rig: Rig, sign: float) -> None:
+    """The counter of 32 bits goes from its largest number to its smallest; beyond the limit it counts as ever."""
+    if not rig.kind.standard:
+        edge = sign * 100.0  # rad as a float do not wrap
+    else:
+        edge = sign * 2.0**31 / rig.session.dictionary.find(0x608F, 1).number() * 2.0 * math.pi
+    rig.set_angle(edge - sign * 0.1)
+    stopped(
+        rig, replace(ENVELOPE, travel_rad=0.5), lambda guard: rig.show_angle(edge + sign * 0.45), "travel",
+        WATCH_S + STOP_S, allowed=lambda guard: rig.show_angle(edge + sign * 0.3),
+    )  # fmt: skip
+
+
 def test_a_locked_shaft_that_turns(rig: Rig) -> None:
     at = rig.drive.live("theta_m_rad")
     error = stopped(
@@ -228,6 +256,15 @@ def test_over_current(rig: Rig) -> None:
         rig, ENVELOPE, lambda guard: rig.show_current(BEYOND * limit), "current", WATCH_S + STOP_S,
         allowed=lambda guard: rig.show_current(WITHIN * limit),
     )  # fmt: skip
+
+
+def test_an_experiment_that_swallows_the_excess_goes_on_without_voltage(rig: Rig) -> None:
+    with guarded(rig.drive, ENVELOPE) as guard:
+        guard.enable()
+        rig.show_current(2.0 * ENVELOPE.i_max_apk)
+        with pytest.raises(LimitExceeded):
+            guard.wait(1.0)
+        assert not rig.energised
 
 
 def test_energised_too_long(rig: Rig) -> None:
@@ -346,6 +383,53 @@ def test_ctrl_c(rig: Rig) -> None:
         rig.clock.after(0.02, lambda: signal.raise_signal(signal.SIGINT))  # type: ignore[attr-defined]
 
     stopped(rig, ENVELOPE, interrupt, "voltage off, and the drive restored", 0.02 + STOP_S, error=Interrupted)
+
+
+# ---- how it stops --------------------------------------------------------------------------------
+
+
+def test_until_the_speed_loop_is_proven_a_stop_removes_the_voltage(rig: Rig) -> None:
+    """No ramp, which would run a speed loop: 0x605A = 0 and 0x6007 = 2 meanwhile, and no quick stop is active."""
+    options = {key: rig.session.dictionary.find(*key) for key in ((0x605A, 0), (0x6007, 0))}
+    for entry, value in zip(options.values(), (6, 1), strict=True):
+        entry.value = entry.encode(value)  # as on an EPOS4; a fault when the connection is lost
+    seen = []
+
+    def fail(guard: GuardedDrive) -> None:
+        seen.extend(entry.number() for entry in options.values())
+        raise ZeroDivisionError("of the experiment")
+
+    stopped(rig, ENVELOPE, fail, "of the experiment", STOP_S, error=ZeroDivisionError)
+    assert seen == [QuickStop.DISABLE, AbortConnection.DISABLE_VOLTAGE]
+    assert State.QUICK_STOP_ACTIVE not in rig.states
+    assert [entry.number() for entry in options.values()] == [6, 1]
+
+
+def test_a_drive_that_keeps_its_option_codes_is_stopped_without_a_ramp_too(rig: Rig) -> None:
+    def refused(data: bytes) -> None:
+        raise Refused(AbortCode.VALUE)
+
+    for key in ((0x605A, 0), (0x6007, 0)):
+        entry = rig.session.dictionary.find(*key)
+        entry.value, entry.sink = entry.encode(2 if key[0] == 0x605A else 3), refused
+
+    def fail(guard: GuardedDrive) -> None:
+        rig.states.clear()
+        raise ZeroDivisionError("of the experiment")
+
+    stopped(rig, ENVELOPE, fail, "of the experiment", STOP_S, error=ZeroDivisionError)
+    assert State.QUICK_STOP_ACTIVE not in rig.states
+
+
+def test_a_supervision_that_leaves_the_voltage_on_is_refused(rig: Rig) -> None:
+    """Another state is not enough: quick stop active after which the drive stays energised (0x605A = 6)."""
+    for key, value in (((0x605A, 0), 6), ((0x6007, 0), 3)):
+        entry = rig.session.dictionary.find(*key)
+        entry.value, entry.sink = entry.encode(value), lambda data: None
+    named = "QUICK STOP ACTIVE, but was still energised, 350 ms"
+    with pytest.raises(SafetyRefusal, match=named), guarded(rig.drive, ENVELOPE):
+        pass
+    assert not rig.energised
 
 
 def test_a_pulled_cable_is_said_above_all(rig: Rig) -> None:
