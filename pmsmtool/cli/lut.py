@@ -32,8 +32,13 @@ _TEMPERATURE = Quantity("temperature")
 @click.option("--axis", type=click.Choice(["speed", "flux"]), default="speed", help="Second axis.")
 @click.option("--torque-points", type=int, metavar="N", help="Uniform torque axis.  [default: refined to the bounds]")
 @click.option("--speed-points", "y_points", type=int, metavar="N", help="Uniform second axis.")
-@click.option("--torque-bound", type=float, default=0.01, metavar="RATIO", help="Torque error between nodes / T_max.")
-@click.option("--voltage-bound", type=float, default=0.01, metavar="RATIO", help="Voltage excess there / limit.")
+@click.option(
+    "--torque-bound", type=float, metavar="RATIO",
+    help="Torque error between nodes / T_max.  [default: 0.01, or the next larger one that fits the drive]",
+)
+@click.option(
+    "--voltage-bound", type=float, metavar="RATIO", help="Voltage excess there / limit.  [default: as above]"
+)
 @click.option("--stored", type=click.Choice(["auto", "float32", "int16"]), default="auto", help="Format in the drive.")
 @click.option(
     "--u-dc", "U_dc_v", type=Quantity("voltage"), multiple=True, help="DC-link voltage; several: an axis, refined."
@@ -57,7 +62,8 @@ def lut_command(
     """Make the current references of SOURCE, a machine file, a design, a run directory or a profile.
 
     Least loss for every torque and speed within current, voltage, demagnetisation and map; motoring and generating;
-    with the limit that binds and the margins of every cell. Exit code 1 when the bounds do not fit the drive's memory.
+    with the limit that binds and the margins of every cell. Without bounds, the largest grid that fits the drive's
+    memory is taken and named; exit code 1 when bounds that are given do not fit it.
     """
     from pmsmtool.design.iron_loss import load_iron_loss_map
     from pmsmtool.design.lookup_design import LookupRequest, design_table

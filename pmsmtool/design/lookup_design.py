@@ -41,6 +41,10 @@ Array = NDArray[np.float64]
 FIRST_TORQUES, FIRST_SPEEDS = 17, 13
 """Nodes of the axes that refinement starts from."""
 
+BOUNDS = (0.01, 0.02, 0.03, 0.05, 0.08, 0.12)
+"""Largest errors between nodes where none is asked for, over the largest torque and the voltage limit: the first whose
+grid fits the drive."""
+
 LEAST_FLUX_RATIO = 0.02
 """Smallest flux limit of a flux table over the largest, where the speed axis gives none."""
 
@@ -55,8 +59,9 @@ class LookupRequest:
         Second axis.
     torque_points, y_points : int or None
         Uniform axes with these nodes; None refines until the bounds hold.
-    torque_bound, voltage_bound : float
-        Largest error between nodes, over the largest torque and over the voltage limit.
+    torque_bound, voltage_bound : float or None
+        Largest error between nodes, over the largest torque and over the voltage limit; None takes the first of
+        :data:`BOUNDS` that fits the drive.
     stored : {"auto", "float32", "int16"}
         Format in the drive; ``auto`` takes float32 where it fits.
     U_dc_v : tuple of float
@@ -70,8 +75,8 @@ class LookupRequest:
     axis: AxisKind = "speed"
     torque_points: int | None = None
     y_points: int | None = None
-    torque_bound: float = 0.01
-    voltage_bound: float = 0.01
+    torque_bound: float | None = None
+    voltage_bound: float | None = None
     stored: str = "auto"
     U_dc_v: tuple[float, ...] = ()
     T_winding_c: float | None = None
@@ -89,8 +94,9 @@ class LookupRequest:
             if value is not None and not 2 <= value <= 4096:
                 wrong.append(f"{name} = {value} is outside 2..4096")
         for name in ("torque_bound", "voltage_bound"):
-            if not getattr(self, name) > 0.0:
-                wrong.append(f"{name} = {getattr(self, name)!r} is not positive")
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                wrong.append(f"{name} = {value!r} is not positive")
         U_dc = self.U_dc_v
         if any(not (math.isfinite(U) and U > 0.0) for U in U_dc) or sorted(set(U_dc)) != list(U_dc):
             wrong.append("the DC-link voltages are not positive and increasing")
@@ -112,12 +118,16 @@ class LookupDesign:
         Bounds between its nodes.
     notes : tuple of str
         What a person must know.
+    torque_bound, voltage_bound : float
+        What its grid was refined to, over the largest torque and the voltage limit; infinite for uniform axes.
     """
 
     table: LookupTable
     stored: StoredFormat
     error: InterpolationError
     notes: tuple[str, ...]
+    torque_bound: float = math.inf
+    voltage_bound: float = math.inf
 
 
 def design_table(
@@ -163,21 +173,47 @@ def design_table(
         table = as_stored(problem.solve(*stored_axes(x, y[1], problem.U_dc)), stored)
         return LookupDesign(table, stored, interpolation_error(table), (*notes, *problem.flux_note(table)))
     x = np.linspace(-torque, torque, FIRST_TORQUES)
+    limit = float(problem.V_max.min()) if request.axis == "speed" else float(y[1][-1])
     failed: DesignInfeasible | None = None
-    choices: tuple[StoredFormat, ...] = ("float32", "int16")
-    for stored in choices:
-        if request.stored not in ("auto", stored):
-            continue
-        limit = float(problem.V_max.min()) if request.axis == "speed" else float(y[1][-1])
-        bounds = GridBounds(request.torque_bound * torque, request.voltage_bound * limit, stored)
-        try:
-            table, error = refined_table(problem.solve, x, y[0], problem.U_dc, bounds)
-        except DesignInfeasible as refused:
-            failed = refused
-            continue
-        return LookupDesign(table, stored, error, (*notes, *problem.flux_note(table)))
+    for torque_bound, voltage_bound in _bounds(request):
+        for stored in _formats(request, first=failed is None):
+            bounds = GridBounds(torque_bound * torque, voltage_bound * limit, stored, LUT_CAPACITY_WORDS)
+            try:
+                table, error = refined_table(problem.solve, x, y[0], problem.U_dc, bounds)
+            except DesignInfeasible as refused:
+                failed = refused
+                continue
+            notes = (*notes, *problem.flux_note(table), *_wider(request, torque_bound, voltage_bound))
+            return LookupDesign(table, stored, error, notes, torque_bound, voltage_bound)
     assert failed is not None
     raise failed
+
+
+def _formats(request: LookupRequest, *, first: bool) -> tuple[StoredFormat, ...]:
+    """Return the formats to try; int16, where it fits, in half the memory, is all there is to try with wider bounds."""
+    if request.stored == "auto":
+        return ("float32", "int16") if first else ("int16",)
+    return ("int16",) if request.stored == "int16" else ("float32",)
+
+
+def _bounds(request: LookupRequest) -> list[tuple[float, float]]:
+    """Return the bounds of torque and voltage to try: what is asked for, and where nothing is, each of BOUNDS."""
+    torque, voltage = request.torque_bound, request.voltage_bound
+    tried = [(b if torque is None else torque, b if voltage is None else voltage) for b in BOUNDS]
+    return list(dict.fromkeys(tried))
+
+
+def _wider(request: LookupRequest, torque_bound: float, voltage_bound: float) -> tuple[str, ...]:
+    """Return what to say of a table whose bounds are not the first ones."""
+    free = (("torque", request.torque_bound, torque_bound), ("voltage", request.voltage_bound, voltage_bound))
+    wider = [(name, bound) for name, asked, bound in free if asked is None and bound > BOUNDS[0]]
+    if not wider:
+        return ()
+    names = " and ".join(name for name, _ in wider)
+    return (
+        f"a table within {100.0 * BOUNDS[0]:g} % of {names} does not fit the drive's {LUT_CAPACITY_WORDS} words: "
+        f"this one is within {100.0 * wider[0][1]:g} %",
+    )
 
 
 def _fitting(request: LookupRequest, n_x: int, n_y: int, n_z: int) -> StoredFormat:

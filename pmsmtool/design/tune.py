@@ -51,9 +51,6 @@ ACCELERATION_SHARE = 0.8
 FW_SHARE = 0.8
 """And at most this share of the slope at which field weakening falls behind by the whole voltage reserve."""
 
-TABLE_BOUNDS = (0.01, 0.02, 0.03, 0.05)
-"""Errors between the nodes of a table that are tried, in this order."""
-
 _CURRENT_OPTIONS = 0b111
 _PREDICTOR_OPTION = 1 << 4
 
@@ -187,23 +184,14 @@ def _design_table(
     from pmsmtool.design.lookup_design import LookupRequest, design_table
     from pmsmtool.design.lookup_file import lut_values
 
-    refused: DesignInfeasible | None = None
-    for bound in TABLE_BOUNDS:
-        asked = LookupRequest(torque_bound=bound, voltage_bound=bound)
-        try:
-            made = design_table(source, rated, asked, request.voltage_margin)
-        except DesignInfeasible as error:
-            refused = error
-            continue
-        values, tables = lut_values(made.table, made.stored)
-        how = f"{made.stored}, within {100.0 * bound:g} % of torque and voltage between nodes"
-        facts: dict[str, Scalar] = {
-            "table_torque_error_nm": made.error.torque_nm,
-            "table_voltage_excess_v": made.error.voltage_v,
-        }
-        return _Part({name: DesignValue(value, how) for name, value in values.items()}, {}, facts, made.notes), tables
-    assert refused is not None
-    raise refused
+    made = design_table(source, rated, LookupRequest(), request.voltage_margin)
+    values, tables = lut_values(made.table, made.stored)
+    how = f"{made.stored}, within {100.0 * made.torque_bound:g} % of torque and voltage between nodes"
+    facts: dict[str, Scalar] = {
+        "table_torque_error_nm": made.error.torque_nm,
+        "table_voltage_excess_v": made.error.voltage_v,
+    }
+    return _Part({name: DesignValue(value, how) for name, value in values.items()}, {}, facts, made.notes), tables
 
 
 # -- speed loop ----------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,9 +16,9 @@ from pmsmtool.design.margins import JUDGED_PERCENTILE, MarginRequest, Spread, ma
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.sampled_loop import LoopMargins
 from pmsmtool.design.tolerance import tolerance_box
-from pmsmtool.design.tune import TABLE_BOUNDS, tune
+from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
-from pmsmtool.errors import DesignInfeasible, NotAvailable
+from pmsmtool.errors import NotAvailable
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.workflow.held_design import Designed, why_not_judged
@@ -89,10 +88,12 @@ def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
     Raises
     ------
     DesignInfeasible
-        Not even the widest of ``TABLE_BOUNDS`` fits the drive's memory.
+        Not even a table within the widest of ``lookup_design.BOUNDS`` fits the drive's memory.
     """
     design = load_design(run.path / "design.toml")
-    made, bound = _bounded_table(design, request)
+    margin = design["field_weakening.margin"]
+    rated = ratings(design.machine, (1.0 - margin) * design.machine.inverter.V_max_v)
+    made = design_table(design.machine, rated, request, margin)
     table, error = made.table, made.error
     used = design["field_weakening.mode"] == FIELD_WEAKENING["lookup"]
     if used:
@@ -103,8 +104,10 @@ def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
     run.save("params.toml", design.parameter_set().to_toml())
     torque = float(max(abs(table.torque_nm[0]), table.torque_nm[-1]))
     criteria = [
-        _at_most("torque error between nodes", error.torque_nm / torque, bound),
-        _at_most("voltage beyond the limit between nodes", error.voltage_v / float(table.V_max_v.min()), bound),
+        _at_most("torque error between nodes", error.torque_nm / torque, made.torque_bound),
+        _at_most(
+            "voltage beyond the limit between nodes", error.voltage_v / float(table.V_max_v.min()), made.voltage_bound
+        ),
     ]
     shape = " x ".join(map(str, table.i_d_a.shape))
     names, counts = table.binding_counts()
@@ -115,25 +118,7 @@ def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
     files = ("lut.npz", "lut.csv", "design.toml", "params.toml")
     summary = f"{shape} cells, {made.stored}; torque to {torque:.4g} N m, speed to {table.y[-1]:.5g} rpm"
     notes = made.notes if used else (*made.notes, "the table is for reading: this design finds its references itself")
-    if bound > request.torque_bound:
-        notes = (
-            *notes,
-            f"a table within {100.0 * request.torque_bound:g} % does not fit the drive: {100.0 * bound:g} %",
-        )
     return _stage("lut", summary, criteria, values=values, files=files, fallbacks=notes)
-
-
-def _bounded_table(design: Design, request: LookupRequest) -> tuple[LookupDesign, float]:
-    """Make the table with the tightest bound that fits the drive, from the one asked for on."""
-    machine, margin = design.machine, design["field_weakening.margin"]
-    rated = ratings(machine, (1.0 - margin) * machine.inverter.V_max_v)
-    bounds = [request.torque_bound, *(bound for bound in TABLE_BOUNDS if bound > request.torque_bound)]
-    for bound in bounds[:-1]:
-        with contextlib.suppress(DesignInfeasible):
-            asked = replace(request, torque_bound=bound, voltage_bound=bound)
-            return design_table(machine, rated, asked, margin), bound
-    asked = replace(request, torque_bound=bounds[-1], voltage_bound=bounds[-1])
-    return design_table(machine, rated, asked, margin), bounds[-1]
 
 
 def _at_most(what: str, value: float, largest: float) -> Acceptance:

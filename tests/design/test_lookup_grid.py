@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
+from pmsmtool.design import lookup_design
 from pmsmtool.design.iron_loss import load_iron_loss_map
 from pmsmtool.design.lookup_design import LookupDesign, LookupRequest, design_table
 from pmsmtool.design.lookup_file import lut_values, lut_words, table_csv, table_facts, table_npz
@@ -219,6 +220,21 @@ def test_a_voltage_axis_is_refined_and_bounded_between_its_voltages_too(stored: 
             assert value <= bound
         worst_torque = max(worst_torque, found[0])
     assert worst_torque >= 0.5 * error.torque_nm
+
+
+def test_without_bounds_two_voltages_get_the_largest_grid_that_fits_and_it_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With a tenth of the memory, which is as full at 5 and 8 % as all of it with the default profile at 1 %."""
+    monkeypatch.setattr(lookup_design, "LUT_CAPACITY_WORDS", 800)
+    design = made("interior-2k2", U_dc_v=(400.0, 600.0))
+    assert design.torque_bound == design.voltage_bound in lookup_design.BOUNDS[1:]
+    assert any(f"this one is within {100.0 * design.torque_bound:g} %" in note for note in design.notes)
+    assert table_words(*design.table.i_d_a.shape, design.stored) <= 800  # type: ignore[arg-type]
+    assert design.error.torque_nm <= design.torque_bound * design.table.torque_nm[-1]
+    assert design.error.voltage_v <= design.voltage_bound * design.table.V_max_v.min()
+    with pytest.raises(DesignInfeasible, match="asked for"):
+        made("interior-2k2", U_dc_v=(400.0, 600.0), torque_bound=0.01)
 
 
 @pytest.mark.parametrize("stored", ["float32", "int16"])
