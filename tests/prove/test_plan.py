@@ -12,9 +12,11 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.port import Injection
 from pmsmtool.errors import NotAvailable
-from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.parameters import InverterParameters, MachineParameters
 from pmsmtool.resources import data_folder
-from pmsmtool.workflow.prove.plan import RPM, STEPS, Conditions, plan_proof
+from pmsmtool.workflow.prove.plan import RPM, SIGNALS, STEPS, Conditions, plan_proof
+from pmsmtool.workflow.prove.simulated import BASE_SPEED, SimulatedDrives
 from pmsmtool.workflow.prove.stage import ProofRequest, envelope_of
 from pmsmtool.workflow.random_drives import draw_drive
 
@@ -58,6 +60,56 @@ def test_nothing_leaves_the_envelope(seed: int) -> None:
             assert experiment.base_rad_s * made["motor.pole_pairs"] * made["motor.psi_f_wb"] < V_max
         assert experiment.rows * 5 * 4 <= 65536, "the recorder's memory"
         assert experiment.rows % experiment.repeats == 0
+
+
+def light(J_kgm2: float = 1.2e-5, psi_f_wb: float = 0.02) -> MachineFile:
+    """A 24-V machine that its own torque speeds up to the base speed within milliseconds."""
+    return MachineFile(
+        "light",
+        MachineParameters(
+            7, 0.05, 25e-6, 25e-6, psi_f_wb, I_nom_apk=30.0, I_max_apk=60.0, n_nom_rpm=750.0, n_max_rpm=1420.0,
+            J_kgm2=J_kgm2, B_nms=2e-6, tau_c_nm=0.002,
+        ),
+        InverterParameters(U_dc_v=24.0, f_s_hz=40e3, dead_time_s=0.3e-6),
+    )  # fmt: skip
+
+
+def test_a_light_shaft_keeps_its_speed_within_the_steps() -> None:
+    """The torque of the largest level, integrated: before, 1.3 of the speed held; the back-emf left no linear loop."""
+    machine = light().machine
+    made = tune(light(), TuneRequest())
+    plan = plan_proof(made, conditions(made, U_dc_v=24.0))
+    steps = next(e for e in plan.experiments if e.name == "q_steps")
+    level_s = steps.excitation.hold_periods * steps.excitation.buffer.count(steps.excitation.amplitude)
+    level_s /= steps.repeats * 40e3
+    assert machine.J_kgm2 is not None
+    rise = 1.5 * 7 * machine.psi_f_wb * steps.excitation.amplitude / machine.J_kgm2 * level_s * steps.repeats
+    assert 0.0 < rise <= 0.25 * steps.base_rad_s * (1.0 + 1e-9)
+    assert not [e for e in plan.experiments if e.name == "unreachable"]
+    assert "too light" in " ".join(plan.left_out)
+
+
+@pytest.mark.parametrize("J_kgm2", [1e-2, 1.0])
+def test_an_inertia_that_counts_for_nothing_leaves_the_steps_to_the_voltage(J_kgm2: float) -> None:
+    made = tune(light(J_kgm2), TuneRequest())
+    plan = plan_proof(made, conditions(made, U_dc_v=24.0))
+    steps = next(e for e in plan.experiments if e.name == "q_steps")
+    V, emf = 0.85 * made.machine.inverter.V_max_v, steps.base_rad_s * 7 * 0.02
+    assert steps.excitation.amplitude == pytest.approx(0.7 * (V - emf) / made["current.K_p_q_v_per_a"], rel=0.02)
+    assert "unreachable" in [e.name for e in plan.experiments]
+
+
+@pytest.mark.parametrize("psi_f_wb", [0.005, 0.02])
+def test_the_predicted_records_begin_at_their_speed(psi_f_wb: float) -> None:
+    """The drawn friction slows a light shaft while the prediction gets ready; the machine's record begins at its speed."""
+    made = tune(light(psi_f_wb=psi_f_wb), TuneRequest())
+    plan = plan_proof(made, conditions(made, U_dc_v=24.0))
+    drives = SimulatedDrives(made, conditions(made, U_dc_v=24.0), plan, 4, 0)
+    for experiment in plan.experiments:
+        if experiment.name in ("q_steps", "d_steps"):
+            once = replace(experiment, rows=experiment.pattern_rows, repeats=1)
+            begun = drives.respond(once)[:, SIGNALS.index("omega_e_rad_s"), 0] / (7 * experiment.base_rad_s) - 1.0
+            assert (begun >= BASE_SPEED[0] - 0.03).all() and (begun <= BASE_SPEED[1] + 0.03).all()  # 12-bit encoder
 
 
 def test_a_locked_shaft_leaves_the_current_steps() -> None:

@@ -29,6 +29,8 @@ STEP_VOLTAGE_SHARE = 0.7
 """And its first voltage K_p i, of what the back-EMF leaves: the steps are to show the linear loop."""
 STEP_SPEED_SHARE = 0.4
 """Speed of the current steps, of the base speed: fast enough to show the decoupling."""
+STEP_SPEED_RISE = 0.25
+"""Largest rise of the speed within a level of the q steps, relative (40 random drives: at most 0.032)."""
 SCALE_SHARE = 0.25
 """Least scale of the current steps, of the rated current: ripple and converter steps do not shrink with the steps."""
 SPEED_SHARE = 0.92
@@ -54,7 +56,9 @@ UNREACHABLE_LEAST = 1.05
 """Voltage that an unreachable current takes in steady state, of the largest: wanted, and least that counts."""
 UNREACHABLE_ROWS = (24, 96)
 UNREACHABLE_SPEED_RISE = 0.05
-"""Rise of the speed while it is asked for, relative."""
+UNREACHABLE_LARGEST_RISE = 0.25
+"""Rise of the speed while it is asked for, relative: wanted, and largest with the fewest rows and all of the current
+(40 random drives: at most 0.032). Beyond, the speed decides what the voltage lets through, not the governor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,9 +228,9 @@ class _Sizes:
         """Speed of the current steps."""
         return min(STEP_SPEED_SHARE * self.omega_base, 0.7 * self.omega_max) if self.turns else 0.0
 
-    def torque(self, i_q_a: float) -> float:
-        """Torque at i_d = 0 (N m)."""
-        return 1.5 * self.p * self.psi * i_q_a
+    def rise(self, i_q_a: float) -> float:
+        """Rise of the electrical speed per control period at i_d = 0 (rad/s); none where the inertia is not known."""
+        return 1.5 * self.p**2 * self.psi * i_q_a / self.J * self.T_s if self.J > 0.0 else 0.0
 
 
 def _speed_step(s: _Sizes) -> Experiment:
@@ -259,12 +263,16 @@ def _current_steps(s: _Sizes, axis: str) -> Experiment:
     emf = s.omega_steps * s.psi
     room = s.V_linear - emf if axis == "q" else math.sqrt(max(s.V_linear**2 - emf**2, 0.0))
     K_p = s.design[f"current.K_p_{axis}_v_per_a"]
-    step = min(STEP_SHARE * s.I_test, STEP_VOLTAGE_SHARE * room / max(K_p, 1e-9))
-    if step <= 0.0:
-        raise NotAvailable("no current step fits the voltage", hint="check U_dc and the design's voltage")
     periods = SETTLE / (s.alpha[axis] * s.T_s)
     decimation = max(1, math.ceil(periods / LEVEL_ROWS[1]))
     level = min(LEVEL_ROWS[1], max(LEVEL_ROWS[0], math.ceil(periods / decimation)))
+    # the shaft runs up while a level lasts: a light one takes voltage with it, and speed
+    rise = s.rise(1.0) * level * decimation if axis == "q" and s.omega_steps > 0.0 else 0.0
+    step = min(STEP_SHARE * s.I_test, STEP_VOLTAGE_SHARE * room / (max(K_p, 1e-9) + STEP_VOLTAGE_SHARE * rise * s.psi))
+    if rise > 0.0:
+        step = min(step, STEP_SPEED_RISE * s.omega_steps / rise, (s.omega_max - s.omega_steps) / rise)
+    if step <= 0.0:
+        raise NotAvailable("no current step fits the voltage", hint="check U_dc and the design's voltage")
     pattern = tuple(step * share for share in STEPS for _ in range(level))
     repeats = max(1, PATTERN_ROWS // len(pattern))
     rows = repeats * len(pattern)
@@ -293,8 +301,13 @@ def _unreachable(s: _Sizes) -> Experiment | str:
             break
     else:
         return f"unreachable reference: the voltage suffices for {s.i_lim:.4g} A at every speed below field weakening"
-    rise = s.torque(current) / s.J * s.T_s  # mechanical, per period
-    periods = UNREACHABLE_SPEED_RISE * omega / s.p / max(rise, 1e-30)
+    rise = s.rise(current)
+    if UNREACHABLE_ROWS[0] * rise > min(UNREACHABLE_LARGEST_RISE * omega, s.omega_max - omega):
+        return (
+            f"unreachable reference: the shaft is too light, {current:.4g} A may speed it up by "
+            f"{UNREACHABLE_ROWS[0] * rise / s.p / RPM:.4g} rpm from {omega / s.p / RPM:.4g} rpm within the record"
+        )
+    periods = UNREACHABLE_SPEED_RISE * omega / max(rise, 1e-30)
     rows = round(min(UNREACHABLE_ROWS[1], max(UNREACHABLE_ROWS[0], periods)))
     excitation = Excitation(Shape.STEP, Injection.I_Q, current, duration_s=rows * s.T_s)
     speed = omega / s.p / RPM

@@ -27,6 +27,7 @@ from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
 from pmsmtool.sim.kernel import Params, Part, Setup, Simulation, library
 from pmsmtool.sim.scenarios import MODES
+from pmsmtool.sim.signals import Truth
 from pmsmtool.sim.simulated_machine import MODELS, SHAPES, build_setup
 from pmsmtool.workflow.prove.defects import DEFECTS, QUANTITIES, Defect, is_possible
 from pmsmtool.workflow.prove.plan import SIGNALS, Conditions, Experiment, ProofPlan
@@ -129,8 +130,13 @@ class SimulatedDrives:
         if experiment.excitation.point is Injection.SPEED:
             crossover = float(self._design.facts.get("speed_crossover_rad_s", 50.0))
             run_in = round((RUN_IN if experiment.base_rad_s else 0.25) / (crossover * self._T_s))
-        for drive, phase in zip(drives, self._phase, strict=False):
-            drive.run(phase + run_in)
+        for row, drive in enumerate(drives):
+            drive.run(self._phase[row] + run_in)
+            if experiment.base_rad_s and experiment.excitation.point is not Injection.SPEED:
+                # a light shaft has coasted: the record of the machine begins at its speed (``measured.KEPT``)
+                lost = (1.0 + self._base_speed[row]) * experiment.base_rad_s - drive.signal(Truth.OMEGA_M)
+                drives[row] = self._start(row, experiment, defect, lost)
+                drives[row].run(self._phase[row] + run_in)
         wanted = [DRIVE_SIGNALS[name][0] for name in SIGNALS]
         for drive in drives:
             _excite(drive, experiment.excitation)
@@ -139,11 +145,11 @@ class SimulatedDrives:
             drive.run(experiment.rows * experiment.decimation)
         return averaged(np.stack(records).transpose(0, 2, 1), experiment)
 
-    def _start(self, row: int, experiment: Experiment, defect: Defect | None) -> Simulation:
+    def _start(self, row: int, experiment: Experiment, defect: Defect | None, lead_rad_s: float = 0.0) -> Simulation:
         setup = Setup.from_buffer_copy(self.setups[row])
         speed = experiment.excitation.point is Injection.SPEED
         share = 0.0 if speed else self._base_speed[row]
-        setup.omega_M = (1.0 + share) * experiment.base_rad_s
+        setup.omega_M = (1.0 + share) * experiment.base_rad_s + lead_rad_s
         params = Params()
         simulation = Simulation(setup, self._image, self._scaled(setup))
         if defect is not None:
