@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_text
 
 NEXT_STEP = "correct the text there; https://toml.io shows the format"
 
@@ -50,24 +51,6 @@ def read_toml(path: Path, *, hint: str = "check the path") -> dict[str, Any]:
         Missing, unreadable, or as :func:`parse_toml`.
     """
     return parse_toml(read_text(path, hint=hint), where=str(path))
-
-
-def read_text(path: Path, *, hint: str = "check the path") -> str:
-    """Return the text of a file.
-
-    Raises
-    ------
-    ConfigError
-        Missing or unreadable.
-    """
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=str(path), hint=hint) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"cannot be read as text: {error}", where=str(path), hint="give a text file in UTF-8 that you may read"
-        ) from None
 
 
 def _whole_numbers(value: Any, name: str) -> Iterator[tuple[str, int]]:

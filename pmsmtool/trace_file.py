@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import ROWS_BYTES, read_text, write_file
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.trace import Trace
 from pmsmtool.units import UNITS
@@ -74,15 +74,7 @@ def write_trace(trace: Trace, path: Path) -> None:
     if suffix not in (".npz", ".csv"):
         raise _no_format(path)
     data = trace_npz(trace) if suffix == ".npz" else trace_csv(trace).encode()
-    part = path.with_name(f"{path.name}.part")
-    try:
-        part.write_bytes(data)
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise ConfigError(
-            f"cannot be written: {error.strerror}", where=str(path), hint="choose another folder"
-        ) from None
+    write_file(path, data)
 
 
 @next_step(NEXT_STEP)
@@ -169,12 +161,7 @@ def _trace(columns: dict[str, NDArray[np.float64]], units: dict[str, str], meta:
 
 def _from_csv(path: Path) -> Trace:
     where = str(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=where, hint="check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read as text: {error}", where=where) from None
+    lines = read_text(path, largest=ROWS_BYTES, encoding="utf-8-sig").splitlines()
     meta: dict[str, Any] = {}
     if lines and lines[-1].startswith("# {"):
         try:

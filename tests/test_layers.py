@@ -20,8 +20,9 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "pmsmtool"
 
 FLOORS: dict[str, int] = {
-    "errors": 1,
+    "errors": 0,
     "cia402": 1,
+    "files": 1,
     "bus": 2,
     "units": 2,
     "native": 2,

@@ -1,9 +1,14 @@
 """NumPy archives: deterministic bytes, and one clear error per kind of damage."""
 
+import io
+import tracemalloc
+import zipfile
+
 import numpy as np
 import pytest
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import NUMBERS_BYTES
 from pmsmtool.npz_file import npz_bytes, read_npz
 
 ARRAYS = {"x": np.arange(5.0), "grid": np.arange(6).reshape(2, 3), "text": np.array('{"a": 1}')}
@@ -76,3 +81,41 @@ def test_a_single_array_is_no_archive(tmp_path):
         np.save(file, np.arange(3))
     with pytest.raises(ConfigError, match="single array"):
         read_npz(path)
+
+
+def bomb(kind, count, *, said=None):
+    """A small archive with one array that announces ``said`` numbers and unpacks to ``count`` of them."""
+    header = io.BytesIO()
+    fields = {"descr": np.dtype(kind).str, "fortran_order": False, "shape": (said or count,)}
+    np.lib.format.write_array_header_1_0(header, fields)
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("x.npy", "w") as member:
+        member.write(header.getvalue())
+        block = bytes(1 << 20)
+        for _ in range(count * np.dtype(kind).itemsize >> 20):
+            member.write(block)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (lambda: bomb("f8", (NUMBERS_BYTES >> 3) + (1 << 17)), "more than the 128 MiB"),
+        (lambda: bomb("i1", 17 << 20), "more than the 128 MiB"),  # 136 MiB once it is computed with
+        (lambda: bomb("f8", 1 << 17, said=1 << 50), "is not an array of"),
+    ],
+    ids=["unpacked size", "widened numbers", "header only"],
+)
+def test_what_an_archive_announces_is_refused_before_it_is_unpacked(tmp_path, data, said):
+    path = tmp_path / "bomb.npz"
+    path.write_bytes(data())
+    assert path.stat().st_size < 1 << 20
+    tracemalloc.start()
+    try:
+        with pytest.raises(ConfigError) as caught:
+            read_npz(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert said in f"{caught.value}"
+    assert peak < 4 << 20  # 2 GB before

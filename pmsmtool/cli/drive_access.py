@@ -12,6 +12,7 @@ import click
 from pmsmtool.cli.options import FILE, BusOptions
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import BusError, ConfigError
+from pmsmtool.files import read_text
 
 if TYPE_CHECKING:
     from pmsmtool.bus.connection import Connection
@@ -40,14 +41,8 @@ def read_map(path: Path | None) -> DriveMap:
         return reference_map()
     if str(path) in family_names() and not path.is_file():
         return load_family(str(path))
-    try:
-        return parse_drive_map(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"cannot be read: {error}",
-            where=str(path),
-            hint="give a map file in UTF-8 that you may read, or the name of a shipped family",
-        ) from error
+    hint = "give a map file in UTF-8 that you may read, or the name of a shipped family"
+    return parse_drive_map(read_text(path, hint=hint), str(path))
 
 
 @contextmanager

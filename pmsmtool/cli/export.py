@@ -13,7 +13,7 @@ import click
 from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import FILE, NODE, examples, text_options
 from pmsmtool.cli.output import Output
-from pmsmtool.cli.output_file import write_file
+from pmsmtool.files import read_bytes, write_file
 
 if TYPE_CHECKING:
     from pmsmtool.firmware.drive_map import DriveMap
@@ -83,20 +83,12 @@ def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
 @_written
 def dcf_command(design: Path, into: Path | None, node_id: int, map_file: Path | None, out: Output) -> bytes:
     """Write a device configuration file (CiA 306)."""
-    from pmsmtool.errors import ConfigError
     from pmsmtool.workflow.export import dcf_file
 
     drive_map = read_map(map_file)
     if into is None and map_file is not None:
         raise click.UsageError("--map needs --into: the data sheet of that drive")
-    try:
-        base = None if into is None else into.read_bytes()
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be read: {error.strerror}",
-            where=str(into),
-            hint="give with --into an EDS or DCF that you may read",
-        ) from None
+    base = None if into is None else read_bytes(into, hint="give with --into an EDS or DCF that you may read")
     wanted = _parameters(design, drive_map, out)
     return dcf_file(wanted, drive_map=drive_map, base=base, node_id=node_id, where=str(into or "EDS"))
 

@@ -10,7 +10,8 @@ import click
 
 from pmsmtool.cli.options import FILE, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, table
-from pmsmtool.cli.output_file import save_figure, write_file
+from pmsmtool.cli.output_file import save_figure
+from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
     from pmsmtool.design.lookup_design import LookupDesign

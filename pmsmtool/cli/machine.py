@@ -9,6 +9,7 @@ import click
 
 from pmsmtool.cli.options import CURRENT, FILE, FREQUENCY, TIME, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.files import write_file
 
 _BETWEEN = click.Choice(["line-line", "phase"])
 _SOURCE = click.Choice(["datasheet", "meter", "guess"])
@@ -71,7 +72,7 @@ def new_command(path: Path, force: bool, out: Output, **given: Any) -> None:
     result = machine_from_datasheet(_sheet(given))
     text = dump_machine_file(result.machine_file)
     parse_machine(text, where=str(path))  # what the reader would refuse is not written
-    _write(path, text.encode())
+    write_file(path, text)
     rows = [(step.key, step.given, step.rule, step.result) for step in result.conversions]
     data = {
         "file": path,
@@ -151,19 +152,8 @@ def map_command(
     out.result("machine-map", data, lines)
     if path is not None:
         content = flux_map_npz(flux_map) if path.suffix.lower() == ".npz" else flux_map_csv(flux_map).encode()
-        _write(path, content)
+        write_file(path, content)
         out.note(f"wrote {path}")
     if not report.ok:
         bad = [finding.name for finding in report.findings if not finding.ok]
         raise CheckFailed(f"not good: {', '.join(bad)}", where=str(source), hint="see the options that repair")
-
-
-def _write(path: Path, content: bytes) -> None:
-    from pmsmtool.errors import ConfigError
-
-    try:
-        path.write_bytes(content)
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be written: {error.strerror}", where=str(path), hint="choose another folder"
-        ) from None

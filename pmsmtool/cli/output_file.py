@@ -2,36 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-def write_file(path: Path, content: bytes | str) -> None:
-    """Write a file in one step: a reader finds the old or the new one, never a part.
-
-    Raises
-    ------
-    ConfigError
-        It cannot be written; the old file, if there was one, is still there.
-    """
-    data = content.encode() if isinstance(content, str) else content
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        if path.exists() and not path.is_file():  # a device such as /dev/stdout cannot be replaced
-            path.write_bytes(data)
-            return
-        part.write_bytes(data)
-        os.replace(part, path)
-    except OSError as error:
-        raise _unwritable(path, error) from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def make_folder(path: Path) -> None:

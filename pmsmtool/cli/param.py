@@ -107,7 +107,7 @@ def set_command(
 @output_options
 def dump_command(bus: BusOptions, out: Output, everything: bool, path: Path | None, map_file: Path | None) -> None:
     """Print the drive's parameters as a parameter set that flash-params takes."""
-    from pmsmtool.cli.output_file import write_file
+    from pmsmtool.files import write_file
 
     with open_node(bus, read_map(map_file)) as node:
         warn_of_other_drive(node, out)

@@ -101,9 +101,7 @@ def _same_drive(run: RunDirectory, serial: int) -> None:
         )
 
 
-def _proven(
-    run: RunDirectory, out: Output, prove: Callable[[Callable[[str], None]], Stage], *, fresh: bool
-) -> Stage:
+def _proven(run: RunDirectory, out: Output, prove: Callable[[Callable[[str], None]], Stage], *, fresh: bool) -> Stage:
     """Carry the proof out and record it; a run that was made for it and saw no prediction leaves no trace."""
     import shutil
 

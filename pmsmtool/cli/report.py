@@ -8,7 +8,7 @@ import click
 
 from pmsmtool.cli.options import FILE, examples, output_options
 from pmsmtool.cli.output import Output
-from pmsmtool.cli.output_file import write_file
+from pmsmtool.files import write_file
 
 
 @click.command(

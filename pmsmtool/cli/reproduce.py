@@ -140,7 +140,8 @@ def _text(found: Reproduction) -> Iterator[str]:
 
 
 def _write(found: Reproduction, path: Path | None, figure_path: Path | None, out: Output) -> None:
-    from pmsmtool.cli.output_file import make_folder, save_figure, write_file
+    from pmsmtool.cli.output_file import make_folder, save_figure
+    from pmsmtool.files import write_file
     from pmsmtool.workflow.reproduce.drawing import csv_text, figure_of
 
     targets: list[Path] = []

@@ -176,7 +176,7 @@ def clone_command(
     MACHINE is the machine file, run directory or profile that says what is on the drive; the drive is only read.
     """
     from pmsmtool.cli.drive_access import open_node, read_map, warn_of_other_drive
-    from pmsmtool.cli.output_file import write_file
+    from pmsmtool.files import write_file
     from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
     from pmsmtool.machine.profile import machine_path
     from pmsmtool.workflow.capabilities import examine

@@ -12,8 +12,8 @@ import click
 from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import FILE, examples, options_named, output_options
 from pmsmtool.cli.output import Output, table
-from pmsmtool.cli.output_file import write_file
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design

@@ -12,6 +12,7 @@ from typing import Any
 
 from pmsmtool.design.sampled_loop import LoopMargins
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_text
 from pmsmtool.machine.key import did_you_mean
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_from_tables, machine_tables
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY
@@ -150,13 +151,7 @@ def achieved(loop: LoopMargins) -> str:
 @next_step(NEXT_STEP)
 def load_design(path: Path) -> Design:
     """Read ``design.toml``; raises ``ConfigError`` naming the file and everything that is wrong."""
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=str(path), hint="`pmsmtool tune MACHINE -o design.toml`") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read as text: {error}", where=str(path)) from None
-    return parse_design(text, where=str(path))
+    return parse_design(read_text(path, hint="`pmsmtool tune MACHINE -o design.toml`"), where=str(path))
 
 
 @next_step(NEXT_STEP)
@@ -164,8 +159,8 @@ def load_machine_or_design(path: Path) -> tuple[MachineFile, Design | None]:
     """Read a machine file or a design, told apart by their schema; a design brings its own machine."""
     text = ""
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+        text = read_text(path)
+    except ConfigError:
         pass  # the reader below says what is wrong
     if re.search(rf'^schema\s*=\s*"{re.escape(SCHEMA)}"', text, re.MULTILINE):
         design = load_design(path)

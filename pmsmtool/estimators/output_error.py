@@ -159,9 +159,7 @@ def _advance(model: AxisModel, h: float) -> tuple[float, float, float, float, fl
     return a, b, e, c, (1.0 - e - c) * conductance_ratio
 
 
-def respond(
-    model: AxisModel, command: Vector, period_s: float, start_a: float, pulses: Pulses | None = None
-) -> Vector:
+def respond(model: AxisModel, command: Vector, period_s: float, start_a: float, pulses: Pulses | None = None) -> Vector:
     """Measured current from the first modelled sample on, shape (n - first + 1,), in equilibrium at ``start_a``.
 
     Parameters

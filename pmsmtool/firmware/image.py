@@ -177,9 +177,7 @@ def unpack_image(image: bytes) -> tuple[dict[str, float], bytes]:
     """
     if len(image) < SCALAR_BYTES:
         raise ImageRefused(ImageStatus.SIZE, f"{len(image)} bytes, the scalars alone take {SCALAR_BYTES}")
-    values: dict[str, float] = dict(
-        zip((row.name for row in CATALOGUE), _SCALARS.unpack_from(image), strict=True)
-    )
+    values: dict[str, float] = dict(zip((row.name for row in CATALOGUE), _SCALARS.unpack_from(image), strict=True))
     lut = bytes(image[SCALAR_BYTES:])
     _check_ranges(values)
     _check_lut(values, lut)

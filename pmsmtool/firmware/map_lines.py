@@ -32,4 +32,4 @@ def line_of(text: str, path: tuple[str, ...]) -> int:
 
 
 def _parts(text: str) -> tuple[str, ...]:
-    return tuple(next(filter(None, found)) for found in _PART.findall(text))
+    return tuple(next(filter(None, found), "") for found in _PART.findall(text))  # "" is a key, too

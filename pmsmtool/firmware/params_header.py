@@ -20,9 +20,7 @@ from pmsmtool.params.catalogue import (
 )
 
 CORE_DIRECTORY = Path(__file__).parent / "core"
-BANNER = (
-    "/* Generated from pmsmtool/params/catalogue.py by python -m pmsmtool.firmware.params_header: do not edit. */"
-)
+BANNER = "/* Generated from pmsmtool/params/catalogue.py by python -m pmsmtool.firmware.params_header: do not edit. */"
 _EXACT_IN_BINARY32 = 1 << 24
 _LINE_LENGTH = 120
 

@@ -7,11 +7,8 @@ being told, also after the tool was killed.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,9 +16,12 @@ from typing import Any, Literal
 
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_text, write_file
 from pmsmtool.resources import user_folder
 
 NEXT_STEP = "give a file of `pmsmtool backup`, or a journal as it was written"
+
+_ELSEWHERE = "PMSMTOOL_HOME names another folder for journals"
 
 SCHEMA = "pmsmtool.snapshot/1"
 
@@ -146,10 +146,7 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
 @next_step(NEXT_STEP)
 def read_snapshot(path: Path) -> Snapshot:
     """Read a snapshot file; raises ``ConfigError`` naming it."""
-    try:
-        return parse_snapshot(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read: {error}", where=str(path)) from error
+    return parse_snapshot(read_text(path), str(path))
 
 
 def write_snapshot(path: Path, snapshot: Snapshot) -> None:
@@ -162,25 +159,9 @@ def write_snapshot(path: Path, snapshot: Snapshot) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-                file.write(snapshot.dumps())
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
-            raise
-        _sync_folder(path.parent)
     except OSError as error:
-        raise ConfigError(
-            f"the snapshot cannot be written: {error.strerror or error}",
-            where=str(path),
-            likely="the folder is read-only or full",
-            hint="PMSMTOOL_HOME names another folder for journals",
-        ) from error
+        raise ConfigError(f"cannot be made: {error.strerror}", where=str(path.parent), hint=_ELSEWHERE) from error
+    write_file(path, snapshot.dumps(), synced=True, hint=_ELSEWHERE)
 
 
 class JournalFolder:
@@ -259,13 +240,3 @@ def _entry(row: dict[str, Any]) -> Entry:
 def check_sum(body: dict[str, Any]) -> str:
     """Return the check sum of a snapshot's content."""
     return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
-
-
-def _sync_folder(folder: Path) -> None:
-    # Windows cannot open a folder; there the rename is on disk with the file.
-    with contextlib.suppress(PermissionError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -13,11 +13,13 @@ from pathlib import Path
 
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import ConfigError, SafetyRefusal
+from pmsmtool.files import read_text, write_file
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.firmware.drive_map_file import map_hash
 from pmsmtool.firmware.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
 from pmsmtool.flash.journal import JournalFolder
 
+_RIGHTS = "check your rights there and the space on the disk"
 SHOWN = 12
 """Digits of a hash that a message shows."""
 
@@ -114,22 +116,20 @@ def remember_map(drive_map: DriveMap, folder: JournalFolder) -> None:
     path = memory_of(folder)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({"map": drive_map.name, "sha256": map_hash(drive_map)}) + "\n", encoding="utf-8")
     except OSError as error:
-        raise ConfigError(
-            f"cannot be written: {error.strerror or error}",
-            where=str(path),
-            hint="check your rights there and the space on the disk",
-        ) from error
+        raise ConfigError(f"cannot be made: {error.strerror}", where=str(path.parent), hint=_RIGHTS) from error
+    text = json.dumps({"map": drive_map.name, "sha256": map_hash(drive_map)}) + "\n"
+    write_file(path, text, synced=True, hint=_RIGHTS)
 
 
 def _kept(folder: JournalFolder) -> str:
     path = memory_of(folder)
     if not path.exists():
         return ""
+    text = read_text(path)
     try:
-        return str(json.loads(path.read_text(encoding="utf-8"))["sha256"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return str(json.loads(text)["sha256"])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ConfigError(
             f"damaged: {error}", where=str(path), hint="delete it if the map in use is the right one"
         ) from error

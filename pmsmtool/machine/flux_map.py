@@ -17,6 +17,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -39,6 +40,8 @@ from pmsmtool.machine.flux_map_cells import (
 
 Array = NDArray[np.float64]
 
+NODES_MAX = 1 << 19
+"""Of each of the two tables: 724 x 724, 130 MB of cells."""
 INVERSE_NODES = (129, 129)
 """Flux nodes of the inverse table unless the map says otherwise: 4 MB of cells, built in 20 ms."""
 
@@ -212,6 +215,9 @@ def _violations(flux_map: FluxMap) -> list[str]:
         elif not axis[0] <= 0.0 <= axis[-1]:
             found.append(f"axis {name} runs from {axis[0]:g} to {axis[-1]:g} A and leaves out zero current")
     shape = (len(flux_map.i_d_a), len(flux_map.i_q_a)) if not found else None
+    for name, extent in (("the grid", shape or (0, 0)), ("inverse_nodes", flux_map.inverse_nodes)):
+        if math.prod(extent) > NODES_MAX:
+            found.append(f"{name} has {math.prod(extent)} nodes, at most {NODES_MAX} are taken")
     for name, grid in (("psi_d_wb", flux_map.psi_d_wb), ("psi_q_wb", flux_map.psi_q_wb)):
         if shape is not None and grid.shape != shape:
             found.append(f"{name} has shape {grid.shape}, the axes say {shape}")

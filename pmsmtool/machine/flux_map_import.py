@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_text
 from pmsmtool.machine.flux_map import INVERSE_NODES, FluxMap, meta_json
 from pmsmtool.machine.flux_map_cells import Kind
 from pmsmtool.machine.flux_map_repair import FluxGrid, fill_holes
@@ -162,7 +163,7 @@ def _settings(arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[Kind, tup
         nodes = (first, second)
     try:
         meta = dict(json.loads(str(arrays["meta"]))) if "meta" in arrays else {}
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RecursionError):
         raise ConfigError("meta is not JSON with names", where=where) from None
     return kind, nodes, meta
 
@@ -182,6 +183,12 @@ def _grid(i_d: Array, i_q: Array, psi_d: Array, psi_q: Array, *, own: bool, wher
         notes.append("the fluxes were indexed [i_q, i_d] and were transposed")
     axis_d, psi_d, psi_q = _rising(axis_d, psi_d, psi_q, 0, "i_d", notes)
     axis_q, psi_d, psi_q = _rising(axis_q, psi_d, psi_q, 1, "i_q", notes)
+    if (axis_d.shape, axis_q.shape) != (psi_d.shape[:1], psi_d.shape[1:]):
+        raise ConfigError(
+            f"the currents have shapes {axis_d.shape} and {axis_q.shape}, the fluxes {psi_d.shape}",
+            where=where,
+            likely="an array was cut, or is one of another map",
+        )
     return FluxGrid(*(np.ascontiguousarray(a, dtype=np.float64) for a in (axis_d, axis_q, psi_d, psi_q)))
 
 
@@ -248,13 +255,7 @@ def _collect(arrays: dict[str, NDArray[Any]], values: Mapping[str, Any]) -> None
 
 def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
     where = str(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=where, hint="check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read as text: {error}", where=where) from None
-    rows, meta = _csv_rows(text, where)
+    rows, meta = _csv_rows(read_text(path, encoding="utf-8-sig"), where)
     if not rows:
         raise ConfigError("is empty", where=where)
     columns = [re.sub(r"[^a-z]", "", cell.lower()) for cell in rows[0][1]]
@@ -277,7 +278,7 @@ def _csv_rows(text: str, where: str) -> tuple[list[tuple[int, list[str]]], dict[
         if line.startswith("# {"):
             try:
                 facts = json.loads(line[2:])
-            except json.JSONDecodeError:
+            except (ValueError, RecursionError):
                 raise ConfigError(
                     "the settings line is not JSON", where=f"{where}:{number}", likely="a truncated file"
                 ) from None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,8 @@ def fill_holes(grid: FluxGrid) -> tuple[FluxGrid, str]:
     ConfigError
         Too many holes.
     """
+    from scipy.sparse.linalg import spsolve  # start-up
+
     known = ~grid.holes
     if known.mean() < 0.5 or min(np.sum(known.any(axis=1)), np.sum(known.any(axis=0))) < 4:
         raise ConfigError(
@@ -72,26 +75,27 @@ def fill_holes(grid: FluxGrid) -> tuple[FluxGrid, str]:
     rows = _second_differences(grid.i_d_a, grid.i_q_a)
     hole = ~known.ravel()
     filled = []
+    unknown, normal = rows[:, hole], rows[:, hole].T @ rows[:, hole]
     for values in (grid.psi_d_wb, grid.psi_q_wb):
         flat = np.where(hole, 0.0, values.ravel())
-        flat[hole] = np.linalg.lstsq(rows[:, hole], -rows[:, ~hole] @ flat[~hole], rcond=None)[0]
+        flat[hole] = spsolve(normal.tocsc(), -(unknown.T @ (rows[:, ~hole] @ flat[~hole])))
         filled.append(flat.reshape(values.shape))
     text = f"holes filled by the smoothest surface; {grid.holes_text()}"
     return replace(grid, psi_d_wb=filled[0], psi_q_wb=filled[1]), text
 
 
-def _second_differences(axis_d: Array, axis_q: Array) -> Array:
-    """Matrix of all second divided differences of a grid, scaled by the mean steps, shape (m, n_d n_q)."""
+def _second_differences(axis_d: Array, axis_q: Array) -> Any:
+    """Sparse matrix of all second divided differences of a grid, scaled by the mean steps, shape (m, n_d n_q)."""
+    from scipy.sparse import diags_array, eye_array, kron, vstack  # start-up
 
-    def along(axis: Array) -> Array:
+    def along(axis: Array) -> Any:
         h = np.diff(axis) / np.mean(np.diff(axis))
-        matrix = np.zeros((len(axis) - 2, len(axis)))
-        for m in range(len(axis) - 2):
-            matrix[m, m], matrix[m, m + 2] = 2 / (h[m] * (h[m] + h[m + 1])), 2 / (h[m + 1] * (h[m] + h[m + 1]))
-            matrix[m, m + 1] = -matrix[m, m] - matrix[m, m + 2]
-        return matrix
+        before, behind = 2 / (h[:-1] * (h[:-1] + h[1:])), 2 / (h[1:] * (h[:-1] + h[1:]))
+        diagonals, shape = [before, -before - behind, behind], (len(axis) - 2, len(axis))
+        return diags_array(diagonals, offsets=[0, 1, 2], shape=shape)
 
-    return np.vstack([np.kron(along(axis_d), np.eye(len(axis_q))), np.kron(np.eye(len(axis_d)), along(axis_q))])
+    along_d, along_q = kron(along(axis_d), eye_array(len(axis_q))), kron(eye_array(len(axis_d)), along(axis_q))
+    return vstack([along_d, along_q]).tocsc()
 
 
 def symmetrise(flux_map: FluxMap) -> FluxMap:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_text
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_table import flux_map_table
 from pmsmtool.machine.key import Value
@@ -100,12 +101,7 @@ def load_machine_file(path: Path) -> MachineFile:
     ConfigError
         The file cannot be read, or everything that is wrong in it.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=str(path), hint="`pmsmtool sim list` names the profiles") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read as text: {error}", where=str(path)) from None
+    text = read_text(path, hint="`pmsmtool sim list` names the profiles")
     return parse_machine(text, where=str(path), folder=Path(path).parent)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_bytes, too_large
 
 NEXT_STEP = "save it as -v7 or older, or give the map as .csv or .npz"
 
@@ -27,14 +28,16 @@ Content = dict[str, Any]
 _HEADER_BYTES = 128
 _DEEPEST = 8
 """Structures inside structures."""
+_MOST_ELEMENTS = 10_000
+"""Beside each other; a structure has four and one for each of its fields."""
 _MATRIX, _COMPRESSED = 14, 15
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 """Data types of an element -> numpy's letter."""
 _STRUCT_CLASS = 2
 _NUMERIC_CLASSES = range(6, 16)
 _COMPLEX_FLAG = 0x0800
-_LARGEST_BYTES = 1 << 30
-"""Of one decompressed element; a flux map has some 100 kB."""
+_LARGEST_BYTES = 16 << 20
+"""Of the file, and of all it unpacks to; a flux map has some 100 kB."""
 
 
 class _Damaged(Exception):
@@ -57,25 +60,26 @@ def read_mat(path: Path) -> Content:
         Missing, another level of the format, or damaged.
     """
     where = str(path)
-    try:
-        content = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=where, hint="check the path") from None
-    except OSError as error:
-        raise ConfigError(f"cannot be read: {error.strerror or error}", where=where) from None
+    content = read_bytes(path, largest=_LARGEST_BYTES)
     if content[:8] == b"\x89HDF\r\n\x1a\n" or content[512:520] == b"\x89HDF\r\n\x1a\n":
         raise ConfigError("is a MATLAB 7.3 file", where=where, hint="save it with -v7, or export .csv")
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise ConfigError("is not a MATLAB file of level 5", where=where, hint="save it with -v7, or export .csv")
     found: Content = {}
+    room = _LARGEST_BYTES
     try:
         for element in _elements(content[_HEADER_BYTES:], order):
-            whole = _unpacked(element, order)
+            whole = _unpacked(element, order, room)
+            room -= len(whole.data)
+            if room <= 0:
+                raise too_large("the unpacked content", _LARGEST_BYTES, where)
             if whole.kind == _MATRIX:
                 name, value = _matrix(whole.data, order, 0)
                 if name and value is not None:
                     found[name] = value
+    except ConfigError:
+        raise
     except (_Damaged, ValueError, struct.error, zlib.error) as error:
         raise ConfigError(f"is not a readable .mat file ({error})", where=where, likely="truncated") from None
     return found
@@ -83,8 +87,11 @@ def read_mat(path: Path) -> Content:
 
 def _elements(data: bytes, order: str) -> Iterator[_Element]:
     """Walk through the elements; small ones hold size and type in one word."""
-    at = 0
+    at, count = 0, 0
     while at + 8 <= len(data):
+        count += 1
+        if count > _MOST_ELEMENTS:
+            raise _Damaged(f"more than {_MOST_ELEMENTS} elements in one")
         kind, size = struct.unpack_from(f"{order}II", data, at)
         if kind >> 16:
             kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
@@ -100,10 +107,13 @@ def _elements(data: bytes, order: str) -> Iterator[_Element]:
         at = after
 
 
-def _unpacked(element: _Element, order: str) -> _Element:
+def _unpacked(element: _Element, order: str, room: int) -> _Element:
+    """Return an element, of a compressed one what is in it, cut at ``room`` bytes."""
     if element.kind != _COMPRESSED:
         return element
-    data = zlib.decompressobj().decompress(element.data, _LARGEST_BYTES)
+    data = zlib.decompressobj().decompress(element.data, room + 8)
+    if len(data) > room:
+        return _Element(_COMPRESSED, data)
     inner = next(_elements(data, order), None)
     if inner is None:
         raise _Damaged("an empty compressed element")

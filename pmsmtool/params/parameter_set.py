@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_text
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY, LUT_CAPACITY_WORDS
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_text
@@ -136,10 +137,7 @@ def parse_parameter_set(text: str, where: str = "params.toml") -> ParameterSet:
 @next_step(NEXT_STEP)
 def read_parameter_set(path: Path) -> ParameterSet:
     """Read ``params.toml`` from a file; raises ``ConfigError`` naming the file."""
-    try:
-        return parse_parameter_set(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read: {error}", where=str(path)) from error
+    return parse_parameter_set(read_text(path), str(path))
 
 
 def default_set() -> ParameterSet:

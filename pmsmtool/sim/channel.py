@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_text
 from pmsmtool.firmware.drive_map_file import parse_drive_map
 from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.profile import machine_path
@@ -177,10 +178,7 @@ def _map(drive: str) -> DriveMap:
     """Return a shipped family's map, or that of a file."""
     if not drive.endswith(".toml"):
         return load_family(drive)
-    try:
-        return parse_drive_map(Path(drive).read_text(encoding="utf-8"), drive)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the drive map cannot be read: {error}", where=drive) from error
+    return parse_drive_map(read_text(Path(drive)), drive)
 
 
 CoreMaker = Callable[["MachineFile", int], "DriveCore"]

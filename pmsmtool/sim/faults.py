@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_text
 from pmsmtool.toml_file import parse_toml
 
 NEXT_STEP = "`pmsmtool sim faults` prints an example with every key"
@@ -335,8 +336,4 @@ def load_faults(path: Path) -> FaultPlan:
     ConfigError
         The file cannot be read, or everything that is wrong in it.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the faults file cannot be read: {error}", where=str(path)) from error
-    return parse_faults(text, where=str(path))
+    return parse_faults(read_text(path), where=str(path))

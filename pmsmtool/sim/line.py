@@ -111,9 +111,7 @@ class Line:
     def withdraw(self, sender: Node, can_id: int | None) -> None:
         """Take back queued frames of a node, of one identifier or all."""
         kept = [
-            item
-            for item in self._pending
-            if item[2] is not sender or (can_id is not None and item[3].can_id != can_id)
+            item for item in self._pending if item[2] is not sender or (can_id is not None and item[3].can_id != can_id)
         ]
         if len(kept) != len(self._pending):
             self._pending = kept

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError, next_step
-from pmsmtool.machine.key import Value, did_you_mean
+from pmsmtool.machine.key import Key, Value, check_table, did_you_mean
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.sim.kernel import Target
 from pmsmtool.sim.simulated_machine import ROTORS, RPM
@@ -126,7 +126,15 @@ def _violations(scenario: Scenario) -> list[str]:
 
 # ---- files ---------------------------------------------------------------------------------------------------
 
-_KEYS = ("name", "duration_s", "mode", "rotor", "start_rpm", "decimation", "schedule", "simulation")
+KEYS: tuple[Key, ...] = (
+    Key("", "name", "text", "", 0, 0, None, "what the trace is called"),
+    Key("", "duration_s", "float", "s", 1e-9, LONGEST_S, None, "simulated time", required=True),
+    Key("", "mode", "text", "", 0, 0, None, "running mode of the drive", required=True, choices=tuple(MODES)),
+    Key("", "rotor", "text", "", 0, 0, "", "how the rotor moves", choices=tuple(ROTORS)),
+    Key("", "start_rpm", "float", "rpm", -1e6, 1e6, 0.0, "mechanical speed at the start"),
+    Key("", "decimation", "int", "1", 1, 2**31, 1, "control periods per row of the trace"),
+)
+"""The values of a scenario file outside its tables ``[schedule]`` and ``[simulation]``."""
 
 
 @next_step(NEXT_STEP)
@@ -146,15 +154,9 @@ def load_scenario(path: Path) -> Scenario:
 
 
 def _from_tables(tables: dict[str, Any], where: str, stem: str) -> Scenario:
-    wrong = [f"{key}: unknown{did_you_mean(key, list(_KEYS))}" for key in tables if key not in _KEYS]
-    wrong += [f"{key} is missing" for key in ("duration_s", "mode") if key not in tables]
-    for key in ("duration_s", "start_rpm", "decimation"):
-        value = tables.get(key, 1)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            wrong.append(f"{key} is not a number")
-    for key in ("name", "mode", "rotor"):
-        if not isinstance(tables.get(key, ""), str):
-            wrong.append(f"{key} is not text")
+    wrong: list[str] = []
+    head = {name: value for name, value in tables.items() if name not in ("schedule", "simulation")}
+    values: dict[str, Any] = dict(check_table(head, KEYS, {"": where, **{k: f"{where}: {k}" for k in head}}, wrong, {}))
     profiles: dict[str, Profile] = {}
     for key in ("schedule", "simulation"):
         if not isinstance(tables.get(key, {}), dict):
@@ -164,16 +166,7 @@ def _from_tables(tables: dict[str, Any], where: str, stem: str) -> Scenario:
     if wrong:
         raise ConfigError("the scenario cannot be used", where=where, violations=wrong)
     try:
-        return Scenario(
-            name=tables.get("name", stem),
-            duration_s=float(tables["duration_s"]),
-            mode=tables["mode"],
-            schedule=profiles,
-            rotor=tables.get("rotor", ""),
-            start_rpm=float(tables.get("start_rpm", 0.0)),
-            decimation=int(tables.get("decimation", 1)),
-            simulation=tables.get("simulation", {}),
-        )
+        return Scenario(**{"name": stem, **values}, schedule=profiles, simulation=tables.get("simulation", {}))
     except ConfigError as error:
         raise ConfigError(error.what, where=where, violations=error.violations) from None
 

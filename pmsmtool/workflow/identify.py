@@ -20,6 +20,7 @@ from pmsmtool.drive.port import Drive
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.experiments.rotation import dwell_within
+from pmsmtool.files import read_text
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, MachineLimits, MachineParameters
 from pmsmtool.trace import Trace
@@ -355,7 +356,7 @@ def asked_again(
     for name in needed:
         if not (run.path / name).is_file():
             raise ConfigError(f"the run has no {name}", where=str(run.path), hint="it is not a run of identify")
-    request = parse_request((run.path / REQUEST).read_text(encoding="utf-8"), where=str(run.path / REQUEST))
+    request = parse_request(read_text(run.path / REQUEST), where=str(run.path / REQUEST))
     if tolerance is not None:
         request = replace(request, tolerance=tolerance)
     return replace(request, tolerance=calibrated_tolerance(request.tolerance, calibration))

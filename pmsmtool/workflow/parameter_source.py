@@ -9,12 +9,13 @@ from pmsmtool.design import design_file
 from pmsmtool.design.design_file import parse_design
 from pmsmtool.design.open_loops import SMALLER, smaller_gains
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_bytes, read_text
 from pmsmtool.firmware.dcf import values_of
 from pmsmtool.firmware.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.eds import parse_eds
 from pmsmtool.params import parameter_set
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
-from pmsmtool.toml_file import parse_toml, read_text
+from pmsmtool.toml_file import parse_toml
 
 NEXT_STEP = "give a parameter set, a design, a DCF, a table of `lut`, or a run directory"
 
@@ -79,10 +80,7 @@ def _file(path: Path) -> Path:
 
 
 def _from_dcf(path: Path, drive_map: DriveMap) -> ParameterSet:
-    try:
-        sheet = parse_eds(path.read_bytes(), str(path))
-    except OSError as error:
-        raise ConfigError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
+    sheet = parse_eds(read_bytes(path), str(path))
     values = values_of(sheet)
     names = (*drive_map.cells, *drive_map.tables)
     found = {name: values[drive_map.address(name)] for name in names if drive_map.address(name) in values}

@@ -28,8 +28,9 @@ from pmsmtool.errors import (
     decisive,
     exit_code_of,
 )
+from pmsmtool.files import PART
 from pmsmtool.workflow.observe import GIVEN_BACK
-from pmsmtool.workflow.run_directory import PART, RECORD, RunDirectory, Stage, Status
+from pmsmtool.workflow.run_directory import RECORD, RunDirectory, Stage, Status
 
 WRITTEN_AFTER = (RECORD, "report.html")
 """Files of a run that say what the others hold: not counted among them."""

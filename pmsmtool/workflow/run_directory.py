@@ -12,7 +12,6 @@ import datetime
 import getpass
 import hashlib
 import json
-import os
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -20,11 +19,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import ROWS_BYTES, read_text, write_file
 
 SCHEMA = "pmsmtool.run/1"
 RECORD = "run.json"
-PART = ".part"
-"""Suffix of a file that is being written: without it, all of the file is there."""
+_OTHER_FOLDER = "choose another folder with --runs DIR"
 _OTHER_RUN = "this run cannot be read or continued: give another one, or begin anew"
 
 Status = Literal["pass", "fail", "refused", "interrupted", "not available"]
@@ -153,13 +152,10 @@ class RunDirectory:
             If there is no record, or it is not one of ours.
         """
         path = self.path / RECORD
+        text = read_text(path, largest=ROWS_BYTES, hint="give a directory that identify or commission made")
         try:
-            raw = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise ConfigError(
-                "no run.json here", where=str(self.path), hint="give a directory that identify or commission made"
-            ) from None
-        except (OSError, ValueError) as error:
+            raw = json.loads(text)
+        except (ValueError, RecursionError) as error:
             raise ConfigError(f"the record cannot be read: {error}", where=str(path), hint=_OTHER_RUN) from error
         if not isinstance(raw, dict) or raw.get("schema") != SCHEMA:
             raise ConfigError(f"the record is not of schema {SCHEMA}", where=str(path), hint=_OTHER_RUN)
@@ -172,26 +168,11 @@ class RunDirectory:
     def write(self, record: RunRecord) -> None:
         """Replace the record in one step (write beside it, sync, rename)."""
         text = json.dumps(asdict(record), indent=1, allow_nan=True) + "\n"
-        part = self.path / f".{RECORD}{PART}"
-        try:
-            with part.open("w", encoding="utf-8", newline="\n") as stream:
-                stream.write(text)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(part, self.path / RECORD)
-        except OSError as error:
-            raise _unwritable(self.path, error) from error
+        write_file(self.path / RECORD, text, synced=True, hint=_OTHER_FOLDER)
 
     def save(self, name: str, content: bytes | str) -> None:
         """Put a file into the run, in one step; raises ``ConfigError`` when it cannot be written."""
-        data = content.encode() if isinstance(content, str) else content
-        target = self.path / name
-        part = target.with_name(f".{target.name}{PART}")
-        try:
-            part.write_bytes(data)
-            os.replace(part, target)
-        except OSError as error:
-            raise _unwritable(target, error) from error
+        write_file(self.path / name, content, hint=_OTHER_FOLDER)
 
     def add(self, stage: Stage) -> None:
         """Append a stage to the record, with the hashes of the files it names."""
@@ -244,5 +225,5 @@ def _unwritable(path: Path, error: OSError) -> ConfigError:
         f"cannot write: {error.strerror or error}",
         where=str(path),
         likely="a read-only or full disk",
-        hint="choose another folder with --runs DIR",
+        hint=_OTHER_FOLDER,
     )

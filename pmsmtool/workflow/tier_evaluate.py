@@ -23,6 +23,7 @@ from pmsmtool.estimators.resistance import normalised as resistance_at_reference
 from pmsmtool.estimators.rotation_offset import offset_by_turns
 from pmsmtool.estimators.supply_power import resistance_by_supply
 from pmsmtool.estimators.voltage_flux import flux_by_undriven_voltage, flux_by_voltage_limit
+from pmsmtool.files import read_text
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.trace import Trace
@@ -326,7 +327,7 @@ def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibrat
         )
     if not (run.path / FACTS).is_file():
         return replay_injection(run, tolerance, calibration)
-    facts = parse_facts((run.path / FACTS).read_text(encoding="utf-8"), where=str(run.path / FACTS))
+    facts = parse_facts(read_text(run.path / FACTS), where=str(run.path / FACTS))
     request = asked_again(run, (REQUEST, NAMEPLATE) if facts.source else (REQUEST,), tolerance, calibration)
     known = load_machine_file(run.path / NAMEPLATE) if facts.source else None
     recorded = run.read().stage("identify")

@@ -19,6 +19,7 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import Track, track
 from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, TRACKED, Known
+from pmsmtool.files import read_text
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
@@ -180,15 +181,16 @@ def dump_known(known: Known) -> str:
 
 def load_known(path: Path) -> Known:
     """Read what :func:`dump_known` wrote; raises ``ConfigError`` when it is damaged."""
+    text = read_text(path)
     try:
-        facts: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        facts: dict[str, Any] = json.loads(text)
         curve = facts.pop("curve")
         if curve is not None:
             curve = InverterCurve(np.array(curve["i_phase_a"]), np.array(curve["u_error_v"]), 0.0)
         (L_std_d, L_std_q), (share, share_std) = facts.pop("L_std"), facts.pop("error_share")
         numbers = {name: float(value) for name, value in facts.items()}
         return Known(**numbers, curve=curve, L_std=(L_std_d, L_std_q), error_share=(share, share_std))
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise ConfigError(
             f"cannot be read: {error}", where=str(path), hint="track again; or take the file from a copy of the run"
         ) from error

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import random
+import struct
+import tracemalloc
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -89,3 +92,20 @@ def test_damaged_bytes_end_in_arrays_or_in_one_error(tmp_path: Path) -> None:
         except ConfigError:
             refused += 1
     assert 0 < refused < 500
+
+
+def test_streams_that_unpack_to_gigabytes_are_cut_at_the_limit(tmp_path):
+    """Sixteen compressed elements of 16 MiB each, 256 MiB in 260 kB: the sum counts, not each."""
+    element = struct.pack("<II", 14, (16 << 20) - 8) + bytes((16 << 20) - 8)
+    packed = zlib.compress(element, 9)
+    path = tmp_path / "bomb.mat"
+    one = struct.pack("<II", 15, len(packed)) + packed
+    path.write_bytes(b"MATLAB 5.0".ljust(124) + b"\0\1IM" + one * 16)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ConfigError, match=r"more than the 16 MiB|array without"):
+            read_mat(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 64 << 20  # 4.25 GB before for a file of 1 MB

@@ -51,9 +51,7 @@ def _object_lists(rows: Sequence[ObjectRow]) -> Iterator[str]:
     indices = sorted({row.index for row in rows})
     groups = {
         "MandatoryObjects": [index for index in indices if index in _MANDATORY],
-        "OptionalObjects": [
-            index for index in indices if index not in _MANDATORY and not 0x2000 <= index < 0x6000
-        ],
+        "OptionalObjects": [index for index in indices if index not in _MANDATORY and not 0x2000 <= index < 0x6000],
         "ManufacturerObjects": [index for index in indices if 0x2000 <= index < 0x6000],
     }
     for name, members in groups.items():

@@ -389,4 +389,3 @@ class Session:
 
 
 _LIMIT_KEYS = ("max_current", "rated_current", "max_torque", "rated_torque", "max_speed")
-

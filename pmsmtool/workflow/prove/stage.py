@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, count
@@ -36,6 +35,7 @@ from pmsmtool.errors import (
     SdoAbort,
     VerifyMismatch,
 )
+from pmsmtool.files import write_file
 from pmsmtool.flash.restore import plan_download
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.trace import Trace
@@ -231,16 +231,13 @@ def commit(run: RunDirectory, prediction: Prediction) -> tuple[str, str]:
     path = run.path / folder / PREDICTION
     try:
         path.parent.mkdir(parents=True)
-        with path.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
     except OSError as error:
         raise ConfigError(
             f"the prediction cannot be committed: {error.strerror}",
             where=str(path),
             hint="check your rights there and the space on the disk",
         ) from error
+    write_file(path, data, synced=True, hint="check your rights there and the space on the disk")
     return digest, folder
 
 

@@ -1,0 +1,142 @@
+"""Reading and writing whole files: how large one may be, and how the old one stays until the new one is there.
+
+Every file that comes from outside is read here, so that its size is checked before its content is in memory. Every
+file that the tool leaves is written here: beside its place under a name that did not exist, then renamed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from pathlib import Path
+
+from pmsmtool.errors import ConfigError
+
+TEXT_BYTES = 8 << 20
+"""Largest file of keys or objects (TOML, JSON, EDS); the largest that is known, a drive's EDS, has 4 MB."""
+ROWS_BYTES = 64 << 20
+"""Largest text of rows (CSV): some 3 million numbers."""
+NUMBERS_BYTES = 128 << 20
+"""Largest archive, packed and unpacked: 16 million numbers of 8 bytes, a minute of 13 signals at 20 kHz."""
+PART = ".part"
+"""Suffix of a file that is being written: without it, all of the file is there."""
+_DEVICES = ("/dev/", "/proc/")
+# Written in place: /dev/stdout cannot be replaced, and must not be where the user could.
+
+
+def read_bytes(path: Path, *, largest: int = TEXT_BYTES, hint: str = "check the path") -> bytes:
+    """Return the bytes of a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    largest : int
+        Bytes it may have; more are not read.
+    hint : str
+        Next step where there is no such file.
+
+    Raises
+    ------
+    ConfigError
+        Missing, unreadable or too large.
+    """
+    where = str(path)
+    try:
+        with Path(path).open("rb") as stream:
+            status = os.fstat(stream.fileno())
+            regular = stat.S_ISREG(status.st_mode)
+            if regular and status.st_size > largest:
+                raise too_large("the file", largest, where)
+            content = stream.read() if regular else stream.read(largest + 1)
+    except FileNotFoundError:
+        raise ConfigError("no such file", where=where, hint=hint) from None
+    except ConfigError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
+        reason = (error.strerror if isinstance(error, OSError) else "") or error
+        raise ConfigError(f"cannot be read: {reason}", where=where, hint="give a file that you may read") from None
+    if len(content) > largest:
+        raise too_large("the file", largest, where)
+    return content
+
+
+def read_text(path: Path, *, largest: int = TEXT_BYTES, encoding: str = "utf-8", hint: str = "check the path") -> str:
+    """Return the text of a file, with one kind of line end; raises ``ConfigError`` as :func:`read_bytes`."""
+    try:
+        text = read_bytes(path, largest=largest, hint=hint).decode(encoding)
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"cannot be read as text: {error}", where=str(path), hint="give a text file in UTF-8"
+        ) from None
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+
+
+def too_large(what: str, largest: int, where: str) -> ConfigError:
+    """Return the refusal of something with more than ``largest`` bytes."""
+    return ConfigError(
+        f"{what} has more than the {largest >> 20} MiB that are read",
+        where=where,
+        likely="a damaged file, or one of another kind",
+        hint="give a smaller file: fewer samples, or fewer points",
+    )
+
+
+def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: str = "choose another folder") -> None:
+    """Write a file in one step: a reader finds the old or the new one, never a part.
+
+    Parameters
+    ----------
+    path : Path
+        The file; a link of that name is replaced, never followed. A device (``/dev/stdout``) is written in place.
+    content : bytes or str
+        All of it; text is written in UTF-8.
+    synced : bool
+        Whether it must be on the disk on return, for what has to survive a power cut.
+    hint : str
+        Next step where it cannot be written.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be written; the old file, if there was one, is still there.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    path = Path(path)
+    try:
+        if str(path).startswith(_DEVICES) or (path.exists() and not path.is_file()):
+            path.write_bytes(data)
+            return
+        # O_EXCL: a file or link that somebody left under this name is never opened.
+        part = path.with_name(f".{path.name}.{os.urandom(6).hex()}{PART}")
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+        descriptor = os.open(part, flags, 0o666)
+        try:
+            with os.fdopen(descriptor, "wb") as stream:
+                stream.write(data)
+                stream.flush()
+                if synced:
+                    os.fsync(stream.fileno())
+            os.replace(part, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                part.unlink()
+            raise
+        if synced:
+            _sync_folder(path.parent)
+    except (OSError, ValueError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else "") or error
+        raise ConfigError(
+            f"cannot be written: {reason}", where=str(path), likely="a read-only or full disk", hint=hint
+        ) from error
+
+
+def _sync_folder(folder: Path) -> None:
+    # Windows cannot open a folder; there the rename is on disk with the file.
+    with contextlib.suppress(PermissionError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

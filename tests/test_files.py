@@ -1,0 +1,77 @@
+"""Whole files: what is too large is not read; what is written is there as a whole, and no planted link is followed."""
+
+import os
+import secrets
+
+import numpy as np
+import pytest
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.files import read_bytes, read_text, write_file
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import write_trace
+from pmsmtool.workflow.run_directory import RunDirectory
+
+
+def test_a_file_larger_than_the_limit_is_refused(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_bytes(b"x" * 101)
+    assert read_bytes(path, largest=101) == b"x" * 101
+    with pytest.raises(ConfigError, match="more than"):
+        read_bytes(path, largest=100)
+
+
+def test_an_endless_device_ends_at_the_limit():
+    with pytest.raises(ConfigError, match="more than"):
+        read_text("/dev/zero")
+
+
+def test_line_ends_of_any_kind_are_one_kind(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_bytes(b"a\r\nb\rc\n")
+    assert read_text(path) == "a\nb\nc\n"
+
+
+TRACE = Trace(np.array([0.0, 1.0]), {"i_a": np.array([1.0, 2.0])}, {"i_a": "A"}, {})
+WRITERS = {
+    "trace": lambda path: write_trace(TRACE, path),
+    "file": lambda path: write_file(path, "new"),
+    "run": lambda path: RunDirectory(path.parent).save(path.name, "new"),
+}
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_a_link_planted_at_the_temporary_name_is_never_followed(tmp_path, write):
+    """Both names that were used before; the name now holds 48 random bits and is opened exclusively."""
+    victim, path = tmp_path / "victim", tmp_path / "out.csv"
+    victim.write_text("precious")
+    for name in (f"{path.name}.part", f".{path.name}.part", f".{path.name}.{os.getpid()}.part"):
+        (tmp_path / name).symlink_to(victim)
+    write(path)
+    assert victim.read_text() == "precious"
+    assert path.read_bytes() not in (b"", b"precious") and not path.is_symlink()
+
+
+def test_a_guessed_temporary_name_is_refused_not_followed(tmp_path, monkeypatch):
+    victim, path = tmp_path / "victim", tmp_path / "out"
+    victim.write_text("precious")
+    monkeypatch.setattr(os, "urandom", bytes)
+    (tmp_path / f".out.{bytes(6).hex()}.part").symlink_to(victim)
+    with pytest.raises(ConfigError, match="cannot be written"):
+        write_file(path, secrets.token_hex(4))
+    assert victim.read_text() == "precious" and not path.exists()
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "out"
+    path.write_text("old")
+    monkeypatch.setattr(os, "replace", lambda *names: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(ConfigError, match="No space left"):
+        write_file(path, "new", synced=True)
+    assert path.read_text() == "old" and [found.name for found in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_usual_rights_of_a_new_file_are_kept(tmp_path):
+    (tmp_path / "usual").touch()
+    write_file(tmp_path / "ours", b"")
+    assert (tmp_path / "ours").stat().st_mode == (tmp_path / "usual").stat().st_mode
