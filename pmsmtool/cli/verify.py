@@ -20,10 +20,11 @@ from pmsmtool.cli.output import Output
     ),
 )
 @click.argument("source", type=click.Path(path_type=Path))
+@click.option("--other-drive", is_flag=True, help="The backup is of another drive of this kind (a spare part).")
 @map_option
 @bus_options
 @output_options
-def verify_command(bus: BusOptions, out: Output, source: Path, map_file: Path | None) -> None:
+def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool, map_file: Path | None) -> None:
     """Compare the drive's bytes with a parameter set, a design, a DCF, a run or a backup; exit code 1 when they differ.
 
     Bytes only. Whether the machine behaves as designed is what `pmsmtool prove` shows.
@@ -31,7 +32,7 @@ def verify_command(bus: BusOptions, out: Output, source: Path, map_file: Path | 
     from pmsmtool.cli.flash_session import checked_identity, plan_facts
     from pmsmtool.errors import VerifyMismatch
     from pmsmtool.flash.journal import read_snapshot
-    from pmsmtool.flash.restore import plan_download, plan_restore
+    from pmsmtool.flash.restore import check_snapshot, plan_download, plan_restore
     from pmsmtool.workflow.parameter_source import load_parameters
 
     drive_map = read_map(map_file)
@@ -39,16 +40,19 @@ def verify_command(bus: BusOptions, out: Output, source: Path, map_file: Path | 
     with open_node(bus, drive_map) as node:
         identity = checked_identity(node)
         if backup:
-            plan = plan_restore(node, read_snapshot(source))
+            snapshot = read_snapshot(source)
+            check_snapshot(node.map, snapshot, identity, other_drive=other_drive)
+            plan = plan_restore(node, snapshot)
         else:
             plan = plan_download(node, load_parameters(source, drive_map))
     equal = len(plan.entries) - len(plan.changes)
     text = [f"{equal} of {len(plan.entries)} objects hold these bytes (behaviour: run `prove`)"]
     out.result("verify", {"identity": identity, "ok": not plan.changes, **plan_facts(plan)}, text)
     if plan.changes:
+        command = f"restore{' --other-drive' if other_drive else ''}" if backup else "flash-params"
         raise VerifyMismatch(
             f"{len(plan.changes)} of {len(plan.entries)} objects hold something else",
             where=f"node {identity.node}",
             differences=plan.lines()[: len(plan.changes)],
-            hint=f"`pmsmtool {'restore' if backup else 'flash-params'} {source}` brings them to the drive",
+            hint=f"`pmsmtool {command} {source}` brings them to the drive",
         )

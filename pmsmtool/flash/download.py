@@ -133,6 +133,8 @@ class Download:
             Ctrl-C, after the roll-back.
         """
         self._gate()
+        if (aside := self.folder.set_aside_damaged()) is not None:
+            self._say(f"the last journal was damaged, is kept as {aside}; what the drive held before is not known")
         if not self.has_work(store=store):
             self._close_stale(restoring)
             return self._outcome(0, starts=1, stored=self._was_stored)

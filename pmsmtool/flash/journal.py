@@ -9,24 +9,33 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import ConfigError, next_step
-from pmsmtool.files import read_text, write_file
+from pmsmtool.files import read_bytes, read_text, write_file
+from pmsmtool.machine.key import Key, check_table
 from pmsmtool.resources import user_folder
 
 NEXT_STEP = "give a file of `pmsmtool backup`, or a journal as it was written"
 
+_HASH_DIGITS = 12
+"""In the names of older journals."""
 _ELSEWHERE = "PMSMTOOL_HOME names another folder for journals"
 
 SCHEMA = "pmsmtool.snapshot/1"
 
 Kind = Literal["journal", "backup"]
 State = Literal["open", "done", "restored"]
+
+
+class DamagedSnapshot(ConfigError):
+    """The bytes are not those of a snapshot as it was written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,28 +128,38 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
     """
     try:
         document = json.loads(text)
-        check = document.pop("check")
-        if document["schema"] != SCHEMA:
-            raise ConfigError(
-                f"schema is {document['schema']!r}, expected {SCHEMA!r}",
-                where=where,
-                hint="restore it with the version of pmsmtool that wrote it",
-            )
-        if check != check_sum(document):
-            raise ConfigError(
-                "the snapshot is damaged: its check sum does not fit", where=where, likely="it was edited or cut"
-            )
-        entries = tuple(_entry(row) for row in document["entries"])
-        identity = Identity(node=document["node"], **document["identity"])
-        return Snapshot(
-            document["kind"], document["state"], identity, document["signature"], document["content"], entries
-        )
-    except ConfigError:
-        raise
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
+        raise DamagedSnapshot(f"not a snapshot: {error}", where=where, likely="it was edited or cut") from error
+    if not isinstance(document, dict):
+        raise DamagedSnapshot("not a snapshot: it holds no names", where=where)
+    schema, check = document.get("schema"), document.pop("check", None)
+    if isinstance(schema, str) and schema != SCHEMA:
         raise ConfigError(
-            f"not a snapshot: {error}", where=where, hint="give a file of `pmsmtool backup` or a journal"
-        ) from error
+            f"schema is {schema!r}, expected {SCHEMA!r}",
+            where=where,
+            hint="restore it with the version of pmsmtool that wrote it",
+        )
+    if check != check_sum(document):
+        raise DamagedSnapshot(
+            "the snapshot is damaged: its check sum does not fit", where=where, likely="it was edited or cut"
+        )
+    wrong: list[str] = []
+    identity = document.pop("identity", None)
+    rows = document.pop("entries", None)
+    head = _checked(document, _HEAD, where, wrong)
+    who = _checked(identity, _IDENTITY, f"{where}: identity", wrong)
+    found = [_entry(row, f"{where}: entries[{k}]", wrong) for k, row in enumerate(rows if type(rows) is list else ())]
+    entries = tuple(entry for entry in found if entry is not None)
+    if not entries:
+        wrong.append(f"{where}: holds no entries")
+    for what, keys in (("name", [e.name for e in entries]), ("object", [(e.index, e.sub) for e in entries])):
+        if len(set(keys)) < len(keys):
+            wrong.append(f"{where}: an entry's {what} is there twice")
+    if wrong:
+        raise DamagedSnapshot("not a snapshot", where=where, violations=wrong)
+    return Snapshot(
+        head["kind"], head["state"], Identity(node=head["node"], **who), head["signature"], head["content"], entries
+    )
 
 
 @next_step(NEXT_STEP)
@@ -164,6 +183,38 @@ def write_snapshot(path: Path, snapshot: Snapshot) -> None:
     write_file(path, snapshot.dumps(), synced=True, hint=_ELSEWHERE)
 
 
+_WORD = 0xFFFFFFFF
+
+
+def _required(name: str, meaning: str, *, choices: tuple[str, ...] = ()) -> Key:
+    return Key("", name, "text", "", 0, 0, None, meaning, required=True, choices=choices)
+
+
+def _whole(name: str, largest: int, meaning: str) -> Key:
+    return Key("", name, "int", "1", 0, largest, None, meaning, required=True)
+
+
+_HEAD: tuple[Key, ...] = (
+    _required("schema", "format of the file"),
+    _required("kind", "journal or backup", choices=get_args(Kind)),
+    _required("state", "how the download ended", choices=get_args(State)),
+    _whole("node", 127, "node of the drive"),
+    _whole("signature", _WORD, "layout of its parameter set"),
+    _required("content", "content hash of the set"),
+)
+_IDENTITY: tuple[Key, ...] = (
+    *(_whole(name, _WORD, "object 0x1018") for name in ("vendor", "product", "revision", "serial")),
+    *(_required(name, "text of the drive") for name in ("name", "hardware", "software")),
+)
+_ENTRY: tuple[Key, ...] = (
+    _required("name", "parameter, table or mark"),
+    _required("object", "index and sub-index"),
+    _required("old", "bytes the drive held"),
+    Key("", "new", "text", "", 0, 0, None, "bytes it was to hold"),
+)
+_OBJECT = re.compile(r"0x([0-9A-Fa-f]{4}):([0-9A-Fa-f]{2})")
+
+
 class JournalFolder:
     """Journals of one drive: ``journal.json`` is the last download's, older ones stand beside it.
 
@@ -181,7 +232,30 @@ class JournalFolder:
 
     def last(self) -> Snapshot | None:
         """Return the last journal, None when there never was one."""
-        return read_snapshot(self.path) if self.path.exists() else None
+        try:
+            return read_snapshot(self.path) if self.path.exists() else None
+        except DamagedSnapshot as error:
+            error.hint = (
+                f"`restore FILE` with a backup or an older journal ({self.path.with_name('journal-*.json')}); "
+                "the next flash-params sets this one aside"
+            )
+            raise
+
+    def set_aside_damaged(self) -> Path | None:
+        """Rename the last journal when it is damaged, and return its new name; its bytes stay as they are."""
+        try:
+            self.last()
+        except DamagedSnapshot:
+            digest = hashlib.sha256(read_bytes(self.path, largest=_WORD)).hexdigest()[:_HASH_DIGITS]
+            aside = self.path.with_name(f"journal-damaged-{digest}.json")
+            try:
+                os.replace(self.path, aside)
+            except OSError as error:
+                raise ConfigError(
+                    f"cannot be renamed: {error.strerror}", where=str(self.path), hint=_ELSEWHERE
+                ) from error
+            return aside
+        return None
 
     def begin(self, snapshot: Snapshot) -> Snapshot:
         """Put a new journal on disk and return it; of one still open, the old contents are kept.
@@ -203,7 +277,7 @@ class JournalFolder:
 
     def _archive(self, snapshot: Snapshot) -> None:
         text = snapshot.dumps()
-        name = hashlib.sha256(text.encode()).hexdigest()[:12]
+        name = hashlib.sha256(text.encode()).hexdigest()[:_HASH_DIGITS]
         write_snapshot(self.path.with_name(f"journal-{name}.json"), snapshot)
 
 
@@ -228,13 +302,29 @@ def _marks_last(entry: Entry) -> int:
     return names.index(entry.name) + 1 if entry.name in names else 0
 
 
-def _entry(row: dict[str, Any]) -> Entry:
-    index, sub = row["object"].split(":")
-    new = row.get("new")
-    return Entry(
-        str(row["name"]), int(index, 16), int(sub, 16), bytes.fromhex(row["old"]),
-        None if new is None else bytes.fromhex(new),
-    )  # fmt: skip
+def _checked(table: Any, keys: tuple[Key, ...], where: str, wrong: list[str]) -> dict[str, Any]:
+    """Return the values of a table, all of which a snapshot has."""
+    if not isinstance(table, dict):
+        wrong.append(f"{where} is not a table of names")
+        return {}
+    return dict(check_table(table, keys, {"": where, **{name: f"{where}: {name}" for name in table}}, wrong, {}))
+
+
+def _entry(row: Any, where: str, wrong: list[str]) -> Entry | None:
+    before = len(wrong)
+    values = _checked(row, _ENTRY, where, wrong)
+    if len(wrong) > before:
+        return None
+    at = _OBJECT.fullmatch(values["object"])
+    try:
+        old, new = (None if (text := values.get(side)) is None else bytes.fromhex(text) for side in ("old", "new"))
+    except ValueError as error:
+        at = None
+        wrong.append(f"{where}: bytes that are not hexadecimal ({error})")
+    else:
+        if at is None:
+            wrong.append(f"{where}: object = {values['object']!r} is not of the form 0x2010:02")
+    return None if at is None else Entry(values["name"], int(at[1], 16), int(at[2], 16), old or b"", new)
 
 
 def check_sum(body: dict[str, Any]) -> str:

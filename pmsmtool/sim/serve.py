@@ -34,8 +34,16 @@ _SLICE_NS = 50_000_000
 _BEHIND_S = 0.1
 # Further behind the wall clock than this, beyond an idle time, is not made up for.
 _IDLE_S = 0.1
-_RECEIVE_BYTES = 65536
+_RECEIVE_BYTES = 8192
+# Of one client in one turn, some 250 frames: whoever floods the line does not keep the others waiting.
 _BACKLOG_LIMIT = 4 << 20
+# Bytes that a client has not read; more, and it is dropped.
+_QUEUE_LIMIT = 64
+# Frames of one client that wait for the wire; before these have left, no more are taken from it.
+_ACCEPTED_AT_ONCE = 64
+_MOST_CLIENTS = 512
+_HANDSHAKE_S = 10.0
+# A client that is not in raw mode by then is dropped.
 _LONGEST_COMMAND = 200
 _GREETING, _OPENED, _RAW = range(3)
 
@@ -48,21 +56,26 @@ class Client:
     connection: socket.socket
     echo: bool = False
     stage: int = _GREETING
+    since: float = field(default_factory=time.monotonic)
     held_until: float = 0.0
     incoming: bytes = b""
     outgoing: bytearray = field(default_factory=bytearray)
+    queued: int = 0
+    awaited: int = selectors.EVENT_READ
+    here: bool = True
 
     # ---- endpoint of the line ------------------------------------------------------------------
 
     def hear(self, frame: Frame, own: bool) -> None:
         """Queue a frame for the program; remote frames have no place in the protocol."""
-        if frame.flags & REMOTE:
+        if frame.flags & REMOTE or len(self.outgoing) > _BACKLOG_LIMIT:
             return
         identifier = f"{frame.can_id:08X}" if frame.flags & EXTENDED else f"{frame.can_id:03X}"
         self.outgoing += f"< frame {identifier} {self.server.stamp():.6f} {frame.data.hex()} >".encode("ascii")
 
     def transmitted(self, acknowledged: bool) -> None:
-        """Nothing waits for it: the program has gone on."""
+        """Make room for the program's next frame."""
+        self.queued -= 1
 
     def pull(self, recv_raises: bool) -> None:
         """Fault injection: the adapter is pulled, the connection ends."""
@@ -71,14 +84,19 @@ class Client:
     # ---- the program's commands ----------------------------------------------------------------
 
     def take(self, data: bytes) -> None:
-        """Take bytes of the program and obey the complete commands in them."""
+        """Take bytes of the program and obey the complete commands in them, as far as its frames find room."""
         self.incoming += data
-        while (end := self.incoming.find(b">")) >= 0:
+        while self.here and not self.full and (end := self.incoming.find(b">")) >= 0:
             words = self.incoming[:end].decode("ascii", "replace").strip().removeprefix("<").split()
             self.incoming = self.incoming[end + 1 :]
             self._obey(words)
-        if len(self.incoming) > _LONGEST_COMMAND:
+        if len(self.incoming) > _LONGEST_COMMAND and not self.full:
             self.server.drop(self)
+
+    @property
+    def full(self) -> bool:
+        """Whether frames of the program must leave before more are taken."""
+        return self.queued >= _QUEUE_LIMIT
 
     def _obey(self, words: Sequence[str]) -> None:
         if words[:1] == ["send"] and self.stage == _RAW:
@@ -89,6 +107,8 @@ class Client:
         elif words == ["rawmode"] and self.stage == _OPENED:
             self.outgoing += b"< ok >"
             self.server.flush(self)
+            if not self.here:
+                return  # it has vanished; attached now, it would hear every frame for ever
             self.stage = _RAW
             self.held_until = time.monotonic() + HOLD_S
             self.server.line.attach(self)
@@ -107,6 +127,7 @@ class Client:
         except (ValueError, IndexError):
             self.outgoing += b"< error could not parse send command >"
             return
+        self.queued += 1
         self.server.line.queue(self, Frame(can_id, data, EXTENDED if extended else 0))
 
 
@@ -143,7 +164,7 @@ class SocketcandServer:
         self._say = say
         self._speed = speed
         self._selector = selectors.DefaultSelector()
-        self._clients: list[Client] = []
+        self._clients: dict[Client, None] = {}
         self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
             if hasattr(socket, "SO_EXCLUSIVEADDRUSE"):  # Windows: SO_REUSEADDR would let two servers share a port
@@ -151,7 +172,7 @@ class SocketcandServer:
             else:
                 self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._listener.bind((host, port))
-            self._listener.listen()
+            self._listener.listen(_ACCEPTED_AT_ONCE)
         except OSError as error:
             self._listener.close()
             raise BusError(
@@ -183,10 +204,21 @@ class SocketcandServer:
                 for key, events in self._selector.select(idle_s):
                     self._ready(key.data, events)
                 self._run(idle_s)
-                for client in tuple(self._clients):
-                    self.flush(client)
+                self._go_on()
         finally:
             self.close()
+
+    def _go_on(self) -> None:
+        """Take what clients had to wait with, send what waits for them, drop those that are not there."""
+        latest = time.monotonic() - _HANDSHAKE_S
+        for client in tuple(self._clients):
+            if client.incoming and not client.full:
+                client.take(b"")
+            if client.outgoing:
+                self.flush(client)
+            self._await(client)
+            if len(client.outgoing) > _BACKLOG_LIMIT or (client.stage != _RAW and client.since < latest):
+                self.drop(client)
 
     def close(self) -> None:
         """Drop all clients and stop listening."""
@@ -222,6 +254,8 @@ class SocketcandServer:
             limits.append((next_ns - self._now_ns()) / NS / self._speed)
         if self._now_ns() - self.line.clock.now_ns > _SLICE_NS:
             limits.append(0.0)
+        if any(client.full for client in self._clients):
+            limits.append(0.0)
         limits += [client.held_until - wall for client in self._clients if client.outgoing and client.held_until > wall]
         return max(0.0, min(limits))
 
@@ -229,7 +263,9 @@ class SocketcandServer:
 
     def _ready(self, client: Client | None, events: int) -> None:
         if client is None:
-            self._accept()
+            for _ in range(_ACCEPTED_AT_ONCE):
+                if not self._accept():
+                    return
             return
         if events & selectors.EVENT_READ:
             try:
@@ -243,41 +279,57 @@ class SocketcandServer:
             else:
                 self.drop(client)
 
-    def _accept(self) -> None:
+    def _accept(self) -> bool:
+        """Take one connection; return whether there was one."""
         try:
             connection, _ = self._listener.accept()
         except OSError:
-            return
+            return False
+        if len(self._clients) >= _MOST_CLIENTS:
+            connection.close()
+            return True
         connection.setblocking(False)
         with contextlib.suppress(OSError):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client = Client(self, connection)
-        self._clients.append(client)
+        self._clients[client] = None
         self._selector.register(connection, selectors.EVENT_READ, client)
         client.outgoing += b"< hi >"
         self.flush(client)
+        return True
 
     def flush(self, client: Client) -> None:
         """Send what waits for a client, as much as it takes."""
-        if client not in self._clients or client.held_until > time.monotonic():
+        if not client.here or client.held_until > time.monotonic():
             return
         try:
             while client.outgoing:
                 sent = client.connection.send(client.outgoing)
                 del client.outgoing[:sent]
         except BlockingIOError:
-            if len(client.outgoing) > _BACKLOG_LIMIT:
-                self.drop(client)
+            pass
         except OSError:
             self.drop(client)
-        if client in self._clients:
-            wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.outgoing else 0)
-            self._selector.modify(client.connection, wanted, client)
+
+    def _await(self, client: Client) -> None:
+        """Wait for what can happen next with a client: a full one is not read."""
+        sending = client.outgoing and client.held_until <= time.monotonic()
+        wanted = (0 if client.full else selectors.EVENT_READ) | (selectors.EVENT_WRITE if sending else 0)
+        if client.here and wanted != client.awaited:
+            if client.awaited == 0:
+                self._selector.register(client.connection, wanted, client)
+            elif wanted == 0:
+                self._selector.unregister(client.connection)
+            else:
+                self._selector.modify(client.connection, wanted, client)
+            client.awaited = wanted
 
     def drop(self, client: Client) -> None:
         """Close a client's connection."""
-        if client in self._clients:
-            self._clients.remove(client)
+        if client.here:
+            client.here = False
+            del self._clients[client]
             self.line.detach(client)
-            self._selector.unregister(client.connection)
+            if client.awaited:
+                self._selector.unregister(client.connection)
             client.connection.close()
