@@ -45,9 +45,14 @@ static void prepare_speed_estimate(pmsm_drive *drive)
 
 uint32_t pmsm_drive_load(pmsm_drive *drive, const uint8_t *image, uint32_t size)
 {
+    const uint32_t reversed = drive->params.encoder_reversed;
     const uint32_t status = pmsm_image_load(image, size, &drive->params, drive->lut, PMSM_LUT_WORDS);
     if (status == PMSM_IMAGE_OK) {
         pmsm_parameters_changed(&drive->control);
+        if (drive->params.encoder_reversed != reversed) { /* the same rotation, counted the other way */
+            drive->pll_theta = -drive->pll_theta;
+            drive->pll_omega = -drive->pll_omega;
+        }
         prepare_speed_estimate(drive);
     }
     return status;
@@ -65,10 +70,12 @@ static void estimate_speed(pmsm_drive *drive)
     const double T_s = 1e-9 * (double)drive->params.inverter_T_s_ns;
     const double theta = (drive->params.encoder_reversed != 0u) ? -drive->sensors.theta_M : drive->sensors.theta_M;
     if (!isfinite(theta)) {
-        return; /* trips; the estimate must survive it */
+        drive->pll_follows = 0u; /* trips; the speed estimate must survive it, the rotor turns on unseen */
+        return;
     }
-    if (drive->period_count == 0u) {
+    if (drive->pll_follows == 0u) {
         drive->pll_theta = theta - drive->pll_omega * T_s;
+        drive->pll_follows = 1u;
     }
     const double predicted = drive->pll_theta + drive->pll_omega * T_s;
     const double error = theta - predicted;

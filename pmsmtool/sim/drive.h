@@ -111,6 +111,7 @@ typedef struct pmsm_drive {
     uint32_t excitation_started;        /* 1 in the period in which an excitation started */
     uint32_t trip_last;
     double average_first[PMSM_TRACE_CHANNELS];
+    uint32_t pll_follows;               /* 0: the next angle starts the speed estimate's, without a jump */
 } pmsm_drive;
 
 /* A command that has been carried out; 0 stop, 1 arm (or start an average), 2 start (or force) are new ones. */

@@ -70,7 +70,10 @@ class Settings:
 
 @next_step(NEXT_STEP)
 def settings_of(machine_file: MachineFile) -> Settings:
-    """Return the simulation settings; the encoder's kind falls back to ``[encoder]``.
+    """Return the simulation settings as the drive meets them; the encoder's kind falls back to ``[encoder]``.
+
+    Two swapped leads are resolved here. They mirror the machine: with its shaft counted along the phase order of the
+    drive, it is the same machine with an encoder that counts the other way and has the opposite offset and angle.
 
     Raises
     ------
@@ -82,6 +85,10 @@ def settings_of(machine_file: MachineFile) -> Settings:
         values["encoder_reversed"] = machine_file.encoder.direction < 0
     if "encoder_bits" not in machine_file.simulation and machine_file.encoder.bits is not None:
         values["encoder_bits"] = machine_file.encoder.bits
+    if values["leads_swapped"]:
+        values["encoder_reversed"] = not values["encoder_reversed"]
+        for name in ("encoder_offset_rad", "theta_M_start_rad"):
+            values[name] = -float(values.get(name, 0.0))  # type: ignore[arg-type]
     if values["drive_fault"] not in DRIVE_FAULTS:
         raise ConfigError(
             f"there is no drive fault {values['drive_fault']!r}",

@@ -132,6 +132,41 @@ def test_speed_and_angle_follow_the_encoder_without_a_lag(speed: float) -> None:
     assert bench.drive.pll_omega == pytest.approx(-speed, rel=1e-4, abs=1e-8)
 
 
+@pytest.mark.parametrize("bandwidth", [600.0, 1e5])
+@pytest.mark.parametrize("speed", [0.0, 65.0])
+def test_no_parameter_makes_the_speed_estimate_jump(speed: float, bandwidth: float) -> None:
+    """Far from zero, the angle jumps by twice of it with the sign; offset, bandwidth, reset move nothing either."""
+    bench = Bench(speed, encoder__pll_bandwidth_rad_s=bandwidth)
+    bench.drive.enabled = 0
+    bench.theta_M = 5000.0
+    bench.run(20)
+    for change, sign in (
+        ({"encoder__reversed": 1}, -1.0),
+        ({"encoder__offset_rad": 3.0}, -1.0),
+        ({"encoder__pll_bandwidth_rad_s": 0.5 * bandwidth}, -1.0),
+        ({"encoder__reversed": 0, "encoder__offset_rad": 0.0}, 1.0),
+    ):
+        bench.load(**change)
+        for _ in range(20):
+            bench.run()
+            assert bench.drive.pll_omega == pytest.approx(sign * speed, rel=1e-6, abs=1e-6)
+    assert bench.drive.trip == 0
+
+
+def test_the_speed_estimate_survives_a_gap_of_the_encoder() -> None:
+    bench = Bench(65.0)
+    bench.drive.enabled = 0
+    bench.run(20)
+    seen, bench.theta_M = bench.theta_M, math.nan
+    bench.run(2)
+    bench.theta_M = seen + 50.0
+    bench.run()
+    assert bench.drive.trip == 0x5530 and bench.drive.pll_omega == pytest.approx(65.0)
+    bench.library.pmsm_drive_reset_fault(ctypes.byref(bench.drive))
+    bench.run(20)
+    assert bench.drive.trip == 0
+
+
 def test_window_average_and_its_spread() -> None:
     bench = Bench(30.0)
     bench.drive.reference.i_q_ref = 5.0

@@ -78,6 +78,7 @@ SWITCHES: dict[str, tuple[Value, Mapping[str, Value]]] = {
     "encoder_bits": (10, {}),
     "encoder_offset_rad": (0.3, {}),
     "encoder_reversed": (True, {}),
+    "leads_swapped": (True, {}),
     "encoder_once_rad": (0.01, {}),
     "encoder_twice_rad": (0.01, {}),
     "encoder_latency_s": (2e-5, {}),

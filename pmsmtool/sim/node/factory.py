@@ -13,6 +13,7 @@ from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.sim.node.family import Face, Reduced
 from pmsmtool.sim.node.node import Settings
 from pmsmtool.sim.node.parameter_set import ParameterImage
+from pmsmtool.sim.simulated_machine import settings_of
 
 if TYPE_CHECKING:
     from pmsmtool.machine.machine_file import MachineFile
@@ -67,18 +68,15 @@ def set_up_values(machine_file: MachineFile) -> dict[str, float]:
     From the simulated machine itself: a drive of another family, or without current set-points, cannot be given this
     through its own dictionary.
     """
-    truth = machine_file.simulation_settings()
-
-    def number(key: str) -> float:
-        return float(truth[key])  # type: ignore[arg-type]
-
+    truth = settings_of(machine_file)
+    number = truth.number
     alpha = SET_UP_BANDWIDTH / machine_file.inverter.T_s
     values = {
         "motor.pole_pairs": number("pole_pairs"),
         "motor.R_s_ohm": number("R_s_ohm"),
         "motor.psi_f_wb": number("psi_f_wb"),
         "encoder.offset_rad": number("encoder_offset_rad"),
-        "encoder.reversed": float(bool(truth["encoder_reversed"])),
+        "encoder.reversed": float(truth.flag("encoder_reversed")),
     }
     for axis in "dq":
         inductance = number(f"L_{axis}_h")
