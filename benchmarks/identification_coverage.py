@@ -45,7 +45,7 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, statistical_half_width, total_half_width
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.sim.simulated_machine import Settings, device_slope_ohm
+from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, evaluate
 from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of
@@ -68,7 +68,7 @@ DRAWN_SPREAD = 0.10
 
 def truth_of(drive: MachineFile, evaluation: Evaluation) -> dict[str, float]:
     """Return what the estimates should be: of a saturated machine the incremental values at the printed bias."""
-    values = Settings(drive.simulation_settings())
+    values = settings_of(drive)
     truth = {name: values.number(name) for name in ("L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")}
     truth["R_s_ohm"] = true_loop_resistance(drive)
     devices = device_slope_ohm(values)
@@ -139,7 +139,7 @@ def threshold_share(row: Mapping[str, Any]) -> float:
 
 def threshold_difference_v(drive: MachineFile) -> float:
     """Return V_diode - V_switch of a drive (V)."""
-    values = Settings(drive.simulation_settings())
+    values = settings_of(drive)
     switch = values.number("device_drop_v")
     return values.number("diode_drop_v") - switch if switch > 0.0 else 0.0
 

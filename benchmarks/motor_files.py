@@ -22,8 +22,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from benchmarks.commissioning import prepared
 from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -35,14 +33,12 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow.capabilities import examine
 from pmsmtool.workflow.commission import Commissioning, Silent, begin_run
 from pmsmtool.workflow.prove.stage import ProofRequest
-from pmsmtool.workflow.random_drives import draw_drive
+from pmsmtool.workflow.random_drives import data_sheet, draw_drive
 from pmsmtool.workflow.report_page import verdict
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 from pmsmtool.workflow.tier_stages import open_tier_drive
 
 LEVELS = {"full": "", "inject": "&tier=inject", "recorder": "&tier=recorder", "standard": "&drive=cia402"}
-CATALOGUE_SHARE = {"R_s_ohm": 0.10, "L_d_h": 0.30, "L_q_h": 0.30, "psi_f_wb": 0.10, "J_kgm2": 0.10}
-T_RANGE_C = (5.0, 90.0)
 ERRORS: dict[str, tuple[tuple[str, ...], float]] = {
     "pole pairs x2": (("pole_pairs",), 2.0),
     "pole pairs /2": (("pole_pairs",), 0.5),
@@ -78,19 +74,8 @@ class Outcome:
 
 
 def drive_of(seed: int) -> MachineFile:
-    """Return a drive of the population at a random temperature."""
-    drive = draw_drive(seed, ("ideal", "timing", "gains")[seed % 3])
-    temperature = float(np.random.default_rng([20260116, seed]).uniform(*T_RANGE_C))
-    heat = dict.fromkeys(("T_winding_c", "T_magnet_c", "T_ambient_c"), temperature)
-    return replace(drive, simulation={**drive.simulation, **heat})
-
-
-def catalogue_file(drive: MachineFile, seed: int) -> MachineFile:
-    """Return what a right catalogue states of a drive."""
-    rng = np.random.default_rng([20260117, seed])
-    machine = drive.machine
-    off = {key: getattr(machine, key) * (1.0 + share * rng.uniform(-1, 1)) for key, share in CATALOGUE_SHARE.items()}
-    return replace(drive, machine=replace(machine, **off), simulation={})
+    """Return a drive of the population."""
+    return draw_drive(seed, ("ideal", "timing", "gains")[seed % 3])
 
 
 def wrong_file(file: MachineFile, error: str) -> MachineFile:
@@ -137,7 +122,7 @@ def commission_one(job: tuple[str, str, int, bool]) -> Outcome:
     """Commission one drive with one file."""
     error, level, seed, to_the_end = job
     drive_file = drive_of(seed)
-    file = catalogue_file(drive_file, seed)
+    file = data_sheet(drive_file, seed)
     if error != RIGHT:
         file = wrong_file(file, error)
     with prepared():

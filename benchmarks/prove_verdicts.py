@@ -41,7 +41,7 @@ from pmsmtool.flash.restore import marks_of, plan_download
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.sim.drive_kernel import KernelCore
 from pmsmtool.sim.kernel import Params
-from pmsmtool.sim.simulated_machine import Settings
+from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.workflow.prove import stage as proving
 from pmsmtool.workflow.prove.simulated import predict_proof
 from pmsmtool.workflow.random_drives import draw_drive
@@ -97,7 +97,7 @@ KINDS: dict[str, Change] = {
 
 def declared(drive: MachineFile) -> MachineFile:
     """Return what identification would say of a drive: the truth, off by a draw from its own intervals."""
-    true, settings = drive.machine, Settings(drive.simulation_settings())
+    true, settings = drive.machine, settings_of(drive)
     rng = np.random.default_rng([20261121, int(settings.number("seed"))])
     values: dict[str, Any] = {}
     for name, (std, systematic) in DECLARED.items():
@@ -115,7 +115,11 @@ def declared(drive: MachineFile) -> MachineFile:
         drive,
         machine=replace(true, **values, B_nms=None, tau_c_nm=float(rng.uniform(0.7, 1.3)) * (true.tau_c_nm or 0.0)),
         inverter=replace(drive.inverter, V_dead_v=plateau, i_knee_apk=max(knee, 1e-3)),
-        encoder=replace(drive.encoder, offset_rad=math.remainder(offset, 2.0 * math.pi)),
+        encoder=replace(
+            drive.encoder,
+            offset_rad=math.remainder(offset, 2.0 * math.pi),
+            direction=-1 if settings.flag("encoder_reversed") else 1,
+        ),
         std={**{n: s * values[n] for n, (s, _) in DECLARED.items()}, "offset_rad": OFFSET_STD_RAD},
         systematic={n: s * values[n] for n, (_, s) in DECLARED.items()},
         conditions={"noise_apk": noise},

@@ -44,7 +44,7 @@ from pmsmtool.experiments.supply_levels import ReadSupply
 from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.sim.simulated_machine import Settings, device_slope_ohm
+from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import evaluate
 from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of
@@ -70,7 +70,7 @@ AT_REFERENCE = {"inject": OF_THE_MACHINE, "recorder": ("R_s_ohm", "psi_f_wb")}
 
 def truth_of(drive: MachineFile) -> dict[str, float]:
     """Return what the estimates should be, at the temperature of the run."""
-    values = Settings(drive.simulation_settings())
+    values = settings_of(drive)
     devices = device_slope_ohm(values)
     rise, magnets = (values.number(f"T_{part}_c") - drive.machine.T_ref_c for part in ("winding", "magnet"))
     psi = values.number("psi_f_wb") * (1.0 + drive.machine.alpha_psi_per_k * magnets)
@@ -141,7 +141,7 @@ def judged(tier: str, seed: int, speed: float, *, given: bool = True) -> dict[st
     """Identify one drive; returns errors and half widths, or the refusal."""
     drive = draw_drive(seed)
     truth = truth_of(drive)
-    values = Settings(drive.simulation_settings())
+    values = settings_of(drive)
     truth |= {name: values.number(name) for name in AT_REFERENCE.get(tier, ()) if not name.endswith("_rad")}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.toml"

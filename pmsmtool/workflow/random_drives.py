@@ -2,7 +2,8 @@
 
 Two draws. :func:`draw_drive` takes a whole drive from the population below; :func:`draw_around` varies a given
 machine file. The ranges are fixed here, before any run, and every drive follows from its seed alone. What is drawn
-goes into ``[simulation]`` (the truth) and into the nameplate; the tool sees the nameplate only.
+goes into ``[simulation]`` (the truth) and into the nameplate; the tool sees the nameplate only. Half of the encoders
+count against the phase order, half of the machines have two leads swapped, winding and magnets have 5 to 90 degC.
 """
 
 from __future__ import annotations
@@ -65,6 +66,10 @@ ENCODER_BITS = (12, 19)
 ENCODER_OFFSET_RAD = math.radians(180.0)
 LEG_MISMATCH_SHARE = 0.05
 ACCELERATION_TIME_S = (0.05, 0.4)
+T_RANGE_C = (5.0, 90.0)
+"""Winding and magnets when the tool meets them, alike and not known to it."""
+CATALOGUE_SHARE = {"R_s_ohm": 0.10, "L_d_h": 0.30, "L_q_h": 0.30, "psi_f_wb": 0.10, "J_kgm2": 0.10}
+"""Tolerances that a data sheet states."""
 SENSOR_LAG_S = (0.0, 20e-6)
 SAMPLING_SHIFT_SHARE = (0.0, 0.10)
 
@@ -162,7 +167,7 @@ def _with_truth(
     full_scale = max(float(rng.uniform(*ADC_SPAN)) * I_nom, 1.4 * (machine.I_max_apk or I_nom))
     step = 2.0 * full_scale / 2**12
     slope = float(rng.uniform(*kind.slope_drop_v)) / I_nom
-    temperature = float(rng.uniform(15.0, 60.0))
+    temperature = float(rng.uniform(*T_RANGE_C))
     truth: dict[str, Value] = {
         "inverter_model": "switched",
         "device_drop_v": float(rng.uniform(*kind.drop_v)),
@@ -197,7 +202,18 @@ def _with_truth(
         for phase in "abc":
             truth[f"sensor_gain_{phase}"] = common
         truth["U_dc_gain"] = 1.0 + GAIN_STD * float(rng.standard_normal())
+    truth["encoder_reversed"], truth["leads_swapped"] = (bool(rng.random() < 0.5) for _ in range(2))
     return replace(drive, simulation={**drive.simulation, **truth})
+
+
+def data_sheet(drive: MachineFile, seed: int) -> MachineFile:
+    """Return what a right data sheet states of a drive: its ratings, and its machine within :data:`CATALOGUE_SHARE`."""
+    rng = np.random.default_rng([20260117, seed])
+    values = {
+        key: (getattr(drive.machine, key) or 0.0) * (1.0 + share * rng.uniform(-1.0, 1.0))
+        for key, share in CATALOGUE_SHARE.items()
+    }
+    return replace(drive, machine=replace(drive.machine, **values), simulation={})
 
 
 def true_loop_resistance(drive: MachineFile) -> float:

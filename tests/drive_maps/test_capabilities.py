@@ -26,6 +26,7 @@ from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.resources import data_folder
+from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.workflow.capabilities import (
     EXPECTED,
     FEATURES,
@@ -257,7 +258,7 @@ def test_pole_pairs_and_offset_of_a_random_drive_by_cia402(tmp_path: Path) -> No
         found = identify_standard(standard, envelope_for(drive)).estimates
         assert not simulated.power.state.energised
         standard.close()
-    truth = float(drive.simulation["encoder_offset_rad"])  # type: ignore[arg-type]
+    truth = settings_of(drive).number("encoder_offset_rad")
     assert found["pole_pairs"].value == drive.machine.pole_pairs
     # issue: 2 deg; the program benchmarks.tier_intervals measured 0.2 deg at most over 40 drives
     assert abs(math.degrees(math.remainder(found["offset_rad"].value - truth, 2.0 * math.pi))) < 0.5

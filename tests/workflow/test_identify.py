@@ -21,6 +21,7 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace_file import read_trace
 from pmsmtool.workflow.evaluate import tolerance_on
 from pmsmtool.workflow.identify import (
@@ -144,8 +145,7 @@ def test_a_reluctance_machine_follows_a_smaller_and_slower_vector(seed: int, tmp
         drive.close()
     found = load_machine_file(run.path / MACHINE)
     assert found.machine.pole_pairs == base.machine.pole_pairs
-    offset = drive_file.simulation_settings()["encoder_offset_rad"]
-    assert isinstance(offset, float)
+    offset = settings_of(drive_file).number("encoder_offset_rad")
     off = math.remainder(found.estimates["offset_rad"].value - offset, 2.0 * math.pi)
     assert abs(off) < COARSE_RAD, math.degrees(off)
 

@@ -17,6 +17,7 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.experiments.vector_lead import FIRST_SHARE, LEAD_S, lead_onto_vector
 from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace import Trace
 from pmsmtool.workflow import tier_identify
 from pmsmtool.workflow.random_drives import draw_drive
@@ -112,7 +113,7 @@ def offset_error_deg(drive: MachineFile, traces: dict[str, Trace]) -> float:
     """Return the error of the offset; the pole pairs are asserted."""
     found = tier_result(traces, tier_identify.TierFacts("standard")).estimates
     assert found["pole_pairs"].value == drive.machine.pole_pairs
-    truth = float(drive.simulation["encoder_offset_rad"])  # type: ignore[arg-type]
+    truth = settings_of(drive).number("encoder_offset_rad")
     return abs(math.degrees(math.remainder(found["offset_rad"].value - truth, 2.0 * math.pi)))
 
 

@@ -1,0 +1,129 @@
+"""Run the whole command `pmsmtool commission FILE --yes` on random drives and judge verdicts and values.
+
+    python -m benchmarks.whole_commission --drives 200 --first 120000 --results results.jsonl
+
+Drives follow from their seeds (``workflow/random_drives.py``: switched inverter, half of the encoders reversed, half of
+the machines with two leads swapped, 5 to 90 degC, three kinds of sensors in turn). FILE is a data sheet within its
+tolerances, and the drive's memory holds the set of another motor. The command runs in the process, over frames, with
+its default options. Every result is appended to the file as it comes; a seed in the file is not run again, and
+``--drives 0`` only sums up. A false alarm: a right file that the comparison of the values contradicts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import statistics
+import struct
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks.commissioning import QUANTITIES, commanded, errors_of, prepared
+from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.params.catalogue import layout_signature
+from pmsmtool.sim.node.factory import factory_values, set_up_values
+from pmsmtool.sim.node.memory import FileStorage, Memory
+from pmsmtool.sim.node.parameter_set import ParameterImage
+from pmsmtool.sim.node.store import IMAGE_KEY, SIGNATURE_KEY, encode
+from pmsmtool.workflow.random_drives import data_sheet, draw_drive
+from pmsmtool.workflow.report_page import verdict
+from pmsmtool.workflow.run_directory import RunDirectory
+
+BLOCKS = ("ideal", "timing", "gains")
+OTHER = 1_000_000
+"""Seed of the motor in a drive's memory, above the drive's."""
+PARTIAL = 10
+LINES = 12
+"""Lines of what a failed command told that are kept."""
+
+
+def fill_memory(path: Path, drive: MachineFile, other: MachineFile) -> None:
+    """Write the memory of a drive that served another motor: its data, the sign of its encoder, its gains."""
+    on_this_inverter = replace(other, inverter=drive.inverter)
+    image = ParameterImage.of_values(factory_values(drive) | set_up_values(on_this_inverter))
+    content = {IMAGE_KEY: image.pack(), SIGNATURE_KEY: struct.pack("<I", layout_signature())}
+    for _ in Memory(FileStorage(path)).store(encode(content)):
+        pass
+
+
+def commission_one(seed: int) -> dict[str, Any]:
+    """Commission one drive and return what is judged."""
+    drive = draw_drive(seed, BLOCKS[seed % len(BLOCKS)])
+    start = time.process_time()
+    with prepared():
+        Path("drive.toml").write_text(dump_machine_file(drive), encoding="utf-8")
+        Path("sheet.toml").write_text(dump_machine_file(data_sheet(drive, seed)), encoding="utf-8")
+        fill_memory(Path("held.nv"), drive, draw_drive(seed + OTHER))
+        code, told = commanded("commission", "sheet.toml", "-i", "pmsmsim", "-c", "drive.toml?nv=held.nv", "--yes")
+        result: dict[str, Any] = {"seed": seed, "code": code, "word": "", "stage": "", "values": {}, "alarms": []}
+        for folder in Path("runs").glob("*/"):
+            stages = RunDirectory(folder).read().stages
+            failed = [s.name for s in stages if s.status not in ("pass", "not available")]
+            result |= {"word": verdict(folder).word, "stage": failed[-1] if failed else ""}
+            result["alarms"] = [r["name"] for s in stages for r in s.comparison if r["verdict"] == "contradicts"]
+            errors = errors_of(drive, folder)
+            found = load_machine_file(folder / "machine.toml").estimates if errors else {}
+            result["values"] = {
+                name: (error, total_half_width(found[name]) / found[name].value) for name, error in errors.items()
+            }
+        result["told"] = [] if code == 0 else told.strip().splitlines()[-LINES:]
+    return {**result, "seconds": time.process_time() - start}
+
+
+def ended(result: dict[str, Any]) -> str:
+    """Return PASS, PARTIAL or FAIL."""
+    return {0: "PASS", PARTIAL: "PARTIAL"}.get(result["code"], "FAIL")
+
+
+def summary(results: Sequence[dict[str, Any]]) -> list[str]:
+    """Return counts, failures, and errors against their total intervals."""
+    count = Counter(map(ended, results))
+    lines = [f"{len(results)} drives: " + ", ".join(f"{count[word]} {word}" for word in ("PASS", "PARTIAL", "FAIL"))]
+    lines.append(f"gate false alarms: {sum(bool(result['alarms']) for result in results)}")
+    lines.append(f"{'quantity':10} {'values':>6} {'median half width %':>19} {'beyond 1x':>9} {'2x':>4} {'3x':>4}")
+    for name in QUANTITIES:
+        pairs = [result["values"][name] for result in results if name in result["values"]]
+        if pairs:
+            ratios = [abs(error) / half for error, half in pairs]
+            beyond = [sum(ratio > times for ratio in ratios) for times in (1, 2, 3)]
+            width = 100.0 * statistics.median(half for _, half in pairs)
+            lines.append(f"{name:10} {len(pairs):6d} {width:19.2f} {beyond[0]:9d} {beyond[1]:4d} {beyond[2]:4d}")
+    for result in sorted(results, key=lambda each: str(each["stage"])):
+        if result["code"]:
+            lines.append(f"{result['seed']} {ended(result)} exit {result['code']}, {result['stage'] or 'no stage'}:")
+            lines += [f"    {line}" for line in result["told"]]
+    return lines
+
+
+def read_results(path: Path) -> list[dict[str, Any]]:
+    """Return the results of a file; one line that was cut off is left out."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("}")]
+
+
+def main() -> None:
+    """Run the program."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--drives", type=int, default=200)
+    parser.add_argument("--first", type=int, default=120_000, help="first seed")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--results", type=Path, default=Path("whole_commission.jsonl"))
+    asked = parser.parse_args()
+    done = {result["seed"] for result in read_results(asked.results)}
+    seeds = [seed for seed in range(asked.first, asked.first + asked.drives) if seed not in done]
+    with multiprocessing.Pool(asked.processes, maxtasksperchild=1) as pool, asked.results.open("a") as file:
+        for result in pool.imap_unordered(commission_one, seeds, chunksize=1):
+            file.write(json.dumps(result) + "\n")
+            file.flush()
+            print(f"{result['seed']} {ended(result)} {result['stage']} {result['seconds']:.0f} s", flush=True)
+    print("\n".join(summary(read_results(asked.results))))
+
+
+if __name__ == "__main__":
+    main()
