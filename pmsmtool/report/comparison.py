@@ -39,7 +39,7 @@ def table_cells(rows: Iterable[Mapping[str, Any]]) -> list[tuple[str, str, str, 
         unit, half = str(row["unit"]), float(row["interval"])
         held = told(row["held"], unit) + (" (factory default)" if row["held"] is not None and row["factory"] else "")
         measured = told(row["measured"], unit)
-        measured += f" +-{told(half, unit, 2)}" if row["measured"] is not None and half else ""
+        measured += f" +-{told(half, unit, 2)}" if row["measured"] is not None and half and unit != "1" else ""
         cells.append((row["name"], told(row["stated"], unit), row["tolerance"], held, measured, row["verdict"]))
     return cells
 

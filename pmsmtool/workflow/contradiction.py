@@ -128,7 +128,8 @@ class Row:
     def text(self) -> str:
         """One sentence: both values, the limit, and for a contradiction its likely cause."""
         other, value = ("measured", self.measured) if self.measured is not None else ("the drive holds", self.held)
-        within = f" +-{told(self.interval, self.unit, 2)}" if self.measured is not None and self.interval else ""
+        shown = self.measured is not None and self.interval and self.name not in EXACT
+        within = f" +-{told(self.interval, self.unit, 2)}" if shown else ""
         allowed = "exactly that" if self.name in EXACT else f"{told(self.low, self.unit)} to "
         allowed += "" if self.name in EXACT else f"{told(self.high, self.unit)} ({self.tolerance})"
         end = f"; likely {self.cause}" if self.cause else ""

@@ -328,3 +328,11 @@ def test_bad_input_and_bad_drives_change_nothing(case: str, tool: Tool) -> None:
     assert backup("interior-2k2?nv=drive.nv") == before
     runs = [*Path(".").glob("runs/*"), Path("run"), Path("other"), Path("edited")]
     assert not any(RunDirectory(run).read().passed("flash") for run in runs)
+
+
+def test_a_contradiction_is_accepted_by_a_person_only(tool: Tool) -> None:
+    code, _, told = tool("commission", "--sim", "interior-2k2", "--yes", "--accept-contradiction", "R_s_ohm")
+    assert code == 2 and "not together with --yes" in told
+    code, _, told = tool("commission", "--sim", "interior-2k2", "--accept-contradiction", "pole_pairs")
+    assert code == 5 and "pole_pairs cannot be accepted" in told
+    assert not Path("runs").exists()

@@ -17,8 +17,18 @@ from pmsmtool.design.margins import MarginRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.errors import CheckFailed, ConfigError, Declined, ExitCode, Interrupted, SafetyRefusal, VerifyMismatch
+from pmsmtool.errors import (
+    CheckFailed,
+    ConfigError,
+    Contradiction,
+    Declined,
+    ExitCode,
+    Interrupted,
+    SafetyRefusal,
+    VerifyMismatch,
+)
 from pmsmtool.firmware.image import crc32
+from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
@@ -293,3 +303,45 @@ def _frames(run: RunDirectory, drive: CanopenDrive, monkeypatch: pytest.MonkeyPa
 def test_every_stage_has_a_step(tmp_path: Path, drive: CanopenDrive) -> None:
     assert tuple(Commissioning(identified(tmp_path, drive), drive, Told(), Noted())._steps()) == STAGES
     assert set(commission.OUTPUTS) <= set(STAGES)
+
+
+def test_a_measured_flux_that_contradicts_the_file_ends_the_chain(
+    tmp_path: Path, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Full level, flux 65 % and inertia 5 times too high in the file: nothing is designed, nothing written."""
+    truth = load_machine_file(data_folder("profiles") / f"{PROFILE}.toml")
+    machine = truth.machine
+    assert machine.J_kgm2 is not None
+    wrong = replace(machine, psi_f_wb=1.65 * machine.psi_f_wb, J_kgm2=5.0 * machine.J_kgm2)
+    values = [
+        {"name": key, "value": getattr(machine, key), "std": 0.0, "total_95": 0.0, "unit": "1", "T_c": 20.0}
+        for key in ("pole_pairs", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")
+    ]
+    measured = Stage("identify", "pass", 1.0, values=values)
+    monkeypatch.setattr(commission, "identify_stage", lambda *_: measured)
+    before = active_crc(drive)
+    run = begin_run(drive, tmp_path)
+    person = Told()
+    sheet = replace(truth, machine=wrong, std={})
+    chain = Commissioning(run, drive, person, Noted(), sheet, accept_contradictions=("J_kgm2",))
+    with pytest.raises(Contradiction) as ended:
+        chain.carry_out()
+    text = str(ended.value)
+    assert "psi_f_wb: the data sheet states" in text and "measured 0.545 Wb" in text and "J_kgm2:" not in text
+    assert ended.value.exit_code == ExitCode.CHECK_FAILED
+    assert active_crc(drive) == before and not person.shown and not (run.path / "design.toml").exists()
+    rows = {row["name"]: row["verdict"] for row in run.read().stage("identify").comparison}  # type: ignore[union-attr]
+    assert (rows["psi_f_wb"], rows["J_kgm2"], rows["R_s_ohm"]) == ("contradicts", "accepted", "agrees")
+
+
+def test_differences_that_follow_from_unchecked_values_say_so(tmp_path: Path, drive: CanopenDrive) -> None:
+    run = identified(tmp_path, drive)
+    stage = run.read().stages[0]
+    row = {"name": "R_s_ohm", "verdict": "NOT CHECKED", "source": "data sheet", "text": "", "unit": "ohm"}
+    run.write(replace(run.read(), stages=(replace(stage, comparison=[row]),)))
+    person = Told(writes=False)
+    with pytest.raises(Declined):
+        finish(run, drive, person)
+    marked = {line.split()[0] for line in person.shown[0] if line.endswith("from R: NOT CHECKED")}
+    assert {"motor.R_s_ohm", "current.K_i_d_v_per_as", "current.K_i_q_v_per_as"} <= marked
+    assert "current.K_p_d_v_per_a" not in marked

@@ -21,7 +21,7 @@ from pmsmtool.design.open_loops import lacking_gains
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
+from pmsmtool.errors import ConfigError, Contradiction, IdentificationError, NotAvailable
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.machine.machine_file import load_machine_file
@@ -171,7 +171,7 @@ def test_one_pair_of_gains_is_the_smaller_of_both_axes(tmp_path: Path) -> None:
     assert machine.machine.J_kgm2 == pytest.approx(truth.J_kgm2, rel=0.06)
     assert machine.machine.R_s_ohm == truth.R_s_ohm and "R_s_ohm" not in machine.estimates
     assert "as given: pole_pairs, R_s_ohm" in str(machine.provenance["source"])
-    assert any("taken as given, not measured: pole_pairs, R_s_ohm" in line for line in verdict(run.path).lines)
+    assert "pole pairs: data sheet, NOT CHECKED; R: data sheet, NOT CHECKED" in verdict(run.path).lines[-1]
     page = report_page(run.path)
     assert "PASS FOR ITS TIER" in page
     assert page.count("<td>as given</td>") == 4
@@ -235,6 +235,26 @@ def test_a_data_sheet_of_another_machine_is_seen(tmp_path: Path) -> None:
             running.carry_out()
         assert is_safe(drive.node.state())
     assert verdict(run.path).word == "FAIL"
+
+
+def test_a_file_of_other_pole_pairs_than_the_drive_holds_writes_nothing(tmp_path: Path) -> None:
+    """EPOS4 without mode 11: nothing measures the pole pairs, and somebody has set 3 in the drive."""
+    sheet = load_machine_file(PROFILE)
+    wrong = replace(sheet, machine=replace(sheet.machine, pole_pairs=7, R_s_ohm=0.46), std={})
+    with opened("&drive=epos4") as (drive, found):
+        names = list(found.drive_map.cells)
+        before = DriveParameters(drive.node).read(names)
+        run, person = begin_run(drive, tmp_path, tier=found.tier), Told()
+        with pytest.raises(Contradiction, match="pole_pairs: the data sheet states 7, the drive holds 3") as ended:
+            Commissioning(run, drive, person, Quiet(), wrong, capabilities=found).carry_out()
+        assert DriveParameters(drive.node).read(names) == before and not person.shown
+        assert is_safe(drive.node.state())
+    assert ended.value.exit_code == 1 and "--accept" not in ended.value.hint
+    assert not (run.path / "design.toml").exists()
+    rows = {row["name"]: row for row in run.read().stage("identify").comparison}  # type: ignore[union-attr]
+    assert (rows["pole_pairs"]["stated"], rows["pole_pairs"]["held"]) == (7, 3)
+    assert rows["R_s_ohm"]["verdict"] == "NOT CHECKED"
+    assert "Data sheet, drive, measured" in report_page(run.path)
 
 
 def test_recorder_tier_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Path) -> None:
