@@ -70,7 +70,7 @@ class StageProgress:
         text = stage.summary if stage.status == "pass" else stage.note.splitlines()[0] if stage.note else ""
         seconds = f"  ({stage.seconds:.1f} s)" if stage.seconds >= 0.05 else ""
         self._out.note(f"[{number}/{count}] {stage.name:<9} {stage.status.upper()}  {text}{seconds}".rstrip())
-        if stage.comparison:
+        if any(row["stated"] is not None for row in stage.comparison):
             from pmsmtool.cli.output import table
             from pmsmtool.report.comparison import HEADS, table_cells
 
