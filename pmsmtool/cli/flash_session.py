@@ -72,7 +72,8 @@ def write_plan(
     )  # fmt: skip
     job.admit()  # nobody is asked for what would be refused after his consent
     if job.has_work(store=store):
-        lines = [*plan.lines(), "the set is stored, and the drive is reset to see it" if store else "not stored"]
+        stored = "the set is stored, and the drive is reset to see it: homing is lost"
+        lines = [*plan.lines(), stored if store else "not stored"]
         ask_writing(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
     return job.run(store=store, restoring=restoring)
 

@@ -7,11 +7,20 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pmsmtool.errors import SafetyRefusal
+from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.units import format_current
 
 Shaft = Literal["free", "locked", "coupled"]
 Load = Literal["none", "gravity"]
 Brake = Literal["open", "drive", "none"]
+
+OFF_S = 0.5
+"""Longest time from a tool that fails to the voltage being off: freshness of a look, one heartbeat period, the drive's
+consumer time and its reaction (``guard``, ``heartbeat``, ``dead_man``)."""
+LEAST_INERTIA = 0.8
+"""Of the one that is given: a data sheet's is true to 20 %."""
+_ANGLES = tuple(math.radians(5.0 * k) for k in range(13))
+# Of the current vector, from the q axis towards negative d: the largest torque lies within 45 degrees, and is flat.
 
 _MAY = {
     "free": "may turn freely",
@@ -40,6 +49,8 @@ class Envelope:
         What the shaft may do.
     load, brake : str
         What pulls on it, and the holding brake.
+    acceleration_rad_s2 : float or None
+        Of the shaft by the largest current (mechanical), None where the inertia is not known.
     """
 
     i_max_apk: float
@@ -50,10 +61,17 @@ class Envelope:
     shaft: Shaft = "free"
     load: Load = "none"
     brake: Brake = "none"
+    acceleration_rad_s2: float | None = None
 
     def lines(self) -> list[str]:
         """Return the envelope as a person reads it before consenting."""
         rpm = self.speed_max_rad_s * 60.0 / (2.0 * math.pi)
+        if self.acceleration_rad_s2 is None:
+            gain = "the speed gained until then is not known (no inertia is given)"
+        else:
+            gain = (
+                f"until then all torque would add {self.acceleration_rad_s2 * OFF_S * 60.0 / (2.0 * math.pi):.3g} rpm"
+            )
         travel = "not limited" if math.isinf(self.travel_rad) else f"{math.degrees(self.travel_rad):.4g} deg (mech)"
         energy = "not limited" if math.isinf(self.energy_j) else f"{self.energy_j:.4g} J"
         return [
@@ -62,6 +80,7 @@ class Envelope:
             f"travel    {travel}",
             f"energy    {energy} in the winding",
             f"duration  at most {self.duration_s:.4g} s",
+            f"failure   of the tool: voltage off after {OFF_S:g} s; {gain}",
             "stop      voltage off, the shaft coasts; by the drive's ramp only once its speed loop has kept a speed",
             f"shaft     {self.shaft}: {_MAY[self.shaft]}; load {self.load}, brake {self.brake}",
         ]
@@ -80,3 +99,14 @@ class Envelope:
                 likely="--load gravity was given and the shaft is not locked",
                 hint="uncouple the load, or lock the shaft and say --shaft locked",
             )
+
+
+def largest_acceleration(machine: MachineParameters, i_max_apk: float) -> float | None:
+    """Return the largest acceleration (rad/s2, mechanical) by a current (A peak); None where the inertia is not known.
+
+    The inertia is taken at the low end of what a data sheet's may be.
+    """
+    if not machine.J_kgm2:
+        return None
+    torque = max(machine.torque_nm(-i_max_apk * math.sin(angle), i_max_apk * math.cos(angle)) for angle in _ANGLES)
+    return torque / (LEAST_INERTIA * machine.J_kgm2)

@@ -142,16 +142,27 @@ class GuardedDrive:
             # Rounded up: a permille of the rated current must not cut what the envelope allows.
             permille = math.ceil(1000.0 * self.envelope.i_max_apk / rated_apk)
             if permille < node.get(objects.MAX_CURRENT_PERMILLE):
-                node.put(objects.MAX_CURRENT_PERMILLE, permille)
+                self._put_limit(objects.MAX_CURRENT_PERMILLE, permille)
             rpm = math.ceil(self.envelope.speed_max_rad_s * 60.0 / (2.0 * math.pi))
             if rpm < node.get(objects.MAX_SPEED_RPM):
-                node.put(objects.MAX_SPEED_RPM, rpm)
+                self._put_limit(objects.MAX_SPEED_RPM, rpm)
         except SdoAbort as abort:
             raise NotAvailable(
                 "the drive has no current and speed limit of its own (0x6073, 0x6075, 0x6080)",
                 where=abort.where,
                 hint="without them nothing is moved",
             ) from abort
+
+    def _put_limit(self, item: objects.DriveObject, value: float) -> None:
+        self._node.put(item, value)
+        held = self._node.get(item)
+        if held > value:
+            raise SafetyRefusal(
+                f"the drive holds the limit {held:.0f}, not the {value:.0f} that was written",
+                where=f"node {self._node.node}, 0x{item.index:04X}:{item.sub:02X}",
+                likely="the object is locked, or follows another one of the maker's",
+                hint="set it with the maker's software; nothing is moved without limits in the drive",
+            )
 
     def stop(self) -> bool:
         """Stop and confirm it; a Ctrl-C meanwhile removes the voltage at once.

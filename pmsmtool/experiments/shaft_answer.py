@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError
 
-FIRST_SHARE, FIRST_S = 0.08, 0.02
-"""Current of the first push, of the test current, and its length (s)."""
-MOST_TRIES = 10
+FIRST_SHARE, FIRST_S = 0.05, 0.02
+"""Current of the first push, of the test current, and its length (s): the inertia is not known before it."""
+MOST_TRIES = 11
 
 
 def acceleration_per_ampere(drive: Drive, i_test_a: float, answered: Callable[[float, float], bool]) -> float:

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft
+from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft, largest_acceleration
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import ConfigError, NotAvailable
@@ -161,6 +161,7 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
         shaft=request.shaft,
         load=request.load,
         brake=request.brake,
+        acceleration_rad_s2=largest_acceleration(machine, i_max),
     )
 
 
@@ -168,7 +169,7 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
     """Return what a person reads before consenting: the envelope and what will happen inside it."""
     steps = steps_of(request.quantities, request.shaft == "locked")
     allowed = [*envelope.lines(), *unused_current(envelope.i_max_apk, nameplate, pulses="map" in steps)]
-    lines = [*allowed, "the rotor aligns with current vectors: it may jump by half an electrical turn"]
+    lines = [*allowed, "the rotor aligns with current vectors: it may jump by half an electrical turn; homing is lost"]
     if request.half_frequency:
         lines.append(half_frequency.PLAN_LINE)
     if "rotation" in steps:

@@ -14,6 +14,7 @@ from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import speed_run
+from pmsmtool.experiments.shaft_answer import FIRST_S, FIRST_SHARE
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.limits import Limits
 
@@ -131,8 +132,8 @@ class SpeedStage:
 
     def _acceleration_per_ampere(self, target: float, pole_pairs: int) -> float:
         """Return the acceleration per ampere (rad/s2/A), from pushes that grow until the shaft answers."""
-        current, seconds = 0.1 * self.limits.I_test_apk, 0.02
-        for _ in range(8):
+        current, seconds = FIRST_SHARE * self.limits.I_test_apk, FIRST_S
+        for _ in range(9):
             decimation = max(1, round(seconds / (256 * self.drive.period_s)))
             push = self._push(current, 256, decimation, pole_pairs)
             omega = push["omega_e_rad_s"] / pole_pairs

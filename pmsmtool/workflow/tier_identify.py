@@ -16,7 +16,7 @@ from dataclasses import replace
 
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.envelope import Envelope, largest_acceleration
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent, rated_apk
 from pmsmtool.drive.tier_drives import TorqueDrive
@@ -234,13 +234,15 @@ def tier_envelope(drive: CanopenDrive, request: IdentifyRequest, known: MachineF
         raise ConfigError(
             f"the drive's largest speed (0x6080) is {rpm:.0f} rpm: that is no limit", hint="give --speed-max"
         )
+    i_max = HEADROOM * rated if request.i_max_apk is None else request.i_max_apk
     return Envelope(
-        i_max_apk=HEADROOM * rated if request.i_max_apk is None else request.i_max_apk,
+        i_max_apk=i_max,
         speed_max_rad_s=rpm * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,
         duration_s=DURATION_S,
         shaft=request.shaft,
         load=request.load,
         brake=request.brake,
+        acceleration_rad_s2=None if known is None else largest_acceleration(known.machine, i_max),
     )
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import can
 import pytest
@@ -21,17 +22,20 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import AbortConnection, QuickStop, State
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
-from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration
 from pmsmtool.drive.guard import FRESH_S, LOCKED_TRAVEL_RAD, OVERSHOOT, WATCH_S, GuardedDrive, guarded
 from pmsmtool.drive.heartbeat import PERIOD_S
 from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
+from pmsmtool.drive.port import Drive
 from pmsmtool.drive.recorded_means import RecordedMeans
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
 from pmsmtool.errors import DriveFault, Interrupted, LimitExceeded, PmsmtoolError, SafetyRefusal, StopNotConfirmed
+from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
 from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.firmware.shipped_maps import load_family
+from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.session import Session
@@ -327,14 +331,14 @@ def test_a_lost_heartbeat(rig: Rig) -> None:
     stopped(rig, ENVELOPE, lambda guard: guard._heartbeat.stop(), LEFT, declared, error=DriveFault)
 
 
-HUNG_S = FRESH_S + PERIOD_S + 1e-3 * CONSUMER_MS + REACTION_S
+HUNG_S = OFF_S
 """From the last look of a tool that hangs to the voltage being off, as declared; measured 0.30 to 0.36 s."""
 
 
 def test_a_main_thread_that_hangs_in_a_driver_call(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """The adapter's driver does not return from a request; the heartbeat's own thread must not keep the machine on."""
     bus = rig.drive.node.connection.bus
-    send, hung = bus.send, []
+    send, hung = bus.send, list[bool]()
 
     def hang(guard: GuardedDrive) -> None:
         def blocked(message: can.Message, timeout: float | None = None) -> None:
@@ -351,7 +355,7 @@ def test_a_main_thread_that_hangs_in_a_driver_call(rig: Rig, monkeypatch: pytest
 
 def test_a_guard_that_hangs(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """The look at the machine does not come back."""
-    live, hung = rig.drive.live, []
+    live, hung = rig.drive.live, list[bool]()
 
     def slow(name: str) -> float:
         if not hung:
@@ -385,6 +389,60 @@ def test_ctrl_c(rig: Rig) -> None:
     stopped(rig, ENVELOPE, interrupt, "voltage off, and the drive restored", 0.02 + STOP_S, error=Interrupted)
 
 
+@pytest.mark.parametrize("index", [0x6073, 0x6080])
+def test_a_limit_that_the_drive_does_not_hold_is_refused(rig: Rig, index: int) -> None:
+    """Current and speed limit are written into the drive and read back."""
+    rig.session.dictionary.find(index, 0).sink = lambda data: None
+    with pytest.raises(SafetyRefusal, match=f"0x{index:04X}:00") as caught, guarded(rig.drive, ENVELOPE):
+        pass
+    assert "holds the limit" in caught.value.what and rig.off_since is None
+
+
+def test_a_supervision_that_only_reports_is_refused(rig: Rig) -> None:
+    """An emergency message and the state as it was: no stop."""
+    power = rig.session.power
+    power.connection_lost = lambda node: power._emergency.raise_error(0x8130, bytes((node,)))  # type: ignore[method-assign]
+    with pytest.raises(SafetyRefusal, match="still enabled 350 ms after"), guarded(rig.drive, ENVELOPE):
+        pass
+    assert not rig.energised
+
+
+def test_the_time_that_is_declared_is_that_of_its_parts() -> None:
+    assert pytest.approx(FRESH_S + PERIOD_S + 1e-3 * CONSUMER_MS + REACTION_S) == OFF_S
+
+
+def test_the_envelope_says_what_a_failure_adds_in_speed() -> None:
+    """1.5 x 3 x 0.5 Wb x 4 A = 9 Nm on 0.8 x 0.01 kg m2: 1125 rad/s2, in 0.5 s 5370 rpm; a salient machine more."""
+    machine = MachineParameters(3, 1.0, 0.01, 0.01, 0.5, J_kgm2=0.01)
+    acceleration = largest_acceleration(machine, 4.0)
+    assert acceleration == pytest.approx(1125.0)
+    line = replace(ENVELOPE, acceleration_rad_s2=acceleration).lines()[5]
+    assert "voltage off after 0.5 s" in line and "add 5.37e+03 rpm" in line
+    salient = largest_acceleration(replace(machine, L_q_h=0.05), 4.0)
+    assert salient == pytest.approx(1176.7, rel=1e-3), "its reluctance torque at some 20 degrees"
+    assert largest_acceleration(replace(machine, J_kgm2=None), 4.0) is None
+    assert "not known (no inertia is given)" in ENVELOPE.lines()[5]
+
+
+def test_the_first_torque_pulse_is_small_and_short() -> None:
+    """Inertia unknown: at most 5 % of the current for 20 ms, whatever the shaft then does."""
+    asked: list[tuple[float, float]] = []
+    current = [0.0]
+
+    class Light:
+        def live(self, name: str) -> float:
+            return 1.0 * len(asked)
+
+        def command_current(self, i_d_a: float, i_q_a: float) -> None:
+            current[0] = i_q_a
+
+        def wait(self, seconds: float) -> None:
+            asked.append((current[0], seconds))
+
+    acceleration_per_ampere(cast(Drive, Light()), 10.0, lambda way, seconds: True)
+    assert asked == [(0.5, 0.02), (-0.5, 0.02)]
+
+
 # ---- how it stops --------------------------------------------------------------------------------
 
 
@@ -393,7 +451,7 @@ def test_until_the_speed_loop_is_proven_a_stop_removes_the_voltage(rig: Rig) -> 
     options = {key: rig.session.dictionary.find(*key) for key in ((0x605A, 0), (0x6007, 0))}
     for entry, value in zip(options.values(), (6, 1), strict=True):
         entry.value = entry.encode(value)  # as on an EPOS4; a fault when the connection is lost
-    seen = []
+    seen: list[float] = []
 
     def fail(guard: GuardedDrive) -> None:
         seen.extend(entry.number() for entry in options.values())

@@ -23,7 +23,7 @@ from pmsmtool.design.prediction import Array, Prediction
 from pmsmtool.design.prediction_file import from_arrays, to_arrays
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft
+from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft, largest_acceleration
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.errors import (
@@ -102,13 +102,15 @@ class _Record:
 def envelope_of(design: Design, request: ProofRequest, plan: ProofPlan | None = None) -> Envelope:
     """Return the motion envelope: what the request says, else the design's largest current and speed."""
     T_s = design.machine.inverter.T_s
+    i_max = design["motor.I_max_apk"] if request.i_max_apk is None else request.i_max_apk
     return Envelope(
-        i_max_apk=design["motor.I_max_apk"] if request.i_max_apk is None else request.i_max_apk,
+        i_max_apk=i_max,
         speed_max_rad_s=design["motor.n_max_rpm"] * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,
         duration_s=60.0 if plan is None else 45.0 + 2.0 * plan.seconds(T_s),
         shaft=request.shaft,
         load=request.load,
         brake=request.brake,
+        acceleration_rad_s2=largest_acceleration(design.machine.machine, i_max),
     )
 
 
