@@ -1,7 +1,8 @@
 """Random CAN frames and damaged files, at the tool and at the drive: no crash, no hang, no error that is not ours.
 
 Run from the repository: ``python benchmarks/fuzz.py [N] [NAME...]`` (default 100 000 of each). Seeds are fixed, so
-that a failure comes again. Files are damaged in their text, or, where they are binary, in their bytes.
+that a failure comes again. Files are damaged in their text, or, where they are binary, in their bytes. Each input may
+take ``LONGEST_S`` and ``LARGEST_BYTES`` of memory.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import random
+import resource
 import signal
 import sys
 import tempfile
@@ -16,13 +18,17 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from pmsmtool.design.design_file import design_text, parse_design
+from pmsmtool.design.lookup_file import table_parameters
 from pmsmtool.design.tune import tune
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import PmsmtoolError
@@ -32,15 +38,21 @@ from pmsmtool.firmware.drive_map import reference_map
 from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.firmware.eds import parse_eds
 from pmsmtool.flash.journal import Entry, Snapshot, check_sum, parse_snapshot
+from pmsmtool.flash.restore import check_snapshot, restore_plan
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_check import check_flux_map
 from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz, load_flux_map
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
+from pmsmtool.npz_file import npz_bytes, read_npz
+from pmsmtool.params.catalogue import layout_signature
 from pmsmtool.params.parameter_set import default_set, parse_parameter_set
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.faults import EXAMPLE, parse_faults
 from pmsmtool.sim.scenarios import load_scenario
-from pmsmtool.trace_file import read_trace
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import read_trace, trace_npz
+from pmsmtool.workflow.report_page import report_page
+from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage, new_record
 from tests.bus.frame_fuzz import transfers
 from tests.flash.rig import with_tables
 from tests.node.test_random_requests import FRAMES, test_after_any_requests_a_power_cycle_brings_a_healthy_node
@@ -48,6 +60,8 @@ from tests.node.test_random_requests import FRAMES, test_after_any_requests_a_po
 BATCH = 1000
 LONGEST_S = 20
 """An input that takes longer hangs: SIGALRM ends the program."""
+LARGEST_BYTES = 1 << 30
+"""Address space beyond that of the program as it is loaded: more is a ``MemoryError``, and not handled."""
 SCENARIO = """\
 schema = "pmsmtool.scenario/1"
 name = "reversal"
@@ -87,6 +101,34 @@ def _use_snapshot(text: str) -> None:
         body.pop("check", None)
         parse_snapshot(json.dumps({**body, "check": check_sum(body)}), "fuzz")
     parse_snapshot(text, "fuzz")
+
+
+def _use_backup(text: str) -> None:
+    """Read a backup and compare it with the drive it is of, as ``verify`` does."""
+    body = json.loads(text) if text.startswith("{") and text.endswith("}\n") else {}
+    body.pop("check", None)
+    found = parse_snapshot(json.dumps({**body, "check": check_sum(body)}), "fuzz")
+    check_snapshot(reference_map(), found, SNAPSHOT.identity, other_drive=True)
+    restore_plan(reference_map(), found, {entry.name: entry.old for entry in _BACKUP.entries}).lines()
+
+
+def _use_run(text: str) -> None:
+    path = _SCRATCH / "run" / "run.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text, encoding="utf-8", errors="replace")
+    report_page(RunDirectory(path.parent))
+
+
+def _use_look_up(data: bytes) -> None:
+    path = _SCRATCH / "lut.npz"
+    path.write_bytes(data)
+    table_parameters(read_npz(path), "fuzz")
+
+
+def _use_trace_npz(data: bytes) -> None:
+    path = _SCRATCH / "trace.npz"
+    path.write_bytes(data)
+    read_trace(path)
 
 
 def _use_dcf(text: str) -> None:
@@ -129,6 +171,12 @@ def _small_map() -> FluxMap:
     return FluxMap(i_d, i_q, psi_d, psi_q)
 
 
+def _look_up() -> dict[str, NDArray[Any]]:
+    tables = {name: np.array(table) for name, table in with_tables(3).tables.items()}
+    return {"torque_nm": tables["lut.axis_x"], "speed_rpm": tables["lut.axis_y"], "i_d_a": tables["lut.i_d_a"],
+            "i_q_a": tables["lut.i_q_a"]}  # fmt: skip
+
+
 def _mat() -> bytes:
     from scipy.io import savemat
 
@@ -138,6 +186,29 @@ def _mat() -> bytes:
     return buffer.getvalue()
 
 
+def _record() -> str:
+    record = new_record(("identify",), drive={"serial": 1}, bus={}, versions={}, operator="x")
+    passed = Acceptance("std", "0.1", "0.2", True)
+    values = [{"name": "R_s_ohm", "value": 0.1, "std": 0.01, "systematic": 0.0, "unit": "ohm"}]
+    stages = tuple(Stage(name, "pass", 1.0, values, [passed], ["none"]) for name in ("identify", "tune"))
+    return json.dumps(asdict(replace(record, stages=stages)), indent=1)
+
+
+def _backup() -> Snapshot:
+    """Every parameter of the reference drive at its default."""
+    encoded = reference_map().encode(default_set())
+    entries = tuple(Entry(name, *reference_map().address(name), data) for name, data in encoded.items())
+    identity = replace(SNAPSHOT.identity, vendor=reference_map().vendor, product=reference_map().product)
+    return Snapshot("backup", "done", identity, layout_signature(), "", entries)
+
+
+def _trace() -> Trace:
+    t_s = np.arange(20) * 1e-4
+    return Trace(t_s, {"i_d_a": np.arange(20) * 0.1}, {"i_d_a": "A"}, {"f_s_hz": 1e4})
+
+
+_BACKUP = _backup()
+SNAPSHOT = replace(SNAPSHOT, identity=_BACKUP.identity)
 _SCRATCH = Path(tempfile.mkdtemp(prefix="fuzz-"))
 _MACHINE = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
 _EDS = (data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds").read_bytes()
@@ -147,6 +218,8 @@ TEXTS: dict[str, tuple[str, Callable[[str], object]]] = {
     "parameter-sets": (default_set().merged(with_tables(3)).to_toml(), _use_set),
     "drive-maps": (dump_drive_map(reference_map()), parse_drive_map),
     "snapshots": (SNAPSHOT.dumps(), _use_snapshot),
+    "backups": (_BACKUP.dumps(), _use_backup),
+    "run-records": (_record(), _use_run),
     "eds": (_SHORT_EDS, lambda text: parse_eds(text.encode("utf-8", "replace"), "fuzz", node_id=1)),
     "dcf": (_SHORT_EDS, _use_dcf),
     "machine-files": (dump_machine_file(_MACHINE), parse_machine),
@@ -160,6 +233,8 @@ BINARIES: dict[str, tuple[Callable[[], bytes], Callable[[bytes], object]]] = {
     "concise-dcf": (lambda: write_concise([Written(0x2010, 2, b"abcd"), Written(0x1017, 0, b"ab")]), read_concise),
     "flux-maps-npz": (lambda: flux_map_npz(_small_map()), _use_map_bytes(".npz")),
     "flux-maps-mat": (_mat, _use_map_bytes(".mat")),
+    "traces-npz": (lambda: trace_npz(_trace()), _use_trace_npz),
+    "look-up-tables": (lambda: npz_bytes(_look_up()), _use_look_up),
 }
 
 
@@ -269,6 +344,12 @@ def _at_the_drive(count: int) -> None:
     print(f"{seeds * FRAMES} random frames at the drive, healthy after each {FRAMES}: {seconds:.0f} s", flush=True)
 
 
+def limit_memory() -> None:
+    """Make an allocation beyond ``LARGEST_BYTES`` fail, where the system can."""
+    loaded = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (loaded + LARGEST_BYTES, resource.RLIM_INFINITY))
+
+
 def main() -> None:
     """Print how the inputs ended."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
@@ -289,4 +370,5 @@ def main() -> None:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
+    limit_memory()
     main()

@@ -6,14 +6,14 @@ import hashlib
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from pmsmtool.design.sampled_loop import LoopMargins
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
-from pmsmtool.machine.key import did_you_mean
+from pmsmtool.machine.key import Key, check_table, did_you_mean
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_from_tables, machine_tables
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
@@ -196,9 +196,12 @@ def parse_design(text: str, *, where: str = "design.toml") -> Design:
             hint="run `pmsmtool tune` on the changed machine",
         )
     values, wrong = _read_values(tables.get("value"))
-    loops, wrong_loops = _read_loops(tables.get("loop", {}))
+    if not wrong:
+        found = ParameterSet({name: entry.value for name, entry in values.items()})
+        wrong += [f"{where}: {line}" for line in found.bound_violations()]
+    loops, wrong_loops = _read_loops(tables.get("loop", {}), where)
     wrong += wrong_loops
-    wrong += _odd_tables(tables)
+    wrong += _odd_tables(tables, where)
     lost = {name: v.loop for name, v in values.items() if v.loop not in {"", *loops}}
     wrong += [f"{name}: names the loop {loop}, which is not there" for name, loop in lost.items()]
     if wrong:
@@ -239,13 +242,18 @@ def _all_numbers(values: Iterable[Any]) -> bool:
     return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
 
 
-def _odd_tables(tables: Mapping[str, Any]) -> list[str]:
+def _odd_tables(tables: Mapping[str, Any], where: str) -> list[str]:
     """Return what is wrong with the parts that are only carried along."""
     wrong = [f"[{name}] is not a table" for name in ("request", "facts", "table") if not _is_table(tables, name)]
     notes = tables.get("notes", [])
     if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
         wrong.append("notes is not a list of texts")
     if not wrong:
+        from pmsmtool.design.tune_request import request_violations  # it needs this module
+
+        wrong += request_violations(tables.get("request", {}), where)
+        facts = {name: fact for name, fact in tables.get("facts", {}).items() if not isinstance(fact, str | bool)}
+        check_table(facts, [replace(_FACT, name=name) for name in facts], _places(where, "facts", facts), wrong, {})
         arrays = tables.get("table", {})
         wrong += [
             f"table.{name} is not an array of numbers"
@@ -259,16 +267,37 @@ def _is_table(tables: Mapping[str, Any], name: str) -> bool:
     return isinstance(tables.get(name, {}), dict)
 
 
-def _read_loops(table: Any) -> tuple[dict[str, LoopMargins], list[str]]:
-    names = {item.name for item in fields(LoopMargins)}
+_FACT = Key("facts", "", "float", "", -1e30, 1e30, None, "a result of the design")
+
+
+def _besides(name: str) -> tuple[float, ...]:
+    """Without a crossing a margin is infinite and the place of the crossing NaN (``LoopMargins``)."""
+    return (math.inf, math.nan) if name.endswith("crossover_rad_s") else (math.inf,)
+
+
+_LOOP_KEYS: tuple[Key, ...] = (
+    Key("loop", "stable", "bool", "", 0, 1, None, "whether the loop is stable", required=True),
+    *(
+        Key("loop", item.name, "float", "", -1e12, 1e12, None, "a margin", required=True, besides=_besides(item.name))
+        for item in fields(LoopMargins)
+        if item.name != "stable"
+    ),
+)
+
+
+def _places(where: str, table: str, found: Mapping[str, Any]) -> dict[str, str]:
+    return {"": f"{where}: [{table}]", **{name: f"{where}: [{table}] {name}" for name in found}}
+
+
+def _read_loops(table: Any, where: str) -> tuple[dict[str, LoopMargins], list[str]]:
     loops: dict[str, LoopMargins] = {}
     wrong: list[str] = []
     for name, entry in (table if isinstance(table, dict) else {}).items():
-        if not isinstance(entry, dict) or set(entry) != names:
-            wrong.append(f"loop.{name}: holds other keys than {', '.join(sorted(names))}")
-        elif not isinstance(entry["stable"], bool) or not _all_numbers(v for k, v in entry.items() if k != "stable"):
-            wrong.append(f"loop.{name}: stable is not true or false, or another value not a number")
-        else:
-            numbers = {key: float(value) for key, value in entry.items() if key != "stable"}
-            loops[name] = LoopMargins(stable=entry["stable"], **numbers)
+        if not isinstance(entry, dict):
+            wrong.append(f"{where}: [loop.{name}] is not a table")
+            continue
+        before = len(wrong)
+        values: dict[str, Any] = dict(check_table(entry, _LOOP_KEYS, _places(where, f"loop.{name}", entry), wrong, {}))
+        if len(wrong) == before:
+            loops[name] = LoopMargins(**values)
     return loops, wrong

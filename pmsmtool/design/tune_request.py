@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 from pmsmtool.design.current_loop import Method
 from pmsmtool.design.design_file import Scalar
@@ -12,6 +14,7 @@ from pmsmtool.design.governor import MODES as GOVERNOR_MODES
 from pmsmtool.design.polar_laws import LAWS as POLAR_LAWS
 from pmsmtool.design.speed_loop import SpeedMethod
 from pmsmtool.errors import ConfigError
+from pmsmtool.machine.key import Key, KeyKind, check_table
 
 CONTROLLERS = ("pi", "polar")
 
@@ -119,3 +122,26 @@ class TuneRequest:
         """Return what was asked, without what was left open."""
         given = {item.name: getattr(self, item.name) for item in fields(self)}
         return {name: value for name, value in given.items() if value is not None}
+
+
+_KINDS: dict[str, KeyKind] = {"str": "text", "float": "float", "int": "int", "bool": "bool"}
+_KEYS: tuple[Key, ...] = (
+    *(
+        Key("request", item.name, _KINDS[str(item.type).split(" ")[0]], "", -1e9, 1e9, None, "what was asked")
+        for item in fields(TuneRequest)
+    ),
+    Key("request", "drive", "text", "", 0, 0, None, "drive map the design is for"),
+    Key("request", "drive_bandwidth_hz", "float", "Hz", 1e-3, 1e6, None, "bandwidth of that drive's current loops"),
+)
+
+
+def request_violations(table: Mapping[str, Any], where: str) -> list[str]:
+    """Return what is wrong with the ``[request]`` of a design: names, types and what :class:`TuneRequest` refuses."""
+    wrong: list[str] = []
+    places = {"": f"{where}: [request]", **{name: f"{where}: [request] {name}" for name in table}}
+    values: dict[str, Any] = dict(check_table(table, _KEYS, places, wrong, {}))
+    try:
+        TuneRequest(**{item.name: values[item.name] for item in fields(TuneRequest) if item.name in values})
+    except ConfigError as error:
+        wrong += [f"{where}: [request] {violation}" for violation in error.violations]
+    return wrong

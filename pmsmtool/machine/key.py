@@ -39,6 +39,8 @@ class Key:
         Allowed texts; empty for free text.
     falls_back : str
         Key in another table that holds without this one, ``[table] key``.
+    besides : tuple of float
+        Numbers allowed outside the bounds, among them infinity and NaN: zero for "none", infinity for "no limit".
     """
 
     table: str
@@ -52,6 +54,7 @@ class Key:
     required: bool = False
     choices: tuple[str, ...] = ()
     falls_back: str = ""
+    besides: tuple[float, ...] = ()
 
     def check(self, value: Any) -> tuple[Value | None, str]:
         """Return the value as its type and an empty text, or None and what is wrong with it."""
@@ -88,6 +91,8 @@ class Key:
         return (None, problems[0]) if problems else (tuple(float(item) for item in value), "")
 
     def _bounds(self, value: float) -> str:
+        if any(value == other or (math.isnan(value) and math.isnan(other)) for other in self.besides):
+            return ""
         if not math.isfinite(value):
             return f"= {value} is not finite"
         unit = "" if self.unit in ("", "1") else f" {self.unit}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from pmsmtool.machine.key import Key, KeyKind, Value
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
@@ -19,8 +20,9 @@ def _key(
     *,
     kind: KeyKind = "float",
     required: bool = False,
+    besides: tuple[float, ...] = (),
 ) -> Key:
-    return Key(table, name, kind, unit, low, high, default, meaning, required)
+    return Key(table, name, kind, unit, low, high, default, meaning, required, besides=besides)
 
 
 def _text(table: str, name: str, meaning: str) -> Key:
@@ -34,7 +36,9 @@ MACHINE_KEYS: tuple[Key, ...] = (
     _key("machine", "R_s_ohm", "ohm", 1e-5, 1e3, None, "loop resistance per phase at T_ref", required=True),
     _key("machine", "L_d_h", "H", 1e-7, 10, None, "incremental d inductance", required=True),
     _key("machine", "L_q_h", "H", 1e-7, 10, None, "incremental q inductance", required=True),
-    _key("machine", "psi_f_wb", "Wb", 0, 100, None, "PM flux linkage at T_ref (peak)", required=True),
+    _key(
+        "machine", "psi_f_wb", "Wb", 1e-6, 100, None, "PM flux linkage at T_ref (peak)", required=True, besides=(0.0,)
+    ),
     _key("machine", "R_winding_ohm", "ohm", 1e-5, 1e3, None, "copper part of R_s"),
     _key("machine", "L_d_app_h", "H", 1e-7, 10, None, "apparent d inductance, default L_d_h"),
     _key("machine", "L_q_app_h", "H", 1e-7, 10, None, "apparent q inductance, default L_q_h"),
@@ -92,13 +96,13 @@ ESTIMATE_KEYS: tuple[Key, ...] = (
     _key("estimate", "systematic", "", 0, math.inf, 0.0, "half width of the 95 % systematic part"),
     _text("estimate", "unit", "unit of the three"),
     _key("estimate", "n", "1", 0, 2**53, 0, "samples or levels in the fit", kind="int"),
-    _key("estimate", "chi2", "1", 0, math.inf, None, "reduced chi-square of the fit"),
+    _key("estimate", "chi2", "1", 0, 1e30, None, "reduced chi-square of the fit"),
     _key("estimate", "T_c", "degC", -100, 400, None, "winding or magnet temperature"),
     _text("estimate", "method", "how it was found"),
     _text("estimate", "source", "who found it: pmsmtool, vendor, datasheet, meter"),
     _key("estimate", "i_d_apk", "A", -1e5, 1e5, None, "bias point"),
     _key("estimate", "i_q_apk", "A", -1e5, 1e5, None, "bias point"),
-    _key("estimate", "dof", "1", 0, math.inf, None, "degrees of freedom behind std"),
+    _key("estimate", "dof", "1", 0, 1e15, None, "degrees of freedom behind std"),
     _text("estimate", "fallback", "what the method fell back to"),
 )
 
@@ -111,8 +115,25 @@ MEASURABLE: dict[str, Key] = {
 def deviation_keys(table: str) -> tuple[Key, ...]:
     """Return the keys of ``[std]`` or ``[systematic]``: one non-negative number per measurable key."""
     return tuple(
-        Key(table, key.name, "float", key.unit, 0, math.inf, None, f"of {key.meaning}") for key in MEASURABLE.values()
+        Key(table, key.name, "float", key.unit, 0, _span(key), None, f"of {key.meaning}") for key in MEASURABLE.values()
     )
+
+
+def estimate_keys(key: Key) -> tuple[Key, ...]:
+    """Return the keys of ``[estimate.<key>]``: of what is never negative an estimate near zero may be."""
+    low = key.minimum if key.minimum > 0 else -max(abs(key.minimum), key.maximum)
+    bounds = {"value": (low, key.maximum), "std": (0, _span(key)), "systematic": (0, _span(key))}
+    return tuple(
+        replace(row, minimum=bounds[row.name][0], maximum=bounds[row.name][1], unit=key.unit, besides=key.besides)
+        if row.name in bounds
+        else row
+        for row in ESTIMATE_KEYS
+    )
+
+
+def _span(key: Key) -> float:
+    """Return the largest deviation: from one bound to the other."""
+    return key.maximum - key.minimum
 
 
 def machine_file_keys() -> tuple[Key, ...]:

@@ -20,8 +20,9 @@ from pmsmtool.machine.machine_keys import (
     MACHINE_KEYS,
     MEASURABLE,
     deviation_keys,
+    estimate_keys,
 )
-from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
 from pmsmtool.units import UNITS
 
@@ -37,6 +38,8 @@ TABLES: dict[str, tuple[Key, ...]] = {
     "simulation": SIMULATION_KEYS,
 }
 OTHER_TABLES = ("estimate", "conditions", "provenance", "flux_map")
+LARGEST_RATIO = 10
+"""Of a standard deviation to its value, and of a value to its estimate; more is another unit or a slip of the pen."""
 ELSEWHERE = {key.name: table for table in ("limits", "encoder", "inverter", "machine") for key in TABLES[table]}
 
 
@@ -121,7 +124,8 @@ class MachineReader:
                 continue
             before = len(self.violations)
             places = self.places(table, "estimate", name)
-            values: dict[str, Any] = dict(check_table(table, ESTIMATE_KEYS, places, self.violations, {}))
+            keys = estimate_keys(key) if name == key.name else ESTIMATE_KEYS
+            values: dict[str, Any] = dict(check_table(table, keys, places, self.violations, {}))
             unit = values.setdefault("unit", key.unit)
             if unit not in UNITS or UNITS[unit].dimension != UNITS[key.unit].dimension:
                 self.violations.append(f"{self.place('estimate', name, 'unit')} = {unit!r} is not {key.unit!r}")
@@ -160,6 +164,9 @@ class MachineReader:
             if small is not None and large is not None and small > large:
                 self.violations.append(f"{self.place(table, low)} = {small:g} is above {high} = {large:g}")
 
+        for key in MEASURABLE.values():
+            self.deviation(key, values)
+        self.friction(values["machine"])
         ordered("machine", "I_nom_apk", "I_max_apk")
         ordered("machine", "n_nom_rpm", "n_max_rpm")
         ordered("machine", "R_winding_ohm", "R_s_ohm")
@@ -175,6 +182,44 @@ class MachineReader:
             )
         elif any(b <= a for a, b in pairwise(currents)):
             self.violations.append(f"{self.place('inverter', 'voltage_error_i_apk')} does not increase")
+
+    def deviation(self, key: Key, values: Mapping[str, dict[str, Any]]) -> None:
+        """A deviation many times the value, or an estimate of another size than the value beside it."""
+        value = values[key.table].get(key.name)
+        if value is None or key.minimum <= 0.0 or value == 0.0:
+            return
+        for table in ("std", "systematic"):
+            if values[table].get(key.name, 0.0) > LARGEST_RATIO * value:
+                self.violations.append(
+                    f"{self.place(table, key.name)} = {values[table][key.name]:g} is more than {LARGEST_RATIO} times "
+                    f"the value {value:g} {key.unit}"
+                )
+        found = values["estimate"].get(key.name)
+        if found is not None and not value <= LARGEST_RATIO * found.value <= LARGEST_RATIO**2 * value:
+            self.violations.append(
+                f"{self.place('estimate', key.name, 'value')} = {found.value:g} differs more than {LARGEST_RATIO} "
+                f"times from [{key.table}] {key.name} = {value:g} {key.unit}: likely one of the two in another unit"
+            )
+
+    def friction(self, machine: Mapping[str, Any]) -> None:
+        """Friction at rated speed that the machine could not overcome by far: likely another unit."""
+        needed = ("pole_pairs", "R_s_ohm", "psi_f_wb", "L_d_h", "L_q_h", "n_nom_rpm")
+        i_a = machine.get("I_max_apk", machine.get("I_nom_apk"))
+        if i_a is None or any(name not in machine for name in needed):
+            return
+        truth = MachineParameters(**{name: machine[name] for name in needed})
+        most = max(abs(truth.torque_nm(i_d, i_a)) for i_d in (-i_a, i_a))
+        viscous, coulomb = (
+            machine.get("B_nms", 0.0) * machine["n_nom_rpm"] * UNITS["rpm"].factor,
+            machine.get("tau_c_nm", 0.0),
+        )
+        friction = viscous + coulomb
+        if friction > LARGEST_RATIO * most:
+            key = "B_nms" if viscous > coulomb else "tau_c_nm"
+            self.violations.append(
+                f"{self.place('machine', key)} = {machine[key]:g}: friction of {friction:.3g} N m at n_nom is more "
+                f"than {LARGEST_RATIO} times the largest torque, {most:.3g} N m; likely another unit"
+            )
 
 
 def _map_file(file: str, folder: Path | None) -> FluxMap:

@@ -68,8 +68,11 @@ class ParameterSet:
 
     def violations(self) -> tuple[str, ...]:
         """List every value out of bounds and every table that does not fit its descriptor."""
-        found = [line for name, value in self.values.items() for line in _bound_violations(name, value)]
-        return tuple(found + _table_violations(self.values, self.tables))
+        return (*self.bound_violations(), *_table_violations(self.values, self.tables))
+
+    def bound_violations(self) -> tuple[str, ...]:
+        """List every value out of bounds."""
+        return tuple(line for name, value in self.values.items() for line in _bound_violations(name, value))
 
     def content_hash(self) -> str:
         """Return ``sha256:<hex>`` over values and tables in canonical form (provenance not included)."""
