@@ -35,6 +35,7 @@ from pmsmtool.errors import (
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.workflow.capabilities import Capabilities, Tier
 from pmsmtool.workflow.compared_stage import check_accepted, compared, refusal
+from pmsmtool.workflow.contradiction import DATA_SHEET
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
 from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplate_of
@@ -256,7 +257,7 @@ class Commissioning:
 
     def _compared(self, stage: Stage) -> Stage:
         """Return the stage with data sheet, drive and measurement side by side: the gate before anything is written."""
-        known = None if self.nameplate is None else (self.nameplate, "data sheet")
+        known = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
         if known is None and self.tier is not None and self.tier.found.tier is not Tier.INJECT:
             known = self.tier.known()
         loaded = self.identify.shaft == "coupled"

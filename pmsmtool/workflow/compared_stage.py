@@ -12,8 +12,14 @@ from pmsmtool.errors import ConfigError, Contradiction, SafetyRefusal, SdoAbort
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import default_set
 from pmsmtool.report.comparison import contradictions
-from pmsmtool.workflow.contradiction import ACCEPTABLE, HELD, ORDER, compare
+from pmsmtool.workflow.contradiction import ACCEPTABLE, DATA_SHEET, HELD, ORDER, compare
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
+
+CONTRADICTS = "machine file, drive and measurement contradict each other; nothing was written"
+LEAST_COUNTS = 64
+"""Fewer increments per turn are a drive's unset 0x608F (1 : 1), not an encoder's."""
+_KEYS = {"encoder_counts": "[encoder] bits", "J_per_psi": "J_kgm2 or psi_f_wb", "L_phase_h": "L_d_h and L_q_h"}
+"""Keys of a machine file to correct, where a row is not called by one."""
 
 
 def check_accepted(names: Collection[str]) -> None:
@@ -57,7 +63,9 @@ def held_values(drive: CanopenDrive) -> dict[str, float]:
                 held[key] = drive.parameters.read_value(f"motor.{key}")
     with contextlib.suppress(SdoAbort):
         if drive.node.has(ENCODER_COUNTS.index, ENCODER_COUNTS.sub):
-            held["encoder_counts"] = drive.node.get(ENCODER_COUNTS) / max(1.0, drive.node.get(MOTOR_TURNS))
+            counts = drive.node.get(ENCODER_COUNTS) / max(1.0, drive.node.get(MOTOR_TURNS))
+            if counts >= LEAST_COUNTS:
+                held["encoder_counts"] = counts
     return held
 
 
@@ -110,13 +118,14 @@ def refusal(stage: Stage, run: RunDirectory) -> Contradiction | None:
     if not wrong:
         return None
     names = [str(row["name"]) for row in wrong]
-    accepted = "".join(f" --accept-contradiction {name}" for name in names if name in ACCEPTABLE)
-    if not all(name in ACCEPTABLE for name in names):
-        accepted = ""
+    hint = f"correct {', '.join(_KEYS.get(name, name) for name in names)} in the machine file and begin a new run"
+    if any(row["source"] != DATA_SHEET for row in wrong):
+        hint = "give a machine file of this motor (`pmsmtool machine new` writes one) and begin a new run"
+    elif all(name in ACCEPTABLE for name in names):
+        hint += f"; or, knowing why, add {' '.join(f'--accept-contradiction {name}' for name in names)}"
     return Contradiction(
-        "\n  - ".join(["what was given contradicts; nothing was written", *(str(row["text"]) for row in wrong)]),
+        "\n  - ".join([CONTRADICTS, *(str(row["text"]) for row in wrong)]),
         where=str(run.path),
         likely="; ".join(dict.fromkeys(str(row["cause"]) for row in wrong if row["cause"])),
-        hint=f"correct {', '.join(names)} in the machine file and begin a new run"
-        + (f"; or, knowing why, add{accepted}" if accepted else ""),
+        hint=hint,
     )

@@ -37,6 +37,8 @@ FACTORY_SHARE = 1e-6
 RATIO_SHARE = 0.08
 """Within this of a known ratio, it is named as the likely cause."""
 
+DATA_SHEET = "data sheet"
+"""What a machine file that a person gave is called."""
 EXACT = ("pole_pairs", "encoder_counts")
 RATIO = "J_per_psi"
 PHASE_INDUCTANCE = "L_phase_h"
@@ -112,7 +114,7 @@ class Row:
     high: float = math.nan
     tolerance: str = ""
     factory: bool = False
-    source: str = "data sheet"
+    source: str = DATA_SHEET
     verdict: Verdict = "held"
     cause: str = ""
 
@@ -134,7 +136,7 @@ class Row:
         allowed += "" if self.name in EXACT else f"{told(self.high, self.unit)} ({self.tolerance})"
         end = f"; likely {self.cause}" if self.cause else ""
         return (
-            f"{self.name}: the {self.source} states {told(self.stated, self.unit)}, "
+            f"{self.name}: the {self.source.removeprefix('the ')} states {told(self.stated, self.unit)}, "
             f"{other} {told(value, self.unit)}{within}; allowed: {allowed}{end}"
         )
 
@@ -157,7 +159,7 @@ def compare(
     used: Collection[str] = (),
     loaded: bool = False,
     accept: Collection[str] = (),
-    source: str = "data sheet",
+    source: str = DATA_SHEET,
 ) -> tuple[Row, ...]:
     """Return the table of what is stated, held and measured.
 
@@ -221,7 +223,7 @@ def _measured(values: Sequence[Mapping[str, Any]]) -> dict[str, _Measured]:
     found = {}
     for value in values:
         vendor = value.get("source") == "vendor"
-        if not ("std" in value or vendor) or value.get("check"):
+        if not ("std" in value or vendor) or value.get("check") or not value.get("accepted", True):
             continue
         number = float(value["value"])
         half = VENDOR_SHARE * abs(number) if vendor else float(value.get("total_95") or 0.0)

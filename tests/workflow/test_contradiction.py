@@ -40,7 +40,7 @@ def stated(**factors: float) -> MachineFile:
     """A file whose values are the truth times a factor; pole pairs as given."""
     machine = TRUTH.machine
     values = {key: f if key == "pole_pairs" else getattr(machine, key) * f for key, f in factors.items()}
-    return replace(TRUTH, machine=replace(machine, **values))
+    return replace(TRUTH, machine=replace(machine, **values))  # type: ignore[arg-type]
 
 
 def found(rows: tuple[Row, ...]) -> Mapping[str, str]:
@@ -166,6 +166,11 @@ def test_a_memory_of_another_motor_is_healthy_where_everything_is_measured() -> 
     held["encoder_counts"] = 2.0**17
     rows = compare(TRUTH, held, measured())
     assert not wrong(rows) and not unchecked([row.facts() for row in rows])
+
+
+def test_a_refused_value_checks_nothing() -> None:
+    values = [{**v, "accepted": v["name"] != "R_s_ohm"} for v in measured(R_s_ohm=9.9)]
+    assert found(compare(TRUTH, {}, values))["R_s_ohm"] == "NOT CHECKED"
 
 
 def test_encoder_counts_are_those_of_the_drive() -> None:
