@@ -180,7 +180,15 @@ def summary(outcomes: Sequence[Outcome]) -> list[str]:
         rows = [o for o in outcomes if (o.error, o.level) == (error, level)]
         count: Counter[str] = Counter()
         for o in rows:
-            ended = "contradicted" if o.contradicted else "refused" if o.code == 6 else "other" if o.code else "passed"
+            ended = (
+                "contradicted"
+                if o.contradicted
+                else "refused"
+                if o.code == 6
+                else "other"
+                if o.code not in (0, 10)
+                else "passed"
+            )
             count[ended] += 1
             count["PASS"] += o.word == "PASS" and not o.code
             count["written"] += o.written
