@@ -21,6 +21,7 @@ PACKAGE = ROOT / "pmsmtool"
 
 FLOORS: dict[str, int] = {
     "errors": 0,
+    "plain_text": 1,
     "cia402": 1,
     "files": 1,
     "bus": 2,

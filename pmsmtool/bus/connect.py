@@ -6,6 +6,7 @@ import contextlib
 import errno
 import logging
 import socket
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,16 @@ import can
 
 from pmsmtool.bus.connection import TRACE_HINT, Connection
 from pmsmtool.errors import BusError, ConfigError, PmsmtoolError
+from pmsmtool.plain_text import reason
 
 __all__ = ["Connection", "connect"]
 
 SOCKETCAND_DEFAULTS: Mapping[str, Any] = {"host": "127.0.0.1", "port": 29536, "channel": "vcan0"}
 """What ``pmsmtool sim serve`` offers; used for what neither the caller nor python-can's files say."""
 TRACE_SUFFIXES = (".asc", ".blf", ".log", ".trc")
-_SERVER_TIMEOUT_S = 3.0
+_SERVER_TIMEOUT_S = 2.0
+OPEN_LIMIT_S = 10.0
+"""Adapters take up to 3 s to open (slcan sleeps for 2 s); one that needs longer is taken for hung."""
 
 
 def connect(
@@ -53,7 +57,8 @@ def connect(
     arguments = {key: value for key, value in given.items() if value is not None}
     writer = None if trace is None else _open_trace(trace)
     try:
-        bus = can.Bus(**_completed(arguments))
+        configured = _configured(arguments)
+        bus = _open_in_time(_completed(arguments, configured), configured.get("interface"))
     except (can.CanError, OSError, ValueError, NotImplementedError, ImportError, TypeError) as error:
         if writer is not None:
             writer.stop()
@@ -61,12 +66,56 @@ def connect(
     return Connection(bus, writer=writer)
 
 
-def _completed(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Add what python-can's configuration lacks for a simulated drive in another process."""
+def _open_in_time(arguments: dict[str, Any], interface: str | None) -> can.BusABC:
+    """Open a bus; python-can's back ends may wait for ever for a driver, or for a server's first word.
+
+    Raises
+    ------
+    TimeoutError
+        It did not open within ``OPEN_LIMIT_S``.
+    """
+    if interface == "pmsmsim":
+        return can.Bus(**arguments)  # in this process; its clock belongs to this thread
+    opened: list[can.BusABC] = []
+    failed: list[BaseException] = []
+    given_up = threading.Event()
+
+    def work() -> None:
+        try:
+            opened.append(can.Bus(**arguments))
+            if given_up.is_set():
+                opened[0].shutdown()
+        except BaseException as error:
+            failed.append(error)
+
+    worker = threading.Thread(target=work, name="pmsmtool bus opener", daemon=True)
+    before = socket.getdefaulttimeout()
+    # Also of the sockets made now, for good: a server that stops reading must not keep a sender waiting.
+    socket.setdefaulttimeout(_SERVER_TIMEOUT_S)
+    try:
+        worker.start()
+        worker.join(OPEN_LIMIT_S)
+    finally:
+        given_up.set()
+        socket.setdefaulttimeout(before)
+    if failed:
+        raise failed[0]
+    if not opened:
+        raise TimeoutError(f"no answer within {OPEN_LIMIT_S:g} s")
+    return opened[0]
+
+
+def _configured(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments with what python-can's own configuration adds."""
     configured = dict(arguments)
     if not arguments.get("ignore_config"):
         with contextlib.suppress(can.CanInterfaceNotImplementedError):
             configured = can.util.load_config(config=configured)
+    return configured
+
+
+def _completed(arguments: dict[str, Any], configured: dict[str, Any]) -> dict[str, Any]:
+    """Add what python-can's configuration lacks for a simulated drive in another process."""
     if configured.get("interface") != "socketcand":
         return arguments
     logging.getLogger("can.interfaces.socketcand").setLevel(logging.CRITICAL)
@@ -90,14 +139,19 @@ def _open_failure(arguments: Mapping[str, Any], error: Exception) -> PmsmtoolErr
         )
     where = " ".join(str(arguments[k]) for k in ("interface", "channel") if arguments.get(k) is not None)
     return BusError(
-        f"the bus does not open: {error}", where=where, likely=_why_closed(name, error), hint="`pmsmtool doctor`"
+        f"the bus does not open: {reason(error)}",
+        where=where,
+        likely=_why_closed(name, error),
+        hint="`pmsmtool doctor`",
     )
 
 
 def _why_closed(name: str | None, error: Exception) -> str:
     if isinstance(error, (can.CanInterfaceNotImplementedError, ImportError)):
         return "the adapter's driver or python-can's extra for it is not installed"
-    if isinstance(error, (ConnectionError, TimeoutError)):
+    if isinstance(error, TimeoutError):
+        return "whoever listens there is no socketcand server, or it hangs" if name == "socketcand" else "it hangs"
+    if isinstance(error, ConnectionError):
         return "no server listens there; `pmsmtool sim serve` starts one"
     if getattr(error, "errno", None) == errno.EAFNOSUPPORT:
         return "this system has no SocketCAN"

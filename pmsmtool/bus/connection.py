@@ -21,6 +21,7 @@ import can
 
 from pmsmtool.bus.clock import Clock, clock_of
 from pmsmtool.errors import BusError, ConfigError, PmsmtoolError
+from pmsmtool.plain_text import reason
 
 TRACE_HINT = "name a file in a folder that can be written and has room"
 """What to do when a bus trace cannot be written."""
@@ -196,6 +197,11 @@ class Connection:
         left = () if callback is None else tuple(c for c in self._subscribers.get(cob_id, ()) if c != callback)
         self._subscribers[cob_id] = left
 
+    @property
+    def shared(self) -> bool:
+        """Whether other programs may be on the bus, too: not on the simulated one in this process."""
+        return self._reader is not None
+
     def mailbox(self, cob_id: int) -> Mailbox:
         """Return a queue of the frames of one COB-ID."""
         return Mailbox(self, cob_id)
@@ -303,7 +309,7 @@ class Connection:
             except PmsmtoolError as error:
                 self._failure = error
                 return
-            except (can.CanError, OSError, ValueError) as error:
+            except Exception as error:  # whatever a back end raises ends reception, and is told to whoever waits
                 if not self._closing:
                     self._failure = gone(error)
                 return
@@ -318,7 +324,7 @@ class Connection:
             return
         self.frames_received += 1
         cob_id = message.arbitration_id
-        if message.is_extended_id or message.is_remote_frame or not message.is_rx:
+        if message.is_extended_id or message.is_remote_frame or not message.is_rx or len(message.data) > 8:
             return
         self.heard.add(cob_id)
         for callback in self._subscribers.get(cob_id, ()):
@@ -339,7 +345,7 @@ class Connection:
     def _send_failure(self, error: Exception) -> BusError:
         if _is_full(error):
             return BusError(
-                f"no frame can be sent: {error}",
+                f"no frame can be sent: {reason(error)}",
                 where=str(self.bus.channel_info),
                 likely="no other node acknowledges: wrong bit rate, no power, no termination, or bus off",
                 hint="`pmsmtool doctor`",
@@ -355,7 +361,7 @@ def _is_full(error: Exception) -> bool:
 def gone(error: Exception) -> BusError:
     """Return the error that says the adapter is gone."""
     return BusError(
-        f"the adapter is gone: {error}",
+        f"the adapter is gone: {reason(error)}",
         likely="unplugged, its server ended, or bus off",
         hint="check cable and adapter; the drive stops by itself when its heartbeat supervision is set",
     )

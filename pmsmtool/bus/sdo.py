@@ -17,10 +17,21 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from pmsmtool.bus import sdo_block
+from pmsmtool.bus import sdo_block, sdo_segmented
 from pmsmtool.bus.abort_codes import TRANSPORT_CODES, AbortCode, abort_advice, abort_text
 from pmsmtool.bus.connection import Connection
-from pmsmtool.bus.sdo_transfer import MULTIPLEXOR, Attempt, BlockRefused, Mode, Retry, Transfer, TransferLost
+from pmsmtool.bus.sdo_transfer import (
+    LARGEST_UNKNOWN,
+    MULTIPLEXOR,
+    OBJECT_LIMIT_S,
+    SLOWEST_S_PER_BYTE,
+    Attempt,
+    BlockRefused,
+    Mode,
+    Retry,
+    Transfer,
+    TransferLost,
+)
 from pmsmtool.errors import BusError, DriveTimeout, PmsmtoolError, SdoAbort
 
 __all__ = ["Mode", "Retry", "SdoChannel", "Transfer"]
@@ -33,10 +44,20 @@ DRAIN_LIMIT_S = 1.0
 """A node that never falls silent does not keep the channel longer than this."""
 TRIES = 3
 """Attempts per object, the first included (CANopen reference, section 6)."""
-CHECK_INTERVAL_S = 0.2
+CHECK_INTERVAL_S = 0.1
 """While an answer is awaited, the node's supervision is asked this often."""
 BLOCK_THRESHOLD = 28
 """Bytes from which a block transfer has fewer frames than a segmented one."""
+LATE_S = 0.5
+"""Segments name no object: after a lost segmented upload this long is waited for late ones, before the barrier."""
+BARRIER = ((0x1000, 0), (0x1018, 1), (0x1018, 2), (0x1018, 0))
+"""Objects every node answers for, read in turn: what arrives before the answer belongs to the past."""
+SLOWEST_ANSWER_S = 1.0
+"""The time-out grows to this with a node that answers late."""
+
+
+class OutOfTime(DriveTimeout):
+    """The time that a command has for its transfers is over."""
 
 
 class SdoChannel:
@@ -80,6 +101,11 @@ class SdoChannel:
         self.discarded = 0
         self._check = check
         self.active_s = -math.inf
+        self._over_s = math.inf
+        self._silence_s = math.inf
+        self._unanswered_s: float | None = None
+        self._unsettled = False
+        self._barriers = 0
         self._cancelled: BaseException | None = None
         self._request_id = 0x600 + node
         self._mailbox = connection.mailbox(0x580 + node)
@@ -92,7 +118,14 @@ class SdoChannel:
         return self.upload(index, sub, size=size).data
 
     def upload(
-        self, index: int, sub: int, *, size: int | None = None, mode: Mode = Mode.AUTO, tries: int = TRIES
+        self,
+        index: int,
+        sub: int,
+        *,
+        size: int | None = None,
+        longest: int = LARGEST_UNKNOWN,
+        mode: Mode = Mode.AUTO,
+        tries: int = TRIES,
     ) -> Transfer:
         """Read an object.
 
@@ -100,6 +133,8 @@ class SdoChannel:
         ----------
         size : int, optional
             Expected length; anything else is an error, also when the node announces it so.
+        longest : int
+            Bytes taken at most where no length is expected.
         mode : Mode
             ``AUTO`` reads by block when ``size`` says that pays, falling back to segments.
 
@@ -115,6 +150,7 @@ class SdoChannel:
         if mode is Mode.AUTO:
             mode = Mode.BLOCK if (size or 0) > BLOCK_THRESHOLD else Mode.SEGMENTED
         with self._transfer(index, sub, mode, size) as attempt:
+            attempt.longest = longest
             data, count = self._persist(attempt, tries, lambda: self._upload_once(attempt))
             return self._result(attempt, data, count)
 
@@ -146,6 +182,7 @@ class SdoChannel:
         with self._transfer(index, sub, mode, len(data)) as attempt:
             recover = (lambda: self._already_holds(attempt, data)) if retry is Retry.READ_BACK else None
             limit = 1 if retry is Retry.NEVER else tries
+            attempt.urgent = mode is Mode.EXPEDITED and retry is not Retry.READ_BACK
             _, used = self._persist(attempt, limit, lambda: self._download_once(attempt, data), recover)
             return self._result(attempt, data, used)
 
@@ -156,6 +193,29 @@ class SdoChannel:
     def cancel(self, reason: BaseException | None) -> None:
         """Make the transfer under way, and all later ones, raise ``reason``; None lifts that."""
         self._cancelled = reason
+
+    def finish_within(self, seconds: float) -> None:
+        """Give all transfers from now on this long together (s on the bus clock); then they raise ``OutOfTime``."""
+        self._over_s = self.connection.clock.now() + seconds
+
+    @contextmanager
+    def limited(self, *, silence_s: float, own_s: float, total_s: float) -> Iterator[None]:
+        """Inside, raise ``OutOfTime`` when no valid answer came for ``silence_s``, or after ``total_s``.
+
+        Parameters
+        ----------
+        own_s : float
+            What the transfers inside have at least, where the node was silent before (s).
+        """
+        before = self._over_s, self._silence_s
+        now = self.connection.clock.now()
+        self._over_s, self._silence_s = now + total_s, silence_s
+        if self._unanswered_s is not None:
+            self._unanswered_s = max(self._unanswered_s, now + own_s - silence_s)
+        try:
+            yield
+        finally:
+            self._over_s, self._silence_s = before
 
     def close(self) -> None:
         """Stop listening."""
@@ -174,28 +234,34 @@ class SdoChannel:
             frame = self._mailbox.get(min(timeout_s, CHECK_INTERVAL_S))
             if frame is not None:
                 return frame if len(frame) == 8 else frame.ljust(8, b"\0")
-            self._raise_if_pointless()
+            self.raise_if_pointless()
             timeout_s -= CHECK_INTERVAL_S
             if timeout_s <= 0.0:
                 return None
 
     def await_answer(self, attempt: Attempt, accept: Callable[[bytes], bool], what: str) -> bytes:
         """Return the first frame that ``accept`` takes; discard others, raise on an abort or silence."""
-        deadline = self.connection.clock.now() + attempt.timeout_s
+        now = self.connection.clock.now()
+        deadline = now + attempt.timeout_s
+        if self._unanswered_s is None:
+            self._unanswered_s = now
         while True:
-            frame = self.receive(deadline - self.connection.clock.now())
-            if frame is None:
-                raise TransferLost(f"no answer to {what} within {attempt.timeout_s:g} s")
-            if frame[0] == 0x80:
+            frame = self.receive(max(0.0, deadline - now))
+            if frame is not None and frame[0] == 0x80:
                 self.raise_if_abort_of(attempt, frame)
-            elif accept(frame):
+            elif frame is not None and accept(frame):
+                self._unanswered_s = None
                 return frame
+            now = self.connection.clock.now()
+            if frame is None or now > deadline:  # whoever floods the channel does not prolong the wait
+                raise TransferLost(f"no answer to {what} within {attempt.timeout_s:g} s")
             attempt.discarded += 1
 
     def raise_if_abort_of(self, attempt: Attempt, frame: bytes) -> None:
         """Raise when an abort frame belongs to this transfer; a node that names no object means us."""
         if not attempt.owns(frame) and MULTIPLEXOR.unpack_from(frame)[1:] != (0, 0):
             return
+        self._unanswered_s = None
         code = int.from_bytes(frame[4:8], "little")
         if code in TRANSPORT_CODES:
             raise TransferLost(f"node aborted: {abort_text(code)} ({code:#010x})", code, abort_owed=False)
@@ -207,8 +273,24 @@ class SdoChannel:
 
     def check_announced(self, attempt: Attempt, announced: int | None) -> None:
         """Compare the announced with the expected length before anything is transferred."""
-        if announced is not None and attempt.size is not None and announced != attempt.size:
+        if announced is None:
+            return
+        if attempt.size is not None and announced != attempt.size:
             raise TransferLost(f"node announces {announced} bytes, expected {attempt.size}", AbortCode.LENGTH)
+        self._check_longest(attempt, announced)
+
+    def raise_if_over(self, attempt: Attempt, received: int) -> None:
+        """Raise when the object has taken its time, however lively the node is, or is longer than it may be."""
+        self._check_longest(attempt, received)
+        if self.connection.clock.now() > attempt.until_s:
+            raise TransferLost(f"not complete in time: {received} bytes moved")
+
+    def _check_longest(self, attempt: Attempt, length: int) -> None:
+        if attempt.size is None and length > attempt.longest:
+            self._abort(attempt, AbortCode.TOO_LONG)
+            raise self._failure(
+                attempt, TransferLost(f"longer than the {attempt.longest} bytes taken", AbortCode.TOO_LONG), 1
+            )
 
     def check_size(self, attempt: Attempt, data: bytes, announced: int | None) -> bytes:
         """Compare what came with what was announced and what was expected."""
@@ -231,14 +313,19 @@ class SdoChannel:
         while True:
             count += 1
             try:
+                self._settle(attempt)
                 return once(), count
             except TransferLost as lost:
+                self._unsettled = True
                 attempt.notes.append(f"try {count}: {lost.what}")
                 self._leave(attempt, lost)
                 if recover is not None and attempt.mode is Mode.EXPEDITED and recover():
                     return b"", count
-                if count < tries:
+                over = self.connection.clock.now() > attempt.until_s
+                if count < tries and not over:
                     continue
+                if over:
+                    raise self._failure(attempt, lost, count) from None
                 if attempt.mode is not Mode.BLOCK or (self.block_supported and lost.code == AbortCode.TIMED_OUT):
                     raise self._failure(attempt, lost, count) from None
                 attempt.mode = Mode.SEGMENTED
@@ -253,31 +340,10 @@ class SdoChannel:
                 self._fall_back(attempt)
             else:
                 self.block_supported = self.block_supported or normal is None or None
-                return data if normal is None else self._finish_upload(attempt, normal)
+                return data if normal is None else sdo_segmented.upload(self, attempt, normal)
         self.send(attempt.head(0x40) + b"\0\0\0\0")
         first = self.await_answer(attempt, lambda f: f[0] & 0xE0 == 0x40 and attempt.owns(f), "the upload request")
-        return self._finish_upload(attempt, first)
-
-    def _finish_upload(self, attempt: Attempt, first: bytes) -> bytes:
-        """Return the object whose normal upload the node began with the frame ``first``."""
-        if first[0] & 0x02:
-            attempt.mode = Mode.EXPEDITED
-            length = 4 - (first[0] >> 2 & 3) if first[0] & 0x01 else min(4, attempt.size or 4)
-            return self.check_size(attempt, first[4 : 4 + length], None)
-        attempt.mode = Mode.SEGMENTED
-        announced = int.from_bytes(first[4:8], "little") if first[0] & 0x01 else None
-        self.check_announced(attempt, announced)
-        limit = sdo_block.UNBOUNDED_LIMIT if announced is None else announced
-        data, toggle, more = bytearray(), 0, True
-        while more:
-            self.send(bytes((0x60 | toggle, 0, 0, 0, 0, 0, 0, 0)))
-            frame = self._await_toggled(attempt, toggle, len(data))
-            data += frame[1 : 8 - (frame[0] >> 1 & 7)]
-            if len(data) > limit:
-                raise TransferLost(f"node sent more than the {limit} bytes announced", AbortCode.TOO_LONG)
-            more = not frame[0] & 0x01
-            toggle ^= 0x10
-        return self.check_size(attempt, bytes(data), announced)
+        return sdo_segmented.upload(self, attempt, first)
 
     def _download_once(self, attempt: Attempt, data: bytes) -> bytes:
         if attempt.mode is Mode.EXPEDITED:
@@ -293,28 +359,14 @@ class SdoChannel:
                 self.block_supported = True
                 return data
         attempt.mode = Mode.SEGMENTED
-        self._download_segmented(attempt, data)
+        sdo_segmented.download(self, attempt, data)
         return data
-
-    def _download_segmented(self, attempt: Attempt, data: bytes) -> None:
-        self.send(attempt.head(0x21) + len(data).to_bytes(4, "little"))
-        self.await_answer(attempt, lambda f: f[0] == 0x60 and attempt.owns(f), "the write request")
-        toggle = 0
-        for start in range(0, max(len(data), 1), 7):
-            piece = data[start : start + 7]
-            last = start + 7 >= len(data)
-            self.send(bytes((toggle | (7 - len(piece)) << 1 | last,)) + piece.ljust(7, b"\0"))
-            self._await_toggled(attempt, 0x20 | toggle, start)
-            toggle ^= 0x10
-
-    def _await_toggled(self, attempt: Attempt, command: int, position: int) -> bytes:
-        """Return the answer to one segment; one with the other toggle is a duplicate of the last."""
-        return self.await_answer(attempt, lambda f: f[0] & 0xF0 == command, f"the segment at byte {position}")
 
     def _already_holds(self, attempt: Attempt, data: bytes) -> bool:
         """After a lost answer: read the object before it is written again."""
         probe = Attempt(attempt.index, attempt.sub, attempt.timeout_s, Mode.SEGMENTED)
         try:
+            self._settle(probe)
             held = self._upload_once(probe) == data
         except (TransferLost, SdoAbort) as error:
             attempt.notes.append(f"read-back after a lost answer failed: {error}")
@@ -338,9 +390,38 @@ class SdoChannel:
         """Abort what is left of a transfer and wait until nothing late arrives any more."""
         if lost.abort_owed:
             self._abort(attempt, lost.code)
-        deadline = self.connection.clock.now() + DRAIN_LIMIT_S
-        while self.receive(QUIET_S) is not None and self.connection.clock.now() < deadline:
-            attempt.discarded += 1
+        clock = self.connection.clock
+        late_s = clock.now() + (LATE_S if attempt.segments and lost.code == AbortCode.TIMED_OUT else 0.0)
+        deadline = clock.now() + DRAIN_LIMIT_S
+        while clock.now() < deadline:
+            if self.receive(QUIET_S) is not None:
+                attempt.discarded += 1
+            elif clock.now() >= late_s:
+                return
+
+    def _settle(self, attempt: Attempt) -> None:
+        """After a lost transfer: read an object whose answer tells that nothing older is still to come."""
+        if not self._unsettled or attempt.urgent:
+            return
+        index, sub = BARRIER[self._barriers % len(BARRIER)]
+        self._barriers += 1
+        barrier = Attempt(index, sub, attempt.timeout_s, Mode.SEGMENTED)
+        began = self.connection.clock.now()
+        for left in reversed(range(TRIES)):
+            self.send(barrier.head(0x40) + b"\0\0\0\0")
+            try:
+                self.await_answer(barrier, lambda f: f[0] & 0xE0 == 0x40 and barrier.owns(f), "the barrier read")
+                break
+            except SdoAbort:
+                break  # also an answer, to this very request
+            except TransferLost:
+                if not left:
+                    raise
+        self._unsettled = False
+        took_s = self.connection.clock.now() - began
+        if took_s > 0.5 * self.timeout_s:
+            self.timeout_s = max(self.timeout_s, min(2.0 * took_s, SLOWEST_ANSWER_S))
+            attempt.timeout_s = max(attempt.timeout_s, self.timeout_s)
 
     def _fall_back(self, attempt: Attempt) -> None:
         if not attempt.notes:
@@ -351,6 +432,7 @@ class SdoChannel:
     @contextmanager
     def _transfer(self, index: int, sub: int, mode: Mode, size: int | None) -> Iterator[Attempt]:
         attempt = Attempt(index, sub, self.slow_objects.get((index, sub), self.timeout_s), mode, size)
+        attempt.until_s = self.connection.clock.now() + OBJECT_LIMIT_S + SLOWEST_S_PER_BYTE * (size or 0)
         if self.connection.in_callback():
             raise PmsmtoolError(
                 "SDO transfer asked for from a bus callback, where it would wait for itself",
@@ -359,12 +441,17 @@ class SdoChannel:
             )
         with self._lock:
             attempt.discarded += self._mailbox.clear()
-            self._raise_if_pointless()
+            self.raise_if_pointless()
             try:
                 yield attempt
+            except OutOfTime:
+                self._unsettled = True
+                self._abort_quietly(attempt)
+                raise
             except (SdoAbort, DriveTimeout):
                 raise
             except BaseException:
+                self._unsettled = True
                 # Interrupted, cancelled or supervised away: the node must not stay inside a transfer.
                 self._abort_quietly(attempt)
                 raise
@@ -377,9 +464,18 @@ class SdoChannel:
         except BusError:
             pass  # the error under way says more than this one
 
-    def _raise_if_pointless(self) -> None:
+    def raise_if_pointless(self) -> None:
+        """Raise what makes further transfers pointless: cancelled, out of time, or what the supervision found."""
         if self._cancelled is not None:
             raise self._cancelled
+        now = self.connection.clock.now()
+        silent_s = 0.0 if self._unanswered_s is None else now - self._unanswered_s
+        if silent_s > self._silence_s or now > self._over_s:
+            likely, hint = self.connection.explain_silence(self.node)
+            raise OutOfTime(
+                f"no valid answer for {silent_s:.1f} s" if silent_s > self._silence_s else "the command takes too long",
+                where=f"node {self.node}", likely=likely, hint=hint,
+            )  # fmt: skip
         if self._check is not None:
             self._check()
 

@@ -27,8 +27,8 @@ SWITCH_BYTES = 4
 """Protocol switch threshold: objects of up to this many bytes come expedited (pst, B9)."""
 SILENCES = 4
 """Times in a row that nothing new may arrive before the transfer starts over."""
-UNBOUNDED_LIMIT = 1 << 24
-"""Bytes after which an upload without an announced size is taken for a node that never ends."""
+FRAMES_LIMIT = 4 * BLOCK_SIZE
+"""Frames in one sub-block, duplicates included, after which the node is taken for one that never ends it."""
 
 
 def upload(channel: SdoChannel, attempt: Attempt) -> tuple[bytes, bytes | None]:
@@ -57,7 +57,7 @@ def upload(channel: SdoChannel, attempt: Attempt) -> tuple[bytes, bytes | None]:
 
 def _receive_blocks(channel: SdoChannel, attempt: Attempt, announced: int | None) -> tuple[bytearray, bytes]:
     """Return the data with its padding, and the acknowledgement of its last sub-block."""
-    limit = (UNBOUNDED_LIMIT if announced is None else announced) + 7
+    limit = (attempt.limit if announced is None else announced) + 7
     data = bytearray()
     silences = 0
     request = b"\xa3" + bytes(7)
@@ -66,7 +66,8 @@ def _receive_blocks(channel: SdoChannel, attempt: Attempt, announced: int | None
         count, last, frames = _receive_sub_block(channel, attempt, data)
         silences = 0 if count else silences + 1
         if len(data) > limit:
-            raise TransferLost(f"node sent more than the {announced} bytes announced", AbortCode.TOO_LONG)
+            raise TransferLost(f"node sent more than {limit - 7} bytes", AbortCode.TOO_LONG)
+        channel.raise_if_over(attempt, len(data) - 7)  # the last segment is padded
         if frames:
             request = bytes((0xA2, count, BLOCK_SIZE, 0, 0, 0, 0, 0))
         elif announced is not None and announced - len(data) <= 7:
@@ -82,7 +83,7 @@ def _receive_blocks(channel: SdoChannel, attempt: Attempt, announced: int | None
 def _receive_sub_block(channel: SdoChannel, attempt: Attempt, data: bytearray) -> tuple[int, bool, int]:
     """Append one sub-block; return segments taken in order, whether the last was one, frames seen."""
     taken, frames, previous = 0, 0, b""
-    while True:
+    for _ in range(FRAMES_LIMIT):
         frame = channel.receive(attempt.timeout_s)
         if frame is None:
             return taken, False, frames
@@ -105,6 +106,7 @@ def _receive_sub_block(channel: SdoChannel, attempt: Attempt, data: bytearray) -
         previous = frame
         if number == BLOCK_SIZE or command & 0x80:
             return taken, False, frames
+    raise TransferLost(f"node sends the same segments again and again after byte {len(data)}", AbortCode.SEQUENCE)
 
 
 def _await_end(channel: SdoChannel, attempt: Attempt, acknowledgement: bytes) -> bytes:
@@ -124,7 +126,7 @@ def download(channel: SdoChannel, attempt: Attempt, data: bytes) -> None:
     first = _initiate(channel, attempt, lambda f: f[0] & 0xFB == 0xA0)
     has_crc = bool(first[0] & 0x04)
     block_size = first[4]
-    position = 0
+    position, refused = 0, 0
     while position < len(data):
         if not 1 <= block_size <= 127:
             raise TransferLost(f"node asks for blocks of {block_size} segments", AbortCode.BLOCK_SIZE)
@@ -132,6 +134,9 @@ def download(channel: SdoChannel, attempt: Attempt, data: bytes) -> None:
         for segment in segments:
             channel.send(segment)
         count, block_size = _acknowledged(channel, attempt, segments, position, has_crc)
+        refused = 0 if count else refused + 1
+        if refused > SILENCES:
+            raise TransferLost(f"node acknowledges no segment from byte {position} on", AbortCode.SEQUENCE)
         attempt.retransmitted += len(segments) - count
         position += 7 * count
     end = bytes((0xC1 | -len(data) % 7 << 2,)) + crc_hqx(data, 0).to_bytes(2, "little") + bytes(5)

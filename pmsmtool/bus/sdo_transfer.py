@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -10,6 +11,12 @@ from pmsmtool.bus.abort_codes import AbortCode
 
 MULTIPLEXOR = struct.Struct("<BHB")
 """Command specifier, index, sub-index: the head of every initiate and abort frame."""
+LARGEST_UNKNOWN = 1 << 20
+"""Bytes of an object whose size nobody knows; the EDS in a drive (0x1021) has some 10^5."""
+OBJECT_LIMIT_S = 60.0
+"""Time one object may take, all tries together, beyond what its expected size needs."""
+SLOWEST_S_PER_BYTE = 4e-3
+"""A segmented transfer at 10 kbit/s: two frames of 130 bits for 7 bytes."""
 
 
 class Mode(StrEnum):
@@ -68,16 +75,30 @@ class Transfer:
 
 @dataclass(slots=True)
 class Attempt:
-    """One object under way: what is awaited and what was met."""
+    """One object under way: what is awaited and what was met.
+
+    ``longest`` bytes are taken at most where no ``size`` is expected, and the object has until ``until_s`` on the bus
+    clock, all tries together. ``segments`` tells that the attempt has begun a segmented upload,
+    ``urgent`` that it is a command, which waits for no barrier: its answer names its object.
+    """
 
     index: int
     sub: int
     timeout_s: float
     mode: Mode
     size: int | None = None
+    longest: int = LARGEST_UNKNOWN
+    until_s: float = math.inf
+    segments: bool = False
+    urgent: bool = False
     retransmitted: int = 0
     discarded: int = 0
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def limit(self) -> int:
+        """Bytes that are taken at most."""
+        return self.longest if self.size is None else self.size
 
     def head(self, command: int) -> bytes:
         """Return command specifier and multiplexor."""

@@ -17,6 +17,7 @@ import click
 from pmsmtool.cli.options import MotionOptions
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import Declined
+from pmsmtool.plain_text import plain
 
 Subject = Literal["motion", "writing"]
 
@@ -99,7 +100,7 @@ def _ask(
     out: Output,
 ) -> Consent:
     for line in text:
-        click.echo(line, err=True)  # shown even when quiet: nobody consents to what he has not seen
+        click.echo(plain(line), err=True)  # shown even when quiet: nobody consents to what he has not seen
     if options.serial is not None and options.serial != serial:
         raise Declined(
             f"the drive's serial number is {serial}, --serial says {options.serial}: nothing was done",

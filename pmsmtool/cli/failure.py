@@ -22,6 +22,7 @@ from pmsmtool.errors import (
     decisive,
     related,
 )
+from pmsmtool.plain_text import plain
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -86,7 +87,7 @@ def _tell_others(error: BaseException, told: BaseException) -> None:
 
 def _tell(error: PmsmtoolError) -> None:
     label = next((text for kind, text in _LABELS if isinstance(error, kind)), "error")
-    _echo(f"{click.style(label, fg='red', bold=True)}: {error.what}")
+    _echo(error.what, click.style(label, fg="red", bold=True) + ": ")
     details = error.violations if isinstance(error, ConfigError) else ()
     details = error.differences if isinstance(error, VerifyMismatch) else details
     for detail in details:
@@ -155,5 +156,5 @@ def _keep(text: str) -> Path | None:
     return None
 
 
-def _echo(text: str) -> None:
-    click.echo(text.rstrip("\n"), err=True)
+def _echo(text: str, label: str = "") -> None:
+    click.echo(label + plain(text.rstrip("\n")), err=True)

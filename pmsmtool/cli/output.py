@@ -12,6 +12,8 @@ from typing import Any
 
 import click
 
+from pmsmtool.plain_text import one_line, plain
+
 
 def jsonable(value: Any) -> Any:
     """Return a value as plain JSON types.
@@ -49,7 +51,7 @@ def jsonable(value: Any) -> Any:
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
     """Return aligned lines: text to the left, numbers to the right, two blanks between columns."""
-    body = [[str(cell) for cell in row] for row in rows]
+    body = [[one_line(str(cell)) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(heads, *body, strict=True)]
     numeric = [bool(body) and all(_is_number(row[k]) for row in body) for k in range(len(heads))]
     lines = []
@@ -103,7 +105,7 @@ class Output:
             self.json_line(command, data)
             return
         for line in text() if callable(text) else text:
-            click.echo(line)
+            click.echo(plain(line))
 
     def json_line(self, command: str, data: Mapping[str, Any]) -> None:
         """Print one JSON object on a line of its own (``monitor`` prints many)."""
@@ -124,18 +126,18 @@ class Output:
 
     def warn(self, text: str) -> None:
         """Say on stderr what must be read even when quiet."""
-        self._say(f"{click.style('warning', fg='yellow', bold=True)}: {text}")
+        self._say(text, click.style("warning", fg="yellow", bold=True) + ": ")
 
     def status(self, text: str) -> None:
         """Show progress in one line that is overwritten; nothing where stderr is no terminal."""
         if self.verbosity >= 0 and sys.stderr.isatty():
-            text = text[:119]
+            text = one_line(text, 110)
             click.echo(f"\r{text.ljust(self._status_width)}", nl=False, err=True)
             self._status_width = len(text)
 
-    def _say(self, text: str) -> None:
+    def _say(self, text: str, label: str = "") -> None:
         self._clear_status()
-        click.echo(text, err=True)
+        click.echo(label + plain(text), err=True)
 
     def _clear_status(self) -> None:
         if self._status_width:
@@ -149,7 +151,11 @@ def set_up_logging(verbosity: int) -> None:
         return  # Python's own default: warnings to stderr
     import logging
 
+    class Plain(logging.Formatter):
+        def format(self, record: logging.LogRecord) -> str:
+            return plain(super().format(record))
+
     levels = {-1: logging.ERROR, 1: logging.INFO}
-    logging.basicConfig(
-        level=levels.get(verbosity, logging.DEBUG), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
-    )
+    shown = logging.StreamHandler(sys.stderr)
+    shown.setFormatter(Plain("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=levels.get(verbosity, logging.DEBUG), handlers=[shown])

@@ -6,6 +6,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from pmsmtool.cli.output import Output
+from pmsmtool.plain_text import plain
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -51,6 +52,7 @@ class StageProgress:
 
     def say(self, text: str) -> None:
         """Show a step inside the stage."""
+        text = plain(text)
         if self._live is None or self._task is None:
             self._out.detail(f"      {text}")
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING
 
 import click
@@ -10,7 +11,10 @@ from pmsmtool.cli.options import BusOptions, bus_options, examples, output_optio
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
+    from pmsmtool.bus.connection import Connection
     from pmsmtool.cia402 import State
+    from pmsmtool.drive.drive_node import DriveNode
+    from pmsmtool.errors import PmsmtoolError
 
 
 @click.command("stop", epilog=examples("pmsmtool -i pmsmsim stop", "pmsmtool stop -n 5", "pmsmtool stop --all"))
@@ -20,31 +24,70 @@ if TYPE_CHECKING:
 def stop_command(bus: BusOptions, out: Output, everyone: bool) -> None:
     """Quick stop, zero current, voltage off, confirmed from the statusword.
 
-    Exit code 8 when a drive does not confirm: the machine may be energised, use the hardware stop.
+    Exit code 8 when a drive does not confirm, or none answers: the machine may be energised, use the hardware stop.
+    A drive that brakes has the time of its ramp; one without a valid answer for 2 s has not confirmed. Several drives
+    are stopped at the same time. Nothing is waited for that another program does with the drive.
     """
-    from pmsmtool.bus.scan import find_nodes
-    from pmsmtool.cli.drive_access import choose_node
     from pmsmtool.drive.drive_node import DriveNode
-    from pmsmtool.drive.stop import quick_stop, state_text
-    from pmsmtool.errors import PmsmtoolError
+    from pmsmtool.drive.stop import state_text
 
-    stopped: list[tuple[int, State]] = []
-    failures: list[PmsmtoolError] = []
     with bus.connect() as connection:
-        if everyone:
-            found = find_nodes(connection)
-            ids = [entry.node for entry in found if entry.is_drive or entry.device_type is None]
-        else:
-            ids = [choose_node(connection, bus.node)]
-        for node_id in ids:
-            node = DriveNode(connection, node_id)
-            try:
-                stopped.append((node_id, quick_stop(node)))
-            except PmsmtoolError as error:  # the others are stopped first
-                failures.append(error)
-            finally:
-                node.close()
+        nodes = [DriveNode(connection, node_id) for node_id in _whom(connection, bus.node, everyone)]
+        stopped, failures = _stop_together(connection, nodes, out)
     lines = [f"node {node_id}  stopped: {state_text(state)}" for node_id, state in stopped]
     out.result("stop", {"stopped": [{"node": node_id, "state": state} for node_id, state in stopped]}, lines)
     if failures:
-        raise failures[0]
+        raise failures[0] if len(failures) == 1 else ExceptionGroup("drives that did not confirm", failures)
+
+
+def _whom(connection: Connection, node: int | None, everyone: bool) -> list[int]:
+    """Return the nodes to stop.
+
+    Raises
+    ------
+    StopNotConfirmed
+        None answers.
+    ConfigError
+        Several do, and neither one nor all were asked for.
+    """
+    from pmsmtool.bus.scan import find_nodes
+    from pmsmtool.cli.drive_access import choose_node
+    from pmsmtool.drive.stop import nobody_confirms
+    from pmsmtool.errors import BusError
+
+    try:
+        if not everyone:
+            return [choose_node(connection, node)]
+        found = [entry.node for entry in find_nodes(connection) if entry.is_drive or entry.device_type is None]
+    except BusError as error:
+        raise nobody_confirms(error.what, error.likely) from error
+    if not found:
+        raise nobody_confirms("no drive answers", connection.explain_silence(0)[0])
+    return found
+
+
+def _stop_together(
+    connection: Connection, nodes: list[DriveNode], out: Output
+) -> tuple[list[tuple[int, State]], list[PmsmtoolError]]:
+    """Stop all at the same time, so that the last does not turn until the first has stood still."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from pmsmtool.drive.stop import ask_at_once, quick_stop
+    from pmsmtool.errors import BusError, PmsmtoolError
+
+    def stop(node: DriveNode) -> State | PmsmtoolError:
+        try:
+            return quick_stop(node, say=lambda text: out.status(f"node {node.node}: {text}"))
+        except PmsmtoolError as error:
+            return error
+
+    for node in nodes:
+        with contextlib.suppress(BusError):
+            ask_at_once(node)
+    if connection.shared and len(nodes) > 1:
+        with ThreadPoolExecutor(len(nodes)) as pool:
+            results = list(pool.map(stop, nodes))
+    else:
+        results = [stop(node) for node in nodes]
+    stopped = [(n.node, found) for n, found in zip(nodes, results, strict=True) if not isinstance(found, PmsmtoolError)]
+    return stopped, [found for found in results if isinstance(found, PmsmtoolError)]

@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.nmt import NmtCommand, NmtState, reset_node, send_nmt
 from pmsmtool.bus.sdo import Retry, SdoChannel
@@ -16,6 +17,7 @@ from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import DriveFault, DriveTimeout, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap, reference_map
+from pmsmtool.plain_text import one_line
 
 STATE_TIMEOUT_S = 2.0
 """A state transition without motion takes milliseconds; charging a DC link may take longer."""
@@ -25,6 +27,8 @@ STORE_POLL_S = 0.1
 READY_TIMEOUT_S = 3.0
 """After boot-up a node answers SDO requests within this time."""
 POLL_S = 0.005
+LONGEST_NAME = 256
+"""Bytes of 0x1008 to 0x100A that are read; drives use up to 64."""
 
 Watcher = Callable[[int, int], None]
 """Called with index and sub-index before an object is written."""
@@ -108,11 +112,13 @@ class DriveNode:
     # ---- identity -------------------------------------------------------------------------------
 
     def identity(self) -> Identity:
-        """Read identity object and names; also the producer heartbeat time; supervision begins here."""
+        """Read identity object and names; also the producer heartbeat time; supervision begins here.
+
+        A number the node does not have is 0: only the vendor is mandatory (CiA 301, object 0x1018).
+        """
         self.supervision.begin()
-        vendor, product, revision, serial = (
-            int.from_bytes(self.sdo.read(objects.IDENTITY, sub, size=4), "little") for sub in range(1, 5)
-        )
+        vendor = self._identity_number(1)
+        product, revision, serial = (self._identity_number(sub) for sub in (2, 3, 4))
         name, hardware, software = (
             self._text(*where) for where in (objects.DEVICE_NAME, objects.HARDWARE_VERSION, objects.SOFTWARE_VERSION)
         )
@@ -120,11 +126,20 @@ class DriveNode:
             self.supervision.heartbeat_period_s = self.get(objects.PRODUCER_HEARTBEAT_MS) / 1000.0 or None
         return Identity(self.node, vendor, product, revision, serial, name, hardware, software)
 
+    def _identity_number(self, sub: int) -> int:
+        try:
+            return int.from_bytes(self.sdo.read(objects.IDENTITY, sub, size=4), "little")
+        except SdoAbort as abort:
+            if sub > 1 and abort.code in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX):
+                return 0
+            raise
+
     def _text(self, index: int, sub: int) -> str:
         try:
-            return self.sdo.read(index, sub).rstrip(b"\0").decode("ascii", "replace")
-        except SdoAbort:
-            return ""
+            data = self.sdo.upload(index, sub, longest=LONGEST_NAME).data
+        except SdoAbort as abort:
+            return f"(longer than {LONGEST_NAME} bytes)" if abort.code == AbortCode.TOO_LONG else ""
+        return one_line(data.rstrip(b"\0").decode("ascii", "replace"))
 
     # ---- CiA 402 --------------------------------------------------------------------------------
 

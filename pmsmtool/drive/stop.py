@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
+from collections.abc import Callable
 
+from pmsmtool.bus.sdo import OutOfTime
 from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.cia402 import Command, QuickStop, State
 from pmsmtool.drive import objects
@@ -12,19 +15,40 @@ from pmsmtool.errors import BusError, DriveFault, PmsmtoolError, SdoAbort, StopN
 
 STOP_MARGIN_S = 1.0
 """Beyond the time the deceleration ramp needs."""
+SILENCE_S = 1.5
+"""A drive without a valid answer for so long does not confirm any more; with all around it that takes 2 s."""
+OWN_S = 0.2
+"""What a stop has at least, of a drive that was silent before."""
+RAMP_LIMIT_S = 60.0
+"""No ramp is waited for longer: then the voltage is removed, whatever the drive says about its speed."""
+STALLED_S = 1.0
+"""A speed that has not fallen for so long does not follow the ramp: the voltage is removed."""
+ANSWERS_S = 8.0
+"""Beyond the ramp: the states on the way and the references, of a drive that answers after retries."""
+_HARDWARE_STOP = (
+    "use the hardware stop (emergency stop, safe torque off, or mains), check cable and supply, then reset the drive:"
+    " until then it may hold values of an interrupted run"
+)
+SPEED_PERIOD_S = 0.1
+FALLEN = 0.995
+"""A speed below this share of the lowest before has fallen."""
 STOP_TRIES = 4
 """A stop is asked for this often: each kind of alarm may end one attempt."""
 STANDSTILL_MRPM = 5_000.0
 """Speed (thousandths of rpm) below which a drive that stays in quick stop counts as standing."""
 
 
-def quick_stop(node: DriveNode, *, ramp: bool = True) -> State:
+def quick_stop(node: DriveNode, *, ramp: bool = True, say: Callable[[str], None] = lambda text: None) -> State:
     """Quick stop, voltage off, references to zero; return the state the statusword then shows.
+
+    A drive that answers has the time of its ramp; one that is silent for ``SILENCE_S`` ends the stop.
 
     Parameters
     ----------
     ramp : bool
         Whether the drive may brake by its quick stop ramp; without it the voltage is removed and the shaft coasts.
+    say : callable
+        Told how the speed falls.
 
     Raises
     ------
@@ -32,18 +56,21 @@ def quick_stop(node: DriveNode, *, ramp: bool = True) -> State:
         The drive did not confirm; the machine may be energised.
     """
     failure: PmsmtoolError | None = None
-    for _ in range(STOP_TRIES):
-        try:
-            with node.emergencies_tolerated(), node.supervision.other_masters_tolerated():
-                return _stop_once(node, ramp=ramp)
-        except StopNotConfirmed:
-            raise
-        except NodeReset as reset:
-            failure = reset  # a drive that boots is off; the next round confirms it
-        except (BusError, DriveFault) as error:
-            failure = error
-            with contextlib.suppress(BusError):
-                disable_at_once(node)
+    with node.sdo.limited(silence_s=SILENCE_S, own_s=OWN_S, total_s=RAMP_LIMIT_S + ANSWERS_S):
+        for _ in range(STOP_TRIES):
+            try:
+                with node.emergencies_tolerated(), node.supervision.other_masters_tolerated():
+                    return _stop_once(node, say, ramp=ramp)
+            except StopNotConfirmed:
+                raise
+            except NodeReset as reset:
+                failure = reset  # a drive that boots is off; the next round confirms it
+            except (BusError, DriveFault) as error:
+                failure = error
+                with contextlib.suppress(BusError):
+                    disable_at_once(node)
+                if isinstance(error, OutOfTime):
+                    break
     raise not_confirmed(node, failure.what if failure else "no answer") from failure
 
 
@@ -59,6 +86,12 @@ def disable(node: DriveNode) -> State:
     if state is None or not is_safe(state):
         raise not_confirmed(node, f"the statusword still shows {state_text(state)}")
     return state
+
+
+def ask_at_once(node: DriveNode) -> None:
+    """Send the controlword of the quick stop without waiting for anything: each of several drives begins to brake."""
+    word = objects.CONTROLWORD
+    node.sdo.post(word.index, word.sub, word.encode(Command.QUICK_STOP))
 
 
 def disable_at_once(node: DriveNode) -> None:
@@ -94,8 +127,14 @@ def not_confirmed(node: DriveNode, why: str) -> StopNotConfirmed:
         f"the drive did not confirm that it stopped ({why}): the machine may be energised",
         where=f"node {node.node}, 0x6041:00",
         likely="the bus or the drive does not answer; its heartbeat supervision stops it if that was set",
-        hint="use the hardware stop (emergency stop, safe torque off, or mains), check cable and supply, then reset the"
-        " drive: until then it may hold values of an interrupted run",
+        hint=_HARDWARE_STOP,
+    )
+
+
+def nobody_confirms(why: str, likely: str) -> StopNotConfirmed:
+    """Return the error of a stop that reached no drive at all."""
+    return StopNotConfirmed(
+        f"no stop was confirmed ({why}): the machine may be energised", likely=likely, hint=_HARDWARE_STOP
     )
 
 
@@ -104,19 +143,27 @@ def state_text(state: State | None) -> str:
     return "an undefined state" if state is None else state.name.replace("_", " ")
 
 
-def _stop_once(node: DriveNode, *, ramp: bool) -> State:
+def _stop_once(node: DriveNode, say: Callable[[str], None], *, ramp: bool) -> State:
     state = node.state()
     if ramp and not is_safe(state):
         node.go(Command.QUICK_STOP)
-        stays = node.whole(objects.QUICK_STOP_OPTION) >= QuickStop.SLOW_DOWN_AND_STAY if _has_option(node) else False
-        node.wait_for_state(lambda now: _has_stopped(node, now, stays), _stop_time_s(node))
+        option = _option(node)
+        stays = option is not None and option.stays
+        ramp_s = _ramp_s(node, option)
+        if ramp_s > STOP_MARGIN_S:
+            say(f"braking, up to {ramp_s:.0f} s")
+        falling = _Falling(node, say)
+        node.wait_for_state(lambda now: _has_stopped(node, now, stays) or falling.stalled(), STOP_MARGIN_S + ramp_s)
     state = disable(node)
     zero_references(node)
     return state
 
 
-def _has_option(node: DriveNode) -> bool:
-    return node.has(objects.QUICK_STOP_OPTION.index, objects.QUICK_STOP_OPTION.sub)
+def _option(node: DriveNode) -> QuickStop | None:
+    """Return the quick stop option; None where the drive has none, or one of its maker's own."""
+    with contextlib.suppress(SdoAbort, ValueError):
+        return QuickStop(node.whole(objects.QUICK_STOP_OPTION))
+    return None
 
 
 def _has_stopped(node: DriveNode, state: State | None, stays: bool) -> bool:
@@ -125,10 +172,45 @@ def _has_stopped(node: DriveNode, state: State | None, stays: bool) -> bool:
     return stays and state is State.QUICK_STOP_ACTIVE and abs(node.get(objects.VELOCITY_MRPM)) < STANDSTILL_MRPM
 
 
-def _stop_time_s(node: DriveNode) -> float:
-    """Time the ramp of 0x6085 needs from the present speed; the margin alone where the drive tells neither."""
+def _ramp_s(node: DriveNode, option: QuickStop | None) -> float:
+    """Twice the time its ramp (0x6085, or 0x6084) needs from the present speed; 0 where the drive tells neither."""
+    slow = option in (QuickStop.SLOW_DOWN, QuickStop.SLOW_DOWN_AND_STAY)
+    ramp = objects.PROFILE_DECELERATION if slow else objects.QUICK_STOP_DECELERATION
     try:
         rpm = abs(node.get(objects.VELOCITY_MRPM)) / 1000.0
-        return STOP_MARGIN_S + 2.0 * rpm / max(node.get(objects.QUICK_STOP_DECELERATION), 1.0)
+        return min(2.0 * rpm / max(node.get(ramp), 1.0), RAMP_LIMIT_S)
     except SdoAbort:
-        return STOP_MARGIN_S
+        return 0.0
+
+
+class _Falling:
+    """Watches the speed while a drive brakes.
+
+    Parameters
+    ----------
+    node : DriveNode
+        The drive.
+    say : callable
+        Told the speed as it falls.
+    """
+
+    def __init__(self, node: DriveNode, say: Callable[[str], None]) -> None:
+        self._node = node
+        self._say = say
+        self._lowest = math.inf
+        self._since_s = self._read_s = node.connection.clock.now()
+
+    def stalled(self) -> bool:
+        """Whether the speed has not fallen for ``STALLED_S``; not where the drive shows none, or stands."""
+        now = self._node.connection.clock.now()
+        if now - self._read_s < SPEED_PERIOD_S:
+            return False
+        self._read_s = now
+        try:
+            speed = abs(self._node.get(objects.VELOCITY_MRPM))
+        except SdoAbort:
+            return False
+        self._say(f"braking, {speed / 1000.0:.0f} rpm")
+        if speed < min(FALLEN * self._lowest, self._lowest - 1.0):
+            self._lowest, self._since_s = speed, now
+        return speed >= STANDSTILL_MRPM and now - self._since_s > STALLED_S
