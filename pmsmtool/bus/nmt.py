@@ -9,6 +9,8 @@ from pmsmtool.errors import DriveTimeout
 
 NMT_ID = 0x000
 HEARTBEAT_ID = 0x700
+TOOL_NODE = 0x7E
+"""Node id the tool's heartbeat carries; 0x7F is left to a PLC or configuration tool."""
 BOOT_TIMEOUT_S = 5.0
 """A drive's firmware is up again within this time; the simulated one needs a fraction of a second."""
 

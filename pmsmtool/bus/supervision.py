@@ -12,12 +12,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from pmsmtool.bus.connection import Connection
-from pmsmtool.bus.nmt import HEARTBEAT_ID, NMT_ID, NmtState
+from pmsmtool.bus.nmt import HEARTBEAT_ID, NMT_ID, TOOL_NODE, NmtState
 from pmsmtool.cia402 import error_text
 from pmsmtool.errors import BusError, DriveFault
 
-HEARTBEAT_TOLERANCE = 1.5
-"""Periods after which a heartbeat counts as lost (CANopen reference, section 6)."""
+HEARTBEAT_TOLERANCE = 2.5
+"""Periods without any frame of the node after which it counts as lost: one lost heartbeat is no lost node."""
+LIFE = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580)
+"""Emergencies, TPDOs and SDO answers: beside its heartbeat, what only a living node sends (CiA 301, section 7.3.3)."""
+HARMLESS = frozenset({0x1000, 0x1018})
+"""Who only reads these looks who is on the bus, as every second tool does before it knows that the drive is taken."""
 SENT_MEMORY = 256
 """Requests remembered to tell our own echo from a second master; a sub-block has 127."""
 STOPPING_CLASSES = frozenset({0x2, 0x3, 0x4, 0x7})
@@ -85,7 +89,9 @@ class Supervision:
     emergencies : list of Emergency
         In order of arrival.
     foreign_requests : int
-        SDO requests to the node and NMT commands that this program did not send.
+        SDO requests to the node, NMT commands and heartbeats of a master that this program did not send.
+    foreign : str
+        What the last of them was.
     stop_at_emergency, stop_at_other_master : bool
         Whether these end the work; not while the drive is being stopped.
     """
@@ -97,6 +103,7 @@ class Supervision:
         self.boot_ups = 0
         self.emergencies: list[Emergency] = []
         self.foreign_requests = 0
+        self.foreign = ""
         self.stop_at_emergency = True
         self.stop_at_other_master = True
         self._connection = connection
@@ -106,14 +113,16 @@ class Supervision:
         self._emergencies_seen = 0
         self._foreign_seen = 0
         self._paused = False
-        self._subscriptions = (
+        self._subscriptions = [
             (HEARTBEAT_ID + node, self._on_heartbeat),
             (0x080 + node, self._on_emergency),
             (0x600 + node, self._on_request),
             (NMT_ID, self._on_request),
             (0x580 + node, self._on_answer),
-        )
-        for cob_id in (0x600 + node, NMT_ID):
+            (HEARTBEAT_ID + TOOL_NODE, self._on_master),
+            *((base + node, self._on_life) for base in LIFE),
+        ]
+        for cob_id in (0x600 + node, NMT_ID, HEARTBEAT_ID + TOOL_NODE):
             connection.sent.setdefault(cob_id, deque(maxlen=SENT_MEMORY))
         for cob_id, callback in self._subscriptions:
             connection.subscribe(cob_id, callback)
@@ -122,6 +131,13 @@ class Supervision:
         """Stop listening."""
         for cob_id, callback in self._subscriptions:
             self._connection.unsubscribe(cob_id, callback)
+
+    def expect_master(self, master: int) -> None:
+        """Take heartbeats of a node for those of another master: one that the drive itself supervises (0x1016)."""
+        subscription = (HEARTBEAT_ID + master, self._on_master)
+        if master != self.node and subscription not in self._subscriptions:
+            self._subscriptions.append(subscription)
+            self._connection.subscribe(*subscription)
 
     @contextmanager
     def expected_reset(self) -> Iterator[None]:
@@ -164,7 +180,7 @@ class Supervision:
         if self.foreign_requests > self._foreign_seen and self.stop_at_other_master:
             self._foreign_seen = self.foreign_requests
             raise SecondMaster(
-                "another master sends requests to this node",
+                f"another master is on the bus: {self.foreign}",
                 where=f"node {self.node}",
                 likely="a PLC, the vendor's software or a second pmsmtool is connected",
                 hint="disconnect it: two masters on one SDO channel corrupt each other's transfers",
@@ -198,7 +214,8 @@ class Supervision:
             if self._overdue():
                 self._last_heard_s = None
                 raise HeartbeatLost(
-                    f"no heartbeat for {HEARTBEAT_TOLERANCE:g} periods of {self.heartbeat_period_s:g} s",
+                    f"no heartbeat, and no other frame, for {HEARTBEAT_TOLERANCE:g} periods "
+                    f"of {self.heartbeat_period_s:g} s",
                     where=f"node {self.node}",
                     likely="the node lost its supply, or the cable is open",
                     hint="check supply and cable, then run the command again",
@@ -221,6 +238,19 @@ class Supervision:
         if state == NmtState.BOOT_UP:
             self.boot_ups += 1
 
+    def _on_life(self, cob_id: int, data: bytes, timestamp: float) -> None:
+        if self._last_heard_s is not None:  # of a node whose heartbeat was heard; others are not watched
+            self._last_heard_s = self._connection.clock.now()
+            self._deaf_then_s = self._connection.deaf_s
+
+    def _on_master(self, cob_id: int, data: bytes, timestamp: float) -> None:
+        if data in self._connection.sent.get(cob_id, ()):
+            self._connection.sent[cob_id].clear()  # our own, echoed
+        else:
+            self.foreign_requests += 1
+            name = "another pmsmtool" if cob_id == HEARTBEAT_ID + TOOL_NODE else "a master this drive supervises"
+            self.foreign = f"the heartbeat of node {cob_id - HEARTBEAT_ID}, {name}"
+
     def _on_emergency(self, cob_id: int, data: bytes, timestamp: float) -> None:
         if len(data) >= 2:
             code = int.from_bytes(data[:2], "little")
@@ -233,9 +263,24 @@ class Supervision:
         sent = self._connection.sent[cob_id]
         if data in sent:
             sent.remove(data)  # the adapter echoes what we send
-        else:
+        elif cob_id == NMT_ID or not _only_looks(data):
             self.foreign_requests += 1
+            self.foreign = "an NMT command" if cob_id == NMT_ID else _described(data)
 
     def _on_answer(self, cob_id: int, data: bytes, timestamp: float) -> None:
         # An echo arrives before the answer it causes; what is older has no echo to come.
         self._connection.sent[0x600 + self.node].clear()
+
+
+def _only_looks(request: bytes) -> bool:
+    """Whether an SDO request only reads, or ends the reading of, who the node is."""
+    return request[:1] in (b"\x40", b"\x80") and int.from_bytes(request[1:3], "little") in HARMLESS
+
+
+def _described(request: bytes) -> str:
+    """Name an SDO request; inside a transfer only its initiate frame names the object."""
+    kinds = {1: "a write of", 2: "a read of", 4: "an abort of"}
+    kind = kinds.get(request[0] >> 5) if len(request) >= 4 else None
+    if kind is None:
+        return "an SDO transfer to this node"
+    return f"{kind} 0x{int.from_bytes(request[1:3], 'little'):04X}:{request[3]:02X} of this node"

@@ -123,13 +123,13 @@ def commission_command(
 @contextmanager
 def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDrive, Capabilities]]:
     """Open the drive with what it has; without a map, the one of its identity is used."""
-    from pmsmtool.cli.drive_access import choose_node
+    from pmsmtool.cli.drive_access import claimed_node
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.workflow.capabilities import examine
     from pmsmtool.workflow.tier_stages import open_tier_drive
 
     with bus.connect() as connection:
-        node = DriveNode(connection, choose_node(connection, bus.node))
+        node = DriveNode(connection, claimed_node(connection, bus.node))
         found = examine(node, given)
         node.close()
         drive = open_tier_drive(connection, node.node, found)

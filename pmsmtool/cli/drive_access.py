@@ -57,7 +57,7 @@ def open_node(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[Dr
     from pmsmtool.drive.drive_node import DriveNode
 
     with bus.connect() as connection:
-        node = DriveNode(connection, choose_node(connection, bus.node), drive_map=drive_map)
+        node = DriveNode(connection, claimed_node(connection, bus.node), drive_map=drive_map)
         if drive_map is not None and drive_map.name == OWN_FAMILY:
             _refuse_another_family(node)
         yield node
@@ -119,7 +119,7 @@ def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[C
 
     with bus.connect() as connection:
         try:
-            drive = CanopenDrive(connection, choose_node(connection, bus.node), drive_map=drive_map)
+            drive = CanopenDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
         except SdoAbort as abort:
             raise NotAvailable(
                 "this drive does not have the objects that experiments and commissioning need",
@@ -130,6 +130,21 @@ def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[C
         check_motion(drive.node.map, drive.identity)
         yield drive
         drive.close()
+
+
+def claimed_node(connection: Connection, node: int | None) -> int:
+    """Return the node id to use, as :func:`choose_node`, its drive locked until the connection is closed.
+
+    Raises
+    ------
+    SecondMaster
+        Another program works with the drive.
+    """
+    from pmsmtool.drive.drive_lock import claim
+
+    chosen = choose_node(connection, node)
+    claim(connection, chosen)
+    return chosen
 
 
 def choose_node(connection: Connection, node: int | None) -> int:

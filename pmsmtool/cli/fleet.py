@@ -50,6 +50,7 @@ def flash_fleet(
 ) -> None:
     """Plan for every node, ask once, write one after the other; a failure on one does not spare the others."""
     from pmsmtool.cli.flash_session import checked_identity, plan_facts
+    from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.errors import CheckFailed, PmsmtoolError
     from pmsmtool.flash.download import Download
@@ -60,6 +61,7 @@ def flash_fleet(
     with bus.connect() as connection:
         jobs: list[Download] = []
         for node_id in nodes:
+            claim(connection, node_id)
             node = DriveNode(connection, node_id, drive_map=drive_map)
             identity = checked_identity(node)
             plan = plan_download(node, wanted)

@@ -11,11 +11,12 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass
 
+from pmsmtool.bus.nmt import TOOL_NODE
 from pmsmtool.cia402 import AbortConnection, QuickStop, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
-from pmsmtool.drive.heartbeat import PERIOD_S, TOOL_NODE, Heartbeat
+from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat
 from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import SafetyRefusal, SdoAbort
 

@@ -12,11 +12,9 @@ from types import TracebackType
 
 from pmsmtool.bus.clock import Ticker
 from pmsmtool.bus.connection import Connection
-from pmsmtool.bus.nmt import HEARTBEAT_ID, NmtState
+from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE, NmtState
 from pmsmtool.errors import BusError
 
-TOOL_NODE = 0x7E
-"""Node id the tool's heartbeat carries; 0x7F is left to a PLC or configuration tool."""
 PERIOD_S = 0.05
 """Five heartbeats within the drive's consumer time of ``dead_man.CONSUMER_MS``."""
 

@@ -8,16 +8,21 @@ leaves an open journal: the same command, or ``restore``, finishes.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
+from pmsmtool.bus.nmt import TOOL_NODE
+from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.bus.supervision import NodeReset
+from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import (
+    DriveTimeout,
     Interrupted,
     PmsmtoolError,
     SafetyRefusal,
@@ -29,6 +34,8 @@ from pmsmtool.flash.map_gate import check_map, remember_map
 from pmsmtool.flash.plan import Change, Plan, differences
 from pmsmtool.params.catalogue import layout_signature
 
+CONSUMERS_MAX = 8
+"""Entries of 0x1016 that are read; drives have one to four."""
 LISTEN_S = 0.25
 """Before the first write the bus is listened to this long: another master would be heard."""
 _STARTS = 2
@@ -188,8 +195,30 @@ class Download:
                 likely="another tool is at work, or one was interrupted while this plan was made",
                 hint="make sure that no other tool is connected, then run the command again",
             )
+        self._watch_for_masters()
         self.node.connection.wait(LISTEN_S)
         self.node.supervision.check()
+
+    def _watch_for_masters(self) -> None:
+        """Take heartbeats of the nodes that the drive supervises for those of other masters."""
+        with contextlib.suppress(SdoAbort):
+            count = self.node.sdo.read(objects.CONSUMER_HEARTBEAT, 0, size=1)[0]
+            for sub in range(1, min(count, CONSUMERS_MAX) + 1):
+                word = int.from_bytes(self.node.sdo.read(objects.CONSUMER_HEARTBEAT, sub, size=4), "little")
+                other = word >> 16 & 0xFF
+                if word & 0xFFFF and 0 < other < 0x80 and other != TOOL_NODE and not self._is_device(other):
+                    self.node.supervision.expect_master(other)
+
+    def _is_device(self, other: int) -> bool:
+        """Whether a node answers for its device type: drives of one machine supervise each other, too."""
+        channel = SdoChannel(self.node.connection, other)
+        try:
+            channel.upload(objects.DEVICE_TYPE.index, objects.DEVICE_TYPE.sub, tries=1)
+        except (DriveTimeout, SdoAbort) as error:
+            return isinstance(error, SdoAbort)
+        finally:
+            channel.close()
+        return True
 
     def _close_stale(self, restoring: bool) -> None:
         """An interrupted download that had reached its end after all."""

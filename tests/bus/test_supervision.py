@@ -81,7 +81,7 @@ def test_time_in_which_this_computer_did_not_listen_is_no_silence(
     connection.wait(1.0)
     connection.deaf_s += 0.9
     supervision.check()
-    connection.wait(0.3)
+    connection.wait(0.5)
     with pytest.raises(HeartbeatLost):
         supervision.check()
 
@@ -152,3 +152,65 @@ def test_own_echo_is_no_second_master(bus: ScriptedBus, connection: Connection, 
     connection.wait(0.01)
     supervision.check()
     assert supervision.foreign_requests == 0
+
+
+def test_any_frame_of_the_node_is_life(bus: ScriptedBus, connection: Connection, supervision: Supervision) -> None:
+    supervision.heartbeat_period_s = 0.2
+    bus.deliver(0x700 + NODE, b"\x05")
+    connection.wait(0.01)
+    for base in (0x080, 0x180, 0x280, 0x380, 0x480, 0x580):
+        connection.wait(0.4)
+        bus.deliver(base + NODE, bytes(8))
+        connection.wait(0.2)
+        supervision.check()
+    connection.wait(0.51)
+    with pytest.raises(HeartbeatLost, match="no other frame"):
+        supervision.check()
+
+
+def test_one_lost_heartbeat_is_no_lost_node(bus: ScriptedBus, connection: Connection, supervision: Supervision) -> None:
+    supervision.heartbeat_period_s = 0.2
+    for _ in range(5):
+        bus.deliver(0x700 + NODE, b"\x05")
+        connection.wait(0.4)
+        supervision.check()
+
+
+@pytest.mark.parametrize(
+    ("cob_id", "frame", "name"),
+    [
+        (0x600 + NODE, b"\x2b\x40\x60\x00\x06\0\0\0", "a write of 0x6040:00"),
+        (0x600 + NODE, b"\x40\x10\x20\x02\0\0\0\0", "a read of 0x2010:02"),
+        (0x000, bytes((0x81, NODE)), "an NMT command"),
+        (0x77E, b"\x05", "the heartbeat of node 126, another pmsmtool"),
+    ],
+)
+def test_another_master_is_named(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision, cob_id: int, frame: bytes, name: str
+) -> None:
+    bus.deliver(cob_id, frame)
+    connection.collect()
+    with pytest.raises(SecondMaster, match=name):
+        supervision.check()
+
+
+@pytest.mark.parametrize("index", [0x1000, 0x1018])
+def test_who_only_looks_is_no_second_master(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision, index: int
+) -> None:
+    bus.deliver(0x600 + NODE, b"\x40" + index.to_bytes(2, "little") + bytes(5))
+    connection.collect()
+    supervision.check()
+
+
+def test_heartbeat_of_a_master_that_the_drive_supervises(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision
+) -> None:
+    bus.deliver(0x701, b"\x05")
+    connection.collect()
+    supervision.check()
+    supervision.expect_master(1)
+    bus.deliver(0x701, b"\x05")
+    connection.collect()
+    with pytest.raises(SecondMaster, match="node 1, a master this drive supervises"):
+        supervision.check()

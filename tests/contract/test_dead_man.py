@@ -20,10 +20,11 @@ import can
 import pytest
 
 from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.nmt import TOOL_NODE
 from pmsmtool.cia402 import State
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
-from pmsmtool.drive.heartbeat import TOOL_NODE, Heartbeat
+from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.errors import ExitCode
 from tests.contract.contract import Peer
 from tests.drive.bench import sim_bench

@@ -13,11 +13,11 @@ import pytest
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import WallClock
 from pmsmtool.bus.connect import Connection
-from pmsmtool.bus.nmt import HEARTBEAT_ID
+from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE
 from pmsmtool.cia402 import AbortConnection, State
 from pmsmtool.drive.dead_man import CONSUMER_MS, TRIES, prove_dead_man
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.heartbeat import PERIOD_S, TOOL_NODE, Heartbeat
+from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat
 from pmsmtool.errors import BusError, SafetyRefusal
 from pmsmtool.sim.node.dictionary import Refused
 from tests.bus.scripted import ScriptedBus, ScriptedSlave

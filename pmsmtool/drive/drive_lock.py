@@ -1,0 +1,115 @@
+"""One program per drive: a lock file per serial number, which the system frees when its owner ends or dies.
+
+Two programs on one SDO channel corrupt each other's transfers, and both roll back. The lock lets the first one win and
+names it to the second. ``stop`` never asks for it; a drive simulated in this process cannot be shared and has none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import getpass
+import hashlib
+import os
+import sys
+from pathlib import Path
+
+from pmsmtool.bus.connection import Connection
+from pmsmtool.bus.sdo import SdoChannel
+from pmsmtool.bus.supervision import SecondMaster
+from pmsmtool.drive import objects
+from pmsmtool.errors import ConfigError, SdoAbort
+from pmsmtool.firmware.drive_map import reference_map
+from pmsmtool.plain_text import one_line
+from pmsmtool.resources import user_folder
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+_LOCKED_BYTE = 1 << 30
+"""Windows locks bytes, and who holds the file must stay readable: the locked byte lies behind the text."""
+_LONGEST_OWNER = 200
+
+
+def claim(connection: Connection, node_id: int) -> None:
+    """Lock the drive of a node until the connection is closed.
+
+    Only vendor, product and serial number are read before: another program at work takes these reads for harmless.
+
+    Raises
+    ------
+    SecondMaster
+        Another program of this account works with the drive; it is named.
+    """
+    if not connection.shared:
+        return
+    try:
+        folder = user_folder() / "locks"
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder / f"{_key(connection, node_id)}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+    except (OSError, ConfigError):
+        return  # nothing can be written for this user: no journal either, so nothing is downloaded
+    if not _lock(descriptor):
+        owner = one_line(os.read(descriptor, _LONGEST_OWNER).decode("utf-8", "replace").strip()) or "unknown"
+        os.close(descriptor)
+        raise SecondMaster(
+            f"another pmsmtool works with this drive: {owner}",
+            where=f"node {node_id}",
+            likely="a second terminal, a script or a scheduled job",
+            hint=f"wait until it has ended, or end it; `pmsmtool stop -n {node_id}` works all the same",
+        )
+    connection.at_close.append(lambda: os.close(descriptor))
+    os.ftruncate(descriptor, 0)
+    os.write(descriptor, _owner().encode("utf-8", "replace")[:_LONGEST_OWNER])
+
+
+def _key(connection: Connection, node_id: int) -> str:
+    """Return the drive's name among locks.
+
+    One without a serial number is known by its bus and node id; simulated ones, of which several servers give the same
+    number, by both.
+    """
+    sdo = SdoChannel(connection, node_id)
+    try:
+        numbers = []
+        for sub in (1, 2, 4):
+            try:
+                numbers.append(int.from_bytes(sdo.read(objects.IDENTITY, sub, size=4), "little"))
+            except SdoAbort:
+                numbers.append(0)
+    finally:
+        sdo.close()
+    vendor, product, serial = numbers
+    name = f"{vendor:08x}-{product:08x}-{serial}"
+    if serial and vendor != reference_map().vendor:
+        return name
+    where = str(connection.bus.channel_info).rpartition("@")[2]  # of socketcand the server, whatever name is opened
+    place = hashlib.sha256(where.encode()).hexdigest()[:12]
+    return f"{name}-{place}-{node_id}"
+
+
+def _lock(descriptor: int) -> bool:
+    try:
+        if sys.platform == "win32":
+            os.lseek(descriptor, _LOCKED_BYTE, os.SEEK_SET)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+            os.lseek(descriptor, 0, os.SEEK_SET)
+        else:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        if sys.platform == "win32":
+            os.lseek(descriptor, 0, os.SEEK_SET)
+        return False
+    return True
+
+
+def _owner() -> str:
+    """Say who holds the lock, as the next program's user needs it to find him."""
+    user = "an unknown user"
+    with contextlib.suppress(OSError, KeyError, ImportError):
+        user = getpass.getuser()
+    since = datetime.datetime.now().strftime("%Y-%m-%d %H:%M:%S")
+    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    return f"process {os.getpid()} of {user} since {since}: {command}"
