@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, open_node, read_map
+from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map
 from pmsmtool.cli.options import FILE, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
@@ -28,7 +28,7 @@ def backup_command(bus: BusOptions, out: Output, path: Path, force: bool, map_fi
 
     if path.exists() and not force:
         raise ConfigError("the file exists", where=str(path), hint="choose another name, or --force")
-    with open_node(bus, read_map(map_file)) as node:
+    with open_node(bus, read_map(map_file), within_s=WHOLE_SET_S) as node:
         identity = checked_identity(node)
         snapshot = take_backup(node, identity, progress=lambda done, total: out.status(f"{done}/{total}"))
     write_snapshot(path, snapshot)

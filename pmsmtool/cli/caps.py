@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, open_node, read_map
+from pmsmtool.cli.drive_access import LOOKING_S, map_option, open_node, read_map
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
@@ -37,7 +37,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None) -> None:
     from pmsmtool.workflow.capabilities import examine
 
     given = None if map_file is None else read_map(map_file)
-    with open_node(bus) as node:
+    with open_node(bus, within_s=LOOKING_S) as node:
         found = examine(node, given)
     out.result("caps", _facts(found), lambda: _lines(found))
     if given is not None and given.name != GENERIC and not found.map_is_drives:

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from pmsmtool.firmware.drive_map import DriveMap
 
 
+LOOKING_S = 30.0
+"""Time for the transfers of a command that reads a few objects; a drive that answers needs a second."""
+WHOLE_SET_S = 120.0
+"""Time for reading all parameters and tables, 200 KiB of tables at 50 kbit/s take 80 s."""
 OWN_FAMILY = "pmsmsim"
 """The reference drive's map, which commands take without ``--map``."""
 
@@ -46,8 +50,15 @@ def read_map(path: Path | None) -> DriveMap:
 
 
 @contextmanager
-def open_node(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[DriveNode]:
+def open_node(
+    bus: BusOptions, drive_map: DriveMap | None = None, *, within_s: float | None = None
+) -> Iterator[DriveNode]:
     """Open the bus and the node on it; without ``-n`` the only drive there is.
+
+    Parameters
+    ----------
+    within_s : float, optional
+        What all transfers may take together, of a command that only reads.
 
     Raises
     ------
@@ -58,6 +69,8 @@ def open_node(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[Dr
 
     with bus.connect() as connection:
         node = DriveNode(connection, claimed_node(connection, bus.node), drive_map=drive_map)
+        if within_s is not None:
+            node.sdo.finish_within(within_s)
         if drive_map is not None and drive_map.name == OWN_FAMILY:
             _refuse_another_family(node)
         yield node
@@ -93,11 +106,16 @@ def _vendor_product(node: DriveNode) -> tuple[int, int] | None:
     return vendor, product
 
 
-def warn_of_other_drive(node: DriveNode, out: Output) -> None:
-    """Say that what is read is read through the map of another drive; writing through it is refused."""
+def difference_of_drive(node: DriveNode) -> str:
+    """Say in which way the drive is not the one of its map; empty when it is."""
     from pmsmtool.flash.map_gate import other_drive
 
-    differ = other_drive(node.map, *(_vendor_product(node) or (0, 0)))
+    return other_drive(node.map, *(_vendor_product(node) or (0, 0)))
+
+
+def warn_of_other_drive(node: DriveNode, out: Output) -> None:
+    """Say that what is read is read through the map of another drive; writing through it is refused."""
+    differ = difference_of_drive(node)
     if differ:
         out.warn(f"{differ}: what is read may mean something else, and nothing is written or moved through it")
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import open_node
+from pmsmtool.cli.drive_access import LOOKING_S, open_node
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
@@ -27,7 +27,7 @@ def show_command(bus: BusOptions, out: Output) -> None:
     """Show the present fault and the error history; exit code 4 while the drive is in fault."""
     from pmsmtool.cia402 import State
 
-    with open_node(bus) as node:
+    with open_node(bus, within_s=LOOKING_S) as node:
         facts = _faults(node)
         out.result("fault-show", facts, lambda: _lines(facts))
         if facts["state"] in (State.FAULT, State.FAULT_REACTION_ACTIVE):

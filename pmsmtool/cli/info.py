@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import open_node
+from pmsmtool.cli.drive_access import LOOKING_S, open_node
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
@@ -26,25 +26,26 @@ PATIENCE_S = 1.0
 @output_options
 def info_command(bus: BusOptions, out: Output) -> None:
     """Show identity, state, faults and parameter set of a drive."""
-    with open_node(bus) as node:
+    with open_node(bus, within_s=LOOKING_S) as node:
         facts = read_facts(node)
     out.result("info", facts, lambda: _lines(facts))
 
 
 def read_facts(node: DriveNode) -> dict[str, Any]:
     """Return what ``info`` shows, read from the drive; what it does not have is None."""
-    from pmsmtool.cia402 import error_text
+    from pmsmtool.cia402 import error_text, state_of
     from pmsmtool.drive import objects
 
     identity = node.identity()
     if node.supervision.heartbeat_period_s is not None:
         node.connection.wait(min(HEARTBEAT_PERIODS * node.supervision.heartbeat_period_s, PATIENCE_S))
-    code = _whole(node, objects.ERROR_CODE)
+    code, word = _whole(node, objects.ERROR_CODE), _whole(node, objects.STATUSWORD)
     days, milliseconds = _whole(node, objects.CONFIGURATION_DATE), _whole(node, objects.CONFIGURATION_TIME)
     return {
         "identity": identity,
         "device_type": _whole(node, objects.DEVICE_TYPE),
-        "state": node.state(),
+        "statusword": word,
+        "state": None if word is None else state_of(word),
         "mode": _whole(node, objects.MODE_DISPLAY),
         "nmt_state": node.supervision.nmt_state,
         "heartbeat_s": node.supervision.heartbeat_period_s,
@@ -110,11 +111,14 @@ def _moment(days: int | None, milliseconds: int | None) -> str | None:
 
 def _lines(facts: dict[str, Any]) -> list[str]:
     identity, state, held = facts["identity"], facts["state"], facts["parameter_set"]
+    shown = "undefined" if state is None else state.name.replace("_", " ")
+    if facts["statusword"] is None:
+        shown = "not shown: no 0x6041, this is no CiA 402 drive"
     lines = [
         f"node      {identity.node}  {identity.name}  hw {identity.hardware or '-'}  sw {identity.software or '-'}",
         f"identity  vendor {identity.vendor:#010x}  product {identity.product:#x}  revision {identity.revision:#x}  "
         f"serial {identity.serial}",
-        f"state     {'undefined' if state is None else state.name.replace('_', ' ')}  mode {facts['mode']}  "
+        f"state     {shown}  mode {'-' if facts['mode'] is None else facts['mode']}  "
         f"NMT {'-' if facts['nmt_state'] is None else facts['nmt_state'].name.replace('_', '-')}",
     ]
     if facts["error_code"]:

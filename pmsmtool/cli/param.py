@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, open_node, read_map, warn_of_other_drive
+from pmsmtool.cli.drive_access import (
+    LOOKING_S,
+    WHOLE_SET_S,
+    difference_of_drive,
+    map_option,
+    open_node,
+    read_map,
+    warn_of_other_drive,
+)
 from pmsmtool.cli.options import (
     FILE,
     BusOptions,
@@ -24,6 +32,7 @@ from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
+    from pmsmtool.errors import PmsmtoolError
     from pmsmtool.firmware.drive_map import DriveMap
     from pmsmtool.params.diff import Difference
     from pmsmtool.params.parameter_set import ParameterSet
@@ -44,20 +53,33 @@ def param_command() -> None:
 @bus_options
 @output_options
 def get_command(bus: BusOptions, out: Output, names: tuple[str, ...], map_file: Path | None) -> None:
-    """Print parameters in SI, or the bytes of any object."""
+    """Print parameters in SI, or the bytes of any object.
+
+    An object given by its address is read as bytes where the map is not this drive's. What cannot be read is named in
+    its row; the exit code is that of the worst.
+    """
     drive_map = read_map(map_file)
     wanted = [entry for name in names for entry in _resolve(name, drive_map)]
-    with open_node(bus, drive_map) as node:
-        if any(name for name, _ in wanted):
-            warn_of_other_drive(node, out)
-        _say_staged(node, out)
-        entries = [_read(node, entry) for entry in wanted]
+    addresses = [text for text in names if _ADDRESS.fullmatch(text)]
+    of_no_map = len(addresses) == len(names) and map_file is None
+    with open_node(bus, None if of_no_map else drive_map, within_s=LOOKING_S) as node:
+        if difference_of_drive(node):
+            raw = {_resolve(text, drive_map)[0][1] for text in addresses}
+            wanted = [("" if where in raw else name, where) for name, where in wanted]
+            if any(name for name, _ in wanted):
+                warn_of_other_drive(node, out)
+        else:
+            _say_staged(node, out)
+        entries, failures = _read_all(node, wanted)
     heads = ("name", "value", "unit", "object")
-    out.result(
-        "param-get",
-        {"parameters": entries},
-        lambda: table(heads, [(e["name"], _text(e), e["unit"], e["object"]) for e in entries]),
-    )
+    if len(entries) > 1 or not failures:
+        out.result(
+            "param-get",
+            {"parameters": entries},
+            lambda: table(heads, [(e["name"], _text(e), e["unit"], e["object"]) for e in entries]),
+        )
+    if failures:
+        raise max(failures, key=_badness)
 
 
 @param_command.command(
@@ -109,7 +131,7 @@ def dump_command(bus: BusOptions, out: Output, everything: bool, path: Path | No
     """Print the drive's parameters as a parameter set that flash-params takes."""
     from pmsmtool.files import write_file
 
-    with open_node(bus, read_map(map_file)) as node:
+    with open_node(bus, read_map(map_file), within_s=WHOLE_SET_S) as node:
         warn_of_other_drive(node, out)
         _say_staged(node, out)
         held = _device_set(node)
@@ -142,7 +164,7 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
 
     drive_map = read_map(map_file)
     if "device" in (old, new):
-        with open_node(bus, drive_map) as node:
+        with open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
             warn_of_other_drive(node, out)
             held = _device_set(node)
             sets = [held if side == "device" else _side(side, drive_map) for side in (old, new)]
@@ -247,6 +269,32 @@ def _number(text: str, name: str) -> float:
 # ---- reading ---------------------------------------------------------------------------------------------
 
 
+def _read_all(node: DriveNode, wanted: list[_Entry]) -> tuple[list[dict[str, Any]], list[PmsmtoolError]]:
+    """Return what each object holds, or why it could not be read, and these errors."""
+    from pmsmtool.bus.sdo import OutOfTime
+    from pmsmtool.errors import BusError, DriveTimeout, PmsmtoolError
+
+    entries, failures = [], []
+    for entry in wanted:
+        try:
+            entries.append(_read(node, entry))
+        except PmsmtoolError as error:
+            if isinstance(error, OutOfTime) or (isinstance(error, BusError) and not isinstance(error, DriveTimeout)):
+                raise
+            name, (index, sub) = entry
+            where = f"0x{index:04X}:{sub:02X}"
+            entries.append({"name": name or where, "value": None, "unit": "", "object": where, "error": error.what})
+            failures.append(error)
+    return entries, failures
+
+
+def _badness(error: PmsmtoolError) -> int:
+    """Order errors: what the drive does not have, what it refuses, what it does not answer."""
+    from pmsmtool.errors import BusError, NotAvailable
+
+    return 2 if isinstance(error, BusError) else 0 if isinstance(error, NotAvailable) else 1
+
+
 def _read(node: DriveNode, entry: _Entry) -> dict[str, Any]:
     from pmsmtool.drive.parameters import DriveParameters
     from pmsmtool.params.catalogue import BY_NAME
@@ -261,6 +309,8 @@ def _read(node: DriveNode, entry: _Entry) -> dict[str, Any]:
 
 
 def _text(entry: dict[str, Any]) -> str:
+    if "error" in entry:
+        return f"not read: {entry['error']}"
     if entry["value"] is not None:
         return f"{entry['value']:.9g}"
     data = bytes.fromhex(entry["bytes"])

@@ -6,12 +6,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pmsmtool.cli.drive_access import LOOKING_S
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
     from pmsmtool.bus.connection import Connection
     from pmsmtool.bus.scan import FoundNode
+
+
+NODE_S = 5.0
+"""Time for the identity of one node; one that answers needs 10 ms."""
 
 
 @click.command("scan", epilog=examples("pmsmtool -i pmsmsim scan", "pmsmtool -i socketcan -c can0 scan --json"))
@@ -30,12 +35,17 @@ def scan_command(bus: BusOptions, out: Output) -> None:
         if not found:
             likely, hint = connection.explain_silence(0)
             raise BusError("no node answers", where=str(connection.bus.channel_info), likely=likely, hint=hint)
-        nodes = [_facts(connection, entry) for entry in found]
+        end_s = connection.clock.now() + LOOKING_S
+        nodes = [_facts(connection, entry, end_s) for entry in found]
+    for facts in nodes:
+        if "error" in facts:
+            out.warn(f"node {facts['node']}: {facts['error']}")
     heads = ("node", "device", "name", "vendor", "product", "serial", "nmt", "state")
     out.result("scan", {"nodes": nodes}, lambda: table(heads, [_cells(facts) for facts in nodes]))
 
 
-def _facts(connection: Connection, entry: FoundNode) -> dict[str, Any]:
+def _facts(connection: Connection, entry: FoundNode, end_s: float) -> dict[str, Any]:
+    from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.errors import BusError, SdoAbort
 
@@ -45,9 +55,17 @@ def _facts(connection: Connection, entry: FoundNode) -> dict[str, Any]:
         "profile": None if entry.device_type is None else entry.device_type & 0xFFFF,
         "nmt_state": entry.nmt_state,
     }
+    left_s = min(NODE_S, end_s - connection.clock.now())
     if entry.device_type is None:
         return facts
+    if left_s <= 0.0:
+        return facts | {"error": f"not asked: the nodes before took {LOOKING_S:g} s"}
+    try:
+        claim(connection, entry.node)
+    except BusError as error:  # reading on would disturb whoever works with it
+        return facts | {"error": error.what}
     node = DriveNode(connection, entry.node)
+    node.sdo.finish_within(left_s)
     try:
         identity = node.identity()
         facts |= {key: getattr(identity, key) for key in ("vendor", "product", "revision", "serial", "name")}

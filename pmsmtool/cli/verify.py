@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, open_node, read_map
+from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
@@ -37,7 +37,7 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
 
     drive_map = read_map(map_file)
     backup = source.suffix == ".json"
-    with open_node(bus, drive_map) as node:
+    with open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
         identity = checked_identity(node)
         if backup:
             snapshot = read_snapshot(source)

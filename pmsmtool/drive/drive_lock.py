@@ -31,6 +31,8 @@ else:
 _LOCKED_BYTE = 1 << 30
 """Windows locks bytes, and who holds the file must stay readable: the locked byte lies behind the text."""
 _LONGEST_OWNER = 200
+IDENTITY_S = 5.0
+"""Time for three numbers; a drive that answers needs 5 ms."""
 
 
 def claim(connection: Connection, node_id: int) -> None:
@@ -72,6 +74,7 @@ def _key(connection: Connection, node_id: int) -> str:
     number, by both.
     """
     sdo = SdoChannel(connection, node_id)
+    sdo.finish_within(IDENTITY_S)
     try:
         numbers = []
         for sub in (1, 2, 4):
