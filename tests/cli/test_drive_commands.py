@@ -13,8 +13,10 @@ from typing import Any
 import can
 import pytest
 
+from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.cli.main import run
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.errors import SdoAbort
 from pmsmtool.firmware.drive_map import reference_map
 from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
@@ -126,6 +128,31 @@ def test_param_get_by_name_wildcard_and_object(tool: Tool) -> None:
     found = loaded(tool("param", "get", "motor.R_*", "0x2010:01", "0x1018:04", "--json"))["parameters"]
     assert [(p["name"], p["value"]) for p in found[:2]] == [("motor.R_s_ohm", 0.137), ("motor.pole_pairs", 4)]
     assert bytes.fromhex(found[2]["bytes"]) == (22001).to_bytes(4, "little")
+
+
+def test_param_get_reads_addresses_raw_on_a_foreign_drive_and_gives_each_its_result(tool: Tool) -> None:
+    """There 0x2010:01 is no object; in our map it is a parameter."""
+    foreign = "interior-2k2?drive=epos4&nv=:memory:"
+    code, out, err = tool("param", "get", "0x1018:01", "0x2010:01", "0x6041", "--json", channel=foreign)
+    entries = json.loads(out)["parameters"]
+    assert code == 4 and "0x2010:01" in err
+    assert [entry["object"] for entry in entries] == ["0x1018:01", "0x2010:01", "0x6041:00"]
+    assert entries[0]["bytes"] == "fb000000" and len(entries[2]["bytes"]) == 4
+    assert "error" in entries[1] and not entries[1].get("bytes")
+    assert tool("param", "get", "0x1018:01", "0x6041", channel=foreign)[0] == 0
+
+
+def test_info_shows_who_a_node_without_a_statusword_is(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = SdoChannel.read
+
+    def without(self: SdoChannel, index: int, sub: int, **given: Any) -> bytes:
+        if index == 0x6041:
+            raise SdoAbort(0x06020000, index, sub, "node refused")
+        return read(self, index, sub, **given)
+
+    monkeypatch.setattr(SdoChannel, "read", without)
+    code, out, _ = tool("info")
+    assert code == 0 and "serial 22001" in out and "no CiA 402 drive" in out
 
 
 def test_param_get_unknown(tool: Tool) -> None:
@@ -318,8 +345,14 @@ def test_stop_that_is_not_confirmed_is_exit_8(tool: Tool, monkeypatch: pytest.Mo
     assert code == 8 and "STOP NOT CONFIRMED" in err and "hardware stop" in err
 
 
-def test_stop_without_a_drive_is_exit_8_when_the_node_was_named(tool: Tool) -> None:
-    assert tool("-n", "99", "stop")[0] == 8
+@pytest.mark.parametrize("whom", [("-n", "99", "stop"), ("stop",), ("stop", "--all")])
+def test_stop_that_reaches_no_drive_is_exit_8(
+    tool: Tool, monkeypatch: pytest.MonkeyPatch, whom: tuple[str, ...]
+) -> None:
+    """Exit code 3 only where no adapter opened: here it did."""
+    monkeypatch.setattr("pmsmtool.bus.scan.find_nodes", lambda connection: [])
+    code, _, err = tool(*whom)
+    assert code == 8 and "STOP NOT CONFIRMED" in err and "hardware stop" in err
 
 
 # ---- bad buses and bad drives -----------------------------------------------------------------------------

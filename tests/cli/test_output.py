@@ -7,11 +7,15 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 
+from pmsmtool.cli.failure import report
 from pmsmtool.cli.output import Output, jsonable, table
+from pmsmtool.errors import BusError
+from pmsmtool.plain_text import reason
 
 
 class Mode(enum.IntEnum):
@@ -90,3 +94,28 @@ def test_table_aligns() -> None:
         "R_winding  12.25",
     ]
     assert table(("a", "b"), []) == ["a  b"]
+
+
+NASTY = "a\x1b[2J\x07\x9b31m\x7f\u202eb"
+SHOWN = "a\\x1b[2J\\x07\\x9b31m\\x7f\\u202eb"
+
+
+def test_nothing_that_steers_a_terminal_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever the way to the terminal; lines stay lines, but not inside a cell of a table."""
+    out = Output(verbosity=1)
+    with mock.patch("click.utils.should_strip_ansi", return_value=False):
+        out.result("x", {}, [NASTY, *table(("n", "m"), [(NASTY + "\n", 1)])])
+        for say in (out.note, out.detail, out.warn):
+            say(NASTY + "\nnext")
+        report(BusError(NASTY, where=NASTY, likely=NASTY, hint=NASTY))
+    printed = capsys.readouterr()
+    text = printed.out + printed.err.replace("\x1b[31m", "").replace("\x1b[33m", "").replace("\x1b[1m", "")
+    assert text.replace("\x1b[0m", "").count(SHOWN) == 2 + 3 + 4
+    assert all(c.isprintable() or c == "\n" for c in text.replace("\x1b[0m", ""))
+    assert SHOWN + "\\n" in printed.out
+
+
+def test_a_back_ends_traceback_is_no_message() -> None:
+    error = ValueError("Failed to receive: bad\x1b  Traceback (most recent call last):\n  File 'x.py'\n")
+    assert reason(error) == "Failed to receive: bad\\x1b"
+    assert len(reason(ValueError("x" * 10_000))) < 320
