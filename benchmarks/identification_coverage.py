@@ -218,12 +218,10 @@ def measured(drive: MachineFile, half_frequency: bool = False) -> Measured:
         return _measured(path, half_frequency)
 
 
-def evaluated(
-    traces: dict[str, Trace], nameplate: MachineFile, tolerance: SensorTolerance | None = None
-) -> Evaluation:
+def evaluated(traces: dict[str, Trace], nameplate: MachineFile, tolerance: SensorTolerance | None = None) -> Evaluation:
     """Estimate from the traces of :func:`measured`."""
     T_ref_c, inverter = nameplate.machine.T_ref_c, nameplate.inverter
-    return evaluate(traces, inverter.T_s, T_ref_c=T_ref_c, U_dc_v=inverter.U_dc_v, tolerance=tolerance)
+    return evaluate(traces, inverter.T_s, T_ref_c=T_ref_c, U_dc_v=inverter.U_dc_v, tolerance=tolerance).whole()
 
 
 def _measured(path: Path, half_frequency: bool) -> Measured:

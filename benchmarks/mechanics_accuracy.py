@@ -73,7 +73,7 @@ def identify_one(seed: int) -> Row:
                 measurement.run(request.quantities)
             drive.close()
     inverter = nameplate.inverter
-    result = evaluate(traces, inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=inverter.U_dc_v)
+    result = evaluate(traces, inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=inverter.U_dc_v).whole()
     found, settings = result.estimates(), settings_of(drive_file)
     row: Row = {"seed": seed}
     for key in KEYS:

@@ -132,7 +132,7 @@ def _by_injection(drive: RecordingDrive) -> TierResult:
     with guarded(drive, envelope) as guard:
         Measurement(guard, limits, traces.__setitem__, lambda text: None).run(request.quantities)
     T_s, T_ref, U_dc = nameplate.inverter.T_s, nameplate.machine.T_ref_c, nameplate.inverter.U_dc_v
-    found = evaluate(traces, T_s, T_ref_c=T_ref, U_dc_v=U_dc)
+    found = evaluate(traces, T_s, T_ref_c=T_ref, U_dc_v=U_dc).whole()
     estimates: dict[str, Estimate] = found.estimates()
     return TierResult({name: estimates[name] for name in OF_THE_MACHINE}, {}, {})
 

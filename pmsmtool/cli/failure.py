@@ -16,6 +16,7 @@ from pmsmtool.errors import (
     ExitCode,
     Interrupted,
     NotAvailable,
+    Partial,
     PmsmtoolError,
     StopNotConfirmed,
     VerifyMismatch,
@@ -71,6 +72,7 @@ def report(error: BaseException, verbosity: int = 0) -> int:
 
 _LABELS: tuple[tuple[type[PmsmtoolError], str], ...] = (
     (StopNotConfirmed, "STOP NOT CONFIRMED"),
+    (Partial, "partial"),
     (CheckFailed, "not good"),
     (Declined, "declined"),
     (Interrupted, "interrupted"),
@@ -90,6 +92,7 @@ def _tell(error: PmsmtoolError) -> None:
     _echo(error.what, click.style(label, fg="red", bold=True) + ": ")
     details = error.violations if isinstance(error, ConfigError) else ()
     details = error.differences if isinstance(error, VerifyMismatch) else details
+    details = error.missing if isinstance(error, Partial) else details
     for detail in details:
         _echo(f"  - {detail}")
     hint = error.hint or (_WHAT_IT_GIVES if isinstance(error, NotAvailable) else "")

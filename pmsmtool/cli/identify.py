@@ -297,7 +297,7 @@ def _keep(run: RunDirectory, given: Consent) -> None:
 
 def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
     from pmsmtool.cli.output import table
-    from pmsmtool.errors import IdentificationError
+    from pmsmtool.errors import IdentificationError, Partial
     from pmsmtool.report.report import total_interval
     from pmsmtool.units import format_estimate, format_quantity
 
@@ -320,7 +320,10 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
         )
     heads = ("quantity", "value, total 95 %", "statistical", "systematic", "at", "method")
     warnings = [*stage.fallbacks, *([stage.note] if stage.note else [])]
-    data = {"run": str(run.path), "values": list(stage.values), "status": stage.status, "warnings": warnings}
+    data = {
+        "run": str(run.path), "values": list(stage.values), "status": stage.status, "refused": dict(stage.refused),
+        "warnings": warnings,
+    }  # fmt: skip
     out.result("identify", data, table(heads, rows))
     for line in warnings:
         out.warn(line)
@@ -328,8 +331,17 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
     for name in stage.files:
         if not name.startswith(("traces/", "nameplate", "request")):
             out.note(f"-> {run.path / name}")
-    if stage.status != "pass":
-        from pmsmtool.workflow.commission import NOT_ACCEPTED
+    if stage.status == "pass":
+        return
+    refused = [f"{name}: {reason}" for name, reason in stage.refused.items()]
+    if stage.status == "partial":
+        raise Partial(
+            f"{len(stage.refused)} of the quantities asked for {'is' if len(stage.refused) == 1 else 'are'} refused",
+            where=str(run.path),
+            hint="the accepted values stand in machine.toml; `pmsmtool help refusals` explains each name",
+            missing=refused,
+        )
+    from pmsmtool.workflow.commission import NOT_ACCEPTED
 
-        broken = [f"{line.what}: {line.measured}, limit {line.limit}" for line in stage.acceptance if not line.ok]
-        raise IdentificationError("E_NOT_ACCEPTED", "; ".join(broken), where=str(run.path), hint=NOT_ACCEPTED)
+    broken = [f"{line.what}: {line.measured}, limit {line.limit}" for line in stage.acceptance if not line.ok]
+    raise IdentificationError("E_NOT_ACCEPTED", "; ".join(refused or broken), where=str(run.path), hint=NOT_ACCEPTED)

@@ -69,7 +69,9 @@ class StageProgress:
     def end(self, stage: Stage, number: int, count: int) -> None:
         """Say how the stage ended, in one line."""
         self.pause()
-        text = stage.summary if stage.status == "pass" else stage.note.splitlines()[0] if stage.note else ""
+        text = (
+            stage.summary if stage.status in ("pass", "partial") else stage.note.splitlines()[0] if stage.note else ""
+        )
         seconds = f"  ({stage.seconds:.1f} s)" if stage.seconds >= 0.05 else ""
         self._out.note(f"[{number}/{count}] {stage.name:<9} {stage.status.upper()}  {text}{seconds}".rstrip())
         if any(row["stated"] is not None for row in stage.comparison):

@@ -143,7 +143,7 @@ def _comparison(latest: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 
 def _verdict_of(latest: list[Mapping[str, Any]], complete: Sequence[str], not_checked: Mapping[str, str]) -> Verdict:
-    failed = [stage for stage in latest if stage["status"] not in ("pass", UNAVAILABLE)]
+    failed = [stage for stage in latest if stage["status"] not in ("pass", "partial", UNAVAILABLE)]
     done = {stage["name"] for stage in latest}
     missing = [name for name in complete if name not in done]
     if failed:
@@ -154,8 +154,11 @@ def _verdict_of(latest: list[Mapping[str, Any]], complete: Sequence[str], not_ch
     lacking = [stage for stage in latest if stage["status"] == UNAVAILABLE]
     values = [value for stage in latest for value in stage.get("values", ())]
     bare = [value for value in values if "source" in value and "std" not in value and value["name"] not in not_checked]
+    refused = [f"{name} refused: {why}" for stage in latest for name, why in stage.get("refused", {}).items()]
+    if refused:
+        return Verdict("open", "PARTIAL", tuple(refused))
     if lacking or bare or not_checked:
-        passed = [stage for stage in latest if stage["status"] == "pass"]
+        passed = [stage for stage in latest if stage["status"] in ("pass", "partial")]
         return _partial(passed, lacking, _bare_lines(bare), criteria)
     head = f"{latest[0]['name']} alone" if len(latest) == 1 else f"{len(latest)} stages"
     met = {0: "no criteria", 1: "1 criterion, met"}.get(criteria, f"{criteria} criteria, all met")

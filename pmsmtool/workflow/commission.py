@@ -44,6 +44,7 @@ from pmsmtool.workflow.report_page import report_page
 from pmsmtool.workflow.run_account import RunAccount, status_of, text_of
 from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, new_record
 from pmsmtool.workflow.tier_stages import TierStages
+from pmsmtool.workflow.verdicts import blocking
 
 FROM_TABLE = TuneRequest(field_weakening="lookup")
 """The chain's default design: the drive takes its current references from the table the chain makes and checks."""
@@ -113,7 +114,7 @@ NOTHING_TAKEN = (
     "alone"
 )
 """Next steps after a run of which nothing was available: the same run gives the same again."""
-SETTLED = ("pass", "not available")
+SETTLED = ("pass", "partial", "not available")
 """How a stage may have ended that is not run again."""
 OUTPUTS: Mapping[str, tuple[str, ...]] = {
     "identify": ("machine.toml",),
@@ -212,7 +213,7 @@ class Commissioning:
         """Refuse a run of which nothing was available: it is not green."""
         record = self.run.read()
         stages = [stage for name in STAGES if (stage := record.stage(name)) is not None]
-        if not any(stage.status == "pass" for stage in stages):
+        if not any(stage.status in ("pass", "partial") for stage in stages):
             raise NotAvailable(
                 "\n  - ".join(["nothing of the chain can be done", *(f"{s.name}: {s.note}" for s in stages)]),
                 where=f"node {self.drive.identity.node}",
@@ -306,7 +307,10 @@ class Commissioning:
     def _identify(self) -> Stage:
         identity = self.drive.identity
         known = self.nameplate or nameplate_of(self.drive, identity.name or f"drive {identity.serial:#010x}")
-        return identify_stage(self.run, self.drive, known, self.identify, self.person.allow_motion, self._say)
+        stage = identify_stage(self.run, self.drive, known, self.identify, self.person.allow_motion, self._say)
+        # without a file that a person gave, the drive's own set would stand in: it may be another machine's
+        stops = blocking(stage.refused, given=self.nameplate is not None)
+        return replace(stage, status="fail") if stops else stage
 
     def _prove(self) -> Stage:
         design = load_design(self.run.path / "design.toml")
@@ -327,6 +331,7 @@ def _not_good(stage: Stage, run: RunDirectory) -> PmsmtoolError:
     if (contradicted := refusal(stage, run)) is not None:
         return contradicted
     if stage.name == "identify":
+        what = "; ".join(f"{name}: {reason}" for name, reason in stage.refused.items()) or what
         return IdentificationError("E_NOT_ACCEPTED", what, where=where, hint=NOT_ACCEPTED)
     if stage.name == "verify":
         return VerifyMismatch(what, where=where, hint="flash again: commission --resume " + where)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.estimators.axis_layout import Motion
 from pmsmtool.estimators.axis_response import initial_inductance
 from pmsmtool.estimators.cross_check import CrossCheck, cross_check
@@ -25,7 +26,6 @@ from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, 
 from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance, settled_levels
 from pmsmtool.estimators.sampling_instant import Sampling, ShownInstant
 from pmsmtool.estimators.switching_ripple import Modulation
-from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
@@ -35,8 +35,6 @@ from pmsmtool.workflow.sampling_stage import resistance_as_sampled
 
 R_MEASURED = "R_s_ohm_measured"
 """Name of the resistance at the temperature of the test: what no normalisation widens."""
-RESONANCE = ("resonance_hz", "antiresonance_hz", "resonance_zeta")
-"""Keys of a second mass: a response without one takes them out of the machine file."""
 MOTION_STD = 0.2
 """Relative standard deviation of the rotor's answer to an injection as the pushes show it: friction takes part."""
 RELUCTANCE_STD = 0.3
@@ -47,9 +45,15 @@ MOSFET_LINK_V = 100.0
 """Below this DC link bridges are made of MOSFETs, which have no threshold."""
 
 
+_Found = TypeVar("_Found")
+
+
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """What the traces of a run say; None where an experiment was not run."""
+    """What the traces of a run say; None where an experiment was not run, or is in ``refused`` with its reason.
+
+    ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics`` and ``frf``.
+    """
 
     noise: Noise
     phases: PhaseCheck | None = None
@@ -63,6 +67,13 @@ class Evaluation:
     flux_map: FluxMapResult | None = None
     frequency_response: FrequencyResponse | None = None
     map_estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    refused: Mapping[str, IdentificationError] = field(default_factory=dict)
+
+    def whole(self) -> Evaluation:
+        """Return this; raises the first refusal where there is one (``IdentificationError``)."""
+        for refusal in self.refused.values():
+            raise refusal
+        return self
 
     @property
     def offset(self) -> Estimate | None:
@@ -134,8 +145,9 @@ def evaluate(
     T_ref_c: float = 20.0,
     U_dc_v: float = math.inf,
     tolerance: SensorTolerance | None = None,
+    ended: Mapping[str, IdentificationError] | None = None,
 ) -> Evaluation:
-    """Estimate everything the traces allow.
+    """Estimate everything the traces allow; what is refused takes only what depends on it along.
 
     Parameters
     ----------
@@ -151,11 +163,13 @@ def evaluate(
         DC link of the nameplate (V); infinite: the thresholds of the bridge are not counted.
     tolerance : SensorTolerance
         Declared sensor tolerances.
+    ended : mapping of str to IdentificationError, optional
+        Experiments that were refused while they ran, by the keys of ``Evaluation.refused``: their traces are not whole.
 
     Raises
     ------
     IdentificationError
-        The first refusal, by its name.
+        Noise, phases, encoder counts or current sensors: then no value can be trusted.
     ConfigError
         There is no zero-current trace.
     """
@@ -168,33 +182,60 @@ def evaluate(
         result = replace(result, phases=check_phases(traces["phase_vectors"], result.noise))
     if "first_turn" in traces:
         check_encoder_counts(traces["first_turn"])
+    refused = dict(ended or {})
+
+    def attempt(quantity: str, estimate: Callable[[], _Found]) -> _Found | None:
+        if quantity in refused:
+            return None
+        try:
+            return estimate()
+        except IdentificationError as refusal:
+            refused[quantity] = refusal
+            return None
+
     if "levels" in traces:
-        resistance = resistance_of(traces["levels"], result.noise, T_ref_c, tolerance)
-        copper = Copper(T_ref_c, COPPER_ALPHA_PER_K)
-        resistance, split = resistance_at_two_frequencies(traces, result.noise, resistance, copper, tolerance)
-        result = replace(result, resistance=resistance, split=split)
+        found = attempt("R", lambda: resistances_of(traces, result.noise, T_ref_c, tolerance))
+        if found is not None:
+            result = replace(result, resistance=found[0], split=found[1])
     if "phase_pairs" in traces and result.resistance is not None:
         result = replace(result, pairs=check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve))
-    if "rotation_forward" in traces:
-        encoder = estimate_encoder(traces["rotation_forward"], traces["rotation_backward"])
-        result = replace(result, encoder=encoder)
-    if "speeds" in traces and result.resistance is not None:
-        flux = flux_of(traces, result.resistance, period_s, T_ref_c, tolerance)
+    if "rotation_backward" in traces:
+        turns = traces["rotation_forward"], traces["rotation_backward"]
+        result = replace(result, encoder=attempt("encoder", lambda: estimate_encoder(*turns)))
+    resistance = result.resistance
+    # a wrong angle or number of pole pairs is in the speeds, too
+    if "speeds" in traces and resistance is not None and "encoder" not in refused:
+        flux = attempt("psi", lambda: flux_of(traces, resistance, period_s, T_ref_c, tolerance))
         result = replace(result, flux=flux)
-    if result.resistance is not None and result.encoder is not None and any(k.startswith("square_d") for k in traces):
-        result = replace(result, inductance=inductance_of(traces, result, tolerance, U_dc_v))
-        result = as_sampled(traces, result, period_s, T_ref_c, tolerance)
-    flux_map = map_stage.flux_map_of(traces, result, tolerance)
+    shots = all(any(name.startswith(f"square_{axis}") for name in traces) for axis in "dq")
+    if resistance is not None and result.encoder is not None and shots:
+        before = result
+        inductance = attempt("L", lambda: inductance_of(traces, before, tolerance, U_dc_v))
+        if inductance is not None:
+            rough = replace(before, inductance=inductance)
+            result = attempt("psi", lambda: as_sampled(traces, rough, period_s, T_ref_c, tolerance)) or replace(
+                rough, flux=None
+            )
+    flux_map = attempt("map", lambda: map_stage.flux_map_of(traces, result, tolerance))
     if flux_map is not None:
         result = replace(result, flux_map=flux_map, map_estimates=map_stage.map_estimates(result, flux_map, traces))
     dead_time_s = 0.0
     if result.resistance is not None and math.isfinite(U_dc_v):
         dead_time_s = max(0.0, result.resistance.V_dead_v) * period_s / U_dc_v
-    mechanics = mechanics_stage.mechanics_of(traces, result, tolerance, dead_time_s)
-    result = replace(result, mechanics=mechanics)
-    return replace(
-        result, frequency_response=frequency_stage.frequency_response_of(traces, result, tolerance, dead_time_s)
-    )
+    shaft = result
+    mechanics = attempt("mechanics", lambda: mechanics_stage.mechanics_of(traces, shaft, tolerance, dead_time_s))
+    moving = replace(shaft, mechanics=mechanics)
+    response = attempt("frf", lambda: frequency_stage.frequency_response_of(traces, moving, tolerance, dead_time_s))
+    return replace(moving, frequency_response=response, refused=refused)
+
+
+def resistances_of(
+    traces: Mapping[str, Trace], noise: Noise, T_ref_c: float, tolerance: SensorTolerance
+) -> tuple[ResistanceResult, FrequencySplit | None]:
+    """Return the resistance by one control frequency, or by two where both were measured."""
+    resistance = resistance_of(traces["levels"], noise, T_ref_c, tolerance)
+    copper = Copper(T_ref_c, COPPER_ALPHA_PER_K)
+    return resistance_at_two_frequencies(traces, noise, resistance, copper, tolerance)
 
 
 def resistance_of(
@@ -273,7 +314,10 @@ def flux_of(
 def _rough_inductance(traces: Mapping[str, Trace], axis: str) -> float:
     """Inductance from the ripple of the first shot of an axis, without its delay and resistance; 0 without one (H)."""
     shots = shots_of(traces, axis, 1)
-    return initial_inductance(bare_shot(shots[0], axis)) if shots else 0.0
+    try:
+        return initial_inductance(bare_shot(shots[0], axis)) if shots else 0.0
+    except IdentificationError:  # a bad shot refuses L, not what only corrects by it
+        return 0.0
 
 
 def inductance_of(
@@ -337,49 +381,3 @@ def _frame_ahead(shots: Sequence[Trace], encoder: EncoderResult, offset: float) 
         for shot in shots
     ]
     return math.atan2(sum(map(math.sin, angles)), sum(map(math.cos, angles)))
-
-
-def machine_of(evaluation: Evaluation, nameplate: MachineFile, conditions: Mapping[str, object]) -> MachineFile:
-    """Return the machine file with every identified value in place of the nameplate's.
-
-    What was not identified keeps the nameplate's value; ``[estimate]`` names what was.
-    """
-    found = evaluation.estimates()
-    values = {name: found[name].value for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2") if name in found}
-    machine = replace(nameplate.machine, **values)  # type: ignore[arg-type]
-    if evaluation.mechanics is not None:
-        B, tau_c = evaluation.mechanics.B, evaluation.mechanics.tau_c
-        machine = replace(machine, tau_c_nm=max(0.0, tau_c.value), B_nms=max(0.0, B.value))
-    if evaluation.frequency_response is not None:
-        resonant = {name: estimate.value for name, estimate in evaluation.frequency_response.found.items()}
-        machine = replace(machine, **{**dict.fromkeys(RESONANCE), **resonant})  # type: ignore[arg-type]
-    flux_map = nameplate.flux_map
-    if evaluation.flux_map is not None:
-        machine, flux_map = map_stage.with_map(machine, evaluation.map_estimates), evaluation.flux_map.flux_map
-    inverter, encoder = nameplate.inverter, nameplate.encoder
-    if evaluation.encoder is not None and evaluation.offset is not None:
-        machine = replace(machine, pole_pairs=round(evaluation.encoder.pole_pairs.value))
-        encoder = replace(encoder, offset_rad=evaluation.offset.value, direction=evaluation.encoder.direction)
-    if evaluation.resistance is not None:
-        curve = evaluation.resistance.curve
-        plateau = max(0.0, evaluation.resistance.V_dead_v)
-        inverter = replace(
-            inverter,
-            V_dead_v=plateau,
-            i_knee_apk=curve.knee_a(plateau),
-            voltage_error_i_apk=tuple(map(float, curve.i_phase_a)),
-            voltage_error_v=tuple(map(float, curve.u_error_v)),
-        )
-    measurable = {name: estimate for name, estimate in found.items() if name != "pole_pairs"}
-    return replace(
-        nameplate,
-        machine=machine,
-        inverter=inverter,
-        encoder=encoder,
-        std={**nameplate.std, **{name: e.std for name, e in measurable.items()}},
-        systematic={**nameplate.systematic, **{name: e.systematic for name, e in measurable.items()}},
-        estimates={**nameplate.estimates, **found, **{check.name: check.estimate for check in evaluation.checks}},
-        conditions=dict(conditions),
-        simulation={},
-        flux_map=flux_map,
-    )

@@ -6,6 +6,7 @@ bytes years later. Nothing is stored in the drive.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -17,7 +18,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft, largest_acceleration
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
-from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.errors import ConfigError, DriveFault, IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.experiments.rotation import dwell_within
 from pmsmtool.files import read_text
@@ -27,12 +28,16 @@ from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
 from pmsmtool.workflow import frequency_stage, half_frequency, identify_verdict, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_tolerance
-from pmsmtool.workflow.evaluate import evaluate, machine_of
+from pmsmtool.workflow.evaluate import evaluate
+from pmsmtool.workflow.identified_machine import machine_of
 from pmsmtool.workflow.limits import HEADROOM, Limits, require_speed, unused_current
 from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Measurement, steps_of
 from pmsmtool.workflow.predicted_file import PREDICTED, dump_predicted
+from pmsmtool.workflow.refused_file import REFUSED, dump_refused, refused_in
+from pmsmtool.workflow.run_account import status_of, text_of
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 from pmsmtool.workflow.sampling_stage import timing_estimates
+from pmsmtool.workflow.verdicts import verdicts_of
 
 MACHINE = "machine.toml"
 NAMEPLATE = "nameplate.toml"
@@ -223,11 +228,33 @@ def identify_stage(
         V_max_v=nameplate.inverter.V_max_v,
     )
 
+    clock = drive.node.connection.clock
+    start = clock.now()
+    try:
+        _measure(run, drive, envelope, limits, request, say)
+    except (DriveFault, IdentificationError, SafetyRefusal) as error:
+        # what was measured before is not lost: it is evaluated and recorded, and the run ends as it did
+        with contextlib.suppress(PmsmtoolError):
+            kept = evaluated_stage(run, nameplate, request)
+            run.add(replace(kept, status=status_of(error), note=text_of(error), seconds=clock.now() - start))
+        raise
+    stage = evaluated_stage(run, nameplate, request)
+    return replace(stage, seconds=clock.now() - start)
+
+
+def _measure(
+    run: RunDirectory,
+    drive: CanopenDrive,
+    envelope: Envelope,
+    limits: Limits,
+    request: IdentifyRequest,
+    say: Callable[[str], None],
+) -> None:
+    """Run the experiments inside the guard; traces, predictions and refusals go into the run."""
+
     def keep(name: str, trace: Trace) -> None:
         run.save(f"traces/{name}.npz", trace_npz(trace))
 
-    clock = drive.node.connection.clock
-    start = clock.now()
     with guarded(drive, envelope, say=say) as guard:
         locked = request.shaft == "locked"
         measurement = Measurement(guard, limits, keep, say, held=locked, half_frequency=request.half_frequency)
@@ -239,9 +266,11 @@ def identify_stage(
             run.save(PREDICTED, dump_predicted(predictions))
 
         measurement.predicted = predicted
-        measurement.run(request.quantities)
-    stage = evaluated_stage(run, nameplate, request)
-    return replace(stage, seconds=clock.now() - start)
+        try:
+            measurement.run(request.quantities)
+        finally:
+            if measurement.refused:
+                run.save(REFUSED, dump_refused(measurement.refused))
 
 
 def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: IdentifyRequest) -> Stage:
@@ -262,35 +291,50 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         T_ref_c=nameplate.machine.T_ref_c,
         U_dc_v=nameplate.inverter.U_dc_v,
         tolerance=request.tolerance,
+        ended=refused_in(run),
     )
     parts = half_frequency.split_estimates(evaluation.split, nameplate.inverter.U_dc_v, request.tolerance)
     timing = timing_estimates(evaluation.inductance, evaluation.shown, request.tolerance)
     conditions = identify_verdict.conditions_of(evaluation, request) | half_frequency.split_conditions(
         evaluation.split, parts
     )
-    machine = machine_of(evaluation, nameplate, conditions)
-    text = dump_machine_file(machine)
-    target, prefix = place_of(run, text)
-    made = map_stage.save_map(target, evaluation.flux_map)
-    made |= frequency_stage.save_response(target, evaluation.frequency_response)
-    target.save(MACHINE, text)
-    made_files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
-    made_files |= {name: "" for name in (PREDICTED,) if (run.path / name).is_file()}
     found = evaluation.estimates()
-    acceptance = identify_verdict.acceptance_of(evaluation, found, machine)
+    designed = machine_of(evaluation, nameplate, conditions)
+    acceptance = identify_verdict.acceptance_of(evaluation, found, designed, request.quantities)
+    had = identify_verdict.had_of(evaluation)
+    verdicts = verdicts_of(request.quantities, evaluation.refused, had, acceptance)
+    if not verdicts.accepted:
+        evaluation.whole()
+    rejected = {key for key, line in acceptance.items() if not line.ok}
+    kept = evaluation if "flux map" not in rejected else replace(evaluation, flux_map=None, map_estimates={})
+    machine = machine_of(kept, nameplate, conditions, rejected)
+    text = dump_machine_file(machine)
+    files = {}
+    if verdicts.accepted:
+        target, prefix = place_of(run, text)
+        made = map_stage.save_map(target, kept.flux_map)
+        made |= frequency_stage.save_response(target, kept.frequency_response)
+        target.save(MACHINE, text)
+        files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
+    files |= {name: "" for name in (PREDICTED, REFUSED) if (run.path / name).is_file()}
+    fallen = [f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback]
+    facts = [
+        {**identify_verdict.value_facts(name, estimate), "accepted": name not in rejected}
+        for name, estimate in (found | parts | timing).items()
+    ]
+    summary = identify_verdict.summary_of(kept, {name: e for name, e in found.items() if name not in rejected})
     return Stage(
         "identify",
-        "pass" if all(line.ok for line in acceptance) else "fail",
+        verdicts.status,
         0.0,
-        values=[
-            *(identify_verdict.value_facts(name, estimate) for name, estimate in (found | parts | timing).items()),
-            *map(identify_verdict.check_facts, evaluation.checks),
-        ],
-        acceptance=acceptance,
-        fallbacks=[f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback],
-        files={**made_files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
+        values=[*facts, *map(identify_verdict.check_facts, evaluation.checks)],
+        # what is refused is no criterion of the values that go on
+        acceptance=[line for line in acceptance.values() if line.ok or verdicts.status == "fail"],
+        fallbacks=[*verdicts.lines(), *fallen],
+        files={**files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
         note="; ".join(identify_verdict.warnings_of(evaluation, request)),
-        summary=identify_verdict.summary_of(evaluation, found),
+        summary="; ".join([summary, *(f"{name} refused" for name in verdicts.refused)]),
+        refused=dict(verdicts.refused),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pmsmtool.design.interval_needs import JUDGED, OFFSET, Need, interval_needs
@@ -21,21 +21,31 @@ if TYPE_CHECKING:
     from pmsmtool.workflow.identify import IdentifyRequest
 
 
-def acceptance_of(evaluation: Evaluation, found: Mapping[str, Estimate], machine: MachineFile) -> list[Acceptance]:
-    """Return what every value is judged by: what its interval leaves of the design's margins and limits."""
+def acceptance_of(
+    evaluation: Evaluation, found: Mapping[str, Estimate], machine: MachineFile, asked: Collection[str]
+) -> dict[str, Acceptance]:
+    """Return what every value is judged by, by its key: what its interval leaves of the design's margins and limits."""
     # the offset of the slow turn alone, which is for the pole pairs, is coarse, and nobody asked for it
-    coarse = {OFFSET} if evaluation.flux is None else set()
+    coarse = {OFFSET} if evaluation.flux is None and "encoder" not in asked else set()
     judged = [name for name in JUDGED if name in found and name not in coarse]
-    return [
-        *judged_values({name: found[name] for name in judged}, machine),
-        *map_stage.map_acceptance(evaluation.flux_map),
-    ]
+    criteria = judged_values({name: found[name] for name in judged}, machine)
+    mapped = map_stage.map_acceptance(evaluation.flux_map)
+    return criteria | dict(zip(("flux map",), mapped, strict=False))
 
 
-def judged_values(found: Mapping[str, Estimate], machine: MachineFile) -> list[Acceptance]:
-    """Return the criterion of every value: what binds the design of the machine first over its interval."""
+def had_of(evaluation: Evaluation) -> list[str]:
+    """Return the evaluations that gave a result, by the keys of ``Evaluation.refused``."""
+    results = {
+        "R": evaluation.resistance, "encoder": evaluation.encoder, "L": evaluation.inductance, "psi": evaluation.flux,
+        "map": evaluation.flux_map, "mechanics": evaluation.mechanics, "frf": evaluation.frequency_response,
+    }  # fmt: skip
+    return [name for name, result in results.items() if result is not None]
+
+
+def judged_values(found: Mapping[str, Estimate], machine: MachineFile) -> dict[str, Acceptance]:
+    """Return the criterion of every value by its key: what binds the design of the machine first over its interval."""
     needs = interval_needs(machine, {name: total_half_width(estimate) for name, estimate in found.items()})
-    return [_accepted(name, estimate, needs.get(name, ())) for name, estimate in found.items()]
+    return {name: _accepted(name, estimate, needs.get(name, ())) for name, estimate in found.items()}
 
 
 def summary_of(evaluation: Evaluation, found: Mapping[str, Estimate]) -> str:

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.errors import IdentificationError
+from pmsmtool.errors import IdentificationError, PmsmtoolError
 from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.noise import Noise, estimate_noise
@@ -77,6 +77,7 @@ def steps_of(quantities: Iterable[str], held: bool = False) -> set[str]:
     return steps & set(HELD) if held else steps
 
 
+_Found = TypeVar("_Found")
 COMPENSATION = "inverter.deadtime_compensation"
 
 
@@ -115,15 +116,16 @@ class Measurement:
     half_frequency: bool = False
     spent: Callable[[], tuple[float, float]] | None = None
     predicted: Callable[[dict[str, Any]], None] | None = None
+    refused: dict[str, IdentificationError] = field(default_factory=dict)
     _kept: dict[str, Trace] = field(default_factory=dict)
 
     def run(self, quantities: tuple[str, ...]) -> None:
-        """Run what the quantities need.
+        """Run what the quantities need; what is refused (:attr:`refused`) takes along only what depends on it.
 
         Raises
         ------
         IdentificationError
-            A trap was seen; nothing more is moved.
+            Noise, phases, encoder counts or current sensors: nothing more is moved.
         """
         steps = steps_of(quantities, self.held)
         if self.drive.read(COMPENSATION) != 0.0:
@@ -136,24 +138,57 @@ class Measurement:
         if "rotation" in steps:
             self._encoder_counts(start, standstill.DC_ANGLE_RAD)
             start = standstill.DC_ANGLE_RAD
-        resistance = self._levels(noise, start) if "levels" in steps else None
+        resistance = self._attempt("R", lambda: self._levels(noise, start)) if "levels" in steps else None
+        if resistance is not None:
+            self._pairs(noise, resistance)
         self._tell_spent()
-        last = standstill.DC_ANGLE_RAD + (standstill.PHASE_ANGLES_RAD[-1] if "levels" in steps else 0.0)
-        encoder = self._rotation(last) if "rotation" in steps else None
+        last = standstill.DC_ANGLE_RAD + (standstill.PHASE_ANGLES_RAD[-1] if resistance is not None else 0.0)
+        encoder = self._attempt("encoder", lambda: self._rotation(last)) if "rotation" in steps else None
         self._tell_spent()
+        turned = False
         if resistance is not None and encoder is not None:
-            square = SquareStage(self.drive, self.limits, self._keep_for_later, self.say, self.ripple_share)
-            inductances = square.measure(noise, resistance, encoder) if "square" in steps else None
-            self._tell_spent()
-            if inductances is not None and "speeds" in steps:
-                SpeedStage(self.drive, self.limits, self._keep_for_later, self.say).measure(
-                    resistance, encoder, inductances
-                )
-                self._tell_spent()
-                if steps & set(shaft_forecast.LATER):
-                    self._shaft(noise, resistance, encoder, steps)
-        if resistance is not None and "map" in steps:
-            map_stage.measure_map(self.drive, self.limits, noise, resistance, self.held, self.keep, self.say)
+            turned = self._driven(noise, resistance, encoder, steps)
+        if resistance is not None and "map" in steps and (self.held or turned):
+            known = resistance
+            self._attempt(
+                "map",
+                lambda: map_stage.measure_map(self.drive, self.limits, noise, known, self.held, self.keep, self.say),
+            )
+
+    def _driven(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> bool:
+        """Run what needs the rotor's angle; whether the machine runs under control by what was found."""
+        square = SquareStage(self.drive, self.limits, self._keep_for_later, self.say, self.ripple_share)
+        inductances = (
+            self._attempt("L", lambda: square.measure(noise, resistance, encoder)) if "square" in steps else None
+        )
+        self._tell_spent()
+        if inductances is None or "speeds" not in steps:
+            return False
+        speeds = SpeedStage(self.drive, self.limits, self._keep_for_later, self.say)
+
+        def coasted() -> bool:
+            speeds.measure(resistance, encoder, inductances)
+            return True
+
+        ran = self._attempt("psi", coasted)
+        self._tell_spent()
+        if ran and steps & set(shaft_forecast.LATER):
+            self._shaft(noise, resistance, encoder, steps)
+        return bool(ran)
+
+    def _attempt(self, quantity: str, measure: Callable[[], _Found]) -> _Found | None:
+        """Measure; a refusal is kept and said, and the drive is off until the next experiment enables it."""
+        try:
+            return measure()
+        except IdentificationError as refusal:
+            self.refused[quantity] = refusal
+            self.say(f"  {quantity} refused: {refusal.what}")
+            self.drive.disable()
+            self.drive.enable()
+            return None
+        except PmsmtoolError as error:  # it ends the run; the traces of this experiment are not whole
+            self.refused[quantity] = IdentificationError("E_NOT_MEASURED", f"the run ended during it: {error.what}")
+            raise
 
     def _shaft(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> None:
         """Run what measures the shaft, and say before each how well."""
@@ -166,7 +201,10 @@ class Measurement:
                     self.say(shaft_forecast.mechanics_line(values))
                     self._tell(entry("mechanics", values, rough=forecast.rough))
 
-            mechanics_stage.measure_mechanics(self.drive, self.limits, self.keep, self.say, pushes)
+            self._attempt(
+                "mechanics",
+                lambda: mechanics_stage.measure_mechanics(self.drive, self.limits, self.keep, self.say, pushes),
+            )
             self._tell_spent()
         if "response" in steps:
 
@@ -178,7 +216,12 @@ class Measurement:
                     values = {"J_kgm2": found.J, **at}
                     self._tell(entry("frequency response", values, coherent_to_hz=found.highest_hz))
 
-            frequency_stage.measure_frequency_response(self.drive, self.limits, self.keep, self.say, sequence)
+            self._attempt(
+                "frf",
+                lambda: frequency_stage.measure_frequency_response(
+                    self.drive, self.limits, self.keep, self.say, sequence
+                ),
+            )
             self._tell_spent()
 
     def _forecast(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult) -> ShaftForecast | None:
@@ -271,12 +314,16 @@ class Measurement:
         self.keep("levels", trace)
         resistance = resistance_of(trace, noise)
         measure_at_half_frequency(self.drive, plan, resistance, self.half_frequency, self.keep, self.say)
+        return resistance
+
+    def _pairs(self, noise: Noise, resistance: ResistanceResult) -> None:
+        """Compare the phases; current sensors that differ spoil every value, so that ends the run."""
+        largest = self.limits.I_test_apk
         strongest = max(standstill.PAIR_SHARES) * largest
         self.say(f"pairs of phases: two currents up to {strongest:.3g} A through each")
         pairs = standstill.hold_pairs(self.drive, largest, TURN_SHARE * largest, standstill.DC_ANGLE_RAD)
         self.keep("phase_pairs", pairs)
         check_pairs(pairs, noise, resistance.curve)
-        return resistance
 
     def _rotation(self, start_rad: float) -> EncoderResult:
         """Turn the vector from where it was last; with less current and slower again when the rotor was not on it."""

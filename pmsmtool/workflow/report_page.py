@@ -93,7 +93,9 @@ def _identification_figures(run: RunDirectory, record: RunRecord) -> Iterator[Fi
     if "zero_current" not in traces:
         return
     period_s = traces["zero_current"].period_s
-    found = _evaluated(traces, period_s, complete=record.passed("identify"))
+    identified = record.stage("identify")
+    complete = identified is not None and identified.status in ("pass", "partial")
+    found = _evaluated(traces, period_s, complete=complete)
     if found is None:
         return
     resistance, inductance, flux = found.resistance, found.inductance, found.flux

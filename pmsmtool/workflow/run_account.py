@@ -157,7 +157,9 @@ def accounted(run: RunDirectory, stage: str, tell: Say) -> Iterator[Say]:
             yield account.say
         except BaseException as error:
             with contextlib.suppress(ConfigError, OSError):
-                run.add(Stage(stage, status_of(error), 0.0, note=text_of(error)))
+                kept = run.read().stage(stage)
+                if kept is None or kept.note != text_of(error):  # else it is recorded with what it measured
+                    run.add(Stage(stage, status_of(error), 0.0, note=text_of(error)))
             raise
 
 

@@ -26,7 +26,7 @@ RECORD = "run.json"
 _OTHER_FOLDER = "choose another folder with --runs DIR"
 _OTHER_RUN = "this run cannot be read or continued: give another one, or begin anew"
 
-Status = Literal["pass", "fail", "refused", "interrupted", "not available"]
+Status = Literal["pass", "partial", "fail", "refused", "interrupted", "not available"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,8 @@ class Stage:
     name : str
         ``identify``, ``tune``, ``lut``, ``margins``, ``flash``, ``verify`` ...
     status : Status
-        ``pass`` only when every acceptance holds; ``not available``: the drive lacks what ``note`` names.
+        ``pass`` only when every acceptance holds; ``partial``: they hold, but something asked for could not be had;
+        ``not available``: the drive lacks what ``note`` names.
     seconds : float
         Time the stage took on the bus clock (s).
     values : sequence of mapping
@@ -65,6 +66,8 @@ class Stage:
         What a person reads in the one line of the stage.
     comparison : sequence of mapping
         Rows *data sheet | drive | measured* (``workflow/contradiction.py``).
+    refused : mapping of str to str
+        Quantity that was asked for and is not given -> its reason.
     """
 
     name: str
@@ -77,6 +80,7 @@ class Stage:
     note: str = ""
     summary: str = ""
     comparison: Sequence[Mapping[str, Any]] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,7 +52,9 @@ def test_the_inertia_is_right_where_i_d_does_not_stay_zero(name: str, seed: int,
             measurement.run(IdentifyRequest().quantities)
         drive.close()
     inverter = nameplate.inverter
-    found = evaluate(traces, inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=inverter.U_dc_v).estimates()
+    found = (
+        evaluate(traces, inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=inverter.U_dc_v).whole().estimates()
+    )
     settings = settings_of(drive_file)
     for key, limit in LIMIT.items():
         error = abs(found[key].value - settings.number(key))
