@@ -28,6 +28,7 @@ from pmsmtool.estimators.flux_linkage import LEVEL_RATIO
 from pmsmtool.estimators.flux_linkage_rows import pairs_of
 from pmsmtool.estimators.resistance import FIT_FROM, MEAN_NOISE_FACTOR
 from pmsmtool.machine.parameters import InverterParameters
+from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, flux_of, inductance_of, resistance_of
 
@@ -137,7 +138,7 @@ def realisation(
     u_q = speeds["u_q_v"].copy()
     u_q[coasting.pairs] += coasting.sigma_v[:, None] * rng.standard_normal(coasting.pairs.shape)
     rows = {**clean, "speeds": replace(speeds, signals={**speeds.signals, "u_q_v": u_q})}
-    flux = flux_of(rows, found.resistance, inverter.T_s, 20.0, None, L, found.inductance.sampling)
+    flux = flux_of(rows, found.resistance, inverter.T_s, MAGNET_ALPHA_PER_K, None, L, found.inductance.sampling)
     psi = flux.psi_measured.value
     values = {"R": resistance.R_measured.value, "L_d": inductance.L_d.value, "L_q": inductance.L_q.value}
     return {**values, "psi_f": psi, "psi_f, curvature free": psi}

@@ -33,6 +33,7 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible, NotAvailable
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 
 Array = NDArray[np.float64]
 
@@ -277,9 +278,8 @@ def machine_box(source: MachineFile, box: ToleranceBox) -> MachineBox:
         half = box.factors[name].half_width if name in box.factors else 0.0
         return (1.0 - half) * low, (1.0 + half) * high
 
-    copper = machine.R_s_ohm if machine.R_winding_ohm is None else machine.R_winding_ohm
-    R = [machine.R_s_ohm + copper * machine.alpha_R_per_k * (T - machine.T_ref_c) for T in box.T_winding_c]
-    psi = [machine.psi_f_wb * (1.0 + machine.alpha_psi_per_k * (T - machine.T_ref_c)) for T in box.T_magnet_c]
+    R = [resistance_at(machine, T) for T in box.T_winding_c]
+    psi = [magnet_flux_at(machine, T) for T in box.T_magnet_c]
     return MachineBox(
         ends("R_s_ohm", min(R), max(R)),
         ends("L_d_h", machine.L_d_h, machine.L_d_h),

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 from pmsmtool.design.design_file import DesignValue, Scalar
 from pmsmtool.design.lookup_table import RPM, torque_limits
-from pmsmtool.design.operating_machine import at_temperature, magnet_flux_at
+from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.temperature import magnet_flux_at
 
 MODES: Mapping[str, int] = {"off": 0, "lookup": 1, "gradient": 2, "accelerated": 3, "uncompensated": 4}
 """``field_weakening.mode`` of the catalogue."""
@@ -147,7 +148,7 @@ def limit_facts(source: MachineFile, rated: Ratings, V_m: float) -> dict[str, Sc
     facts: dict[str, Scalar] = {}
     hot = source.limits.T_magnet_max_c
     if hot is not None:
-        facts["psi_f_at_T_magnet_max_wb"] = flux_at_temperature(machine, hot)
+        facts["psi_f_at_T_magnet_max_wb"] = magnet_flux_at(machine, hot)
     if source.flux_map is not None or machine.psi_f_wb <= 0.0:
         return facts
     facts["characteristic_current_apk"] = machine.psi_f_wb / machine.L_d_decoupling_h
@@ -260,8 +261,3 @@ def mtpva(machine: MachineParameters, omega_e: float, V_m: float, I_max: float) 
         return None
     i_d = max(inside)
     return i_d, math.sqrt(I_max**2 - i_d * i_d)
-
-
-def flux_at_temperature(machine: MachineParameters, T_magnet_c: float) -> float:
-    """Return psi(T) = psi(T_ref) (1 + alpha_psi (T - T_ref)) (Wb), (36)."""
-    return magnet_flux_at(machine, T_magnet_c)

@@ -18,6 +18,7 @@ from pmsmtool.design.ratings import Ratings
 from pmsmtool.design.tolerance import Samples
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 
 Array = NDArray[np.float64]
 
@@ -126,11 +127,8 @@ class HeadroomLimits:
 
 def headroom(machine: MachineParameters, cells: OperatingCells, limits: HeadroomLimits, samples: Samples) -> Headroom:
     """Evaluate the nominal references on every sample."""
-    T_rise = samples.column("T_winding_c") - machine.T_ref_c
-    copper = machine.R_s_ohm if machine.R_winding_ohm is None else machine.R_winding_ohm
-    R = samples.column("R_s_ohm") * (machine.R_s_ohm + copper * machine.alpha_R_per_k * T_rise)
-    warm = 1.0 + machine.alpha_psi_per_k * (samples.column("T_magnet_c") - machine.T_ref_c)
-    psi_f = machine.psi_f_wb * samples.column("psi_f_wb") * warm
+    R = samples.column("R_s_ohm") * resistance_at(machine, samples.column("T_winding_c"))
+    psi_f = samples.column("psi_f_wb") * magnet_flux_at(machine, samples.column("T_magnet_c"))
     i_d, i_q, psi_d, psi_q = _fluxes(machine, cells, psi_f, samples)
     v_d, v_q = R * i_d - cells.omega_e * psi_q, R * i_q + cells.omega_e * psi_d
     V_max = limits.utilisation * samples.column("U_dc_v")
@@ -139,7 +137,7 @@ def headroom(machine: MachineParameters, cells: OperatingCells, limits: Headroom
     with np.errstate(divide="ignore", invalid="ignore"):
         need = np.where(cells.torque_nm == 0.0, current, current * np.abs(cells.torque_nm / torque))
     need = np.where(np.sign(torque) * np.sign(cells.torque_nm) < 0.0, np.inf, need)
-    hottest = machine.R_s_ohm + copper * machine.alpha_R_per_k * (limits.T_winding_max_c - machine.T_ref_c)
+    hottest = resistance_at(machine, limits.T_winding_max_c)
     rated = int(np.argmax(cells.torque_nm - 1e-9 * cells.speed_rpm))
     loss = samples.column("R_s_ohm")[:, 0] * need[:, rated] ** 2 * (R / samples.column("R_s_ohm"))[:, 0]
     return Headroom(

@@ -27,6 +27,7 @@ from pmsmtool.design.tolerance import Samples, ToleranceBox
 from pmsmtool.design.vector_margins import Response, VectorMargins, current_response, speed_response, vector_margins
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 
 Array = NDArray[np.float64]
 
@@ -254,11 +255,9 @@ def evaluate(problem: MarginProblem, samples: Samples) -> BlockResult:
     """Evaluate every quantity on every sample."""
     values: dict[str, Array] = {}
     responses: dict[str, Response] = {}
-    rise = samples.column("T_winding_c") - problem.machine.T_ref_c
-    copper = problem.machine.R_winding_ohm or problem.machine.R_s_ohm
+    R = samples.column("R_s_ohm") * resistance_at(problem.machine, samples.column("T_winding_c"))
     for axis in _AXES:
         plant = problem.plants[axis]
-        R = samples.column("R_s_ohm") * (plant.R + copper * problem.machine.alpha_R_per_k * rise)
         span = problem.least.get(axis, plant.L) - plant.L
         L = samples.column(f"L_{axis}_h") * (plant.L + samples.column("operating_point") * span)
         model = (plant.R, plant.L) if problem.predictor else None
@@ -270,8 +269,8 @@ def evaluate(problem: MarginProblem, samples: Samples) -> BlockResult:
         model = (plant.R, plant.L) if problem.predictor else None
         here = np.array([[plant.R]]), np.array([[plant.L]])
         nominal = current_response(problem.gains["q"], *here, plant.T_s, plant.delay_periods, model)
-        warm = 1.0 + problem.machine.alpha_psi_per_k * (samples.column("T_magnet_c") - problem.machine.T_ref_c)
-        gain = samples.column("psi_f_wb") * warm / samples.column("J_kgm2")
+        psi = magnet_flux_at(problem.machine, samples.column("T_magnet_c")) / (problem.machine.psi_f_wb or 1.0)
+        gain = samples.column("psi_f_wb") * psi / samples.column("J_kgm2")
         loop = speed_response(problem.speed, gain, responses["q"], nominal)
         _store(values, "speed", vector_margins(loop, problem.speed.T_s, problem.speed_crossover))
     found = headroom(problem.machine, problem.cells, problem.limits, samples)

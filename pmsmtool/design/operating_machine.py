@@ -1,7 +1,7 @@
 """The machine at given temperatures: what a steady operating point is computed from.
 
-R(T) = R_s with its copper part scaled by 1 + alpha_R (T - T_ref); psi_f(T) = psi_f (1 + alpha_psi (T - T_ref)). A flux
-map is shifted along psi_d by the change of psi_f, its inductances kept.
+R(T) and psi(T) are those of ``machine/temperature``. A flux map is shifted along psi_d by the change of psi_f, its
+inductances kept.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_cells import FluxMapStruct, library
 from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 
 Array = NDArray[np.float64]
 
@@ -131,17 +132,6 @@ class OperatingMachine:
         numbers = (self.pole_pairs, self.R, self.L_d, self.L_q, self.psi_f, self.psi_shift)
         maps = tuple("" if m is None else m.content_hash() for m in (self.flux_map, self.loss_map))
         return " ".join(repr(part) for part in (*numbers, *maps))
-
-
-def resistance_at(machine: MachineParameters, T_winding_c: float) -> float:
-    """Return the loop resistance (ohm) at a winding temperature; without R_winding all of R_s is taken for copper."""
-    copper = machine.R_s_ohm if machine.R_winding_ohm is None else machine.R_winding_ohm
-    return machine.R_s_ohm + copper * machine.alpha_R_per_k * (T_winding_c - machine.T_ref_c)
-
-
-def magnet_flux_at(machine: MachineParameters, T_magnet_c: float) -> float:
-    """Return the magnet flux linkage (Wb) at a magnet temperature, (36) of Jercic et al. 2017."""
-    return machine.psi_f_wb * (1.0 + machine.alpha_psi_per_k * (T_magnet_c - machine.T_ref_c))
 
 
 def at_temperature(

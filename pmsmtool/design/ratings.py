@@ -17,6 +17,7 @@ from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import InverterParameters
+from pmsmtool.machine.temperature import loop_coefficient_per_k
 from pmsmtool.params.catalogue import BY_NAME
 
 TRIP_CURRENT_RATIO = 1.5
@@ -153,7 +154,7 @@ def _motor(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
         "L_q_h": machine.L_q_h,
         "psi_f_wb": machine.psi_f_wb,
         "T_ref_c": machine.T_ref_c,
-        "alpha_R_per_k": machine.alpha_R_per_k,
+        "alpha_R_per_k": loop_coefficient_per_k(machine),
         "alpha_psi_per_k": machine.alpha_psi_per_k,
     }
     values = {f"motor.{name}": DesignValue(float(value), GIVEN) for name, value in given.items()}

@@ -32,6 +32,7 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.sampling_instant import CoastingPairs, Sampling, ShownInstant, shown_instant
 from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.trace import Trace
 
 Vector = NDArray[np.float64]
@@ -123,7 +124,7 @@ def estimate_flux_linkage(
     sampling: Sampling | None = None,
     tolerance: SensorTolerance | None = None,
     T_ref_c: float = 20.0,
-    alpha_psi_per_k: float = -0.0012,
+    alpha_psi_per_k: float = MAGNET_ALPHA_PER_K,
 ) -> FluxResult:
     """PM flux linkage from the means of windows at steady currents.
 

@@ -16,7 +16,7 @@ from pmsmtool.estimators.flux_map_fit import CoenergyFit, MagnetFlux, fit_coener
 from pmsmtool.estimators.flux_map_rows import Frame
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.estimators.resistance import ResistanceResult
+from pmsmtool.estimators.resistance import ResistanceResult, resistance_warmed
 from pmsmtool.machine.flux_map import FluxMap, require_monotonic
 from pmsmtool.machine.flux_map_reciprocity import reciprocal_change
 from pmsmtool.machine.parameters import Estimate
@@ -25,7 +25,6 @@ from pmsmtool.trace import Trace
 Array = NDArray[np.float64]
 
 STAGE = "flux map"
-COPPER_ALPHA_PER_K = 0.00393
 NODES = 41
 """Nodes per axis of the exported map."""
 TURNS_LEAST = 4
@@ -250,12 +249,10 @@ def _check_pulses(traces: Sequence[Trace]) -> None:
 
 
 def _R_at(resistance: ResistanceResult, traces: Sequence[Trace]) -> float:
-    """Resistance at the mean temperature of the pulses (ohm); the share of copper is not known and taken as all."""
-    R = resistance.R_measured
+    """Resistance at the mean temperature of the pulses (ohm)."""
     known = [float(np.mean(trace["T_winding_c"])) for trace in traces if "T_winding_c" in trace.signals]
     T = sum(known) / len(known) if known else math.nan
-    warmer = COPPER_ALPHA_PER_K * (T - R.T_c) if math.isfinite(T) and math.isfinite(R.T_c) else 0.0
-    return R.value * (1.0 + warmer)
+    return resistance_warmed(resistance.R_measured, T, resistance.copper)
 
 
 def _axis(breaks: Array, i_max: float) -> Array:

@@ -32,7 +32,8 @@ from pmsmtool.estimators.inverter_error import InverterCurve, curve_from_levels
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.parameters import Estimate, MachineParameters
+from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K
 from pmsmtool.trace import Trace
 
 STAGE = "resistance"
@@ -94,8 +95,13 @@ class Copper:
     """
 
     T_ref_c: float = 20.0
-    alpha_per_k: float = 0.00393
+    alpha_per_k: float = COPPER_ALPHA_PER_K
     R_winding_ohm: float | None = None
+
+
+def copper_of(machine: MachineParameters) -> Copper:
+    """Return what a machine file says of the winding."""
+    return Copper(machine.T_ref_c, machine.alpha_R_per_k, machine.R_winding_ohm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +126,8 @@ class ResistanceResult:
         Information weight of each tail model.
     verdict : Verdict
         ``warn`` when the fit is above its chi-square limit.
+    copper : Copper
+        What R is taken to another temperature by.
     """
 
     R_s: Estimate
@@ -130,6 +138,7 @@ class ResistanceResult:
     hardness: float
     weights: dict[tuple[int, ...], float]
     verdict: Verdict
+    copper: Copper = Copper()
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,6 +250,7 @@ def estimate_resistance(
         hardness=hardness,
         weights=dict(zip(tail_models(), (float(w) for w in weights), strict=True)),
         verdict=verdict,
+        copper=copper,
     )
 
 
@@ -333,9 +343,19 @@ def at_one_temperature(levels: Trace, R: Estimate, copper: Copper) -> Trace:
     T = levels["T_winding_c"]
     if not (math.isfinite(R.T_c) and np.all(np.isfinite(T))):
         return levels
-    slope = _slope_per_k(R.value * _copper_share(copper, R.value), R.T_c, copper)
-    warmer = slope * (T - R.T_c) * levels["i_d_a"]
+    warmer = _per_k(R, copper) * (T - R.T_c) * levels["i_d_a"]
     return replace(levels, signals={**levels.signals, "u_d_v": levels["u_d_v"] - warmer})
+
+
+def resistance_warmed(R: Estimate, T_c: float, copper: Copper) -> float:
+    """Return a measured resistance at another temperature of the winding (ohm); as it is where either is unknown."""
+    known = math.isfinite(T_c) and math.isfinite(R.T_c)
+    return R.value + (_per_k(R, copper) * (T_c - R.T_c) if known else 0.0)
+
+
+def _per_k(R: Estimate, copper: Copper) -> float:
+    """Change per kelvin of a measured resistance (ohm/K): that of its copper part."""
+    return _slope_per_k(R.value * _copper_share(copper, R.value), R.T_c, copper)
 
 
 def _slope_per_k(R_copper: float, T_c: float, copper: Copper) -> float:

@@ -16,6 +16,7 @@ from typing import Literal
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
+from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K
 from pmsmtool.units import format_quantity
 
 Between = Literal["line-line", "phase"]
@@ -23,8 +24,6 @@ Connection = Literal["star", "delta"]
 Kind = Literal["rms", "peak"]
 Source = Literal["datasheet", "meter", "guess"]
 
-COPPER_ALPHA_PER_K = 0.00393
-"""Temperature coefficient of copper at 20 degC (IEC 60028: annealed copper)."""
 
 T_REF_C = 20.0
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from pmsmtool.machine.key import Key, KeyKind, Value
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
+from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K
 
 
 def _key(
@@ -43,8 +44,8 @@ MACHINE_KEYS: tuple[Key, ...] = (
     _key("machine", "L_d_app_h", "H", 1e-7, 10, None, "apparent d inductance, default L_d_h"),
     _key("machine", "L_q_app_h", "H", 1e-7, 10, None, "apparent q inductance, default L_q_h"),
     _key("machine", "T_ref_c", "degC", -60, 200, 20.0, "reference temperature of R_s and psi_f"),
-    _key("machine", "alpha_R_per_k", "1/K", 0, 0.01, 0.00393, "temperature coefficient of the winding (copper)"),
-    _key("machine", "alpha_psi_per_k", "1/K", -0.01, 0.001, -0.0012, "temperature coefficient of the magnet flux"),
+    _key("machine", "alpha_R_per_k", "1/K", 0, 0.01, COPPER_ALPHA_PER_K, "temperature coefficient of the copper"),
+    _key("machine", "alpha_psi_per_k", "1/K", -0.01, 0.001, MAGNET_ALPHA_PER_K, "temperature coefficient of psi_f"),
     _key("machine", "I_nom_apk", "A", 1e-3, 1e5, None, "rated current (peak)"),
     _key("machine", "I_max_apk", "A", 1e-3, 1e5, None, "time-limited current (peak)"),
     _key("machine", "I_max_time_s", "s", 0, 3600, None, "time I_max may flow from cold"),

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K
+
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
@@ -68,8 +70,8 @@ class MachineParameters:
     L_d_app_h: float | None = None
     L_q_app_h: float | None = None
     T_ref_c: float = 20.0
-    alpha_R_per_k: float = 0.00393
-    alpha_psi_per_k: float = -0.0012
+    alpha_R_per_k: float = COPPER_ALPHA_PER_K
+    alpha_psi_per_k: float = MAGNET_ALPHA_PER_K
     I_nom_apk: float | None = None
     I_max_apk: float | None = None
     I_max_time_s: float | None = None

@@ -96,7 +96,7 @@ _ROWS: tuple[tuple[str, int, int, WireType, str, float, float, float, bool, str]
         0,
         0.01,
         False,
-        "temperature coefficient of the winding",
+        "temperature coefficient of R_s (copper's times its share)",
     ),
     (
         "motor.alpha_psi_per_k",

@@ -23,10 +23,17 @@ from pmsmtool.estimators.inductance import FrameAhead, InductanceResult, bare_sh
 from pmsmtool.estimators.mechanics import MechanicsResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases
-from pmsmtool.estimators.resistance import Copper, ResistanceResult, estimate_resistance, settled_levels
+from pmsmtool.estimators.resistance import (
+    Copper,
+    ResistanceResult,
+    estimate_resistance,
+    resistance_warmed,
+    settled_levels,
+)
 from pmsmtool.estimators.sampling_instant import Sampling, ShownInstant
 from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.trace import Trace
 from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_traces
@@ -39,8 +46,6 @@ MOTION_STD = 0.2
 """Relative standard deviation of the rotor's answer to an injection as the pushes show it: friction takes part."""
 RELUCTANCE_STD = 0.3
 """Standard deviation of what reluctance takes from it, relative: the inductances are rough and incremental."""
-COPPER_ALPHA_PER_K = 0.00393
-"""Temperature coefficient of copper at 20 degC (IEC 60028)."""
 MOSFET_LINK_V = 100.0
 """Below this DC link bridges are made of MOSFETs, which have no threshold."""
 
@@ -143,6 +148,8 @@ def evaluate(
     period_s: float,
     *,
     T_ref_c: float = 20.0,
+    copper: Copper | None = None,
+    alpha_psi_per_k: float = MAGNET_ALPHA_PER_K,
     U_dc_v: float = math.inf,
     tolerance: SensorTolerance | None = None,
     ended: Mapping[str, IdentificationError] | None = None,
@@ -158,7 +165,11 @@ def evaluate(
     period_s : float
         Control period (s).
     T_ref_c : float
-        Temperature the values are referred to (degC).
+        Temperature the values are referred to (degC); that of ``copper`` where it is given.
+    copper : Copper, optional
+        What the machine file says of the winding.
+    alpha_psi_per_k : float
+        Temperature coefficient of the magnet flux (1/K).
     U_dc_v : float
         DC link of the nameplate (V); infinite: the thresholds of the bridge are not counted.
     tolerance : SensorTolerance
@@ -176,6 +187,7 @@ def evaluate(
     if "zero_current" not in traces:
         raise ConfigError("the run has no zero-current trace", hint="run identify again")
     tolerance = tolerance_on(tolerance or SensorTolerance(), U_dc_v)
+    copper = copper or Copper(T_ref_c)
     traces = calibrated_traces(traces, tolerance)
     result = Evaluation(estimate_noise(traces["zero_current"]))
     if "phase_vectors" in traces:
@@ -194,7 +206,7 @@ def evaluate(
             return None
 
     if "levels" in traces:
-        found = attempt("R", lambda: resistances_of(traces, result.noise, T_ref_c, tolerance))
+        found = attempt("R", lambda: resistances_of(traces, result.noise, copper, tolerance))
         if found is not None:
             result = replace(result, resistance=found[0], split=found[1])
     if "phase_pairs" in traces and result.resistance is not None:
@@ -205,7 +217,7 @@ def evaluate(
     resistance = result.resistance
     # a wrong angle or number of pole pairs is in the speeds, too
     if "speeds" in traces and resistance is not None and "encoder" not in refused:
-        flux = attempt("psi", lambda: flux_of(traces, resistance, period_s, T_ref_c, tolerance))
+        flux = attempt("psi", lambda: flux_of(traces, resistance, period_s, alpha_psi_per_k, tolerance))
         result = replace(result, flux=flux)
     shots = all(any(name.startswith(f"square_{axis}") for name in traces) for axis in "dq")
     if resistance is not None and result.encoder is not None and shots:
@@ -213,7 +225,7 @@ def evaluate(
         inductance = attempt("L", lambda: inductance_of(traces, before, tolerance, U_dc_v))
         if inductance is not None:
             rough = replace(before, inductance=inductance)
-            result = attempt("psi", lambda: as_sampled(traces, rough, period_s, T_ref_c, tolerance)) or replace(
+            result = attempt("psi", lambda: as_sampled(traces, rough, period_s, alpha_psi_per_k, tolerance)) or replace(
                 rough, flux=None
             )
     flux_map = attempt("map", lambda: map_stage.flux_map_of(traces, result, tolerance))
@@ -230,20 +242,18 @@ def evaluate(
 
 
 def resistances_of(
-    traces: Mapping[str, Trace], noise: Noise, T_ref_c: float, tolerance: SensorTolerance
+    traces: Mapping[str, Trace], noise: Noise, copper: Copper, tolerance: SensorTolerance
 ) -> tuple[ResistanceResult, FrequencySplit | None]:
     """Return the resistance by one control frequency, or by two where both were measured."""
-    resistance = resistance_of(traces["levels"], noise, T_ref_c, tolerance)
-    copper = Copper(T_ref_c, COPPER_ALPHA_PER_K)
+    resistance = resistance_of(traces["levels"], noise, copper, tolerance)
     return resistance_at_two_frequencies(traces, noise, resistance, copper, tolerance)
 
 
 def resistance_of(
-    levels: Trace, noise: Noise, T_ref_c: float = 20.0, tolerance: SensorTolerance | None = None
+    levels: Trace, noise: Noise, copper: Copper | None = None, tolerance: SensorTolerance | None = None
 ) -> ResistanceResult:
     """Return the resistance at a reference temperature; levels at which the shaft moved are left out, and counted."""
     levels, left_out = settled_levels(levels, noise)
-    copper = Copper(T_ref_c, COPPER_ALPHA_PER_K)
     result = estimate_resistance(levels, noise, tolerance=tolerance, copper=copper)
     if not left_out:
         return result
@@ -253,7 +263,7 @@ def resistance_of(
 
 
 def as_sampled(
-    traces: Mapping[str, Trace], result: Evaluation, period_s: float, T_ref_c: float, tolerance: SensorTolerance
+    traces: Mapping[str, Trace], result: Evaluation, period_s: float, alpha_psi_per_k: float, tolerance: SensorTolerance
 ) -> Evaluation:
     """Return resistance and flux linkage for the mean current, once the inductances and the instant are known."""
     resistance, flux, inductance = result.resistance, result.flux, result.inductance
@@ -263,9 +273,9 @@ def as_sampled(
     L = (inductance.L_d.value, inductance.L_q.value)
     modulation = modulation_of(traces["speeds"], resistance, L, period_s)
     assert modulation is not None
-    copper = Copper(T_ref_c, COPPER_ALPHA_PER_K)
+    copper = resistance.copper
     resistance = resistance_as_sampled(resistance, inductance, flux.shown, modulation, copper, tolerance)
-    again = flux_of(traces, resistance, period_s, T_ref_c, tolerance, L, inductance.sampling)
+    again = flux_of(traces, resistance, period_s, alpha_psi_per_k, tolerance, L, inductance.sampling)
     return replace(result, resistance=resistance, flux=replace(again, shown=flux.shown))
 
 
@@ -283,7 +293,7 @@ def flux_of(
     traces: Mapping[str, Trace],
     resistance: ResistanceResult,
     period_s: float,
-    T_ref_c: float,
+    alpha_psi_per_k: float,
     tolerance: SensorTolerance | None,
     L_h: tuple[float, float] | None = None,
     sampling: Sampling | None = None,
@@ -293,12 +303,10 @@ def flux_of(
     Before the inductances are known (H), rough ones from the ripple serve, and currents count as sampled in time.
     """
     speeds = traces["speeds"]
-    R = resistance.R_measured
     T = float(np.mean(speeds["T_winding_c"]))
-    warmer = COPPER_ALPHA_PER_K * (T - R.T_c) if math.isfinite(T) and math.isfinite(R.T_c) else 0.0
     return estimate_flux_linkage(
         speeds,
-        R.value * (1.0 + warmer),
+        resistance_warmed(resistance.R_measured, T, resistance.copper),
         period_s=period_s,
         inverter=resistance.curve,
         modulation=modulation_of(
@@ -307,7 +315,8 @@ def flux_of(
         lag_s=float(speeds.meta.get("speed_lag_s", 0.0)),
         sampling=sampling,
         tolerance=tolerance,
-        T_ref_c=T_ref_c,
+        T_ref_c=resistance.copper.T_ref_c,
+        alpha_psi_per_k=alpha_psi_per_k,
     )
 
 

@@ -33,6 +33,8 @@ def machine_of(
     if evaluation.frequency_response is not None:
         resonant = {name: estimate.value for name, estimate in evaluation.frequency_response.found.items()}
         machine = replace(machine, **{**dict.fromkeys(RESONANCE), **resonant})  # type: ignore[arg-type]
+    if machine.R_winding_ohm is not None and machine.R_winding_ohm > machine.R_s_ohm:
+        machine = replace(machine, R_winding_ohm=machine.R_s_ohm)  # a copper part is no more than what was measured
     flux_map = nameplate.flux_map
     if evaluation.flux_map is not None:
         machine, flux_map = map_stage.with_map(machine, evaluation.map_estimates), evaluation.flux_map.flux_map

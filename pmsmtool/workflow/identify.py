@@ -20,6 +20,7 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import ConfigError, DriveFault, IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal
 from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.resistance import copper_of
 from pmsmtool.experiments.rotation import dwell_within
 from pmsmtool.files import read_text
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
@@ -119,6 +120,8 @@ def nameplate_of(drive: Drive, name: str) -> MachineFile:
         I_max_time_s=read("motor.I_max_time_s"),
         n_max_rpm=read("motor.n_max_rpm"),
         T_ref_c=read("motor.T_ref_c"),
+        alpha_R_per_k=read("motor.alpha_R_per_k"),
+        alpha_psi_per_k=read("motor.alpha_psi_per_k"),
     )
     inverter = InverterParameters(
         U_dc_v=read("inverter.U_dc_nom_v"),
@@ -288,7 +291,8 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     evaluation = evaluate(
         traces,
         nameplate.inverter.T_s,
-        T_ref_c=nameplate.machine.T_ref_c,
+        copper=copper_of(nameplate.machine),
+        alpha_psi_per_k=nameplate.machine.alpha_psi_per_k,
         U_dc_v=nameplate.inverter.U_dc_v,
         tolerance=request.tolerance,
         ended=refused_in(run),
@@ -333,7 +337,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         fallbacks=[*verdicts.lines(), *fallen],
         files={**files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
         note="; ".join(identify_verdict.warnings_of(evaluation, request)),
-        summary="; ".join([summary, *(f"{name} refused" for name in verdicts.refused)]),
+        summary="; ".join(filter(None, (summary, *(f"{name} refused" for name in verdicts.refused)))),
         refused=dict(verdicts.refused),
     )
 

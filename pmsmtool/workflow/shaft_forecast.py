@@ -131,7 +131,7 @@ def forecast_of(
     pole_pairs = round(encoder.pole_pairs.value)
     J, psi, L_q = (drive.read(f"motor.{name}") for name in ("J_kgm2", "psi_f_wb", "L_q_h"))
     per_a = 1.5 * pole_pairs * psi
-    flux = flux_of(traces, resistance, drive.period_s, drive.read("motor.T_ref_c"), tolerance)
+    flux = flux_of(traces, resistance, drive.period_s, drive.read("motor.alpha_psi_per_k"), tolerance)
     B, tau_c = shaft_prediction.rough_friction(traces["speeds"], J, per_a, pole_pairs)
     step = encoder_step([traces[name]["theta_M_rad"] for name in ("push_0", "push_1")])
     U_dc_v = float(traces["speeds"].meta["U_dc_v"])

@@ -18,14 +18,15 @@ from pmsmtool.estimators.estimate import SENSOR_GAIN_TOLERANCE, SensorTolerance,
 from pmsmtool.estimators.flux_linkage import normalised as flux_at_reference
 from pmsmtool.estimators.inertia_ratio import estimate_ratios
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
-from pmsmtool.estimators.resistance import Copper
+from pmsmtool.estimators.resistance import Copper, copper_of
 from pmsmtool.estimators.resistance import normalised as resistance_at_reference
 from pmsmtool.estimators.rotation_offset import offset_by_turns
 from pmsmtool.estimators.supply_power import resistance_by_supply
 from pmsmtool.estimators.voltage_flux import flux_by_undriven_voltage, flux_by_voltage_limit
 from pmsmtool.files import read_text
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
-from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
+from pmsmtool.machine.parameters import Estimate, InverterParameters
+from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 from pmsmtool.units import format_estimate
@@ -57,8 +58,6 @@ SUPPLY_LEVELS = "supply_levels"
 NO_VOLTAGE = "needs injection, or a recorder of voltages at loop rate"
 NO_POLE_PAIRS = "needs the pole pairs: mode 11, an object in the drive's map, or a machine file"
 NO_LINK = "needs the DC link (0x6079) or the machine's voltage"
-ALPHA_PSI_PER_K = -0.0012
-"""Temperature coefficient of the flux linkage where no machine file says it."""
 OFFSET_LIMIT_RAD = math.radians(2.5)
 """Largest total 95 % half width of an accepted encoder offset; measured: 1.66 to 1.77 deg on nine of ten drives."""
 LIMITS: Mapping[str, float] = {
@@ -140,7 +139,7 @@ def tier_result(
     inverter: InverterParameters | None = None,
     psi_f_wb: float = 0.0,
     copper: Copper | None = None,
-    alpha_psi_per_k: float = ALPHA_PSI_PER_K,
+    alpha_psi_per_k: float = MAGNET_ALPHA_PER_K,
 ) -> TierResult:
     """Estimate from traces.
 
@@ -261,11 +260,6 @@ def push_estimates(found: PushResult) -> dict[str, Estimate]:
     """Return what the pushes told by the keys of a machine file; R only where the inverter's error does not hide it."""
     told = {"psi_f_wb": found.psi_f, "L_q_app_h": found.L_q, "frame_offset_rad": found.frame_offset}
     return told if found.R is None else {"R_s_ohm": found.R, **told}
-
-
-def copper_of(machine: MachineParameters) -> Copper:
-    """Return what a machine file says of the winding."""
-    return Copper(machine.T_ref_c, machine.alpha_R_per_k, machine.R_winding_ohm)
 
 
 # ---- the stage --------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.machine_keys import MEASURABLE
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.temperature import magnet_flux_at
 
 NEEDED = ("pole_pairs", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
 """Keys of a machine that a design stands on."""
@@ -124,7 +125,7 @@ def _flux_of_the_run(known: MachineFile, measured: Estimate | None) -> float:
         return known.machine.psi_f_wb
     if not math.isfinite(measured.T_c):
         return measured.value
-    return measured.value * (1.0 + known.machine.alpha_psi_per_k * (measured.T_c - known.machine.T_ref_c))
+    return magnet_flux_at(replace(known.machine, psi_f_wb=measured.value), measured.T_c)
 
 
 def _times(ratio: Estimate, psi: float, of: Estimate | None, unit: str) -> Estimate:

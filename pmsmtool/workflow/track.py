@@ -21,6 +21,7 @@ from pmsmtool.estimators.tracking import Track, track
 from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, TRACKED, Known
 from pmsmtool.files import read_text
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.temperature import loop_coefficient_per_k
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
 from pmsmtool.workflow.identify import stored_traces
@@ -134,10 +135,9 @@ def follow(observations: Trace, known: Known, machine: MachineFile, wanted: Sequ
     """
     found = track(observations, known, wanted)
     values = machine.machine
-    share = 1.0 if values.R_winding_ohm is None else min(1.0, values.R_winding_ohm / values.R_s_ohm)
     temperatures = {}
     for name, quantity, alpha in (
-        ("T_winding_c", "R_s_ohm", values.alpha_R_per_k * share),
+        ("T_winding_c", "R_s_ohm", loop_coefficient_per_k(values)),
         ("T_magnet_c", "psi_f_wb", values.alpha_psi_per_k),
     ):
         reference = {"R_s_ohm": values.R_s_ohm, "psi_f_wb": values.psi_f_wb}[quantity]

@@ -6,7 +6,7 @@ value is good enough; else it is refused with its reason, and what follows from 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from pmsmtool.errors import IdentificationError
@@ -27,10 +27,10 @@ KEYS: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Keys of the machine file (and the map) whose intervals are judged for a quantity."""
 FOLLOWS: Mapping[str, str] = {
-    "R": "the design takes R from the machine file it began with",
+    "R": "a design goes on only with a machine file that states R",
     "inverter": "the voltage error of the inverter is not compensated",
-    "L": "the current loops take L from the machine file they began with",
-    "psi": "the design takes psi from the machine file it began with",
+    "L": "a design goes on only with a machine file that states L",
+    "psi": "a design goes on only with a machine file that states psi",
     "encoder": "torque needs the encoder offset: nothing that turns the shaft goes on",
     "poles": "torque needs the pole pairs: nothing that turns the shaft goes on",
     "mechanics": "speed control needs J: without one in the machine file it is not designed",
@@ -92,14 +92,14 @@ def verdicts_of(
     acceptance : mapping of str to Acceptance
         Criterion of each judged key.
     """
-    had = set(had)
+    asked, had = tuple(asked), set(had)
     good: list[str] = []
     bad: dict[str, str] = {}
     for quantity in asked:
         step = STEP[quantity]
         broken = [acceptance[key] for key in KEYS.get(quantity, ()) if key in acceptance and not acceptance[key].ok]
         if step not in had:
-            bad[quantity] = _why(step, refused, had)
+            bad[quantity] = _why(step, refused, had, asked)
         elif broken:
             bad[quantity] = f"{NOT_ACCEPTED}: " + "; ".join(
                 f"{line.what} {line.measured}, limit {line.limit}" for line in broken
@@ -109,17 +109,22 @@ def verdicts_of(
     return Verdicts(tuple(good), bad)
 
 
-def _why(step: str, refused: Mapping[str, IdentificationError], had: set[str]) -> str:
-    """Return why an evaluation gave no result: its own refusal, or that of what it needs."""
-    if step in refused:
-        error = refused[step]
-        parts = [("likely", error.likely), ("try", error.hint)]
-        more = "; ".join(f"{name}: {text}" for name, text in parts if text)
-        return f"{error.what} ({more})" if more else error.what
-    lacking = next((name for name in NEEDED.get(step, ()) if name not in had), None)
-    if lacking is None:
-        return "not measured: the run ended before it"
-    return f"needs {lacking}: {_why(lacking, refused, had)}"
+def _why(step: str, refused: Mapping[str, IdentificationError], had: set[str], asked: Sequence[str]) -> str:
+    """Return why an evaluation gave no result: its own refusal, or the first one of what it needs."""
+    root = step
+    while root not in refused:
+        lacking = next((name for name in NEEDED.get(root, ()) if name not in had), None)
+        if lacking is None:
+            break
+        root = lacking
+    needs = "" if root == step else f"needs {root}: "
+    if root not in refused:
+        return f"{needs}not measured: the run ended before it"
+    error = refused[root]
+    if needs and any(STEP[quantity] == root for quantity in asked):
+        return needs + error.reason  # told in full where it was asked for
+    more = "; ".join(f"{name}: {text}" for name, text in (("likely", error.likely), ("try", error.hint)) if text)
+    return f"{needs}{error.what} ({more})" if more else needs + error.what
 
 
 def blocking(refused: Mapping[str, str], *, given: bool) -> list[str]:

@@ -109,7 +109,6 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "offset of one sensor": ({"sensor_offset_a_apk": 0.03 * I_NOM_APK}, "E_CURRENT_SENSOR"),
     "encoder stuck": ({"drive_fault": "encoder_stuck"}, "E_ENCODER"),
     "rotor locked unsaid": ({"rotor": "locked"}, "E_ENCODER"),
-    "converter too small": ({"adc_full_scale_apk": 0.7 * I_NOM_APK}, "E_CLIPPED"),
     "noise as large as the signal": ({"sensor_noise_apk": 0.3 * I_NOM_APK}, "E_SNR"),
     "converter coarser than its noise": ({"sensor_noise_apk": 0.0}, "E_SNR"),
 }
@@ -128,6 +127,20 @@ def test_a_bad_machine_is_refused_by_name(case: str, tool: Tool) -> None:
     assert name in err, err
     assert "likely:" in err and "try:" in err
     assert not list(Path("runs").glob("*/machine.toml"))
+
+
+def test_a_converter_that_is_too_small_for_the_levels_leaves_what_less_current_measured(tool: Tool) -> None:
+    channel = profile("interior-2k2", adc_full_scale_apk=0.7 * I_NOM_APK)
+    with PmsmSimBus(channel):
+        before = held(channel)
+        code, out, err = tool("identify", "-i", "pmsmsim", "-c", channel, "--yes", "--json", "R", "L", "poles")
+        assert code == 10, err
+        assert held(channel) == before
+    data = json.loads(out)
+    assert set(data["refused"]) == {"R", "L"} and data["status"] == "partial"
+    assert data["refused"]["R"].startswith("E_CLIPPED") and data["refused"]["L"] == "needs R: E_CLIPPED"
+    assert "pole_pairs" in {value["name"] for value in data["values"]}
+    assert "partial: 2 of the quantities asked for are refused" in err
 
 
 CHANNEL = "interior-2k2?nv=drive.nv"

@@ -13,7 +13,6 @@ from pmsmtool.design.admissible_set import PredictionModel
 from pmsmtool.design.current_loop import imc
 from pmsmtool.design.field_weakening import (
     empty_above_rpm,
-    flux_at_temperature,
     mtpv,
     mtpv_entry_rpm,
     mtpva,
@@ -38,6 +37,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.image import lut_size_words
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.temperature import magnet_flux_at
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 R, L_D, L_Q, PSI, P, T_S = 0.137, 2.3e-3, 2.1e-3, 0.41, 4, 1.0 / 12e3
@@ -125,7 +125,7 @@ def test_mtpva_is_the_corner_the_table_kernel_finds() -> None:
 
 def test_hot_magnet() -> None:
     """(36): 150 K at 0.12 %/K are 18 %."""
-    assert flux_at_temperature(MTPV_MACHINE, 170.0) == pytest.approx(0.82 * 0.1)
+    assert magnet_flux_at(MTPV_MACHINE, 170.0) == pytest.approx(0.82 * 0.1)
 
 
 def test_torque_constant_is_the_slope_of_the_torque() -> None:

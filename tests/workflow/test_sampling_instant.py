@@ -55,7 +55,9 @@ def test_psi_f_is_wrong_for_samples_taken_to_be_in_time() -> None:
     assert Settings(drive.simulation_settings()).number("sampling_shift_s") == pytest.approx(INSTANT_S, rel=2e-3)
     traces, nameplate, evaluation, truth, share = _found()
     assert evaluation.resistance is not None
-    plain = flux_of(traces, evaluation.resistance, nameplate.inverter.T_s, nameplate.machine.T_ref_c, SensorTolerance())
+    plain = flux_of(
+        traces, evaluation.resistance, nameplate.inverter.T_s, nameplate.machine.alpha_psi_per_k, SensorTolerance()
+    )
     assert plain.psi_f.value / truth["psi_f_wb"] - 1.0 + share > 2e-3
 
 

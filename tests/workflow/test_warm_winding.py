@@ -12,7 +12,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.workflow.identify import MACHINE, IdentifyRequest, identify_stage, nameplate_of
+from pmsmtool.workflow.identify import MACHINE, NAMEPLATE, IdentifyRequest, identify_stage, nameplate_of, replay
 from pmsmtool.workflow.random_drives import true_loop_resistance
 from pmsmtool.workflow.run_directory import RunDirectory, new_record
 
@@ -44,3 +44,12 @@ def test_resistance_is_accepted_and_true_at_the_reference(name: str, T_c: float,
     written = load_machine_file(run.path / MACHINE)
     assert written.estimates["R_s_ohm_measured"].value == measured["value"]
     assert written.machine.R_s_ohm == at_reference["value"]
+
+    # a machine file's own coefficients are used, and kept
+    nameplate = load_machine_file(run.path / NAMEPLATE)
+    own = replace(nameplate.machine, alpha_R_per_k=0.0030, alpha_psi_per_k=-0.002)
+    (run.path / NAMEPLATE).write_text(dump_machine_file(replace(nameplate, machine=own)), encoding="utf-8")
+    again = {value["name"]: value["value"] for value in replay(run).values}
+    assert again["R_s_ohm"] == pytest.approx(measured["value"] / (1.0 + 0.0030 * (measured["T_c"] - 20.0)), rel=1e-3)
+    kept = load_machine_file(run.path / MACHINE).machine
+    assert (kept.alpha_R_per_k, kept.alpha_psi_per_k) == (0.0030, -0.002)

@@ -25,7 +25,7 @@ typedef struct pmsm_params {
     float    motor_I_nom_apk;                /* [A] rated current (peak) */
     float    motor_J_kgm2;                   /* [kg m2] total inertia */
     float    motor_T_ref_c;                  /* [degC] reference temperature of R_s and psi_f */
-    float    motor_alpha_R_per_k;            /* [1/K] temperature coefficient of the winding */
+    float    motor_alpha_R_per_k;            /* [1/K] temperature coefficient of R_s (copper's times its share) */
     float    motor_alpha_psi_per_k;          /* [1/K] temperature coefficient of the magnet flux */
     float    motor_L_d_app_h;                /* [H] apparent d inductance (decoupling, torque) */
     float    motor_L_q_app_h;                /* [H] apparent q inductance (decoupling, torque) */

@@ -1,0 +1,45 @@
+"""The one home of R(T), psi(T) and the temperature coefficients.
+
+R(T) = R_s + R_winding alpha_R (T - T_ref): only the copper part of the loop warms with the winding; where the split is
+not known all of it counts as copper. psi(T) = psi_f (1 + alpha_psi (T - T_ref)).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from pmsmtool.machine.parameters import MachineParameters
+
+COPPER_ALPHA_PER_K = 0.00393
+"""Temperature coefficient of copper at 20 degC (IEC 60028: annealed copper)."""
+MAGNET_ALPHA_PER_K = -0.0012
+"""Temperature coefficient of the flux linkage where no machine file says it: sintered NdFeB, -0.11 to -0.12 %/K."""
+
+Degrees = TypeVar("Degrees", float, NDArray[np.float64])
+
+
+def copper_ohm(machine: MachineParameters) -> float:
+    """Return the copper part of R_s at T_ref (ohm); all of it where the split is not known."""
+    return machine.R_s_ohm if machine.R_winding_ohm is None else machine.R_winding_ohm
+
+
+def loop_coefficient_per_k(machine: MachineParameters) -> float:
+    """Return the temperature coefficient of the whole loop R_s (1/K): that of its copper part, times its share.
+
+    What a drive heats all of R_s by: R_s (1 + this (T - T_ref)) is :func:`resistance_at`.
+    """
+    return machine.alpha_R_per_k * copper_ohm(machine) / machine.R_s_ohm
+
+
+def resistance_at(machine: MachineParameters, T_winding_c: Degrees) -> Degrees:
+    """Return the loop resistance (ohm) at winding temperatures (degC) of any shape."""
+    return machine.R_s_ohm + copper_ohm(machine) * machine.alpha_R_per_k * (T_winding_c - machine.T_ref_c)
+
+
+def magnet_flux_at(machine: MachineParameters, T_magnet_c: Degrees) -> Degrees:
+    """Return the magnet flux linkage (Wb) at magnet temperatures (degC), (36) of Jercic et al. 2017."""
+    return machine.psi_f_wb * (1.0 + machine.alpha_psi_per_k * (T_magnet_c - machine.T_ref_c))
