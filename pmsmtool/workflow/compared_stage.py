@@ -97,7 +97,7 @@ def compared(
     rows = compare(
         None if known is None else known[0],
         held_values(drive),
-        stage.values,
+        [value for value in stage.values if value.get("accepted", True)],
         defaults=defaults,
         used=("pole_pairs",) if isinstance(drive, RecorderDrive) else (),
         loaded=loaded,
