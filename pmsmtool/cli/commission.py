@@ -19,11 +19,16 @@ from pmsmtool.cli.progress import StageProgress
 
 if TYPE_CHECKING:
     from pmsmtool.drive.canopen_drive import CanopenDrive
+    from pmsmtool.errors import Partial
     from pmsmtool.firmware.drive_map import DriveMap
+    from pmsmtool.report.verdict import Verdict
     from pmsmtool.workflow.capabilities import Capabilities
     from pmsmtool.workflow.run_directory import RunDirectory
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
+STAGES = ("identify", "tune", "lut", "margins", "flash", "verify", "prove")
+LIMITS = ("current", "speed")
+"""As in ``workflow.commission`` and ``workflow.rated_limits``, which take too long to import for ``--help``."""
 
 
 @click.command(
@@ -52,6 +57,11 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 )
 @click.option("--drive-bandwidth-hz", type=click.FloatRange(0.0, min_open=True), metavar="HZ", help="Bandwidth of the "
               "current control of a drive that takes no gains; its limits are then designed.")  # fmt: skip
+@click.option("--require", multiple=True, type=click.Choice(STAGES), metavar="STAGE", help="A stage without which the "
+              "run fails (exit 1) instead of ending partial (exit 10); may be repeated.")  # fmt: skip
+@click.option("--accept-limit", "accept_limits", multiple=True, type=click.Choice(LIMITS), metavar="NAME",
+              help="Accept a design that ends below the machine's rated current or speed; may be repeated. On a real "
+              "bus not together with --yes.")  # fmt: skip
 @click.option("--sensor-tol", type=click.FloatRange(0.0, 0.2), default=0.01, help="95 % tolerance of sensor gains.")
 @click.option("--accept-contradiction", "accept", multiple=True, metavar="NAME", help="Go on although MACHINE states "
               "another R_s_ohm, L_q_h or J_kgm2 than was measured or the drive holds; never with --yes.")  # fmt: skip
@@ -71,6 +81,8 @@ def commission_command(
     accept: tuple[str, ...],
     flux_map: bool,
     drive_bandwidth_hz: float | None,
+    require: tuple[str, ...],
+    accept_limits: tuple[str, ...],
     **design: Any,
 ) -> None:
     """Identify the machine, design its control, make the table, judge the margins, flash, verify, prove, report.
@@ -83,8 +95,12 @@ def commission_command(
 
     On a drive that gives less than the reference drive (`pmsmtool caps`) every stage runs as far as its tier and its
     map go: what it cannot measure is taken from MACHINE and marked so, and a stage that cannot run says what it needs.
-    The verdict is then for its tier.
+
+    The verdict is PASS (exit 0) only when all seven stages ran and nothing stayed unchecked, FAIL (exit 1) when a
+    criterion is not met, a stage of --require is missing, or the design ends below the machine's rated current or
+    speed, else PARTIAL (exit 10), with the reason for every stage that did not run.
     """
+    from pmsmtool.cli.consent import refuse_unattended
     from pmsmtool.errors import ConfigError
     from pmsmtool.workflow.commission import Commissioning, begin_run
     from pmsmtool.workflow.compared_stage import check_accepted
@@ -93,6 +109,8 @@ def commission_command(
     if accept and motion.yes:
         raise click.UsageError("--accept-contradiction is a person's decision: not together with --yes")
     check_accepted(accept)
+    refuse_unattended("--accept-limit", accept_limits, motion, simulated=bus.simulated())
+
     begun = RunDirectory(resume) if resume is not None else None
     if begun is not None and machine is not None:
         raise ConfigError("MACHINE and --resume exclude each other", hint="a run keeps the machine it began with")
@@ -114,6 +132,7 @@ def commission_command(
         chain = Commissioning(run, drive, person, progress, **asked, capabilities=found)
         chain.drive_bandwidth_hz = drive_bandwidth_hz
         chain.accept_contradictions = accept
+        chain.require, chain.accept_limits = require, accept_limits
         for line in () if chain.tier is None else chain.tier.plan_lines():
             out.note(line)
         with _reported(run, out, fresh=begun is None):
@@ -249,12 +268,26 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
             raise
         try:
             write_report(run)
-            out.note(f"report: {run.path / 'report.html'}; {_next_step(run, error)}")
+            _show(run, out)
+            out.note(_next_step(run, error))
         except Exception as second:  # whatever it is, what ended the chain outranks it
             out.warn(f"the report could not be written: {type(second).__name__}: {second}")
         raise
     write_report(run)
-    _show(run, out)
+    found = _show(run, out)
+    if found.kind == "partial":
+        raise _partial(found, run)
+
+
+def _partial(found: Verdict, run: RunDirectory) -> Partial:
+    """Return the error of a run that is good as far as it went."""
+    from pmsmtool.errors import Partial
+
+    return Partial(
+        f"{found.lines[0].split(',')[0]}; the reasons stand above",
+        where=str(run.path),
+        hint="`pmsmtool caps` lists what this drive can give; --require STAGE makes a missing stage exit 1",
+    )
 
 
 def _next_step(run: RunDirectory, error: BaseException) -> str:
@@ -266,7 +299,7 @@ def _next_step(run: RunDirectory, error: BaseException) -> str:
     return f"go on with: pmsmtool commission --resume {run.path}"
 
 
-def _show(run: RunDirectory, out: Output) -> None:
+def _show(run: RunDirectory, out: Output) -> Verdict:
     from pmsmtool.workflow.report_page import verdict
 
     record, found = run.read(), verdict(run.path)
@@ -280,9 +313,12 @@ def _show(run: RunDirectory, out: Output) -> None:
         "run": run.path,
         "report": run.path / "report.html",
         "verdict": found.word,
+        "simulated": found.simulated,
+        "reasons": found.lines,
         "stages": stages,
         "values": [] if identified is None else list(identified.values),
         "comparison": [] if identified is None else list(identified.comparison),
     }
-    lines = [f"{found.word}: {'; '.join(found.lines)}", f"report: {run.path / 'report.html'}"]
+    lines = [found.headline, *(f"  - {line}" for line in found.details), f"report: {run.path / 'report.html'}"]
     out.result("commission", data, lines)
+    return found

@@ -16,7 +16,7 @@ import click
 
 from pmsmtool.cli.options import MotionOptions
 from pmsmtool.cli.output import Output
-from pmsmtool.errors import Declined
+from pmsmtool.errors import ConfigError, Declined
 from pmsmtool.plain_text import plain
 
 Subject = Literal["motion", "writing"]
@@ -55,6 +55,21 @@ def missing_for_yes(options: MotionOptions) -> list[str]:
         "--serial": options.serial,
     }
     return [name for name, value in needed.items() if value is None]
+
+
+def refuse_unattended(option: str, names: Iterable[str], options: MotionOptions, *, simulated: bool) -> None:
+    """Refuse an ``--accept-...`` option together with ``--yes`` on a real bus: a person accepts, not a script.
+
+    Raises
+    ------
+    ConfigError
+        Both are given, and the bus is not the simulated drive.
+    """
+    if list(names) and options.yes and not simulated:
+        raise ConfigError(
+            f"{option} and --yes exclude each other on a real bus",
+            hint=f"leave --yes out and answer the questions, or leave {option} out",
+        )
 
 
 def ask_motion(

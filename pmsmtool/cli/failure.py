@@ -53,9 +53,13 @@ def report(error: BaseException, verbosity: int = 0) -> int:
         _echo(_traceback(error))
     if isinstance(chosen, click.exceptions.Exit):
         return chosen.exit_code
+    if isinstance(chosen, StopNotConfirmed):  # the most urgent line is the last on the screen
+        _tell_others(error, chosen)
+        _tell(chosen, head_last=True)
+        return int(chosen.exit_code)
     if isinstance(chosen, PmsmtoolError):
         _tell(chosen)
-        if chosen is not error or isinstance(chosen, StopNotConfirmed):
+        if chosen is not error:
             _tell_others(error, chosen)
         return int(chosen.exit_code)
     if isinstance(chosen, click.ClickException):
@@ -87,9 +91,11 @@ def _tell_others(error: BaseException, told: BaseException) -> None:
             _echo(f"  {'also:':<8}{type(other).__name__}: {first}")
 
 
-def _tell(error: PmsmtoolError) -> None:
+def _tell(error: PmsmtoolError, *, head_last: bool = False) -> None:
     label = next((text for kind, text in _LABELS if isinstance(error, kind)), "error")
-    _echo(error.what, click.style(label, fg="red", bold=True) + ": ")
+    label = click.style(label, fg="yellow" if isinstance(error, Partial) else "red", bold=True) + ": "
+    if not head_last:
+        _echo(error.what, label)
     details = error.violations if isinstance(error, ConfigError) else ()
     details = error.differences if isinstance(error, VerifyMismatch) else details
     details = error.missing if isinstance(error, Partial) else details
@@ -99,6 +105,8 @@ def _tell(error: PmsmtoolError) -> None:
     for name, text in (("where", error.where), ("likely", error.likely), ("try", hint)):
         if text:
             _echo(f"  {name + ':':<8}{text}")
+    if head_last:
+        _echo(error.what if "hardware stop" in error.what else f"{error.what}; use the hardware stop", label)
 
 
 def _tell_usage(error: click.ClickException) -> int:

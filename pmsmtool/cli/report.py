@@ -33,6 +33,6 @@ def report_command(run: Path, path: Path | None, out: Output) -> None:
     path = run / "report.html" if path is None else path
     write_file(path, report_page(run))
     found, ended = verdict(run), how_it_ended(run)
-    data = {"file": path, "verdict": found.word, "reasons": found.lines, "ended": ended}
-    out.result("report", data, [found.word, *found.lines, *ended])
+    data = {"file": path, "verdict": found.word, "simulated": found.simulated, "reasons": found.lines, "ended": ended}
+    out.result("report", data, [found.headline, *found.details, *ended])
     out.note(f"wrote {path}")

@@ -7,24 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
-from pmsmtool.report.comparison import HEADS, headline, table_cells, unchecked
+from pmsmtool.report.comparison import HEADS, table_cells
+from pmsmtool.report.verdict import COMPLETE, comparison_of, latest_of, verdict_of
 from pmsmtool.units import format_estimate, format_quantity
-
-COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
-"""Stages of a full commissioning; one that is missing keeps the verdict open."""
-
-VENDOR = "vendor"
-"""Source of a value that the drive measured by itself: without an interval."""
-
-AS_GIVEN = "as given"
-"""Source of a value that a person brought in a machine file."""
-
-UNAVAILABLE = "not available"
-"""Status of a stage that the drive cannot give."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +57,7 @@ def render(
     not_checked : sequence of str
         What a reader must not assume; printed as it is.
     complete : sequence of str
-        Stages that a green verdict needs.
+        Stages that a pass needs.
     ended : sequence of str
         How a run ended that did not come to its end.
     """
@@ -76,13 +65,14 @@ def render(
 
     source = resources.files("pmsmtool.report").joinpath("templates/report.html.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    latest = _latest(record.get("stages", ()))
+    latest = latest_of(record.get("stages", ()))
     drive = record.get("drive", {})
     name = str(drive.get("name") or "drive")
+    found, rows = verdict_of(record, complete), comparison_of(latest)
     return environment.from_string(source).render(
         title=f"Commissioning of {name}, serial {int(drive.get('serial', 0)):#010x}",
         subtitle=f"started {record['started_utc']} by {record['operator']}",
-        verdict=verdict_of(latest, complete),
+        verdict=found,
         ended=list(ended),
         stages=latest,
         estimates=[
@@ -91,7 +81,7 @@ def render(
             for value in stage.get("values", ())
             if "std" in value or "source" in value
         ],
-        comparison=[HEADS, *table_cells(_comparison(latest))] if _comparison(latest) else [],
+        comparison=[HEADS, *table_cells(rows)] if rows else [],
         fallbacks=[f"{stage['name']}: {line}" for stage in latest for line in stage.get("fallbacks", ())],
         # the table of stages has the note only where there are no criteria
         notes=[
@@ -104,105 +94,6 @@ def render(
         # A later stage may write a file of an earlier one again: the last digest is that of the file.
         files=sorted({name: digest for stage in latest for name, digest in stage.get("files", {}).items()}.items()),
     )
-
-
-def _latest(stages: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return the last entry of every stage, in the order the stages were first run."""
-    return list({stage["name"]: stage for stage in stages}.values())
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """The first thing a reader sees: ``kind`` is ``pass``, ``fail`` or ``open``; ``lines`` are its reasons."""
-
-    kind: str
-    word: str
-    lines: tuple[str, ...]
-
-
-def verdict_of(stages: Sequence[Mapping[str, Any]], complete: Sequence[str] = COMPLETE) -> Verdict:
-    """Return the verdict on the stages of a run; the last entry of each counts.
-
-    Parameters
-    ----------
-    stages : sequence of mapping
-        ``stages`` of ``run.json``.
-    complete : sequence of str
-        Stages that a green verdict needs.
-    """
-    latest = _latest(stages)
-    rows = _comparison(latest)
-    first, left = headline(rows)
-    found = _verdict_of(latest, complete, unchecked(rows))
-    return replace(found, lines=(*first, *found.lines, *left))
-
-
-def _comparison(latest: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return the rows *data sheet | drive | measured* of a run."""
-    return [row for stage in latest for row in stage.get("comparison", ())]
-
-
-def _verdict_of(latest: list[Mapping[str, Any]], complete: Sequence[str], not_checked: Mapping[str, str]) -> Verdict:
-    failed = [stage for stage in latest if stage["status"] not in ("pass", "partial", UNAVAILABLE)]
-    done = {stage["name"] for stage in latest}
-    missing = [name for name in complete if name not in done]
-    if failed:
-        return Verdict("fail", "FAIL", tuple(f"{_with_status(stage)}: {_failure(stage)}" for stage in failed))
-    if missing:
-        return Verdict("open", "NOT COMPLETE", (f"not run yet: {', '.join(missing)}",))
-    criteria = sum(len(stage.get("acceptance", ())) for stage in latest)
-    lacking = [stage for stage in latest if stage["status"] == UNAVAILABLE]
-    values = [value for stage in latest for value in stage.get("values", ())]
-    bare = [value for value in values if "source" in value and "std" not in value and value["name"] not in not_checked]
-    refused = [f"{name} refused: {why}" for stage in latest for name, why in stage.get("refused", {}).items()]
-    if refused:
-        return Verdict("open", "PARTIAL", tuple(refused))
-    if lacking or bare or not_checked:
-        passed = [stage for stage in latest if stage["status"] in ("pass", "partial")]
-        return _partial(passed, lacking, _bare_lines(bare), criteria)
-    head = f"{latest[0]['name']} alone" if len(latest) == 1 else f"{len(latest)} stages"
-    met = {0: "no criteria", 1: "1 criterion, met"}.get(criteria, f"{criteria} criteria, all met")
-    return Verdict("pass", "PASS", (f"{head}, {met}",))
-
-
-def _partial(
-    passed: list[Mapping[str, Any]],
-    lacking: list[Mapping[str, Any]],
-    taken: list[str],
-    criteria: int,
-) -> Verdict:
-    """Return the verdict on a drive that cannot give everything: green for its tier, and what that leaves open."""
-    if not passed:
-        return Verdict("open", "NOTHING AVAILABLE", tuple(f"{s['name']}: not available: {s['note']}" for s in lacking))
-    names = ", ".join(str(stage["name"]) for stage in passed)
-    behaviour = "" if any(stage["name"] == "prove" for stage in passed) else "; its behaviour was not proven"
-    head = f"as far as this drive goes: {names}; {criteria} criteria, all met{behaviour}"
-    missing = (f"{stage['name']}: not available: {stage['note']}" for stage in lacking)
-    return Verdict("pass", "PASS FOR ITS TIER", (head, *taken, *missing))
-
-
-def _bare_lines(values: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return one line per source of values that were not measured by this program."""
-    names: dict[str, list[str]] = {}
-    for value in values:
-        names.setdefault(str(value["source"]), []).append(str(value["name"]))
-    heads = {VENDOR: "the drive's own, without an interval", AS_GIVEN: "taken as given, not measured"}
-    return [
-        f"{heads.get(source, f'taken from {source}, not measured')}: {', '.join(named)}"
-        for source, named in names.items()
-    ]
-
-
-def _with_status(stage: Mapping[str, Any]) -> str:
-    """Return the name of a stage, with how it ended where that says more than that it failed."""
-    return str(stage["name"]) if stage["status"] == "fail" else f"{stage['name']} {stage['status']}"
-
-
-def _failure(stage: Mapping[str, Any]) -> str:
-    broken = [line for line in stage.get("acceptance", ()) if not line["ok"]]
-    if broken:
-        return "; ".join(f"{line['what']}: {line['measured']}, limit {line['limit']}" for line in broken)
-    return str(stage.get("note") or stage["status"])
 
 
 def _estimate_row(value: Mapping[str, Any]) -> dict[str, str]:

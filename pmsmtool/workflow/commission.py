@@ -33,6 +33,7 @@ from pmsmtool.errors import (
     VerifyMismatch,
 )
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.report.verdict import RAN
 from pmsmtool.workflow.capabilities import Capabilities, Tier
 from pmsmtool.workflow.compared_stage import check_accepted, compared, refusal
 from pmsmtool.workflow.contradiction import DATA_SHEET
@@ -40,6 +41,7 @@ from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
 from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplate_of
 from pmsmtool.workflow.prove.stage import ProofRequest, not_proven, prove_stage
+from pmsmtool.workflow.rated_limits import within_ratings
 from pmsmtool.workflow.report_page import report_page
 from pmsmtool.workflow.run_account import RunAccount, status_of, text_of
 from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, new_record
@@ -160,6 +162,10 @@ class Commissioning:
         Bandwidth of the current control of a drive that keeps its own.
     accept_contradictions : tuple of str
         Quantities of the machine file whose contradiction a person accepts.
+    require : tuple of str
+        Stages without which the run fails; kept in its record, so that they hold when it is resumed.
+    accept_limits : tuple of str
+        Limits of the design (:data:`~pmsmtool.workflow.rated_limits.NAMES`) accepted below the machine's ratings.
     """
 
     run: RunDirectory
@@ -175,6 +181,8 @@ class Commissioning:
     capabilities: Capabilities | None = None
     drive_bandwidth_hz: float | None = None
     accept_contradictions: tuple[str, ...] = ()
+    require: tuple[str, ...] = ()
+    accept_limits: tuple[str, ...] = ()
     _account: RunAccount | None = field(default=None, init=False)
 
     def carry_out(self) -> None:
@@ -190,9 +198,13 @@ class Commissioning:
         check_accepted(self.accept_contradictions)
         record = self.run.read()
         self._check_drive(record)
+        self.require = required_of(record, self.require)
+        if self.require:
+            self.run.write(replace(record, request={**record.request, "require": self.require}))
         self._account = account = RunAccount(self.run, self.progress.say)
         with account.kept():
             try:
+                self._refuse_required(record)
                 self._carry_out_due(record, account)
             except KeyboardInterrupt:
                 raise Interrupted("the machine is off") from None
@@ -213,12 +225,20 @@ class Commissioning:
         """Refuse a run of which nothing was available: it is not green."""
         record = self.run.read()
         stages = [stage for name in STAGES if (stage := record.stage(name)) is not None]
-        if not any(stage.status in ("pass", "partial") for stage in stages):
+        if not any(stage.status in RAN for stage in stages):
             raise NotAvailable(
                 "\n  - ".join(["nothing of the chain can be done", *(f"{s.name}: {s.note}" for s in stages)]),
                 where=f"node {self.drive.identity.node}",
                 hint=NOTHING_GIVEN if self.nameplate is None else NOTHING_TAKEN,
             )
+
+    def _refuse_required(self, record: RunRecord) -> None:
+        """Refuse, before anything moves or is written, what cannot give a stage that is required."""
+        reasons = {} if self.tier is None else self.tier.unavailable()
+        reasons |= {stage.name: stage.note for stage in record.stages if stage.status == "not available"}
+        lines = [f"{name}: not available: {reasons[name]}" for name in self.require if name in reasons]
+        if lines:
+            raise _required(lines, self.run)
 
     def _check_drive(self, record: RunRecord) -> None:
         found = drive_facts(self.drive.identity)
@@ -251,10 +271,16 @@ class Commissioning:
                 self.run.add(failed)
             self.progress.end(failed, number, len(STAGES))
             raise
+        self._settle(stage, number)
+
+    def _settle(self, stage: Stage, number: int) -> None:
+        """Record a stage; raises its error where its criteria are not met, or where it is required and missing."""
         self.run.add(stage)
         self.progress.end(stage, number, len(STAGES))
         if stage.status not in SETTLED:
             raise _not_good(stage, self.run)
+        if stage.status == "not available" and stage.name in self.require:
+            raise _required([f"{stage.name}: not available: {stage.note}"], self.run)
 
     def _compared(self, stage: Stage) -> Stage:
         """Return the stage with data sheet, drive and measurement side by side: the gate before anything is written."""
@@ -266,9 +292,7 @@ class Commissioning:
 
     def _not_available(self, name: str, number: int, error: NotAvailable, seconds: float) -> None:
         files = {file: "" for file in OUTPUTS.get(name, ()) if (self.run.path / file).is_file()}
-        stage = Stage(name, "not available", seconds, note=error.what, files=files)
-        self.run.add(stage)
-        self.progress.end(stage, number, len(STAGES))
+        self._settle(Stage(name, "not available", seconds, note=error.what, files=files), number)
 
     @property
     def tier(self) -> TierStages | None:
@@ -287,7 +311,7 @@ class Commissioning:
             asked = self.prove or proof_within(self.identify)
             return {
                 "identify": lambda: tier.identify(self.identify, person.allow_motion, say),
-                "tune": lambda: tier.tune(self.tune),
+                "tune": lambda: within_ratings(self.run, tier.tune(self.tune), self.accept_limits),
                 "lut": lambda: tier.lut(self.lookup),
                 "margins": lambda: tier.margins(self.margins),
                 "flash": lambda: tier.flash(person.allow_writing, say),
@@ -296,7 +320,7 @@ class Commissioning:
             }
         return {
             "identify": self._identify,
-            "tune": lambda: tune_stage(self.run, self.tune),
+            "tune": lambda: within_ratings(self.run, tune_stage(self.run, self.tune), self.accept_limits),
             "lut": lambda: lut_stage(self.run, self.lookup),
             "margins": lambda: margins_stage(self.run, self.margins),
             "flash": lambda: flash_stage(self.run, self.drive, self.person.allow_writing, say),
@@ -321,6 +345,19 @@ class Commissioning:
         """Leave the machine off, confirmed, where this program may have energised it."""
         if self.drive.may_be_energised:
             quick_stop(self.drive.node)
+
+
+def required_of(record: RunRecord, more: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the stages a run must have: those it was begun with, and more."""
+    return tuple(dict.fromkeys((*record.request.get("require", ()), *more)))
+
+
+def _required(lines: Sequence[str], run: RunDirectory) -> CheckFailed:
+    return CheckFailed(
+        f"required, and cannot be had: {'; '.join(lines)}",
+        where=str(run.path),
+        hint="provide what is missing, or begin a new run without --require",
+    )
 
 
 def _not_good(stage: Stage, run: RunDirectory) -> PmsmtoolError:

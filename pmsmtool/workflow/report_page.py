@@ -21,7 +21,8 @@ from pmsmtool.design.open_loops import open_loops
 from pmsmtool.errors import IdentificationError
 from pmsmtool.npz_file import read_npz
 from pmsmtool.report import figures
-from pmsmtool.report.report import COMPLETE, Change, Figure, Verdict, render, verdict_of
+from pmsmtool.report.report import Change, Figure, render
+from pmsmtool.report.verdict import COMPLETE, Verdict, is_simulated, verdict_of
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, shots_of
 from pmsmtool.workflow.identify import stored_traces
@@ -38,6 +39,11 @@ NOT_CHECKED = (
     "Saturation beyond the bias points that are named, cogging and slot harmonics, iron losses.",
 )
 """What a reader of a green report must not assume."""
+SERVED = ("socketcand", "virtual", "udp_multicast")
+"""Interfaces of python-can behind which another program may stand instead of a drive."""
+ANY_DRIVE = (
+    "Whether a real drive answered: the bus is {}, and only a simulated drive of this program names itself (0x1008)."
+)
 ONE_STAGE = ("identify", "track", "prove")
 """Commands whose run is one stage of the same name."""
 CHAINS = ("commission", "fleet")
@@ -65,6 +71,8 @@ def report_page(path: Path) -> str:
     not_checked = NOT_CHECKED[1:] if record.passed("prove") else NOT_CHECKED
     if not any(record.passed(stage) for stage in ("flash", "verify", "prove")):
         not_checked = (NOTHING_COMPARED, *NOT_CHECKED[1:])
+    if not is_simulated(asdict(record)) and record.bus.get("interface") in SERVED:
+        not_checked = (ANY_DRIVE.format(record.bus["interface"]), *not_checked)
     return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=not_checked,
                   complete=_complete(record), ended=account_lines(record.account))  # fmt: skip
 
@@ -72,7 +80,7 @@ def report_page(path: Path) -> str:
 def verdict(path: Path) -> Verdict:
     """Return the verdict of a run; raises ``ConfigError`` when there is none in the folder."""
     record = RunDirectory(path).read()
-    return verdict_of([asdict(stage) for stage in record.stages], _complete(record))
+    return verdict_of(asdict(record), _complete(record))
 
 
 def _complete(record: RunRecord) -> Sequence[str]:

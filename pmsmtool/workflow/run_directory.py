@@ -68,6 +68,11 @@ class Stage:
         Rows *data sheet | drive | measured* (``workflow/contradiction.py``).
     refused : mapping of str to str
         Quantity that was asked for and is not given -> its reason.
+    not_checked : sequence of str
+        What the result follows from and this run did not check (``R_s_ohm: data sheet, NOT CHECKED``): each line stands
+        in the headline of the report, and the verdict on a commissioning is then at most partial.
+    accepted : sequence of str
+        What a person accepted although it is outside a limit, with the option that says so; on the first screen.
     """
 
     name: str
@@ -81,6 +86,8 @@ class Stage:
     summary: str = ""
     comparison: Sequence[Mapping[str, Any]] = ()
     refused: Mapping[str, str] = field(default_factory=dict)
+    not_checked: Sequence[str] = ()
+    accepted: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -127,6 +127,14 @@ class TierStages:
         lines.append("prove: " + (f"not available: {proof}" if proof else self._provable()))
         return lines
 
+    def unavailable(self) -> dict[str, str]:
+        """Return the stages that drive and map cannot give, with the reason, as known before anything moves."""
+        writing, proof = self._no_writing(), self._no_proof()
+        reasons = {"flash": writing, "verify": writing, "prove": proof}
+        if self.known() is None:
+            reasons["identify"] = self._nothing()
+        return {name: reason for name, reason in reasons.items() if reason}
+
     # ---- the stages -----------------------------------------------------------------------------
 
     def identify(self, request: IdentifyRequest, allow: Allow, say: Say) -> Stage:
@@ -277,8 +285,11 @@ class TierStages:
     def _no_proof(self) -> str:
         if self.found.drive_map.staging and self.found.tier in (Tier.INJECT, Tier.RECORDER):
             return ""
-        lacking = ", ".join(name for name in PREDICTED if name not in self.found.drive_map.cells)
-        reason = f"needs a loop that is all ours, to predict its response: the map has no object for {lacking}"
+        cells = self.found.drive_map.cells
+        reason = "the drive's current-loop gains cannot be read"
+        if not lacking_gains(cells)[CURRENT_LOOPS]:
+            lacking = ", ".join(name for name in PREDICTED if name not in cells)
+            reason = f"the response of its speed loop cannot be predicted: the map has no object for {lacking}"
         design = self.run.path / "design.toml"
         return reason + (NOT_SHOWN if design.is_file() and guaranteed(load_design(design)) else "")
 

@@ -15,7 +15,7 @@ from pmsmtool.design.lookup_design import LookupRequest
 from pmsmtool.design.open_loops import open_loops
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import IdentificationError
-from pmsmtool.report.report import Verdict
+from pmsmtool.report.verdict import Verdict
 from pmsmtool.resources import data_folder
 from pmsmtool.workflow import report_page
 from pmsmtool.workflow.design_stages import lut_stage, tune_stage
@@ -45,8 +45,8 @@ def page_of(folder: Path) -> str:
 
 def test_the_page_needs_nothing_else_and_puts_the_verdict_first(made: Path) -> None:
     page = page_of(made)
-    assert page.index("NOT COMPLETE") < page.index("<h2")
-    assert "not run yet: identify, margins, verify, prove" in page
+    assert page.index("PARTIAL: 3 of 7 stages ran") < page.index("<h1")
+    assert "not run: identify, margins, verify, prove" in page
     assert not re.search(r"<(script|link|iframe|img)\b|@import|url\((?!#)", page)
     assert not re.search(r'(?:src|href)="(?!#)', page)
     assert page.count("<svg") == 2
@@ -71,27 +71,27 @@ def test_json_gives_the_verdict_on_stdout_alone(made: Path, tmp_path: Path, caps
     assert program(["report", str(made), "--json", "-o", str(tmp_path / "r.html")]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["schema"] == "pmsmtool.report/1"
-    assert found["verdict"] == "NOT COMPLETE"
+    assert found["verdict"] == "PARTIAL" and found["simulated"] is False
 
 
 @pytest.mark.parametrize("name", ["track", "identify", "prove"])
 def test_a_run_of_one_stage_is_complete_with_that_stage(name: str, tmp_path: Path) -> None:
     command = ["pmsmtool", "-i", "pmsmsim", name, "psi"]
     run = RunDirectory.create(tmp_path, 7, new_record(command, drive={}, bus={}, versions={}, operator="A. Engineer"))
-    assert report_page.verdict(run.path).lines == (f"not run yet: {name}",)
+    assert report_page.verdict(run.path).lines == (f"{name} did not run",)
     run.add(Stage(name, "pass", 1.0, note="worth a note", acceptance=[Acceptance("width", "1 %", "3 %", True)]))
     assert report_page.verdict(run.path) == Verdict("pass", "PASS", (f"{name} alone, 1 criterion, met",))
     page = page_of(run.path)
-    assert "NOT COMPLETE" not in page and f"<li>{name}: worth a note</li>" in page
+    assert "PARTIAL" not in page and f"<li>{name}: worth a note</li>" in page
     run.add(Stage("tune", "pass", 1.0))
-    assert report_page.verdict(run.path).word == "NOT COMPLETE", "somebody went on towards a commissioning"
+    assert report_page.verdict(run.path).word == "PARTIAL", "somebody went on towards a commissioning"
 
 
 def test_a_commissioning_of_one_stage_so_far_is_not_complete(tmp_path: Path) -> None:
     command = ["pmsmtool", "commission", "--runs", "identify"]
     run = RunDirectory.create(tmp_path, 7, new_record(command, drive={}, bus={}, versions={}, operator="A. Engineer"))
     run.add(Stage("identify", "pass", 1.0))
-    assert report_page.verdict(run.path).word == "NOT COMPLETE"
+    assert report_page.verdict(run.path).word == "PARTIAL"
 
 
 def test_a_failed_stage_makes_the_verdict(made: Path, tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ def test_a_failed_stage_makes_the_verdict(made: Path, tmp_path: Path) -> None:
     shutil.copytree(made, run.path)
     run.add(Stage("tune", "fail", 0.0, acceptance=[Acceptance("phase margin", "31 deg", ">= 45 deg", False)]))
     page = page_of(run.path)
-    assert ">FAIL</strong>" in page and "tune: phase margin: 31 deg, limit &gt;= 45 deg" in page
+    assert "<strong>FAIL: tune: phase margin: 31 deg, limit &gt;= 45 deg" in page
 
 
 def test_the_loops_drawn_are_those_of_the_design(made: Path) -> None:

@@ -121,7 +121,7 @@ def test_a_killed_run_is_not_taken_for_a_complete_one(tool: Tool, monkeypatch: p
     run = only_run()
     assert run.read().account["state"] == "open" and run.read().stages == ()
     data, page = reported(tool, run)
-    assert data["verdict"] == "NOT COMPLETE"
+    assert data["verdict"] == "PARTIAL"
     assert "did not end: the program was killed, or it still runs" in data["ended"][0] and data["ended"][0] in page
 
 

@@ -7,7 +7,8 @@ import math
 
 import pytest
 
-from pmsmtool.report.report import COMPLETE, Change, Figure, render, total_interval
+from pmsmtool.report.report import Change, Figure, render, total_interval
+from pmsmtool.report.verdict import COMPLETE, NEEDED
 
 
 def _record() -> dict:
@@ -38,6 +39,7 @@ def _record() -> dict:
             "i_q_apk": math.nan,
         }
     ]
+    stages[0]["values"] += [{**stages[0]["values"][0], "name": name} for name in NEEDED if name != "R_s_ohm"]
     return {
         "schema": "pmsmtool.run/1",
         "started_utc": "2026-01-01T00:00:00Z",
@@ -67,10 +69,10 @@ def test_conditions_are_read_by_a_person() -> None:
 
 def test_all_passed_is_pass_and_names_the_value_with_its_interval() -> None:
     page = render(_record(), not_checked=["thermal behaviour under load"])
-    assert ">PASS</strong>" in page
+    assert ">SIMULATED DRIVE, PASS: 7 of 7 stages ran, 7 criteria, all met</strong>" in page
     assert "0.1371" in page and "multi-level DC" in page
     assert "thermal behaviour under load" in page
-    assert page.index(">PASS</strong>") < page.index("Stages"), "the verdict comes first"
+    assert page.index("PASS: 7 of 7") < page.index("<h1>") < page.index("Stages"), "the verdict comes first"
 
 
 @pytest.mark.parametrize("missing", COMPLETE)
@@ -78,8 +80,8 @@ def test_a_missing_stage_keeps_the_verdict_open(missing: str) -> None:
     record = _record()
     record["stages"] = [stage for stage in record["stages"] if stage["name"] != missing]
     page = render(record)
-    assert "NOT COMPLETE" in page and f"not run yet: {missing}" in page
-    assert ">PASS</strong>" not in page
+    assert "PARTIAL: 6 of 7 stages ran" in page and f"not run: {missing}" in page
+    assert "PASS:" not in page
 
 
 def test_a_failed_criterion_is_named_with_number_and_limit() -> None:
@@ -88,7 +90,7 @@ def test_a_failed_criterion_is_named_with_number_and_limit() -> None:
     stage["status"] = "fail"
     stage["acceptance"][0] = {"what": "phase margin", "measured": "31 deg", "limit": "40 deg", "ok": False}
     page = render(record)
-    assert ">FAIL</strong>" in page and "phase margin: 31 deg, limit 40 deg" in page
+    assert "FAIL: " in page and "phase margin: 31 deg, limit 40 deg" in page
 
 
 def test_a_stage_that_was_repeated_counts_with_its_last_entry() -> None:
@@ -96,7 +98,7 @@ def test_a_stage_that_was_repeated_counts_with_its_last_entry() -> None:
     failed = copy.deepcopy(record["stages"][0])
     failed["status"] = "fail"
     record["stages"].insert(0, failed)
-    assert ">PASS</strong>" in render(record)
+    assert "PASS: 7 of 7" in render(record)
 
 
 def test_text_from_outside_is_escaped_and_figures_are_inline() -> None:

@@ -21,7 +21,7 @@ from pmsmtool.drive.mapped_recorder_drive import DELAY_DOUBT_PERIODS, RECORDED, 
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive.tier_drives import ParameterDrive
-from pmsmtool.errors import Interrupted, NotAvailable
+from pmsmtool.errors import Interrupted, NotAvailable, Partial
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.recorded_push import DELAY_DOUBT, estimate_pushes
 from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
@@ -183,11 +183,11 @@ def test_the_chain_measures_by_it_and_says_what_is_left(tmp_path: Path, monkeypa
     bus = ["-i", "pmsmsim", "-c", f"interior-2k2?nv=:memory:&drive={path}"]
     asked = ["commission", str(machine_path("interior-2k2")), "--map", str(path), "--runs", str(tmp_path / "runs")]
     result = CliRunner().invoke(cli, [*bus, *asked, "--yes"])
-    assert result.exit_code == 0, result.output
+    assert isinstance(result.exception, Partial), result.output
     assert "recorded torque pushes" in result.output
     for line in ("identify  PASS", "flash     PASS", "verify    PASS", "prove     NOT AVAILABLE"):
         assert line in result.output
-    assert "PASS FOR ITS TIER" in result.output
+    assert "SIMULATED DRIVE, PARTIAL: 6 of 7 stages ran" in result.output
     machine_file = load_machine_file(next((tmp_path / "runs").glob("*/machine.toml")))
     measured = machine_file.machine.R_s_ohm
     assert measured != 3.6 and measured == pytest.approx(3.6, rel=0.05)

@@ -1,0 +1,218 @@
+"""The first thing a reader sees of a run: whether all that was asked for ran and held its criteria, and on which drive.
+
+A run passes only when every stage it must have ran and passed, and nothing its result follows from stayed unchecked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pmsmtool.errors import ExitCode
+from pmsmtool.report.comparison import headline, unchecked
+
+COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
+"""Stages of a full commissioning."""
+
+VENDOR = "vendor"
+"""Source of a value that the drive measured by itself: without an interval."""
+
+AS_GIVEN = "as given"
+"""Source of a value that a person brought in a machine file."""
+
+UNAVAILABLE = "not available"
+"""Status of a stage that the drive cannot give."""
+
+RAN = ("pass", "partial")
+"""Status of a stage that ran and met its criteria; ``partial``: something asked of it could not be had."""
+
+NEEDED = ("pole_pairs", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")
+"""Values that the gains of a commissioning follow from."""
+
+RATIOS = {"J_kgm2": "J_per_psi"}
+"""Needed values that a drive without a voltage gives as a ratio to the flux linkage."""
+
+SIMULATED = "SIMULATED DRIVE"
+SIMULATED_INTERFACE = "pmsmsim"
+SIMULATED_NAMES = ("pmsmsim", "simulated ")
+"""How the device names (0x1008) of this program's simulated drives begin, on every bus that serves them."""
+
+STOP_NOT_CONFIRMED = "STOP NOT CONFIRMED"
+USE_HARDWARE_STOP = "the machine may be energised: use the hardware stop"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a run is worth.
+
+    Attributes
+    ----------
+    kind : str
+        ``pass``, ``partial`` or ``fail``.
+    word : str
+        ``PASS``, ``PARTIAL``, ``FAIL`` or ``STOP NOT CONFIRMED``.
+    lines : tuple of str
+        Its reasons; the first one completes the headline.
+    simulated : bool
+        Whether a simulated drive answered, as far as its identity says so.
+    """
+
+    kind: Literal["pass", "partial", "fail"]
+    word: str
+    lines: tuple[str, ...]
+    simulated: bool = False
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one line: whose drive, the word, its first reason."""
+        return f"{f'{SIMULATED}, ' if self.simulated else ''}{self.word}: {self.lines[0]}"
+
+    @property
+    def details(self) -> tuple[str, ...]:
+        """The reasons below the headline."""
+        return self.lines[1:]
+
+
+def is_simulated(record: Mapping[str, Any]) -> bool:
+    """Return whether a run was made on a simulated drive of this program: its bus, or the name it gives itself."""
+    name = str(record.get("drive", {}).get("name") or "")
+    return record.get("bus", {}).get("interface") == SIMULATED_INTERFACE or name.startswith(SIMULATED_NAMES)
+
+
+def latest_of(stages: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the last entry of every stage, in the order the stages were first run."""
+    return list({stage["name"]: stage for stage in stages}.values())
+
+
+def comparison_of(latest: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the rows *data sheet | drive | measured* of a run."""
+    return [row for stage in latest for row in stage.get("comparison", ())]
+
+
+def verdict_of(record: Mapping[str, Any], complete: Sequence[str] = COMPLETE) -> Verdict:
+    """Return the verdict on a run; the last entry of each stage counts.
+
+    Parameters
+    ----------
+    record : mapping
+        Content of ``run.json`` (schema ``pmsmtool.run/1``).
+    complete : sequence of str
+        Stages that a pass needs.
+    """
+    latest = latest_of(record.get("stages", ()))
+    account = record.get("account") or {}
+    ended = account.get("exit_code") if account.get("state", "complete") != "complete" else None
+    simulated = is_simulated(record)
+    accepted, unmeasured = headline(comparison_of(latest))
+    accepted += [str(line) for stage in latest for line in stage.get("accepted", ())]
+    failures = [*_failures(latest, stopped=ended in _NOT_JUDGED), *_required(record, latest)]
+    if ended == ExitCode.STOP_NOT_CONFIRMED:
+        return Verdict("fail", STOP_NOT_CONFIRMED, (USE_HARDWARE_STOP, *failures, *accepted), simulated)
+    if failures:
+        return Verdict("fail", "FAIL", (*failures, *accepted), simulated)
+    ran = [stage for stage in latest if stage["status"] in RAN]
+    left = [*unmeasured, *_unchecked(latest, complete)]
+    missing = [*_missing(latest, complete), *_unfinished(account, latest)]
+    head = _counted(ran, latest, complete)
+    partial = bool(missing or left) or any(stage["status"] == "partial" for stage in latest)
+    if not partial:
+        return Verdict("pass", "PASS", (head, *_shown(latest, complete), *accepted), simulated)
+    return Verdict("partial", "PARTIAL", ("; ".join((head, *left)), *accepted, *missing), simulated)
+
+
+_NOT_JUDGED = (ExitCode.DECLINED, ExitCode.INTERRUPTED)
+"""Exit codes of a run that a person ended: no criterion was broken."""
+
+
+def _failures(latest: Sequence[Mapping[str, Any]], *, stopped: bool) -> list[str]:
+    """Return what failed, one line per stage; a stage that a person ended did not."""
+    ended = ("refused", "interrupted") if stopped else ()
+    failed = [stage for stage in latest if stage["status"] not in (*RAN, UNAVAILABLE, *ended)]
+    return [f"{_with_status(stage)}: {_failure(stage)}" for stage in failed]
+
+
+def _required(record: Mapping[str, Any], latest: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the stages that were required (``--require``) and did not run."""
+    found = {stage["name"]: stage for stage in latest}
+    lines = []
+    for name in (record.get("request") or {}).get("require", ()):
+        stage = found.get(name)
+        if stage is None:
+            lines.append(f"{name}: required, and it did not run")
+        elif stage["status"] == UNAVAILABLE:
+            lines.append(f"{name}: required, and not available: {stage['note']}")
+    return lines
+
+
+def _unchecked(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> list[str]:
+    """Return what else the result follows from and nothing measured: not in the comparison, or not compared."""
+    told = unchecked(comparison_of(latest))
+    values = [value for stage in latest for value in stage.get("values", ()) if value["name"] not in told]
+    bare: dict[str, list[str]] = {}
+    for value in values:
+        if "source" in value and "std" not in value:
+            bare.setdefault(str(value["source"]), []).append(str(value["name"]))
+    sources = {VENDOR: "the drive's own measurement, without an interval", AS_GIVEN: "data sheet"}
+    lines = [f"{', '.join(names)}: {sources.get(source, source)}, NOT CHECKED" for source, names in bare.items()]
+    identified = next((stage for stage in latest if stage["name"] == "identify" and stage["status"] in RAN), None)
+    if len(complete) > 1 and identified is not None:
+        known = {str(value["name"]) for value in values if "std" in value or "source" in value} | set(told)
+        absent = [name for name in NEEDED if name not in known and RATIOS.get(name) not in known]
+        lines += [f"{', '.join(absent)}: not measured in this run, NOT CHECKED"] if absent else []
+    if len(complete) > 1:
+        lines += [str(line) for stage in latest for line in stage.get("not_checked", ())]
+    return list(dict.fromkeys(lines))
+
+
+def _missing(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> list[str]:
+    """Return which stages did not run, or not wholly, each with its reason."""
+    found = {stage["name"] for stage in latest}
+    lines = [
+        f"{_with_status(stage)}: {str(stage['note']) or _failure(stage)}"
+        for stage in latest
+        if stage["status"] != "pass" and not stage.get("refused")
+    ]
+    lines += [f"{name}: refused: {why}" for stage in latest for name, why in (stage.get("refused") or {}).items()]
+    never = [name for name in complete if name not in found and len(complete) > 1]
+    return [*lines, *([f"not run: {', '.join(never)}"] if never else [])]
+
+
+def _unfinished(account: Mapping[str, Any], latest: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return that a run did not come to its end, where no stage says so: it was killed, or could not be written."""
+    said = any(stage["name"] == account.get("stage") and stage["status"] != "pass" for stage in latest)
+    if said or account.get("state", "complete") == "complete":
+        return []
+    return [f"{account['stage']}: begun, and its end was not recorded"]
+
+
+def _shown(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> list[str]:
+    """Return what a pass does not show: the experiments that its proof left out, and notes of a run of one stage."""
+    proof = next((stage for stage in latest if stage["name"] == "prove"), None)
+    lines = [] if proof is None else [f"not shown by prove: {line}" for line in proof.get("fallbacks", ())]
+    if len(complete) == 1:
+        lines += [str(line) for stage in latest for line in stage.get("not_checked", ())]
+    return lines
+
+
+def _counted(ran: Sequence[Mapping[str, Any]], latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> str:
+    """Return how much ran and was judged."""
+    criteria = sum(len(stage.get("acceptance", ())) for stage in ran)
+    met = {0: "no criteria", 1: "1 criterion, met"}.get(criteria, f"{criteria} criteria, all met")
+    if len(complete) == 1:
+        return f"{complete[0]} alone, {met}" if latest else f"{complete[0]} did not run"
+    count = sum(stage["name"] in complete for stage in ran)
+    proven = "" if any(stage["name"] == "prove" for stage in ran) else ", behaviour not proven"
+    return f"{count} of {len(complete)} stages ran, {met}{proven}"
+
+
+def _with_status(stage: Mapping[str, Any]) -> str:
+    """Return the name of a stage, with how it ended where that says more than that it failed."""
+    return str(stage["name"]) if stage["status"] == "fail" else f"{stage['name']}: {stage['status']}"
+
+
+def _failure(stage: Mapping[str, Any]) -> str:
+    broken = [line for line in stage.get("acceptance", ()) if not line["ok"]]
+    if broken:
+        return "; ".join(f"{line['what']}: {line['measured']}, limit {line['limit']}" for line in broken)
+    return str(stage.get("note") or stage["status"])
