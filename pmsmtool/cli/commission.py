@@ -268,7 +268,7 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
             raise
         try:
             write_report(run)
-            _show(run, out)
+            _show(run, out, ended=True)
             out.note(_next_step(run, error))
         except Exception as second:  # whatever it is, what ended the chain outranks it
             out.warn(f"the report could not be written: {type(second).__name__}: {second}")
@@ -299,7 +299,8 @@ def _next_step(run: RunDirectory, error: BaseException) -> str:
     return f"go on with: pmsmtool commission --resume {run.path}"
 
 
-def _show(run: RunDirectory, out: Output) -> Verdict:
+def _show(run: RunDirectory, out: Output, *, ended: bool = False) -> Verdict:
+    """Show the verdict; of a run that an error ended as one object with ``--json``, else beside the error."""
     from pmsmtool.workflow.report_page import verdict
 
     record, found = run.read(), verdict(run.path)
@@ -320,5 +321,9 @@ def _show(run: RunDirectory, out: Output) -> Verdict:
         "comparison": [] if identified is None else list(identified.comparison),
     }
     lines = [found.headline, *(f"  - {line}" for line in found.details), f"report: {run.path / 'report.html'}"]
-    out.result("commission", data, lines)
+    if ended and not out.json:
+        for line in (found.headline, lines[-1]):
+            out.note(line)
+    else:
+        out.result("commission", data, lines)
     return found

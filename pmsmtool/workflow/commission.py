@@ -260,7 +260,7 @@ class Commissioning:
         try:
             stage = replace(self._steps()[name](), seconds=clock.now() - start)
             if name == "identify":
-                stage = self._compared(stage)
+                stage = self._compared(self._without_map(stage))
         except BaseException as error:
             if isinstance(error, NotAvailable) and self.tier is not None:
                 self._not_available(name, number, error, clock.now() - start)
@@ -281,6 +281,12 @@ class Commissioning:
             raise _not_good(stage, self.run)
         if stage.status == "not available" and stage.name in self.require:
             raise _required([f"{stage.name}: not available: {stage.note}"], self.run)
+
+    def _without_map(self, stage: Stage) -> Stage:
+        """Return the stage saying that a flux map was asked for and is not there."""
+        if "map" not in self.identify.quantities or any(name.startswith("flux_map") for name in stage.files):
+            return stage
+        return replace(stage, not_checked=[*stage.not_checked, "flux map: asked for, not available, NOT CHECKED"])
 
     def _compared(self, stage: Stage) -> Stage:
         """Return the stage with data sheet, drive and measurement side by side: the gate before anything is written."""

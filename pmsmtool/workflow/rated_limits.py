@@ -7,12 +7,11 @@ from dataclasses import replace
 
 from pmsmtool.design.design_file import Design, load_design
 from pmsmtool.workflow.closed_stage import FACT, guaranteed
+from pmsmtool.workflow.prove.stage import ROUNDING
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
 NAMES = ("current", "speed")
 """Limits of a design that can be accepted below the machine's ratings."""
-_ROUNDING = 1e-6
-"""Relative: a rating that went through a drive's units and back is the same rating."""
 
 
 def within_ratings(run: RunDirectory, stage: Stage, accepted: Sequence[str] = ()) -> Stage:
@@ -31,7 +30,7 @@ def within_ratings(run: RunDirectory, stage: Stage, accepted: Sequence[str] = ()
         return stage
     lines, taken = [], []
     for name, held, rated, unit in _limits(load_design(run.path / "design.toml")):
-        ok = held >= rated * (1.0 - _ROUNDING)
+        ok = held >= rated * (1.0 - ROUNDING)
         what, measured = f"rated {name} within the design", f"{held:.4g} {unit}"
         if ok or name not in accepted:
             hint = "" if ok else f" (or --accept-limit {name})"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import signal
 from dataclasses import replace
@@ -23,6 +24,7 @@ from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.flash.restore import take_backup
 from pmsmtool.machine.flux_map_import import load_flux_map
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.report.verdict import NEEDED
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow import commission
@@ -86,12 +88,13 @@ def assert_identified(drive: MachineFile, folder: Path) -> None:
 
 def identified(folder: Path, serial: int = 22001) -> RunDirectory:
     """A run whose identification has passed, as if the profile's own numbers had been measured."""
-    drive = {"node": 1, "vendor": REFERENCE_VENDOR, "product": REFERENCE_PRODUCT, "serial": serial, "name": "bench"}
+    drive = {"node": 1, "vendor": REFERENCE_VENDOR, "product": REFERENCE_PRODUCT, "serial": serial, "name": "pmsmsim b"}
     run = RunDirectory(folder)
     folder.mkdir()
     run.write(new_record(["test"], drive=drive, bus={}, versions={}))
     shutil.copy(data_folder("profiles") / "interior-2k2.toml", folder / "machine.toml")
-    run.add(Stage("identify", "pass", 9.0, files={"machine.toml": ""}))
+    values = [{"name": name, "value": 1.0, "std": 0.0, "systematic": 0.0, "unit": "ohm"} for name in NEEDED]
+    run.add(Stage("identify", "pass", 9.0, values=values, files={"machine.toml": ""}))
     return run
 
 
@@ -148,7 +151,7 @@ def test_a_machine_that_saturates_is_not_proven_without_its_map(tool: Tool) -> N
     directory, record = the_run()
     assert record.stages[-1].name == "prove" and record.stages[-1].status == "fail"
     page = (directory.path / "report.html").read_text()
-    assert ">FAIL</strong>" in page and "OUTSIDE its band" in page
+    assert ">SIMULATED DRIVE, FAIL: prove: " in page and "OUTSIDE its band" in page
 
 
 @pytest.mark.usefixtures("few_machines")
@@ -160,7 +163,7 @@ def test_a_failed_criterion_ends_the_chain_and_resume_goes_on_there(tool: Tool) 
     code, out, err = tool("commission", *bus, "--resume", "run", "--gain-margin-db", "12", "--bandwidth-hz", "900")
     assert code == 1 and out == "" and "asked for: 45 degree, 12 dB" in err
     assert [(stage.name, stage.status) for stage in directory.read().stages] == [("identify", "pass"), ("tune", "fail")]
-    assert ">FAIL</strong>" in (directory.path / "report.html").read_text()
+    assert ">SIMULATED DRIVE, FAIL: tune: " in (directory.path / "report.html").read_text()
     assert backup("interior-2k2?nv=drive.nv") == before
     code, out, err = tool("commission", *bus, "--resume", "run")
     assert code == 0, err
@@ -208,6 +211,48 @@ def test_through_another_process_with_the_limits_a_real_drive_needs(
         assert_identified(drive, directory.path)
         assert out.startswith("SIMULATED DRIVE, PASS: 7 of 7 stages ran")
         assert tool("verify", str(directory.path))[0] == 0
+
+
+# ---- less than everything ---------------------------------------------------------------------------------
+
+COPLEY = ("-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=cia402", "--yes")
+SHEET = str(data_folder("profiles") / "interior-2k2.toml")
+
+
+def test_a_stage_that_is_required_and_cannot_be_had_ends_it_before_anything_moves(tool: Tool) -> None:
+    code, out, err = tool("commission", SHEET, *COPLEY, "--require", "tune", "--require", "prove", "--json")
+    assert code == 1 and "required, and cannot be had: prove: not available" in err
+    assert "Apk" not in err, "no envelope to consent to"
+    found = json.loads(out)
+    assert (found["verdict"], found["simulated"], found["stages"]) == ("FAIL", True, [])
+    directory, record = the_run()
+    assert record.request["require"] == ["tune", "prove"]
+    assert tool("commission", *COPLEY, "--resume", str(directory.path))[0] == 1, "it stays required"
+
+
+def test_a_stage_that_turns_out_to_be_missing_ends_a_chain_that_requires_it(tool: Tool) -> None:
+    code, _, err = tool("commission", SHEET, *COPLEY, "--require", "margins")
+    assert code == 1 and "margins: not available" in err
+    assert [stage.name for stage in the_run()[1].stages][-1] == "margins"
+
+
+def test_a_design_below_the_ratings_fails_unless_a_person_accepts_each_limit(tool: Tool) -> None:
+    asked = ("commission", SHEET, *COPLEY, "--drive-bandwidth-hz", "800")
+    code, _, err = tool(*asked)
+    assert code == 1, "--yes does not accept it"
+    assert "A pk, limit >= 6.08 A pk (or --accept-limit current)" in err
+    assert "rpm, limit >= 1500 rpm (or --accept-limit speed)" in err
+    resumed = ("commission", *COPLEY, "--drive-bandwidth-hz", "800", "--resume", str(the_run()[0].path))
+    code, _, err = tool(*resumed, "--accept-limit", "speed")
+    assert code == 1 and "rated current within the design" in err and "rated speed within" not in err
+    code, out, _ = tool(*resumed, "--accept-limit", "speed", "--accept-limit", "current")
+    assert code == 10 and out.startswith("SIMULATED DRIVE, PARTIAL: 4 of 7 stages ran")
+    assert re.search(r"accepted \(--accept-limit speed\): the design ends at 6\d\d rpm, rated 1500 rpm", out)
+
+
+def test_a_script_accepts_no_limit_on_a_real_bus(tool: Tool) -> None:
+    code, _, err = tool("commission", "-i", "socketcan", "-c", "none", "--yes", "--accept-limit", "speed")
+    assert code == 2 and "--accept-limit and --yes exclude each other on a real bus" in err
 
 
 # ---- Ctrl-C -----------------------------------------------------------------------------------------------

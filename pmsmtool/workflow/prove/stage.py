@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,8 @@ GROSS = 3.0
 SPEED = "omega_e_rad_s"
 ENCODER_INCREMENTS = DriveObject(0x608F, 1, "I")
 _HASH_DIGITS = 12
+ROUNDING = 1e-6
+"""Relative: a rating that went through a drive's units and back is the same rating."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +162,24 @@ def prove_stage(
         if isinstance(error, SdoAbort):
             raise
         event = error  # the guard has stopped the machine and restored the drive
-    return _stage(plan, prediction, record, event, digest, folder)
+    stage = _stage(plan, prediction, record, event, digest, folder)
+    return replace(stage, not_checked=_beyond(design, conditions))
+
+
+def _beyond(design: Design, conditions: Conditions) -> list[str]:
+    """Return what a proof within its envelope leaves open of the machine's ratings."""
+    machine = design.machine.machine
+    rated_rpm = machine.n_nom_rpm or design["motor.n_max_rpm"]
+    rows = (
+        ("current", conditions.i_max_apk, design["motor.I_nom_apk"], "A pk"),
+        ("speed", conditions.speed_max_rad_s / RPM, rated_rpm, "rpm"),
+    )
+    lines = [
+        f"{name} beyond {allowed:.4g} of rated {rated:.4g} {unit} (the envelope of the proof): NOT CHECKED"
+        for name, allowed, rated, unit in rows
+        if allowed < rated * (1.0 - ROUNDING)
+    ]
+    return [*lines, *(["turning shaft (locked): NOT CHECKED"] if conditions.shaft == "locked" else [])]
 
 
 def _shown(plan: ProofPlan, names: tuple[str, ...]) -> ProofPlan:
