@@ -129,8 +129,8 @@ def _ask(
         out.warn(f"--yes alone moves and writes only a simulated drive; missing here: {', '.join(missing)}")
     if not person_present():
         raise Declined(
-            f"nobody can be asked for consent to {_NAMES[subject]}: nothing was done",
-            likely="standard input or standard error is not a terminal",
+            f"no terminal to ask for consent to {_NAMES[subject]}: nothing was done",
+            likely="standard input or standard error is not a terminal: give --yes with limits, or run interactively",
             hint="--yes" if simulated or not missing else f"--yes {' '.join(f'{name} ...' for name in missing)}",
         )
     try:

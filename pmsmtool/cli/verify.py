@@ -46,7 +46,7 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
         else:
             plan = plan_download(node, load_parameters(source, drive_map))
     equal = len(plan.entries) - len(plan.changes)
-    text = [f"{equal} of {len(plan.entries)} objects hold these bytes (behaviour: run `prove`)"]
+    text = [f"{equal} of {len(plan.entries)} objects match (values only; run prove to test behaviour)"]
     out.result("verify", {"identity": identity, "ok": not plan.changes, **plan_facts(plan)}, text)
     if plan.changes:
         command = f"restore{' --other-drive' if other_drive else ''}" if backup else "flash-params"

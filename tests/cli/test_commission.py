@@ -247,7 +247,7 @@ def test_a_design_below_the_ratings_fails_unless_a_person_accepts_each_limit(too
     assert code == 1 and "rated current within the design" in err and "rated speed within" not in err
     code, out, _ = tool(*resumed, "--accept-limit", "speed", "--accept-limit", "current")
     assert code == 10 and out.startswith("SIMULATED DRIVE, PARTIAL: 4 of 7 stages ran")
-    assert re.search(r"accepted \(--accept-limit speed\): the design ends at 6\d\d rpm, rated 1500 rpm", out)
+    assert re.search(r"accepted \(--accept-limit speed\): the design ends at \d+ rpm, rated 1500 rpm", out)
 
 
 def test_a_script_accepts_no_limit_on_a_real_bus(tool: Tool) -> None:
@@ -335,7 +335,7 @@ BAD: dict[str, tuple[tuple[str, ...], int, str]] = {
     "wrong bit rate": ((*FAULTY, "interior-2k2?bitrate=500000&nv=drive.nv", "-b", "250000"), 3, "wrong bit rate"),
     "another serial number": ((*DRIVE, "--serial", "5"), 7, "serial number is 22001, --serial says 5"),
     "a map for another drive": ((*DRIVE, "--map", "map.toml"), 2, "the map 'other' is for vendor"),
-    "nobody to ask": (DRIVE[:-1], 7, "nobody can be asked for consent to move the machine"),
+    "nobody to ask": (DRIVE[:-1], 7, "no terminal to ask for consent to move the machine"),
     "drive in fault": ((*FAULTY, "low.toml?nv=drive.nv"), 4, "DC-link under-voltage"),
     "no heartbeat supervision": ((*FAULTY, "interior-2k2?nv=drive.nv&faults=absent.toml"), 5, "0x1016"),
     "write refused": ((*FAULTY, "interior-2k2?nv=drive.nv&faults=refuse.toml", "--resume", "run"), 4, "0x06090030"),

@@ -146,7 +146,7 @@ def test_a_converter_that_is_too_small_for_the_levels_leaves_what_less_current_m
 CHANNEL = "interior-2k2?nv=drive.nv"
 UNMOVED: dict[str, tuple[tuple[str, ...], int, str]] = {
     "a locked shaft cannot turn": (("--yes", "--shaft", "locked"), 9, "cannot be identified on a locked shaft"),
-    "nobody to ask": ((), 7, "nobody can be asked for consent to move the machine"),
+    "nobody to ask": ((), 7, "no terminal to ask for consent to move the machine"),
     "unwritable folder": (("--yes", "--runs", "taken/below"), 2, "cannot write"),
     "unknown quantity": (("--yes", "Q"), 2, "cannot identify Q"),
     "gravity load": (("--yes", "--load", "gravity"), 5, "a gravity load falls"),
