@@ -1,4 +1,4 @@
-"""Every checked number of ``pmsmtool reproduce`` in one table: figure, row, target, measured, holds.
+"""Every checked number of ``pmsmtool reproduce``: figure, row, printed, expected, target, measured, source.
 
 Run from the repository: ``python -m benchmarks.reproduced_rows [--seed 1] [--only NAME ...]``; about two minutes of one
 core. Writes ``benchmarks/tables/reproduce.txt`` (``--only``: prints). Exit code 1 when a row does not hold.
@@ -21,7 +21,13 @@ TABLE = Path(__file__).resolve().parent / "tables" / "reproduce.txt"
 def line(check: Check) -> str:
     """One row of the table."""
     unit = "" if check.unit == "1" else f" {check.unit}"
-    return f"{'yes' if check.within else 'NO ':3} | {check.what} | {check.allowed}{unit} | {check.ours:.4g}{unit}"
+    printed, expected = ("-" if number is None else f"{number:.6g}{unit}" for number in check.two_columns)
+    return " | ".join(
+        (
+            "yes" if check.within else "NO ", check.what, printed, expected, f"{check.allowed}{unit}",
+            f"{check.ours:.4g}{unit}", check.where or "-",
+        )
+    )  # fmt: skip
 
 
 def rows(seed: int, only: list[str]) -> tuple[list[str], int]:
@@ -34,7 +40,8 @@ def rows(seed: int, only: list[str]) -> tuple[list[str], int]:
         lines += ["", f"{figure.name}: {figure.title}", *(line(check) for check in checks)]
         count += len(checks)
         missed += sum(not check.within for check in checks)
-    return [f"{count} rows, {missed} do not hold. Columns: holds | number | target | measured.", *lines], missed
+    return [f"{count} rows, {missed} do not hold. Columns: holds | number | printed in the paper | expected | target | "
+             "measured | source.", *lines], missed
 
 
 def main() -> int:

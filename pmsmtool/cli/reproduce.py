@@ -75,7 +75,7 @@ def reproduce_command(
             f"checked numbers are out of range: {len(outside)}",
             where="reproduce",
             likely="; ".join(outside),
-            hint="the table shows the printed number, ours and the allowed range",
+            hint="the table shows the printed or expected number, ours and the allowed range",
         )
 
 
@@ -104,8 +104,8 @@ def _data(found: Reproduction) -> dict[str, Any]:
         "source": found.source,
         "ok": found.good,
         "checks": [
-            {"what": c.what, "published": c.published, "ours": c.ours, "unit": c.unit, "low": c.low, "high": c.high,
-             "within": c.within, "where": c.where}
+            {"what": c.what, **dict(zip(("printed", "expected"), c.two_columns, strict=True)), "ours": c.ours,
+             "unit": c.unit, "low": c.low, "high": c.high, "within": c.within, "where": c.where}
             for c in found.checks
         ],
         "tables": [

@@ -17,6 +17,7 @@ from pmsmtool.workflow.reproduce.figure import (
     Reproduction,
     Series,
     Table,
+    as_printed,
     at_least,
     at_most,
     check_table,
@@ -26,9 +27,9 @@ from pmsmtool.workflow.reproduce.registry import FIGURES, find
 
 
 def test_a_check_is_within_its_range_and_never_without_a_number() -> None:
-    assert near("x", 2.0, 2.1, "A", absolute=0.1).within
-    assert not near("x", 2.0, 2.11, "A", absolute=0.1).within
-    assert near("x", -30.0, -31.0, "%", relative=0.05).within
+    assert near("x", 2.0, 2.1, "A", absolute=0.1, where="fig. 1").within
+    assert not near("x", 2.0, 2.11, "A", absolute=0.1, where="fig. 1").within
+    assert near("x", -30.0, -31.0, "%", relative=0.05, where="fig. 1").within
     assert at_most("x", 1.0, 1.0, "A").within
     assert not at_most("x", 1.0 + 1e-9, 1.0, "A").within
     assert at_least("x", 0.0, 0.0, "A").within
@@ -37,10 +38,31 @@ def test_a_check_is_within_its_range_and_never_without_a_number() -> None:
 
 
 def test_the_range_is_shown() -> None:
-    checks = (at_most("a", 3.0, 1.0, "A"), at_least("b", 1.0, 0.5, "A"), near("c", 1.0, 1.0, "A", absolute=0.25))
-    shown = [row[4] for row in check_table(checks).shown()]
+    checks = (
+        at_most("a", 3.0, 1.0, "A"),
+        at_least("b", 1.0, 0.5, "A"),
+        near("c", 1.0, 1.0, "A", absolute=0.25, where="fig. 1"),
+    )
+    shown = [row[5] for row in check_table(checks).shown()]
     assert shown == ["<= 1", ">= 0.5", "0.75 .. 1.25"]
-    assert [row[5] for row in check_table(checks).shown()] == ["NO", "yes", "yes"]
+    assert [row[6] for row in check_table(checks).shown()] == ["NO", "yes", "yes"]
+
+
+def test_only_what_the_paper_prints_stands_under_printed() -> None:
+    checks = (
+        as_printed("R_s", 0.137, 0.137, "ohm", where="table 1"),
+        near("t", 0.92, 1.0, "ms", where="read off fig. 10"),
+    )
+    table = check_table(checks)
+    assert [column.name for column in table.columns[1:3]] == ["printed", "expected"]
+    assert [row[1:3] for row in table.rows] == [(0.137, None), (None, 0.92)]
+    assert [row[-1] for row in table.rows] == ["table 1", "read off fig. 10"]
+    assert checks[0].within and not as_printed("R_s", 0.137, 0.1371, "ohm", where="table 1").within
+
+
+def test_an_expected_number_without_a_source_is_refused() -> None:
+    with pytest.raises(ValueError, match="needs its source"):
+        near("t", 0.92, 0.92, "ms")
 
 
 def test_a_row_must_fill_its_columns() -> None:
@@ -57,12 +79,12 @@ def test_cells_have_the_digits_of_their_column() -> None:
 def example(panels: int = 1) -> Reproduction:
     x = np.array([0.0, 1.0, 2.0])
     panel = Panel("p", "time / s", "i / A", (Series("one", x, x**2), Series("two", x, np.array([1.0, math.nan, 2.0]))))
-    return Reproduction("n", "t", "s", (), (panel,) * panels, (Check("w", 1.0, 5.0, "A", 0.0, 2.0),))
+    return Reproduction("n", "t", "s", (), (panel,) * panels, (Check("w", 1.0, 5.0, "A", 0.0, 2.0, "read off fig. 1"),))
 
 
 def test_the_checked_numbers_are_the_last_table() -> None:
     assert not example().good
-    assert tables_of(example())[-1].title == "printed numbers"
+    assert tables_of(example())[-1].title.startswith("checked numbers")
     assert tables_of(Reproduction("n", "t", "s")) == ()
 
 

@@ -48,7 +48,7 @@ def test_tables_go_to_stdout_and_files_hold_the_same_bytes_twice(pmsmtool: Comma
     for name in ("one", "two"):
         done = pmsmtool("jercic-fig12", "-o", str(tmp_path / name))
         assert done.exit_code == 0, done.stderr
-        assert "printed numbers" in done.stdout
+        assert "checked numbers: printed in the paper, or expected" in done.stdout
         assert "predicted excess" in done.stdout
         assert "wrote" in done.stderr
         assert "wrote" not in done.stdout

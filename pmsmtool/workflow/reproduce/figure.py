@@ -76,14 +76,14 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One printed number beside ours.
+    """One number of a paper, or one that follows from it, beside ours.
 
     Attributes
     ----------
     what : str
         The number, with its conditions.
-    published : float
-        As printed in ``where``; NaN where only a bound is.
+    expected : float
+        The number in ``where``; NaN where only a bound is.
     ours : float
         As computed here, same unit.
     unit : str
@@ -91,21 +91,34 @@ class Check:
     low, high : float
         Allowed range of ``ours``, ends included; infinite where one-sided.
     where : str
-        Equation, figure, table or section it is printed in.
+        Where the number comes from: what prints it, what curve it was read off, or what it was derived from.
+    printed : bool
+        Whether the paper prints this very number in ``where``; false for one read off a figure or derived.
     """
 
     what: str
-    published: float
+    expected: float
     ours: float
     unit: str
     low: float
     high: float
     where: str = ""
+    printed: bool = False
+
+    def __post_init__(self) -> None:
+        if math.isfinite(self.expected) and not self.where:
+            raise ValueError(f"{self.what}: an expected number needs its source")
 
     @property
     def within(self) -> bool:
         """Whether ours lies in the allowed range; a number that is not finite does not."""
         return math.isfinite(self.ours) and self.low <= self.ours <= self.high
+
+    @property
+    def two_columns(self) -> tuple[float | None, float | None]:
+        """What the paper prints, and what is expected otherwise; None for the other one."""
+        number = self.expected if math.isfinite(self.expected) else None
+        return (number, None) if self.printed else (None, number)
 
     @property
     def allowed(self) -> str:
@@ -117,7 +130,7 @@ class Check:
 
 def near(
     what: str,
-    published: float,
+    expected: float,
     ours: float,
     unit: str,
     *,
@@ -125,19 +138,25 @@ def near(
     relative: float = 0.0,
     where: str = "",
 ) -> Check:
-    """Return a check of a number against a printed one within an absolute plus a relative tolerance."""
-    room = absolute + relative * abs(published)
-    return Check(what, published, ours, unit, published - room, published + room, where)
+    """Return a check of a number against an expected one within an absolute plus a relative tolerance."""
+    room = absolute + relative * abs(expected)
+    return Check(what, expected, ours, unit, expected - room, expected + room, where)
 
 
-def at_most(what: str, ours: float, limit: float, unit: str, *, published: float = math.nan, where: str = "") -> Check:
+def as_printed(what: str, printed: float, ours: float, unit: str, *, where: str) -> Check:
+    """Return a check of a number against the one that the paper prints, to the digits a float holds."""
+    room = 1e-12 * abs(printed)
+    return Check(what, printed, ours, unit, printed - room, printed + room, where, printed=True)
+
+
+def at_most(what: str, ours: float, limit: float, unit: str, *, expected: float = math.nan, where: str = "") -> Check:
     """Return a check of a number against an upper limit."""
-    return Check(what, published, ours, unit, -math.inf, limit, where)
+    return Check(what, expected, ours, unit, -math.inf, limit, where)
 
 
-def at_least(what: str, ours: float, limit: float, unit: str, *, published: float = math.nan, where: str = "") -> Check:
+def at_least(what: str, ours: float, limit: float, unit: str, *, expected: float = math.nan, where: str = "") -> Check:
     """Return a check of a number against a lower limit."""
-    return Check(what, published, ours, unit, limit, math.inf, where)
+    return Check(what, expected, ours, unit, limit, math.inf, where)
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +230,7 @@ class Reproduction:
     panels : tuple of Panel
         Plot; empty for a table alone.
     checks : tuple of Check
-        Printed numbers beside ours.
+        Printed and expected numbers beside ours.
     notes : tuple of str
         Conditions, assumptions, and what differs from the paper and why.
     columns : int
@@ -235,9 +254,12 @@ class Reproduction:
 
 def check_table(checks: Sequence[Check]) -> Table:
     """Return the checks as a table."""
-    heads = ("number", "printed", "ours", "unit", "allowed", "within", "where")
-    rows = tuple((c.what, c.published, c.ours, c.unit, c.allowed, "yes" if c.within else "NO", c.where) for c in checks)
-    return Table("printed numbers", tuple(Column(head) for head in heads), rows)
+    heads = ("number", "printed", "expected", "ours", "unit", "allowed", "within", "source")
+    rows = tuple(
+        (c.what, *c.two_columns, c.ours, c.unit, c.allowed, "yes" if c.within else "NO", c.where) for c in checks
+    )
+    title = "checked numbers: printed in the paper, or expected from its source"
+    return Table(title, tuple(Column(head) for head in heads), rows)
 
 
 def _text(cell: Cell, digits: int) -> str:

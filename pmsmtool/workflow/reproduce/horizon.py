@@ -18,6 +18,7 @@ EPS: tuple[float | None, ...] = (0.1, 0.01, 1e-3, 1e-4, None)
 REFERENCE = {"modulus optimum": (18, 24, 34), "IMC 2000 rad/s": (36, 49, 71), "second order 2000 rad/s": (14, 23, 33)}
 """k_max at eps = 0.1, 0.01, 1e-3, computed independently."""
 K_ROOM = 1
+COMPUTED = "derived: independent computation of (28)-(30)"
 SPEED_RPM = 620.0
 CAP = 100
 """Horizons beyond this count as not finitely determined here; the reference looked up to 800."""
@@ -39,7 +40,7 @@ def horizons(seed: int) -> Reproduction:
         rows.append((name, "all", SPEED_RPM, "yes" if model.has_straight_segment() else "no", *map(_shown, found)))
         for eps, expected, one in zip(EPS, reference, found, strict=False):
             what = f"k_max, {name}, eps {eps:g}"
-            checks.append(near(what, expected, _number(one), "1", absolute=K_ROOM, where="(28)-(30)"))
+            checks.append(near(what, expected, _number(one), "1", absolute=K_ROOM, where=COMPUTED))
         determined = found[-1].k_max is not None and not found[-1].by_tolerance
         what = f"finitely determined without steady-state row, {name}"
         checks.append(at_most(what, float(determined), 0.0, "1", where="(28)-(30)"))
@@ -51,7 +52,7 @@ def horizons(seed: int) -> Reproduction:
         )
         for eps, expected, one in zip((0.01, 1e-3), BOUNDED_REFERENCE[rpm], pair, strict=True):
             what = f"k_max, bounded states, {rpm:g} rpm, eps {eps:g}"
-            checks.append(near(what, expected, _number(one), "1", absolute=K_ROOM, where="(28)-(30)"))
+            checks.append(near(what, expected, _number(one), "1", absolute=K_ROOM, where=COMPUTED))
     heads = (
         Column("tuning"), Column("states"), Column("speed", "rpm"), Column("straight segment"),
         *(Column("no steady-state row" if eps is None else f"eps {eps:g}") for eps in EPS),
@@ -104,11 +105,11 @@ def _matrices() -> tuple[Table, list[Check]]:
         unit = np.eye(6)
         A = np.column_stack([_euler(model, x) for x in unit])
         C = np.column_stack([_demand(model, w, x) for x in unit])
-        for what, ours, printed in (
+        for what, ours, stepped in (
             ("A", model.system_matrix(), A),
             ("A_d, A_q", model.voltage_rows(w), C),
         ):
-            deviation = float(np.abs(ours - printed).max() / np.abs(printed).max())
+            deviation = float(np.abs(ours - stepped).max() / np.abs(stepped).max())
             rows.append((name, what, deviation))
             checks.append(at_most(f"{what}, {name}: deviation", deviation, MATRIX_ROOM, "1", where="(15)-(16), (27)"))
     heads = (Column("tuning"), Column("matrix"), Column("largest deviation", "", 2))

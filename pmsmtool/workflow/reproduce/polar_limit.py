@@ -133,7 +133,7 @@ def _modulator(seed: int) -> tuple[Table, list[Check], list[tuple[float, Held]]]
             worst,
             0.01,
             "1",
-            published=0.0,
+            expected=0.0,
             where="own statement",
         ),
         near(

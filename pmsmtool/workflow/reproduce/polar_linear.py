@@ -121,7 +121,7 @@ def figure_7(seed: int) -> Reproduction:
     checks = (
         near("overshoot at 0 rpm", 18.5, m.over, "%", absolute=1.5, where=EXPECTED),
         near("settling at 0 rpm", 2.6, m.settle_ms, "ms", absolute=0.3, where=EXPECTED),
-        at_most("peak i_d at 0 rpm", m.i_d_a, 0.01, "A", published=0.0, where=EXPECTED),
+        at_most("peak i_d at 0 rpm", m.i_d_a, 0.01, "A", expected=0.0, where=EXPECTED),
     )
     return _figure("miyajima-fig7", "linear range at 0 rpm", LOW_RPM, SIMULATION, seed, checks)
 
@@ -132,7 +132,7 @@ def figure_8(seed: int) -> Reproduction:
     printed = measured(response(PRINTED, HIGH_RPM, seed=seed))
     blind = measured(response(PRINTED, LOW_RPM, seed=seed))
     checks = (
-        at_most("overshoot at 400 rpm", high.over, 20.5, "%", published=18.7, where=EXPECTED),
+        at_most("overshoot at 400 rpm", high.over, 20.5, "%", expected=18.7, where=EXPECTED),
         Check("peak i_d at 400 rpm", 0.18, high.i_d_a, "A", 0.1, 0.45, EXPECTED),
         near(
             "settling, 400 rpm over 0 rpm",
@@ -143,7 +143,7 @@ def figure_8(seed: int) -> Reproduction:
             where="section IV.C",
         ),
         at_least("(15) as printed: settling at 400 rpm", min(printed.settle_ms, 1e3), 19.9, "ms", where=EXPECTED),
-        at_least("(15) as printed: peak i_d at 400 rpm", printed.i_d_a, 3.0, "A", published=8.2, where=EXPECTED),
+        at_least("(15) as printed: peak i_d at 400 rpm", printed.i_d_a, 3.0, "A", expected=8.2, where=EXPECTED),
         near("(15) as printed: overshoot at 0 rpm", 18.5, blind.over, "%", absolute=1.5, where=EXPECTED),
     )
     return _figure("miyajima-fig8", "linear range at 400 rpm", HIGH_RPM, SIMULATION, seed, checks)
@@ -154,7 +154,7 @@ def figure_9(seed: int) -> Reproduction:
     r = response(LINEAR, LOW_RPM, EXPERIMENT, seed=seed)
     rest = phase_step_rms(r, LEAD_S + 3.5 * EACH_S)
     checks = (
-        at_least("rms phase step at 0 N m, 0 rpm", rest, 0.2, "rad", published=0.5, where="Fig. 9 (d); " + EXPECTED),
+        at_least("rms phase step at 0 N m, 0 rpm", rest, 0.2, "rad", expected=0.5, where="Fig. 9 (d); " + EXPECTED),
     )
     return _figure("miyajima-fig9", "linear range at 0 rpm with noise and dead time", LOW_RPM, EXPERIMENT, seed, checks)
 
@@ -165,7 +165,7 @@ def figure_10(seed: int) -> Reproduction:
     rest = phase_step_rms(r, LEAD_S + 3.5 * EACH_S)
     checks = (
         at_most(
-            "rms phase step at 0 N m, 400 rpm", rest, 0.05, "rad", published=0.0143, where="Fig. 10 (d); " + EXPECTED
+            "rms phase step at 0 N m, 400 rpm", rest, 0.05, "rad", expected=0.0143, where="Fig. 10 (d); " + EXPECTED
         ),
     )
     return _figure(
@@ -193,12 +193,12 @@ def compared(seed: int) -> Reproduction:
                 abs(high.over - low.over),
                 0.5,
                 "%",
-                published=0.0,
+                expected=0.0,
                 where=EXPECTED,
             ),
-            at_most(f"{law.name}: overshoot at 400 rpm", high.over, 3.5, "%", published=2.8, where=EXPECTED),
+            at_most(f"{law.name}: overshoot at 400 rpm", high.over, 3.5, "%", expected=2.8, where=EXPECTED),
             at_most(
-                f"{law.name}: i_d at 400 rpm, of the step", high.i_d_percent, 1.0, "%", published=0.7, where=EXPECTED
+                f"{law.name}: i_d at 400 rpm, of the step", high.i_d_percent, 1.0, "%", expected=0.7, where=EXPECTED
             ),
         ]
     shown = (LINEAR, REGULARISED, UNIFIED_TUNED, *BASELINES)
@@ -278,7 +278,7 @@ def at_zero_voltage(seed: int, realisations: int = 16, spikes: int = 30) -> Repr
             at_most(f"{law.name}: phase step / paper's", m.phase_rad / papers.phase_rad, 1 / 15, "1", where=EXPECTED),
             at_most(f"{law.name}: std of i_d / paper's", m.i_d_a / papers.i_d_a, 1.0, "1", where=EXPECTED),
             at_most(f"{law.name}: std of i_q / paper's", m.i_q_a / papers.i_q_a, 1.0, "1", where=EXPECTED),
-            at_most(f"{law.name}: largest i_d spike", max(m.spikes_a), 0.12, "A", published=0.07, where=EXPECTED),
+            at_most(f"{law.name}: largest i_d spike", max(m.spikes_a), 0.12, "A", expected=0.07, where=EXPECTED),
         ]
     plots = tuple(
         Panel(law.name, "time / ms", "delta / rad", (Series("delta", 1e3 * r.t, r.delta),))

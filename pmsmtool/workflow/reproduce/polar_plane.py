@@ -86,7 +86,7 @@ def equilibria(seed: int) -> Reproduction:
     worst = max(point.residual_a_per_s(m) for point in points)
     far = equilibrium_at_amplitude(m, _omega(800.0), m.current_a(12.0), V_PEAK)
     checks = (
-        at_most("largest equilibrium residual", worst, 1e-6, "A/s", published=0.0, where="f(x_o, u_o) = 0"),
+        at_most("largest equilibrium residual", worst, 1e-6, "A/s", expected=0.0, where="f(x_o, u_o) = 0"),
         near("largest i_q at 800 rpm", 31.9, far.i_q / PEAK, "A", absolute=0.05, where=EXPECTED),
         near("largest torque at 800 rpm", 8.42, K_T * far.i_q / PEAK, "N m", absolute=0.01, where=EXPECTED),
         near("i_q at the linear limit, 800 rpm", 13.17, _limit_i_q(800.0), "A", absolute=0.05, where=EXPECTED),
@@ -153,7 +153,7 @@ def _identities() -> list[Check]:
                     errors["polynomials"] = max(errors["polynomials"], float(np.abs(got / wanted - 1.0).max()))
     limits = {"polynomials": 1e-6}
     return [
-        at_most(f"{name}: largest relative error", value, limits.get(name, 1e-9), "1", published=0.0, where="(2)-(11)")
+        at_most(f"{name}: largest relative error", value, limits.get(name, 1e-9), "1", expected=0.0, where="(2)-(11)")
         for name, value in errors.items()
     ]
 

@@ -117,10 +117,10 @@ def transitions(seed: int) -> Reproduction:
     for ramp in (TORQUE, SPEED):
         table, found = _table(ramp, SIMULATION, seed)
         tables += [table, _table(ramp, EXPERIMENT, seed)[0]]
-        for law, published in ((UNIFIED, (0.022, 0.008)), (UNIFIED_TUNED, (0.006, 0.0))):
+        for law, derived in ((UNIFIED, (0.022, 0.008)), (UNIFIED_TUNED, (0.006, 0.0))):
             what = f"{law.name}: torque bump, {ramp.name.split()[0]} ramp"
-            expected = published[0 if ramp is TORQUE else 1]
-            checks.append(at_most(what, found[law.name][0], BUMP_NM, "N m", published=expected, where=EXPECTED))
+            expected = derived[0 if ramp is TORQUE else 1]
+            checks.append(at_most(what, found[law.name][0], BUMP_NM, "N m", expected=expected, where=EXPECTED))
         bump = found[PROPOSED.name][0]
         expected = 0.031 if ramp is TORQUE else 0.020
         what = f"proposed: torque bump, {ramp.name.split()[0]} ramp"

@@ -46,12 +46,12 @@ V_MAX = V_DC / math.sqrt(2.0)
 M_PER_V = 2.0 / (math.sqrt(1.5) * V_DC)
 """Modulation index M = V_a / (sqrt(3/2) V_dc/2) per volt; M_max = 2/sqrt(3) at the linear limit."""
 
-EXPECTED = "re-derivation, set A"
+EXPECTED = "derived: the paper's equations on the assumed machine"
 """Where the expected numbers come from: the paper prints none, and its Table I is missing."""
 
 ASSUMED = (
     "the paper's Table I is missing: every machine number is assumed (profile miyajima-2013-assumed)",
-    "the paper prints curves, no numbers: 'printed' is what its equations give for the assumed machine",
+    "the paper prints curves, no numbers: 'expected' is what its equations give for the assumed machine",
     "amperes and volts are power-invariant as in the paper: times sqrt(2/3) for peak",
 )
 """Notes that every figure carries."""

@@ -164,13 +164,13 @@ def figure_3(seed: int) -> Reproduction:
     laws = (CONVENTIONAL, PROPOSED, PROPOSED_ON_MEASUREMENT, WOUND_UP)
     old, new, kind, wound = (measured(response(one, seed=seed)) for one in laws)
     checks = (
-        at_most("proposed: steady |i_d|", abs(new.end_a), 0.02, "A", published=0.0, where=EXPECTED),
+        at_most("proposed: steady |i_d|", abs(new.end_a), 0.02, "A", expected=0.0, where=EXPECTED),
         at_most(
-            "area of i_d > 0 / conventional", new.area_mas / old.area_mas, 0.15, "1", published=0.106, where=EXPECTED
+            "area of i_d > 0 / conventional", new.area_mas / old.area_mas, 0.15, "1", expected=0.106, where=EXPECTED
         ),
-        at_most("peak i_d / conventional", new.peak_a / old.peak_a, 0.92, "1", published=0.87, where=EXPECTED),
+        at_most("peak i_d / conventional", new.peak_a / old.peak_a, 0.92, "1", expected=0.87, where=EXPECTED),
         at_most(
-            "the same, P and D on the measurement", kind.peak_a / old.peak_a, 0.5, "1", published=0.38, where=EXPECTED
+            "the same, P and D on the measurement", kind.peak_a / old.peak_a, 0.5, "1", expected=0.38, where=EXPECTED
         ),
         Check("settling up / conventional", 0.83, new.up_ms / old.up_ms, "1", 0.65, 1.15, EXPECTED),
         Check("settling down / conventional", 0.83, new.down_ms / old.down_ms, "1", 0.65, 1.15, EXPECTED),
@@ -179,7 +179,7 @@ def figure_3(seed: int) -> Reproduction:
             wound.down_ms / new.down_ms,
             3.0,
             "1",
-            published=4.9,
+            expected=4.9,
             where=EXPECTED,
         ),
     )
@@ -192,7 +192,7 @@ def figure_4(seed: int) -> Reproduction:
     """Fig. 4: conventional control in the experiment, here on the whole simulated drive."""
     m = measured(response(CONVENTIONAL, EXPERIMENT, seed))
     checks = (
-        at_least("conventional: i_d at 1 N m (flux strengthening)", m.end_a, 3.5, "A", where="Fig. 4 (a), no number"),
+        at_least("conventional: i_d at 1 N m (flux strengthening)", m.end_a, 3.5, "A", where="Fig. 4 (a), a curve"),
         Check("conventional: settling up", 11.0, m.up_ms, "ms", 8.0, 13.0, EXPECTED),
         Check("conventional: settling down", 10.7, m.down_ms, "ms", 8.0, 13.0, EXPECTED),
     )
@@ -205,9 +205,9 @@ def figure_5(seed: int) -> Reproduction:
     """Fig. 5: the proposed control in the experiment, here on the whole simulated drive."""
     old, new = (measured(response(one, EXPERIMENT, seed)) for one in (CONVENTIONAL, PROPOSED))
     checks = (
-        at_most("proposed: steady |i_d|", abs(new.end_a), 0.1, "A", published=0.0, where="Fig. 5 (a), no number"),
+        at_most("proposed: steady |i_d|", abs(new.end_a), 0.1, "A", expected=0.0, where="read off Fig. 5 (a)"),
         at_most(
-            "area of i_d > 0 / conventional", new.area_mas / old.area_mas, 0.15, "1", published=0.106, where=EXPECTED
+            "area of i_d > 0 / conventional", new.area_mas / old.area_mas, 0.15, "1", expected=0.106, where=EXPECTED
         ),
         Check("settling up / conventional", 0.83, new.up_ms / old.up_ms, "1", 0.65, 1.15, EXPECTED),
         Check("settling down / conventional", 0.83, new.down_ms / old.down_ms, "1", 0.65, 1.15, EXPECTED),
@@ -224,11 +224,11 @@ def compared(seed: int) -> Reproduction:
     whole_table, _ = _table(EVERY, EXPERIMENT, seed)
     unified, tuned, rough = ideal[UNIFIED.name], ideal[UNIFIED_TUNED.name], noisy[UNIFIED.name]
     checks = (
-        at_most("unified: settling up", unified.up_ms, 6.0, "ms", published=4.9, where=EXPECTED),
-        at_most("unified: settling down", unified.down_ms, 3.0, "ms", published=2.0, where=EXPECTED),
-        at_most("unified: overshoot", max(unified.over_up, unified.over_down), 1.0, "%", published=0.0, where=EXPECTED),
-        at_most("unified: peak i_d", unified.peak_a, 0.1, "A", published=0.0, where=EXPECTED),
-        at_most("unified, delay and noise: peak i_d", rough.peak_a, 0.3, "A", published=0.08, where=EXPECTED),
+        at_most("unified: settling up", unified.up_ms, 6.0, "ms", expected=4.9, where=EXPECTED),
+        at_most("unified: settling down", unified.down_ms, 3.0, "ms", expected=2.0, where=EXPECTED),
+        at_most("unified: overshoot", max(unified.over_up, unified.over_down), 1.0, "%", expected=0.0, where=EXPECTED),
+        at_most("unified: peak i_d", unified.peak_a, 0.1, "A", expected=0.0, where=EXPECTED),
+        at_most("unified, delay and noise: peak i_d", rough.peak_a, 0.3, "A", expected=0.08, where=EXPECTED),
         at_most("unified, 0.97 V_max: settling up", tuned.up_ms, 6.0, "ms", where=EXPECTED),
         near("unified: copper loss at 4.5 N m", 46.9, unified.loss_w, "W", absolute=0.2, where=EXPECTED),
         near(

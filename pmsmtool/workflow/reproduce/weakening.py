@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,6 +17,7 @@ from pmsmtool.workflow.reproduce.figure import (
     Reproduction,
     Series,
     Table,
+    as_printed,
     at_most,
     near,
 )
@@ -54,6 +56,7 @@ COMPENSATED_END, COMPENSATED_RAMP = 0.1, 1.5
 """Voltage error (%) of the compensated laws that must hold; measured 0.02 and 1.1."""
 UNCOMPENSATED_END = {TABLE_2A.name: (7.3, 0.5), TABLE_2B.name: (-31.0, 2.0)}
 """Voltage error (%) of the uncompensated law and its tolerance."""
+STEADY = "derived: steady state of the plant; fig. 11 is a curve"
 CURRENT_A = 56.5
 
 
@@ -128,8 +131,30 @@ def table_2(seed: int) -> Reproduction:
     found = _table_2()
     table = Table(_title(), HEADS, tuple(run.row for runs in found.values() for run in runs.values()))
     return Reproduction(
-        "jercic-table2", "Robustness of field weakening", f"{JERCIC}, table 2", (table,), (), _checks(found), _notes()
+        "jercic-table2", "Robustness of field weakening", f"{JERCIC}, table 2", (table,), (),
+        (*_printed(), *_checks(found)), _notes(),
+    )  # fmt: skip
+
+
+def _printed() -> list[Check]:
+    """Return what the paper prints in numbers: the machine and the settings that its results follow from."""
+    machine, f_s = source().machine, source().inverter.f_s_hz
+    N_FW = law_values(COMPENSATED, False)["field_weakening.N_fw"]
+    rows: tuple[tuple[str, float, float, str, str], ...] = (
+        ("rated speed", 620.0, machine.n_nom_rpm or math.nan, "rpm", "table 1"),
+        ("rated current, taken as peak", 28.0, machine.I_nom_apk or math.nan, "A", "table 1"),
+        ("R_s", 0.137, machine.R_s_ohm, "ohm", "table 1"),
+        ("L_d", 2.3e-3, machine.L_d_h, "H", "table 1"),
+        ("L_q", 2.1e-3, machine.L_q_h, "H", "table 1"),
+        ("magnet flux linkage", 0.41, machine.psi_f_wb, "Wb", "table 1"),
+        ("pole pairs", 4.0, float(machine.pole_pairs), "1", "table 1"),
+        ("sampling frequency", 12e3, f_s, "Hz", "table 1"),
+        ("factor of L, fig. 11 (a)", 0.7, TABLE_2A.L, "1", "table 2"),
+        ("factor of psi, fig. 11 (b)", 0.7, TABLE_2B.psi, "1", "table 2"),
+        ("factor of R_s, fig. 11 (b)", 1.5, TABLE_2B.R, "1", "table 2"),
+        ("N_FW", 50.0, N_FW, "1", "section 5"),
     )
+    return [as_printed(name, value, ours, unit, where=where) for name, value, ours, unit, where in rows]
 
 
 def figure_11(seed: int) -> Reproduction:
@@ -183,15 +208,18 @@ def _checks(found: dict[str, dict[str, Sweep]]) -> tuple[Check, ...]:
             row = runs[law.name].row
             what = f"{law.name}, {plant}"
             checks += [
-                near(f"{what}: voltage error, end", 0.0, float(row[3]), "%", absolute=COMPENSATED_END, where="fig. 11"),
+                near(
+                    f"{what}: voltage error, end", 0.0, float(row[3]), "%", absolute=COMPENSATED_END,
+                    where="read off fig. 11",
+                ),
                 at_most(f"{what}: voltage error, ramp", float(row[4]), COMPENSATED_RAMP, "%", where="fig. 11"),
                 at_most(f"{what}: peak current", float(row[9]), CURRENT_A, "A", where="(17)"),
-            ]
+            ]  # fmt: skip
         if plant in UNCOMPENSATED_END:
             expected, room = UNCOMPENSATED_END[plant]
             row = runs[UNCOMPENSATED.name].row
             what = f"{UNCOMPENSATED.name}, {plant}: voltage error, end"
-            checks.append(near(what, expected, float(row[3]), "%", absolute=room, where="fig. 11, no number printed"))
+            checks.append(near(what, expected, float(row[3]), "%", absolute=room, where=STEADY))
             checks.append(at_most(f"{what}: peak current", float(row[9]), CURRENT_A, "A", where="(17)"))
     return tuple(checks)
 
