@@ -296,9 +296,12 @@ def _keep(run: RunDirectory, given: Consent) -> None:
 
 
 def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
+    from dataclasses import asdict
+
     from pmsmtool.cli.output import table
     from pmsmtool.errors import IdentificationError, Partial
     from pmsmtool.report.report import total_interval
+    from pmsmtool.report.verdict import on_which_drive
     from pmsmtool.units import format_estimate, format_quantity
 
     rows = []
@@ -327,7 +330,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
     out.result("identify", data, table(heads, rows))
     for line in warnings:
         out.warn(line)
-    out.note(stage.summary)
+    out.note(on_which_drive(stage.summary, asdict(run.read())))
     for name in stage.files:
         if not name.startswith(("traces/", "nameplate", "request")):
             out.note(f"-> {run.path / name}")

@@ -126,12 +126,16 @@ def _with_consents(record: Any, consents: list[dict[str, Any]]) -> Any:
 
 
 def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
+    from dataclasses import asdict
+
     from pmsmtool.cli.output import table
+    from pmsmtool.report.verdict import is_simulated, on_which_drive
 
     facts = {str(value["name"]): value["value"] for value in stage.values if "where" not in value}
     data = {
         "run": run.path,
         "verdict": "PASS" if stage.status == "pass" else "FAIL",
+        "simulated": is_simulated(asdict(run.read())),
         "prediction": facts["prediction"],
         "cause": facts["cause"],
         "event": facts["event"],
@@ -146,5 +150,6 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
     out.result("prove", data, lambda: table(("", "response", "measured"), rows))
     for line in stage.fallbacks:
         out.warn(f"not run: {line}")
-    out.note(f"{data['verdict']}: {stage.summary if stage.status == 'pass' else stage.note}")
+    text = f"{data['verdict']}: {stage.summary if stage.status == 'pass' else stage.note}"
+    out.note(on_which_drive(text, asdict(run.read())))
     out.note(f"report: {run.path / 'report.html'}")

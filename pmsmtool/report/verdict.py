@@ -80,6 +80,11 @@ def is_simulated(record: Mapping[str, Any]) -> bool:
     return record.get("bus", {}).get("interface") == SIMULATED_INTERFACE or name.startswith(SIMULATED_NAMES)
 
 
+def on_which_drive(text: str, record: Mapping[str, Any]) -> str:
+    """Return a headline that says so where a simulated drive answered."""
+    return ", ".join(part for part in (SIMULATED if is_simulated(record) else "", text) if part)
+
+
 def latest_of(stages: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Return the last entry of every stage, in the order the stages were first run."""
     return list({stage["name"]: stage for stage in stages}.values())

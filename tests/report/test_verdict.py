@@ -9,7 +9,7 @@ import pytest
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.report.report import render
-from pmsmtool.report.verdict import COMPLETE, NEEDED, verdict_of
+from pmsmtool.report.verdict import COMPLETE, NEEDED, on_which_drive, verdict_of
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow.capabilities import examine
 
@@ -128,3 +128,5 @@ def test_a_served_simulation_is_known_by_the_name_it_gives_itself(face: str) -> 
     served = record(drive={"name": name, "serial": 7}, bus={"interface": "socketcand"})
     assert verdict_of(served).headline.startswith("SIMULATED DRIVE, PASS")
     assert ">SIMULATED DRIVE, PASS: 7 of 7" in render(served)
+    assert on_which_drive("R 3.6 ohm", served) == "SIMULATED DRIVE, R 3.6 ohm"
+    assert on_which_drive("", served) == "SIMULATED DRIVE" and on_which_drive("R", record()) == "R"
