@@ -101,7 +101,7 @@ def test_an_inertia_that_counts_for_nothing_leaves_the_steps_to_the_voltage(J_kg
 
 @pytest.mark.parametrize("psi_f_wb", [0.005, 0.02])
 def test_the_predicted_records_begin_at_their_speed(psi_f_wb: float) -> None:
-    """The drawn friction slows a light shaft while the prediction gets ready; the machine's record begins at its speed."""
+    """The drawn friction slows a light shaft while the prediction gets ready; a record begins at its speed."""
     made = tune(light(psi_f_wb=psi_f_wb), TuneRequest())
     plan = plan_proof(made, conditions(made, U_dc_v=24.0))
     drives = SimulatedDrives(made, conditions(made, U_dc_v=24.0), plan, 4, 0)

@@ -74,9 +74,11 @@ def design() -> Design:
 
 
 @contextmanager
-def flashed(design: Design, *, delay: float = 0.0, rotor: str = "free") -> Iterator[CanopenDrive]:
+def flashed(
+    design: Design, *, delay: float = 0.0, rotor: str = "free", truth: MachineFile | None = None
+) -> Iterator[CanopenDrive]:
     """A simulated drive that holds the design."""
-    truth = machine()
+    truth = truth or machine()
     truth = replace(truth, inverter=replace(truth.inverter, delay_periods=1.5 + delay))
     truth = replace(truth, simulation={**truth.simulation, "rotor": rotor})
     Path("drive.toml").write_text(dump_machine_file(truth))
@@ -190,10 +192,25 @@ def test_a_fault_is_named_with_the_experiment(design: Design, monkeypatch: pytes
     assert stage.status == "fail" and "0x2310" in stage.note and "during speed_step" in stage.note
 
 
+def test_a_heavy_shaft_is_given_the_time_it_needs() -> None:
+    """It takes 9 s to the speed of the unreachable current; 7 s were all a proof waited for."""
+    base = machine()
+    heavy = replace(base, machine=replace(base.machine, J_kgm2=2.0), std={**base.std, "J_kgm2": 0.02})
+    made = tune(heavy, TuneRequest())
+    with flashed(made, truth=heavy) as drive:
+        stage = prove_stage(
+            begin_run(drive, Path("runs")), drive, made, replace(FEW, experiments=("unreachable",)),
+            lambda shown: None, lambda line: None,
+        )  # fmt: skip
+        assert is_safe(drive.node.state())
+    assert stage.status == "pass", stage.note
+
+
 def test_a_speed_that_is_not_reached_is_named(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody waits for it here, so it is on its way: named, with a reason, and the machine is stopped."""
     monkeypatch.setattr(measured, "RISE_S", 0.0)
     monkeypatch.setattr(measured, "REACH_S", 0.0)
+    monkeypatch.setattr(measured, "REACH_FACTOR", 0.0)
     with flashed(design) as drive:
         _, stage = prove(drive, design)
         assert is_safe(drive.node.state())

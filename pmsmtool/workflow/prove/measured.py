@@ -18,7 +18,9 @@ from pmsmtool.trace import Trace
 from pmsmtool.workflow.prove.plan import RPM, SIGNALS, Conditions, Experiment, ProofPlan
 
 REACH_S = 4.0
-"""A speed that is not reached by then is not waited for any longer."""
+REACH_FACTOR = 2.0
+"""A speed that is not reached by then, and by this many times what the design's slope takes, is not waited for any
+longer."""
 REACHED = 0.05
 """Relative distance from its speed at which an experiment is not begun."""
 KEPT = (-0.05, 0.02)
@@ -39,7 +41,8 @@ CURRENT_LIMITED = 1 << 2
 """Flag of the drive: the current asked for was cut (``PMSM_FLAG_CURRENT_LIMITED`` of ``pmsm_core.h``)."""
 STANDSTILL_S = 2.0
 STANDSTILL_RAD_S = 1.0
-"""Longest wait for the shaft, and electrical speed that counts as standstill (the noise of a 12-bit encoder)."""
+"""Longest wait for the shaft, beyond what the design's slope takes, and electrical speed that counts as standstill (the
+noise of a 12-bit encoder)."""
 LOOK_S = 0.05
 RISE_STEPS = 64
 RISE_SHARE = 0.25
@@ -89,7 +92,7 @@ def run_experiments(
             break
     if any(e.base_rad_s for e in plan.experiments):
         _approach(drive, 0.0, design.machine.machine.pole_pairs)
-        _come_to_rest(drive)
+        _come_to_rest(drive, design.machine.machine.pole_pairs)
 
 
 def _recorded(
@@ -101,10 +104,11 @@ def _recorded(
         if experiment.base_rad_s or experiment.excitation.point is Injection.SPEED:
             _approach(drive, experiment.base_rad_s, pole_pairs)
             if not omega_e:
-                _come_to_rest(drive)  # the shaft may still turn from what was done before
+                _come_to_rest(drive, pole_pairs)  # the shaft may still turn from what was done before
         if omega_e:
-            if reach(drive, omega_e, limit_s=REACH_S) >= REACH_S:
-                _refuse_other_speed(drive, experiment, omega_e, design, conditions)
+            limit_s = max(REACH_S, _ramp_s(drive, experiment.base_rad_s, pole_pairs))
+            if reach(drive, omega_e, limit_s=limit_s) >= limit_s:
+                _refuse_other_speed(drive, experiment, omega_e, limit_s, design, conditions)
             drive.wait(experiment.settle_s)
         trace = drive.record(SIGNALS, experiment.rows, decimation=experiment.decimation,
                              excitation=experiment.excitation)  # fmt: skip
@@ -120,7 +124,7 @@ def _recorded(
 
 
 def _refuse_other_speed(
-    drive: Drive, experiment: Experiment, omega_e_rad_s: float, design: Design, conditions: Conditions
+    drive: Drive, experiment: Experiment, omega_e_rad_s: float, limit_s: float, design: Design, conditions: Conditions
 ) -> None:
     """Raise when the machine is not near the speed it should have reached."""
     state = drive.average(STATE, max(1, round(STATE_S / drive.period_s)))
@@ -130,7 +134,7 @@ def _refuse_other_speed(
         return  # it only does not rest there
     rpm = design.machine.machine.pole_pairs * RPM
     raise SpeedNotReached(
-        f"the speed was not reached: {omega / rpm:.4g} of {omega_e_rad_s / rpm:.4g} rpm after {REACH_S:g} s, with "
+        f"the speed was not reached: {omega / rpm:.4g} of {omega_e_rad_s / rpm:.4g} rpm after {limit_s:.3g} s, with "
         f"i_d = {state['i_d_a']:.3g} A and i_q = {state['i_q_a']:.3g} A, before {experiment.name}",
         likely=_why_not(state, limited, design, conditions)
         if abs(omega) < abs(omega_e_rad_s)
@@ -166,10 +170,18 @@ def _approach(drive: Drive, speed_rad_s: float, pole_pairs: int) -> None:
     drive.command_speed(speed_rad_s)
 
 
-def _come_to_rest(drive: Drive) -> None:
+def _ramp_s(drive: Drive, speed_rad_s: float, pole_pairs: int) -> float:
+    """Time to allow for a mechanical speed (s): what a heavy shaft needs with the design's slope, and as much again."""
+    slope = drive.read("speed.acceleration_rpm_per_s") * RPM
+    change = abs(speed_rad_s - drive.live("omega_e_rad_s") / pole_pairs)
+    return REACH_FACTOR * change / slope if slope > 0.0 else 0.0
+
+
+def _come_to_rest(drive: Drive, pole_pairs: int) -> None:
     """Wait for the shaft as long as it gets slower; the guard's stop brakes what is left."""
     waited, last = 0.0, math.inf
-    while waited < STANDSTILL_S:
+    longest_s = STANDSTILL_S + _ramp_s(drive, 0.0, pole_pairs)
+    while waited < longest_s:
         speed = abs(drive.live("omega_e_rad_s"))
         if speed > 0.98 * last or speed < STANDSTILL_RAD_S:
             return

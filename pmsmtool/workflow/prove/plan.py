@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from typing import Any
 
 from pmsmtool.design.design_file import Design
@@ -143,9 +144,11 @@ class ProofPlan:
     experiments: tuple[Experiment, ...]
     left_out: tuple[str, ...] = ()
 
-    def seconds(self, T_s: float) -> float:
-        """Return about how long the machine is energised (s)."""
-        return sum(e.rows * e.decimation * T_s + 0.5 for e in self.experiments)
+    def seconds(self, T_s: float, slope_rad_s2: float) -> float:
+        """Return about how long the machine is energised (s), with a mechanical acceleration (rad/s2)."""
+        speeds = [0.0, *(e.base_rad_s for e in self.experiments), 0.0]
+        ramps = sum(abs(b - a) for a, b in pairwise(speeds)) / slope_rad_s2 if slope_rad_s2 > 0.0 else 0.0
+        return ramps + sum(e.rows * e.decimation * T_s + 0.5 for e in self.experiments)
 
 
 def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:

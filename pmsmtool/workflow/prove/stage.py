@@ -103,12 +103,12 @@ class _Record:
 
 def envelope_of(design: Design, request: ProofRequest, plan: ProofPlan | None = None) -> Envelope:
     """Return the motion envelope: what the request says, else the design's largest current and speed."""
-    T_s = design.machine.inverter.T_s
+    T_s, slope = design.machine.inverter.T_s, design["speed.acceleration_rpm_per_s"] * RPM
     i_max = design["motor.I_max_apk"] if request.i_max_apk is None else request.i_max_apk
     return Envelope(
         i_max_apk=i_max,
         speed_max_rad_s=design["motor.n_max_rpm"] * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,
-        duration_s=60.0 if plan is None else 45.0 + 2.0 * plan.seconds(T_s),
+        duration_s=60.0 if plan is None else 45.0 + 2.0 * plan.seconds(T_s, slope),
         shaft=request.shaft,
         load=request.load,
         brake=request.brake,
