@@ -64,7 +64,15 @@ class LssMaster:
         self._mailbox.close()
 
     def fast_scan(self) -> LssAddress | None:
-        """Return the identity of one unconfigured slave, None when there is none; the slave is left selected."""
+        """Return the identity of one unconfigured slave, None when there is none.
+
+        Every slave is in the waiting state afterwards. It is before, too: a slave that an earlier master left in the
+        configuration state takes no part in a scan.
+        """
+        with self._all_waiting_afterwards():
+            return self._scan()
+
+    def _scan(self) -> LssAddress | None:
         if not self._confirmed(0, 128, 0, 0):
             return None
         numbers = []
@@ -134,8 +142,14 @@ class LssMaster:
     @contextmanager
     def configuration(self, address: LssAddress) -> Iterator[None]:
         """Select one slave; every slave returns to the waiting state afterwards, and takes its new id then."""
+        with self._all_waiting_afterwards():
+            self.select(address)
+            yield
+
+    @contextmanager
+    def _all_waiting_afterwards(self) -> Iterator[None]:
+        """Switch all slaves to the waiting state, before and on every way out (CiA 305, switch state global)."""
         self._send(LssCommand.SWITCH_GLOBAL, b"\0")
-        self.select(address)
         try:
             yield
         finally:

@@ -20,6 +20,7 @@ from pmsmtool.errors import SdoAbort
 from pmsmtool.firmware.drive_map import reference_map
 from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
+from pmsmtool.sim.bus import PmsmSimBus
 from tests.cli.conftest import Result, Tool
 from tests.simulated_bus import settle
 
@@ -436,6 +437,20 @@ def test_lss_finds_a_node_without_an_id_and_gives_it_one(tool: Tool) -> None:
     code, out, err = tool("lss", "set-node", "9", "--store", "--yes", channel=fresh)
     assert code == 0 and "serial 22001 is node 9" in out, err
     assert loaded(tool("scan", "--json", channel="interior-2k2?nv=fresh.nv"))["nodes"][0]["node"] == 9
+
+
+def test_lss_works_as_often_as_it_is_asked_between_two_power_ons(tool: Tool) -> None:
+    """The drive keeps its power: a scan left it in the configuration state, where no other scan finds it."""
+    fresh = "interior-2k2?node=255&nv=fresh.nv"
+    bus = PmsmSimBus(fresh)
+    try:
+        for _ in range(2):
+            assert loaded(tool("lss", "scan", "--json", channel=fresh))["found"]["serial"] == 22001
+        assert tool("lss", "set-node", "9", channel=fresh)[0] == 7, "declined"
+        assert loaded(tool("lss", "scan", "--json", channel=fresh))["found"]["serial"] == 22001
+        assert tool("lss", "set-node", "9", "--yes", channel=fresh)[0] == 0
+    finally:
+        bus.shutdown()
 
 
 def test_lss_with_nobody_to_configure(tool: Tool) -> None:

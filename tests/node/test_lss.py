@@ -102,3 +102,15 @@ def test_bit_timing_is_that_of_the_line_only(make_bench: BenchMaker) -> None:
     assert lss(bench, 0x13, 0, 2) == [b"\x13\x00" + bytes(6)]
     assert lss(bench, 0x13, 0, 0) == [b"\x13\x01" + bytes(6)]
     assert lss(bench, 0x13, 1, 2) == [b"\x13\x01" + bytes(6)]
+
+
+def test_only_the_waiting_state_or_a_reset_ends_the_configuration_state(make_bench: BenchMaker) -> None:
+    bench = make_bench()
+    lss(bench, 0x04, 1)
+    assert lss(bench, 0x04, 2) == [] and lss(bench, 0x5E), "a state that CiA 305 does not know changes nothing"
+    lss(bench, 0x04, 0)
+    assert lss(bench, 0x5E) == []
+    lss(bench, 0x04, 1)
+    bench.nmt(130)
+    assert bench.frames(0x701, 0.1) == [b"\x00"]
+    assert lss(bench, 0x5E) == [], "waiting again"

@@ -89,6 +89,8 @@ class LssSlave:
         self._send(bytes((command, *values)).ljust(8, b"\0"))
 
     def _switch(self, mode: int) -> None:
+        if mode not in (0, 1):
+            return  # CiA 305 knows waiting and configuration
         was_configuring = self._state.configuring
         self._state.configuring = mode == 1
         if was_configuring and mode == 0:

@@ -319,6 +319,7 @@ class Session:
         self.power.connection_ended()
         self.nmt = NmtState.INITIALISING
         self.sdo.reset()
+        self.lss = self._make_lss()  # it is waiting again
         fresh = Dictionary(self.hardware.node_id)
         for entry in self.dictionary:
             if entry.row.index in Group.COMMUNICATION.indices and entry.row.stored:
