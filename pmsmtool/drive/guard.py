@@ -59,6 +59,9 @@ KEPT_SHARE, KEPT_S = 0.1, 0.5
 UNPROVEN_BY = ("motor.", "encoder.", "current.", "speed.", "inverter.")
 """Parameters after whose change a proven speed loop is proven no more."""
 _ROUNDING = 1e-9
+RATED_RATIO = 30.0
+"""Largest current limit over the drive's rated current (0x6075): three times the rated current of a motor ten times as
+large as the one that the drive still holds."""
 _Object = tuple[int, int]
 _MARKS: tuple[_Object, ...] = tuple(
     (mark.index, mark.sub) for mark in (objects.CONFIGURATION_DATE, objects.CONFIGURATION_TIME)
@@ -134,11 +137,24 @@ class GuardedDrive:
                 hint="limit the current and the duration instead",
             )
 
+    def _refuse_no_limit(self, rated_apk: float) -> None:
+        """Refuse a current limit so far above the drive's rated current that it limits nothing."""
+        i_max, largest = self.envelope.i_max_apk, RATED_RATIO * rated_apk
+        if not i_max <= largest:  # what is no number is no limit either
+            raise SafetyRefusal(
+                f"the current limit of {i_max:.4g} A (peak) is none: the drive is rated {rated_apk:.4g} A (peak), and "
+                f"at most {RATED_RATIO:g} times that, {largest:.4g} A, counts as a limit; nothing was energised",
+                where=f"node {self._node.node}, 0x6075:00",
+                likely="a wrong digit or unit in --i-max, or the drive holds the rated current of a much smaller motor",
+                hint="give --i-max what the motor stands, or write the motor's rated current to 0x6075 first",
+            )
+
     def _limit_in_drive(self) -> None:
         """Make the drive itself keep current and speed (0x6073, 0x6080), where it can."""
         node = self._node
         try:
             rated_apk = 1e-3 * node.get(objects.RATED_CURRENT_MA) * math.sqrt(2.0)
+            self._refuse_no_limit(rated_apk)
             # Rounded up: a permille of the rated current must not cut what the envelope allows.
             permille = math.ceil(1000.0 * self.envelope.i_max_apk / rated_apk)
             if permille < node.get(objects.MAX_CURRENT_PERMILLE):

@@ -439,6 +439,17 @@ def test_lss_finds_a_node_without_an_id_and_gives_it_one(tool: Tool) -> None:
     assert loaded(tool("scan", "--json", channel="interior-2k2?nv=fresh.nv"))["nodes"][0]["node"] == 9
 
 
+@pytest.mark.parametrize("command", [("jog", "--current", "0.1Apk"), ("identify", "R"), ("commission",)])
+def test_a_current_limit_that_limits_nothing_is_refused_before_anything_is_energised(
+    tool: Tool, command: tuple[str, ...]
+) -> None:
+    code, _, err = tool(*command, "--i-max", "100000Apk", "--yes")
+    assert code == 5, err
+    assert "the current limit of 1e+05 A (peak) is none" in err and "at most 30 times that" in err
+    assert "0x6075" in err and "--i-max" in err
+    assert "dead-man proven" not in err
+
+
 def test_lss_works_as_often_as_it_is_asked_between_two_power_ons(tool: Tool) -> None:
     """The drive keeps its power: a scan left it in the configuration state, where no other scan finds it."""
     fresh = "interior-2k2?node=255&nv=fresh.nv"

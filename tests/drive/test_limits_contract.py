@@ -285,6 +285,21 @@ def test_energised_too_long(rig: Rig) -> None:
     stopped(rig, envelope, transfer, "time energised", 1.2 + WATCH_S + STOP_S)
 
 
+@pytest.mark.parametrize("i_max_apk", [1e5, math.inf, math.nan])
+def test_a_current_limit_that_limits_nothing_is_refused(rig: Rig, i_max_apk: float) -> None:
+    """30 times the rated current is the most that counts as a limit, whatever motor the drive still holds."""
+    before = rig.memory()
+    with pytest.raises(SafetyRefusal, match="is none: the drive is rated") as caught, \
+            guarded(rig.drive, replace(ENVELOPE, i_max_apk=i_max_apk)):  # fmt: skip
+        pass
+    assert rig.off_since is None, "it was never enabled"
+    assert rig.memory() == before
+    assert caught.value.where and caught.value.likely and caught.value.hint
+    rated_apk = 1e-3 * math.sqrt(2.0) * rig.session.dictionary.find(0x6075, 0).number()
+    with guarded(rig.drive, replace(ENVELOPE, i_max_apk=29.9 * rated_apk)):
+        pass
+
+
 def test_energy(rig: Rig) -> None:
     """1.5 R i^2: 48.6 W at 3 A and 3.6 ohm, which spend 25 J in 0.51 s. Without a resistance the limit is refused."""
     envelope, R_s_ohm = replace(ENVELOPE, energy_j=25.0), rig.drive.read("motor.R_s_ohm")
