@@ -40,15 +40,17 @@ class Monitor(RecorderFace):
         self._rows = b""
         self._running = False
         self._fetched = True
-        self._register(objects.DIVIDER, objects.WINDOW, objects.MAPPED, objects.TRIGGER_KIND)
+        self._register(objects.DIVIDER, objects.WINDOW)
+        self._keeps(objects.MAPPED, range(objects.CHANNELS + 1))
+        self._keeps(objects.TRIGGER_KIND, (0, objects.FORCED))  # no edge trigger here
         self._shows(objects.STATUS, self._status)
         self._shows(objects.LARGEST_BYTES, lambda: MEMORY_BYTES)
         self._shows(objects.BYTES_LEFT, lambda: len(self._collected()))
         self._shows(objects.ROW_BYTES, lambda: 4 * len(self._mapped()))
         self._shows(objects.LOOP_RATE_HZ, lambda: round(1e9 / self._plant.core.period_ns))
-        self._takes(objects.ENABLE, self._enable)
-        self._takes(objects.REMOVE_DATA, self._remove)
-        self._takes(objects.FORCE_TRIGGER, self._trigger)
+        self._takes(objects.ENABLE, self._enable, (0, 1))
+        self._takes(objects.REMOVE_DATA, self._remove, (1,))
+        self._takes(objects.FORCE_TRIGGER, self._trigger, (1,))
         for k in range(objects.CHANNELS):
             self._takes(_map_word(k), self._map(_map_word(k)))
         self._gives(objects.DATA, self._block)
@@ -85,7 +87,7 @@ class Monitor(RecorderFace):
         self._fetched = True
 
     def _trigger(self, data: bytes) -> None:
-        if not self._running:
+        if not self._running or self._number(objects.TRIGGER_KIND) != objects.FORCED:
             raise Refused(AbortCode.DEVICE_STATE)
         self._rows, self._fetched = b"", False
         names = [name for name, _ in self._mapped()]

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.firmware.recorder_map import Address
 from pmsmtool.firmware.wire_units import wire_unit
-from pmsmtool.sim.node.dictionary import Dictionary, Entry
+from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.drive_core import RecorderSetup, RecorderState
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.power_drive import Plant
@@ -62,10 +63,24 @@ class RecorderFace:
         entry.writable = False
         entry.source = lambda: entry.encode(value())
 
-    def _takes(self, address: Address, sink: Callable[[bytes], None]) -> None:
-        """Make a register whose writing does something; the sink keeps the bytes where they count."""
+    def _takes(self, address: Address, sink: Callable[[bytes], None], defined: Container[int] | None = None) -> None:
+        """Make a register whose writing does something; the sink keeps the bytes where they count.
+
+        Where the maker defines a few values only, every other one is refused: a drive need not do anything sensible
+        with it.
+        """
         self._register(address)
-        self._entries[address].sink = sink
+
+        def strict(data: bytes) -> None:
+            if defined is not None and int.from_bytes(data, "little") not in defined:
+                raise Refused(AbortCode.VALUE)
+            sink(data)
+
+        self._entries[address].sink = strict
+
+    def _keeps(self, address: Address, defined: Container[int]) -> None:
+        """Make a register that keeps one of the values the maker defines."""
+        self._takes(address, lambda data: self._keep(address, data), defined)
 
     def _gives(self, index: int, data: Callable[[], bytes]) -> None:
         """Make a DOMAIN."""

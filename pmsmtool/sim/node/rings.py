@@ -50,12 +50,14 @@ class Rings(RecorderFace):
         self._armed = self._triggered = False
         self._held: tuple[int, bytes] = (0, b"")
         self._row_s = self._sample_s = 1.0
-        self._register(objects.CONFIGURATION, objects.PERIOD, objects.PRECEDING, objects.USED)
+        self._register(objects.PERIOD, objects.PRECEDING)
+        self._keeps(objects.CONFIGURATION, range(1 << 4))
+        self._keeps(objects.USED, range(objects.VARIABLES + 1))
         self._keep(objects.PERIOD, (10).to_bytes(2, "little"))
         for k in range(objects.VARIABLES):
             for first in (objects.FIRST_INDEX, objects.FIRST_SUB):
                 self._takes(_of(first, k), self._choose(_of(first, k)))
-        self._takes(objects.CONTROL, self._control)
+        self._takes(objects.CONTROL, self._control, (objects.START, objects.FORCE_TRIGGER, objects.STOP))
         self._shows(objects.STATUS, self._status)
         self._shows(objects.LARGEST, self._largest)
         self._shows(objects.RECORDED, lambda: self._taken()[0])

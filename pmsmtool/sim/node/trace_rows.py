@@ -50,7 +50,7 @@ class TraceRows(RecorderFace):
         self._shows(objects.REFERENCE_PERIOD_NS, lambda: self._plant.core.period_ns)
         self._shows(objects.RECORDED, self._recorded)
         self._shows(objects.LARGEST, self._largest)
-        self._takes(objects.START, self._start)
+        self._takes(objects.START, self._start, (0, 1))
         for k in range(objects.CHANNELS):
             self._takes(_channel(k), self._choose(_channel(k)))
         self._gives(objects.DATA, self._data)
