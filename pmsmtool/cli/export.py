@@ -143,10 +143,10 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, out: O
     """Write the parameters and the control core as C99 sources.
 
     The core is what the simulated drive runs, byte for byte; the compiler flags it is checked with stand at the top of
-    the configuration.
+    the configuration, and which values it does not read: those of sampling, encoder and trips are for your application.
     """
     from pmsmtool.cli.output_file import make_folder
-    from pmsmtool.firmware.export_c import c_files
+    from pmsmtool.firmware.export_c import c_files, not_read_by_core
     from pmsmtool.workflow.export import image_of
     from pmsmtool.workflow.parameter_source import load_parameters
 
@@ -160,6 +160,8 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, out: O
     for name, text in files.items():
         write_file(folder / name, text)
     out.note(f"wrote {len(files)} files to {folder}")
+    unread = ", ".join(not_read_by_core())
+    out.note(f"for your application, not read by these files: {unread}")
 
 
 @export_command.command("csv", epilog=examples("pmsmtool export csv design.toml -o parameters.csv"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import struct
 import subprocess
@@ -12,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.export_c import FLAGS, c_files, header_file, image_of_json
+from pmsmtool.firmware.export_c import FLAGS, c_files, core_files, header_file, image_of_json, not_read_by_core
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.firmware.params_header import c_float
 from pmsmtool.params.catalogue import CATALOGUE
@@ -121,3 +122,39 @@ def test_a_literal_reads_back_to_the_same_bits(value: float) -> None:
     text = c_float(value)
     assert text.endswith("F")
     assert struct.pack("<f", float(text[:-1])) == struct.pack("<f", value)
+
+
+@needs_compiler
+def test_what_the_core_does_not_read_is_said_and_is_what_a_compiler_does_not_miss(tmp_path: Path) -> None:
+    """Without the members that are named, the core compiles; without the others, the compiler misses every one."""
+    unread = set(not_read_by_core())
+    assert {"encoder.pll_bandwidth_rad_s", "encoder.offset_rad", "protection.i_trip_apk"} <= unread
+    assert not {"current.K_p_d_v_per_a", "motor.psi_f_wb", "governor.k_max"} & unread
+
+    def missed(gone: set[str]) -> str:
+        for name, text in core_files():
+            if name == "pmsm_params.h":
+                for row in CATALOGUE:
+                    if row.name in gone:
+                        text = text.replace(f" {row.c_name};", f" gone_{row.index:x}_{row.sub:x};")
+            (tmp_path / name).write_text(text)
+        sources = [str(path) for path in sorted(tmp_path.glob("*.c"))]
+        assert COMPILER is not None
+        asked = [COMPILER, "-std=c99", "-fsyntax-only", *sources]
+        return subprocess.run(asked, capture_output=True, text=True, check=False, timeout=60).stderr
+
+    assert "error" not in missed(unread)
+    told = missed({row.name for row in CATALOGUE} - unread)
+    assert [row.name for row in CATALOGUE if row.name not in unread and row.c_name not in told] == []
+
+
+def test_the_export_says_of_every_value_whether_its_code_reads_it() -> None:
+    files = c_files(pack_image(_values()))
+    said = "not read by this code"
+    source = " ".join(files["pmsm_cfg.c"].split())
+    for row in CATALOGUE:
+        comment = source.split(f".{row.c_name} = ")[1].split("*/")[0]
+        assert (said in comment) is (row.name in not_read_by_core()), row.name
+        listed = files["pmsm_cfg.h"].split("#ifndef")[0].split(said)[1]
+        assert (row.name in listed.replace(",", " ").split()) is (row.name in not_read_by_core())
+    assert json.loads(files["pmsm_cfg.json"])["not_read_by_core"] == list(not_read_by_core())
