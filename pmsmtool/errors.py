@@ -46,6 +46,7 @@ class ExitCode(IntEnum):
     PARTIAL = 10
     INTERNAL = 70
     INTERRUPTED = 130
+    READER_GONE = 141
 
 
 class PmsmtoolError(Exception):
@@ -321,8 +322,13 @@ def decisive(error: BaseException) -> BaseException:
 
 
 def exit_code_of(error: BaseException) -> ExitCode:
-    """Return the exit code of a program that an error ends; an error that is not ours is a bug."""
+    """Return the exit code of a program that an error ends; an error that is not ours is a bug.
+
+    A broken pipe is neither: whoever read the output went away, as from a filter that SIGPIPE ends (128 + 13).
+    """
     chosen = decisive(error)
     if isinstance(chosen, PmsmtoolError):
         return chosen.exit_code
+    if isinstance(chosen, BrokenPipeError):
+        return ExitCode.READER_GONE
     return ExitCode.INTERRUPTED if isinstance(chosen, KeyboardInterrupt) else ExitCode.INTERNAL

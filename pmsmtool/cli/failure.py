@@ -28,9 +28,6 @@ from pmsmtool.plain_text import plain
 if TYPE_CHECKING:
     from pathlib import Path
 
-READER_GONE = 141
-"""Exit code when whoever read standard output went away, as of a filter that SIGPIPE ends (128 + 13)."""
-
 _DISK = (errno.ENOSPC, errno.EROFS, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC))
 """Errors of writing that name no file, such as those of standard output."""
 _DISK_HINT = "check the path, your rights there and the space on the disk"

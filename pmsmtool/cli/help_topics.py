@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import click
 
 from pmsmtool.cli.command_table import COMMANDS
-from pmsmtool.cli.failure import READER_GONE
 from pmsmtool.cli.options import examples
 from pmsmtool.cli.output import table
 from pmsmtool.errors import ExitCode
@@ -30,6 +29,7 @@ EXIT_CODES: dict[ExitCode, str] = {
     ExitCode.PARTIAL: "partial: what ran is good, but something asked for could not be had; it is named",
     ExitCode.INTERNAL: "a bug in pmsmtool; the traceback is kept in the file that is named",
     ExitCode.INTERRUPTED: "interrupted; a machine that moved was stopped, and the stop confirmed",
+    ExitCode.READER_GONE: "whoever read the output went away (| head), as with any filter",
 }
 
 SAFETY = """\
@@ -98,7 +98,6 @@ def _units() -> str:
 
 def _exit_codes() -> str:
     rows = [(int(code), meaning) for code, meaning in EXIT_CODES.items()]
-    rows.append((READER_GONE, "whoever read the output went away (| head), as with any filter"))
     return "\n".join(table(("code", "meaning"), sorted(rows)))
 
 

@@ -10,15 +10,15 @@ import select
 import signal
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
 from pmsmtool import __version__
-from pmsmtool.cli.failure import READER_GONE, report
+from pmsmtool.cli.failure import report
 from pmsmtool.cli.lazy_group import COMPLETE_VARIABLE, LazyGroup
 from pmsmtool.cli.options import VERBOSITY, examples, global_options
-from pmsmtool.errors import decisive
+from pmsmtool.errors import ExitCode, decisive
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -60,9 +60,9 @@ def run(arguments: Sequence[str]) -> int:
         sys.stdout.flush()
     except BaseException as error:
         if isinstance(decisive(error), BrokenPipeError) and _reader_gone():
-            return READER_GONE
+            return int(ExitCode.READER_GONE)
         code = report(error, _verbosity(context))
-        return READER_GONE if _reader_gone() and code == 0 else code
+        return int(ExitCode.READER_GONE) if _reader_gone() and code == 0 else code
     return 0
 
 
@@ -74,16 +74,21 @@ def _verbosity(context: click.Context | None) -> int:
 
 
 def _reader_gone() -> bool:
-    """Whether nobody reads standard output any more.
+    """Whether nobody reads standard output or standard error any more.
 
     What could not be written is given up, so that Python's own exit neither tries again nor changes the exit code.
     """
+    gone = [_is_given_up(stream) for stream in (sys.stdout, sys.stderr)]
+    return any(gone)
+
+
+def _is_given_up(stream: TextIO) -> bool:
     try:
-        descriptor = sys.stdout.fileno()
+        descriptor = stream.fileno()
     except (OSError, ValueError):
         return False  # no file of the system behind it
     try:
-        sys.stdout.flush()
+        stream.flush()
         gone = given_up = _pipe_is_broken(descriptor)
     except OSError as error:
         gone, given_up = isinstance(error, BrokenPipeError), True
@@ -101,6 +106,21 @@ def _pipe_is_broken(descriptor: int) -> bool:
     return any(event & select.POLLERR for _, event in question.poll(0))
 
 
+def _open_standard_streams() -> None:
+    """Give up what a closed standard stream would have carried (``>&-``), as if it were redirected to the null device.
+
+    Otherwise the next file that is opened gets its number, and what is printed goes into that file.
+    """
+    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            mode = "r" if name == "stdin" else "w"
+            null = os.open(os.devnull, os.O_RDONLY if name == "stdin" else os.O_WRONLY)
+            if null != descriptor:
+                os.dup2(null, descriptor)
+                os.close(null)
+            setattr(sys, name, open(descriptor, mode, encoding="utf-8", closefd=False))  # noqa: SIM115 - for good
+
+
 def _interrupt(number: int, frame: FrameType | None) -> None:
     # Whoever puts Ctrl-C off puts this off, too; SIGINT itself may be ignored, in a background job of a shell.
     handler = signal.getsignal(signal.SIGINT)
@@ -114,6 +134,7 @@ def main() -> None:
     # One thread: more add up in another order, and a replay on a host with other processors would differ in the last
     # digits; to start them takes 50 ms, too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _open_standard_streams()
     gc.set_threshold(_GARBAGE_THRESHOLD)
     atexit.register(gc.freeze)  # what is left at exit goes with the process
     if COMPLETE_VARIABLE in os.environ:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import signal
@@ -36,6 +37,8 @@ from pmsmtool.errors import (
 )
 from pmsmtool.machine.machine_keys import machine_file_keys
 from pmsmtool.sim.scenarios import BUILT_IN, SCHEDULES
+from pmsmtool.workflow.run_account import accounted
+from pmsmtool.workflow.run_directory import RunDirectory, new_record
 
 ROOT = Path(__file__).resolve().parents[2]
 SLOW = ("numpy", "scipy", "can", "canopen", "matplotlib", "rich", "jinja2", "tomlkit", "filterpy")
@@ -306,6 +309,37 @@ def test_every_exit_code_is_explained() -> None:
     assert set(EXIT_CODES) == set(ExitCode)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no shell of this kind")
+@pytest.mark.parametrize("closed", ["1>&-", "2>&-", "0<&-", "0<&- 1>&- 2>&-"])
+def test_a_closed_standard_stream_is_no_bug_and_its_number_no_files(closed: str, tmp_path: Path) -> None:
+    """`>&-` ended in a traceback; the first file that is opened must not become standard output, either."""
+    line = f"{sys.executable} -m pmsmtool tune {ROOT / 'profiles' / 'interior-2k2.toml'} -o {tmp_path / 'd.toml'}"
+    done = subprocess.run(["sh", "-c", f"{line} {closed}"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert (tmp_path / "d.toml").read_text().startswith("# Design of one drive")
+
+
+def test_a_run_that_a_closed_pipe_ends_is_not_recorded_as_a_bug(tmp_path: Path) -> None:
+    run_directory = RunDirectory(tmp_path)
+    run_directory.write(new_record(["test"], drive={}, bus={}, versions={}))
+    with pytest.raises(BrokenPipeError), accounted(run_directory, "identify", lambda line: None):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+    assert run_directory.read().account["exit_code"] == ExitCode.READER_GONE == 141
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pipes of this kind")
+def test_a_closed_pipe_behind_standard_error_is_no_bug(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "pmsmtool", "tune", "interior-2k2", "-o", str(tmp_path / "d.toml")]
+    home = {**os.environ, "PMSMTOOL_HOME": str(tmp_path)}
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=writing, env=home, check=False)
+    os.close(writing)
+    assert done.returncode == ExitCode.READER_GONE
+    assert not list(tmp_path.glob("crashes/*"))
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no pipes of this kind")
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_reader_gone_and_full_disk(unbuffered: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -315,7 +349,7 @@ def test_reader_gone_and_full_disk(unbuffered: str, monkeypatch: pytest.MonkeyPa
     os.close(reading)
     done = subprocess.run(command, cwd=ROOT, stdout=writing, stderr=subprocess.PIPE, text=True)
     os.close(writing)
-    assert (done.returncode, done.stderr) == (failure.READER_GONE, "")
+    assert (done.returncode, done.stderr) == (ExitCode.READER_GONE, "")
     if Path("/dev/full").exists():
         with Path("/dev/full").open("w") as full:
             done = subprocess.run(command, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
