@@ -232,7 +232,9 @@ def test_a_vector_that_turns_between_two_reads_is_no_excess(bench: SimBench, mon
     def slowly(name: str) -> float:
         if name == "i_q_a":
             bench.drive.command_current(0.0, 2.9, fixed_angle_rad=0.0)
-            bench.drive.wait(FRESH_S)
+            for _ in range(20):  # a second, in which the tool asks often enough to be alive
+                bench.drive.wait(0.5 * FRESH_S)
+                bench.drive.node.state()
         value = read(name)
         seen.get(name, []).append(value)
         return value
@@ -240,7 +242,7 @@ def test_a_vector_that_turns_between_two_reads_is_no_excess(bench: SimBench, mon
     with guarded(bench.drive, ENVELOPE) as guard:
         guard.enable()
         guard.command_current(-2.9, 0.0, fixed_angle_rad=0.0)
-        bench.drive.wait(1.0)
+        guard.wait(1.0)
         monkeypatch.setattr(bench.drive, "live", slowly)
         guard.wait(0.0)
         monkeypatch.undo()
