@@ -106,8 +106,8 @@ class GuardedDrive:
 
     # ---- beginning and end ----------------------------------------------------------------------
 
-    def begin(self, *, prove: bool = True) -> None:
-        """Note the marks, bring the limits into the drive, prove the dead-man; the drive is off on return."""
+    def begin(self, *, prove: bool = True, first: Mapping[str, float] | None = None) -> None:
+        """Note the marks, write limits and ``first``, prove the dead-man; the drive is off on return."""
         self.envelope.refuse_gravity()
         if not is_safe(self._node.state()):
             raise SafetyRefusal(
@@ -124,6 +124,7 @@ class GuardedDrive:
         self._refuse_unwatched()
         self._limit_in_drive()
         self._drive.stops_by_ramp = False
+        self.write(first or {})
         if prove:
             self.proof = prove_dead_man(self._drive, self._heartbeat)
 
@@ -514,6 +515,7 @@ def guarded(
     envelope: Envelope,
     *,
     prove: bool = True,
+    first: Mapping[str, float] | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[GuardedDrive]:
     """Lend a drive to an experiment, within an envelope.
@@ -526,6 +528,8 @@ def guarded(
         Its limits.
     prove : bool
         Whether the dead-man is proven first; without it nothing may be enabled.
+    first : mapping, optional
+        Parameters that are written before anything is enabled, the dead-man's proof included.
     say : callable
         Told one line per step.
 
@@ -544,7 +548,7 @@ def guarded(
     interrupted = False
     try:
         try:
-            guard.begin(prove=prove)
+            guard.begin(prove=prove, first=first)
             if guard.proof is not None:
                 say(str(guard.proof))
             yield guard

@@ -32,7 +32,7 @@ from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.evaluate import evaluate
 from pmsmtool.workflow.identified_machine import machine_of
 from pmsmtool.workflow.limits import HEADROOM, Limits, require_speed, unused_current
-from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Measurement, steps_of
+from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Measurement, starting_gains, steps_of
 from pmsmtool.workflow.predicted_file import PREDICTED, dump_predicted
 from pmsmtool.workflow.refused_file import REFUSED, dump_refused, refused_in
 from pmsmtool.workflow.run_account import status_of, text_of
@@ -258,7 +258,7 @@ def _measure(
     def keep(name: str, trace: Trace) -> None:
         run.save(f"traces/{name}.npz", trace_npz(trace))
 
-    with guarded(drive, envelope, say=say) as guard:
+    with guarded(drive, envelope, first=starting_gains(limits), say=say) as guard:
         locked = request.shaft == "locked"
         measurement = Measurement(guard, limits, keep, say, held=locked, half_frequency=request.half_frequency)
         measurement.spent = lambda: (guard.energised_s, guard.energy_j)

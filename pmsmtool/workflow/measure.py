@@ -24,6 +24,7 @@ from pmsmtool.experiments import rotation, speed_run, square_injection, standsti
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.experiments.vector_turn import RAMP_S
+from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.trace import Trace
 from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage, shaft_forecast
 from pmsmtool.workflow.evaluate import resistance_of, tolerance_on
@@ -79,6 +80,19 @@ def steps_of(quantities: Iterable[str], held: bool = False) -> set[str]:
 
 _Found = TypeVar("_Found")
 COMPENSATION = "inverter.deadtime_compensation"
+START_GAIN_SHARE = 1.0 / 15.0
+"""Proportional gain before anything is known, of V_max / I_nom: an eighth of the limit of stability (L times 1.05 per
+period, for a delay of 1.5) where the rated current drops a tenth of the voltage in L and 30 periods are a turn."""
+START_INTEGRAL_RATE_RAD_S = 100.0
+"""Integral gain over the proportional one."""
+
+
+def starting_gains(limits: Limits) -> dict[str, float]:
+    """Return gains from the ratings alone; a drive may hold those of another motor, far too weak or unstable here."""
+    K_p = START_GAIN_SHARE * limits.V_max_v / limits.I_nom_apk
+    gains = {"K_p_d_v_per_a": K_p, "K_p_q_v_per_a": K_p}
+    gains |= {f"K_i_{axis}_v_per_as": START_INTEGRAL_RATE_RAD_S * K_p for axis in "dq"}
+    return {f"current.{name}": min(gain, BY_NAME[f"current.{name}"].maximum) for name, gain in gains.items()}
 
 
 @dataclass(slots=True)
