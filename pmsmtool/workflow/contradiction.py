@@ -314,7 +314,8 @@ def _allowed(
 ) -> tuple[float, float, str]:
     """Return the range a stated value allows, and how that is called."""
     share, text = _share(name, file)
-    low, high = 1.0 - share, 1.0 + share
+    # a catalogue does not say whether its share is of what it states or of what is there
+    low, high = 1.0 - share, 1.0 + share if name in file.std else 1.0 / (1.0 - share)
     machine = file.machine
     span = f"{T_RANGE_C[0]:g} to {T_RANGE_C[1]:g} degC"
     if name == RATIO:
