@@ -183,6 +183,8 @@ def compare(
         What ``stated`` is called.
     """
     found = _measured(values)
+    if PHASE_INDUCTANCE in found and stated is not None and stated.machine.L_d_h == stated.machine.L_q_h:
+        found = dict.fromkeys(("L_d_h", "L_q_h"), found[PHASE_INDUCTANCE]) | found
     sheet = _stated(stated, found)
     accepted = {*accept, *(name for group in _TOGETHER if group & set(accept) for name in group)} & set(ACCEPTABLE)
     rows = []
@@ -235,8 +237,6 @@ def _measured(values: Sequence[Mapping[str, Any]]) -> dict[str, _Measured]:
         found["J_kgm2"] = _Measured(ratio.value * psi.value, half, False, math.nan, math.nan)
     if "L_q_h" not in found and "L_q_app_h" in found:
         found["L_q_h"] = found["L_q_app_h"]
-    for axis in ("L_d_h", "L_q_h") if PHASE_INDUCTANCE in found else ():
-        found.setdefault(axis, found[PHASE_INDUCTANCE])
     return found
 
 

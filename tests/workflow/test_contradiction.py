@@ -139,6 +139,22 @@ def test_one_inductance_for_both_axes_lies_between_them() -> None:
     assert one(0.65 * L_d) == ["L_d_h"] and one(1.6 * L_q) == ["L_q_h"]
 
 
+def test_one_inductance_measured_by_the_drive_lies_between_the_axes() -> None:
+    """A drive that measures one phase, 15 % off at most: it checks neither L_d nor L_q of a salient file."""
+
+    def phase(inductance: float) -> list[dict[str, Any]]:
+        return [{"name": "L_phase_h", "value": inductance, "unit": "H", "source": "vendor"}]
+
+    L_d, L_q = TRUTH.machine.L_d_h, TRUTH.machine.L_q_h
+    for inductance in (L_d, L_q):
+        rows = compare(TRUTH, {}, phase(inductance))
+        assert not wrong(rows) and found(rows)["L_d_h"] == found(rows)["L_q_h"] == "NOT CHECKED"
+    assert wrong(compare(TRUTH, {}, phase(2.0 * L_q))) == ["L_phase_h"]
+    assert wrong(compare(TRUTH, {}, phase(0.5 * L_d))) == ["L_phase_h"]
+    round_rotor = replace(TRUTH, machine=replace(TRUTH.machine, L_q_h=L_d))
+    assert found(compare(round_rotor, {}, phase(L_d)))["L_q_h"] == "agrees"
+
+
 # ---- what the drive holds -----------------------------------------------------------------------------------
 
 

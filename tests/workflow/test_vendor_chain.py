@@ -13,7 +13,7 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
-from pmsmtool.errors import IdentificationError
+from pmsmtool.errors import Contradiction
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.machine_file import load_machine_file
@@ -124,5 +124,5 @@ def test_a_drive_set_to_other_pole_pairs_is_not_pushed(tmp_path: Path) -> None:
 
 
 def test_a_data_sheet_of_another_machine_is_seen(tmp_path: Path) -> None:
-    with pytest.raises(IdentificationError, match="pole_pairs: the data sheet states 4, measured 3"):
+    with pytest.raises(Contradiction, match="pole_pairs: the data sheet states 4, measured 3"):
         chain(tmp_path, without_torque(load_family("synapticon")), pole_pairs=4)
