@@ -68,9 +68,10 @@ def open_node(
     from pmsmtool.drive.drive_node import DriveNode
 
     with bus.connect() as connection:
+        began_s = connection.clock.now()
         node = DriveNode(connection, claimed_node(connection, bus.node), drive_map=drive_map)
         if within_s is not None:
-            node.sdo.finish_within(within_s)
+            node.sdo.finish_within(within_s - (connection.clock.now() - began_s))
         if drive_map is not None and drive_map.name == OWN_FAMILY:
             _refuse_another_family(node)
         yield node

@@ -69,7 +69,7 @@ PMSMTOOL_INTERFACE PMSMTOOL_CHANNEL PMSMTOOL_BITRATE PMSMTOOL_NODE PMSMTOOL_SIM 
                        as -i -c -b -n --sim --trace-can; an option that is typed wins
 PMSMTOOL_JSON PMSMTOOL_VERBOSE PMSMTOOL_QUIET
                        as --json -v -q
-PMSMTOOL_HOME          folder for what must outlive a run (journals, crash reports); now {home}
+PMSMTOOL_HOME          folder for what must outlive a run (journals, locks, crash reports); now {home}
 CAN_INTERFACE CAN_CHANNEL CAN_BITRATE CAN_CONFIG
                        python-can's own, with ~/.canrc, ~/.can, /etc/can.conf and can.ini; decide what is not given
 NO_COLOR               no colours

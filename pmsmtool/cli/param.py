@@ -271,16 +271,13 @@ def _number(text: str, name: str) -> float:
 
 def _read_all(node: DriveNode, wanted: list[_Entry]) -> tuple[list[dict[str, Any]], list[PmsmtoolError]]:
     """Return what each object holds, or why it could not be read, and these errors."""
-    from pmsmtool.bus.sdo import OutOfTime
-    from pmsmtool.errors import BusError, DriveTimeout, PmsmtoolError
+    from pmsmtool.errors import PmsmtoolError
 
     entries, failures = [], []
     for entry in wanted:
         try:
             entries.append(_read(node, entry))
         except PmsmtoolError as error:
-            if isinstance(error, OutOfTime) or (isinstance(error, BusError) and not isinstance(error, DriveTimeout)):
-                raise
             name, (index, sub) = entry
             where = f"0x{index:04X}:{sub:02X}"
             entries.append({"name": name or where, "value": None, "unit": "", "object": where, "error": error.what})
