@@ -268,15 +268,26 @@ class DriveNode:
         try:
             self.sdo.download(index, sub, b"save", retry=Retry.NEVER)
         except DriveTimeout:
-            self._wait_for_store()
+            self.wait_for_store()
 
-    def _wait_for_store(self) -> None:
-        """The confirmation was lost: the drive has finished when 0x1010 can be read again."""
+    def wait_for_store(self) -> None:
+        """Wait where the confirmation is missing: the drive has finished when it answers for 0x1010 again.
+
+        Raises
+        ------
+        DriveTimeout
+            It does not within twice ``STORE_TIMEOUT_S``.
+        """
         deadline = self.connection.clock.now() + STORE_TIMEOUT_S
         while self.connection.clock.now() < deadline:
-            with contextlib.suppress(DriveTimeout, SdoAbort):
-                self.sdo.read(*objects.STORE_ALL)
+            try:
+                self.sdo.upload(*objects.STORE_ALL, tries=1)
                 return
+            except DriveTimeout:
+                pass
+            except SdoAbort as abort:
+                if abort.code in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY):
+                    return  # it answers, and cannot be asked for more
             self.connection.wait(STORE_POLL_S)
         raise DriveTimeout(
             f"the drive does not finish storing within {2 * STORE_TIMEOUT_S:g} s",

@@ -339,6 +339,8 @@ class Download:
             and self._parameters.crc_active == self._crc_before
         ):
             return  # the staged copy was discarded, or lost in a reset; nothing of it ever acted
+        if self.phase is Phase.STORING:
+            self.node.wait_for_store()  # interrupted while the drive stores, which takes no write meanwhile
         old = tuple(_reversed(change) for change in self.plan.entries)
         if self.phase is Phase.ACTIVE and self._was_stored:
             self.node.reset()

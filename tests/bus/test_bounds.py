@@ -228,3 +228,17 @@ def test_a_server_that_does_not_speak_socketcand_is_given_up(greeting: bytes) ->
             connect("socketcand", "vcan0", host="127.0.0.1", port=server.getsockname()[1], ignore_config=True)
         assert time.monotonic() - began < 5.0
         assert caught.value.exit_code == 3 and "\x1b" not in caught.value.what and "Traceback" not in caught.value.what
+
+
+@pytest.mark.parametrize("code", [None, 0x06010001])
+def test_a_store_under_way_is_waited_for_and_no_longer(code: int | None) -> None:
+    """A drive that stores answers nothing meanwhile; one whose 0x1010 cannot be read has finished when it says so."""
+    slave = ScriptedSlave({(0x1010, 1): b"\x01\0\0\0", (0x1000, 0): bytes(4)}, hung=True)
+    if code is not None:
+        slave.refuse[0x1010, 1] = code
+    bus = ScriptedBus(slave)
+    bus.clock.after(1.5, lambda: setattr(slave, "hung", False))
+    node = DriveNode(Connection(bus), NODE)
+    node.sdo.slow_objects.clear()
+    node.wait_for_store()
+    assert 1.5 < bus.clock.now() < 3.0
