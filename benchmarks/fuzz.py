@@ -52,7 +52,7 @@ from pmsmtool.sim.scenarios import load_scenario
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
 from pmsmtool.workflow.report_page import report_page
-from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage, new_record
+from pmsmtool.workflow.run_directory import Acceptance, Stage, new_record
 from tests.bus.frame_fuzz import transfers
 from tests.flash.rig import with_tables
 from tests.node.test_random_requests import FRAMES, test_after_any_requests_a_power_cycle_brings_a_healthy_node
@@ -105,7 +105,12 @@ def _use_snapshot(text: str) -> None:
 
 def _use_backup(text: str) -> None:
     """Read a backup and compare it with the drive it is of, as ``verify`` does."""
-    body = json.loads(text) if text.startswith("{") and text.endswith("}\n") else {}
+    try:
+        body = json.loads(text)
+    except ValueError:
+        body = None
+    if not isinstance(body, dict):
+        return
     body.pop("check", None)
     found = parse_snapshot(json.dumps({**body, "check": check_sum(body)}), "fuzz")
     check_snapshot(reference_map(), found, SNAPSHOT.identity, other_drive=True)
@@ -116,7 +121,7 @@ def _use_run(text: str) -> None:
     path = _SCRATCH / "run" / "run.json"
     path.parent.mkdir(exist_ok=True)
     path.write_text(text, encoding="utf-8", errors="replace")
-    report_page(RunDirectory(path.parent))
+    report_page(path.parent)
 
 
 def _use_look_up(data: bytes) -> None:
@@ -203,8 +208,8 @@ def _backup() -> Snapshot:
 
 
 def _trace() -> Trace:
-    t_s = np.arange(20) * 1e-4
-    return Trace(t_s, {"i_d_a": np.arange(20) * 0.1}, {"i_d_a": "A"}, {"f_s_hz": 1e4})
+    t_s = np.linspace(0.0, 19e-4, 20)
+    return Trace(t_s, {"i_d_a": np.linspace(0.0, 1.9, 20)}, {"i_d_a": "A"}, {"f_s_hz": 1e4})
 
 
 _BACKUP = _backup()

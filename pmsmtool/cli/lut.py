@@ -34,12 +34,12 @@ _TEMPERATURE = Quantity("temperature")
 @click.option("--torque-points", type=int, metavar="N", help="Uniform torque axis.  [default: refined to the bounds]")
 @click.option("--speed-points", "y_points", type=int, metavar="N", help="Uniform second axis.")
 @click.option(
-    "--torque-bound", type=float, metavar="RATIO",
+    "--torque-bound",
+    type=float,
+    metavar="RATIO",
     help="Torque error between nodes / T_max.  [default: 0.01, or the next larger one that fits the drive]",
 )
-@click.option(
-    "--voltage-bound", type=float, metavar="RATIO", help="Voltage excess there / limit.  [default: as above]"
-)
+@click.option("--voltage-bound", type=float, metavar="RATIO", help="Voltage excess there / limit.  [default: as above]")
 @click.option("--stored", type=click.Choice(["auto", "float32", "int16"]), default="auto", help="Format in the drive.")
 @click.option(
     "--u-dc", "U_dc_v", type=Quantity("voltage"), multiple=True, help="DC-link voltage; several: an axis, refined."

@@ -154,14 +154,14 @@ def table_parameters(arrays: Mapping[str, NDArray[Any]], where: str) -> Paramete
     hint = "give lut.npz as `lut` writes it"
     try:
         facts = json.loads(str(arrays["meta"]))
-        kind, stored = facts["axis_kind"], facts["stored"]
+        kind, stored = str(facts["axis_kind"]), str(facts["stored"])
         second = "speed_rpm" if kind == "speed" else "flux_wb"
         z = arrays["U_dc_v"] if "U_dc_v" in arrays else facts["U_dc_v"]
         names = ("torque_nm", second, "i_d_a", "i_q_a")
-        x, y, i_d, i_q = (np.asarray(arrays[name], dtype=np.float64) for name in names)
-    except (KeyError, TypeError, ValueError) as error:
+        x, y, i_d, i_q, z = (np.asarray(one, dtype=np.float64) for one in (*(arrays[name] for name in names), z))
+    except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
         raise ConfigError(f"is no look-up table: {error}", where=where, hint=hint) from None
-    parts = (x, y, np.asarray(z, dtype=np.float64), i_d, i_q)
+    parts = (x, y, z, i_d, i_q)
     cells = parts[0].size * parts[1].size * parts[2].size
     if facts.get("schema") != SCHEMA or kind not in _KINDS or stored not in _FORMATS or {i_d.size, i_q.size} != {cells}:
         raise ConfigError("is no look-up table as a drive stores it", where=where, hint=hint)

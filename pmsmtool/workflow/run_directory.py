@@ -14,9 +14,9 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import ROWS_BYTES, read_text, write_file
@@ -170,11 +170,15 @@ class RunDirectory:
             raise ConfigError(f"the record cannot be read: {error}", where=str(path), hint=_OTHER_RUN) from error
         if not isinstance(raw, dict) or raw.get("schema") != SCHEMA:
             raise ConfigError(f"the record is not of schema {SCHEMA}", where=str(path), hint=_OTHER_RUN)
-        try:
-            raw["stages"] = tuple(_stage(entry) for entry in raw.get("stages", ()))
-            return RunRecord(**raw)
-        except (TypeError, KeyError, AttributeError) as error:
-            raise ConfigError(f"the record is damaged: {error}", where=str(path), hint=_OTHER_RUN) from error
+        wrong = _shape_violations(raw, RunRecord)
+        for k, entry in enumerate(raw["stages"] if isinstance(raw.get("stages"), list) else ()):
+            wrong += [f"stages[{k}] {text}" for text in _stage_violations(entry)]
+        if wrong:
+            raise ConfigError(
+                "the record is damaged", where=str(path), likely="it was edited", hint=_OTHER_RUN, violations=wrong
+            )
+        raw["stages"] = tuple(_stage(entry) for entry in raw.get("stages", ()))
+        return RunRecord(**raw)
 
     def write(self, record: RunRecord) -> None:
         """Replace the record in one step (write beside it, sync, rename)."""
@@ -229,6 +233,56 @@ def _stage(entry: Mapping[str, Any]) -> Stage:
     values = dict(entry)
     values["acceptance"] = tuple(Acceptance(**line) for line in values.get("acceptance", ()))
     return Stage(**values)
+
+
+_SHAPES: dict[str, tuple[type, ...]] = {
+    "str": (str,), "Status": (str,), "bool": (bool,), "float": (int, float),
+    "Mapping": (dict,), "Sequence": (list,),
+}  # fmt: skip
+"""Annotation of a field -> what JSON has in its place."""
+
+
+def _shape_violations(table: Any, kind: type) -> list[str]:
+    """Return which fields of a record are missing, unknown or of another type."""
+    if not isinstance(table, dict):
+        return ["is not a table"]
+    wrong = [f"{name}: unknown" for name in table if name not in {item.name for item in fields(kind)}]
+    for item in fields(kind):
+        shape = str(item.type).split("[")[0]
+        if item.name not in table:
+            if item.default is MISSING and item.default_factory is MISSING:
+                wrong.append(f"{item.name} is missing")
+        elif not isinstance(table[item.name], _SHAPES[shape]) or (shape == "float" and table[item.name] is True):
+            wrong.append(f"{item.name} is {type(table[item.name]).__name__}, not {shape}")
+        elif (str(item.type) == "Sequence[str]" and not all(isinstance(text, str) for text in table[item.name])) or (
+            str(item.type) == "Mapping[str, str]" and not all(isinstance(t, str) for t in table[item.name].values())
+        ):
+            wrong.append(f"{item.name} holds other things than texts")
+        elif str(item.type) == "Sequence[Mapping[str, Any]]" and not all(isinstance(t, dict) for t in table[item.name]):
+            wrong.append(f"{item.name} holds other things than tables")
+    return wrong
+
+
+def _stage_violations(entry: Any) -> list[str]:
+    """Return what is wrong with one stage: types, a status that there is not, values without their numbers."""
+    wrong = _shape_violations(entry, Stage)
+    if wrong:
+        return wrong
+    if entry["status"] not in get_args(Status):
+        wrong.append(f"status = {entry['status']!r} is none of {', '.join(get_args(Status))}")
+    for k, line in enumerate(entry.get("acceptance", ())):
+        wrong += [f"acceptance[{k}]: {text}" for text in _shape_violations(line, Acceptance)]
+    for k, value in enumerate(entry.get("values", ())):
+        numbers = ("value", "std", "systematic") if "std" in value else ("value",) if "source" in value else ()
+        known = [name for name in ("coverage_factor", "T_c") if value.get(name) is not None]
+        wrong += [
+            f"values[{k}]: {name} is not a number"
+            for name in (*numbers, *known)
+            if type(value.get(name)) not in (int, float)
+        ]
+        if numbers and not (isinstance(value.get("name"), str) and isinstance(value.get("unit"), str)):
+            wrong.append(f"values[{k}]: without a name, or without a unit")
+    return wrong
 
 
 def _unwritable(path: Path, error: OSError) -> ConfigError:
