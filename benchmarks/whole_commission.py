@@ -31,11 +31,11 @@ from pmsmtool.sim.node.factory import factory_values, set_up_values
 from pmsmtool.sim.node.memory import FileStorage, Memory
 from pmsmtool.sim.node.parameter_set import ParameterImage
 from pmsmtool.sim.node.store import IMAGE_KEY, SIGNATURE_KEY, encode
-from pmsmtool.workflow.random_drives import data_sheet, draw_drive
+from pmsmtool.workflow.random_drives import Block, data_sheet, draw_drive
 from pmsmtool.workflow.report_page import verdict
 from pmsmtool.workflow.run_directory import RunDirectory
 
-BLOCKS = ("ideal", "timing", "gains")
+BLOCKS: tuple[Block, ...] = ("ideal", "timing", "gains")
 OTHER = 1_000_000
 """Seed of the motor in a drive's memory, above the drive's."""
 PARTIAL = 10

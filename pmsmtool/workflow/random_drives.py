@@ -213,7 +213,7 @@ def data_sheet(drive: MachineFile, seed: int) -> MachineFile:
         key: (getattr(drive.machine, key) or 0.0) * (1.0 + share * rng.uniform(-1.0, 1.0))
         for key, share in CATALOGUE_SHARE.items()
     }
-    return replace(drive, machine=replace(drive.machine, **values), simulation={})
+    return replace(drive, machine=replace(drive.machine, **values), simulation={})  # type: ignore[arg-type]
 
 
 def true_loop_resistance(drive: MachineFile) -> float:
