@@ -71,7 +71,7 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _whole("encoder_bits", 0, 32, 17, "resolution of the encoder per turn, 0 none"),
     _number("encoder_offset_rad", "rad", -_PI2, _PI2, None, "true electrical offset", "[encoder] offset_rad"),
     _flag("encoder_reversed", "the encoder counts against the phase order of the machine"),
-    _flag("leads_swapped", "leads b and c exchanged between drive and machine; loads, traces: along the drive's order"),
+    _flag("leads_swapped", "leads b and c exchanged; load and traces follow the drive's phase order"),
     _number("encoder_once_rad", "rad", -0.1, 0.1, 0.0, "encoder error once per turn, amplitude (mechanical)"),
     _number("encoder_twice_rad", "rad", -0.1, 0.1, 0.0, "encoder error twice per turn, amplitude (mechanical)"),
     _number("encoder_latency_s", "s", 0, 1e-3, 0.0, "age of an encoder sample"),
