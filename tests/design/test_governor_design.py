@@ -13,6 +13,7 @@ from pmsmtool.design.admissible_set import PredictionModel
 from pmsmtool.design.current_loop import imc
 from pmsmtool.design.field_weakening import (
     empty_above_rpm,
+    limit_facts,
     mtpv,
     mtpv_entry_rpm,
     mtpva,
@@ -191,6 +192,15 @@ def test_a_machine_that_can_cancel_its_magnet_has_no_such_speed_but_an_mtpv_entr
     entry = mtpv_entry_rpm(MTPV_MACHINE, 100.0, 150.0)
     assert math.hypot(*mtpv(MTPV_MACHINE, entry * P * math.pi / 30.0, 100.0)) == pytest.approx(150.0, rel=1e-9)
     assert mtpv_entry_rpm(TABLE_1, 0.92 * V_MAX, 56.0) == math.inf
+
+
+@pytest.mark.parametrize("without", ["constant", "magnet"])
+def test_a_flux_map_or_a_machine_without_magnet_has_no_constant_limits(without: str) -> None:
+    source = load_machine_file(PROFILES / "saturated-pmsyrm.toml")
+    assert source.flux_map is not None and source.machine.psi_f_wb > 0.0
+    if without == "magnet":
+        source = replace(source, flux_map=None, machine=replace(source.machine, psi_f_wb=0.0))
+    assert "characteristic_current_apk" not in limit_facts(source, ratings(source, source.inverter.V_max_v), 100.0)
 
 
 def test_tune_says_where_the_machine_ends_and_how_hot_magnets_are() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,6 +50,16 @@ def test_determinant_and_condition_number(omega_e: float, i_q: float) -> None:
     assert np.linalg.det(b) == pytest.approx(point.V_a / SET_A.L_s_h**2, rel=IDENTITY_TOLERANCE)
     scaled = b @ np.diag([V_MAX, 1.0])
     assert np.linalg.cond(scaled) == pytest.approx(V_MAX / point.V_a, rel=IDENTITY_TOLERANCE)
+
+
+@given(speeds, currents, st.floats(0.1, 5.0))
+def test_beside_an_equilibrium_the_current_moves_by_impedance_over_inductance(
+    omega_e: float, i_q: float, off_a: float
+) -> None:
+    point = polar.equilibrium_without_i_d(SET_A, omega_e, i_q, V_MAX)
+    beside = replace(point, i_q=point.i_q + off_a)
+    expected = off_a * math.hypot(SET_A.R_s_ohm / SET_A.L_s_h, omega_e)
+    assert beside.residual_a_per_s(SET_A) == pytest.approx(expected, rel=IDENTITY_TOLERANCE, abs=EQUILIBRIUM_TOLERANCE)
 
 
 @given(st.floats(-1500.0, 1500.0), st.floats(-40.0, 40.0), st.floats(0.5, V_MAX))
