@@ -71,6 +71,8 @@ INVERTER_KEYS: tuple[Key, ...] = (
     _key("inverter", "i_knee_apk", "A", 1e-4, 1e4, None, "current at which it reaches its plateau"),
     _key("inverter", "voltage_error_i_apk", "A", -1e5, 1e5, (), "increasing currents of the table", kind="floats"),
     _key("inverter", "voltage_error_v", "V", -1e3, 1e3, (), "voltage error of one phase there", kind="floats"),
+    _key("inverter", "current_lag_s", "s", 0, 1e-3, None, "time constant of the current sensors"),
+    _key("inverter", "sampling_instant_s", "s", -1e-3, 1e-3, None, "sampling of the currents after the PWM centre"),
 )
 
 ENCODER_KEYS: tuple[Key, ...] = (

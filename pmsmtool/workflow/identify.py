@@ -37,7 +37,7 @@ from pmsmtool.workflow.predicted_file import PREDICTED, dump_predicted
 from pmsmtool.workflow.refused_file import REFUSED, dump_refused, refused_in
 from pmsmtool.workflow.run_account import status_of, text_of
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
-from pmsmtool.workflow.sampling_stage import timing_estimates
+from pmsmtool.workflow.sampling_stage import timing_estimates, with_timing
 from pmsmtool.workflow.verdicts import verdicts_of
 
 MACHINE = "machine.toml"
@@ -312,6 +312,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     rejected = {key for key, line in acceptance.items() if not line.ok}
     kept = evaluation if "flux map" not in rejected else replace(evaluation, flux_map=None, map_estimates={})
     machine = machine_of(kept, nameplate, conditions, rejected)
+    machine = with_timing(machine, timing)
     text = dump_machine_file(machine)
     files = {}
     if verdicts.accepted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,12 @@ from pmsmtool.estimators.inductance import InductanceResult
 from pmsmtool.estimators.resistance import Copper, ResistanceResult, normalised
 from pmsmtool.estimators.sampling_instant import ShownInstant, standstill_instant_s
 from pmsmtool.estimators.switching_ripple import Modulation
+from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 
+LAG = "current_lag_s"
+INSTANT = "sampling_instant_s"
+"""Keys of the current sensors' time constant, and of the sampling instant after the PWM centre."""
 APART_PERIODS = 0.02
 """Standard deviation of instant and lag beside what they do together, which is known better (T_s): a short lag and an
 earlier sample look alike (five late drives: 0.003 to 0.04 T_s off)."""
@@ -68,11 +73,20 @@ def timing_estimates(
     if inductance is None or inductance.sampling is None or shown is None:
         return {}
     std = math.hypot(shown.std_s, APART_PERIODS * shown.period_s)
-    found = {"sampling_instant_s": inductance.sampling.instant_s, "current_lag_s": inductance.sampling.lag_s}
+    found = {INSTANT: inductance.sampling.instant_s, LAG: inductance.sampling.lag_s}
     method = "d voltage of a coasting machine and square waves"
     return {
         name: Estimate(value, std, tolerance.encoder_latency_s, "s", method=method) for name, value in found.items()
     }
+
+
+def with_timing(machine: MachineFile, timing: Mapping[str, Estimate]) -> MachineFile:
+    """Return a machine file with the identified timing of its current sensors: a proof's prediction needs it."""
+    if not timing:
+        return machine
+    lag_s, instant_s = max(0.0, timing[LAG].value), timing[INSTANT].value
+    inverter = replace(machine.inverter, current_lag_s=lag_s, sampling_instant_s=instant_s)
+    return replace(machine, inverter=inverter, estimates={**machine.estimates, **timing})
 
 
 def timing_warnings(shown: ShownInstant | None) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from pmsmtool.design.design_file import Design, DesignValue
@@ -13,12 +14,13 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.port import Injection
 from pmsmtool.errors import NotAvailable
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.parameters import InverterParameters, MachineParameters
+from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.resources import data_folder
 from pmsmtool.workflow.prove.plan import RPM, SIGNALS, STEPS, Conditions, plan_proof
 from pmsmtool.workflow.prove.simulated import BASE_SPEED, SimulatedDrives
 from pmsmtool.workflow.prove.stage import ProofRequest, envelope_of
 from pmsmtool.workflow.random_drives import draw_drive
+from pmsmtool.workflow.sampling_stage import INSTANT, LAG
 
 
 def design(name: str = "interior-2k2") -> Design:
@@ -110,6 +112,25 @@ def test_the_predicted_records_begin_at_their_speed(psi_f_wb: float) -> None:
             once = replace(experiment, rows=experiment.pattern_rows, repeats=1)
             begun = drives.respond(once)[:, SIGNALS.index("omega_e_rad_s"), 0] / (7 * experiment.base_rad_s) - 1.0
             assert (begun >= BASE_SPEED[0] - 0.03).all() and (begun <= BASE_SPEED[1] + 0.03).all()  # 12-bit encoder
+
+
+def test_the_prediction_samples_when_the_identified_sensors_do() -> None:
+    """A lag of 10 us at 40 kHz left a healthy drive outside its band: 0.1 of a period was the most that was drawn."""
+    lag, instant, std = 10e-6, 2e-6, 0.4e-6
+    source = light()
+    inverter = replace(source.inverter, current_lag_s=lag, sampling_instant_s=instant)
+    estimates = {name: Estimate(value, std, 0.0, "s") for name, value in ((LAG, lag), (INSTANT, instant))}
+    for file, known in ((replace(source, inverter=inverter, estimates=estimates), True), (source, False)):
+        made = tune(file, TuneRequest())
+        drawn = SimulatedDrives(
+            made, conditions(made, U_dc_v=24.0), plan_proof(made, conditions(made, U_dc_v=24.0)), 16, 0
+        ).setups
+        lags, shifts = (np.array([getattr(one, name) for one in drawn]) for name in ("sensor_lag", "sampling_shift"))
+        if known:
+            assert lags == pytest.approx(lag, abs=3.0 * std) and np.ptp(lags) > std
+            assert lags + shifts == pytest.approx(lag + instant)
+        else:
+            assert 0.0 <= lags.min() and lags.max() <= 0.1 * inverter.T_s and not shifts.any()
 
 
 def test_a_locked_shaft_leaves_the_current_steps() -> None:

@@ -31,6 +31,7 @@ from pmsmtool.sim.signals import Truth
 from pmsmtool.sim.simulated_machine import MODELS, SHAPES, build_setup
 from pmsmtool.workflow.prove.defects import DEFECTS, QUANTITIES, Defect, is_possible
 from pmsmtool.workflow.prove.plan import SIGNALS, Conditions, Experiment, ProofPlan
+from pmsmtool.workflow.sampling_stage import INSTANT, LAG
 
 RUNS = 96
 """Drawn machines: the largest of 96 holds 95 % of all with a confidence of 99.3 %."""
@@ -53,7 +54,9 @@ FRICTION_SHARE = 0.03
 FRICTION_FACTOR = 2.0
 """Factor either way where it gives them."""
 LAG_SHARE = 0.1
-"""Largest lag of the current sensors, of the control period, that the design does not know."""
+"""Largest lag of the current sensors, of the control period, where it was not identified."""
+TIMING_COVERAGE = 2.0
+"""Half range of identified lag and instant, of their standard deviation."""
 OFFSET_SHARE = 0.001
 MISMATCH = 0.002
 """Standard deviations of sensor offsets (of I_max) and of the phases' gains against each other."""
@@ -303,10 +306,25 @@ def _draw(
     setup.sensors.offset[:] = list(rng.normal(0.0, OFFSET_SHARE * I_max, 3))
     setup.sensors.gain[:] = list(rng.normal(1.0, MISMATCH, 3))
     _draw_inverter(setup, machine, rng)
-    setup.sensor_lag = float(rng.uniform(0.0, LAG_SHARE)) * machine.inverter.T_s
+    setup.sensor_lag, setup.sampling_shift = _timing(machine, rng, late=setup.delay > 0)
     setup.theta_M = float(rng.uniform(-math.pi, math.pi))
     setup.seed = int(rng.integers(2**62))
     return setup
+
+
+def _timing(machine: MachineFile, rng: np.random.Generator, *, late: bool) -> tuple[float, float]:
+    """Draw the lag of the current sensors and the sampling instant (s): about what was identified, else a short lag.
+
+    What both do together is known better than either: what one is drawn longer, the other is earlier.
+    """
+    lag, instant, T_s = machine.inverter.current_lag_s, machine.inverter.sampling_instant_s, machine.inverter.T_s
+    where = float(rng.uniform(0.0, 1.0))
+    if lag is None or instant is None:
+        return where * LAG_SHARE * T_s, 0.0
+    stds = [machine.estimates[name].std for name in (LAG, INSTANT) if name in machine.estimates]
+    apart = (2.0 * where - 1.0) * TIMING_COVERAGE * math.hypot(*stds)
+    shift = max(-T_s, min(T_s, instant - apart))
+    return max(0.0, lag + apart), shift if late else min(0.0, shift)
 
 
 def _draw_inverter(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
