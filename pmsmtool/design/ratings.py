@@ -16,7 +16,7 @@ from pmsmtool.design.lookup_table import RPM, torque_limits
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.machine.parameters import InverterParameters
+from pmsmtool.machine.parameters import InverterParameters, MachineParameters
 from pmsmtool.machine.temperature import loop_coefficient_per_k
 from pmsmtool.params.catalogue import BY_NAME
 
@@ -34,6 +34,9 @@ WINDING_LIMIT_C = 155.0
 
 OVERLOAD_S = 10.0
 """Time I_max may flow where the machine file does not say."""
+
+MAGNET_SHARE = 0.7
+"""Share of the magnet's flux linkage that i_d may oppose where no demagnetisation limit is given."""
 
 GIVEN = "machine file"
 
@@ -103,8 +106,10 @@ def ratings(source: MachineFile, V_limit_v: float) -> Ratings:
         I_cont, methods["I_cont"] = I_nom, "rated current"
     I_cont = min(I_cont, I_max)
     i_d_min = limits.i_d_min_apk
-    if i_d_min is None or i_d_min < -I_max:
-        i_d_min, methods["i_d_min"] = -I_max, "-I_max: no nearer demagnetisation limit is given"
+    if i_d_min is None:
+        i_d_min, methods["i_d_min"] = _assumed_i_d_min(machine, I_nom, I_max)
+    elif i_d_min < -I_max:
+        i_d_min, methods["i_d_min"] = -I_max, "-I_max: nearer than the machine file's limit"
     base = base_speed_rpm(source, I_nom, i_d_min, V_limit_v)
     n_max = machine.n_max_rpm
     if n_max is None:
@@ -121,6 +126,16 @@ def ratings(source: MachineFile, V_limit_v: float) -> Ratings:
 
 
 _UNLIMITED_V = 1e9
+
+
+def _assumed_i_d_min(machine: MachineParameters, I_nom: float, I_max: float) -> tuple[float, str]:
+    """Return the most negative i_d (A) where no demagnetisation limit is given, and how it was found."""
+    if machine.psi_f_wb <= 0.0:
+        return -I_max, "-I_max: no magnet to demagnetise"
+    weakened = MAGNET_SHARE * machine.psi_f_wb / machine.L_d_decoupling_h
+    if weakened < I_nom:
+        return -weakened, f"assumed: -{MAGNET_SHARE:g} psi_f/L_d, no i_d_min_apk is given"
+    return -I_nom, "assumed: -I_nom, no i_d_min_apk is given"
 
 
 def base_speed_rpm(source: MachineFile, I_apk: float, i_d_min_a: float, V_limit_v: float) -> float:

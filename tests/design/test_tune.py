@@ -15,7 +15,9 @@ from pmsmtool.cli.main import cli
 from pmsmtool.design.bandwidth import choose_current, least_inductance
 from pmsmtool.design.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.design.design_file import Design, design_text, load_design, parse_design
-from pmsmtool.design.ratings import base_speed_rpm, dead_time_compensation
+from pmsmtool.design.lookup_table import torque_limits
+from pmsmtool.design.operating_machine import at_temperature
+from pmsmtool.design.ratings import base_speed_rpm, dead_time_compensation, ratings
 from pmsmtool.design.sampled_loop import margins
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
@@ -25,6 +27,7 @@ from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import InverterParameters, MachineLimits, MachineParameters
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import parse_parameter_set
+from pmsmtool.workflow.random_drives import draw_drive
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 
@@ -149,6 +152,29 @@ def test_without_inertia_the_speed_loop_is_off_and_said_so() -> None:
     assert design["speed.K_p_nms_per_rad"] == design["speed.K_i_nm_per_rad"] == 0.0
     assert "speed" not in design.loops
     assert any("inertia" in note for note in design.notes)
+
+
+def test_without_a_demagnetisation_limit_the_smaller_of_magnet_and_rated_current_is_assumed() -> None:
+    strong = tune(SURFACE).values["field_weakening.i_d_min_a"]  # 0.7 * 0.41 Wb / 2.3 mH = 125 A, rated 28 A
+    assert strong.value == -28.0
+    assert strong.method.startswith("assumed: -I_nom")
+    machine = replace(SURFACE.machine, L_d_h=14e-3, L_q_h=14e-3)  # 0.7 * 0.41 Wb / 14 mH = 20.5 A
+    weak = ratings(replace(SURFACE, machine=machine), 100.0)
+    assert weak.i_d_min_a == pytest.approx(-20.5)
+    assert weak.methods["i_d_min"].startswith("assumed: -0.7 psi_f/L_d")
+    reluctance = replace(SURFACE, machine=replace(SURFACE.machine, psi_f_wb=0.0))
+    assert ratings(reluctance, 100.0).i_d_min_a == -56.0  # no magnet, nothing to demagnetise
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_with_the_assumed_limit_a_healthy_machine_still_gives_full_torque_at_its_rated_speed(seed: int) -> None:
+    drive = draw_drive(seed)
+    rated = ratings(drive, 0.95 * drive.inverter.V_max_v)
+    assert rated.i_d_min_a >= -(drive.machine.I_nom_apk or 0.0)
+    plane = at_temperature(drive.machine, drive.flux_map)
+    omega = (drive.machine.n_nom_rpm or 0.0) * math.pi / 30.0 * drive.machine.pole_pairs
+    held = torque_limits(plane, [omega], [0.95 * drive.inverter.V_max_v], rated.I_max_apk, rated.i_d_min_a)
+    assert float(held.largest_nm[0, 0]) >= 0.99 * rated.tau_max_nm
 
 
 def test_limits_of_the_machine_file_win_over_assumptions() -> None:
