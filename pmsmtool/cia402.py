@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from enum import IntEnum, IntFlag
 
+HOMING_LOST = "homing is lost"
+"""Said before an alignment, a change of the encoder's parameters and a reset: the position reference is gone after."""
+
 
 class State(IntEnum):
     """States of the power drive system; the value is the statusword pattern of the state."""

@@ -72,8 +72,7 @@ def write_plan(
     )  # fmt: skip
     job.admit()  # nobody is asked for what would be refused after his consent
     if job.has_work(store=store):
-        stored = "the set is stored, and the drive is reset to see it: homing is lost"
-        lines = [*plan.lines(), stored if store else "not stored"]
+        lines = [*plan.lines(), *plan.after_lines(store=store)]
         ask_writing(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
     return job.run(store=store, restoring=restoring)
 

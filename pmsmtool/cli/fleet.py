@@ -100,8 +100,8 @@ def _ask(
 ) -> None:
     from pmsmtool.cli.consent import ask_writing
 
-    kept = "each set is stored, and each drive is reset to see it" if store else "not stored"
-    ask_writing([*lines, kept], motion, simulated=bus.simulated(), serial=due[0].identity.serial, out=out)
+    after = [f"node {job.node.node}: {line}" for job in due for line in job.plan.after_lines(store=store)]
+    ask_writing([*lines, *after], motion, simulated=bus.simulated(), serial=due[0].identity.serial, out=out)
 
 
 def _refuse_serial(motion: MotionOptions) -> None:

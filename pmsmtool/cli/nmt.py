@@ -18,6 +18,7 @@ COMMANDS = ("start", "stop", "pre-operational", "reset-node", "reset-communicati
 def nmt_command(bus: BusOptions, out: Output, command: str) -> None:
     """Send an NMT command to one node; refused while its power stage may be on (exit code 5)."""
     from pmsmtool.bus.nmt import NmtCommand, send_nmt
+    from pmsmtool.cia402 import HOMING_LOST
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.errors import DriveTimeout, SdoAbort
     from pmsmtool.flash.download import refuse_while_enabled
@@ -32,6 +33,7 @@ def nmt_command(bus: BusOptions, out: Output, command: str) -> None:
         except DriveTimeout:
             out.warn("the node answers no SDO (it may be stopped): its state is not known")
         if wanted is NmtCommand.RESET_NODE:
+            out.note(f"the drive is reset: {HOMING_LOST}")
             node.reset()
         else:
             with node.supervision.expected_reset():

@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.params.catalogue import BY_NAME
@@ -111,6 +112,13 @@ class Plan:
         equal = len(self.entries) - len(rows)
         lines.append(f"{len(rows)} of {len(self.entries)} objects change, {equal} hold their value already")
         return [*lines, *self.left_out()]
+
+    def after_lines(self, *, store: bool) -> list[str]:
+        """Return what follows once the set is written: storing and reset, and homing where either takes it."""
+        if store:
+            return [f"the set is stored, and the drive is reset to see it: {HOMING_LOST}"]
+        encoder = any(change.name.startswith("encoder.") for change in self.changes)
+        return ["not stored", *([f"the encoder's parameters change: {HOMING_LOST}"] if encoder else [])]
 
     def left_out(self) -> list[str]:
         """Return what of the set is not written: by name where the map says why, the rest as a number."""

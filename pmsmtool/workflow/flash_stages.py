@@ -42,7 +42,7 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
         consent(
             [
                 *plan.lines(_unchecked_marks(run, [change.name for change in plan.changes])),
-                "the set is stored, and the drive is reset to see it: homing is lost",
+                *plan.after_lines(store=True),
             ]
         )
     outcome = download.run()

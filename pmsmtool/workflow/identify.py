@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft, largest_acceleration
 from pmsmtool.drive.guard import guarded
@@ -177,7 +178,7 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
     """Return what a person reads before consenting: the envelope and what will happen inside it."""
     steps = steps_of(request.quantities, request.shaft == "locked")
     allowed = [*envelope.lines(), *unused_current(envelope.i_max_apk, nameplate, pulses="map" in steps)]
-    lines = [*allowed, "the rotor aligns with current vectors: it may jump by half an electrical turn; homing is lost"]
+    lines = [*allowed, f"the rotor aligns with current vectors: it may jump by half an electrical turn; {HOMING_LOST}"]
     if request.half_frequency:
         lines.append(half_frequency.PLAN_LINE)
     if "rotation" in steps:

@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope, largest_acceleration
@@ -322,6 +323,7 @@ def tier_stage(
             where=f"node {drive.node.node}",
             hint="`pmsmtool commission MACHINE` takes them from a machine file (`pmsmtool machine new` writes one)",
         )
+    moves.append(f"the shaft does not come back to where it stood: {HOMING_LOST}")
     allow_motion([*envelope.lines(), *moves, "nothing is stored in the drive; every changed object is restored"])
     clock = drive.node.connection.clock
     start = clock.now()

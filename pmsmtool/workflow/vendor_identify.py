@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
+from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
@@ -123,6 +124,8 @@ def vendor_stage(
         envelope = tier_envelope(own, request, None if known is None else known[0])
         envelope.refuse_gravity()
         moves = [f"{step.title}: {step.moves}; at most {step.timeout_s:g} s" for step in steps]
+        if request.shaft != "locked":
+            moves.append(f"the drive moves the rotor: {HOMING_LOST}")
         restored = "nothing is stored in the drive; every changed object is restored"
         allow_motion([*envelope.lines(), *moves, BY_ITSELF, restored])
         clock = own.node.connection.clock
