@@ -131,8 +131,10 @@ def nameplate_of(drive: Drive, name: str) -> MachineFile:
         delay_periods=read("inverter.delay_periods"),
         voltage_utilisation=read("inverter.voltage_utilisation"),
     )
+    i_d_min = read("field_weakening.i_d_min_a")
     limits = MachineLimits(
-        i_d_min_apk=read("field_weakening.i_d_min_a"),
+        # what is no nearer than I_max is no demagnetisation limit: the design then assumes one
+        i_d_min_apk=i_d_min if i_d_min > -read("motor.I_max_apk") else None,
         i_trip_apk=read("protection.i_trip_apk"),
         I_cont_apk=read("protection.I_cont_apk"),
         U_dc_min_v=read("protection.U_dc_min_v"),

@@ -11,8 +11,9 @@ from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.experiments.rotation import SLOWEST_STEP_S, STEP_RAD, dwell_within
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import MachineLimits
+from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.resources import data_folder
-from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, plan_lines
+from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of, plan_lines
 from pmsmtool.workflow.limits import LEAST_SPEED_SHARE, Limits, require_speed, unused_current
 
 GIVEN = {"I_nom_apk": 5.0, "i_max_apk": 6.0, "omega_max_rad_s": 300.0, "V_max_v": 28.0}
@@ -70,3 +71,21 @@ def test_a_speed_limit_too_low_for_the_slow_turn_is_refused_with_the_least_one()
         dwell_within(0.015, 1.0 * math.pi / 30.0)
     least = float(caught.value.hint.split("--speed-max ")[1].removesuffix("rpm"))
     assert dwell_within(0.015, least * math.pi / 30.0) <= SLOWEST_STEP_S
+
+
+class _Held:
+    """A drive that holds a set; the rest of it is not asked for."""
+
+    def __init__(self, **changed: float) -> None:
+        self._changed = {name.replace("__", "."): value for name, value in changed.items()}
+
+    def read(self, name: str) -> float:
+        return self._changed.get(name, BY_NAME[name].default)
+
+
+@pytest.mark.parametrize(("held", "known"), [(-12.0, None), (-15.0, None), (-10.0, -10.0)])
+def test_a_drive_whose_i_d_may_reach_the_largest_current_states_no_demagnetisation_limit(
+    held: float, known: float | None
+) -> None:
+    drive = _Held(motor__I_max_apk=12.0, motor__I_nom_apk=6.0, field_weakening__i_d_min_a=held)
+    assert nameplate_of(drive, "held").limits.i_d_min_apk == known  # type: ignore[arg-type]
