@@ -338,10 +338,11 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
         return
     refused = [f"{name}: {reason}" for name, reason in stage.refused.items()]
     if stage.status == "partial":
+        where = "machine.toml" if any(name.endswith("machine.toml") for name in stage.files) else "run.json"
         raise Partial(
             f"{len(stage.refused)} of the quantities asked for {'is' if len(stage.refused) == 1 else 'are'} refused",
             where=str(run.path),
-            hint="the accepted values stand in machine.toml; `pmsmtool help refusals` explains each name",
+            hint=f"the accepted values stand in {where}; `pmsmtool help refusals` explains each name",
             missing=refused,
         )
     from pmsmtool.workflow.commission import NOT_ACCEPTED

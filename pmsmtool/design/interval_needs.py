@@ -65,14 +65,14 @@ class Need:
 
 
 def interval_needs(
-    source: MachineFile, half_widths: Mapping[str, float], request: MarginRequest | None = None
+    source: MachineFile | None, half_widths: Mapping[str, float], request: MarginRequest | None = None
 ) -> dict[str, tuple[Need, ...]]:
     """Return the criteria of every value's interval, the others at their nominal value.
 
     Parameters
     ----------
-    source : MachineFile
-        The machine; its own default design is what is judged.
+    source : MachineFile or None
+        The machine; its own default design is what is judged. None: no machine is known.
     half_widths : mapping of str to float
         Half of the total 95 % interval (SI) of keys of ``JUDGED``; others are left out.
     request : MarginRequest, optional
@@ -81,22 +81,31 @@ def interval_needs(
     Returns
     -------
     dict of str to tuple of Need
-        Empty where no design can be made from the machine file: then tune says why, and no interval is judged.
+        Where no design can be made, tune says why, and only an angle is judged: by the torque that it takes.
     """
     request = MarginRequest() if request is None else request
+    without_design = {OFFSET: (_torque_of_angle(half_widths[OFFSET]),)} if OFFSET in half_widths else {}
+    if source is None:
+        return without_design
     try:
         design = tune(source, _BARE)
         problem = margin_problem(design)
         rated = ratings(source, problem.limits.utilisation * source.inverter.U_dc_v)
         base_rpm = base_speed_rpm(source, rated.I_nom_apk, rated.i_d_min_a, source.inverter.V_max_v)
     except (ConfigError, DesignInfeasible):
-        return {}
+        return without_design
     loops = (*(f"current_{axis}" for axis in "dq"), *(("speed",) if problem.speed is not None else ()))
     found: dict[str, tuple[Need, ...]] = {}
     for name, half in half_widths.items():
         if name in JUDGED and (name == OFFSET or getattr(source.machine, name)):
             found[name] = tuple(_needs(source, problem, loops, base_rpm, request, name, half))
     return found
+
+
+def _torque_of_angle(half: float) -> Need:
+    """Return the torque per current over the interval of the encoder's angle: its cosine."""
+    worst = 100.0 * math.cos(min(half, math.pi))
+    return Need("torque per current", "%", 100.0, worst, 100.0 * (1.0 - TORQUE_SHORTFALL))
 
 
 def _needs(

@@ -42,10 +42,23 @@ def had_of(evaluation: Evaluation) -> list[str]:
     return [name for name, result in results.items() if result is not None]
 
 
-def judged_values(found: Mapping[str, Estimate], machine: MachineFile) -> dict[str, Acceptance]:
-    """Return the criterion of every value by its key: what binds the design of the machine first over its interval."""
-    needs = interval_needs(machine, {name: total_half_width(estimate) for name, estimate in found.items()})
-    return {name: _accepted(name, estimate, needs.get(name, ())) for name, estimate in found.items()}
+STANDS_FOR: Mapping[str, str] = {"L_q_app_h": "L_q_h", "J_per_psi": "J_kgm2"}
+"""Values of a drive without injection, and the machine key whose place they take: loops depend on the ratio J/psi."""
+
+
+def judged_values(found: Mapping[str, Estimate], machine: MachineFile | None) -> dict[str, Acceptance]:
+    """Return the criterion of every value by its key: what binds the design of the machine first over its interval.
+
+    Without a machine there is no design; then only an angle has a limit of its own.
+    """
+    halves = {name: total_half_width(estimate) for name, estimate in found.items()}
+    for name, key in STANDS_FOR.items():
+        if machine is not None and name in halves and found[name].value:
+            halves[key] = halves[name] / abs(found[name].value) * abs(getattr(machine.machine, key) or 0.0)
+    needs = interval_needs(machine, halves)
+    return {
+        name: _accepted(name, estimate, needs.get(STANDS_FOR.get(name, name), ())) for name, estimate in found.items()
+    }
 
 
 def summary_of(evaluation: Evaluation, found: Mapping[str, Estimate]) -> str:
@@ -128,7 +141,7 @@ def _accepted(name: str, estimate: Estimate, needs: Sequence[Need]) -> Acceptanc
     width = f"{math.degrees(half):.3g} deg" if name == OFFSET else f"{100.0 * relative:.2g} %"
     what = f"{name}: total 95 % interval"
     if not needs:  # no design, or nothing of it depends on the value
-        return Acceptance(what, width, "100 %, no design depends on it", name == OFFSET or relative < 1.0)
+        return Acceptance(what, width, "100 %, no design depends on it", relative < 1.0)
     binding = min(needs, key=lambda need: need.reserve)
     return Acceptance(
         what,

@@ -14,7 +14,7 @@ from typing import Literal
 
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
-from pmsmtool.estimators.estimate import SENSOR_GAIN_TOLERANCE, SensorTolerance, total_half_width
+from pmsmtool.estimators.estimate import SENSOR_GAIN_TOLERANCE, SensorTolerance
 from pmsmtool.estimators.flux_linkage import normalised as flux_at_reference
 from pmsmtool.estimators.inertia_ratio import estimate_ratios
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
@@ -29,7 +29,6 @@ from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
-from pmsmtool.units import format_estimate
 from pmsmtool.workflow.calibration import calibrated_traces
 from pmsmtool.workflow.evaluate import tolerance_on
 from pmsmtool.workflow.identify import (
@@ -42,10 +41,10 @@ from pmsmtool.workflow.identify import (
     place_of,
 )
 from pmsmtool.workflow.identify import replay as replay_injection
-from pmsmtool.workflow.identify_verdict import value_facts
 from pmsmtool.workflow.push_limits import not_told, without
-from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
-from pmsmtool.workflow.tier_machine import TierMachine, tier_machine
+from pmsmtool.workflow.run_directory import RunDirectory, Stage
+from pmsmtool.workflow.tier_machine import tier_machine
+from pmsmtool.workflow.tier_verdict import TOLD_BY, judged, stage_of
 
 FACTS = "tier.json"
 """What the estimates depend on besides traces, request and nameplate."""
@@ -58,19 +57,6 @@ SUPPLY_LEVELS = "supply_levels"
 NO_VOLTAGE = "needs injection, or a recorder of voltages at loop rate"
 NO_POLE_PAIRS = "needs the pole pairs: mode 11, an object in the drive's map, or a machine file"
 NO_LINK = "needs the DC link (0x6079) or the machine's voltage"
-OFFSET_LIMIT_RAD = math.radians(2.5)
-"""Largest total 95 % half width of an accepted encoder offset; measured: 1.66 to 1.77 deg on nine of ten drives."""
-LIMITS: Mapping[str, float] = {
-    "R_s_ohm": 0.15, "psi_f_wb": 0.08, "L_q_app_h": 0.15, "J_per_psi": 0.05, "pole_pairs": 0.05,
-}  # fmt: skip
-"""Largest relative total 95 % half width of an accepted value."""
-TOLD_BY = {
-    "R": "R_s_ohm", "L": "L_q_app_h", "psi": "psi_f_wb", "encoder": "offset_rad", "poles": "pole_pairs",
-    "mechanics": "J_per_psi",
-}  # fmt: skip
-"""Key of the estimate that answers for a quantity."""
-
-
 Voltage = Literal["machine", "link", ""]
 
 
@@ -204,7 +190,7 @@ def _by_recorder(
         estimates |= estimate_ratios(pushes, pole_pairs=facts.pole_pairs, tolerance=tolerance)
     except IdentificationError as error:
         missing["J_per_psi"] = error.what
-    reasons = not_told(estimates, pushes, LIMITS["L_q_app_h"])
+    reasons = not_told(estimates, pushes)
     return TierResult(without(estimates, reasons), missing | reasons, traces)
 
 
@@ -291,14 +277,16 @@ def evaluated_stage(
     if not any(TOLD_BY.get(name) in result.estimates for name in request.quantities):
         reasons = [f"{name}: not available: {why}" for name, why in result.missing.items()]
         raise NotAvailable("\n  - ".join(["nothing of what was asked could be told", *reasons]), where=str(run.path))
-    made = tier_machine(known, result.estimates, facts.source)
+    designed = tier_machine(known, result.estimates, facts.source).machine
+    judgement = judged(result.estimates, result.missing, request.quantities, designed)
+    made = tier_machine(known, judgement.kept(result.estimates), facts.source)
     files = dict.fromkeys((*(f"traces/{name}.npz" for name in traces), REQUEST, FACTS), "")
-    if made.machine is not None:
+    if made.machine is not None and judgement.verdicts.accepted:
         text = dump_machine_file(made.machine)
         place, prefix = place_of(run, text)
         place.save(MACHINE, text)
         files[f"{prefix}{MACHINE}"] = ""
-    return replace(_judged(result, made, facts.source), files=files)
+    return replace(stage_of(result.estimates, result.missing, made, judgement, facts.source), files=files)
 
 
 def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibration: Sequence[str] = ()) -> Stage:
@@ -358,36 +346,3 @@ def parse_facts(text: str, *, where: str) -> TierFacts:
             hint="identify again; or take the file from a copy of the run",
         ) from error
     return found
-
-
-def _judged(result: TierResult, made: TierMachine, source: str) -> Stage:
-    criteria = [_accepted(name, e) for name, e in result.estimates.items() if _limit(name)]
-    values = [value_facts(name, estimate) for name, estimate in result.estimates.items()]
-    summary = ", ".join(
-        f"{name} {format_estimate(e.value, total_half_width(e), e.unit)}" for name, e in result.estimates.items()
-    )
-    lost = [f"{name} not told: {why}" for name, why in result.missing.items() if why not in (NO_POWER, NO_VOLTAGE)]
-    fallen = [f"{name}: {estimate.fallback}" for name, estimate in result.estimates.items() if estimate.fallback]
-    note = "a part of the machine only: no machine file is written"
-    return Stage(
-        "identify",
-        "pass" if all(line.ok for line in criteria) else "fail",
-        0.0,
-        values=[*values, *made.given_values(source)],
-        acceptance=criteria,
-        fallbacks=[*(f"{name}: not available: {why}" for name, why in result.missing.items()), *fallen, *made.notes],
-        note=note if made.machine is None else "",
-        summary="; ".join([summary, *lost, *([f"{source}: {', '.join(made.given)}"] if made.given else [])]),
-    )
-
-
-def _limit(name: str) -> float:
-    return OFFSET_LIMIT_RAD if name == "offset_rad" else LIMITS.get(name, 0.0)
-
-
-def _accepted(name: str, estimate: Estimate) -> Acceptance:
-    half, limit, what = total_half_width(estimate), _limit(name), f"{name}: total 95 % interval"
-    if name == "offset_rad":
-        return Acceptance(what, f"{math.degrees(half):.3g} deg", f"{math.degrees(limit):.3g} deg", half <= limit)
-    share = half / abs(estimate.value)
-    return Acceptance(what, f"{100.0 * share:.2g} %", f"{100.0 * limit:.2g} %", share <= limit)

@@ -39,6 +39,7 @@ from pmsmtool.workflow.tier_evaluate import NO_POLE_PAIRS
 from pmsmtool.workflow.tier_identify import can_measure, tier_stage
 from pmsmtool.workflow.tier_machine import NEEDED, tier_machine
 from pmsmtool.workflow.vendor_identify import chain_stage, vendor_line
+from pmsmtool.workflow.verdicts import blocking
 
 DATA_SHEET = "as given"
 SET_UP = "the drive's own set, from its maker's set-up"
@@ -158,12 +159,12 @@ class TierStages:
         reason = self._nothing()
         if self._own_line() and request.shaft != "locked":
             asked = replace(request, quantities=tuple(self._quantities()))
-            return chain_stage(self.run, self.drive, self.found, asked, allow, say, known=known)
+            return _stopped(chain_stage(self.run, self.drive, self.found, asked, allow, say, known=known))
         if not reason and request.shaft == "locked":
             reason = "needs a rotor that may turn, and the shaft is locked"
         if not reason:
             asked = replace(request, quantities=tuple(self._quantities()))
-            return tier_stage(self.run, self.drive, self.found, asked, allow, say, known=known)
+            return _stopped(tier_stage(self.run, self.drive, self.found, asked, allow, say, known=known))
         if known is not None:
             made = tier_machine(known[0], {}, known[1])
             assert made.machine is not None
@@ -306,6 +307,11 @@ class TierStages:
     def _refuse(self, reason: str) -> None:
         if reason:
             raise NotAvailable(reason, where=f"node {self.found.identity.node}")
+
+
+def _stopped(stage: Stage) -> Stage:
+    """Return a stage that fails where pole pairs or angle are refused; what else is lacking is as given, unchecked."""
+    return replace(stage, status="fail") if blocking(stage.refused, given=True) else stage
 
 
 def _without_base(run: RunDirectory, drive_map: DriveMap) -> list[str]:

@@ -37,6 +37,7 @@ from pmsmtool.workflow.vendor_machine import (
     vendor_facts,
     vendor_machine,
 )
+from pmsmtool.workflow.verdicts import KEYS
 
 ANSWERS = "vendor_tuning.json"
 """What the drive answered, byte by byte."""
@@ -249,9 +250,10 @@ def _wrong_set_up(drive: CanopenDrive, own: Stage) -> str:
 
 def _joined(run: RunDirectory, own: Stage, rest: Stage, known: Known) -> Stage:
     """Join both: a measured value with its interval outranks the drive's own, which is then named beside it."""
-    measured = {str(value["name"]): value for value in rest.values if "std" in value}
+    measured = {str(value["name"]): value for value in rest.values if "std" in value and value.get("accepted", True)}
     vendor = {str(value["name"]): value for value in own.values if value["source"] == SOURCE}
     kept = {name: value for name, value in vendor.items() if name not in measured}
+    refused = {name: why for name, why in rest.refused.items() if not set(KEYS.get(name, ())) & set(kept)}
     given = [value for value in rest.values if "std" not in value and value["name"] not in vendor]
     beside = [
         f"{name}: the drive's own value is {format_quantity(value['value'], value['unit'])}, "
@@ -263,9 +265,11 @@ def _joined(run: RunDirectory, own: Stage, rest: Stage, known: Known) -> Stage:
         _write_sources(run, [str(value["name"]) for value in given], known[1])
     return replace(
         rest,
+        status="partial" if refused else "pass",  # the drive's own values are accepted, or it ended there
+        refused=refused,
         seconds=own.seconds + rest.seconds,
         values=[*measured.values(), *kept.values(), *given],
-        acceptance=[*own.acceptance, *rest.acceptance],
+        acceptance=[*own.acceptance, *(line for line in rest.acceptance if line.ok)],
         fallbacks=[*own.fallbacks, *beside, *rest.fallbacks],
         files={**own.files, **rest.files},
         summary="; ".join([own.summary.split("; ")[0], *rest.summary.split("; ")[:1], *_given_text(given, known)]),

@@ -38,13 +38,13 @@ def largest_current_a() -> float:
 
 
 def test_a_strongly_saturated_machine_gives_what_it_can(capsys: pytest.CaptureFixture[str]) -> None:
-    assert identified("saturated-pmsyrm") == 0
+    assert identified("saturated-pmsyrm") == 10
     printed = capsys.readouterr()
     values = {value["name"]: value for value in json.loads(printed.out)["values"]}
     psi = values["psi_f_wb"]
     assert abs(psi["value"] - 0.47669) < psi["total_95"] < 0.02 * 0.47669
     assert "J_per_psi" not in values and "tau_c_per_psi" not in values
-    assert "J_per_psi: not available: this drive lets a d current flow" in printed.err
+    assert "mechanics refused: E_NOT_MEASURED: this drive lets a d current flow" in printed.err
     assert largest_current_a() < 1.2 * 12.45 * 1.25, "measured 14.1; 26.0 before"
 
 
