@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,10 +33,12 @@ from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate, MachineParameters
-from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K
+from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, UNKNOWN_T_RANGE_C
 from pmsmtool.trace import Trace
 
 STAGE = "resistance"
+R_MEASURED = "R_s_ohm_measured"
+"""Name of the resistance at the temperature of the test: what no normalisation widens."""
 Vector = NDArray[np.float64]
 
 TAIL_POWERS = (1, 2, 3, 4, 6)
@@ -407,25 +409,23 @@ def _check_result(R: float, std: float, half_width_limit: float) -> None:
 
 
 def normalised(measured: Estimate, copper: Copper, tolerance: SensorTolerance) -> Estimate:
-    """Return R with its copper part moved from its measured temperature to the reference temperature."""
+    """Return R with its copper part moved from its measured temperature to the reference temperature.
+
+    Where no sensor tells the temperature, the value is the measured one, which is what loops meet, and its systematic
+    half width reaches to what it would be at the reference temperature, had the winding had 5 or 90 degC.
+    """
     if not math.isfinite(measured.T_c):
-        return Estimate(
-            value=measured.value,
-            std=measured.std,
-            systematic=measured.systematic,
-            unit="ohm",
-            n=measured.n,
-            chi2=measured.chi2,
-            T_c=math.nan,
-            method=measured.method,
-            i_d_apk=measured.i_d_apk,
-            fallback="winding temperature unknown: R_s is not normalised",
+        low, high = UNKNOWN_T_RANGE_C
+        off = max(abs(_at_reference_ohm(measured.value, copper, T) - measured.value) for T in UNKNOWN_T_RANGE_C)
+        return replace(
+            measured,
+            systematic=math.hypot(measured.systematic, off),
+            dof=math.inf,
+            fallback=f"winding temperature unknown: R_s as measured, its interval is that of {low:g} to {high:g} degC",
         )
     rise = copper.alpha_per_k * (measured.T_c - copper.T_ref_c)
-    if copper.R_winding_ohm is None:
-        value, unknown = measured.value / (1.0 + rise), tolerance.device_share_max
-    else:
-        value, unknown = measured.value - copper.R_winding_ohm * rise, 0.0
+    value = _at_reference_ohm(measured.value, copper, measured.T_c)
+    unknown = tolerance.device_share_max if copper.R_winding_ohm is None else 0.0
     scale = value / measured.value
     systematic = math.hypot(measured.systematic * scale, unknown * abs(rise) * value)
     systematic = math.hypot(systematic, copper.alpha_per_k * tolerance.temperature_k * value)
@@ -440,6 +440,19 @@ def normalised(measured: Estimate, copper: Copper, tolerance: SensorTolerance) -
         method=measured.method,
         i_d_apk=measured.i_d_apk,
     )
+
+
+def _at_reference_ohm(R_ohm: float, copper: Copper, T_c: float) -> float:
+    """Return a loop resistance of a winding at ``T_c`` as it is at the reference temperature (ohm)."""
+    rise = copper.alpha_per_k * (T_c - copper.T_ref_c)
+    return R_ohm / (1.0 + rise) if copper.R_winding_ohm is None else R_ohm - copper.R_winding_ohm * rise
+
+
+def at_the_test(estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Return estimates with R of an unknown temperature as it was measured: loops do not see the doubt of T_ref."""
+    R, measured = estimates.get("R_s_ohm"), estimates.get(R_MEASURED)
+    unknown = R is not None and measured is not None and not math.isfinite(R.T_c)
+    return {**estimates, "R_s_ohm": measured} if unknown and measured is not None else dict(estimates)
 
 
 def two_point_resistance(levels: Trace) -> float:

@@ -18,6 +18,8 @@ COPPER_ALPHA_PER_K = 0.00393
 """Temperature coefficient of copper at 20 degC (IEC 60028: annealed copper)."""
 MAGNET_ALPHA_PER_K = -0.0012
 """Temperature coefficient of the flux linkage where no machine file says it: sintered NdFeB, -0.11 to -0.12 %/K."""
+UNKNOWN_T_RANGE_C = (5.0, 90.0)
+"""Winding and magnets of a machine whose temperature nothing tells (degC)."""
 
 Degrees = TypeVar("Degrees", float, NDArray[np.float64])
 

@@ -12,8 +12,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
+from pmsmtool.estimators.resistance import R_MEASURED
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.machine_keys import MEASURABLE
+from pmsmtool.machine.temperature import UNKNOWN_T_RANGE_C
 from pmsmtool.report.comparison import told
 
 Verdict = Literal["agrees", "contradicts", "accepted", "NOT CHECKED", "measured", "held"]
@@ -24,8 +26,6 @@ TOLERANCE: Mapping[str, float] = {
 """Relative tolerance of a data sheet that states no standard deviation (catalogues: R and Kt 10 %, L 30 %, J 20 %)."""
 COVERAGE = 1.96
 """Standard deviations of ``[std]`` to a 95 % half width."""
-T_RANGE_C = (5.0, 90.0)
-"""Winding and magnets of a machine whose temperature nothing tells (degC)."""
 DEVICE_SHARE = 0.3
 """Largest part of the measured loop that bridge, cable and shunts have; a data sheet's winding is without it."""
 SALIENCY = 3.0
@@ -231,6 +231,10 @@ def _measured(values: Sequence[Mapping[str, Any]]) -> dict[str, _Measured]:
         half = VENDOR_SHARE * abs(number) if vendor else float(value.get("total_95") or 0.0)
         bias = (math.nan if value.get(key) is None else float(value[key]) for key in ("i_d_apk", "i_q_apk"))
         found[str(value["name"])] = _Measured(number, half, value.get("T_c") is not None, *bias)
+    warm = found.get("R_s_ohm")
+    if warm is not None and not warm.T_known and R_MEASURED in found:
+        # what is allowed covers the temperatures already: they do not count twice
+        found["R_s_ohm"] = replace(warm, half=found[R_MEASURED].half)
     if "J_kgm2" not in found and RATIO in found and "psi_f_wb" in found:
         ratio, psi = found[RATIO], found["psi_f_wb"]
         half = ratio.half * psi.value + psi.half * ratio.value
@@ -317,7 +321,7 @@ def _allowed(
     # a catalogue does not say whether its share is of what it states or of what is there
     low, high = 1.0 - share, 1.0 + share if name in file.std else 1.0 / (1.0 - share)
     machine = file.machine
-    span = f"{T_RANGE_C[0]:g} to {T_RANGE_C[1]:g} degC"
+    span = f"{UNKNOWN_T_RANGE_C[0]:g} to {UNKNOWN_T_RANGE_C[1]:g} degC"
     if name == RATIO:
         over, _ = _share("J_kgm2", file)
         under, _ = _share("psi_f_wb", file)
@@ -328,11 +332,11 @@ def _allowed(
             devices = high * DEVICE_SHARE / (1.0 - DEVICE_SHARE)
             text = f"{text}, devices and cable up to {100.0 * DEVICE_SHARE:g} % of the loop"
         if not T_known:
-            cold, hot = (1.0 + machine.alpha_R_per_k * (T - machine.T_ref_c) for T in T_RANGE_C)
+            cold, hot = (1.0 + machine.alpha_R_per_k * (T - machine.T_ref_c) for T in UNKNOWN_T_RANGE_C)
             low, high, text = low * min(1.0, cold), high * max(1.0, hot), f"{text}, {span}"
         high += devices
     if name in ("psi_f_wb", RATIO) and not (T_known and name == "psi_f_wb"):
-        magnets = [1.0 + machine.alpha_psi_per_k * (T - machine.T_ref_c) for T in T_RANGE_C]
+        magnets = [1.0 + machine.alpha_psi_per_k * (T - machine.T_ref_c) for T in UNKNOWN_T_RANGE_C]
         if name == RATIO:
             magnets = [1.0 / factor for factor in magnets]
         low, high = low * min(1.0, *magnets), high * max(1.0, *magnets)

@@ -24,6 +24,7 @@ from pmsmtool.estimators.mechanics import MechanicsResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases
 from pmsmtool.estimators.resistance import (
+    R_MEASURED,
     Copper,
     ResistanceResult,
     estimate_resistance,
@@ -40,8 +41,6 @@ from pmsmtool.workflow.calibration import calibrated_traces
 from pmsmtool.workflow.half_frequency import resistance_at_two_frequencies
 from pmsmtool.workflow.sampling_stage import resistance_as_sampled
 
-R_MEASURED = "R_s_ohm_measured"
-"""Name of the resistance at the temperature of the test: what no normalisation widens."""
 MOTION_STD = 0.2
 """Relative standard deviation of the rotor's answer to an injection as the pushes show it: friction takes part."""
 RELUCTANCE_STD = 0.3
@@ -111,8 +110,7 @@ class Evaluation:
         found: dict[str, Estimate] = {}
         if self.resistance is not None:
             found["R_s_ohm"] = self.resistance.R_s
-            if math.isfinite(self.resistance.R_s.T_c):
-                found[R_MEASURED] = self.resistance.R_measured
+            found[R_MEASURED] = self.resistance.R_measured
         if self.inductance is not None:
             found["L_d_h"], found["L_q_h"] = self.inductance.L_d, self.inductance.L_q
         if self.flux is not None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pmsmtool.design.interval_needs import JUDGED, OFFSET, Need, interval_needs
 from pmsmtool.estimators.cross_check import CrossCheck
 from pmsmtool.estimators.estimate import Verdict, coverage_factor, statistical_half_width, total_half_width
+from pmsmtool.estimators.resistance import at_the_test
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.units import format_estimate
@@ -27,6 +28,7 @@ def acceptance_of(
     """Return what every value is judged by, by its key: what its interval leaves of the design's margins and limits."""
     # the offset of the slow turn alone, which is for the pole pairs, is coarse, and nobody asked for it
     coarse = {OFFSET} if evaluation.flux is None and "encoder" not in asked else set()
+    found = at_the_test(found)
     judged = [name for name in JUDGED if name in found and name not in coarse]
     criteria = judged_values({name: found[name] for name in judged}, machine)
     mapped = map_stage.map_acceptance(evaluation.flux_map)

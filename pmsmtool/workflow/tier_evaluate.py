@@ -18,7 +18,7 @@ from pmsmtool.estimators.estimate import SENSOR_GAIN_TOLERANCE, SensorTolerance
 from pmsmtool.estimators.flux_linkage import normalised as flux_at_reference
 from pmsmtool.estimators.inertia_ratio import estimate_ratios
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
-from pmsmtool.estimators.resistance import Copper, copper_of
+from pmsmtool.estimators.resistance import R_MEASURED, Copper, copper_of
 from pmsmtool.estimators.resistance import normalised as resistance_at_reference
 from pmsmtool.estimators.rotation_offset import offset_by_turns
 from pmsmtool.estimators.supply_power import resistance_by_supply
@@ -160,7 +160,9 @@ def tier_result(
         return replace(result, traces=recorded)
     estimates: dict[str, Estimate] = {}
     if SUPPLY_LEVELS in traces:
-        estimates["R_s_ohm"] = resistance_by_supply(traces[SUPPLY_LEVELS], tolerance=tolerance)
+        R = resistance_by_supply(traces[SUPPLY_LEVELS], tolerance=tolerance)
+        estimates["R_s_ohm"] = replace(resistance_at_reference(R, copper or Copper(), tolerance), dof=R.dof)
+        estimates[R_MEASURED] = R
     if "rotation_backward" in traces:
         found = estimate_encoder(traces["rotation_forward"], traces["rotation_backward"])
         estimates |= encoder_estimates(found, traces)
@@ -183,6 +185,7 @@ def _by_recorder(
     if "R_s_ohm" in estimates:
         R = replace(estimates["R_s_ohm"], T_c=T_winding_c)
         estimates["R_s_ohm"] = replace(resistance_at_reference(R, copper, tolerance), dof=R.dof)
+        estimates[R_MEASURED] = R
     psi = replace(estimates["psi_f_wb"], T_c=T_magnet_c)
     estimates["psi_f_wb"] = flux_at_reference(psi, copper.T_ref_c, alpha_psi_per_k, tolerance)
     missing = {} if "R_s_ohm" in estimates else {"R_s_ohm": NO_RESISTANCE}

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.estimators.resistance import R_MEASURED
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.machine_keys import MEASURABLE
 from pmsmtool.machine.parameters import Estimate
@@ -87,13 +88,14 @@ def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], sourc
     given = tuple(name for name in (*NEEDED, *ALSO) if name not in fields and getattr(known.machine, name) is not None)
     measured = tuple(name for name in MEASURABLE if name in values)
     kept = {name: values[name] for name in measured}
+    at_test = {name: found[name] for name in (R_MEASURED,) if name in found and "R_s_ohm" in found}
     machine = replace(
         known,
         machine=replace(known.machine, **table),  # type: ignore[arg-type]
         encoder=encoder,
         std={**known.std, **{name: e.std for name, e in kept.items()}},
         systematic={**known.systematic, **{name: e.systematic for name, e in kept.items()}},
-        estimates={**known.estimates, **kept},
+        estimates={**known.estimates, **kept, **at_test},
         provenance={"source": f"measured: {', '.join(measured) or 'nothing'}; {source}: {', '.join(given)}"},
         simulation={},
     )
@@ -101,13 +103,13 @@ def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], sourc
 
 
 def _at_reference(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[dict[str, Estimate], tuple[str, ...]]:
-    """Return the measured values; flux linkage and resistance of an unknown temperature with the doubt that leaves.
+    """Return the measured values; the flux linkage of an unknown temperature with the doubt that leaves.
 
-    Where their temperature is known they are at the reference temperature already (``tier_evaluate``).
+    The resistance has that already, and where temperatures are known both are at the reference (``tier_evaluate``).
     """
     values = {name: estimate for name, estimate in found.items() if name in MEASURABLE}
     notes = []
-    for name, alpha in (("psi_f_wb", known.machine.alpha_psi_per_k), ("R_s_ohm", known.machine.alpha_R_per_k)):
+    for name, alpha in (("psi_f_wb", known.machine.alpha_psi_per_k),):
         if name in values and not math.isfinite(values[name].T_c):
             estimate = values[name]
             doubt = abs(alpha) * UNKNOWN_TEMPERATURE_K * estimate.value

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pmsmtool.design.interval_needs import JUDGED
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.estimators.resistance import at_the_test
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.units import format_estimate
@@ -59,7 +60,8 @@ def judged(
         The machine with the estimates in it, where it is whole.
     """
     acceptance = judged_values(
-        {name: estimate for name, estimate in estimates.items() if name in JUDGED or name in STANDS_FOR}, machine
+        {name: estimate for name, estimate in at_the_test(estimates).items() if name in JUDGED or name in STANDS_FOR},
+        machine,
     )
     had = [STEP[name] for name, key in TOLD_BY.items() if key in estimates]
     lacking = {

@@ -36,7 +36,7 @@ def unknown() -> TierResult:
 
 def test_resistance_and_flux_are_told_at_the_reference_temperature(warm: TierResult, unknown: TierResult) -> None:
     """Nobody says how much of the loop is copper: what devices may be of it widens the interval."""
-    R, raw = warm.estimates["R_s_ohm"], unknown.estimates["R_s_ohm"]
+    R, raw = warm.estimates["R_s_ohm"], unknown.estimates["R_s_ohm_measured"]
     factor = 1.0 + ALPHA * RISE_K
     assert R.value == pytest.approx(raw.value / factor) and R.std == pytest.approx(raw.std / factor)
     assert R.T_c == WARM_C and R.dof == raw.dof and not R.fallback
@@ -49,13 +49,16 @@ def test_resistance_and_flux_are_told_at_the_reference_temperature(warm: TierRes
 
 
 def test_a_temperature_nobody_knows_is_said(unknown: TierResult) -> None:
-    assert unknown.estimates["R_s_ohm"].fallback == "winding temperature unknown: R_s is not normalised"
+    R, raw = unknown.estimates["R_s_ohm"], unknown.estimates["R_s_ohm_measured"]
+    assert R.fallback.startswith("winding temperature unknown: R_s as measured") and R.value == raw.value
+    hot = 1.0 - 1.0 / (1.0 + ALPHA * 70.0)  # of the winding at 90 degC: farther off than at 5 degC
+    assert R.systematic == pytest.approx(math.hypot(raw.systematic, hot * R.value)) and R.std == raw.std
     assert unknown.estimates["psi_f_wb"].fallback == "magnet temperature unknown: psi_f is not normalised"
     assert math.isnan(unknown.estimates["R_s_ohm"].T_c)
 
 
 def test_a_known_winding_leaves_no_doubt_about_the_devices(warm: TierResult, unknown: TierResult) -> None:
-    raw = unknown.estimates["R_s_ohm"]
+    raw = unknown.estimates["R_s_ohm_measured"]
     R = told(WARM_C, copper=Copper(R_winding_ohm=0.3)).estimates["R_s_ohm"]
     assert R.value == pytest.approx(raw.value - 0.3 * ALPHA * RISE_K)
     assert R.systematic < warm.estimates["R_s_ohm"].systematic
@@ -75,6 +78,8 @@ def test_a_machine_takes_the_values_once_and_inertia_by_the_flux_of_the_run(
     assert made.machine.J_kgm2 == pytest.approx(ratio * psi * (1.0 + ALPHA_PSI * RISE_K))
     cold = tier_machine(known, unknown.estimates, "as given")
     assert cold.machine is not None and any("no sensor tells its temperature" in note for note in cold.notes)
+    assert cold.machine.systematic["R_s_ohm"] == unknown.estimates["R_s_ohm"].systematic, "not widened twice"
+    assert cold.machine.estimates["R_s_ohm_measured"] == unknown.estimates["R_s_ohm_measured"]
     raw = unknown.estimates["psi_f_wb"]
     assert cold.machine.machine.J_kgm2 == pytest.approx(unknown.estimates["J_per_psi"].value * raw.value)
     widened = math.hypot(raw.systematic, -ALPHA_PSI * UNKNOWN_TEMPERATURE_K * raw.value)

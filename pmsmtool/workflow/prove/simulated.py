@@ -20,6 +20,7 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.design.prediction import Array, Direction, Prediction, Runs, predict
 from pmsmtool.design.tolerance import Samples, tolerance_box
 from pmsmtool.drive.port import Excitation, Injection
+from pmsmtool.estimators.resistance import at_the_test
 from pmsmtool.machine.flux_map_scaled import FluxScale, ScalableMap
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
@@ -108,7 +109,7 @@ class SimulatedDrives:
     ) -> Sequence[Setup]:
         rng = np.random.default_rng([seed, 1])
         samples = tolerance_box(
-            machine,
+            as_tested(machine),
             U_dc_v=_about(conditions.U_dc_v, U_DC_SPREAD * conditions.U_dc_v),
             T_winding_c=_about(base.T_winding, T_SPREAD_K),
             T_magnet_c=_about(base.T_magnet, T_MAGNET_SPREAD_K if math.isnan(conditions.T_magnet_c) else T_SPREAD_K),
@@ -242,6 +243,18 @@ def _judged(experiments: Sequence[Experiment], responses: Mapping[str, Array]) -
 
 
 # ---- one drawn drive ------------------------------------------------------------------------------------------
+
+
+def as_tested(machine: MachineFile) -> MachineFile:
+    """Return a machine with the interval its resistance has at the temperature of the test, where that is unknown."""
+    R = at_the_test(machine.estimates).get("R_s_ohm")
+    if R is None or "R_s_ohm" not in machine.std or R is machine.estimates["R_s_ohm"]:
+        return machine
+    return replace(
+        machine,
+        std={**machine.std, "R_s_ohm": R.std},
+        systematic={**machine.systematic, "R_s_ohm": R.systematic},
+    )
 
 
 def _simulated(machine: MachineFile, conditions: Conditions) -> MachineFile:
