@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from pmsmtool.machine.parameters import MachineParameters
 
 COPPER_ALPHA_PER_K = 0.00393
@@ -21,7 +21,7 @@ MAGNET_ALPHA_PER_K = -0.0012
 UNKNOWN_T_RANGE_C = (5.0, 90.0)
 """Winding and magnets of a machine whose temperature nothing tells (degC)."""
 
-Degrees = TypeVar("Degrees", float, NDArray[np.float64])
+Degrees = TypeVar("Degrees", float, "NDArray[np.float64]")
 
 
 def copper_ohm(machine: MachineParameters) -> float:

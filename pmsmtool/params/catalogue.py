@@ -15,6 +15,8 @@ import zlib
 from dataclasses import dataclass
 from typing import Literal
 
+from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K
+
 SCHEMA_VERSION = 1
 """Counted by hand when a value changes meaning; a migration accompanies each step."""
 
@@ -92,7 +94,7 @@ _ROWS: tuple[tuple[str, int, int, WireType, str, float, float, float, bool, str]
         0x0A,
         _F32,
         "1/K",
-        0.00393,
+        COPPER_ALPHA_PER_K,
         0,
         0.01,
         False,
@@ -104,7 +106,7 @@ _ROWS: tuple[tuple[str, int, int, WireType, str, float, float, float, bool, str]
         0x0B,
         _F32,
         "1/K",
-        -0.0012,
+        MAGNET_ALPHA_PER_K,
         -0.01,
         0.001,
         False,

@@ -1,0 +1,38 @@
+"""The temperature coefficients have one home; who needs a default takes it from there."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pmsmtool
+from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K
+from pmsmtool.params.catalogue import BY_NAME
+
+PACKAGE = Path(pmsmtool.__file__).parent
+HOME = PACKAGE / "machine" / "temperature.py"
+COEFFICIENTS = (COPPER_ALPHA_PER_K, -MAGNET_ALPHA_PER_K)
+"""Signless: a minus is an operator of its own."""
+
+
+def numbers(path: Path) -> set[float]:
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        constants = (node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Constant))
+        return {float(value) for value in constants if isinstance(value, int | float)}
+    return {float(number) for number in re.findall(r"\b\d+\.\d+(?:[eE][+-]?\d+)?", re.sub(r"//.*|/\*.*?\*/", "", text))}
+
+
+def test_no_other_file_of_the_package_writes_a_coefficient_down() -> None:
+    """The catalogue had a copy of both: a default that is corrected in one place only."""
+    assert numbers(HOME) >= set(COEFFICIENTS)
+    files = [path for kind in ("py", "c", "h", "toml") for path in PACKAGE.rglob(f"*.{kind}") if path != HOME]
+    assert len(files) > 200
+    assert [str(path.relative_to(PACKAGE)) for path in files if numbers(path) & set(COEFFICIENTS)] == []
+
+
+def test_the_drive_starts_with_them() -> None:
+    """Copper gains 0.393 %/K, magnets of sintered NdFeB lose 0.12 %/K."""
+    held = {name: BY_NAME[name].default for name in ("motor.alpha_R_per_k", "motor.alpha_psi_per_k")}
+    assert held == {"motor.alpha_R_per_k": 0.00393, "motor.alpha_psi_per_k": -0.0012}
