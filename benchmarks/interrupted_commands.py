@@ -7,7 +7,7 @@ A moment is a CAN frame that the tool sends or hears; the moments are spread eve
 a run of its own, and the drive stays powered.
 
 *Ctrl-C*: SIGINT at that frame. Wanted: exit code 130, statusword off, everything the drive holds as before; a download
-that was through may also leave exactly the new set.
+that was through may also leave exactly the new set. A command that only writes says which of them the drive holds.
 
 *Adapter*: from that frame on nothing is sent and nothing received. Wanted: exit code 8 where the machine was energised
 (the hardware stop is named), otherwise 3 (or 8); the drive, still powered, off by itself a second later, and its set
@@ -55,6 +55,8 @@ _STATUSWORD_READ = b"\x4b\x41\x60\x00"
 TO_DO = ("hardware stop", "reset the drive")
 MEASURING = ("identify", "commission")
 JOURNALED = ("flash-params", "restore", "commission")
+WRITING = ("flash-params", "restore", "param set")
+OLD_SET = ("the set that it held before", "exactly the old set")
 COMMANDS = {
     "jog": ("jog", "--current", "2Apk", "--for", "1s"),
     "identify": ("identify",),
@@ -205,12 +207,20 @@ def interrupted(how: str, command: str, moment: int | None) -> Outcome:
         verdict, kept = _compare(command, before, after, gone=how == "adapter")
     if how == "ctrl-c":
         wanted = code == 130
+        if command in WRITING and not _names_the_set(told, after, before):
+            verdict, wanted = f"{verdict}; the set is not named rightly: {told[-300:]!r}", False
     else:
         wanted = code == 8 and all(word in told for word in TO_DO) if watch.enabled else code in (3, 8)
         verdict += ", the machine energised when it went" if watch.enabled else ", nothing energised"
     if not told.strip() or "Traceback" in told:
         verdict, wanted = f"{verdict}; said: {told[-300:]!r}", False
     return Outcome(watch.frames, code, verdict, after.off and kept and wanted)
+
+
+def _names_the_set(told: str, after: Held, before: Held) -> bool:
+    """Whether the message says which set the drive holds, and that is the one it holds."""
+    said_old = any(words in told for words in OLD_SET)
+    return said_old != ("the drive holds the new set" in told) and said_old == (after.crc == before.crc)
 
 
 def _compare(command: str, before: Held, after: Held, *, gone: bool) -> tuple[str, bool]:

@@ -48,6 +48,7 @@ def flash_params_command(
     cut or a killed tool, the same command or `pmsmtool restore` finishes.
     """
     from pmsmtool.cli.flash_session import carry_out
+    from pmsmtool.flash.download import set_named
     from pmsmtool.workflow.parameter_source import load_parameters
 
     drive_map = read_map(map_file)
@@ -57,7 +58,16 @@ def flash_params_command(
             nodes, wanted, drive_map, bus, motion, out, store=not no_store, dry_run=dry_run, check=check
         )  # fmt: skip
         return
-    with open_node(bus, drive_map) as node:
+    with set_named() as jobs, open_node(bus, drive_map) as node:
         carry_out(
-            node, wanted, bus, motion, out, command="flash-params", store=not no_store, dry_run=dry_run, check=check
+            node,
+            jobs,
+            wanted,
+            bus,
+            motion,
+            out,
+            command="flash-params",
+            store=not no_store,
+            dry_run=dry_run,
+            check=check,
         )

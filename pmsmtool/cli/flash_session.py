@@ -11,13 +11,14 @@ from pmsmtool.cli.output import Output
 if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.drive.port import Identity
-    from pmsmtool.flash.download import Outcome
+    from pmsmtool.flash.download import Download, Outcome
     from pmsmtool.flash.plan import Change, Plan
     from pmsmtool.params.parameter_set import ParameterSet
 
 
 def carry_out(
     node: DriveNode,
+    jobs: list[Download],
     wanted: ParameterSet,
     bus: BusOptions,
     motion: MotionOptions,
@@ -28,7 +29,7 @@ def carry_out(
     dry_run: bool = False,
     check: bool = False,
 ) -> None:
-    """Plan, ask, write, print."""
+    """Plan, ask, write, print; the download is put into ``jobs`` (``flash.download.set_named``)."""
     from pmsmtool.errors import CheckFailed
     from pmsmtool.flash.restore import marks_of, plan_download
 
@@ -44,13 +45,14 @@ def carry_out(
             )
         return
     outcome = write_plan(
-        node, identity, plan, marks_of(plan.content, datetime.datetime.now()), bus, motion, out, store=store
+        node, jobs, identity, plan, marks_of(plan.content, datetime.datetime.now()), bus, motion, out, store=store
     )
     out.result(command, {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])
 
 
 def write_plan(
     node: DriveNode,
+    jobs: list[Download],
     identity: Identity,
     plan: Plan,
     marks: dict[str, bytes],
@@ -70,6 +72,7 @@ def write_plan(
         node, identity, plan, marks, JournalFolder(identity), say=out.note,
         progress=lambda done, total: out.status(f"{done}/{total}"),
     )  # fmt: skip
+    jobs.append(job)
     job.admit()  # nobody is asked for what would be refused after his consent
     if job.has_work(store=store):
         lines = [*plan.lines(), *plan.after_lines(store=store)]

@@ -53,13 +53,12 @@ def flash_fleet(
     from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.errors import CheckFailed, PmsmtoolError
-    from pmsmtool.flash.download import Download
+    from pmsmtool.flash.download import Download, set_named
     from pmsmtool.flash.journal import JournalFolder
     from pmsmtool.flash.restore import marks_of, plan_download
 
     _refuse_serial(motion)
-    with bus.connect() as connection:
-        jobs: list[Download] = []
+    with set_named() as jobs, bus.connect() as connection:
         for node_id in nodes:
             claim(connection, node_id)
             node = DriveNode(connection, node_id, drive_map=drive_map)

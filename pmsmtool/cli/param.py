@@ -108,14 +108,15 @@ def set_command(
     The change is a transaction as in flash-params: journal, write, read back, roll back on any failure.
     """
     from pmsmtool.cli.flash_session import carry_out
+    from pmsmtool.flash.download import set_named
     from pmsmtool.params.parameter_set import ParameterSet
 
     drive_map = read_map(map_file)
     values: dict[str, float] = {}
     for assignment in assignments:
         values |= _assignment(assignment, drive_map)
-    with open_node(bus, drive_map) as node:
-        carry_out(node, ParameterSet(values), bus, motion, out, command="param-set", store=store)
+    with set_named() as jobs, open_node(bus, drive_map) as node:
+        carry_out(node, jobs, ParameterSet(values), bus, motion, out, command="param-set", store=store)
 
 
 @param_command.command(

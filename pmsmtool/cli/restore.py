@@ -42,11 +42,11 @@ def restore_command(
     """
     from pmsmtool.cli.flash_session import checked_identity, plan_facts, told, write_plan
     from pmsmtool.errors import ConfigError
-    from pmsmtool.flash.download import describe
+    from pmsmtool.flash.download import describe, set_named
     from pmsmtool.flash.journal import JournalFolder, read_snapshot
     from pmsmtool.flash.restore import check_snapshot, nothing_written, old_marks, plan_restore
 
-    with open_node(bus, read_map(map_file)) as node:
+    with set_named() as jobs, open_node(bus, read_map(map_file)) as node:
         identity = checked_identity(node)
         folder = JournalFolder(identity)
         snapshot = folder.last() if snapshot_file is None else read_snapshot(snapshot_file)
@@ -72,6 +72,6 @@ def restore_command(
                 out.warn("whether the drive keeps these values over a reset is not known; flash-params stores a set")
             return
         outcome = write_plan(
-            node, identity, plan, old_marks(snapshot), bus, motion, out, restoring=snapshot_file is None
+            node, jobs, identity, plan, old_marks(snapshot), bus, motion, out, restoring=snapshot_file is None
         )
         out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])

@@ -9,7 +9,7 @@ leaves an open journal: the same command, or ``restore``, finishes.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -39,6 +39,7 @@ CONSUMERS_MAX = 8
 LISTEN_S = 0.25
 """Before the first write the bus is listened to this long: another master would be heard."""
 _STARTS = 2
+NOTHING_WRITTEN = "nothing was written: the drive holds the set that it held before"
 
 
 class Phase(IntEnum):
@@ -120,6 +121,20 @@ class Download:
         self._was_stored = False
         self._crc_before: int | None = None
         self._rolled_back: State = "restored"
+        self._holds = ""
+
+    @property
+    def holds(self) -> str:
+        """Which set the drive holds, as far as this download knows it now."""
+        if self._holds:
+            return self._holds
+        with contextlib.suppress(PmsmtoolError):
+            if (last := self.folder.last()) is not None and last.state == "open":
+                return f"nothing was written, and an earlier download was interrupted: {self._unknown()}"
+        return NOTHING_WRITTEN
+
+    def _unknown(self) -> str:
+        return f"which set the drive holds is not known, `pmsmtool restore -n {self.node.node}` brings the old one back"
 
     def run(self, *, store: bool = True, restoring: bool = False) -> Outcome:
         """Carry the plan out.
@@ -137,7 +152,8 @@ class Download:
         PmsmtoolError
             With the old set back on the drive, or with what to do said.
         Interrupted
-            Ctrl-C, after the roll-back.
+            Ctrl-C, after the roll-back. From the save request on the download is finished first. It says which set
+            the drive holds.
         """
         self._gate()
         if (aside := self.folder.set_aside_damaged()) is not None:
@@ -145,22 +161,36 @@ class Download:
         if not self.has_work(store=store):
             self._close_stale(restoring)
             return self._outcome(0, starts=1, stored=self._was_stored)
-        journal = self._journal(restoring)
-        starts = 0
-        while True:
-            starts += 1
-            try:
-                self._forward(store)
-                break
-            except NodeReset as reset:
-                if starts == _STARTS or self.phase >= Phase.STORING:
-                    raise self._roll_back(reset, journal) from reset
-                self._say(f"{reset.what}; starting over once")
-                self._start_over()
-            except BaseException as error:
-                raise self._roll_back(error, journal) from error
-        self.folder.close(journal, "restored" if restoring else "done")
-        return self._outcome(len(self.plan.changes), starts=starts, stored=store)
+        with contextlib.ExitStack() as hold:
+            # An interrupt leaves no journal behind that nobody closes: from here on it is answered by the roll-back.
+            noted = hold.enter_context(interrupts_deferred())
+            journal = self._journal(restoring)
+            self._holds = self._unknown()
+            starts, what = 0, ""
+            while True:
+                starts += 1
+                try:
+                    hold.close()
+                    if noted:
+                        raise KeyboardInterrupt
+                    if starts > 1:
+                        self._say(f"{what}; starting over once")
+                        self._start_over()
+                    noted = self._forward(store, hold)
+                    break
+                except NodeReset as reset:
+                    if starts == _STARTS or self.phase >= Phase.STORING:
+                        raise self._roll_back(reset, journal) from reset
+                    what = reset.what
+                except BaseException as error:
+                    raise self._roll_back(error, journal) from error
+            self.folder.close(journal, "restored" if restoring else "done")
+            reached = "the set that was to be restored" if restoring else "the new set"
+            self._holds = f"the drive holds {reached}, {'stored and read back' if store else 'until its next reset'}"
+            outcome = self._outcome(len(self.plan.changes), starts=starts, stored=store)
+        if noted:
+            raise Interrupted(f"the download was finished first: {self._holds}")
+        return outcome
 
     # ---- before ---------------------------------------------------------------------------------
 
@@ -260,7 +290,8 @@ class Download:
 
     # ---- forward --------------------------------------------------------------------------------
 
-    def _forward(self, store: bool) -> None:
+    def _forward(self, store: bool, hold: contextlib.ExitStack) -> list[int]:
+        """Write, activate, store; return the list of signals that are held from the save request on."""
         self.phase = Phase.STAGING
         changes = self.plan.changes
         if changes:
@@ -269,15 +300,16 @@ class Download:
         self.phase = Phase.ACTIVE
         expected = self._parameters.crc_active if self.node.map.staging else None
         self._write_marks(self._wanted_marks)
-        if not store:
-            return
-        self.phase = Phase.STORING
-        self._say("storing")
-        self.node.store()
-        self._say("resetting the drive and reading everything again")
-        self.node.reset()
-        check_identity(self.node, self.identity)
-        self._verify(self.plan.entries, self._wanted_marks, expected)
+        noted = hold.enter_context(interrupts_deferred(self._say, "storing"))
+        if store:
+            self.phase = Phase.STORING
+            self._say("storing")
+            self.node.store()
+            self._say("resetting the drive and reading everything again")
+            self.node.reset()
+            check_identity(self.node, self.identity)
+            self._verify(self.plan.entries, self._wanted_marks, expected)
+        return noted
 
     def _write_marks(self, marks: Mapping[str, bytes]) -> None:
         for name, index, sub in MARKS:
@@ -314,25 +346,26 @@ class Download:
         with self.node.supervision.expected_reset():
             self.node.connection.wait(LISTEN_S)
         check_identity(self.node, self.identity)
-        self.phase = Phase.BEFORE
 
     # ---- back -----------------------------------------------------------------------------------
 
     def _roll_back(self, error: BaseException, journal: Snapshot) -> BaseException:
         """Bring the old set back; return the error to raise, which says what the drive holds now."""
-        with interrupts_deferred():
+        with interrupts_deferred(self._say, "bringing the old set back"):
             self.node.sdo.cancel(None)
             try:
                 self._say(f"{_name(error)}: bringing the old set back")
                 with self.node.supervision.expected_reset():
                     self._bring_back()
                 self.folder.close(journal, self._rolled_back)
-                state = "the drive holds exactly the old set again"
-            except (PmsmtoolError, OSError) as second:
-                state = self._left_behind(second)
-        return _told(error, state)
+                self._holds = "the drive holds exactly the old set again"
+            except (PmsmtoolError, OSError, KeyboardInterrupt) as second:
+                self._holds = self._left_behind(second)
+        return _told(error, self._holds)
 
     def _bring_back(self) -> None:
+        if self.phase is Phase.BEFORE:
+            return
         if (
             self.phase is Phase.STAGING
             and self._crc_before is not None
@@ -356,7 +389,7 @@ class Download:
 
     def _left_behind(self, second: BaseException) -> str:
         holds = (
-            "it holds exactly the old or exactly the new set"
+            "it holds exactly the old or exactly the new set, which of them is not known"
             if self.node.map.staging
             else "it may hold a part of the new set"
         )
@@ -369,6 +402,26 @@ class Download:
         crc = self._parameters.crc_active if self.node.map.staging else None
         sdo = self.node.sdo
         return Outcome(written, len(self.plan.entries) - written, stored, crc, sdo.retries, sdo.discarded, starts)
+
+
+@contextlib.contextmanager
+def set_named() -> Iterator[list[Download]]:
+    """Say at a Ctrl-C which set the drives hold; yields the list into which downloads are put that are begun.
+
+    Raises
+    ------
+    Interrupted
+        In place of a ``KeyboardInterrupt``, and for all drives where there are several.
+    """
+    jobs: list[Download] = []
+    try:
+        yield jobs
+    except (KeyboardInterrupt, Interrupted) as error:
+        if isinstance(error, Interrupted) and len(jobs) < 2:
+            raise
+        several = len(jobs) > 1
+        held = [f"node {job.node.node}: {job.holds}" if several else job.holds for job in jobs]
+        raise Interrupted("; ".join(held) or NOTHING_WRITTEN) from error
 
 
 def check_identity(node: DriveNode, expected: Identity) -> None:

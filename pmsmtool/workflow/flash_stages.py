@@ -10,7 +10,7 @@ from typing import Any
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.firmware.image import crc32
-from pmsmtool.flash.download import Download
+from pmsmtool.flash.download import Download, set_named
 from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.plan import Change
 from pmsmtool.flash.restore import marks_of, plan_download
@@ -35,17 +35,19 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
         The download failed; the error says which set the drive holds.
     """
     wanted = read_parameter_set(run.path / "params.toml")
-    plan = plan_download(drive.node, wanted)
-    marks = marks_of(wanted.content_hash(), datetime.datetime.now())
-    download = Download(drive.node, drive.identity, plan, marks, JournalFolder(drive.identity), say=say)
-    if download.has_work(store=True):
-        consent(
-            [
-                *plan.lines(_unchecked_marks(run, [change.name for change in plan.changes])),
-                *plan.after_lines(store=True),
-            ]
-        )
-    outcome = download.run()
+    with set_named() as jobs:
+        plan = plan_download(drive.node, wanted)
+        marks = marks_of(wanted.content_hash(), datetime.datetime.now())
+        download = Download(drive.node, drive.identity, plan, marks, JournalFolder(drive.identity), say=say)
+        jobs.append(download)
+        if download.has_work(store=True):
+            consent(
+                [
+                    *plan.lines(_unchecked_marks(run, [change.name for change in plan.changes])),
+                    *plan.after_lines(store=True),
+                ]
+            )
+        outcome = download.run()
     total = len(plan.entries)
     criteria = [
         Acceptance("objects read back as written, after a reset", f"{total} of {total}", "all", True),

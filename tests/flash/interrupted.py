@@ -1,21 +1,24 @@
-"""Downloads that end at a chosen frame: the drive loses its supply, or the tool is killed."""
+"""Downloads that end at a chosen frame: the drive loses its supply, the tool is killed, a person presses Ctrl-C."""
 
 from __future__ import annotations
 
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import can
 
-from pmsmtool.errors import PmsmtoolError
+from pmsmtool.errors import Interrupted, PmsmtoolError
 from pmsmtool.firmware.image import crc32
+from pmsmtool.flash.download import set_named
+from pmsmtool.flash.restore import marks_of
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.node.memory import RamStorage
 from pmsmtool.sim.node.parameter_set import ParameterImage
-from tests.flash.rig import attach, open_rig
+from tests.flash.rig import WHEN, Rig, attach, open_rig
 
-How = Literal["power cut", "killed"]
+How = Literal["power cut", "killed", "ctrl-c"]
 
 
 class Killed(BaseException):
@@ -58,6 +61,8 @@ def interrupt(wanted: ParameterSet, root: Path, at: int, how: How, *, finish: Li
         if rig.bench.line.frames == last:
             if how == "power cut":
                 rig.bench.node.power_cut()
+            elif how == "ctrl-c":
+                signal.raise_signal(signal.SIGINT)  # the clock holds it back until the frame is through
             else:
                 rig.bench.bus.send = killed  # type: ignore[method-assign]
 
@@ -67,10 +72,13 @@ def interrupt(wanted: ParameterSet, root: Path, at: int, how: How, *, finish: Li
     rig.bench.line.deliver = counted  # type: ignore[method-assign]
     finished = False
     try:
-        rig.download(wanted)
+        _download(rig, wanted)
         finished = True
+    except Interrupted as told:
+        assert how == "ctrl-c"
+        _assert_told(rig, told.what, old, new)
     except (PmsmtoolError, Killed):
-        pass
+        assert how != "ctrl-c"
     rig.bench.line.deliver = deliver  # type: ignore[method-assign]
     if how == "killed":
         del rig.bench.bus.send
@@ -95,6 +103,30 @@ def interrupt(wanted: ParameterSet, root: Path, at: int, how: How, *, finish: Li
     assert_whole(again.bench.node.session, old, new)
     again.bench.bus.shutdown()
     return End(held, finished)
+
+
+def _download(rig: Rig, wanted: ParameterSet) -> None:
+    """As the commands do it."""
+    with set_named() as jobs:
+        plan = rig.plan(wanted)
+        jobs.append(rig.job(plan, marks_of(plan.content, WHEN)))
+        jobs[0].run()
+
+
+def _assert_told(rig: Rig, text: str, old: bytes, new: bytes) -> None:
+    """The message of an exit 130 names the set that acts and is stored, and no journal is left open."""
+    session = rig.bench.node.session
+    assert session is not None
+    named = [held for words, held in ((_OLD, old), (_NEW, new)) if any(word in text for word in words)]
+    assert named == [rig.image()], text
+    stored = session.store.stored.get(0x2001 << 8)
+    assert stored == (new if named == [new] else stored) and stored in (None, *named), text
+    journal = rig.folder.last()
+    assert journal is None or journal.state != "open"
+
+
+_OLD = ("the drive holds the set that it held before", "the drive holds exactly the old set again")
+_NEW = ("the drive holds the new set, stored and read back",)
 
 
 def assert_whole(session: object, old: bytes, new: bytes) -> None:
