@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -31,23 +32,25 @@ def carry_out(
 ) -> None:
     """Plan, ask, write, print; the download is put into ``jobs`` (``flash.download.set_named``)."""
     from pmsmtool.errors import CheckFailed
+    from pmsmtool.flash.journal import JournalFolder
     from pmsmtool.flash.restore import marks_of, plan_download
 
     identity = checked_identity(node)
-    plan = plan_download(node, wanted)
-    if dry_run or check:
-        out.result(command, {"identity": identity, **plan_facts(plan)}, plan.lines())
-        if check and plan.changes:
-            raise CheckFailed(
-                f"{len(plan.changes)} object(s) differ",
-                where=f"node {node.node}",
-                hint="run without --check to write them",
-            )
-        return
-    outcome = write_plan(
-        node, jobs, identity, plan, marks_of(plan.content, datetime.datetime.now()), bus, motion, out, store=store
-    )
-    out.result(command, {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])
+    looking = dry_run or check
+    with contextlib.nullcontext() if looking else JournalFolder(identity).preparing():
+        plan = plan_download(node, wanted)
+        if looking:
+            out.result(command, {"identity": identity, **plan_facts(plan)}, plan.lines())
+            if check and plan.changes:
+                raise CheckFailed(
+                    f"{len(plan.changes)} object(s) differ",
+                    where=f"node {node.node}",
+                    hint="run without --check to write them",
+                )
+            return
+        marks = marks_of(plan.content, datetime.datetime.now())
+        outcome = write_plan(node, jobs, identity, plan, marks, bus, motion, out, store=store)
+        out.result(command, {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])
 
 
 def write_plan(

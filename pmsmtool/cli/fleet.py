@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -58,14 +59,17 @@ def flash_fleet(
     from pmsmtool.flash.restore import marks_of, plan_download
 
     _refuse_serial(motion)
-    with set_named() as jobs, bus.connect() as connection:
+    with set_named() as jobs, contextlib.ExitStack() as notes, bus.connect() as connection:
         for node_id in nodes:
             claim(connection, node_id)
             node = DriveNode(connection, node_id, drive_map=drive_map)
             identity = checked_identity(node)
+            folder = JournalFolder(identity)
+            if not (dry_run or check):
+                notes.enter_context(folder.preparing())
             plan = plan_download(node, wanted)
             marks = marks_of(plan.content, datetime.datetime.now())
-            jobs.append(Download(node, identity, plan, marks, JournalFolder(identity), say=_prefixed(out, node_id)))
+            jobs.append(Download(node, identity, plan, marks, folder, say=_prefixed(out, node_id)))
         plans = {str(job.node.node): plan_facts(job.plan) for job in jobs}
         lines = [
             line for job in jobs for line in (f"node {job.node.node}, serial {job.identity.serial}:", *job.plan.lines())

@@ -44,7 +44,7 @@ def restore_command(
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.download import describe, set_named
     from pmsmtool.flash.journal import JournalFolder, read_snapshot
-    from pmsmtool.flash.restore import check_snapshot, nothing_written, old_marks, plan_restore
+    from pmsmtool.flash.restore import check_snapshot, due_of_journal, nothing_written, old_marks, plan_restore
 
     with set_named() as jobs, open_node(bus, read_map(map_file)) as node:
         identity = checked_identity(node)
@@ -60,6 +60,10 @@ def restore_command(
         check_snapshot(node.map, snapshot, identity, other_drive=other_drive)
         out.note(f"{snapshot.kind} of serial {snapshot.identity.serial}, state {snapshot.state}")
         plan = plan_restore(node, snapshot)
+        if snapshot_file is None and (due := due_of_journal(snapshot, plan, folder)) is not plan:
+            out.note("the last download was killed before it wrote anything: the drive holds what it held before it")
+            out.note(f"`pmsmtool restore {folder.path}` undoes the download before that one")
+            plan = due
         if dry_run:
             out.result("restore", {"identity": identity, **plan_facts(plan)}, plan.lines())
             return

@@ -7,11 +7,12 @@ being told, also after the tool was killed.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -229,6 +230,27 @@ class JournalFolder:
     def __init__(self, identity: Identity, root: Path | None = None) -> None:
         name = f"{identity.vendor:08x}-{identity.product:08x}-{identity.serial}"
         self.path = (root or user_folder() / "journals") / name / "journal.json"
+        self._note = self.path.with_name("begun")
+
+    @contextlib.contextmanager
+    def preparing(self) -> Iterator[None]:
+        """Keep a note while a download is prepared: of a tool killed before its journal only the note is left."""
+        if self.path.exists():  # otherwise there is nothing to go back to
+            with contextlib.suppress(ConfigError, OSError):  # where nothing can be written, the journal says so
+                write_file(self._note, "", synced=True)
+        try:
+            yield
+        finally:
+            self._forget_note()
+
+    def _forget_note(self) -> None:
+        with contextlib.suppress(OSError):
+            self._note.unlink(missing_ok=True)
+
+    @property
+    def was_preparing(self) -> bool:
+        """Whether the last download ended before its journal was begun: it wrote nothing, the last journal is older."""
+        return self._note.exists()
 
     def last(self) -> Snapshot | None:
         """Return the last journal, None when there never was one."""
@@ -269,6 +291,7 @@ class JournalFolder:
         elif previous is not None:
             self._archive(previous)
         write_snapshot(self.path, snapshot)
+        self._forget_note()
         return snapshot
 
     def close(self, snapshot: Snapshot, state: State) -> None:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
-from pmsmtool.errors import ConfigError, SdoAbort
+from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.flash.download import Outcome
-from pmsmtool.flash.journal import MARKS, Entry, Snapshot
+from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
 from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
 from pmsmtool.params.catalogue import BY_NAME, layout_signature
 from pmsmtool.params.diff import table_unit
@@ -171,6 +172,29 @@ def restore_plan(drive_map: DriveMap, snapshot: Snapshot, found: Mapping[str, by
         change = Change(entry.name, entry.index, entry.sub, found[entry.name], entry.old, old_value, value, value, unit)
         entries.append(change)
     return Plan(tuple(entries), (), snapshot.content)
+
+
+def due_of_journal(snapshot: Snapshot, plan: Plan, folder: JournalFolder) -> Plan:
+    """Return what of the last journal's plan is due: nothing where a later download was killed before it wrote.
+
+    Raises
+    ------
+    SafetyRefusal
+        The journal is finished, and the drive was written otherwise since: its old set is more than one download back.
+    """
+    if snapshot.state == "open" or not plan.changes:
+        return plan
+    if folder.was_preparing:
+        return replace(plan, entries=())
+    reached = {(entry.index, entry.sub): entry.new for entry in snapshot.entries}
+    if snapshot.state == "done" and all(change.old == reached[change.index, change.sub] for change in plan.entries):
+        return plan
+    raise SafetyRefusal(
+        "the last download to this drive is finished, and the drive holds neither its old nor its new set",
+        where=str(folder.path),
+        likely="another program or account wrote since, or values wait for a reset",
+        hint=f"`pmsmtool restore {folder.path}` brings back what it held before that download; nothing was written",
+    )
 
 
 def nothing_written(node: DriveNode, plan: Plan) -> Outcome:

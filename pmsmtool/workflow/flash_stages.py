@@ -35,10 +35,11 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
         The download failed; the error says which set the drive holds.
     """
     wanted = read_parameter_set(run.path / "params.toml")
-    with set_named() as jobs:
+    folder = JournalFolder(drive.identity)
+    with set_named() as jobs, folder.preparing():
         plan = plan_download(drive.node, wanted)
         marks = marks_of(wanted.content_hash(), datetime.datetime.now())
-        download = Download(drive.node, drive.identity, plan, marks, JournalFolder(drive.identity), say=say)
+        download = Download(drive.node, drive.identity, plan, marks, folder, say=say)
         jobs.append(download)
         if download.has_work(store=True):
             consent(
