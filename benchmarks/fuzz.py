@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from pmsmtool.design.design_file import design_text, parse_design
+from pmsmtool.design.lookup_file import SCHEMA as LOOK_UP_SCHEMA
 from pmsmtool.design.lookup_file import table_parameters
 from pmsmtool.design.tune import tune
 from pmsmtool.drive.port import Identity
@@ -37,6 +38,8 @@ from pmsmtool.firmware.dcf import read_concise, update_dcf, values_of, write_con
 from pmsmtool.firmware.drive_map import reference_map
 from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.firmware.eds import parse_eds
+from pmsmtool.firmware.image import crc32
+from pmsmtool.firmware.map_tables import look_up_words
 from pmsmtool.flash.journal import Entry, Snapshot, check_sum, parse_snapshot
 from pmsmtool.flash.restore import check_snapshot, restore_plan
 from pmsmtool.machine.flux_map import FluxMap
@@ -177,8 +180,12 @@ def _small_map() -> FluxMap:
 
 
 def _look_up() -> dict[str, NDArray[Any]]:
-    tables = {name: np.array(table) for name, table in with_tables(3).tables.items()}
-    return {"torque_nm": tables["lut.axis_x"], "speed_rpm": tables["lut.axis_y"], "i_d_a": tables["lut.i_d_a"],
+    wanted = with_tables(3)
+    tables = {name: np.array(table) for name, table in wanted.tables.items()}
+    facts = {"schema": LOOK_UP_SCHEMA, "axis_kind": "speed", "stored": "float32", "U_dc_v": 300.0,
+             "words_crc32": crc32(look_up_words(reference_map().encode(wanted)))}  # fmt: skip
+    return {"meta": np.array(json.dumps(facts)),
+            "torque_nm": tables["lut.axis_x"], "speed_rpm": tables["lut.axis_y"], "i_d_a": tables["lut.i_d_a"],
             "i_q_a": tables["lut.i_q_a"]}  # fmt: skip
 
 

@@ -22,6 +22,8 @@ LIFE = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580)
 """Emergencies, TPDOs and SDO answers: beside its heartbeat, what only a living node sends (CiA 301, section 7.3.3)."""
 HARMLESS = frozenset({0x1000, 0x1018})
 """Who only reads these looks who is on the bus, as every second tool does before it knows that the drive is taken."""
+EMERGENCIES_MAX = 1000
+"""Newest emergencies kept: a node that floods the bus sends 4000 a second at 500 kbit/s."""
 SENT_MEMORY = 256
 """Requests remembered to tell our own echo from a second master; a sub-block has 127."""
 STOPPING_CLASSES = frozenset({0x2, 0x3, 0x4, 0x7})
@@ -87,7 +89,7 @@ class Supervision:
     boot_ups : int
         Boot-up messages heard.
     emergencies : list of Emergency
-        In order of arrival.
+        The newest ones, in order of arrival.
     foreign_requests : int
         SDO requests to the node, NMT commands and heartbeats of a master that this program did not send.
     foreign : str
@@ -256,6 +258,12 @@ class Supervision:
             code = int.from_bytes(data[:2], "little")
             register = data[2] if len(data) > 2 else 0
             self.emergencies.append(Emergency(code, register, data[3:8], self._connection.clock.now()))
+            if len(self.emergencies) > EMERGENCIES_MAX:
+                # One that ends the work is not pushed out by others before it was looked at.
+                harmless = (k for k, one in enumerate(self.emergencies) if one.code >> 12 not in STOPPING_CLASSES)
+                oldest = next(harmless, 0)
+                del self.emergencies[oldest]
+                self._emergencies_seen -= oldest < self._emergencies_seen
 
     def _on_request(self, cob_id: int, data: bytes, timestamp: float) -> None:
         if cob_id == NMT_ID and data[1:2] not in (b"\0", bytes((self.node,))):

@@ -9,7 +9,7 @@ import pytest
 from pmsmtool.bus.connect import Connection
 from pmsmtool.bus.nmt import NmtCommand, NmtState, reset_node, send_nmt
 from pmsmtool.bus.sdo import SdoChannel
-from pmsmtool.bus.supervision import HeartbeatLost, NodeReset, SecondMaster, Supervision
+from pmsmtool.bus.supervision import EMERGENCIES_MAX, HeartbeatLost, NodeReset, SecondMaster, Supervision
 from pmsmtool.errors import DriveFault, DriveTimeout
 from tests.bus.scripted import NODE, ScriptedBus, ScriptedSlave
 
@@ -119,6 +119,24 @@ def test_other_emergencies_are_kept_and_short_ones_understood(
     connection.collect()
     supervision.check()
     assert [(e.code, e.register, e.detail) for e in supervision.emergencies] == [(0x8130, 0x11, b"")]
+
+
+def test_a_flood_of_emergencies_keeps_the_newest_and_tells_them_once(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision
+) -> None:
+    for number in range(1500):
+        bus.deliver(0x080 + NODE, b"\x30\x81\x11" + number.to_bytes(5, "little"))
+        connection.collect()
+        if number == 700:
+            supervision.check()
+    assert len(supervision.emergencies) == EMERGENCIES_MAX
+    assert int.from_bytes(supervision.emergencies[-1].detail, "little") == 1499
+    supervision.take_note_of_emergencies()
+    for code in (b"\x10\x23", *(b"\x30\x81",) * 1500):  # over-current, and a flood behind it
+        bus.deliver(0x080 + NODE, code + b"\x03")
+        connection.collect()
+    with pytest.raises(DriveFault, match="0x2310"):
+        supervision.check()
 
 
 def test_second_master_is_noticed(bus: ScriptedBus, connection: Connection, supervision: Supervision) -> None:
