@@ -19,6 +19,7 @@ def nmt_command(bus: BusOptions, out: Output, command: str) -> None:
     """Send an NMT command to one node; refused while its power stage may be on (exit code 5)."""
     from pmsmtool.bus.nmt import NmtCommand, send_nmt
     from pmsmtool.cia402 import HOMING_LOST
+    from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.errors import DriveTimeout, SdoAbort
     from pmsmtool.flash.download import refuse_while_enabled
@@ -27,6 +28,7 @@ def nmt_command(bus: BusOptions, out: Output, command: str) -> None:
     with bus.connect() as connection:
         node = DriveNode(connection, choose_node(connection, bus.node))
         try:
+            claim(connection, node.node)
             refuse_while_enabled(node)
         except SdoAbort:
             out.detail("the node has no statusword: no CiA 402 drive")

@@ -13,9 +13,12 @@ import pytest
 from benchmarks.two_tools import race
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.supervision import SecondMaster
+from pmsmtool.cli.main import run
 from pmsmtool.drive.drive_lock import claim
+from pmsmtool.sim.bus import PmsmSimBus
 from tests.bus.scripted import NODE, ScriptedBus, ScriptedSlave
 from tests.drive.served import serving
+from tests.simulated_bus import settle
 
 
 def connection(monkeypatch: pytest.MonkeyPatch, serial: int) -> Connection:
@@ -60,6 +63,19 @@ def test_a_lock_ends_with_its_owner(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     owner = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, timeout=60)
     assert owner.stdout == "locked\n"
     claim(connection(monkeypatch, 42), NODE)
+
+
+def test_a_drive_at_work_is_not_reset_by_nmt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settle(tmp_path, monkeypatch)
+    monkeypatch.setattr(Connection, "shared", True)
+    command = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:", "nmt", "reset-node"]
+    with Connection(PmsmSimBus("interior-2k2?nv=:memory:")) as working:
+        claim(working, 1)
+        assert run(command) == 3
+        assert "another pmsmtool works with this drive" in capsys.readouterr().err
+    assert run(command) == 0
 
 
 @pytest.mark.wall_clock
