@@ -8,7 +8,9 @@ both sampled at the same instants. Of a rigid shaft it is 1/J at every frequency
 Lines, their noise and coherence come from the local polynomial method, which takes the transient of a record apart from
 the response (Pintelon and Schoukens, System Identification, 2nd ed. 2012, chapter 7, DOI 10.1002/9781118287422). Both
 models are fitted to the transforms of the records with those weights; the Bayesian information criterion (Schwarz 1978,
-DOI 10.1214/aos/1176344136) and the coherence at the resonance decide.
+DOI 10.1214/aos/1176344136) decides: a second mass must explain more than a rigid shaft, and more than one that rings
+at the same frequency by itself. The coherence of a line says nothing there: a peak narrower than seven lines is no
+polynomial, and what is left of it is no noise.
 """
 
 from __future__ import annotations
@@ -24,27 +26,17 @@ from numpy.typing import NDArray
 from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, information_bound, scaled_covariance
 from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.response_lines import HALF_WIDTH, LINES_LEAST, STAGE, local_polynomials, transforms
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-STAGE = "frequency response"
 RECORDS_LEAST = 3
 """Records below which a line's noise is not known."""
-LOWEST_HZ = 5.0
-HIGHEST_SHARE = 0.2
-"""Largest frequency, of the rate of rows: beyond it the spectrum of the sequence folds back."""
-HALF_WIDTH = 3
-"""Lines on each side of one that its polynomials use."""
-ORDER = 2
 COHERENT = 0.5
 """Coherence from which a line belongs to the band that the data support."""
-LINES_LEAST = 40
-"""Coherent lines below which no response is given."""
-COHERENT_AT_RESONANCE = 0.7
-"""Smallest median coherence around a resonance that is claimed; of random data with six records it is below 0.2."""
 INFORMATION_GAIN = 10.0
 """Smallest difference of the information criterion: very strong evidence (Kass and Raftery 1995)."""
 ZETA_MOST = 0.5
@@ -53,13 +45,15 @@ RESONANCE_STD, ANTIRESONANCE_STD = 0.01, 0.02
 """Largest relative standard deviations of a resonance and an antiresonance that are claimed."""
 APART = 0.02
 """Least distance of resonance and antiresonance: closer, a second mass would be a twenty-fifth of the first."""
-BAND_SHARE = 0.95
-"""Of the supported band: a resonance must lie below."""
 START_STEP = 0.02
 """Relative step of the resonances tried as a start."""
-START_ZETAS = (0.01, 0.05, 0.2)
-ZETA_LEAST = 0.002
-"""Damping of the antiresonance to start with where the first look gives none."""
+START_ZETAS = (0.003, 0.01, 0.05, 0.2)
+LN_LARGEST = 20.0
+"""Largest logarithm of a frequency (rad/s) or damping that a fit may try."""
+SHOWN_RATIO, SHOWN_ZETA = 0.2, 0.01
+"""Load over motor and damping of the resonance whose least visible frequency is told where none is found."""
+SHOWN_TRIED = 60
+"""Frequencies tried for it."""
 ZETA_FLOOR = 0.01
 """Relative deviation of the damping beyond the fit's: rows do not show the current between them. Measured on one
 simulated drive: 0.014 too much, 0.005 by the fit."""
@@ -168,8 +162,8 @@ def estimate_frequency_response(
     flagged = sum(int(np.sum(run["flagged"] > 0.0)) for run in runs)
     if flagged:
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
-    omega, U, Y, T = _transforms(runs, torque, direction)
-    G, sigma, std, coherence = _local_polynomials(U, Y)
+    omega, U, Y, T = transforms(runs, torque, direction)
+    G, sigma, std, coherence = local_polynomials(U, Y)
     inner = slice(HALF_WIDTH, len(omega) - HALF_WIDTH)
     omega, U, Y = omega[inner], U[:, inner], Y[:, inner]
     frequency = omega / (2.0 * math.pi)
@@ -187,71 +181,28 @@ def estimate_frequency_response(
     facts = (frequency, G, std, coherence, highest, chi2_rigid)
     scale = (scale_std, tolerance or SensorTolerance())
     one = _inertia(rigid, chi2_rigid, (-1.0, 0.0), *scale)
+    shown = _shown(lines, rigid)
     start = _start(omega, G, std)
     if start is None:
-        reason = f"rigid up to {highest:.3g} Hz: no pair of poles fits"
+        reason = f"rigid up to {highest:.3g} Hz: no pair of poles fits; {shown}"
         return FrequencyResponse(*facts, math.nan, 0.0, reason=reason, inertia=one)
     two = _fit(lines, _two_mass, start)
     chi2 = two.cost / two.dof
-    penalty = (len(start) - len(rigid.x) + 2 * len(runs)) * math.log(len(rigid.residual))
-    gain = (rigid.cost - two.cost) / max(1.0, chi2) - penalty
+    # the same transients, rung by something else than the torque
+    ringing = _fit(lines, lambda at, x: (_rigid(at, x)[0], _two_mass(at, two.x)[1]), rigid.x)
+    terms = len(start) - len(rigid.x)
+    penalty = math.log(len(rigid.residual))
+    without = min(rigid.cost - 2 * len(runs) * penalty, ringing.cost)
+    gain = (without - two.cost) / max(1.0, chi2) - terms * penalty
     estimates = _estimates(two, chi2)
-    against = _against(two, chi2, gain, estimates, frequency, coherence, highest)
+    against = _against(two, chi2, gain, estimates, frequency)
     if against:
         reason = f"no resonance is claimed up to {highest:.3g} Hz: {against}"
-        return FrequencyResponse(*facts, chi2, gain, reason=reason, inertia=one)
+        return FrequencyResponse(*facts, chi2, gain, reason=f"{reason}; {shown}", inertia=one)
     resonance, antiresonance = estimates["resonance_hz"].value, estimates["antiresonance_hz"].value
     reason = f"two masses, J_load/J_motor {(resonance / antiresonance) ** 2 - 1.0:.3g}, over {highest:.3g} Hz"
     both = _inertia(two, chi2, (-1.0, 0.0, 2.0, 0.0, -2.0, 0.0), *scale)
     return FrequencyResponse(*facts, chi2, gain, estimates, reason, both)
-
-
-# ---- lines ------------------------------------------------------------------------------------------------------
-
-
-def _transforms(
-    runs: Sequence[Trace], torque: Callable[[Array, Array], Array], direction: int
-) -> tuple[Array, Complex, Complex, float]:
-    """Return frequency (rad/s), transforms of torque and acceleration in the band, and the period of rows."""
-    T = runs[0].period_s
-    n = len(runs[0]) - 2
-    frequency = np.fft.rfftfreq(n, T)
-    first = int(np.searchsorted(frequency, LOWEST_HZ))
-    band = slice(max(HALF_WIDTH + 1, first), int(np.searchsorted(frequency, HIGHEST_SHARE / T)))
-    U, Y = [], []
-    for run in runs:
-        tau = torque(run["i_d_a"], run["i_q_a"])[1:-1]
-        U.append(np.fft.rfft(tau - np.mean(tau))[band])
-        Y.append(np.fft.rfft(direction * np.diff(run["theta_M_rad"], 2) / T**2)[band])
-    omega: Array = np.asarray(2.0 * math.pi * frequency[band], dtype=np.float64)
-    if len(omega) < LINES_LEAST + 2 * HALF_WIDTH:
-        raise refuse("E_EXCITATION", f"records of {n * T:.3g} s give {len(omega)} lines", stage=STAGE)
-    # the second difference of a position is the acceleration over a triangle of two rows
-    return omega, np.array(U), np.array(Y) / np.sinc(0.5 * omega * T / math.pi) ** 2, T
-
-
-def _local_polynomials(U: Complex, Y: Complex) -> tuple[Complex, Array, Array, Array]:
-    """Return response, noise of one record's line, deviation of the magnitude and coherence of the inner lines."""
-    records = len(U)
-    width = 2 * HALF_WIDTH + 1
-    r = np.linspace(-1.0, 1.0, width)
-    powers = np.stack([r**p for p in range(ORDER + 1)], axis=1)
-    Q, _ = np.linalg.qr(powers)
-    without_transient = np.eye(width) - Q @ Q.T
-    windows = [np.lib.stride_tricks.sliding_window_view(X, width, axis=1) for X in (U, Y)]
-    u, y = (np.moveaxis(window, 0, 1) for window in windows)  # (lines, records, width)
-    W = np.einsum("ij,lrj,jp->lrip", without_transient, u, powers).reshape(len(u), records * width, ORDER + 1)
-    z = (y @ without_transient).reshape(len(u), records * width)
-    normal = np.conj(np.swapaxes(W, 1, 2)) @ W
-    inverse = np.linalg.inv(normal)
-    x = (inverse @ (np.conj(np.swapaxes(W, 1, 2)) @ z[..., None]))[..., 0]
-    rest = z - (W @ x[..., None])[..., 0]
-    dof = records * (width - ORDER - 1) - ORDER - 1
-    variance = np.sum(np.abs(rest) ** 2, axis=1) / dof
-    G = x[:, 0]
-    std = np.sqrt(0.5 * variance * np.real(inverse[:, 0, 0]))
-    explained = np.abs(G) ** 2 * np.mean(np.abs(u) ** 2, axis=(1, 2))
-    return G, np.sqrt(variance), std, explained / (explained + variance)
 
 
 # ---- models -----------------------------------------------------------------------------------------------------
@@ -263,8 +214,9 @@ def _rigid(lines: _Lines, x: Array) -> tuple[Complex, Complex]:
 
 
 def _two_mass(lines: _Lines, x: Array) -> tuple[Complex, Complex]:
-    """The same for ln 1/J_M, delay, and logarithms of w_r, zeta_r, w_a, zeta_a."""
-    w_r, zeta_r, w_a, zeta_a = np.exp(x[2:])
+    """The same for ln 1/J_M, delay, logarithms of w_r, zeta_r, w_a, and zeta_a, which noise may make negative."""
+    w_r, zeta_r, w_a = np.exp(np.minimum(x[2:5], LN_LARGEST))
+    zeta_a = x[5]
     s = 1j * lines.omega
     G = (s**2 + 2.0 * zeta_a * w_a * s + w_a**2) / (s**2 + 2.0 * zeta_r * w_r * s + w_r**2)
     rigid, basis = _rigid(lines, x)
@@ -306,16 +258,16 @@ def _start(omega: Array, G: Complex, std: Array) -> Array | None:
             cost = float(np.sum((rows @ b - target) ** 2))
             if cost < best and b[0] > 0.0 and b[2] > 0.0 and b[0] < b[2]:
                 w_a = w_r * math.sqrt(b[0] / b[2])
-                zeta_a = max(ZETA_LEAST, 0.5 * b[1] / math.sqrt(b[0] * b[2]))
                 best = cost
-                found = np.array([math.log(b[2]), 0.0, *np.log([w_r, zeta_r, w_a, zeta_a])])
+                zeta_a = 0.5 * b[1] / math.sqrt(b[0] * b[2])
+                found = np.array([math.log(b[2]), 0.0, *np.log([w_r, zeta_r, w_a]), zeta_a])
     return found
 
 
 def _estimates(fit: Fit, chi2: float) -> dict[str, Estimate]:
     bound, _ = information_bound(fit.jacobian)
     widen = math.sqrt(max(1.0, chi2))
-    values = np.exp(fit.x[2:])
+    values = np.exp(fit.x[2:5])
     rows = (
         ("resonance_hz", 0, 2.0 * math.pi, 0.0, "Hz"),
         ("antiresonance_hz", 2, 2.0 * math.pi, 0.0, "Hz"),
@@ -357,14 +309,29 @@ def _inertia(
     )
 
 
+def _shown(lines: _Lines, rigid: Fit) -> str:
+    """Return up to where a second mass would have shown: its difference to a rigid shaft, in the noise of the lines."""
+    penalty = INFORMATION_GAIN + (4 + 2 * len(lines.U)) * math.log(len(rigid.residual))
+    power = 2.0 * np.sum(np.abs(lines.U) ** 2, axis=0) / lines.sigma**2
+    highest = 0.0
+    for w_r in np.geomspace(lines.omega[0], lines.omega[-1], SHOWN_TRIED):
+        w_a = w_r / math.sqrt(1.0 + SHOWN_RATIO)
+        zeta_a = SHOWN_ZETA * w_a / w_r
+        # all that turns is known; the motor's share of it is smaller
+        x = np.array([rigid.x[0] + 2.0 * math.log(w_r / w_a), rigid.x[1], *np.log([w_r, SHOWN_ZETA, w_a]), zeta_a])
+        change = np.abs(_two_mass(lines, x)[0] - _rigid(lines, rigid.x)[0])
+        if float(np.sum(power * change**2)) > penalty:
+            highest = float(w_r) / (2.0 * math.pi)
+    load = f"a load of {SHOWN_RATIO:g} of the motor's inertia at {100.0 * SHOWN_ZETA:g} % damping"
+    return f"{load} would show up to {highest:.3g} Hz" if highest else f"{load} would not show at any frequency"
+
+
 def _against(
     fit: Fit,
     chi2: float,
     gain: float,
     estimates: dict[str, Estimate],
     frequency: Array,
-    coherence: Array,
-    highest_hz: float,
 ) -> str:
     """Return what speaks against a second mass, empty where nothing does."""
     resonance, antiresonance = estimates["resonance_hz"], estimates["antiresonance_hz"]
@@ -375,17 +342,16 @@ def _against(
         return "the fit of a second mass did not converge"
     if chi2 > CHI2_REFUSE:
         return f"two masses do not explain the response either, reduced chi-square {chi2:.3g}"
-    if not frequency[0] < antiresonance.value < resonance.value < BAND_SHARE * highest_hz:
+    if not frequency[0] < antiresonance.value < resonance.value < frequency[-1 - HALF_WIDTH]:
         return f"{antiresonance.value:.3g} and {resonance.value:.3g} Hz are not the pair of two masses inside the band"
     if resonance.value < (1.0 + APART) * antiresonance.value:
         return f"zeros and poles at {resonance.value:.3g} Hz are less than {100.0 * APART:g} % apart"
     if zeta > ZETA_MOST:
         return f"the damping {zeta:.3g} is above {ZETA_MOST:g}"
-    width = max(zeta * resonance.value, HALF_WIDTH * float(frequency[1] - frequency[0]))
-    around = np.abs(frequency - resonance.value) <= width
-    seen = float(np.median(coherence[around]))
-    if seen < COHERENT_AT_RESONANCE:
-        return f"the coherence at {resonance.value:.4g} Hz is {seen:.2g}, {COHERENT_AT_RESONANCE:g} is needed"
     if resonance.std > RESONANCE_STD * resonance.value or antiresonance.std > ANTIRESONANCE_STD * antiresonance.value:
-        return f"{resonance.value:.3g} Hz is known to {resonance.std:.2g} Hz only"
+        return (
+            f"poles at {resonance.value:.4g} Hz are known to {resonance.std:.2g} Hz and zeros at "
+            f"{antiresonance.value:.4g} Hz to {antiresonance.std:.2g} Hz, limits {100.0 * RESONANCE_STD:g} and "
+            f"{100.0 * ANTIRESONANCE_STD:g} %"
+        )
     return ""

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.estimators.estimate import CONDITION_LIMIT, information_bound
-from pmsmtool.estimators.frequency_response import COHERENT, HALF_WIDTH, HIGHEST_SHARE, LOWEST_HZ, ORDER
+from pmsmtool.estimators.frequency_response import COHERENT
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, linear_solve
 from pmsmtool.estimators.mechanics import BLOCKS, SCALE_FLOOR
 from pmsmtool.estimators.mechanics_model import Problem, Run, whitener
 from pmsmtool.estimators.mechanics_motion import positions
 from pmsmtool.estimators.mechanics_position import position_std
+from pmsmtool.estimators.response_lines import HALF_WIDTH, HIGHEST_SHARE, LOWEST_HZ, ORDER
 from pmsmtool.trace import Trace
 
 Array = NDArray[np.float64]

@@ -1,0 +1,74 @@
+"""Lines of a mechanical frequency response: transforms of torque and acceleration, and the local polynomial method.
+
+The method takes the transient of a record apart from the response and gives each line its noise (Pintelon and
+Schoukens, System Identification, 2nd ed. 2012, chapter 7, DOI 10.1002/9781118287422).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.trace import Trace
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+STAGE = "frequency response"
+LOWEST_HZ = 5.0
+HIGHEST_SHARE = 0.2
+"""Largest frequency, of the rate of rows: beyond it the spectrum of the sequence folds back."""
+HALF_WIDTH = 3
+"""Lines on each side of one that its polynomials use."""
+ORDER = 2
+LINES_LEAST = 40
+"""Coherent lines below which no response is given."""
+
+
+def transforms(
+    runs: Sequence[Trace], torque: Callable[[Array, Array], Array], direction: int
+) -> tuple[Array, Complex, Complex, float]:
+    """Return frequency (rad/s), transforms of torque and acceleration in the band, and the period of rows."""
+    T = runs[0].period_s
+    n = len(runs[0]) - 2
+    frequency = np.fft.rfftfreq(n, T)
+    first = int(np.searchsorted(frequency, LOWEST_HZ))
+    band = slice(max(HALF_WIDTH + 1, first), int(np.searchsorted(frequency, HIGHEST_SHARE / T)))
+    U, Y = [], []
+    for run in runs:
+        tau = torque(run["i_d_a"], run["i_q_a"])[1:-1]
+        U.append(np.fft.rfft(tau - np.mean(tau))[band])
+        Y.append(np.fft.rfft(direction * np.diff(run["theta_M_rad"], 2) / T**2)[band])
+    omega: Array = np.asarray(2.0 * math.pi * frequency[band], dtype=np.float64)
+    if len(omega) < LINES_LEAST + 2 * HALF_WIDTH:
+        raise refuse("E_EXCITATION", f"records of {n * T:.3g} s give {len(omega)} lines", stage=STAGE)
+    # the second difference of a position is the acceleration over a triangle of two rows
+    return omega, np.array(U), np.array(Y) / np.sinc(0.5 * omega * T / math.pi) ** 2, T
+
+
+def local_polynomials(U: Complex, Y: Complex) -> tuple[Complex, Array, Array, Array]:
+    """Return response, noise of one record's line, deviation of the magnitude and coherence of the inner lines."""
+    records = len(U)
+    width = 2 * HALF_WIDTH + 1
+    r = np.linspace(-1.0, 1.0, width)
+    powers = np.stack([r**p for p in range(ORDER + 1)], axis=1)
+    Q, _ = np.linalg.qr(powers)
+    without_transient = np.eye(width) - Q @ Q.T
+    windows = [np.lib.stride_tricks.sliding_window_view(X, width, axis=1) for X in (U, Y)]
+    u, y = (np.moveaxis(window, 0, 1) for window in windows)  # (lines, records, width)
+    W = np.einsum("ij,lrj,jp->lrip", without_transient, u, powers).reshape(len(u), records * width, ORDER + 1)
+    z = (y @ without_transient).reshape(len(u), records * width)
+    normal = np.conj(np.swapaxes(W, 1, 2)) @ W
+    inverse = np.linalg.inv(normal)
+    x = (inverse @ (np.conj(np.swapaxes(W, 1, 2)) @ z[..., None]))[..., 0]
+    rest = z - (W @ x[..., None])[..., 0]
+    dof = records * (width - ORDER - 1) - ORDER - 1
+    variance = np.sum(np.abs(rest) ** 2, axis=1) / dof
+    G = x[:, 0]
+    std = np.sqrt(0.5 * variance * np.real(inverse[:, 0, 0]))
+    explained = np.abs(G) ** 2 * np.mean(np.abs(u) ** 2, axis=(1, 2))
+    return G, np.sqrt(variance), std, explained / (explained + variance)
