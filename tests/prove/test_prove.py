@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import can
+import numpy as np
 import pytest
 
 from benchmarks.prove_verdicts import KINDS, Shared, flash, spoiled
@@ -21,6 +22,7 @@ from pmsmtool.cia402 import Mode
 from pmsmtool.cli.main import run as program
 from pmsmtool.design.design_file import Design, design_text
 from pmsmtool.design.judgement import judge
+from pmsmtool.design.prediction import Band, Prediction
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -34,7 +36,7 @@ from pmsmtool.workflow.commission import begin_run
 from pmsmtool.workflow.prove import measured
 from pmsmtool.workflow.prove import stage as stages
 from pmsmtool.workflow.prove.plan import Conditions
-from pmsmtool.workflow.prove.stage import ProofRequest, prove_stage, read_proof, responses
+from pmsmtool.workflow.prove.stage import ProofRequest, _too_slow, prove_stage, read_proof, responses
 from pmsmtool.workflow.report_page import report_page
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 
@@ -344,3 +346,19 @@ def test_from_the_command_line(design: Design, capsys: pytest.CaptureFixture[str
     first, second = sorted((run.path / "prove").iterdir())
     assert second.name == f"{first.name}-2", "the same prediction, and no trace of the first proof replaced"
     assert (first / "prediction.npz").read_bytes() == (second / "prediction.npz").read_bytes()
+
+
+def test_a_band_on_both_sides_of_standstill_tells_no_speed() -> None:
+    """Before: 1088 rad/s were "instead of 545.2" within -4329 to 5748, for the edges' magnitudes were compared."""
+    end = {("weakening", "omega_e_rad_s"): np.array([830.0, 1088.0])}
+
+    def said(mean: float, std: float) -> str:
+        band = Band(np.array([830.0, mean]), np.array([10.0, std]), 2.0)
+        return _too_slow(Prediction({}, {("weakening", "omega_e_rad_s"): band}), end)
+
+    assert "tells no speed to prove" in said(545.0, 1000.0) and "instead of" not in said(545.0, 1000.0)
+    assert said(545.0, 540.0) == ""  # -535 to 1625: 1088 lies inside
+    assert said(1500.0, 1350.0) == ""  # -1200 to 4200: before, slower than 1200
+    assert said(1100.0, 10.0) == "" and said(900.0, 10.0) == ""  # faster than both
+    assert "ends at 1088 instead of 1200 rad/s" in said(1200.0, 10.0)
+    assert "ends at 1088 instead of -1200 rad/s" in said(-1200.0, 10.0)
