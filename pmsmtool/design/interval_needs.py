@@ -84,7 +84,9 @@ def interval_needs(
         Where no design can be made, tune says why, and only an angle is judged: by the torque that it takes.
     """
     request = MarginRequest() if request is None else request
-    without_design = {OFFSET: (_torque_of_angle(half_widths[OFFSET]),)} if OFFSET in half_widths else {}
+    without_design: dict[str, tuple[Need, ...]] = (
+        {OFFSET: (_torque_of_angle(half_widths[OFFSET]),)} if OFFSET in half_widths else {}
+    )
     if source is None:
         return without_design
     try:

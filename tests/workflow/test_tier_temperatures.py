@@ -7,10 +7,10 @@ import math
 import pytest
 
 from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.estimators.resistance import Copper
+from pmsmtool.estimators.resistance import Copper, copper_of
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.workflow.tier_evaluate import TierFacts, TierResult, copper_of, tier_result
+from pmsmtool.workflow.tier_evaluate import TierFacts, TierResult, tier_result
 from pmsmtool.workflow.tier_machine import UNKNOWN_TEMPERATURE_K, tier_machine
 from tests.estimators.test_recorded_push import PAIRS, T_S, swing
 
