@@ -147,8 +147,8 @@ def test_the_speed_comes_back_by_the_levels_it_came(monkeypatch: pytest.MonkeyPa
         asked.append(omega_m_rad_s)
         command(self, omega_m_rad_s)
 
-    def watched(self: GuardedDrive, seconds: float) -> None:
-        watch(self, seconds)
+    def watched(self: GuardedDrive) -> None:
+        watch(self)
         seen.append((self._node.connection.clock.now(), self.live("omega_e_rad_s")))
 
     monkeypatch.setattr(GuardedDrive, "command_speed", noted)
