@@ -29,6 +29,8 @@ COUNTS_SHARE = 0.25
 MAX_POLE_PAIRS = 64
 """Pole pairs up to which a turning rotor is told from a standing one."""
 PER_TURN_LEAST_RAD = 2e-3
+PER_TURN_ORDERS = 8
+"""Highest order per turn that shows how much of the following error is no encoder's."""
 PER_TURN_SURE = 4.0
 """Error of the encoder once or twice per turn (mechanical) from which on it is told, and how much more of it both
 directions have in common than they differ by: what a swinging rotor or friction shows differs. Of 22 random drives
@@ -149,16 +151,23 @@ def estimate_encoder(forward: Trace, backward: Trace) -> EncoderResult:
 
 
 def _per_turn(forward: Trace, backward: Trace, pole_pairs: int) -> tuple[float, float]:
-    """Return the clear part of the encoder's error once and twice per turn (rad mechanical)."""
+    """Return the clear part of the encoder's error once and twice per turn (rad mechanical).
+
+    A rotor that sticks and slips behind the vector leaves something of every order: what does not stand out of the
+    others is not the encoder's. Multiples of the pole pairs are left out: offsets of the current sensors have them.
+    """
+    p = abs(pole_pairs)
+    orders = [1, 2, *(k for k in range(3, PER_TURN_ORDERS + 1) if p == 1 or k % p)]
     found = []
     for trace in (forward, backward):
         theta = trace["theta_M_rad"]
-        columns = [np.ones_like(theta), *(wave(k * theta) for k in (1.0, 2.0) for wave in (np.cos, np.sin))]
+        columns = [np.ones_like(theta), *(wave(k * theta) for k in orders for wave in (np.cos, np.sin))]
         off = theta - trace["theta_imposed_rad"] / pole_pairs
         fit = np.linalg.lstsq(np.stack(columns, axis=1), off, rcond=None)[0]
         found.append(fit[1::2] - 1j * fit[2::2])
     common, differs = np.abs(found[0] + found[1]) / 2.0, np.abs(found[0] - found[1]) / 2.0
-    clear = (common > PER_TURN_LEAST_RAD) & (common > PER_TURN_SURE * differs)
+    noise = np.maximum(differs[:2], np.median(common[2:]))
+    clear = (common[:2] > PER_TURN_LEAST_RAD) & (common[:2] > PER_TURN_SURE * noise)
     return float(common[0] * clear[0]), float(common[1] * clear[1])
 
 

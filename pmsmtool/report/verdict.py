@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pmsmtool.errors import ExitCode
-from pmsmtool.report.comparison import headline, unchecked
+from pmsmtool.report.comparison import headline
 
 COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
 """Stages of a full commissioning."""
@@ -152,7 +152,7 @@ def _required(record: Mapping[str, Any], latest: Sequence[Mapping[str, Any]]) ->
 
 def _unchecked(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> list[str]:
     """Return what else the result follows from and nothing measured: not in the comparison, or not compared."""
-    told = unchecked(comparison_of(latest))
+    told = {str(row["name"]) for row in comparison_of(latest) if row["stated"] is not None}
     values = [value for stage in latest for value in stage.get("values", ()) if value["name"] not in told]
     bare: dict[str, list[str]] = {}
     for value in values:
@@ -162,7 +162,7 @@ def _unchecked(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> 
     lines = [f"{', '.join(names)}: {sources.get(source, source)}, NOT CHECKED" for source, names in bare.items()]
     identified = next((stage for stage in latest if stage["name"] == "identify" and stage["status"] in RAN), None)
     if len(complete) > 1 and identified is not None:
-        known = {str(value["name"]) for value in values if "std" in value or "source" in value} | set(told)
+        known = {str(value["name"]) for value in values if "std" in value or "source" in value} | told
         absent = [name for name in NEEDED if name not in known and RATIOS.get(name) not in known]
         lines += [f"{', '.join(absent)}: not measured in this run, NOT CHECKED"] if absent else []
     if len(complete) > 1:

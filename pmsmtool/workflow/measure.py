@@ -201,7 +201,9 @@ class Measurement:
             self.drive.enable()
             return None
         except PmsmtoolError as error:  # it ends the run; the traces of this experiment are not whole
-            self.refused[quantity] = IdentificationError("E_NOT_MEASURED", f"the run ended during it: {error.what}")
+            self.refused[quantity] = IdentificationError(
+                "E_NOT_MEASURED", f"the run ended during it: {error.what}", hint="remove the cause, identify again"
+            )
             raise
 
     def _shaft(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> None:

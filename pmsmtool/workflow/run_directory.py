@@ -163,7 +163,10 @@ class RunDirectory:
             If there is no record, or it is not one of ours.
         """
         path = self.path / RECORD
-        text = read_text(path, largest=ROWS_BYTES, hint="give a directory that identify or commission made")
+        hint = "give a directory that identify or commission made"
+        if not path.exists():
+            raise ConfigError(f"no {RECORD} here", where=str(self.path), hint=hint)
+        text = read_text(path, largest=ROWS_BYTES, hint=hint)
         try:
             raw = json.loads(text)
         except (ValueError, RecursionError) as error:

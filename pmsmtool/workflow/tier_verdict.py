@@ -65,7 +65,7 @@ def judged(
     )
     had = [STEP[name] for name, key in TOLD_BY.items() if key in estimates]
     lacking = {
-        STEP[name]: IdentificationError(NOT_TOLD, why)
+        STEP[name]: IdentificationError(NOT_TOLD, why, hint="state it in MACHINE, or allow more current and speed")
         for name, key in TOLD_BY.items()
         for keys, why in missing.items()
         if key in keys.split(", ") and key not in estimates

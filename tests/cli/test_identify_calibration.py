@@ -29,7 +29,7 @@ def answer(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, flo
     code = run(("identify", *arguments, "--json"))
     printed = capsys.readouterr()
     assert code == 0, printed.err
-    (value,) = json.loads(printed.out)["values"]
+    (value,) = (value for value in json.loads(printed.out)["values"] if value["name"] == "R_s_ohm")
     return dict(value)
 
 

@@ -10,7 +10,7 @@ import pytest
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
-from pmsmtool.errors import BusError, StopNotConfirmed
+from pmsmtool.errors import BusError, DriveFault, StopNotConfirmed
 from tests.drive.contract import ENVELOPE, DriveContract
 from tests.drive.served import Server, serving
 
@@ -32,15 +32,17 @@ class TestServed(DriveContract):
             yield drive
 
 
-def test_main_thread_busy_for_two_seconds_keeps_the_machine_enabled(server: Server) -> None:
+def test_main_thread_busy_for_two_seconds_leaves_the_machine_off(server: Server) -> None:
+    """Nobody looked at the machine meanwhile: the heartbeat stops, and the drive removes the voltage by itself."""
     with server.connect() as connection:
         drive = CanopenDrive(connection, 1)
-        with guarded(drive, ENVELOPE) as guard:
+        with pytest.raises(DriveFault, match="heartbeat"), guarded(drive, ENVELOPE) as guard:
             guard.enable()
             end = time.monotonic() + 2.0
             while time.monotonic() < end:
                 sum(range(50_000))
-            assert drive.node.state() == 0x27
+            assert drive.node.state() != 0x27
+            guard.wait(0.0)
 
 
 def test_server_that_dies_is_noticed_within_two_seconds_and_not_confirmed() -> None:

@@ -28,7 +28,11 @@ def dictionary() -> canopen.ObjectDictionary:
     return canopen.import_od(str(data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds"))
 
 
-@pytest.mark.parametrize("name", all_objects())
+ON_OTHER_DRIVES = {"PROFILE_DECELERATION"}
+"""Objects that the tool reads where a drive has them, and the reference drive has not."""
+
+
+@pytest.mark.parametrize("name", sorted(set(all_objects()) - ON_OTHER_DRIVES))
 def test_index_sub_and_type(dictionary: canopen.ObjectDictionary, name: str) -> None:
     item = all_objects()[name]
     variable = dictionary.get_variable(item.index, item.sub)

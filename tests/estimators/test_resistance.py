@@ -116,7 +116,7 @@ def test_without_a_temperature_sensor_the_value_belongs_to_the_mean_heating() ->
     for k in map(int, easy):
         result = estimate_resistance(levels_of(d, k, rng, heating_k=3.0, sensor=False), noise_of(d, k))
         assert math.isnan(result.R_s.T_c)
-        assert "not normalised" in result.R_s.fallback
+        assert "R_s as measured, its interval is that of 5 to 90 degC" in result.R_s.fallback
         truth = d.R[k] * (1.0 + ALPHA * 1.5)
         assert abs(result.R_s.value - truth) < max(3e-3 * truth, COVERAGE_FACTOR * result.R_s.std)
         assert result.drift == pytest.approx(ALPHA * 3.0, rel=0.15)

@@ -62,7 +62,9 @@ def operated(bench: SimBench, by: str) -> tuple[Trace, float]:
             guard.wait(0.4)
             seen = Observations()
             if by == "pdo":
-                observe_process_data(bench.drive.node, 1.0, 100.0, seen)
+                for _ in range(20):  # who drives the machine looks at it meanwhile
+                    observe_process_data(bench.drive.node, 0.05, 100.0, seen)
+                    guard.wait(0.0)
             else:
                 observe_recordings(bench.drive, 1.0, seen)
             parts.append(seen.trace())

@@ -127,6 +127,10 @@ def ended(ended_once: tuple[Path, int], tmp_path: Path) -> Iterator[tuple[RunDir
         yield RunDirectory(tmp_path / "run"), found
 
 
+EXACTLY = ("std", "systematic", "total_95")
+"""Parts of the interval of a value."""
+
+
 def identified(folder: Path, drive: CanopenDrive) -> RunDirectory:
     """A run whose identification has passed, as if the profile's own numbers had been measured."""
     run = begin_run(drive, folder)
@@ -314,7 +318,7 @@ def test_a_measured_flux_that_contradicts_the_file_ends_the_chain(
     assert machine.J_kgm2 is not None
     wrong = replace(machine, psi_f_wb=1.65 * machine.psi_f_wb, J_kgm2=5.0 * machine.J_kgm2)
     values = [
-        {"name": key, "value": getattr(machine, key), "std": 0.0, "total_95": 0.0, "unit": "1", "T_c": 20.0}
+        {"name": key, "value": getattr(machine, key), "unit": "1", "T_c": 20.0, **dict.fromkeys(EXACTLY, 0.0)}
         for key in ("pole_pairs", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")
     ]
     measured = Stage("identify", "pass", 1.0, values=values)

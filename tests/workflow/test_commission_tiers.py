@@ -21,7 +21,7 @@ from pmsmtool.design.open_loops import lacking_gains
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.errors import ConfigError, Contradiction, IdentificationError, NotAvailable, Partial
+from pmsmtool.errors import ConfigError, Contradiction, NotAvailable, Partial
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.machine.machine_file import load_machine_file
@@ -385,5 +385,5 @@ def test_a_measurement_that_is_not_accepted_says_what_to_change(
     Path("wrong.toml").write_text(text, encoding="utf-8")
     bus = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=cia402"]
     outcome = CliRunner().invoke(cli, [*bus, "commission", "wrong.toml", "--yes"])
-    assert isinstance(outcome.exception, IdentificationError) and "correct that" in outcome.exception.hint
+    assert isinstance(outcome.exception, Contradiction) and "correct pole_pairs" in outcome.exception.hint
     assert "--resume" not in outcome.stderr and "begin a new run" in outcome.stderr
