@@ -44,6 +44,9 @@ STANDSTILL_RAD_S = 1.0
 """Longest wait for the shaft, beyond what the design's slope takes, and electrical speed that counts as standstill (the
 noise of a 12-bit encoder)."""
 LOOK_S = 0.05
+RESTING_LOOKS = 2
+KEPT_LOOKS = 5
+"""Looks in a row that show standstill, or a speed that something keeps (loop or load): no more is to be waited for."""
 RISE_STEPS = 64
 RISE_SHARE = 0.25
 RISE_S = 3.0
@@ -180,10 +183,13 @@ def _ramp_s(drive: Drive, speed_rad_s: float, pole_pairs: int) -> float:
 def _come_to_rest(drive: Drive, pole_pairs: int) -> None:
     """Wait for the shaft as long as it gets slower; the guard's stop brakes what is left."""
     waited, last = 0.0, math.inf
+    resting = kept = 0  # looks in a row: a shaft that swings passes standstill, and is faster for a moment
     longest_s = STANDSTILL_S + _ramp_s(drive, 0.0, pole_pairs)
     while waited < longest_s:
         speed = abs(drive.live("omega_e_rad_s"))
-        if speed > 0.98 * last or speed < STANDSTILL_RAD_S:
+        resting = resting + 1 if speed < STANDSTILL_RAD_S else 0
+        kept = kept + 1 if speed > 0.98 * last else 0
+        if resting == RESTING_LOOKS or kept == KEPT_LOOKS:
             return
         last = speed
         drive.wait(LOOK_S)
