@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pmsmtool.errors import ExitCode
-from pmsmtool.report.comparison import headline
+from pmsmtool.report.comparison import headline, unchecked
 
 COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
 """Stages of a full commissioning."""
@@ -152,11 +152,12 @@ def _required(record: Mapping[str, Any], latest: Sequence[Mapping[str, Any]]) ->
 
 def _unchecked(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> list[str]:
     """Return what else the result follows from and nothing measured: not in the comparison, or not compared."""
-    told = {str(row["name"]) for row in comparison_of(latest) if row["stated"] is not None}
+    told = set(unchecked(comparison_of(latest)))
+    compared = {str(row["name"]) for row in comparison_of(latest) if row.get("stated") is not None}
     values = [value for stage in latest for value in stage.get("values", ()) if value["name"] not in told]
     bare: dict[str, list[str]] = {}
     for value in values:
-        if "source" in value and "std" not in value:
+        if "source" in value and "std" not in value and not (value["source"] == AS_GIVEN and value["name"] in compared):
             bare.setdefault(str(value["source"]), []).append(str(value["name"]))
     sources = {VENDOR: "the drive's own measurement, without an interval", AS_GIVEN: "data sheet"}
     lines = [f"{', '.join(names)}: {sources.get(source, source)}, NOT CHECKED" for source, names in bare.items()]
