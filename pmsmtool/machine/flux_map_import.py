@@ -217,7 +217,7 @@ def _transposed(axis_d: Array, axis_q: Array, psi_d: Array, psi_q: Array, where:
         return psi_d.shape == (len(axis_q), len(axis_d))
     first = np.nanmean(np.abs(np.diff(psi_d, axis=0))) - np.nanmean(np.abs(np.diff(psi_q, axis=0)))
     second = np.nanmean(np.abs(np.diff(psi_d, axis=1))) - np.nanmean(np.abs(np.diff(psi_q, axis=1)))
-    if first * second > 0:
+    if np.sign(first) * np.sign(second) > 0:
         raise ConfigError(
             "a square map with vector axes does not show which index is i_d",
             where=where,

@@ -42,7 +42,8 @@ TRANSMIT_QUEUE = 8
 _PACE_SLICE_S = 0.05
 
 _lines: dict[str, Line] = {}
-_lines_lock = threading.Lock()
+# Its holder may take it again: Python may collect a forgotten bus at any instruction, and ``__del__`` shuts it down.
+_lines_lock = threading.RLock()
 
 
 class _Pace:
@@ -354,8 +355,9 @@ def _join(key: str, build: Callable[[], Line]) -> Line:
 
 
 def _leave(key: str, bus: PmsmSimBus) -> None:
+    # Never both locks at once: a thread that holds the clock may collect a forgotten bus and come here.
+    with bus.line.clock.held:
+        bus.line.detach(bus)
     with _lines_lock:
-        with bus.line.clock.held:
-            bus.line.detach(bus)
         if not bus.line.endpoints and _lines.get(key) is bus.line:
             del _lines[key]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from typing import Any
@@ -10,6 +11,7 @@ import can
 import pytest
 
 from pmsmtool.bus.frame_time import frame_bits, unstuffed_bits
+from pmsmtool.sim import bus as simulated
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.line import Frame, Line
 from tests.node.bench import Bench
@@ -233,3 +235,19 @@ def test_threads_may_send_at_any_time(bench: Bench) -> None:
         thread.join()
     answers = [m for m in bench.listen(0.3) if m.arbitration_id == 0x581]
     assert len(answers) == 200
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_forgotten_bus_is_collected_in_the_middle_of_joining_and_leaving() -> None:
+    """Python may collect one at any instruction, also where its own thread holds the table of lines."""
+    forgotten = [PmsmSimBus(line=Line())]
+
+    def collect_inside() -> None:
+        with simulated._lines_lock:
+            forgotten.clear()
+            gc.collect()
+
+    thread = threading.Thread(target=collect_inside, daemon=True)
+    thread.start()
+    thread.join(10.0)
+    assert not thread.is_alive(), "the thread waits for a lock that it holds itself"
