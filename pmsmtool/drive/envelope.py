@@ -37,6 +37,8 @@ class Envelope:
     ----------
     i_max_apk : float
         Largest current vector (A peak).
+    i_d_max_apk : float
+        Largest d current in the frame of the rotor (A peak): more may demagnetise it; infinity: as the vector.
     speed_max_rad_s : float
         Largest mechanical speed (rad/s).
     duration_s : float
@@ -62,6 +64,7 @@ class Envelope:
     load: Load = "none"
     brake: Brake = "none"
     acceleration_rad_s2: float | None = None
+    i_d_max_apk: float = math.inf
 
     def lines(self) -> list[str]:
         """Return the envelope as a person reads it before consenting."""

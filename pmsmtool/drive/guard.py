@@ -49,6 +49,7 @@ LOCKED_TRAVEL_RAD = math.radians(20.0)
 _TURNS = "the shaft turns, though it is said to be locked"
 _NEXT_STEP = {
     "current": "raise the limit knowingly (--i-max), or ask for less",
+    "d current": "state i_d_min_apk in the machine file where the magnets stand more, or ask for less",
     "speed": "raise the limit knowingly (--speed-max), or ask for less",
     "travel": "clamp the shaft, or say --shaft free where it may turn",
 }
@@ -330,6 +331,8 @@ class GuardedDrive:
     def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
         """Hold a current vector (A peak) within the envelope."""
         self._check("current", math.hypot(i_d_a, i_q_a), self.envelope.i_max_apk, "A")
+        if fixed_angle_rad is None:
+            self._check("d current", abs(i_d_a), self.envelope.i_d_max_apk, "A")
         self._asked_rad_s = 0.0
         self._drive.command_current(i_d_a, i_q_a, fixed_angle_rad=fixed_angle_rad)
 
@@ -396,6 +399,8 @@ class GuardedDrive:
         if excitation.shape is Shape.HYSTERESIS:
             largest = math.hypot(abs(excitation.i_centre_d_a) + excitation.i_limit_d_a, excitation.i_limit_q_a)
             self._check("current", largest, i_max, "A")
+            in_d = abs(excitation.i_centre_d_a) + excitation.i_limit_d_a
+            self._check("d current", in_d, self.envelope.i_d_max_apk, "A")
         if excitation.point is Injection.SPEED:
             self._check("speed", peak, self.envelope.speed_max_rad_s, "rad/s")
             self._refuse_turning()

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.estimators.cross_check import driven_flux_linkage
 from pmsmtool.estimators.estimate import SensorTolerance, condition_gate, information_weights
-from pmsmtool.estimators.flux_linkage_rows import STAGE, Corrected, check_speeds, corrected, pairs_of
+from pmsmtool.estimators.flux_linkage_rows import STAGE, Corrected, check_speeds, corrected, fastest_pair, pairs_of
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.estimators.refusals import refuse
@@ -61,6 +61,10 @@ PENALTY = 7.0
 that is not there made psi_f scatter by three times its bound."""
 INSTANT_STEP = 0.01
 """Step of the derivative by the sampling instant (T_s)."""
+MAGNET_CHANGE = 0.003
+"""Change of the flux linkage over the pulses of a flux map that counts as none, whatever the scatter."""
+PAIR_SCATTERS = 3.0
+"""Scatter of a pair of windows, of which two may be apart."""
 LEVEL_RATIO = 1.2
 """Ratio of d currents above which they are different levels."""
 
@@ -245,6 +249,40 @@ def estimate_flux_linkage(
         residual_wb=even.residual_wb,
         shown=shown,
     )
+
+
+def check_magnet(before: Trace, again: Trace, flux: FluxResult, alpha_psi_per_k: float) -> None:
+    """Compare the flux linkage of two windows with the one of the same two windows later.
+
+    Gains, inverter error and saturation are those of both, and cancel.
+
+    Parameters
+    ----------
+    before, again : Trace
+        Rows of a run over speeds; the two rows of ``again`` repeat ``fastest_pair`` of ``before``.
+    flux : FluxResult
+        Of the run before; its residuals say how well one pair is known.
+    alpha_psi_per_k : float
+        Temperature coefficient of the magnet flux (1/K).
+
+    Raises
+    ------
+    IdentificationError
+        ``E_MAGNET_CHANGED``.
+    """
+    pairs = (before, list(fastest_pair(before))), (again, [0, 1])
+    psi = [float(np.mean(rows["u_q_v"][at] / rows["omega_e_rad_s"][at])) for rows, at in pairs]
+    T = [float(np.mean(rows["T_magnet_c"][at])) for rows, at in pairs]
+    warmer = T[1] - T[0] if np.all(np.isfinite(T)) else 0.0  # without a sensor a few seconds count as none
+    change = psi[1] / (psi[0] * (1.0 + alpha_psi_per_k * warmer)) - 1.0
+    scatter = float(np.sqrt(np.mean(flux.residual_wb**2))) / flux.psi_measured.value
+    limit = max(MAGNET_CHANGE, PAIR_SCATTERS * math.sqrt(2.0) * scatter)
+    if not abs(change) <= limit:
+        raise refuse(
+            "E_MAGNET_CHANGED",
+            f"the flux linkage changed by {100.0 * change:.2g} % over the pulses, limit {100.0 * limit:.2g} %",
+            stage="flux map",
+        )
 
 
 def _fit_d(rows: Corrected) -> tuple[Vector, Vector, int]:

@@ -82,6 +82,12 @@ def pairs_of(speeds: Trace) -> list[tuple[int, int]]:
     return pairs
 
 
+def fastest_pair(speeds: Trace) -> tuple[int, int]:
+    """Return the rows of the run's highest speed that hold i_d with both signs, one after the other."""
+    first = int(np.argmax(speeds["omega_e_rad_s"]))
+    return first, first + 1
+
+
 def corrected(
     speeds: Trace,
     R_ohm: float,

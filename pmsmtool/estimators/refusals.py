@@ -48,6 +48,12 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
         "take away what pulls on the shaft, or lower the current (--i-max)",
     ),
     (
+        "E_MAGNET_CHANGED",
+        "the flux linkage after the pulses of the flux map is not the one before them",
+        "magnets that the d current of the pulses has demagnetised in part",
+        "state an i_d_min_apk well inside that current in the machine file, then identify this rotor again",
+    ),
+    (
         "E_CLIPPED",
         "samples in the fit window were limited or at full scale",
         "the amplitude exceeds the voltage limit, the current limit or the converter's range",

@@ -104,6 +104,8 @@ class ScanPlan:
         Resistive drop at that current and the inverter's error (V): the pulses must be well above it.
     rectangles : tuple
         Shares of d and q current, one trace each.
+    i_d_max_a : float
+        Largest d current, of either sign: more may demagnetise the rotor (A peak).
     """
 
     i_max_a: float
@@ -111,6 +113,11 @@ class ScanPlan:
     held: bool
     drop_v: float = 0.0
     rectangles: tuple[tuple[float, float], ...] = RECTANGLES
+    i_d_max_a: float = math.inf
+
+    def reach_a(self, axis: Axis) -> float:
+        """Return the largest current of an axis (A peak)."""
+        return min(self.i_max_a, self.i_d_max_a) if axis == "d" else self.i_max_a
 
     @property
     def half_periods(self) -> int:
@@ -184,8 +191,9 @@ def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float
     u = max(FIRST_SHARE * plan.u_max_v, SHARES[0] * plan.u_least_v)
     samples = round((2 * TURNS_LEAST + 1) * plan.half_periods)
     found: AxisPulse | None = None
+    reach = plan.reach_a(axis)
     for share in SHARES:
-        limit = share * plan.i_max_a
+        limit = share * reach
         if found is not None:
             # a saturating axis needs less flux than in proportion: the half period comes out shorter, never longer
             grown = limit / (found.limit_a + found.overshoot_a)
@@ -195,11 +203,11 @@ def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float
     assert found is not None
     u = _voltage(plan, 1.0, found.u_v * found.half_period)
     overshoot = found.overshoot_a * u / found.u_v
-    limit = plan.i_max_a - OVERSHOOT_ALLOWANCE * overshoot
-    if limit < 0.4 * plan.i_max_a:
+    limit = reach - OVERSHOOT_ALLOWANCE * overshoot
+    if limit < 0.4 * reach:
         raise refuse(
             "E_EXCITATION",
-            f"the {axis} current overshoots its band by {overshoot:.3g} A of {plan.i_max_a:.3g} A",
+            f"the {axis} current overshoots its band by {overshoot:.3g} A of {reach:.3g} A",
             stage=STAGE,
             likely="a control period too long for this inductance",
         )
@@ -254,7 +262,8 @@ def scan(
         if too_much > 1.0:
             u = (u[0] / too_much, u[1] / too_much)
         bands = [
-            _band(share * plan.i_max_a, axis, volts) for share, axis, volts in zip(rectangle, (d, q), u, strict=True)
+            _band(min(share * plan.i_max_a, plan.reach_a(name)), axis, volts)
+            for share, name, axis, volts in zip(rectangle, AXES, (d, q), u, strict=True)
         ]
         trace = pulse(drive, u, (bands[0], bands[1]), SAMPLES, abort_speed_rad_s, brake=not plan.held)
         keep(replace(trace, meta={**trace.meta, "held": plan.held, "i_max_a": plan.i_max_a}))

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
+from pmsmtool.estimators.flux_linkage_rows import fastest_pair
 from pmsmtool.experiments.signals import readable, table
 from pmsmtool.trace import Trace
 
@@ -163,6 +164,23 @@ def coast_through(drive: Drive, plan: SpeedPlan, pole_pairs: int) -> Rows:
             drive.wait(settle_s)
             settle_s = plan.settle_s
             rows.append(_window(drive, _half_window(drive, plan, speed, pole_pairs, i_q != 0.0)))
+    drive.command_speed(0.0)
+    return rows
+
+
+def repeat_fastest_pair(drive: Drive, speeds: Trace, pole_pairs: int) -> Rows:
+    """Hold the vectors of :func:`fastest_pair` once more and return their rows.
+
+    The drive is enabled on entry with a speed controller that holds the machine; it is asked for standstill on return.
+    """
+    rows: Rows = []
+    omega_e = float(speeds["omega_first_rad_s"][fastest_pair(speeds)[0]])
+    drive.command_speed(omega_e / pole_pairs)
+    reach(drive, omega_e, limit_s=COAST_LIMIT_S, band_rad_s=COAST_BAND * abs(omega_e))
+    for k in fastest_pair(speeds):
+        drive.command_current(float(speeds["i_d_a"][k]), 0.0)
+        drive.wait(SETTLE_MOST_S)
+        rows.append(_window(drive, round(float(speeds["half_s"][k]) / drive.period_s)))
     drive.command_speed(0.0)
     return rows
 

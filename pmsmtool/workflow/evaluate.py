@@ -15,7 +15,7 @@ from pmsmtool.estimators.axis_response import initial_inductance
 from pmsmtool.estimators.cross_check import CrossCheck, cross_check
 from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
+from pmsmtool.estimators.flux_linkage import FluxResult, check_magnet, estimate_flux_linkage
 from pmsmtool.estimators.flux_map_result import FluxMapResult
 from pmsmtool.estimators.frequency_extrapolation import FrequencySplit
 from pmsmtool.estimators.frequency_response import FrequencyResponse
@@ -159,7 +159,8 @@ def evaluate(
     traces : mapping of str to Trace
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
         ``levels_half_frequency``, ``phase_pairs``, ``rotation_forward``, ``rotation_backward``,
-        ``square_d_<half period>``, ``square_q_<half period>``, ``speeds``, ``map_<k>``, ``inertia_<k>``, ``frf_<k>``.
+        ``square_d_<half period>``, ``square_q_<half period>``, ``speeds``, ``map_<k>``, ``speeds_after_map``,
+        ``inertia_<k>``, ``frf_<k>``.
     period_s : float
         Control period (s).
     T_ref_c : float
@@ -226,6 +227,7 @@ def evaluate(
             result = attempt("psi", lambda: as_sampled(traces, rough, period_s, alpha_psi_per_k, tolerance)) or replace(
                 rough, flux=None
             )
+    result = attempt("psi", lambda: magnet_checked(traces, result, alpha_psi_per_k)) or replace(result, flux=None)
     flux_map = attempt("map", lambda: map_stage.flux_map_of(traces, result, tolerance))
     if flux_map is not None:
         result = replace(result, flux_map=flux_map, map_estimates=map_stage.map_estimates(result, flux_map, traces))
@@ -275,6 +277,13 @@ def as_sampled(
     resistance = resistance_as_sampled(resistance, inductance, flux.shown, modulation, copper, tolerance)
     again = flux_of(traces, resistance, period_s, alpha_psi_per_k, tolerance, L, inductance.sampling)
     return replace(result, resistance=resistance, flux=replace(again, shown=flux.shown))
+
+
+def magnet_checked(traces: Mapping[str, Trace], result: Evaluation, alpha_psi_per_k: float) -> Evaluation:
+    """Return the result, unless the magnets give another flux after the pulses of a flux map."""
+    if result.flux is not None and "speeds_after_map" in traces:
+        check_magnet(traces["speeds"], traces["speeds_after_map"], result.flux, alpha_psi_per_k)
+    return result
 
 
 def modulation_of(

@@ -165,6 +165,7 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
         raise ConfigError("rated current and largest speed must be known", hint="give --i-max and --speed-max")
     i_max = HEADROOM * machine.I_nom_apk if request.i_max_apk is None else request.i_max_apk
     speed = machine.n_max_rpm * math.pi / 30.0 if request.speed_max_rad_s is None else request.speed_max_rad_s
+    i_d_min = nameplate.limits.i_d_min_apk
     return Envelope(
         i_max_apk=i_max,
         speed_max_rad_s=speed,
@@ -173,6 +174,7 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
         load=request.load,
         brake=request.brake,
         acceleration_rad_s2=largest_acceleration(machine, i_max),
+        i_d_max_apk=machine.I_nom_apk if i_d_min is None else -i_d_min,
     )
 
 
@@ -192,7 +194,7 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
     if "response" in steps:
         lines.append(frequency_stage.PLAN_LINE)
     if "map" in steps:
-        lines.append(map_stage.PLAN_LINE)
+        lines += map_stage.plan_lines(nameplate)
     lines.append("nothing is stored in the drive; every changed object is restored")
     return lines
 
@@ -232,6 +234,7 @@ def identify_stage(
         i_max_apk=envelope.i_max_apk,
         omega_max_rad_s=envelope.speed_max_rad_s,
         V_max_v=nameplate.inverter.V_max_v,
+        i_d_max_apk=envelope.i_d_max_apk,
     )
 
     clock = drive.node.connection.clock

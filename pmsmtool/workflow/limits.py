@@ -85,6 +85,8 @@ class Limits:
         Largest mechanical speed of the envelope (rad/s).
     V_max_v : float
         Largest voltage (V peak).
+    i_d_max_apk : float
+        Largest d current in the frame of the rotor (A peak).
 
     Raises
     ------
@@ -96,6 +98,7 @@ class Limits:
     i_max_apk: float
     omega_max_rad_s: float
     V_max_v: float
+    i_d_max_apk: float = math.inf
 
     def __post_init__(self) -> None:
         """Refuse before anything moves."""

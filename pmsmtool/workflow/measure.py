@@ -168,6 +168,10 @@ class Measurement:
                 "map",
                 lambda: map_stage.measure_map(self.drive, self.limits, noise, known, self.held, self.keep, self.say),
             )
+            if turned and encoder is not None:
+                self.say("flux linkage after the pulses: two windows of the run over speeds once more")
+                rows = speed_run.repeat_fastest_pair(self.drive, self._kept["speeds"], round(encoder.pole_pairs.value))
+                self.keep("speeds_after_map", speed_run.speeds_trace(rows, {}))
 
     def _driven(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> bool:
         """Run what needs the rotor's angle; whether the machine runs under control by what was found."""

@@ -224,6 +224,19 @@ def test_current_beyond_the_envelope_stops(bench: SimBench) -> None:
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
 
 
+def test_a_d_current_beyond_the_magnets_limit_is_refused_before_it_flows(bench: SimBench) -> None:
+    """In the frame of the rotor only: of a vector that is held in space the rotor turns away."""
+    pulses = Excitation(Shape.HYSTERESIS, Injection.U_D, 20.0, i_limit_d_a=2.1, i_limit_q_a=1.0, duration_s=0.01)
+    with guarded(bench.drive, Envelope(5.0, 20.0, i_d_max_apk=2.0)) as guard:
+        guard.enable()
+        guard.command_current(2.1, 0.0, fixed_angle_rad=0.0)
+        guard.command_current(-1.9, 0.0)
+        for asked in (lambda: guard.command_current(-2.1, 0.0), lambda: guard.record(["i_d_a"], 64, excitation=pulses)):
+            with pytest.raises(LimitExceeded, match="d current") as caught:
+                asked()
+            assert "i_d_min_apk" in caught.value.hint
+
+
 def test_a_vector_that_turns_between_two_reads_is_no_excess(bench: SimBench, monkeypatch: pytest.MonkeyPatch) -> None:
     """i_d and i_q are two objects; a slow host reads one before, one after a turn by 90 degree."""
     read = bench.drive.live

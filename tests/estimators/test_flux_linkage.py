@@ -10,8 +10,8 @@ import pytest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.cross_check import cross_check
 from pmsmtool.estimators.estimate import statistical_half_width
-from pmsmtool.estimators.flux_linkage import FluxResult, estimate_flux_linkage
-from pmsmtool.estimators.flux_linkage_rows import mean_inverter_error
+from pmsmtool.estimators.flux_linkage import MAGNET_CHANGE, FluxResult, check_magnet, estimate_flux_linkage
+from pmsmtool.estimators.flux_linkage_rows import fastest_pair, mean_inverter_error
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
@@ -280,3 +280,25 @@ def test_a_shaft_that_slows_down_in_a_window_costs_nothing(lost: float) -> None:
     found = estimate_flux_linkage(_changed(trace, omega_e_rad_s=shown), R, period_s=T_S, lag_s=lag_s).psi_measured
     assert found.value == pytest.approx(PSI, rel=1e-9)
     assert found.std > 0.02 * lag_s * lost / 0.05 * PSI
+
+
+@pytest.mark.parametrize("T_after_c", [math.nan, 24.0, 40.0])
+def test_a_magnet_that_lost_flux_is_told_from_a_warmer_one(T_after_c: float) -> None:
+    population = Population(11)
+    before = population.speeds(0)
+    before = Trace(before.t_s, {**before.signals, "T_magnet_c": np.full_like(before.t_s, 24.0)}, before.units)
+    flux = population.estimate(0)
+    alpha = -0.002
+    warmth = 1.0 + alpha * (T_after_c - 24.0) if math.isfinite(T_after_c) else 1.0
+    pair = list(fastest_pair(before))
+    assert np.sign(before["i_d_a"][pair]).sum() == 0.0 and len(set(before["omega_e_rad_s"][pair])) == 1
+
+    def again(share: float) -> Trace:
+        rows = {name: values[pair] for name, values in before.signals.items()}
+        rows |= {"u_q_v": share * warmth * rows["u_q_v"], "T_magnet_c": np.full(2, T_after_c)}
+        return Trace(before.t_s[:2], rows, before.units)
+
+    check_magnet(before, again(1.0 - 0.9 * MAGNET_CHANGE), flux, alpha)
+    for share in (1.0 - 1.1 * MAGNET_CHANGE, 1.0 + 1.1 * MAGNET_CHANGE, 0.97, math.nan):
+        with pytest.raises(IdentificationError, match="E_MAGNET_CHANGED"):
+            check_magnet(before, again(share), flux, alpha)

@@ -34,7 +34,7 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
 from pmsmtool.workflow import map_stage
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
-from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, identify_stage, nameplate_of, replay
+from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, identify_stage, nameplate_of, replay, stored_traces
 from pmsmtool.workflow.limits import Limits
 from pmsmtool.workflow.run_directory import RunDirectory, new_record
 
@@ -88,6 +88,12 @@ def test_a_free_rotor_gives_a_map_that_design_uses_and_a_replay_repeats(tmp_path
     assert math.hypot(i_d, i_q) == pytest.approx(machine.machine.I_nom_apk)
     assert values["L_q_app_h"]["value"] == pytest.approx(float(truth.apparent_inductance(i_d, i_q)[1]), rel=0.005)
     assert stage.status == "pass" and "flux map to" in stage.summary
+    # no demagnetisation limit is stated: the pulses keep to the rated current on d, and go beyond it on q only
+    line = next(line for line in said if line.startswith("d current at most"))
+    assert "12.45 Apk" in line and "assumed, the rated current: no i_d_min_apk is stated" in line
+    trains = [trace for name, trace in stored_traces(run).items() if name.startswith("map_")]
+    largest_of = {axis: max(abs(trace[f"i_{axis}_a"]).max() for trace in trains) for axis in "dq"}
+    assert largest_of["d"] < 12.45 < 18.0 < largest_of["q"]
     # design takes it as it is
     assert tune_stage(run, TuneRequest()).status == "pass"
     lut_stage(run, LookupRequest())
@@ -117,7 +123,9 @@ def test_the_measured_machine_with_its_rotor_held(tmp_path: Path) -> None:
         drive = CanopenDrive(connection, 1)
         nameplate = nameplate_of(drive, "bench")
         envelope = envelope_of(nameplate, IdentifyRequest(("map",), i_max_apk=20.0, shaft="locked"))
-        limits = Limits(12.45, envelope.i_max_apk, envelope.speed_max_rad_s, nameplate.inverter.V_max_v)
+        limits = Limits(
+            12.45, envelope.i_max_apk, envelope.speed_max_rad_s, nameplate.inverter.V_max_v, envelope.i_d_max_apk
+        )
         with guarded(drive, envelope) as guard:
             zero_current = standstill.record_zero_current(guard)
             # a held rotor needs an offset that is about right: here half a degree is missing
