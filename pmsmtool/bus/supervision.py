@@ -114,6 +114,7 @@ class Supervision:
         self._boots_seen = 0
         self._emergencies_seen = 0
         self._foreign_seen = 0
+        self._echoes: bool | None = None  # whether the adapter shows what we send as received; None: not known yet
         self._paused = False
         self._subscriptions = [
             (HEARTBEAT_ID + node, self._on_heartbeat),
@@ -270,14 +271,20 @@ class Supervision:
             return
         sent = self._connection.sent[cob_id]
         if data in sent:
-            sent.remove(data)  # the adapter echoes what we send
+            sent.remove(data)
+            self._echoes = True
         elif cob_id == NMT_ID or not _only_looks(data):
             self.foreign_requests += 1
             self.foreign = "an NMT command" if cob_id == NMT_ID else _described(data)
 
     def _on_answer(self, cob_id: int, data: bytes, timestamp: float) -> None:
-        # An echo arrives before the answer it causes; what is older has no echo to come.
-        self._connection.sent[0x600 + self.node].clear()
+        # An echo comes before the answer, or right behind it where adapter and node race. What is older has none to
+        # come, and would hide a second master's request that is the same.
+        sent = self._connection.sent[0x600 + self.node]
+        if len(sent) > 1:
+            self._echoes = False
+        if self._echoes is False:
+            sent.clear()
 
 
 def _only_looks(request: bytes) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import can
 import pytest
 
+from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import Connection
 from pmsmtool.bus.examination import _state
 from pmsmtool.bus.sdo import Mode, SdoChannel
@@ -152,6 +154,40 @@ def test_own_frames_that_look_received(request: pytest.FixtureRequest) -> None:
         connection.wait(0.05)
         with pytest.raises(SecondMaster):
             channel.read(*A)
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_an_echo_behind_its_answer_is_no_second_master(late: bool) -> None:
+    """Adapter and node race for the queue; without echoes a request that repeats our last one is another master's."""
+    connection = ScriptedConnection()
+    supervision = Supervision(connection, NODE)  # type: ignore[arg-type]
+    requests = [bytes((0x40, k, 0x60, 0)) + bytes(4) for k in range(4)]
+    for request in requests:
+        connection.sent[0x600 + NODE].append(request)
+        connection.arrive(0x580 + NODE)
+        if late:
+            connection.arrive(0x600 + NODE, request)
+    assert supervision.foreign_requests == 0
+    for repeated in range(2):
+        connection.arrive(0x600 + NODE, requests[-1])
+        assert supervision.foreign_requests == repeated + 1
+
+
+class ScriptedConnection:
+    """Hands frames to their subscribers in a written order."""
+
+    def __init__(self) -> None:
+        self.clock = VirtualClock()
+        self.sent: dict[int, deque[bytes]] = {}
+        self.deaf_s = 0.0
+        self._subscribers: dict[int, list[Callable[[int, bytes, float], None]]] = {}
+
+    def subscribe(self, cob_id: int, callback: Callable[[int, bytes, float], None]) -> None:
+        self._subscribers.setdefault(cob_id, []).append(callback)
+
+    def arrive(self, cob_id: int, data: bytes = bytes(8)) -> None:
+        for callback in self._subscribers.get(cob_id, ()):
+            callback(cob_id, data, 0.0)
 
 
 def test_buffers_altered_on_send(request: pytest.FixtureRequest) -> None:
