@@ -39,7 +39,6 @@ OFFSET_OFF_RAD = math.radians(2.0)
     ("case", "level"),
     [
         ("encoder", "full"),
-        ("leads", "inject"),
         ("leads", "recorder"),
         ("leads", "standard"),
         ("both", "standard"),

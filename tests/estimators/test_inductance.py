@@ -97,7 +97,7 @@ def errors_of(shots: Shots) -> tuple[np.ndarray, np.ndarray, list[InductanceResu
 @pytest.fixture(scope="module")
 def plain() -> Shots:
     rng = np.random.default_rng(21)
-    return Shots(draw(8, rng), rng)
+    return Shots(draw(5, rng), rng)
 
 
 def test_ideal_sensors(plain: Shots) -> None:
@@ -111,7 +111,7 @@ def test_ideal_sensors(plain: Shots) -> None:
 
 def test_unknown_sensor_lag_and_late_sampling() -> None:
     rng = np.random.default_rng(22)
-    drives = draw(5, rng, lag_max=20e-6, late_max=0.1)
+    drives = draw(3, rng, lag_max=20e-6, late_max=0.1)
     errors, widths, results = errors_of(Shots(drives, rng))
     assert np.quantile(errors, 0.9) < 5e-3  # measured 1.4e-3
     assert np.max(errors) < 2e-2  # measured 2.0e-3
@@ -123,7 +123,7 @@ def test_unknown_sensor_lag_and_late_sampling() -> None:
 
 def test_a_bend_is_not_taken_for_an_inductance() -> None:
     rng = np.random.default_rng(23)
-    drives = draw(3, rng)
+    drives = draw(2, rng)
     drives.bend[:] = 0.4 / drives.I_r
     errors, _, results = errors_of(Shots(drives, rng))
     assert np.quantile(errors[::2], 0.9) < 2.5e-3  # the d axis, measured 1.6e-3
@@ -132,7 +132,7 @@ def test_a_bend_is_not_taken_for_an_inductance() -> None:
 
 def test_a_free_rotor_follows_the_injection() -> None:
     rng = np.random.default_rng(24)
-    drives = draw(4, rng)
+    drives = draw(2, rng)
     drives.offset[:] = 0.0
     errors, _, _ = errors_of(Shots(drives, rng, free=True))
     assert np.quantile(errors, 0.9) < 2.5e-3  # measured 1.3e-3
@@ -249,7 +249,7 @@ def test_efficiency_against_the_bound() -> None:
     one.dV[:] = 0.0
     one.drop[:] = 0.0
     one.offset[:] = 0.0
-    count = 8
+    count = 5
     shots = Shots(repeat(one, count), rng)
     results = [shots.estimate(k, compensate=False) for k in range(count)]
     ratios = []

@@ -268,7 +268,7 @@ def test_another_drive_is_refused(tmp_path: Path, drive: CanopenDrive) -> None:
     assert len(run.read().stages) == 1
 
 
-@pytest.mark.parametrize("share", [0.02, 0.2, 0.4, 0.6, 0.8, 0.97])
+@pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
 def test_ctrl_c_in_the_middle_leaves_old_or_new_and_goes_on(
     share: float, tmp_path: Path, ended_once: tuple[Path, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
