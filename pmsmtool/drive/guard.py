@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
-from pmsmtool.bus.sdo import Mode
 from pmsmtool.cia402 import QuickStop
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.changed_objects import ChangedObjects
 from pmsmtool.drive.dead_man import DeadManProof, prove_dead_man, set_quick_stop
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.envelope import Envelope
@@ -33,7 +33,6 @@ from pmsmtool.errors import (
     SafetyRefusal,
     SdoAbort,
     StopNotConfirmed,
-    VerifyMismatch,
 )
 from pmsmtool.trace import Trace
 
@@ -63,10 +62,6 @@ _ROUNDING = 1e-9
 RATED_RATIO = 30.0
 """Largest current limit over the drive's rated current (0x6075): three times the rated current of a motor ten times as
 large as the one that the drive still holds."""
-_Object = tuple[int, int]
-_MARKS: tuple[_Object, ...] = tuple(
-    (mark.index, mark.sub) for mark in (objects.CONFIGURATION_DATE, objects.CONFIGURATION_TIME)
-)
 RESTORED = "voltage off, drive restored"
 """What is said when a drive that was lent is off and holds again what it held before."""
 
@@ -95,7 +90,7 @@ class GuardedDrive:
         self._drive = drive
         self._node = drive.node
         self._heartbeat = Heartbeat(drive.node.connection, is_watched=self._is_watched)
-        self._before: dict[_Object, bytes] = {}
+        self._changed = ChangedObjects(drive)
         self.over = False
         self._ended = False
         self._start_rad: float | None = None
@@ -117,9 +112,7 @@ class GuardedDrive:
                 hint=f"`pmsmtool stop -n {self._node.node}`, then run the command again",
             )
         self._drive.parameters.settle()
-        self._node.before_write = self._note
-        for mark in _MARKS:
-            self._note(*mark)
+        self._changed.begin()
         self._pole_pairs = self._drive.read("motor.pole_pairs")
         self._R_s_ohm = self._drive.read("motor.R_s_ohm")
         self._refuse_unwatched()
@@ -219,54 +212,11 @@ class GuardedDrive:
         """
         self._ended = True
         self._drive.stops_by_ramp = True
-        self._node.before_write = None
         try:
             with self._node.emergencies_tolerated(), self._node.supervision.other_masters_tolerated():
-                return self._restore()
+                return self._changed.restore()
         finally:
             self._heartbeat.stop()
-
-    def _restore(self) -> int:
-        names = {self._drive.parameters.map.address(n): n for n in (*self._node.map.cells, *self._node.map.tables)}
-        parameters = {names[key]: data for key, data in self._before.items() if key in names}
-        others = {key: data for key, data in self._before.items() if key not in names and key not in _MARKS}
-        changed = {n: data for n, data in parameters.items() if self._drive.parameters.read([n])[n] != data}
-        lines = []
-        if changed:
-            self._drive.replace(changed)
-        back = len(changed)
-        # The marks last: every change of another object clears them.
-        for (index, sub), data in [
-            *reversed(others.items()),
-            *((m, self._before[m]) for m in _MARKS if m in self._before),
-        ]:
-            try:
-                if self._read(index, sub) != data:
-                    self._node.sdo.download(index, sub, data)
-                    back += 1
-                if self._read(index, sub) != data:
-                    lines.append(f"0x{index:04X}:{sub:02X} does not hold {data[:8].hex(' ')} again")
-            except SdoAbort as abort:
-                lines.append(f"0x{index:04X}:{sub:02X}: {abort.what}")
-        if lines:
-            raise VerifyMismatch(
-                "not everything could be restored",
-                where=f"node {self._node.node}",
-                differences=lines,
-                hint="reset the drive: it comes back with what it has stored",
-            )
-        return back
-
-    def _note(self, index: int, sub: int) -> None:
-        if (index, sub) not in self._before:
-            try:
-                self._before[index, sub] = self._read(index, sub)
-            except SdoAbort:
-                return  # cannot be read, so it cannot be restored; nothing the guard writes is of that kind
-
-    def _read(self, index: int, sub: int) -> bytes:
-        domain = (index, sub) in (objects.EXCITATION_BUFFER, *self._node.map.tables.values())
-        return self._node.sdo.upload(index, sub, mode=Mode.BLOCK if domain else Mode.SEGMENTED).data
 
     # ---- the port -------------------------------------------------------------------------------
 
@@ -479,10 +429,9 @@ class GuardedDrive:
             self._kept_since_s = self._looked_s
         if self._looked_s - self._kept_since_s < KEPT_S:
             return
-        option = objects.QUICK_STOP_OPTION
-        before = self._before.get((option.index, option.sub))
+        before = self._changed.held_before(objects.QUICK_STOP_OPTION)
         if before is not None:
-            set_quick_stop(self._node, int(option.decode(before)))
+            set_quick_stop(self._node, int(before))
         self._drive.stops_by_ramp = True
 
     def _stop_without_ramp(self) -> None:

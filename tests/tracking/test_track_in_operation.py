@@ -16,6 +16,7 @@ from pmsmtool.cli.main import run as program
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.stop import quick_stop
+from pmsmtool.errors import ExitCode
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.bus import PmsmSimBus
@@ -43,6 +44,7 @@ PSI_F_WB = 0.545 * (1.0 - 0.0012 * (25.0 - 20.0))
 """Of the profile, at the temperature of its magnets."""
 SERVED_LIMIT = 0.02
 """Largest relative error of psi_f over a served drive; measured 0.13 %."""
+TRIES = 3
 RPM = 0.10471975511965977
 
 
@@ -158,8 +160,11 @@ def test_track_joins_a_served_drive(
     with serving("--scenario", "operation") as server:
         monkeypatch.setenv("CAN_CONFIG", json.dumps({"host": "127.0.0.1", "port": server.port}))
         arguments = ["-i", "socketcand", "-c", "vcan0", "-n", "1", "track", "psi", "--by", by, "--for", f"{seconds}s"]
-        code = program([*arguments, "--json"])
-    printed = capsys.readouterr()
+        for _ in range(TRIES):
+            code = program([*arguments, "--json"])
+            printed = capsys.readouterr()
+            if code != ExitCode.NOT_TRUSTWORTHY:
+                break  # on a busy computer recordings that begin late may be refused, and are: tried again
     assert code == 0, printed.err
     psi = json.loads(printed.out)["values"]["psi_f_wb"]
     # how much is seen, and so how well, is up to the computer: 0.1 to 0.4 % on a busy one

@@ -1,0 +1,90 @@
+"""Objects of a drive that the guard lets be changed: what they held before, and how it is brought back."""
+
+from __future__ import annotations
+
+from pmsmtool.bus.sdo import Mode
+from pmsmtool.drive import objects
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.errors import SdoAbort, VerifyMismatch
+
+_Object = tuple[int, int]
+_MARKS: tuple[_Object, ...] = tuple(
+    (mark.index, mark.sub) for mark in (objects.CONFIGURATION_DATE, objects.CONFIGURATION_TIME)
+)
+"""Cleared by every change of another object."""
+
+
+class ChangedObjects:
+    """Notes the content of every object before its first change, and brings it back.
+
+    Parameters
+    ----------
+    drive : CanopenDrive
+        The drive that is lent.
+    """
+
+    def __init__(self, drive: CanopenDrive) -> None:
+        self._drive = drive
+        self._node = drive.node
+        self._before: dict[_Object, bytes] = {}
+
+    def begin(self) -> None:
+        """Note the marks now, and from now on every object before it is written."""
+        self._node.before_write = self._note
+        for mark in _MARKS:
+            self._note(*mark)
+
+    def held_before(self, item: objects.DriveObject) -> float | None:
+        """Return what an object held before it was changed; None where it was not."""
+        data = self._before.get((item.index, item.sub))
+        return None if data is None else item.decode(data)
+
+    def restore(self) -> int:
+        """Bring back what was changed, read it back, and note nothing more; return how many objects.
+
+        Raises
+        ------
+        VerifyMismatch
+            An object does not hold its old content; each is named.
+        """
+        self._node.before_write = None
+        names = {self._drive.parameters.map.address(n): n for n in (*self._node.map.cells, *self._node.map.tables)}
+        parameters = {names[key]: data for key, data in self._before.items() if key in names}
+        others = {key: data for key, data in self._before.items() if key not in names and key not in _MARKS}
+        changed = {n: data for n, data in parameters.items() if self._drive.parameters.read([n])[n] != data}
+        lines = []
+        if changed:
+            self._drive.replace(changed)
+        back = len(changed)
+        # The marks last: every change of another object clears them.
+        for (index, sub), data in [
+            *reversed(others.items()),
+            *((m, self._before[m]) for m in _MARKS if m in self._before),
+        ]:
+            try:
+                if self._read(index, sub) != data:
+                    self._node.sdo.download(index, sub, data)
+                    back += 1
+                if self._read(index, sub) != data:
+                    lines.append(f"0x{index:04X}:{sub:02X} does not hold {data[:8].hex(' ')} again")
+            except SdoAbort as abort:
+                lines.append(f"0x{index:04X}:{sub:02X}: {abort.what}")
+        if lines:
+            raise VerifyMismatch(
+                "not everything could be restored",
+                where=f"node {self._node.node}",
+                differences=lines,
+                hint="reset the drive: it comes back with what it has stored",
+            )
+        return back
+
+    def _note(self, index: int, sub: int) -> None:
+        if (index, sub) not in self._before:
+            try:
+                self._before[index, sub] = self._read(index, sub)
+            except SdoAbort:
+                return  # cannot be read, so it cannot be restored; nothing the guard writes is of that kind
+
+    def _read(self, index: int, sub: int) -> bytes:
+        domain = (index, sub) in (objects.EXCITATION_BUFFER, *self._node.map.tables.values())
+        return self._node.sdo.upload(index, sub, mode=Mode.BLOCK if domain else Mode.SEGMENTED).data
