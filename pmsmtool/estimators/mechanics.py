@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.estimators.angle_harmonics import AngleHarmonics, angle_harmonics
 from pmsmtool.estimators.estimate import (
     CHI2_WARN,
     SensorTolerance,
@@ -58,6 +59,8 @@ COASTING_FLOOR = 1e-4
 """The same of a coasting, from where it grows."""
 GROWTH_MOST = 2.5
 """Largest growth of the torque's noise from one fit to the next: a fit that has not arrived asks for too much."""
+COGGING_FITS = 2
+"""Fits where there is cogging: its torque takes the inertia of the one before."""
 RIPPLE_MOST = 0.05
 """Largest deviation of a block's torque, of the push's: above, the shaft is not what the model says."""
 UNEXPLAINED = 2.0
@@ -68,6 +71,7 @@ default machine has 0.0035 to 0.0039 (`identify all`), which leaves J at 0.07 % 
 NOISY_TORQUE = "cogging, a load or a gear on the shaft, an elastic coupling, an encoder that is off centre"
 SCALE_FLOOR = 3e-4
 """Relative deviation of the torque's scale beyond that of the flux linkage and of the samples' displacement."""
+NO_HARMONICS = AngleHarmonics()
 METHOD = "pushes and coasting, output error on position, whitened"
 
 
@@ -85,6 +89,8 @@ class MechanicsResult:
         Deviation of a block's torque that the residual asked for, of the push's.
     unexplained : bool
         Whether that is so much more than the currents' noise and the floor that it widens the intervals notably.
+    harmonics : AngleHarmonics
+        Cogging torque and encoder error that were taken out.
     chi2 : float
         Reduced chi-square of the whitened position.
     condition : float
@@ -99,6 +105,7 @@ class MechanicsResult:
     chi2: float
     condition: float
     unexplained: bool
+    harmonics: AngleHarmonics = NO_HARMONICS
 
     @property
     def note(self) -> str:
@@ -154,8 +161,17 @@ def estimate_mechanics(
     if flagged:
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
     step = encoder_step([run["theta_M_rad"] for run in runs])
-    blocks = [_blocks(run, torque, torque_per_a, sigma_a, direction, step) for run in runs]
+    harmonics = angle_harmonics([(run.t_s, direction * run["theta_M_rad"]) for run in runs if run.meta["coasting"]])
+
+    def blocks_of(J_kgm2: float) -> list[Run]:
+        return [_blocks(run, torque, torque_per_a, sigma_a, direction, step, harmonics, J_kgm2) for run in runs]
+
+    blocks = blocks_of(0.0)
     start = _start(blocks)
+    if harmonics.acceleration_rad_s2:
+        for _ in range(COGGING_FITS - 1):  # the torque over the angle is known as an acceleration
+            start = _fit(blocks_of(math.exp(start[0])), start)[0].x
+        blocks = blocks_of(math.exp(start[0]))
     fit, chi2, noise = _fit(blocks, start)
     before = _noise(blocks)
     unexplained = any(noise[kind] > UNEXPLAINED * max(before[kind], COASTING_FLOOR) for kind in noise)
@@ -179,7 +195,7 @@ def estimate_mechanics(
         for value, std, unit in zip((J, B, tau_c), stds, ("kg m2", "N m s", "N m"), strict=True)
     ]
     return MechanicsResult(
-        estimates[0], estimates[1], estimates[2], stds, max(noise.values()), chi2, condition, unexplained
+        estimates[0], estimates[1], estimates[2], stds, max(noise.values()), chi2, condition, unexplained, harmonics
     )
 
 
@@ -196,14 +212,29 @@ def _window(run: Trace) -> Trace:
     return replace(run, t_s=run.t_s[first:], signals={name: values[first:] for name, values in run.signals.items()})
 
 
-def _blocks(run: Trace, torque: Torque, torque_per_a: float, sigma_a: float, direction: int, step: float) -> Run:
+def _blocks(
+    run: Trace,
+    torque: Torque,
+    torque_per_a: float,
+    sigma_a: float,
+    direction: int,
+    step: float,
+    harmonics: AngleHarmonics,
+    J_kgm2: float,
+) -> Run:
+    """Return a trace in blocks without the encoder's error; cogging as a torque of pushes, out of a coasting's way.
+
+    Cogging goes through periods within a block of a coasting, where only the position shows it.
+    """
     rows = max(1, (len(run) - 1) // BLOCKS)
     count = (len(run) - 1) // rows
-    theta = direction * run["theta_M_rad"][: count * rows + 1 : rows]
-    theta_std = position_std(theta, step)
+    shown = direction * run["theta_M_rad"]
+    theta_std = position_std(shown[: count * rows + 1 : rows], step)
     if run.meta["coasting"]:
-        return Run(theta, np.zeros(count), rows * run.period_s, theta_std, 0.0, True)
-    tau = torque(run["i_d_a"], run["i_q_a"])
+        way = harmonics.shaft(harmonics.without_ripple(run.t_s, shown))
+        return Run(way[: count * rows + 1 : rows], np.zeros(count), rows * run.period_s, theta_std, 0.0, True)
+    theta = harmonics.shaft(shown)[: count * rows + 1 : rows]
+    tau = torque(run["i_d_a"], run["i_q_a"]) + harmonics.torque_nm(shown, J_kgm2)
     mean = (0.5 * (tau[:-1] + tau[1:]))[: count * rows].reshape(count, rows).mean(axis=1)
     noise = math.hypot(abs(torque_per_a) * sigma_a / math.sqrt(rows), TORQUE_FLOOR * float(np.max(np.abs(mean))))
     return Run(theta, mean, rows * run.period_s, theta_std, noise, False)

@@ -81,6 +81,12 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
         lines.append("R_s is from one control frequency: the drive does not take half of it")
     if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
         lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
+    if evaluation.mismatch is not None and evaluation.mismatch.corrected:
+        gains = ", ".join(f"{100.0 * gain:+.2g} %" for gain in evaluation.mismatch.gains)
+        lines.append(
+            f"the gains of the current sensors of a, b and c are {gains} off their mean: corrected in the values, not "
+            "in the drive, whose torque ripples twice per electrical turn"
+        )
     if evaluation.encoder is not None:
         lines += [
             f"the encoder is off by {math.degrees(error):.2g} deg (mechanical) {often} per turn: mounted off centre? "
@@ -115,6 +121,9 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     }
     if request.tolerance.bridge_difference_v is not None:
         conditions["bridge_difference_v"] = request.tolerance.bridge_difference_v
+    if evaluation.mismatch is not None and evaluation.mismatch.corrected:
+        pairs = zip("abc", evaluation.mismatch.gains, strict=True)
+        conditions |= {f"sensor_gain_{phase}_over_mean": 1.0 + gain for phase, gain in pairs}
     if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
         conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
     return conditions
