@@ -246,7 +246,9 @@ def evaluate(
     if result.resistance is not None and math.isfinite(U_dc_v):
         dead_time_s = max(0.0, result.resistance.V_dead_v) * period_s / U_dc_v
     shaft = result
-    mechanics = attempt("mechanics", lambda: mechanics_stage.mechanics_of(traces, shaft, tolerance, dead_time_s))
+    mechanics = attempt(
+        "mechanics", lambda: mechanics_stage.mechanics_of(traces, shaft, tolerance, dead_time_s, period_s)
+    )
     moving = replace(shaft, mechanics=mechanics)
     response = attempt("frf", lambda: frequency_stage.frequency_response_of(traces, moving, tolerance, dead_time_s))
     return replace(moving, frequency_response=response, refused=refused)
