@@ -95,8 +95,10 @@ def _come_to_rest(drive: Drive, reached_rad_s: float) -> None:
     """Stop the shaft by the speed controller; the speed is electrical."""
     drive.command_speed(0.0)
     band = REST_SHARE * reached_rad_s
-    waited = speed_run.reach(drive, 0.0, band_rad_s=band)
-    if waited >= speed_run.REACH_LIMIT_S:
+    rate = drive.read("speed.acceleration_rpm_per_s") * math.pi / 30.0 * drive.read("motor.pole_pairs")
+    ramp_s = min(speed_run.RAMP_MOST_S, speed_run.RAMP_DOUBT * reached_rad_s / rate) if rate > 0.0 else 0.0
+    waited = speed_run.reach(drive, 0.0, limit_s=speed_run.REACH_LIMIT_S + ramp_s, band_rad_s=band)
+    if waited >= speed_run.REACH_LIMIT_S + ramp_s:
         raise refuse(
             "E_EXCITATION",
             f"the shaft is not at rest {waited:.2g} s after it was asked to",
