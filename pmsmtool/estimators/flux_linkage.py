@@ -126,6 +126,7 @@ def estimate_flux_linkage(
     modulation: Modulation | None = None,
     lag_s: float = 0.0,
     sampling: Sampling | None = None,
+    apart_s: float = 0.0,
     tolerance: SensorTolerance | None = None,
     T_ref_c: float = 20.0,
     alpha_psi_per_k: float = MAGNET_ALPHA_PER_K,
@@ -150,6 +151,8 @@ def estimate_flux_linkage(
         Delay of the drive's speed behind the rotor's while it accelerates: 2/omega of its estimate's double pole (s).
     sampling : Sampling or None
         When and how the currents are sampled, as the inductances' fit has it; None: at the period's start.
+    apart_s : float
+        What other experiments say of that instant, less what this run shows, where they contradict each other (s).
     tolerance : SensorTolerance
         Declared sensor tolerances.
     T_ref_c, alpha_psi_per_k : float
@@ -191,7 +194,7 @@ def estimate_flux_linkage(
         CURVE_DOUBT * even.change(rows.curve_q_v),
         CURVATURE_DOUBT * (even.low_wb - even.flux_wb),
         LAG_STD * lag_s * even.change(psi * rows.acceleration_rad_s2),
-        0.0 if shown is None else per_instant * shown.std_s,
+        0.0 if shown is None else per_instant * math.hypot(shown.std_s, apart_s),
         RELATIVE_FLOOR * psi,
         tolerance.voltage_scale_std * psi,
     )

@@ -62,7 +62,7 @@ GROWTH_MOST = 2.5
 """Largest growth of the torque's noise from one fit to the next: a fit that has not arrived asks for too much."""
 COGGING_FITS = 2
 """Fits where there is cogging: its torque takes the inertia of the one before."""
-RIPPLE_MOST = 0.05
+RIPPLE_MOST = 0.15
 """Largest deviation of a block's torque, of the push's: above, the shaft is not what the model says."""
 UNEXPLAINED = 2.0
 """Growth of the torque's noise in pushes or coasting from which on it is more than the model's."""
@@ -223,7 +223,8 @@ def estimate_mechanics(
         for value, std, unit in zip((J, B, tau_c), stds, ("kg m2", "N m s", "N m"), strict=True)
     ]
     ripple = max(noise.values())
-    return MechanicsResult(*estimates, stds, ripple, chi2, condition, unexplained, harmonics, drag)
+    J_found, B_found, tau_found = estimates
+    return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, condition, unexplained, harmonics, drag)
 
 
 def _window(run: Trace) -> Trace:

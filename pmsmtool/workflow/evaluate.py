@@ -302,7 +302,9 @@ def as_sampled(
     assert modulation is not None
     copper = resistance.copper
     resistance = resistance_as_sampled(resistance, inductance, flux.shown, modulation, copper, tolerance)
-    again = flux_of(traces, resistance, period_s, alpha_psi_per_k, tolerance, L, inductance.sampling)
+    again = flux_of(
+        traces, resistance, period_s, alpha_psi_per_k, tolerance, L, inductance.sampling, inductance.apart_s
+    )
     return replace(result, resistance=resistance, flux=replace(again, shown=flux.shown))
 
 
@@ -331,6 +333,7 @@ def flux_of(
     tolerance: SensorTolerance | None,
     L_h: tuple[float, float] | None = None,
     sampling: Sampling | None = None,
+    apart_s: float = 0.0,
 ) -> FluxResult:
     """Return the flux linkage, with the resistance at the temperature of the speed run.
 
@@ -348,6 +351,7 @@ def flux_of(
         ),
         lag_s=float(speeds.meta.get("speed_lag_s", 0.0)),
         sampling=sampling,
+        apart_s=apart_s,
         tolerance=tolerance,
         T_ref_c=resistance.copper.T_ref_c,
         alpha_psi_per_k=alpha_psi_per_k,

@@ -65,6 +65,8 @@ class IdentifyRequest:
         What hangs on the shaft and may happen to it.
     half_frequency : bool
         Whether R and inverter are measured at half the control frequency, too.
+    map_if_saturated : bool
+        Whether a machine that the run over speeds shows to saturate is mapped, too.
     tolerance : SensorTolerance
         Declared sensor tolerances.
     """
@@ -76,6 +78,7 @@ class IdentifyRequest:
     load: Load = "none"
     brake: Brake = "none"
     half_frequency: bool = False
+    map_if_saturated: bool = False
     tolerance: SensorTolerance = field(default_factory=SensorTolerance)
 
     def check(self) -> None:
@@ -196,6 +199,8 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
         lines.append(frequency_stage.PLAN_LINE)
     if "map" in steps:
         lines += map_stage.plan_lines(nameplate)
+    elif request.map_if_saturated and "speeds" in steps:
+        lines.append(map_stage.IF_SATURATED)
     lines.append("nothing is stored in the drive; every changed object is restored")
     return lines
 
@@ -267,7 +272,15 @@ def _measure(
 
     with guarded(drive, envelope, first=starting_gains(limits), say=say) as guard:
         locked = request.shaft == "locked"
-        measurement = Measurement(guard, limits, keep, say, held=locked, half_frequency=request.half_frequency)
+        measurement = Measurement(
+            guard,
+            limits,
+            keep,
+            say,
+            held=locked,
+            half_frequency=request.half_frequency,
+            map_if_saturated=request.map_if_saturated,
+        )
         measurement.spent = lambda: (guard.energised_s, guard.energy_j)
         predictions: list[dict[str, Any]] = []
 

@@ -50,6 +50,8 @@ DEVIATION_LIMIT = 0.005
 
 PLAN_LINE = "voltage pulses of both axes up to the largest current: a free shaft jerks, by a turn or so"
 
+IF_SATURATED = f"where the machine saturates: {PLAN_LINE}"
+
 
 def plan_lines(nameplate: MachineFile) -> list[str]:
     """Return what a person reads of the pulses before consenting."""
