@@ -75,7 +75,7 @@ SAMPLING_SHIFT_SHARE = (0.0, 0.10)
 
 
 def draw_drive(seed: int, block: Block = "ideal") -> MachineFile:
-    """Return drive number ``seed`` of the population (identification reference, section 1, with a switched inverter).
+    """Return drive number ``seed`` of the population (docs/identification.md, 1, with a switched inverter).
 
     Emf at base speed is 0.60 to 0.75 of U_dc/sqrt(3), the resistive drop at rated current 2 to 12 % and the inductive
     one 12 to 45 % of the emf, L_q/L_d 1 to 2.2; currents are log-uniform.

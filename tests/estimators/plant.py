@@ -90,7 +90,7 @@ class Drives:
 
 
 def draw(n: int, rng: np.random.Generator, *, lag_max: float = 0.0, late_max: float = 0.0) -> Drives:
-    """Draw n drives from the population of the identification reference, section 1."""
+    """Draw n drives from the population of docs/identification.md, 1."""
     small = rng.random(n) < 0.55
 
     def pick(a: Vector, b: Vector) -> Vector:
