@@ -14,6 +14,7 @@ from importlib import resources
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.params_header import SPDX, c_float
+from pmsmtool.units import rad_s_from_rpm
 
 BITS = 27
 ONE = 1 << BITS
@@ -77,7 +78,7 @@ def q_format(values: Mapping[str, float]) -> QFormat:
     I_base = _power_of_two(2.0 * max(values["motor.I_max_apk"], values["governor.I_transient_apk"]))
     U_base = _power_of_two(2.0 * values["inverter.voltage_utilisation"] * values["protection.U_dc_max_v"])
     speed = max(values["motor.n_max_rpm"], values["protection.n_trip_rpm"])
-    omega_base = _power_of_two(2.0 * values["motor.pole_pairs"] * speed * math.pi / 30.0)
+    omega_base = _power_of_two(rad_s_from_rpm(2.0 * values["motor.pole_pairs"] * speed))
     numbers = _numbers(values, I_base, U_base, omega_base)
     most = RAISED * U_base
     while U_base < most and max(numbers.values()) > LARGEST / ONE:

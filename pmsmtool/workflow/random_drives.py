@@ -23,6 +23,7 @@ from pmsmtool.machine.parameters import (
     MachineLimits,
     MachineParameters,
 )
+from pmsmtool.units import rpm_from_rad_s
 
 Block = Literal["ideal", "timing", "gains"]
 """Sensors: ideal gains and timing; unknown lag and sampling shift; gains off within their tolerance."""
@@ -93,7 +94,7 @@ def draw_drive(seed: int, block: Block = "ideal") -> MachineFile:
     tau_nom = 1.5 * pole_pairs * psi_f * I_nom
     omega_M = omega_base / pole_pairs
     J = tau_nom * _log_uniform(rng, ACCELERATION_TIME_S) / omega_M
-    n_nom = omega_M * 30.0 / math.pi
+    n_nom = rpm_from_rad_s(omega_M)
     machine = MachineParameters(
         pole_pairs=pole_pairs,
         R_s_ohm=float(rng.uniform(*RESISTIVE_SHARE)) * emf / I_nom,
