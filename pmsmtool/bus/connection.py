@@ -222,8 +222,7 @@ class Connection:
             return frames.get_nowait()
         deadline = self.clock.now() + timeout_s
         while True:
-            self.pump(max(timeout_s, 0.0))
-            if not frames.empty():
+            if self.pump(max(timeout_s, 0.0)) and not frames.empty():
                 return frames.get_nowait()
             timeout_s = deadline - self.clock.now()
             if timeout_s < _RESOLUTION_S:
@@ -327,8 +326,11 @@ class Connection:
         if message.is_extended_id or message.is_remote_frame or not message.is_rx or len(message.data) > 8:
             return
         self.heard.add(cob_id)
-        for callback in self._subscribers.get(cob_id, ()):
-            callback(cob_id, bytes(message.data), message.timestamp)
+        callbacks = self._subscribers.get(cob_id)
+        if callbacks:
+            data, timestamp = bytes(message.data), message.timestamp
+            for callback in callbacks:
+                callback(cob_id, data, timestamp)
 
     def _write(self, message: can.Message) -> None:
         try:

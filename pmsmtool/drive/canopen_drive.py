@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -18,9 +17,9 @@ from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.trace import Trace
+from pmsmtool.units import RAD_S_PER_MRPM
 
 PERIOD = "inverter.T_s_ns"
-RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 """The reference drive counts speed in thousandths of a mechanical revolution per minute."""
 
 

@@ -35,6 +35,7 @@ from pmsmtool.errors import (
     StopNotConfirmed,
 )
 from pmsmtool.trace import Trace
+from pmsmtool.units import rpm_from_rad_s
 
 WATCH_S = 0.05
 """The machine is looked at this often while time passes."""
@@ -154,7 +155,7 @@ class GuardedDrive:
             permille = math.ceil(1000.0 * self.envelope.i_max_apk / rated_apk)
             if permille < node.get(objects.MAX_CURRENT_PERMILLE):
                 self._put_limit(objects.MAX_CURRENT_PERMILLE, permille)
-            rpm = math.ceil(self.envelope.speed_max_rad_s * 60.0 / (2.0 * math.pi))
+            rpm = math.ceil(rpm_from_rad_s(self.envelope.speed_max_rad_s))
             if rpm < node.get(objects.MAX_SPEED_RPM):
                 self._put_limit(objects.MAX_SPEED_RPM, rpm)
         except SdoAbort as abort:

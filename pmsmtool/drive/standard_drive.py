@@ -15,7 +15,7 @@ import numpy as np
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
-from pmsmtool.drive.canopen_drive import RAD_S_PER_MRPM, CanopenDrive
+from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.parameters import DriveParameters
@@ -24,6 +24,7 @@ from pmsmtool.drive.recorder import Recorder
 from pmsmtool.errors import DriveTimeout, NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.trace import Trace
+from pmsmtool.units import RAD_S_PER_MRPM
 
 COMMUTATION_ANGLE = DriveObject(0x60EA, 0, "H")
 POSITION = DriveObject(0x6064, 0, "i")

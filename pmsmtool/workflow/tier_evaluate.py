@@ -29,6 +29,7 @@ from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
+from pmsmtool.units import RPM_PER_RAD_S
 from pmsmtool.workflow.calibration import calibrated_traces
 from pmsmtool.workflow.evaluate import tolerance_on
 from pmsmtool.workflow.identify import (
@@ -233,7 +234,7 @@ def below_voltage(facts: TierFacts, utilisation: float, psi_f_wb: float) -> str:
     """Return what the flux linkage needs of a run that did not reach the voltage limit."""
     text = f"needs a speed at which the voltage ends, and up to {facts.top_rpm:.0f} rpm it did not"
     if psi_f_wb > 0.0:
-        rpm = 30.0 / math.pi * utilisation * facts.U_dc_v / (psi_f_wb * facts.pole_pairs)
+        rpm = RPM_PER_RAD_S * utilisation * facts.U_dc_v / (psi_f_wb * facts.pole_pairs)
         text += f" (by the given flux linkage it ends at about {rpm:.0f} rpm with {facts.U_dc_v:.4g} V)"
     return f"{text}: allow a larger --speed-max, or lower the DC link"
 

@@ -33,6 +33,7 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import InverterParameters
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
+from pmsmtool.units import RAD_S_PER_RPM
 from pmsmtool.workflow.capabilities import QUANTITIES, Capabilities, Method
 from pmsmtool.workflow.identify import REQUEST, IdentifyRequest, dump_request
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
@@ -65,7 +66,7 @@ TOP_SHARE = 0.98
 NO_LIMIT_RPM = 100_000.0
 HEADROOM = 1.2
 """Largest current of the envelope over the test current."""
-RPM = math.pi / 30.0
+RPM = RAD_S_PER_RPM
 Keep = Callable[[str, Trace], None]
 Say = Callable[[str], None]
 

@@ -21,10 +21,11 @@ from pmsmtool.sim.node import own_identification
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.monitor import Monitor
 from pmsmtool.sim.node.objects import ObjectRow
-from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, Plant, PowerDrive
+from pmsmtool.sim.node.power_drive import Plant, PowerDrive
 from pmsmtool.sim.node.rings import Rings
 from pmsmtool.sim.node.schedule import Schedule
 from pmsmtool.sim.node.trace_rows import TraceRows
+from pmsmtool.units import RAD_S_PER_MRPM
 
 OWN = range(0x2000, 0x6000)
 """Indices of the reference drive's own objects."""

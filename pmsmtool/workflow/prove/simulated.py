@@ -30,6 +30,7 @@ from pmsmtool.sim.kernel import Params, Part, Setup, Simulation, library
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.signals import Truth
 from pmsmtool.sim.simulated_machine import MODELS, SHAPES, build_setup
+from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 from pmsmtool.workflow.prove.defects import DEFECTS, QUANTITIES, Defect, is_possible
 from pmsmtool.workflow.prove.plan import SIGNALS, Conditions, Experiment, ProofPlan
 from pmsmtool.workflow.sampling_stage import INSTANT, LAG
@@ -317,7 +318,7 @@ def _cut(design: Design, conditions: Conditions) -> ParameterSet:
     cut = {
         "motor.I_max_apk": conditions.i_max_apk,
         "governor.I_transient_apk": conditions.i_max_apk,
-        "motor.n_max_rpm": conditions.speed_max_rad_s * 30.0 / math.pi,
+        "motor.n_max_rpm": rpm_from_rad_s(conditions.speed_max_rad_s),
     }
     return replace(wanted, values={n: min(v, cut[n]) if n in cut else v for n, v in wanted.values.items()})
 
@@ -393,7 +394,7 @@ def _friction(machine: MachineFile, rng: np.random.Generator) -> tuple[float, fl
     """Draw viscous (N m s) and Coulomb friction (N m)."""
     known = machine.machine
     torque = abs(known.torque_nm(0.0, known.I_nom_apk or known.I_max_apk or 0.0))
-    omega = (known.n_nom_rpm or known.n_max_rpm or 3000.0) * math.pi / 30.0
+    omega = rad_s_from_rpm(known.n_nom_rpm or known.n_max_rpm or 3000.0)
     drawn = []
     for value, largest in ((known.B_nms, FRICTION_SHARE * torque / omega), (known.tau_c_nm, FRICTION_SHARE * torque)):
         factor = math.exp(rng.uniform(-1.0, 1.0) * math.log(FRICTION_FACTOR))
