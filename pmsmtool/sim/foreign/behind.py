@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 INNER_MODES = {3: Mode.PROFILE_VELOCITY, 4: Mode.PROFILE_TORQUE, 9: Mode.CYCLIC_VELOCITY, 10: Mode.CYCLIC_TORQUE}
 """Modes that move the simulated machine; the others (profiles of position, homing) are taken and hold no current."""
 POSITION_BITS = 32
+NO_SLOPE = 10_000_000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,7 @@ class Behind:
     set_up : SetUp
         The motor.
     largest_step : float
-        Largest change of a torque command in a cyclic mode, share of the rated torque; for tests.
+        Largest change of a torque command while energised in a cyclic mode, share of the rated torque; for tests.
     """
 
     dictionary: Dictionary
@@ -139,7 +140,7 @@ class Behind:
     def command_torque(self, torque_nm: float) -> None:
         """Take a torque reference (N m)."""
         step = abs(torque_nm - self._torque_nm) / self.set_up.torque_nm
-        if self.dictionary["cia402.mode"].integer() == Mode.CYCLIC_TORQUE:
+        if self.power.state.energised and self.dictionary["cia402.mode"].integer() == Mode.CYCLIC_TORQUE:
             self.largest_step = max(self.largest_step, step)
         self._torque_nm = torque_nm
         rated_nm = self.dictionary["cia402.rated_torque"].number() / 1000.0
@@ -162,6 +163,10 @@ class Behind:
     def limit_speed(self, rpm: float) -> None:
         """Keep the speed (rpm)."""
         self._write("cia402.max_speed", rpm)
+
+    def torque_slope(self, permille_per_s: float) -> None:
+        """Move a profile torque no faster (0: at once)."""
+        self._write("cia402.torque_slope", permille_per_s or NO_SLOPE)
 
     def set_gains(self, K_p_v_per_a: float | None = None, K_i_v_per_as: float | None = None) -> None:
         """Change the gains of both current loops."""

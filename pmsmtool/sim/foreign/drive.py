@@ -8,6 +8,7 @@ maker's set-up tool would have done it; everything else holds what the file says
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,8 @@ COMMUNICATION = range(0x1000, 0x1200)
 LAST_COMMUNICATION = 0x2000
 PASSED_ON = (0x603F, 0x6040, 0x6041, 0x6007, 0x605A, 0x605E)
 """State machine and option codes: numbers of the standard, whoever the maker is."""
+HELD = (0x6072, 0x6073, 0x6087)
+"""Limits whose stored value acts from the start."""
 SERIALS = ((0x1018, 4), (0x2100, 1), (0x6510, 1))
 """Where makers keep the serial number (EPOS4: 0x2100:01, Copley: 0x6510:01)."""
 
@@ -84,7 +87,8 @@ class ForeignDrive:
             entry = Entry(row, 0)
             law = self.laws.get((index, sub))
             if law is not None and law.set_up is not None:
-                entry.value = entry.encode(law.set_up)
+                low, high = (-math.inf if row.low is None else row.low), (math.inf if row.high is None else row.high)
+                entry.value = entry.encode(min(max(law.set_up, low), high))  # no more than the drive can give
             if (index, sub) in SERIALS:
                 entry.value = entry.encode(serial)
             dictionary.show(entry)
@@ -155,7 +159,7 @@ def _obey(law: Law, entry: Entry, behind: Behind) -> None:
         entry.source = lambda: entry.encode(show(behind))
     if act is not None:
         entry.sink = _taken(entry, lambda number: bool(act(behind, number)))
-        if law.set_up is not None or law.index in (0x6072, 0x6073):
+        if law.set_up is not None or law.index in HELD:
             act(behind, entry.number())
 
 

@@ -41,6 +41,8 @@ class Family:
         Units of 0x606C per turn per second where the maker fixes them.
     speed_source : str
         Where that is stated.
+    per_turn : int
+        Units of position per turn where the maker fixes them; 0: the encoder's counts.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Family:
     own_modes: tuple[int, ...] = ()
     speed_per_rps: float | None = None
     speed_source: str = ""
+    per_turn: int = 0
 
 
 def _current(index: int, sub: int, per_apk: float, source: str) -> Law:
@@ -151,6 +154,7 @@ FAMILIES: Sequence[Family] = (
         "Faulhaber", ((0x2333, 1), (0x2350, 3)), _faulhaber, speed_per_rps=60.0,
         speed_source="rpm: its largest profile velocity is 30000",
     ),
+    Family("ZeroErr", ((0x2240, 0), (0x2241, 0), (0x3B69, 0)), _none, per_turn=524_288),
     Family("Elmo Gold", ((0x2F45, 1), (0x60E0, 0)), _none, (0x9A, 0x30923), 0x0000_03ED),
 )  # fmt: skip
 OTHER = Family("CiA 402", (), _none)
@@ -164,7 +168,7 @@ def family_of(objects: MakersObjects) -> Family:
 def laws_of(objects: MakersObjects, motor: SetUp) -> dict[tuple[int, int], Law]:
     """Return the law of every object that has one and that the file has; the maker's before the standard's."""
     family = family_of(objects)
-    per_turn = position_units(objects, motor.counts)
+    per_turn = family.per_turn or position_units(objects, motor.counts)
     per_rps, speed = speed_units(objects, per_turn)
     if family.name == "Copley":
         per_rps, speed = 10.0 * per_turn, "0.1 counts per second (CML)"

@@ -178,10 +178,12 @@ def _row(
 
 
 def _value(text: str, kind: str) -> str:
-    """Return a stored value as an object row keeps it: a number that fits the type, or ASCII text."""
+    """Return a stored value as an object row keeps it: a number that fits its type, or ASCII; blank stays blank."""
     code = TYPES[kind]
     if not code.letter:
         return text.encode("ascii", "replace").decode("ascii")
+    if not text.strip():
+        return "0" if code.is_float else ""  # blank: the file does not say
     try:
         if code.is_float:
             return str(float(text))

@@ -84,8 +84,9 @@ def standard_laws(objects: MakersObjects, set_up: SetUp, per_turn: float, per_rp
     torque = set_up.torque_nm
     yield Law(0x6075, 0, f"{STANDARD}, mA; rms {ASSUMED}", set_up=i_rms_ma)
     yield Law(0x6076, 0, f"{STANDARD}, mN m", set_up=1000.0 * torque)
+    most = 1000.0 * set_up.i_max_apk / set_up.i_nom_apk
     yield Law(
-        0x6073, 0, f"{STANDARD}, permille of 0x6075",
+        0x6073, 0, f"{STANDARD}, permille of 0x6075", set_up=most if objects.stored(0x6073) == 0 else None,
         act=lambda behind, n: behind.limit_current(1e-3 * n * set_up.i_nom_apk),
     )  # fmt: skip
     unset = objects.stored(0x6072) == 0
@@ -98,6 +99,8 @@ def standard_laws(objects: MakersObjects, set_up: SetUp, per_turn: float, per_rp
         0x6071, 0, f"{STANDARD}, permille of the rated torque",
         act=lambda behind, n: behind.command_torque(1e-3 * n * torque),
     )  # fmt: skip
+    if objects.stored(0x6087):  # 0: the file does not say; no slope is assumed
+        yield Law(0x6087, 0, f"{STANDARD}, permille/s", act=lambda behind, n: behind.torque_slope(n))
     yield Law(0x6077, 0, STANDARD, show=lambda behind: 1000.0 * behind.torque_nm() / torque)
     yield Law(0x6078, 0, STANDARD, show=lambda behind: 1000.0 * behind.i_q_a() / set_up.i_nom_apk)
     yield Law(0x6079, 0, f"{STANDARD}, mV", show=lambda behind: 1000.0 * behind.U_dc_v())
