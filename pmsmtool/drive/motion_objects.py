@@ -144,6 +144,15 @@ def shown_current(node: DriveNode, rated: float) -> Quantity:
     raise NotAvailable("the drive shows neither current (0x6078) nor torque (0x6077)", where=f"node {node.node}")
 
 
+def undecided(node: DriveNode, rated: float) -> bool:
+    """Return whether no source says if the current that is shown is peak or rms; it is read as rms."""
+    shown = shown_current(node, rated)
+    if shown.item in (objects.CURRENT_PERMILLE, TORQUE_PERMILLE) and not shown.undecided:
+        base = rated_current(node)
+        return base is not None and base.undecided
+    return shown.undecided
+
+
 def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
     """Return what takes a torque current: mode 4, else 10, as 0x6502 announces, else the maker's own.
 

@@ -14,7 +14,7 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.motion_objects import TORQUE_PERMILLE, rated_current
+from pmsmtool.drive.motion_objects import undecided
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Recording
 from pmsmtool.drive.recorder import Recorder
@@ -52,9 +52,7 @@ class TorqueDrive(TorqueCurrent, StandardDrive):
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)
-        shown = self._current.item in (objects.CURRENT_PERMILLE, TORQUE_PERMILLE)
-        rated = rated_current(self.node) if shown else self._current
-        self.current_undecided = rated is not None and rated.undecided
+        self.current_undecided = undecided(self.node, self._rated_apk)
         self._polled: tuple[str, ...] = ()
         self._rows: list[list[float]] = []
 

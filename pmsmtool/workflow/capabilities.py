@@ -21,6 +21,7 @@ from pmsmtool.drive.motion_objects import (
     rated_apk,
     shown_current,
     torque_target,
+    undecided,
     watched_by_tool,
 )
 from pmsmtool.drive.objects import SUPPORTED_MODES
@@ -138,7 +139,7 @@ NOTES: Mapping[tuple[str, Method], str] = {
     ("psi", Method.RECORDER): "the drive must commutate already",
     ("psi", Method.STANDARD): "where the voltage limit is within the speed limit, or the drive shows its voltage",
     ("mechanics", Method.RECORDER): "J/psi and tau_c/psi",
-    ("mechanics", Method.STANDARD): "J/psi and tau_c/psi; the pole pairs must be known",
+    ("mechanics", Method.STANDARD): "J/psi and tau_c/psi; over the torque constant where the pole pairs are not known",
     ("L", Method.VENDOR): "one inductance for both axes, unless the map has a result for each",
 }
 
@@ -224,6 +225,8 @@ class Capabilities:
         What a maker's recorder takes, or why it is not read; empty where the map names none.
     replaced : tuple of str
         Limits that the drive does not keep by itself, and what replaces them.
+    current_undecided : bool
+        Whether no source says if its amperes are peak or rms.
     """
 
     identity: Identity
@@ -232,6 +235,7 @@ class Capabilities:
     features: frozenset[str]
     recorder: str = ""
     replaced: tuple[str, ...] = ()
+    current_undecided: bool = False
 
     @property
     def tier(self) -> Tier:
@@ -262,6 +266,8 @@ class Capabilities:
         if method is Method.INJECT and "averages" not in self.features:
             expected = FROM_RECORDS.get(quantity, ())  # the others come from drives that average by themselves
             note = "; ".join(part for part in (note, "means are made from records") if part)
+        if self.current_undecided and (quantity, method) == ("mechanics", Method.STANDARD):
+            expected, note = (), f"{note}; {UNDECIDED}"
         if method is Method.RECORDER and not self.drive_map.staging:
             expected = ()  # those were measured with the reference drive's recorder
         return Row(quantity, method, missing, expected, note)
@@ -311,6 +317,7 @@ class Capabilities:
         return str(method or (best.method if best else ""))
 
 
+UNDECIDED = "no source says whether its amperes are peak or rms: +-17 % more"
 MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD, Method.VENDOR)
 """Methods that measure, the best first."""
 _TIERS = (
@@ -374,7 +381,8 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
         found |= {f"vendor {name}" for name in _vendor_quantities(node, drive_map)}
         found |= {"recorder"} if records_pushes(node) else set()
     replaced = () if rated is None or drive_map.staging else tuple(watched_by_tool(node, rated))
-    return Capabilities(identity, drive_map, named, frozenset(found), described(node), replaced)
+    shown = _told(lambda: undecided(node, rated or 1.0)) or False
+    return Capabilities(identity, drive_map, named, frozenset(found), described(node), replaced, shown)
 
 
 def _told(ask: Callable[[], T]) -> T | None:
