@@ -63,6 +63,8 @@ DURATION_S = 600.0
 TOP_SHARE = 0.98
 """Speed at which a run-up is given up, of the largest one."""
 NO_LIMIT_RPM = 100_000.0
+OVER_TORQUE_CONSTANT = "J/K_T, tau_c/K_T from polled torque pushes; J/psi and psi need the pole pairs"
+"""What is told without pole pairs: nothing a design goes on from."""
 UNLIMITED_RPM = 1000.0
 """Largest speed on a drive that has no limit of its own and tells none, unless a person or a machine file says more."""
 HEADROOM = 1.2
@@ -294,7 +296,7 @@ def can_measure(
     if available and pole_pairs and {"psi", "mechanics"} & set(asked):
         lines.append("J/psi, tau_c/psi from polled torque pushes, psi from the voltage limit or the coasting machine")
     elif available and "mechanics" in asked:
-        lines.append("J/K_T, tau_c/K_T from polled torque pushes; J/psi and psi need the pole pairs")
+        lines.append(OVER_TORQUE_CONSTANT)
     return lines
 
 
