@@ -94,6 +94,7 @@ _UNITS: tuple[Unit, ...] = (
     Unit("kg cm2", "inertia", ("kgcm2", "kg cm^2", "kg*cm^2", "kg cm²", "kgcm²"), exponent=-4),
     Unit("g cm2", "inertia", ("gcm2", "g cm^2", "g*cm^2", "g cm²", "gcm²"), exponent=-7),
     Unit("kg m2/Wb", "inertia over flux linkage"),
+    Unit("kg m2 A/(N m)", "inertia over torque constant"),
     Unit("N m/Wb", "torque over flux linkage"),
     Unit("N m s", "viscous friction", ("Nms", "Nm s", "Nms/rad"), True),
     Unit("degC", "temperature", ("°C",)),

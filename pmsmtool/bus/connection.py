@@ -182,6 +182,25 @@ class Connection:
             message.timestamp = self._stamp()
             self._write(message)
 
+    def request(self, cob_id: int, length: int) -> None:
+        """Send a remote frame, once: it is asked again soon.
+
+        Raises
+        ------
+        BusError
+            The adapter is gone, nobody acknowledges, or it sends no remote frames.
+        """
+        message = can.Message(arbitration_id=cob_id, is_remote_frame=True, dlc=length, is_extended_id=False)
+        try:
+            with self._send_lock:
+                self.bus.send(message)
+        except (can.CanError, OSError, ValueError, NotImplementedError) as error:
+            raise self._send_failure(error) from error
+        if self._writer is not None:
+            message.is_rx = False
+            message.timestamp = self._stamp()
+            self._write(message)
+
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send one frame under canopen's name for it, so that its LSS and NMT classes can be used."""
         self.send(can_id, bytes(data))

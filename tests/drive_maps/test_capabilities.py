@@ -65,7 +65,8 @@ def examined(options: str) -> Capabilities:
         ("&drive=epos4", Tier.STANDARD, "epos4"),
         ("&drive=epos2", Tier.MANUAL, "epos2"),
         ("&drive=faulhaber", Tier.MANUAL, "faulhaber"),
-        ("&drive=copley", Tier.STANDARD, "cia402"),  # its identity is in no source: taken as unknown
+        ("&drive=copley", Tier.STANDARD, "copley"),
+        ("&drive=zeroerr", Tier.STANDARD, "zeroerr"),
     ],
 )
 def test_tier_from_map_and_drive(options: str, tier: Tier, map_name: str) -> None:
@@ -164,7 +165,7 @@ def test_caps_as_a_table_and_as_json() -> None:
 
 
 def test_caps_of_an_unknown_drive_says_so() -> None:
-    outcome = run("--sim", CHANNEL + "&drive=copley", "caps")
+    outcome = run("--sim", CHANNEL + "&drive=cia402", "caps")
     assert outcome.exit_code == 0 and "no map names this drive" in outcome.stderr
     outcome = run("--sim", CHANNEL + "&drive=copley", "caps", "--map", "copley")
     assert "map copley (9 parameters)" in outcome.stdout
