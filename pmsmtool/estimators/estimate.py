@@ -61,6 +61,9 @@ class SensorTolerance:
         error that differs from drive to drive, so it belongs to the statistical part. Infinite link: not counted.
     encoder_latency_s : float
         Age of the encoder's angle at the period's start (s): looks like a late current sample.
+    magnet_per_k : float
+        Error of the magnets' temperature coefficient (1/K): what a flux linkage at the reference temperature has from
+        an assumed one.
     current_scale, voltage_scale : float
         True over shown, where an instrument said so; the gains are then the instrument's tolerances.
     bridge_difference_v : float or None
@@ -77,6 +80,7 @@ class SensorTolerance:
     current_scale: float = 1.0
     voltage_scale: float = 1.0
     bridge_difference_v: float | None = None
+    magnet_per_k: float = 0.0
 
     @property
     def applied_scale(self) -> float:

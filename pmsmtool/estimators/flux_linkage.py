@@ -387,7 +387,10 @@ def normalised(measured: Estimate, T_ref_c: float, alpha: float, tolerance: Sens
     known = math.isfinite(measured.T_c)
     factor = 1.0 + alpha * (measured.T_c - T_ref_c) if known else 1.0
     value = measured.value / factor
-    thermal = abs(alpha) * tolerance.temperature_k * value if known else 0.0
+    thermal = 0.0
+    if known:
+        away = tolerance.magnet_per_k * (measured.T_c - T_ref_c)
+        thermal = math.hypot(alpha * tolerance.temperature_k, away) * value
     return Estimate(
         value=value,
         std=measured.std / factor,

@@ -19,15 +19,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.estimators.angle_harmonics import AngleHarmonics, angle_harmonics
 from pmsmtool.estimators.estimate import (
     CHI2_WARN,
     SensorTolerance,
     chi2_gate,
     condition_gate,
     information_bound,
+    information_weights,
 )
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt, linear_solve
-from pmsmtool.estimators.mechanics_model import Problem, Run, whitener
+from pmsmtool.estimators.mechanics_model import SHAFT, Problem, Run, whitener
 from pmsmtool.estimators.mechanics_position import encoder_step, position_std
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
@@ -58,16 +60,22 @@ COASTING_FLOOR = 1e-4
 """The same of a coasting, from where it grows."""
 GROWTH_MOST = 2.5
 """Largest growth of the torque's noise from one fit to the next: a fit that has not arrived asks for too much."""
+COGGING_FITS = 2
+"""Fits where there is cogging: its torque takes the inertia of the one before."""
 RIPPLE_MOST = 0.05
 """Largest deviation of a block's torque, of the push's: above, the shaft is not what the model says."""
 UNEXPLAINED = 2.0
 """Growth of the torque's noise in pushes or coasting from which on it is more than the model's."""
+DRAG_PENALTY = 16.0
+"""Price of the drag in the information criterion: it is there from four standard deviations on, and a shaft without it
+keeps the intervals of B and tau_c."""
 NOTED = 0.01
 """Deviation of a block's torque, of the push's, from which on a reader is told why the intervals are wide: the healthy
 default machine has 0.0035 to 0.0039 (`identify all`), which leaves J at 0.07 % where its tolerance is 1.4 %."""
 NOISY_TORQUE = "cogging, a load or a gear on the shaft, an elastic coupling, an encoder that is off centre"
 SCALE_FLOOR = 3e-4
 """Relative deviation of the torque's scale beyond that of the flux linkage and of the samples' displacement."""
+NO_HARMONICS = AngleHarmonics()
 METHOD = "pushes and coasting, output error on position, whitened"
 
 
@@ -85,6 +93,10 @@ class MechanicsResult:
         Deviation of a block's torque that the residual asked for, of the push's.
     unexplained : bool
         Whether that is so much more than the currents' noise and the floor that it widens the intervals notably.
+    harmonics : AngleHarmonics
+        Cogging torque and encoder error that were taken out.
+    drag : Estimate or None
+        Torque per square of the speed (N m s2), where the data ask for it: it is in neither B nor tau_c.
     chi2 : float
         Reduced chi-square of the whitened position.
     condition : float
@@ -99,16 +111,25 @@ class MechanicsResult:
     chi2: float
     condition: float
     unexplained: bool
+    harmonics: AngleHarmonics = NO_HARMONICS
+    drag: Estimate | None = None
 
     @property
     def note(self) -> str:
         """What a reader should know of the torque's noise; empty where it is too small to be worth it."""
-        if not self.unexplained or self.ripple < NOTED:
-            return ""
-        return (
-            f"J, B and tau_c: torque noise of {100.0 * self.ripple:.2g} % of the push's, counted in their intervals; "
-            f"likely {NOISY_TORQUE}"
-        )
+        lines = []
+        if self.drag is not None:
+            lines.append(f"drag over the square of the speed, {self.drag.value:.3g} N m s2, is in neither B nor tau_c")
+        if self.harmonics.acceleration_rad_s2:
+            orders = ", ".join(f"{h.order}" for h in self.harmonics.acceleration_rad_s2)
+            torque = max(h.amplitude for h in self.harmonics.acceleration_rad_s2) * self.J.value
+            lines.append(f"cogging of {torque:.3g} N m (orders per turn: {orders}) was taken out of J, B and tau_c")
+        if self.unexplained and self.ripple >= NOTED:
+            lines.append(
+                f"J, B and tau_c: torque noise of {100.0 * self.ripple:.2g} % of the push's, counted in their "
+                f"intervals; likely {NOISY_TORQUE}"
+            )
+        return "; ".join(lines)
 
 
 def estimate_mechanics(
@@ -154,16 +175,39 @@ def estimate_mechanics(
     if flagged:
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
     step = encoder_step([run["theta_M_rad"] for run in runs])
-    blocks = [_blocks(run, torque, torque_per_a, sigma_a, direction, step) for run in runs]
+    harmonics = angle_harmonics([(run.t_s, direction * run["theta_M_rad"]) for run in runs if run.meta["coasting"]])
+
+    def blocks_of(J_kgm2: float) -> list[Run]:
+        return [_blocks(run, torque, torque_per_a, sigma_a, direction, step, harmonics, J_kgm2) for run in runs]
+
+    blocks = blocks_of(0.0)
     start = _start(blocks)
-    fit, chi2, noise = _fit(blocks, start)
-    before = _noise(blocks)
+    if harmonics.acceleration_rad_s2:
+        for _ in range(COGGING_FITS - 1):  # the torque over the angle is known as an acceleration
+            start = np.delete(_fit(blocks_of(math.exp(start[0])), start)[0].x, SHAFT)
+        blocks = blocks_of(math.exp(start[0]))
+    with_drag, chi2, noisy = _fit(blocks, start)
+    before, noise = _noise(blocks), _noise(noisy)
     unexplained = any(noise[kind] > UNEXPLAINED * max(before[kind], COASTING_FLOOR) for kind in noise)
-    bound, condition = information_bound(fit.jacobian)
+    without = _minimum(noisy, np.delete(with_drag.x, SHAFT), _scale(blocks, SHAFT))
+    bound, condition = information_bound(without.jacobian)
     condition_gate(condition, "B and tau_c", STAGE)
     _, widen = chi2_gate(chi2, STAGE)
-    J, B, tau_c = math.exp(fit.x[0]), float(fit.x[1]), float(fit.x[2])
-    stds = (J * float(bound[0]) * widen, float(bound[1]) * widen, float(bound[2]) * widen)
+    share = float(information_weights([without.cost, with_drag.cost + DRAG_PENALTY])[1])
+    of_drag, _ = information_bound(with_drag.jacobian)
+    values, deviations = [], []
+    for k in range(SHAFT):
+        pair = without.x[k], with_drag.x[k]
+        mean = (1.0 - share) * pair[0] + share * pair[1]
+        parts = (float(bound[k]) ** 2, float(of_drag[k]) ** 2)
+        spread = share * (1.0 - share) * float(pair[1] - pair[0]) ** 2
+        values.append(float(mean))
+        deviations.append(widen * math.sqrt((1.0 - share) * parts[0] + share * parts[1] + spread))
+    J, B, tau_c = math.exp(values[0]), values[1], values[2]
+    stds = (J * deviations[0], deviations[1], deviations[2])
+    drag = None
+    if share > 0.5:
+        drag = Estimate(float(with_drag.x[SHAFT]), widen * float(of_drag[SHAFT]), 0.0, "N m s2", method=METHOD)
     n = sum(len(block.theta) for block in blocks)
     scale_std = math.hypot(scale_std, SCALE_FLOOR)
     estimates = [
@@ -178,9 +222,8 @@ def estimate_mechanics(
         )
         for value, std, unit in zip((J, B, tau_c), stds, ("kg m2", "N m s", "N m"), strict=True)
     ]
-    return MechanicsResult(
-        estimates[0], estimates[1], estimates[2], stds, max(noise.values()), chi2, condition, unexplained
-    )
+    ripple = max(noise.values())
+    return MechanicsResult(*estimates, stds, ripple, chi2, condition, unexplained, harmonics, drag)
 
 
 def _window(run: Trace) -> Trace:
@@ -196,14 +239,29 @@ def _window(run: Trace) -> Trace:
     return replace(run, t_s=run.t_s[first:], signals={name: values[first:] for name, values in run.signals.items()})
 
 
-def _blocks(run: Trace, torque: Torque, torque_per_a: float, sigma_a: float, direction: int, step: float) -> Run:
+def _blocks(
+    run: Trace,
+    torque: Torque,
+    torque_per_a: float,
+    sigma_a: float,
+    direction: int,
+    step: float,
+    harmonics: AngleHarmonics,
+    J_kgm2: float,
+) -> Run:
+    """Return a trace in blocks without the encoder's error; cogging as a torque of pushes, out of a coasting's way.
+
+    Cogging goes through periods within a block of a coasting, where only the position shows it.
+    """
     rows = max(1, (len(run) - 1) // BLOCKS)
     count = (len(run) - 1) // rows
-    theta = direction * run["theta_M_rad"][: count * rows + 1 : rows]
-    theta_std = position_std(theta, step)
+    shown = direction * run["theta_M_rad"]
+    theta_std = position_std(shown[: count * rows + 1 : rows], step)
     if run.meta["coasting"]:
-        return Run(theta, np.zeros(count), rows * run.period_s, theta_std, 0.0, True)
-    tau = torque(run["i_d_a"], run["i_q_a"])
+        way = harmonics.shaft(harmonics.without_ripple(run.t_s, shown))
+        return Run(way[: count * rows + 1 : rows], np.zeros(count), rows * run.period_s, theta_std, 0.0, True)
+    theta = harmonics.shaft(shown)[: count * rows + 1 : rows]
+    tau = torque(run["i_d_a"], run["i_q_a"]) + harmonics.torque_nm(shown, J_kgm2)
     mean = (0.5 * (tau[:-1] + tau[1:]))[: count * rows].reshape(count, rows).mean(axis=1)
     noise = math.hypot(abs(torque_per_a) * sigma_a / math.sqrt(rows), TORQUE_FLOOR * float(np.max(np.abs(mean))))
     return Run(theta, mean, rows * run.period_s, theta_std, noise, False)
@@ -228,12 +286,19 @@ def _start(runs: Sequence[Run]) -> Array:
     return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
 
 
-def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, dict[bool, float]]:
-    """Return the fit, its reduced chi-square, and the torque's noise that it took."""
+def _scale(runs: Sequence[Run], shared: int) -> Array:
+    """Sizes of the parameters."""
     speed = max(float(np.max(np.abs(np.diff(run.theta)))) / run.T for run in runs)
     largest = max(float(np.max(np.abs(run.torque))) for run in runs)
-    scale = np.array([1.0, largest / speed, largest, *(value for run in runs for value in (1.0, speed))])
-    x = start
+    common = (1.0, largest / speed, largest, largest / speed**2)[:shared]
+    return np.array([*common, *(value for run in runs for value in (1.0, speed))])
+
+
+def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, Sequence[Run]]:
+    """Return the fit with drag, its reduced chi-square, and the runs with the torque's noise that it took."""
+    largest = max(float(np.max(np.abs(run.torque))) for run in runs)
+    scale = _scale(runs, SHAFT + 1)
+    x = np.insert(start, SHAFT, 0.0)
     for share in COARSE_RIPPLES:
         x = _minimum([replace(run, torque_std=max(run.torque_std, share * largest)) for run in runs], x, scale).x
     for count in range(FITS_MOST):
@@ -258,7 +323,7 @@ def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, dict[bool, floa
             runs = noisier  # before a minimum the residual says nothing of the noise
     if not fit.converged:
         raise refuse("E_NOT_CONVERGED", f"{fit.iterations} steps without a minimum", stage=STAGE)
-    return fit, chi2, noise
+    return fit, chi2, runs
 
 
 def _noise(runs: Sequence[Run]) -> dict[bool, float]:
@@ -271,7 +336,8 @@ def _noise(runs: Sequence[Run]) -> dict[bool, float]:
 
 
 def _minimum(runs: Sequence[Run], x: Array, scale: Array) -> Fit:
-    problem = Problem(runs, [whitener(run, math.exp(float(x[0]))) for run in runs], RELATIVE_STEP * scale)
+    factors = [whitener(run, math.exp(float(x[0]))) for run in runs]
+    problem = Problem(runs, factors, RELATIVE_STEP * scale, len(x) - 2 * len(runs))
     return levenberg_marquardt(problem.residual, x, scale, cost_tolerance=1e-4, derivative=problem.jacobian)
 
 

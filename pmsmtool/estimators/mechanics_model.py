@@ -15,6 +15,9 @@ from pmsmtool.estimators.mechanics_motion import positions
 
 Array = NDArray[np.float64]
 
+SHAFT = 3
+"""Parameters of the shaft without drag: ln J, B, tau_c."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
@@ -27,20 +30,32 @@ class Run:
     torque_std: float
     coasting: bool
 
+    @property
+    def square(self) -> Array:
+        """Square of the speed in every block, with its sign (rad2/s2), shape (n,)."""
+        speed = np.diff(self.theta) / self.T
+        return np.asarray(speed * np.abs(speed))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Whitened residual of all traces; a trace knows the three common parameters and its own two."""
+    """Whitened residual of all traces; a trace knows the common parameters and its own two.
+
+    Common are ln J, B and tau_c, and with ``shared`` 4 the drag: a torque against the square of the speed, which the
+    positions show well enough.
+    """
 
     runs: Sequence[Run]
     factors: Sequence[Array]
     step: Array
+    shared: int = SHAFT
 
     def of_run(self, k: int, x: Array) -> Array:
         """Whitened residual of one trace."""
-        run = self.runs[k]
-        own = np.append(x[:3], x[3 + 2 * k : 5 + 2 * k])
-        return np.asarray(self.factors[k] @ (positions(run.torque, run.T, own) - run.theta))
+        run, first = self.runs[k], self.shared + 2 * k
+        own = np.append(x[:SHAFT], x[first : first + 2])
+        torque = run.torque if self.shared == SHAFT else run.torque - x[SHAFT] * run.square
+        return np.asarray(self.factors[k] @ (positions(torque, run.T, own) - run.theta))
 
     def residual(self, x: Array) -> Array:
         """Whitened residual, shape (n,)."""
@@ -51,7 +66,7 @@ class Problem:
         blocks = []
         for k, run in enumerate(self.runs):
             block = np.zeros((len(run.theta), len(x)))
-            for column in (0, 1, 2, 3 + 2 * k, 4 + 2 * k):
+            for column in (*range(self.shared), self.shared + 2 * k, self.shared + 2 * k + 1):
                 plus, minus = x.copy(), x.copy()
                 plus[column] += self.step[column]
                 minus[column] -= self.step[column]

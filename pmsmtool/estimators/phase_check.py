@@ -1,8 +1,8 @@
 """Is the motor there, are its phases and sensors alike? Three small vectors before any larger current; then pairs.
 
 At five percent of the rated current dead time hides an unbalance of the winding: the small vectors find what is not
-connected, and the slope of the voltage through each pair of phases at half and full current finds what is unequal. What
-three sensors measure adds up to nothing unless they differ.
+connected, and the slope of the voltage through each pair of phases at half and full current finds what is unequal; how
+far the gains of the current sensors differ is measured there, too.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.sensor_mismatch import SensorMismatch, estimate_mismatch
 from pmsmtool.trace import Trace
 
 STAGE = "phase check"
@@ -29,8 +30,9 @@ BALANCE_LIMIT = 0.10
 """Largest relative spread of currents or resistances between the phases."""
 SMALL_LIMIT = 0.30
 """The same, of u/i at the small vectors: legs whose dead times differ by 5 % already make 0.11 of it."""
-SENSOR_LIMIT = 0.01
-"""Largest sum of the three phase currents, of the vector's; a gain that is 2 % off makes 1.7 %."""
+SENSOR_LIMIT = 0.05
+"""Largest difference of the gains of two current sensors: up to it the traces are corrected, beyond it a sensor or its
+scale is wrong. Healthy sensors differ by 0.3 to 2 %."""
 OFFSET_LIMIT = 0.2
 """Largest offset of the current sensors, of the small test current: 1 % of the rated one."""
 LEG_DOUBT = 0.05
@@ -142,15 +144,15 @@ class PairCheck:
         Slope of the voltage with phase a, b and c idle (ohm).
     spread : float
         Largest difference between them, relative.
-    sensor_sum : float
-        Largest sum of the phase currents that grows with the current, relative.
+    mismatch : SensorMismatch
+        Gains of the current sensors over their mean.
     judged : bool
         Whether the rotor was at rest, so that the spread means something.
     """
 
     resistance_ohm: tuple[float, float, float]
     spread: float
-    sensor_sum: float
+    mismatch: SensorMismatch
     judged: bool = True
 
 
@@ -172,19 +174,18 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
     IdentificationError
         ``E_CURRENT_SENSOR``, ``E_UNBALANCED``.
     """
-    i = pairs["i_d_a"]
-    steps = np.diff(i)[::2]
-    total = pairs["i_a_a"] + pairs["i_b_a"] + pairs["i_c_a"]
-    sums = np.abs(np.diff(total)[::2] / steps)
-    worst = int(np.argmax(sums))
-    if float(sums[worst]) > SENSOR_LIMIT:
+    mismatch = estimate_mismatch(pairs, noise)
+    if mismatch.spread > SENSOR_LIMIT:
+        named = ", ".join(f"{phase} {100 * gain:+.2g} %" for phase, gain in zip("abc", mismatch.gains, strict=True))
         raise refuse(
             "E_CURRENT_SENSOR",
-            f"through {PAIRS[worst]} the three phase currents add up to {100 * sums[worst]:.2g} % of the current, "
+            f"the gains of the phase current sensors differ by {100 * mismatch.spread:.2g} % ({named} of their mean), "
             f"limit {100 * SENSOR_LIMIT:g} %",
             stage=STAGE,
-            likely="the gains of the phase current sensors differ",
+            likely="a damaged sensor, or a wrong scale of one phase",
         )
+    i = pairs["i_d_a"]
+    steps = np.diff(i)[::2]
     raw = np.diff(pairs["u_d_v"])[::2] / steps
     taken = np.diff(curve.error_v(math.sqrt(3.0) / 2.0 * i) * 2.0 / math.sqrt(3.0))[::2] / steps
     slopes = raw - taken
@@ -202,7 +203,7 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
             stage=STAGE,
         )
     resistances = (float(slopes[0]), float(slopes[1]), float(slopes[2]))
-    return PairCheck(resistances, _spread(slopes), float(sums[worst]), not moved)
+    return PairCheck(resistances, _spread(slopes), mismatch, not moved)
 
 
 def _spread(values: NDArray[np.float64]) -> float:

@@ -29,7 +29,16 @@ SLOWEST = 0.82
 COAST_BAND = 0.03
 COAST_LIMIT_S = 3.0
 """Relative distance and time for a shaft that is left to coast at once: its windows measure where it is. An overshoot
-that friction takes back slowly cost up to 8 s per speed with the narrow band."""
+that friction takes back slowly cost up to 8 s per speed with the narrow band. The time of the ramp comes on top: a
+reversal that took longer than the limit gave windows of the wrong direction."""
+RAMP_DOUBT = 1.5
+"""Time of a ramp, of what the rough inertia says; friction takes part of the torque."""
+RAMP_MOST_S = 25.0
+COAST_LOSS = 0.15
+"""Part of its speed that a shaft may lose in one window; one that would lose more keeps the q current that held its
+speed. Profiles and random drives lose 0.02 to 0.06."""
+HOLD_S = 0.05
+"""Shortest window for that current: whole electrical turns."""
 SETTLE_S, SETTLE_MOST_S = 0.025, 0.1
 """Shortest and longest time between a current's command and its window (s)."""
 Q_WINDOW_S = 0.03
@@ -63,6 +72,8 @@ class SpeedPlan:
         electrical turns must do (s).
     q_window_s : float
         Shortest window of a q current, which accelerates the shaft: whole electrical turns (s).
+    per_ampere_rad_s2, acceleration_rad_s2 : float
+        Rough mechanical acceleration per q current (rad/s2/A), and the one of the speed controller (rad/s2).
     """
 
     omega_max_rad_s: float
@@ -73,6 +84,8 @@ class SpeedPlan:
     window_s: float = 0.06
     longest_s: float = 0.2
     q_window_s: float = Q_WINDOW_S
+    per_ampere_rad_s2: float = 0.0
+    acceleration_rad_s2: float = math.inf
 
     def stations(self) -> list[tuple[float, list[tuple[float, float]]]]:
         """Return the mechanical speeds in the order they are reached, and the vectors that are held at each."""
@@ -152,20 +165,34 @@ def coast_through(drive: Drive, plan: SpeedPlan, pole_pairs: int) -> Rows:
     The drive is enabled on entry with a speed controller that holds the machine; it is asked for standstill on return.
     """
     rows: Rows = []
+    before = 0.0
     for speed, vectors in plan.stations():
         omega_e = speed * pole_pairs
-        controlled = False
+        controlled, held = False, 0.0
         for i_d, i_q in vectors:
             if not controlled or abs(rows[-1]["omega_second_rad_s"]) < SLOWEST * abs(omega_e):
                 drive.command_speed(speed)
-                reach(drive, omega_e, limit_s=COAST_LIMIT_S, band_rad_s=COAST_BAND * abs(omega_e))
-                controlled, settle_s = True, plan.first_s
-            drive.command_current(i_d, i_q)
+                change = abs(speed - before)
+                ramp_s = min(RAMP_MOST_S, RAMP_DOUBT * change / plan.acceleration_rad_s2)
+                reach(drive, omega_e, limit_s=COAST_LIMIT_S + ramp_s, band_rad_s=COAST_BAND * abs(omega_e))
+                held = _holding(drive, plan, speed, pole_pairs)
+                controlled, settle_s, before = True, plan.first_s, speed
+            drive.command_current(i_d, i_q + held)
             drive.wait(settle_s)
             settle_s = plan.settle_s
             rows.append(_window(drive, _half_window(drive, plan, speed, pole_pairs, i_q != 0.0)))
     drive.command_speed(0.0)
     return rows
+
+
+def _holding(drive: Drive, plan: SpeedPlan, speed: float, pole_pairs: int) -> float:
+    """Return the q current that keeps the speed (A); 0 where the shaft coasts through a window well enough without."""
+    turn_s = 2.0 * math.pi / abs(speed * pole_pairs)
+    periods = round(max(1, math.ceil(HOLD_S / turn_s)) * turn_s / drive.period_s)
+    i_q = drive.average(("i_q_a",), periods)["i_q_a"]
+    window_s = plan.settle_s + 2.0 * drive.period_s * _half_window(drive, plan, speed, pole_pairs, False)
+    lost = plan.per_ampere_rad_s2 * abs(i_q) * window_s
+    return i_q if lost > COAST_LOSS * abs(speed) else 0.0
 
 
 def repeat_fastest_pair(drive: Drive, speeds: Trace, pole_pairs: int) -> Rows:

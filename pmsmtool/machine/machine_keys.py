@@ -46,6 +46,7 @@ MACHINE_KEYS: tuple[Key, ...] = (
     _key("machine", "T_ref_c", "degC", -60, 200, 20.0, "reference temperature of R_s and psi_f"),
     _key("machine", "alpha_R_per_k", "1/K", 0, 0.01, COPPER_ALPHA_PER_K, "temperature coefficient of the copper"),
     _key("machine", "alpha_psi_per_k", "1/K", -0.01, 0.001, MAGNET_ALPHA_PER_K, "temperature coefficient of psi_f"),
+    _key("machine", "alpha_psi_tolerance_per_k", "1/K", 0, 0.01, None, "95 % half width of that coefficient"),
     _key("machine", "I_nom_apk", "A", 1e-3, 1e5, None, "rated current (peak)"),
     _key("machine", "I_max_apk", "A", 1e-3, 1e5, None, "time-limited current (peak)"),
     _key("machine", "I_max_time_s", "s", 0, 3600, None, "time I_max may flow from cold"),

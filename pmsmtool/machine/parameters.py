@@ -72,6 +72,7 @@ class MachineParameters:
     T_ref_c: float = 20.0
     alpha_R_per_k: float = COPPER_ALPHA_PER_K
     alpha_psi_per_k: float = MAGNET_ALPHA_PER_K
+    alpha_psi_tolerance_per_k: float | None = None
     I_nom_apk: float | None = None
     I_max_apk: float | None = None
     I_max_time_s: float | None = None

@@ -88,6 +88,7 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number("J_kgm2", "kg m2", 1e-9, 1e4, None, "inertia of rotor and what is rigid with it", "[machine] J_kgm2"),
     _number("B_nms", "N m s", 0, 1e4, None, "viscous friction", "[machine] B_nms"),
     _number("tau_c_nm", "N m", 0, 1e5, None, "Coulomb friction torque", "[machine] tau_c_nm"),
+    _number("drag_nms2", "N m s2", 0, 1e4, 0.0, "drag of air: torque per square of the speed"),
     _number("load_nm", "N m", -1e6, 1e6, 0.0, "load torque, positive against positive rotation"),
     _number("load_viscous_nms", "N m s", 0, 1e4, 0.0, "load torque per speed"),
     _number("J_load_kgm2", "kg m2", 0, 1e4, 0.0, "second mass behind an elastic shaft, 0 none"),
@@ -103,12 +104,16 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number("L_d_h", "H", 1e-7, 10, None, "true d inductance", "[machine] L_d_h"),
     _number("L_q_h", "H", 1e-7, 10, None, "true q inductance", "[machine] L_q_h"),
     _number("psi_f_wb", "Wb", 0, 100, None, "true PM flux linkage at T_ref", "[machine] psi_f_wb"),
+    _number(
+        "alpha_psi_per_k", "1/K", -0.01, 0.001, None, "true coefficient of the magnets", "[machine] alpha_psi_per_k"
+    ),
     _whole("pole_pairs", 1, 64, None, "true pole pairs", "[machine] pole_pairs"),
     _number("iron_loss_ohm", "ohm", 0, 1e6, 0.0, "iron-loss resistance in parallel with the flux voltage, 0 none"),
     _number("eddy_share", "1", 0, 0.9, 0.0, "share of the inductances that fast changes do not see"),
     _number("eddy_time_s", "s", 1e-6, 1, 1e-3, "time constant of that share"),
-    _number("psi_6_wb", "Wb", 0, 10, 0.0, "flux harmonic of order 6 in dq"),
-    _number("psi_12_wb", "Wb", 0, 10, 0.0, "flux harmonic of order 12 in dq"),
+    _number("psi_6_wb", "Wb", 0, 10, 0.0, "flux harmonic of order 6 in dq, the 5th of a phase"),
+    _number("psi_7_wb", "Wb", 0, 10, 0.0, "7th flux harmonic of a phase, of order 6 in dq, too"),
+    _number("psi_12_wb", "Wb", 0, 10, 0.0, "flux harmonic of order 12 in dq, the 11th of a phase"),
     # faults and identity
     _choice("phase_open", ("none", "a", "b", "c"), "none", "a phase that is not connected"),
     Key(_TABLE, "drive_fault", "text", "", -math.inf, math.inf, "none", "misbehaviour of the simulated drive by name"),

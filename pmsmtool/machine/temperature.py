@@ -6,6 +6,7 @@ not known all of it counts as copper. psi(T) = psi_f (1 + alpha_psi (T - T_ref))
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
@@ -18,6 +19,8 @@ COPPER_ALPHA_PER_K = 0.00393
 """Temperature coefficient of copper at 20 degC (IEC 60028: annealed copper)."""
 MAGNET_ALPHA_PER_K = -0.0012
 """Temperature coefficient of the flux linkage where no machine file says it: sintered NdFeB, -0.11 to -0.12 %/K."""
+ASSUMED_MAGNET_PER_K = 0.0009
+"""95 % half width of that assumption: from samarium-cobalt, -0.03 %/K, to ferrite, -0.2 %/K."""
 UNKNOWN_T_RANGE_C = (5.0, 90.0)
 """Winding and magnets of a machine whose temperature nothing tells (degC)."""
 
@@ -40,6 +43,16 @@ def loop_coefficient_per_k(machine: MachineParameters) -> float:
 def resistance_at(machine: MachineParameters, T_winding_c: Degrees) -> Degrees:
     """Return the loop resistance (ohm) at winding temperatures (degC) of any shape."""
     return machine.R_s_ohm + copper_ohm(machine) * machine.alpha_R_per_k * (T_winding_c - machine.T_ref_c)
+
+
+def magnet_tolerance_per_k(machine: MachineParameters) -> float:
+    """Return the 95 % half width of the magnets' coefficient (1/K).
+
+    What the file states; without that, nothing for a coefficient of its own, and the range of magnets for the default.
+    """
+    if machine.alpha_psi_tolerance_per_k is not None:
+        return machine.alpha_psi_tolerance_per_k
+    return ASSUMED_MAGNET_PER_K if math.isclose(machine.alpha_psi_per_k, MAGNET_ALPHA_PER_K, rel_tol=1e-6) else 0.0
 
 
 def magnet_flux_at(machine: MachineParameters, T_magnet_c: Degrees) -> Degrees:

@@ -33,7 +33,7 @@ static inline void accelerations(const pmsm_plant *m, double torque, double thet
                                  double omega_load, double *rotor, double *load)
 {
     const pmsm_machine *k = &m->machine;
-    double net = torque - k->B * omega - k->tau_c * m->friction_sign;
+    double net = torque - (k->B + k->drag * pmsm_real64_abs(omega)) * omega - k->tau_c * m->friction_sign;
     if (k->cogging != 0.0) {
         double s, c;
         pmsm_real64_sincos(k->cogging_periods * theta_M, &s, &c);

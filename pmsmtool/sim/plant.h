@@ -27,9 +27,11 @@ typedef struct {
     const pmsm_flux_map *map;      /* null: constant inductances; else the inverse table is the machine */
     double R_iron;                 /* ohm, parallel to the flux voltage; 0 off */
     double eddy_d, eddy_q, eddy_rate; /* 1/H, 1/H, 1/s: i += eddy (psi - chi), chi' = eddy_rate (psi - chi); 0 off */
-    double psi_6, psi_12;          /* Wb: psi_dq += psi_6 exp(-6 j theta_e) + psi_12 exp(-12 j theta_e); 0 off */
+    double psi_6, psi_12, psi_7;   /* Wb: psi_dq += psi_6 exp(-6 j theta_e) + psi_12 exp(-12 j theta_e)
+                                      + psi_7 exp(6 j theta_e), 5th, 11th and 7th of a phase; 0 off */
     double J, B, tau_c;            /* kg m2, N m s, N m */
     double load_viscous;           /* N m s, of the load */
+    double drag;                   /* N m s2, of air: torque per square of the speed */
     double cogging, cogging_periods; /* N m, periods per mechanical turn */
     double thermal_resistance, thermal_capacity, T_ambient; /* K/W, J/K, degC; capacity 0: T_winding is held */
     uint32_t rotor;                /* enum pmsm_rotor */

@@ -20,15 +20,16 @@ static inline void pmsm_magnet_harmonics(const pmsm_machine *machine, double c, 
     const double c3 = c2 * c - s2 * s, s3 = s2 * c + c2 * s;
     const double c6 = c3 * c3 - s3 * s3, s6 = 2.0 * c3 * s3;
     const double c12 = c6 * c6 - s6 * s6, s12 = 2.0 * c6 * s6;
-    h[0] = machine->psi_6 * c6 + machine->psi_12 * c12;
-    h[1] = -machine->psi_6 * s6 - machine->psi_12 * s12;
-    dh[0] = -6.0 * machine->psi_6 * s6 - 12.0 * machine->psi_12 * s12;
-    dh[1] = -6.0 * machine->psi_6 * c6 - 12.0 * machine->psi_12 * c12;
+    const double even = machine->psi_6 + machine->psi_7, odd = machine->psi_6 - machine->psi_7;
+    h[0] = even * c6 + machine->psi_12 * c12;
+    h[1] = -odd * s6 - machine->psi_12 * s12;
+    dh[0] = -6.0 * even * s6 - 12.0 * machine->psi_12 * s12;
+    dh[1] = -6.0 * odd * c6 - 12.0 * machine->psi_12 * c12;
 }
 
 static inline int pmsm_has_harmonics(const pmsm_machine *machine)
 {
-    return machine->psi_6 != 0.0 || machine->psi_12 != 0.0;
+    return machine->psi_6 != 0.0 || machine->psi_12 != 0.0 || machine->psi_7 != 0.0;
 }
 
 /* Currents of a point from its flux and angle. */

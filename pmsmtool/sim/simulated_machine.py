@@ -182,9 +182,10 @@ def _machine(out: Any, machine_file: MachineFile, settings: Settings, violations
     out.R_copper, out.R_fixed = share * R_phase, (1.0 - share) * R_phase
     out.pole_pairs = settings.whole("pole_pairs")
     out.L_d, out.L_q, out.psi_f = (settings.number(name) for name in ("L_d_h", "L_q_h", "psi_f_wb"))
-    out.T_ref, out.alpha_R, out.alpha_psi = machine.T_ref_c, machine.alpha_R_per_k, machine.alpha_psi_per_k
+    out.T_ref, out.alpha_R = machine.T_ref_c, machine.alpha_R_per_k
+    out.alpha_psi = settings.number("alpha_psi_per_k")
     out.R_iron = settings.number("iron_loss_ohm")
-    out.psi_6, out.psi_12 = settings.number("psi_6_wb"), settings.number("psi_12_wb")
+    out.psi_6, out.psi_12, out.psi_7 = (settings.number(f"psi_{order}_wb") for order in (6, 12, 7))
     eddy = settings.number("eddy_share")
     if eddy > 0.0:
         out.eddy_d, out.eddy_q = (eddy / ((1.0 - eddy) * L) for L in (out.L_d, out.L_q))
@@ -210,6 +211,7 @@ def _mechanics(out: Any, settings: Settings, violations: list[str]) -> None:
         violations.append('a free rotor needs J_kgm2 in [machine] or [simulation], or rotor = "locked" or "driven"')
     out.J, out.B = settings.number("J_kgm2", 1.0), settings.number("B_nms")
     out.tau_c, out.load_viscous = settings.number("tau_c_nm"), settings.number("load_viscous_nms")
+    out.drag = settings.number("drag_nms2")
     out.cogging, out.cogging_periods = settings.number("cogging_nm"), float(settings.whole("cogging_periods"))
     out.J_load = settings.number("J_load_kgm2")
     out.coupling_stiffness = settings.number("coupling_stiffness_nm_per_rad")

@@ -32,6 +32,7 @@ from pmsmtool.estimators.resistance import (
     settled_levels,
 )
 from pmsmtool.estimators.sampling_instant import Sampling, ShownInstant
+from pmsmtool.estimators.sensor_mismatch import SensorMismatch, estimate_mismatch, widened, without_mismatch
 from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
@@ -45,6 +46,8 @@ MOTION_STD = 0.2
 """Relative standard deviation of the rotor's answer to an injection as the pushes show it: friction takes part."""
 RELUCTANCE_STD = 0.3
 """Standard deviation of what reluctance takes from it, relative: the inductances are rough and incremental."""
+FIXED = ("levels", "square_")
+"""Beginnings of the names of traces whose current vector keeps its angle."""
 MOSFET_LINK_V = 100.0
 """Below this DC link bridges are made of MOSFETs, which have no threshold."""
 
@@ -61,6 +64,7 @@ class Evaluation:
 
     noise: Noise
     phases: PhaseCheck | None = None
+    mismatch: SensorMismatch | None = None
     pairs: PairCheck | None = None
     resistance: ResistanceResult | None = None
     split: FrequencySplit | None = None
@@ -188,7 +192,10 @@ def evaluate(
     tolerance = tolerance_on(tolerance or SensorTolerance(), U_dc_v)
     copper = copper or Copper(T_ref_c)
     traces = calibrated_traces(traces, tolerance)
-    result = Evaluation(estimate_noise(traces["zero_current"]))
+    noise = estimate_noise(traces["zero_current"])
+    mismatch = estimate_mismatch(traces["phase_pairs"], noise) if "phase_pairs" in traces else None
+    traces = with_equal_sensors(traces, mismatch)
+    result = Evaluation(noise, mismatch=mismatch)
     if "phase_vectors" in traces:
         result = replace(result, phases=check_phases(traces["phase_vectors"], result.noise))
     if "first_turn" in traces:
@@ -207,7 +214,9 @@ def evaluate(
     if "levels" in traces:
         found = attempt("R", lambda: resistances_of(traces, result.noise, copper, tolerance))
         if found is not None:
-            result = replace(result, resistance=found[0], split=found[1])
+            R = found[0]
+            R = replace(R, R_s=widened(R.R_s, mismatch), R_measured=widened(R.R_measured, mismatch))
+            result = replace(result, resistance=R, split=found[1])
     if "phase_pairs" in traces and result.resistance is not None:
         result = replace(result, pairs=check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve))
     if "rotation_backward" in traces:
@@ -223,6 +232,8 @@ def evaluate(
         before = result
         inductance = attempt("L", lambda: inductance_of(traces, before, tolerance, U_dc_v))
         if inductance is not None:
+            L_d, L_q = widened(inductance.L_d, mismatch), widened(inductance.L_q, mismatch)
+            inductance = replace(inductance, L_d=L_d, L_q=L_q)
             rough = replace(before, inductance=inductance)
             result = attempt("psi", lambda: as_sampled(traces, rough, period_s, alpha_psi_per_k, tolerance)) or replace(
                 rough, flux=None
@@ -235,10 +246,26 @@ def evaluate(
     if result.resistance is not None and math.isfinite(U_dc_v):
         dead_time_s = max(0.0, result.resistance.V_dead_v) * period_s / U_dc_v
     shaft = result
-    mechanics = attempt("mechanics", lambda: mechanics_stage.mechanics_of(traces, shaft, tolerance, dead_time_s))
+    mechanics = attempt(
+        "mechanics", lambda: mechanics_stage.mechanics_of(traces, shaft, tolerance, dead_time_s, period_s)
+    )
     moving = replace(shaft, mechanics=mechanics)
     response = attempt("frf", lambda: frequency_stage.frequency_response_of(traces, moving, tolerance, dead_time_s))
     return replace(moving, frequency_response=response, refused=refused)
+
+
+def with_equal_sensors(traces: Mapping[str, Trace], mismatch: SensorMismatch | None) -> Mapping[str, Trace]:
+    """Return the traces along fixed vectors as equal current sensors would have shown them.
+
+    In a frame that follows the rotor the mismatch is a second harmonic, which the means over whole turns do not see.
+    """
+    if mismatch is None or not mismatch.corrected:
+        return traces
+    fixed = {name: trace for name, trace in traces.items() if name.startswith(FIXED)}
+    return {
+        **traces,
+        **{n: without_mismatch(trace, mismatch, float(trace.meta["fixed_angle_rad"])) for n, trace in fixed.items()},
+    }
 
 
 def resistances_of(

@@ -26,6 +26,7 @@ from pmsmtool.experiments.rotation import dwell_within
 from pmsmtool.files import read_text
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, MachineLimits, MachineParameters
+from pmsmtool.machine.temperature import magnet_tolerance_per_k
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
 from pmsmtool.units import rad_s_from_rpm
@@ -301,7 +302,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         copper=copper_of(nameplate.machine),
         alpha_psi_per_k=nameplate.machine.alpha_psi_per_k,
         U_dc_v=nameplate.inverter.U_dc_v,
-        tolerance=request.tolerance,
+        tolerance=replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(nameplate.machine)),
         ended=refused_in(run),
     )
     parts = half_frequency.split_estimates(evaluation.split, nameplate.inverter.U_dc_v, request.tolerance)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from pmsmtool.design.interval_needs import JUDGED, OFFSET, Need, interval_needs
@@ -29,6 +30,10 @@ def acceptance_of(
     # the offset of the slow turn alone, which is for the pole pairs, is coarse, and nobody asked for it
     coarse = {OFFSET} if evaluation.flux is None and "encoder" not in asked else set()
     found = at_the_test(found)
+    if evaluation.flux is not None and "psi_f_wb" in found:  # loops see the magnets as they were, too
+        measured = evaluation.flux.psi_measured
+        share = measured.systematic / measured.value
+        found["psi_f_wb"] = replace(found["psi_f_wb"], systematic=share * found["psi_f_wb"].value)
     judged = [name for name in JUDGED if name in found and name not in coarse]
     criteria = judged_values({name: found[name] for name in judged}, machine)
     mapped = map_stage.map_acceptance(evaluation.flux_map)
@@ -44,6 +49,8 @@ def had_of(evaluation: Evaluation) -> list[str]:
     return [name for name, result in results.items() if result is not None]
 
 
+ASSUMPTION_TOLD = 1.2
+"""Growth of the systematic interval of psi_f by the way to the reference temperature from which on a reader is told."""
 STANDS_FOR: Mapping[str, str] = {"L_q_app_h": "L_q_h", "J_per_psi": "J_kgm2"}
 """Values of a drive without injection, and the machine key whose place they take: loops depend on the ratio J/psi."""
 
@@ -81,6 +88,12 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
         lines.append("R_s is from one control frequency: the drive does not take half of it")
     if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
         lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
+    if evaluation.mismatch is not None and evaluation.mismatch.corrected:
+        gains = ", ".join(f"{100.0 * gain:+.2g} %" for gain in evaluation.mismatch.gains)
+        lines.append(
+            f"the gains of the current sensors of a, b and c are {gains} off their mean: corrected in the values, not "
+            "in the drive, whose torque ripples twice per electrical turn"
+        )
     if evaluation.encoder is not None:
         lines += [
             f"the encoder is off by {math.degrees(error):.2g} deg (mechanical) {often} per turn: mounted off centre? "
@@ -88,6 +101,12 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
             for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
             if error > 0.0
         ]
+    flux = evaluation.flux
+    if flux is not None and flux.psi_f.systematic > ASSUMPTION_TOLD * flux.psi_measured.systematic:
+        lines.append(
+            "psi_f at the reference temperature rests on an assumed temperature coefficient of the magnets: its range, "
+            "samarium-cobalt to ferrite, is in the interval; state alpha_psi_per_k and alpha_psi_tolerance_per_k"
+        )
     if evaluation.mechanics is not None and evaluation.mechanics.note:
         lines.append(evaluation.mechanics.note)
     lines += timing_warnings(evaluation.shown)
@@ -115,6 +134,9 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     }
     if request.tolerance.bridge_difference_v is not None:
         conditions["bridge_difference_v"] = request.tolerance.bridge_difference_v
+    if evaluation.mismatch is not None and evaluation.mismatch.corrected:
+        pairs = zip("abc", evaluation.mismatch.gains, strict=True)
+        conditions |= {f"sensor_gain_{phase}_over_mean": 1.0 + gain for phase, gain in pairs}
     if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
         conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
     return conditions

@@ -41,8 +41,9 @@ LOWEST_LEVEL = 0.08
 """Lowest DC level of the sweep, of the largest; the low ones serve the inverter curve."""
 CURVE_SHARES = (0.02, 0.04)
 """Levels for the inverter curve alone: a speed run at small current lives there."""
-TURN_SHARE = 0.15
-"""Current that turns the rotor over, of the test current."""
+TURN_SHARES = (0.15, 0.35, 0.6)
+"""Currents that turn the rotor over, of the test current: the first that the encoder shows. A load whose friction takes
+15 % of the rated torque keeps the rotor from following the first."""
 ROTATIONS = (
     (0.35, rotation.QUICK_STEP_RAD, rotation.QUICK_DWELL_S, RAMP_S),
     (0.18, rotation.STEP_RAD, 0.03, 3.0 * RAMP_S),
@@ -120,6 +121,8 @@ class Measurement:
         Whether R is measured at half the control frequency, too.
     spent : callable or None
         Seconds energised and copper loss so far (s, J), told after every stage.
+    turn_share : float
+        Current that turns the rotor over, of the test current; more where it did not follow.
     predicted : callable or None
         Told every prediction (``workflow/predicted_file``) before the machine moves for it.
     """
@@ -133,6 +136,7 @@ class Measurement:
     half_frequency: bool = False
     spent: Callable[[], tuple[float, float]] | None = None
     predicted: Callable[[dict[str, Any]], None] | None = None
+    turn_share: float = TURN_SHARES[0]
     refused: dict[str, IdentificationError] = field(default_factory=dict)
     _kept: dict[str, Trace] = field(default_factory=dict)
 
@@ -320,16 +324,24 @@ class Measurement:
         return check_phases(trace, noise)
 
     def _encoder_counts(self, start_rad: float, end_rad: float) -> None:
-        trace = standstill.turn_and_look(self.drive, TURN_SHARE * self.limits.I_test_apk, start_rad, end_rad)
+        for share in TURN_SHARES:
+            self.turn_share = share
+            trace = standstill.turn_and_look(self.drive, share * self.limits.I_test_apk, start_rad, end_rad)
+            try:
+                check_encoder_counts(trace)
+                break
+            except IdentificationError:
+                if share == TURN_SHARES[-1]:
+                    self.keep("first_turn", trace)
+                    raise
         self.keep("first_turn", trace)
-        check_encoder_counts(trace)
 
     def _levels(self, noise: Noise, start_rad: float) -> ResistanceResult:
         largest = self.limits.I_test_apk
         low = [largest * share for share in CURVE_SHARES]
         plan = standstill.LevelPlan(
             standstill.calm_sequence(self._magnitudes(), low),
-            turn_a=TURN_SHARE * largest,
+            turn_a=self.turn_share * largest,
             start_rad=start_rad,
         )
         self.say(f"R and inverter: {len(plan.levels_a)} levels up to {largest:.3g} A")
@@ -344,7 +356,7 @@ class Measurement:
         largest = self.limits.I_test_apk
         strongest = max(standstill.PAIR_SHARES) * largest
         self.say(f"pairs of phases: two currents up to {strongest:.3g} A through each")
-        pairs = standstill.hold_pairs(self.drive, largest, TURN_SHARE * largest, standstill.DC_ANGLE_RAD)
+        pairs = standstill.hold_pairs(self.drive, largest, self.turn_share * largest, standstill.DC_ANGLE_RAD)
         self.keep("phase_pairs", pairs)
         check_pairs(pairs, noise, resistance.curve)
 

@@ -16,6 +16,8 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux_linkage import FluxResult
 from pmsmtool.estimators.mechanics import MechanicsResult, Torque, estimate_mechanics
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.sampling_instant import Sampling, standstill_instant_s
+from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.experiments import mechanics_run, speed_run
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.trace import Trace
@@ -94,8 +96,10 @@ def _come_to_rest(drive: Drive, reached_rad_s: float) -> None:
     """Stop the shaft by the speed controller; the speed is electrical."""
     drive.command_speed(0.0)
     band = REST_SHARE * reached_rad_s
-    waited = speed_run.reach(drive, 0.0, band_rad_s=band)
-    if waited >= speed_run.REACH_LIMIT_S:
+    rate = drive.read("speed.acceleration_rpm_per_s") * math.pi / 30.0 * drive.read("motor.pole_pairs")
+    ramp_s = min(speed_run.RAMP_MOST_S, speed_run.RAMP_DOUBT * reached_rad_s / rate) if rate > 0.0 else 0.0
+    waited = speed_run.reach(drive, 0.0, limit_s=speed_run.REACH_LIMIT_S + ramp_s, band_rad_s=band)
+    if waited >= speed_run.REACH_LIMIT_S + ramp_s:
         raise refuse(
             "E_EXCITATION",
             f"the shaft is not at rest {waited:.2g} s after it was asked to",
@@ -106,7 +110,11 @@ def _come_to_rest(drive: Drive, reached_rad_s: float) -> None:
 
 
 def mechanics_of(
-    traces: Mapping[str, Trace], result: Evaluation, tolerance: SensorTolerance | None, dead_time_s: float = 0.0
+    traces: Mapping[str, Trace],
+    result: Evaluation,
+    tolerance: SensorTolerance | None,
+    dead_time_s: float = 0.0,
+    period_s: float = 0.0,
 ) -> MechanicsResult | None:
     """Return inertia and friction; None without the run, or without a flux linkage.
 
@@ -118,8 +126,8 @@ def mechanics_of(
         What the runs before it say.
     tolerance : SensorTolerance
         Declared sensor tolerances.
-    dead_time_s : float
-        Of a leg; it displaces the samples of the current.
+    dead_time_s, period_s : float
+        Of a leg, and of the control (s): they displace the samples of the current.
 
     Raises
     ------
@@ -137,7 +145,7 @@ def mechanics_of(
     for k, part in enumerate(parts):
         if not part.meta["coasting"]:
             sampled = in_frame(part, behind)
-            parts[k] = _between_samples(sampled, direction * pole_pairs, result, dead_time_s)
+            parts[k] = _between_samples(sampled, direction * pole_pairs, result, dead_time_s, period_s)
             moved = float(np.mean(np.abs(parts[k]["i_q_a"] - sampled["i_q_a"])))
             displaced = max(displaced, moved / float(np.mean(np.abs(sampled["i_q_a"]))))
     return estimate_mechanics(
@@ -167,22 +175,24 @@ def torque_doubt(flux: FluxResult, displaced: float = 0.0, *, mapped: bool = Fal
     return math.hypot(flux.psi_measured.std / flux.psi_measured.value, SAMPLE_DOUBT * displaced, unseen)
 
 
-def _between_samples(trace: Trace, pole_pairs: int, result: Evaluation, dead_time_s: float) -> Trace:
+def _between_samples(trace: Trace, pole_pairs: int, result: Evaluation, dead_time_s: float, period_s: float) -> Trace:
     """Return a push with the mean currents of the periods in place of the sampled ones.
 
     A dead time delays every pulse by half of it, so that the sample in the middle of the zero vector, where the current
-    falls by the mean voltage over L, is ahead by u t_d/(2 L) (``estimators/switching_ripple``).
+    falls by the mean voltage over L, is ahead by u t_d/(2 L) (``estimators/switching_ripple``); a sensor's lag, and the
+    instant at which it is read, displace it, too, as the inductances' fit and the flux run have found them.
     """
     assert result.flux is not None and result.resistance is not None
     if result.inductance is None:
         return trace
+    sampling = result.inductance.sampling or Sampling()
     R, psi = result.resistance.R_measured.value, result.flux.psi_measured.value
     L_d, L_q = result.inductance.L_d.value, result.inductance.L_q.value
     i_d, i_q = trace["i_d_a"], trace["i_q_a"]
     omega = pole_pairs * _speed(trace)
     u_d, u_q = R * i_d - omega * L_q * i_q, R * i_q + omega * (psi + L_d * i_d)
-    late = 0.5 * dead_time_s
-    return replace(trace, signals={**trace.signals, "i_d_a": i_d - u_d * late / L_d, "i_q_a": i_q - u_q * late / L_q})
+    late = standstill_instant_s(sampling, Modulation(math.inf, (L_d, L_q), period_s, dead_time_s))
+    return replace(trace, signals={**trace.signals, "i_d_a": i_d + u_d * late / L_d, "i_q_a": i_q + u_q * late / L_q})
 
 
 def _speed(trace: Trace) -> Array:

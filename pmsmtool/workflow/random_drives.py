@@ -71,6 +71,8 @@ T_RANGE_C = (5.0, 90.0)
 """Winding and magnets when the tool meets them, alike and not known to it."""
 CATALOGUE_SHARE = {"R_s_ohm": 0.10, "L_d_h": 0.30, "L_q_h": 0.30, "psi_f_wb": 0.10, "J_kgm2": 0.10}
 """Tolerances that a data sheet states."""
+MAGNET_TOLERANCE_PER_K = 1e-4
+"""The same of the magnets' temperature coefficient, for one grade of NdFeB."""
 SENSOR_LAG_S = (0.0, 20e-6)
 SAMPLING_SHIFT_SHARE = (0.0, 0.10)
 
@@ -214,7 +216,8 @@ def data_sheet(drive: MachineFile, seed: int) -> MachineFile:
         key: (getattr(drive.machine, key) or 0.0) * (1.0 + share * rng.uniform(-1.0, 1.0))
         for key, share in CATALOGUE_SHARE.items()
     }
-    return replace(drive, machine=replace(drive.machine, **values), simulation={})  # type: ignore[arg-type]
+    machine = replace(drive.machine, alpha_psi_tolerance_per_k=MAGNET_TOLERANCE_PER_K, **values)  # type: ignore[arg-type]
+    return replace(drive, machine=machine, simulation={})
 
 
 def true_loop_resistance(drive: MachineFile) -> float:

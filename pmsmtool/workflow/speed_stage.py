@@ -194,7 +194,15 @@ class SpeedStage:
         self.drive.enable()
         fastest_rpm = rpm_from_rad_s(largest)
         self.say(f"psi_f and fine offset: coasting from up to {fastest_rpm:.0f} rpm, i_d up to {run_i_d:.3g} A")
-        plan = speed_run.SpeedPlan(largest, run_i_d, i_q, settle_s=loop.settle_s, first_s=2.0 * loop.settle_s)
+        plan = speed_run.SpeedPlan(
+            largest,
+            run_i_d,
+            i_q,
+            settle_s=loop.settle_s,
+            first_s=2.0 * loop.settle_s,
+            per_ampere_rad_s2=per_ampere,
+            acceleration_rad_s2=per_ampere * i_run,
+        )
         rows = speed_run.coast_through(self.drive, plan, pole_pairs)
         speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)
         lag_s = 2.0 / self.drive.read("encoder.pll_bandwidth_rad_s")  # its poles are a double one

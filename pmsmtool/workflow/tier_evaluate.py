@@ -27,7 +27,7 @@ from pmsmtool.files import read_text
 from pmsmtool.firmware.drive_map import TORQUE_FACTOR
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters
-from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
+from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K, magnet_tolerance_per_k
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 from pmsmtool.units import RPM_PER_RAD_S
@@ -308,8 +308,9 @@ def evaluated_stage(
         result = tier_result(traces, facts, request.tolerance)
     else:
         machine = known.machine
+        tolerance = replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(machine))
         result = tier_result(
-            traces, facts, request.tolerance, known.inverter, machine.psi_f_wb, copper_of(machine),
+            traces, facts, tolerance, known.inverter, machine.psi_f_wb, copper_of(machine),
             machine.alpha_psi_per_k,
         )  # fmt: skip
     if {"psi", "mechanics"} & set(request.quantities) and facts.kind == "standard" and not facts.pushed:

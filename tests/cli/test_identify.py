@@ -102,7 +102,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "no motor, averaged": ({"drive_fault": "not_connected", "inverter_model": "averaged"}, "E_NOT_CONNECTED"),
     "bad joint": ({"drive_fault": "unbalanced", "inverter_model": "switched"}, "E_UNBALANCED"),
     "bad joint, averaged": ({"drive_fault": "unbalanced", "inverter_model": "averaged"}, "E_UNBALANCED"),
-    "gain of one sensor off by 2 %": ({"sensor_gain_a": 1.02}, "E_CURRENT_SENSOR"),
+    "gain of one sensor off by 8 %": ({"sensor_gain_a": 1.08}, "E_CURRENT_SENSOR"),
     "offset of one sensor": ({"sensor_offset_a_apk": 0.03 * I_NOM_APK}, "E_CURRENT_SENSOR"),
     "encoder stuck": ({"drive_fault": "encoder_stuck"}, "E_ENCODER"),
     "rotor locked unsaid": ({"rotor": "locked"}, "E_ENCODER"),

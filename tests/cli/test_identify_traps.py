@@ -90,7 +90,7 @@ TRAPS: dict[str, tuple[str, Spoil, str]] = {
         lambda t: {"u_d_v": t["u_d_v"] * np.array([1.0, 1.3, 1.0, 1.0, 1.0, 1.0])},
         "E_UNBALANCED",
     ),
-    "gains of the sensors differ": ("phase_pairs", lambda t: {"i_a_a": 1.03 * t["i_a_a"]}, "E_CURRENT_SENSOR"),
+    "gains of the sensors differ": ("phase_pairs", lambda t: {"i_a_a": 1.08 * t["i_a_a"]}, "E_CURRENT_SENSOR"),
     "a gear before the encoder": (
         "rotation_forward",
         lambda t: {"theta_M_rad": 1.25 * t["theta_M_rad"]},

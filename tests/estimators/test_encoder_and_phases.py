@@ -11,6 +11,7 @@ from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import check_pairs, check_phases
 from pmsmtool.estimators.refusals import REFUSALS, refuse
+from pmsmtool.estimators.sensor_mismatch import without_mismatch
 from pmsmtool.trace import Trace
 
 
@@ -178,7 +179,7 @@ STEP = InverterCurve(np.array([1e-3, 10.0]), np.array([5.0, 5.0]), 0.0)
 def test_equal_pairs_show_their_resistance_whatever_the_dead_time() -> None:
     result = check_pairs(pairs((2.0, 2.0, 2.0)), NOISE, STEP)
     assert result.resistance_ohm == pytest.approx((2.0, 2.0, 2.0))
-    assert result.spread == pytest.approx(0.0, abs=1e-12) and result.sensor_sum == pytest.approx(0.0, abs=1e-12)
+    assert result.spread == pytest.approx(0.0, abs=1e-12) and result.mismatch.spread == pytest.approx(0.0, abs=1e-12)
     assert result.judged
 
 
@@ -187,7 +188,7 @@ def test_equal_pairs_show_their_resistance_whatever_the_dead_time() -> None:
     [
         (pairs((3.0, 2.0, 2.0)), "E_UNBALANCED"),
         (pairs((2.0, 2.0, 1.5)), "E_UNBALANCED"),
-        (pairs((2.0, 2.0, 2.0), gains=(1.0, 0.98, 1.0)), "E_CURRENT_SENSOR"),
+        (pairs((2.0, 2.0, 2.0), gains=(1.0, 0.94, 1.0)), "E_CURRENT_SENSOR"),
         (pairs((3.0, 2.0, 2.0), gains=(1.15, 1.0, 1.0)), "E_CURRENT_SENSOR"),
     ],
 )
@@ -195,6 +196,23 @@ def test_unequal_pairs_and_unequal_sensors_are_told_apart(found: Trace, reason: 
     with pytest.raises(IdentificationError) as caught:
         check_pairs(found, NOISE, STEP)
     assert caught.value.reason == reason
+
+
+def test_sensors_that_differ_a_little_are_measured_and_corrected() -> None:
+    gains = (1.014, 0.99, 0.996)
+    found = check_pairs(pairs((2.0, 2.0, 2.0), gains=gains), NOISE, STEP).mismatch
+    assert found.corrected and found.gains == pytest.approx([gain - 1.0 for gain in gains], abs=2e-4)
+    for angle in (0.3, math.pi / 2.0):  # a vector of (3, 0.2) A as the sensors show it along that angle
+        phases = np.array([3.0 * math.cos(angle - k) - 0.2 * math.sin(angle - k) for k in LEGS]) * gains
+        d = 2.0 / 3.0 * sum(i * math.cos(angle - k) for i, k in zip(phases, LEGS, strict=True))
+        q = -2.0 / 3.0 * sum(i * math.sin(angle - k) for i, k in zip(phases, LEGS, strict=True))
+        shown = trace(i_d_a=np.array([d]), i_q_a=np.array([q]))
+        true = without_mismatch(shown, found, angle)
+        assert abs(d - 3.0) > 5e-3
+        assert (true["i_d_a"][0], true["i_q_a"][0]) == pytest.approx((3.0, 0.2), abs=1e-3)
+
+
+LEGS = tuple(2.0 * math.pi / 3.0 * k for k in range(3))
 
 
 STEEP = InverterCurve(np.array([1e-3, math.sqrt(0.75), math.sqrt(3.0)]), np.array([4.0, 5.0, 8.0]), 0.0)

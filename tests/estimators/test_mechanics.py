@@ -201,3 +201,33 @@ def test_fits_arrive_where_the_encoder_alone_makes_a_narrow_valley() -> None:
     found = estimate_mechanics(traces, lambda i_d, i_q: per_a * i_q, per_a, sigma, 0.0)
     for value, true in zip((found.J, found.B, found.tau_c), truth, strict=True):
         assert abs(value.value - true) < 4.0 * value.std
+
+
+def with_drag(traces: list[Trace], drag: float) -> list[Trace]:
+    """The same run of a shaft that the air brakes, too: integrated in small steps, with the encoder's step."""
+    omega, out, step = 0.0, [], 2.0 * math.pi / 2**BITS
+    for trace in traces:
+        period, fine = trace.period_s, 8
+        theta, shown = 0.0, [0.0]
+        for torque in PER_A * 0.5 * (trace["i_q_a"][:-1] + trace["i_q_a"][1:]):
+            for _ in range(fine):
+                h = period / fine
+                sign = math.copysign(1.0, omega if omega != 0.0 else torque)
+                rate = (torque - B * omega - TAU_C * sign - drag * omega * abs(omega)) / J
+                theta += h * omega + 0.5 * h * h * rate
+                omega += h * rate
+            shown.append(theta)
+        signals = {**trace.signals, "theta_M_rad": step * np.round(np.array(shown) / step)}
+        out.append(replace(trace, signals=signals))
+    return out
+
+
+def test_drag_over_the_square_of_the_speed_is_told_from_friction() -> None:
+    traces = run_of(np.random.default_rng(5))
+    fastest = max(float(np.max(np.abs(np.diff(t["theta_M_rad"])))) / t.period_s for t in traces)
+    drag = 1.5 * TAU_C / fastest**2
+    found = estimate(with_drag(traces, drag))
+    assert found.drag is not None and found.drag.value == pytest.approx(drag, rel=0.1)
+    for value, true in ((found.J, J), (found.B, B), (found.tau_c, TAU_C)):
+        assert abs(value.value - true) < 3.0 * value.std + 1e-3 * true
+    assert "square of the speed" in found.note and estimate(traces).drag is None

@@ -1,0 +1,159 @@
+"""What repeats with the angle of the shaft, from coasting with the voltage off: cogging torque and encoder error.
+
+On a shaft that coasts with the speed w a torque T cos(n theta) moves the position by -T cos(n theta)/(J (n w)^2), an
+error of the encoder by itself, whatever the speed. Once and twice per turn count as the encoder's, higher orders as
+torque. Position minus a polynomial of time is regressed on one order after the other, both directions together, the
+largest first (orthogonal matching pursuit; Pati et al., Asilomar 1993, DOI 10.1109/ACSSC.1993.342465), and an order
+stays while it stands out of what is left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+ENCODER_ORDERS = (1, 2)
+"""Orders that are the encoder's: mounted off centre, and oval."""
+HIGHEST_ORDER = 400
+"""Highest order per turn that is looked for: least common multiples of slots and poles lie below."""
+ORDERS_MOST = 8
+DEGREE = 6
+"""Of the polynomial of time: a coasting without ripple is an exponential."""
+SURE = 6.0
+"""Amplitude of an order, in standard deviations, from which on it is there: 800 are looked for."""
+LEAST_SPEED = 0.2
+"""Speed below which a coasting is not used, of its first: near standstill a torque does more than ripple."""
+LEAST_TURNS = 1.0
+LEAST_ROWS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Harmonic:
+    """One order per turn: ``cosine`` and ``sine`` of the encoder's angle along the phase order, and their deviation."""
+
+    order: int
+    cosine: float
+    sine: float
+    std: float
+
+    @property
+    def amplitude(self) -> float:
+        """Amplitude."""
+        return math.hypot(self.cosine, self.sine)
+
+    @property
+    def phase_rad(self) -> float:
+        """Phase p of amplitude cos(order theta - p) (rad)."""
+        return math.atan2(self.sine, self.cosine)
+
+    def at(self, theta: Array) -> Array:
+        """Value at angles (rad)."""
+        return np.asarray(self.cosine * np.cos(self.order * theta) + self.sine * np.sin(self.order * theta))
+
+
+@dataclass(frozen=True, slots=True)
+class AngleHarmonics:
+    """Encoder error (rad) and acceleration by torque (rad/s2), order by order; travel of the shorter trace (turns)."""
+
+    encoder_rad: tuple[Harmonic, ...] = ()
+    acceleration_rad_s2: tuple[Harmonic, ...] = ()
+    turns: float = 0.0
+
+    def torque_nm(self, theta: Array, J_kgm2: float) -> Array:
+        """Cogging torque at angles."""
+        return np.asarray(J_kgm2 * sum((h.at(theta) for h in self.acceleration_rad_s2), np.zeros_like(theta)))
+
+    def shaft(self, theta: Array) -> Array:
+        """Angle of the shaft of what the encoder shows."""
+        return np.asarray(theta - sum((h.at(theta) for h in self.encoder_rad), np.zeros_like(theta)))
+
+    def without_ripple(self, t_s: Array, theta: Array) -> Array:
+        """Positions of a coasting as they were without torque over the angle; alike where it comes to rest."""
+        if not self.acceleration_rad_s2:
+            return theta
+        used = fast_part(t_s, theta)
+        smooth, omega = _smooth(t_s[:used], theta[:used])
+        out = theta.copy()
+        for h in self.acceleration_rad_s2:
+            out[:used] += h.at(smooth) / (h.order * omega) ** 2
+        return out
+
+
+def fast_part(t_s: Array, theta: Array) -> int:
+    """Rows of a coasting before it is slow."""
+    count = max(2, len(theta) // 40)
+    speed = np.abs(theta[count:] - theta[:-count])
+    slow = np.nonzero(speed < LEAST_SPEED * speed[0])[0]
+    return int(slow[0]) if len(slow) else len(theta)
+
+
+def _smooth(t_s: Array, theta: Array) -> tuple[Array, Array]:
+    x = 2.0 * (t_s - t_s[0]) / (t_s[-1] - t_s[0]) - 1.0
+    fit = legendre.legfit(x, theta, DEGREE)
+    speed = legendre.legval(x, legendre.legder(fit)) * 2.0 / (t_s[-1] - t_s[0])
+    return np.asarray(legendre.legval(x, fit)), np.asarray(speed)
+
+
+def angle_harmonics(coastings: Sequence[tuple[Array, Array]]) -> AngleHarmonics:
+    """Return what repeats with the angle; nothing where the shaft turned too little.
+
+    Parameters
+    ----------
+    coastings : sequence of (ndarray, ndarray)
+        Times (s) and positions along the phase order (rad, unwrapped) of each trace.
+    """
+    parts = [(t[: fast_part(t, theta)], theta[: fast_part(t, theta)]) for t, theta in coastings]
+    parts = [(t, theta) for t, theta in parts if len(t) > LEAST_ROWS and np.ptp(theta) > 2.0 * math.pi * LEAST_TURNS]
+    if not parts:
+        return AngleHarmonics()
+    turns = min(float(np.ptp(theta)) for _, theta in parts) / (2.0 * math.pi)
+    smooth = [_smooth(t, theta) for t, theta in parts]
+    bases = [np.linalg.qr(legendre.legvander(np.linspace(-1.0, 1.0, len(t)), DEGREE))[0] for t, _ in parts]
+    left = np.concatenate([_without(basis, theta) for basis, (_, theta) in zip(bases, parts, strict=True)])
+    lowest = math.ceil(DEGREE / turns)  # slower ones are the polynomial's
+
+    def pair(order: int) -> Array:
+        rows = []
+        for (angle, speed), basis in zip(smooth, bases, strict=True):
+            size = 1.0 if order in ENCODER_ORDERS else -1.0 / (order * speed) ** 2
+            rows.append(np.stack([_without(basis, size * wave(order * angle)) for wave in (np.cos, np.sin)], axis=1))
+        return np.concatenate(rows)
+
+    pairs = {order: pair(order) for order in range(max(1, lowest), HIGHEST_ORDER + 1)}
+    unit = {order: np.linalg.qr(columns)[0] for order, columns in pairs.items()}
+    chosen: list[int] = []
+    fit, std = np.empty(0), np.empty(0)
+    rest = left
+    while len(chosen) < ORDERS_MOST:
+        power = {order: float(np.sum((rest @ unit[order]) ** 2)) for order in pairs if order not in chosen}
+        best = max(power, key=lambda order: power[order])
+        matrix = np.concatenate([pairs[order] for order in (*chosen, best)], axis=1)
+        scale = np.linalg.norm(matrix, axis=0)
+        found = np.linalg.lstsq(matrix / scale, left, rcond=None)[0] / scale
+        after = left - matrix @ found
+        dof = len(left) - DEGREE * len(parts) - matrix.shape[1]
+        covariance = np.linalg.inv((matrix / scale).T @ (matrix / scale)) * float(after @ after) / dof
+        deviation = np.sqrt(np.diag(covariance)) / scale
+        if math.hypot(*found[-2:]) < SURE * max(deviation[-2:]):
+            break
+        chosen, fit, std, rest = [*chosen, best], found, deviation, after
+    harmonics = [
+        Harmonic(order, float(fit[2 * k]), float(fit[2 * k + 1]), float(max(std[2 * k : 2 * k + 2])))
+        for k, order in enumerate(chosen)
+    ]
+    return AngleHarmonics(
+        tuple(sorted((h for h in harmonics if h.order in ENCODER_ORDERS), key=lambda h: h.order)),
+        tuple(sorted((h for h in harmonics if h.order not in ENCODER_ORDERS), key=lambda h: h.order)),
+        turns,
+    )
+
+
+def _without(basis: Array, values: Array) -> Array:
+    return np.asarray(values - basis @ (basis.T @ values))

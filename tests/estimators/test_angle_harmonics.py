@@ -1,0 +1,60 @@
+"""Cogging torque and encoder error from coasting traces with a known truth."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.angle_harmonics import angle_harmonics
+
+STEP = 2.0 * math.pi / 2**17
+RATE_S, ROWS = 1.1e-3, 780
+
+
+def coasting(
+    start_rad_s: float, cogging: dict[int, complex], encoder: dict[int, complex]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A shaft with friction and accelerations Re(c exp(-j n theta)), integrated finely, and what its encoder shows."""
+    fine = 40
+    theta, omega, shown = 0.3, start_rad_s, []
+    h = RATE_S / fine
+    for k in range(ROWS * fine):
+        if k % fine == 0:
+            shown.append(theta)
+
+        def a(x: float, w: float) -> float:
+            ripple = sum((c * complex(math.cos(n * x), -math.sin(n * x))).real for n, c in cogging.items())
+            return ripple - 0.15 * w - math.copysign(8.0, start_rad_s)
+
+        middle = omega + 0.5 * h * a(theta, omega)
+        theta, omega = theta + h * middle, omega + h * a(theta + 0.5 * h * omega, middle)
+    true = np.array(shown)
+    error = sum(((c * np.exp(-1j * n * true)).real for n, c in encoder.items()), np.zeros(ROWS))
+    return RATE_S * np.arange(ROWS), STEP * np.floor((true + error) / STEP)
+
+
+def test_nothing_is_found_where_nothing_repeats() -> None:
+    found = angle_harmonics([coasting(start, {}, {}) for start in (65.0, -70.0)])
+    assert not found.encoder_rad and not found.acceleration_rad_s2 and found.turns > 5.0
+
+
+def test_cogging_of_two_orders_and_an_encoder_off_centre_are_told_apart() -> None:
+    cogging, encoder = {12: 30.0 * np.exp(0.7j), 6: 6.0 * np.exp(-2.0j)}, {1: 3e-3 * np.exp(1.1j)}
+    traces = [coasting(start, cogging, encoder) for start in (65.0, -70.0)]
+    found = angle_harmonics(traces)
+    assert [h.order for h in found.acceleration_rad_s2] == [6, 12] and [h.order for h in found.encoder_rad] == [1]
+    for h in found.acceleration_rad_s2:
+        assert h.amplitude == pytest.approx(abs(cogging[h.order]), rel=0.05)
+        assert h.phase_rad == pytest.approx(np.angle(cogging[h.order]), abs=math.radians(5.0))
+    (once,) = found.encoder_rad
+    assert complex(once.cosine, once.sine) == pytest.approx(encoder[1], abs=3e-5)
+    # what is left of the way is that of a shaft without either
+    t, shown = traces[0]
+    way = found.shaft(found.without_ripple(t, shown))
+    smooth = coasting(65.0, {}, {})[1]
+    off = way - np.polyval(np.polyfit(t, way, 5), t)
+    assert np.std(off) < 0.1 * np.std(shown - np.polyval(np.polyfit(t, shown, 5), t))
+    assert np.std(off) < 4.0 * np.std(smooth - np.polyval(np.polyfit(t, smooth, 5), t))
