@@ -78,7 +78,7 @@ def tail(seeds: int, cases: int, large: int) -> list[str]:
     lines = [
         "Settling to 2 % over T_min, 95th percentile (95 % bootstrap interval), steps with T_min > 1 ms; written by",
         f"`python benchmarks/governor_seeds.py --seeds {seeds} --cases {cases} --tail {large}`.",
-        "Population of the governor reference: reachable steps > 10 A in the 56 A disc, |n| <= 1000 rpm uniform, 5 %",
+        "Population of docs/control.md, 1: reachable steps > 10 A in the 56 A disc, |n| <= 1000 rpm uniform, 5 %",
         "at standstill, start at rest with |v_ss| <= 0.98 V_max, target with <= 0.92 V_max; V_dc 210 V, no delay.",
     ]
     for law, ratios in big.items():

@@ -53,6 +53,8 @@ COMMANDS: tuple[tuple[tuple[str, ...], float], ...] = (
     (("param", "diff", "default", "device"), WHOLE_SET_S),
     (("verify", SET_FILE), WHOLE_SET_S),
     (("backup", "-o", "backup.json"), WHOLE_SET_S),
+    (("flash-params", SET_FILE, "--dry-run"), WHOLE_SET_S),
+    (("restore", "--dry-run"), WHOLE_SET_S),
     (("stop",), STOP_S),
     (("stop", "--all"), STOP_S),
 )

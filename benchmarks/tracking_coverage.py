@@ -45,7 +45,7 @@ SHAPES: dict[str, Callable[[Array], Array]] = {
     "atan": lambda x: np.asarray(2.0 / math.pi * np.arctan(x)),
     "capacitive": lambda x: np.where(np.abs(x) < 1.0, 0.5 * x, np.sign(x) - 0.5 / np.where(x == 0.0, 1.0, x)),
 }
-"""Error curves of the averaged inverter, of its plateau (identification reference, inverter error)."""
+"""Error curves of the averaged inverter, of its plateau (docs/identification.md, 2)."""
 SPEED_SHARES = (-0.6, -0.3, 0.2, 0.4, 0.6)
 LOAD_SHARE = 0.8
 WINDING_K = (5.0, 40.0)

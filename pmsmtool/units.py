@@ -12,8 +12,13 @@ import re
 from dataclasses import dataclass
 from decimal import Decimal
 from difflib import get_close_matches
+from typing import TYPE_CHECKING, TypeVar
 
 from pmsmtool.errors import ConfigError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +49,25 @@ class Unit:
     factor: float = 1.0
 
 
-_RPM = 2.0 * math.pi / 60.0
+RAD_S_PER_RPM = math.pi / 30.0
+"""One turn per minute (rad/s)."""
+RPM_PER_RAD_S = 30.0 / math.pi
+"""One radian per second (rpm)."""
+RAD_S_PER_MRPM = math.pi / 30_000.0
+"""A thousandth of a turn per minute (rad/s)."""
+
+Speed = TypeVar("Speed", float, "NDArray[np.float64]")
+
+
+def rad_s_from_rpm(speed_rpm: Speed) -> Speed:
+    """Return a speed in rad/s of one in rpm; any shape."""
+    return speed_rpm * math.pi / 30.0
+
+
+def rpm_from_rad_s(speed_rad_s: Speed) -> Speed:
+    """Return a speed in rpm of one in rad/s; any shape."""
+    return speed_rad_s * 30.0 / math.pi
+
 
 _UNITS: tuple[Unit, ...] = (
     Unit("1", "ratio"),
@@ -62,15 +85,16 @@ _UNITS: tuple[Unit, ...] = (
     Unit("rad", "angle", (), True),
     Unit("deg", "angle", ("°",), factor=math.pi / 180.0),
     Unit("rad/s", "angular speed", ("1/s",)),
-    Unit("rpm", "angular speed", ("r/min", "1/min", "min-1"), True, factor=_RPM),
+    Unit("rpm", "angular speed", ("r/min", "1/min", "min-1"), True, factor=RAD_S_PER_RPM),
     Unit("rad/s2", "angular acceleration", ("rad/s^2",)),
-    Unit("rpm/s", "angular acceleration", factor=_RPM),
+    Unit("rpm/s", "angular acceleration", factor=RAD_S_PER_RPM),
     Unit("N m", "torque", ("Nm", "N*m"), True),
     Unit("N m/s", "torque slope"),
     Unit("kg m2", "inertia", ("kgm2", "kg m^2", "kg*m^2", "kg m²", "kgm²")),
     Unit("kg cm2", "inertia", ("kgcm2", "kg cm^2", "kg*cm^2", "kg cm²", "kgcm²"), exponent=-4),
     Unit("g cm2", "inertia", ("gcm2", "g cm^2", "g*cm^2", "g cm²", "gcm²"), exponent=-7),
     Unit("kg m2/Wb", "inertia over flux linkage"),
+    Unit("kg m2 A/(N m)", "inertia over torque constant"),
     Unit("N m/Wb", "torque over flux linkage"),
     Unit("N m s", "viscous friction", ("Nms", "Nm s", "Nms/rad"), True),
     Unit("degC", "temperature", ("°C",)),

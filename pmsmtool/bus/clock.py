@@ -28,6 +28,9 @@ _MAIN_THREAD = threading.main_thread().ident
 _SIGINT = int(signal.SIGINT)
 _signal: Any = importlib.import_module("_signal")
 # The module behind ``signal``: its enum conversions would cost a third of the time of a frame.
+_set_handler: Any = _signal.signal
+_pop, _push = heapq.heappop, heapq.heappush
+_thread = threading.get_ident
 
 
 class Ticker(Protocol):
@@ -120,10 +123,10 @@ class _Held:
         self._pending = number
 
     def __enter__(self) -> None:
-        if threading.get_ident() == _MAIN_THREAD:
+        if _thread() == _MAIN_THREAD:
             if self._depth == 0:
                 # First the handler, then the lock: an interrupt in between leaves neither behind.
-                self._previous = _signal.signal(_SIGINT, self._remember)
+                self._previous = _set_handler(_SIGINT, self._remember)
             self._depth += 1
         self._lock.acquire()
 
@@ -131,11 +134,11 @@ class _Held:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._lock.release()
-        if threading.get_ident() == _MAIN_THREAD:
+        if _thread() == _MAIN_THREAD:
             self._depth -= 1
             if self._depth == 0:
                 previous = self._previous
-                _signal.signal(_SIGINT, _signal.SIG_DFL if previous is None else previous)
+                _set_handler(_SIGINT, _signal.SIG_DFL if previous is None else previous)
                 if self._pending:
                     number, self._pending = self._pending, 0
                     _signal.raise_signal(number)
@@ -192,7 +195,7 @@ class VirtualClock:
         """Plan an action; actions of one instant run in the order they were planned."""
         timer = Timer(action)
         self._count += 1
-        heapq.heappush(self._plan, (instant_ns, self._count, timer))
+        _push(self._plan, (instant_ns, self._count, timer))
         return timer
 
     def after(self, seconds: float, action: Callable[[], None]) -> Timer:
@@ -208,27 +211,35 @@ class VirtualClock:
         """Return the instant of the next planned action, ``NEVER`` when there is none."""
         plan = self._plan
         while plan and plan[0][2].action is None:
-            heapq.heappop(plan)
+            _pop(plan)
         return plan[0][0] if plan else NEVER
 
     def step(self, limit_ns: int) -> None:
         """Move to the next planned instant, at most to the limit, and run what is due; the lock must be held."""
         if self.running_actions:
             raise RuntimeError("an action of the clock cannot wait for the clock")
-        instant = min(self.next_ns(), limit_ns)
+        # Once per frame: comparisons instead of min and max, which would cost a fifth of the step.
+        instant = self.next_ns()
+        if instant > limit_ns:
+            instant = limit_ns
         if instant > self.now_ns:
-            if len(self.runners) > 1:
+            runners = self.runners
+            if len(runners) > 1:
                 instant = min(instant, self.now_ns + _JOINT_STEP_NS)
-            for run in self.runners:
-                instant = min(instant, run(instant))
-            self.now_ns = max(self.now_ns, instant)
+            for run in runners:
+                reached = run(instant)
+                if reached < instant:
+                    instant = reached
+            if instant > self.now_ns:
+                self.now_ns = instant
         plan = self._plan
         self.running_actions = True
         try:
             while plan and plan[0][0] <= self.now_ns:
-                timer = heapq.heappop(plan)[2]
-                action, timer.action = timer.action, None
+                timer = _pop(plan)[2]
+                action = timer.action
                 if action is not None:
+                    timer.action = None
                     action()
         finally:
             self.running_actions = False

@@ -123,7 +123,7 @@ def _completed(arguments: dict[str, Any], configured: dict[str, Any]) -> dict[st
     server = {**configured, **missing}
     # python-can tries for ten seconds; where nobody listens that is known at once.
     socket.create_connection((server["host"], int(server["port"])), _SERVER_TIMEOUT_S).close()
-    # Without tcp_tune Nagle's algorithm makes block transfers 17 times slower (CANopen reference, section 1).
+    # Without tcp_tune Nagle's algorithm makes block transfers 17 times slower (docs/canopen.md, 1).
     return {"tcp_tune": True, **arguments, **missing}
 
 

@@ -182,6 +182,25 @@ class Connection:
             message.timestamp = self._stamp()
             self._write(message)
 
+    def request(self, cob_id: int, length: int) -> None:
+        """Send a remote frame, once: it is asked again soon.
+
+        Raises
+        ------
+        BusError
+            The adapter is gone, nobody acknowledges, or it sends no remote frames.
+        """
+        message = can.Message(arbitration_id=cob_id, is_remote_frame=True, dlc=length, is_extended_id=False)
+        try:
+            with self._send_lock:
+                self.bus.send(message)
+        except (can.CanError, OSError, ValueError, NotImplementedError) as error:
+            raise self._send_failure(error) from error
+        if self._writer is not None:
+            message.is_rx = False
+            message.timestamp = self._stamp()
+            self._write(message)
+
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send one frame under canopen's name for it, so that its LSS and NMT classes can be used."""
         self.send(can_id, bytes(data))
@@ -222,8 +241,7 @@ class Connection:
             return frames.get_nowait()
         deadline = self.clock.now() + timeout_s
         while True:
-            self.pump(max(timeout_s, 0.0))
-            if not frames.empty():
+            if self.pump(max(timeout_s, 0.0)) and not frames.empty():
                 return frames.get_nowait()
             timeout_s = deadline - self.clock.now()
             if timeout_s < _RESOLUTION_S:
@@ -327,8 +345,11 @@ class Connection:
         if message.is_extended_id or message.is_remote_frame or not message.is_rx or len(message.data) > 8:
             return
         self.heard.add(cob_id)
-        for callback in self._subscribers.get(cob_id, ()):
-            callback(cob_id, bytes(message.data), message.timestamp)
+        callbacks = self._subscribers.get(cob_id)
+        if callbacks:
+            data, timestamp = bytes(message.data), message.timestamp
+            for callback in callbacks:
+                callback(cob_id, data, timestamp)
 
     def _write(self, message: can.Message) -> None:
         try:

@@ -1,11 +1,10 @@
 """The SDO channel: one client for one node that cannot report a refused write as success.
 
-What the stock clients get wrong and this one does not (numbers of the CANopen reference, section
-2.2): every answer is matched by index and sub-index (B1); lost answers are retried by a policy per
-transfer kind (B2, B3); aborts carry the multiplexor of the transfer (B4); block transfers survive
-gaps and losses at their ends (B5 to B8, ``sdo_block``); a block upload may be answered by a normal
-one (B9); announced and expected sizes are compared (B10); one lock per channel (B11); calls from
-a bus callback are refused instead of waiting for themselves (B12).
+What the stock clients get wrong and this one does not (numbers of ``docs/canopen.md``, 2): every answer is matched by
+index and sub-index (B1); lost answers are retried by a policy per transfer kind (B2, B3); aborts carry the
+multiplexor of the transfer (B4); block transfers survive gaps and losses at their ends (B5 to B8, ``sdo_block``); a
+block upload may be answered by a normal one (B9); announced and expected sizes are compared (B10); one lock per
+channel (B11); calls from a bus callback are refused instead of waiting for themselves (B12).
 
 Protocol: CiA 301, section 7.2.4.3.
 """
@@ -43,7 +42,7 @@ QUIET_S = 0.05
 DRAIN_LIMIT_S = 1.0
 """A node that never falls silent does not keep the channel longer than this."""
 TRIES = 3
-"""Attempts per object, the first included (CANopen reference, section 6)."""
+"""Attempts per object, the first included (docs/canopen.md, 6)."""
 CHECK_INTERVAL_S = 0.1
 """While an answer is awaited, the node's supervision is asked this often."""
 BLOCK_THRESHOLD = 28

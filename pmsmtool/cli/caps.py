@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import LOOKING_S, map_option, open_node, read_map
+from pmsmtool.cli.drive_access import LOOKING_S, map_option, open_node, read_map, rehearsal_bus
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
@@ -21,25 +21,33 @@ if TYPE_CHECKING:
         "pmsmtool --sim interior-2k2 caps",
         "pmsmtool -i pmsmsim -c 'interior-2k2?drive=epos4' caps",
         "pmsmtool -i socketcan -c can0 -n 5 caps --map my-drive.toml --json",
+        "pmsmtool caps --eds maker.eds",
     ),
 )
+@click.option("--eds", metavar="FILE", help="Ask no drive: what one with the objects of this EDS or DCF will give.")
 @map_option
 @bus_options
 @output_options
-def caps_command(bus: BusOptions, out: Output, map_file: Path | None) -> None:
+def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str | None) -> None:
     """Show every quantity, the methods to it, the interval to expect, and what this drive lacks for it.
 
     The drive is only read. Without --map the map of its identity is used, and without one what CiA 402 says. The
     intervals were measured on simulated drives of the same tier; where nothing was measured, nothing is promised.
+
+    With --eds no bus is needed: a simulated drive with exactly the file's objects is asked, a motor set up in it.
     """
     from pmsmtool.firmware.shipped_maps import GENERIC
     from pmsmtool.flash.map_gate import other_drive
     from pmsmtool.workflow.capabilities import examine
 
     given = None if map_file is None else read_map(map_file)
+    if eds is not None:
+        bus = rehearsal_bus(bus, eds=eds)
     with open_node(bus, within_s=LOOKING_S) as node:
         found = examine(node, given)
     out.result("caps", _facts(found), lambda: _lines(found))
+    if eds is not None:
+        out.note(f"no drive was asked: this is what the objects of {eds} allow once a motor is set up")
     if given is not None and given.name != GENERIC and not found.map_is_drives:
         differ = other_drive(given, found.identity.vendor, found.identity.product)
         out.warn(f"{differ}: what is listed is that map's, and nothing is written or moved through it")
@@ -58,6 +66,7 @@ def _facts(found: Capabilities) -> dict[str, Any]:
         "tier": found.tier.value,
         "features": sorted(found.features),
         "recorder": found.recorder,
+        "replaced": list(found.replaced),
         "quantities": [_row_facts(row) for row in found.rows()],
         "parameters": sorted(found.drive_map.cells),
         "left_out": dict(found.drive_map.left_out),
@@ -94,6 +103,7 @@ def _lines(found: Capabilities) -> list[str]:
         f"serial {identity.serial}",
         f"map {found.drive_map.name} ({len(found.drive_map.cells)} parameters)  tier {found.tier}",
         *([f"recorder: {found.recorder}"] if found.recorder else []),
+        *found.replaced,
         "",
     ]
     rows = [(row.quantity, row.method.value, *_said(row)) for row in found.rows()]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, read_map
+from pmsmtool.cli.drive_access import map_option, read_map, rehearsal_bus
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output
 from pmsmtool.cli.progress import StageProgress
@@ -42,6 +42,8 @@ LIMITS = ("current", "speed")
 )
 @click.argument("machine", required=False, type=FILE)
 @click.option("--resume", type=FOLDER, metavar="RUN_DIR", help="Go on with a run where it ended.")
+@click.option("--rehearse", metavar="FAMILY", help="Rehearse: MACHINE, simulated, behind the map of a drive family.")
+@click.option("--eds", metavar="FILE", help="Rehearse: MACHINE, simulated, behind the EDS or DCF of its drive.")
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
 @click.option("--flux-map", is_flag=True, help="Measure the flux map too, and design with it: for a machine that "
               "saturates.")  # fmt: skip
@@ -75,6 +77,8 @@ def commission_command(
     out: Output,
     machine: Path | None,
     resume: Path | None,
+    rehearse: str | None,
+    eds: str | None,
     runs: Path,
     map_file: Path | None,
     sensor_tol: float,
@@ -95,6 +99,7 @@ def commission_command(
 
     On a drive that gives less than the reference drive (`pmsmtool caps`) every stage runs as far as its tier and its
     map go: what it cannot measure is taken from MACHINE and marked so, and a stage that cannot run says what it needs.
+    --rehearse and --eds need no hardware: MACHINE runs simulated behind the dictionary of such a drive.
 
     The verdict is PASS (exit 0) only when all seven stages ran and nothing stayed unchecked, FAIL (exit 1) when a
     criterion is not met, a stage of --require is missing, or the design ends below the machine's rated current or
@@ -106,6 +111,10 @@ def commission_command(
     from pmsmtool.workflow.compared_stage import check_accepted
     from pmsmtool.workflow.run_directory import RunDirectory
 
+    if rehearse is not None or eds is not None:
+        if resume is not None:
+            raise click.UsageError("--resume goes on with the drive of its run: not together with --rehearse or --eds")
+        bus = rehearsal_bus(bus, eds=eds, family=rehearse, machine=machine)
     if accept and motion.yes:
         raise click.UsageError("--accept-contradiction is a person's decision: not together with --yes")
     check_accepted(accept)

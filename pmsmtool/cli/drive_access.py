@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import click
 
-from pmsmtool.cli.options import FILE, BusOptions
+from pmsmtool.cli.options import FILE, SIMULATED_INTERFACE, BusOptions
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import BusError, ConfigError
 from pmsmtool.files import read_text
@@ -25,6 +27,8 @@ LOOKING_S = 30.0
 """Time for the transfers of a command that reads a few objects; a drive that answers needs a second."""
 WHOLE_SET_S = 120.0
 """Time for reading all parameters and tables, 200 KiB of tables at 50 kbit/s take 80 s."""
+REHEARSED = "interior-2k2"
+"""Machine behind a maker's dictionary where none is given."""
 OWN_FAMILY = "pmsmsim"
 """The reference drive's map, which commands take without ``--map``."""
 
@@ -47,6 +51,36 @@ def read_map(path: Path | None) -> DriveMap:
         return load_family(str(path))
     hint = "give a map file in UTF-8 that you may read, or the name of a shipped family"
     return parse_drive_map(read_text(path, hint=hint), str(path))
+
+
+def rehearsal_bus(
+    bus: BusOptions, *, eds: str | None, family: str | None = None, machine: Path | None = None
+) -> BusOptions:
+    """Return a simulated bus with a machine behind a maker's dictionary, in volatile memory.
+
+    Parameters
+    ----------
+    eds : str or None
+        EDS or DCF of the drive, or ``TABLE.csv#FAMILY``.
+    family : str, optional
+        Shipped family whose map the drive shows, instead of a file.
+    machine : Path, optional
+        The machine; a profile without one.
+
+    Raises
+    ------
+    ConfigError
+        A bus is named, too, or both a file and a family.
+    """
+    if bus.interface is not None or bus.channel is not None:
+        raise ConfigError(
+            "a rehearsal needs no bus, and one is named", hint="leave out --sim, -i and -c, or --eds and --rehearse"
+        )
+    if eds is not None and family is not None:
+        raise ConfigError("--rehearse and --eds name two drives", hint="give one of them")
+    shown = f"eds={quote(eds, safe='/#')}" if eds is not None else f"drive={quote(str(family))}"
+    name = REHEARSED if machine is None else str(machine)
+    return replace(bus, interface=SIMULATED_INTERFACE, channel=f"{name}?nv=:memory:&{shown}")
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, open_node, read_map
+from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map
 from pmsmtool.cli.fleet import NodeList, flash_fleet
 from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output
@@ -58,7 +58,7 @@ def flash_params_command(
             nodes, wanted, drive_map, bus, motion, out, store=not no_store, dry_run=dry_run, check=check
         )  # fmt: skip
         return
-    with set_named() as jobs, open_node(bus, drive_map) as node:
+    with set_named() as jobs, open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
         carry_out(
             node,
             jobs,

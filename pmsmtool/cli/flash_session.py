@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import math
 from typing import TYPE_CHECKING, Any
 
 from pmsmtool.cli.options import BusOptions, MotionOptions
@@ -77,6 +78,7 @@ def write_plan(
     )  # fmt: skip
     jobs.append(job)
     job.admit()  # nobody is asked for what would be refused after his consent
+    node.sdo.finish_within(math.inf)  # a person may take his time, and a download has limits of its own
     if job.has_work(store=store):
         lines = [*plan.lines(), *plan.after_lines(store=store)]
         ask_writing(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)

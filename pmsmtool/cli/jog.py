@@ -22,6 +22,7 @@ from pmsmtool.cli.options import (
     output_options,
 )
 from pmsmtool.cli.output import Output, table
+from pmsmtool.units import rpm_from_rad_s
 
 SPEED_MARGIN = 1.5
 """Speed limit over the wanted speed when --speed-max is not given."""
@@ -70,7 +71,7 @@ def jog_command(
         )
     with open_drive(bus, read_map(map_file)) as drive:
         _refuse_beyond("current", current_apk or 0.0, drive.read("motor.I_max_apk"), "Apk", "motor.I_max_apk")
-        rpm = abs(speed_rad_s or 0.0) * 30.0 / math.pi
+        rpm = rpm_from_rad_s(abs(speed_rad_s or 0.0))
         _refuse_beyond("speed", rpm, drive.read("motor.n_max_rpm"), "rpm", "motor.n_max_rpm")
         i_nom_apk = drive.read("motor.I_nom_apk")
         speed = abs(speed_rad_s) * SPEED_MARGIN if speed_rad_s is not None else CURRENT_JOG_SPEED_RAD_S

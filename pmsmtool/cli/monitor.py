@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import open_node, warn_of_other_drive
+from pmsmtool.cli.drive_access import LOOKING_S, open_node, warn_of_other_drive
 from pmsmtool.cli.options import FREQUENCY, TIME, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
 
@@ -81,9 +81,10 @@ def monitor_command(
             hint="escape what is meant literally, or give a part of a name: -g i_q",
         ) from error
     period_s = 1.0 / (rate_hz or DEFAULT_RATE_HZ)
-    with open_node(bus) as node:
+    with open_node(bus, within_s=LOOKING_S) as node:
         warn_of_other_drive(node, out)
         names = _available(node, wanted)
+        node.sdo.finish_within(math.inf)
         if as_csv:
             click.echo(",".join(["t_s", *names]))
             click.echo(",".join(["s", *map(signal_unit, names)]))

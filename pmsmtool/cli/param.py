@@ -115,7 +115,7 @@ def set_command(
     values: dict[str, float] = {}
     for assignment in assignments:
         values |= _assignment(assignment, drive_map)
-    with set_named() as jobs, open_node(bus, drive_map) as node:
+    with set_named() as jobs, open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
         carry_out(node, jobs, ParameterSet(values), bus, motion, out, command="param-set", store=store)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, open_node, read_map
+from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output
 
@@ -46,7 +46,7 @@ def restore_command(
     from pmsmtool.flash.journal import JournalFolder, read_snapshot
     from pmsmtool.flash.restore import check_snapshot, due_of_journal, nothing_written, old_marks, plan_restore
 
-    with set_named() as jobs, open_node(bus, read_map(map_file)) as node:
+    with set_named() as jobs, open_node(bus, read_map(map_file), within_s=WHOLE_SET_S) as node:
         identity = checked_identity(node)
         folder = JournalFolder(identity)
         snapshot = folder.last() if snapshot_file is None else read_snapshot(snapshot_file)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ import click
 
 from pmsmtool.cli.options import FILE, TIME, WholeNumber, examples, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.units import RPM_PER_RAD_S
 
 if TYPE_CHECKING:
     from pmsmtool.trace import Trace
@@ -171,6 +171,6 @@ def _lines(summary: dict[str, dict[str, Any]]) -> Iterator[str]:
     for name, line in summary.items():
         rows.append((name, *(f"{line[key]:.5g}" for key in ("min", "max", "last")), line["unit"]))
         if name == "omega_m_rad_s":
-            rpm = 30.0 / math.pi
+            rpm = RPM_PER_RAD_S
             rows.append(("speed", *(f"{rpm * line[key]:.5g}" for key in ("min", "max", "last")), "rpm"))
     return iter(table(("signal", "min", "max", "last", "unit"), rows))

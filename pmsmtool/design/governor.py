@@ -40,7 +40,7 @@ EPS_LISTED = (0.1, 0.01, 1e-3)
 """Tightenings whose horizon is listed beside the chosen one."""
 
 OBSERVER_TIME_S = 0.8e-3
-"""Time constant of the disturbance observer (reference: gain 0.1 at 12 kHz)."""
+"""Time constant of the disturbance observer (docs/control.md, 1: gain 0.1 at 12 kHz)."""
 
 SLACK = 2e-4
 """Squared voltage over the limit, relative, that counts as none: seen up to 1.1e-4 in the exact plant."""

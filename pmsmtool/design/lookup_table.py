@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pmsmtool.design.operating_machine import OperatingMachine, design_library
 from pmsmtool.errors import ConfigError, DesignInfeasible
+from pmsmtool.units import RPM_PER_RAD_S
 
 Array = NDArray[np.float64]
 AxisKind = Literal["speed", "flux"]
@@ -24,7 +25,7 @@ AxisKind = Literal["speed", "flux"]
 CURRENT, VOLTAGE, DEMAGNETISATION, MAP, CUT, NONE = 1, 2, 4, 8, 16, 32
 """Bits of a cell's limits (``enum pmsm_limit``)."""
 
-RPM = 60.0 / (2.0 * math.pi)
+RPM = RPM_PER_RAD_S
 """rpm per rad/s."""
 
 _NAMES = ((CURRENT, "current"), (VOLTAGE, "voltage"), (DEMAGNETISATION, "demagnetisation"), (MAP, "map"))

@@ -7,7 +7,6 @@ far the gains travel.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,10 +25,11 @@ from pmsmtool.design.polar import (
     linearised,
 )
 from pmsmtool.errors import DesignInfeasible
+from pmsmtool.units import RAD_S_PER_RPM
 
 Array = NDArray[np.float64]
 
-RPM = math.pi / 30.0
+RPM = RAD_S_PER_RPM
 RANK_TOLERANCE = 1e-9
 """A direction counts as reached when its singular value exceeds this share of the largest."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -18,9 +17,9 @@ from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.trace import Trace
+from pmsmtool.units import RAD_S_PER_MRPM
 
 PERIOD = "inverter.T_s_ns"
-RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 """The reference drive counts speed in thousandths of a mechanical revolution per minute."""
 
 
@@ -50,9 +49,12 @@ class CanopenDrive:
         From an attempt to enable until a confirmed stop.
     stops_by_ramp : bool
         Whether a stop may use the drive's quick stop ramp, which runs its speed loop; else it removes the voltage.
+    commands_bounded_current : bool
+        Whether every command is a current that this program bounds, so that it may replace a limit the drive lacks.
     """
 
     stops_by_ramp = True
+    commands_bounded_current = False
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         self.node = DriveNode(connection, node_id, drive_map=drive_map)
@@ -160,14 +162,14 @@ class CanopenDrive:
         self.node.put(objects.TARGET_VELOCITY_MRPM, omega_m_rad_s / RAD_S_PER_MRPM)
         self._set_mode(Mode.PROFILE_VELOCITY)
 
-    def _set_mode(self, mode: Mode) -> None:
+    def _set_mode(self, mode: int) -> None:
         if self.node.whole(objects.MODE_DISPLAY) == mode:
             return
         try:
             self.node.put(objects.MODE, mode)
         except SdoAbort as abort:
             raise NotAvailable(
-                f"the drive has no mode of operation {mode.name.lower().replace('_', ' ')} ({int(mode)})",
+                f"the drive has no mode of operation{_mode_name(mode)} ({int(mode)})",
                 where=f"node {self.node.node}, 0x6060:00",
                 hint="`pmsmtool caps` lists what this drive can give",
             ) from abort
@@ -286,6 +288,10 @@ class CanopenDrive:
         """Let time pass on the bus clock; an alarm of the drive ends it."""
         self.node.connection.wait(seconds)
         self.node.supervision.check()
+
+
+def _mode_name(mode: int) -> str:
+    return f" {Mode(mode).name.lower().replace('_', ' ')}" if mode in set(Mode) else ""
 
 
 def _buffer_periods(excitation: Excitation | None) -> int:

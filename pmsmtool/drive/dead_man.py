@@ -1,9 +1,10 @@
 """Proof of the dead-man: the drive stops by itself when the tool dies.
 
-Nothing moves before this was shown: the consumer heartbeat time 0x1016 is set, abort connection option 0x6007 and quick
-stop option 0x605A are set to remove the voltage where the drive takes that (a ramp runs a speed loop which nobody has
-proven yet), the drive is enabled at zero current, the tool's heartbeat is stopped, and the voltage must be off within
-the declared time: by the state, as bit 4 of the statusword shows the supply, not the power stage (CiA 402-2).
+Nothing moves before this was shown: the consumer heartbeat time 0x1016 is set, or node guarding (0x100C, 0x100D) where
+there is none; abort connection option 0x6007 and quick stop option 0x605A are set to remove the voltage where the drive
+has them and takes that (a ramp runs a speed loop which nobody has proven yet), the drive is enabled at zero current,
+the tool's heartbeat is stopped, and the voltage must be off within the declared time: by the state, as bit 4 of the
+statusword shows the supply, not the power stage (CiA 402-2).
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass
 
-from pmsmtool.bus.nmt import TOOL_NODE
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE, NmtCommand, NmtState, send_nmt
 from pmsmtool.cia402 import AbortConnection, QuickStop, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -32,6 +34,9 @@ ROUND_S = 0.02
 """Polling once takes at most this long; measured 5.4 to 14 ms over socketcand."""
 STALLED_S = 0.05
 """Polling that took longer than it should by more than this, in all, measures nothing."""
+ANSWER_S = 0.2
+"""A remote frame is answered within this time: a round trip takes milliseconds."""
+ABSENT = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX)
 _POLL_S = 0.005
 _STOPPING = (AbortConnection.FAULT, AbortConnection.DISABLE_VOLTAGE, AbortConnection.QUICK_STOP)
 
@@ -48,24 +53,27 @@ class DeadManProof:
         The voltage must be off within this time after the last heartbeat (s).
     measured_s : float
         Time it took (s).
-    abort_connection : AbortConnection
-        Option code 0x6007 in force.
+    abort_connection : AbortConnection or None
+        Option code 0x6007 in force; None where the drive has none: what it does was seen, not asked.
     quick_stop : int or None
         Option code 0x605A in force; None where the drive has none.
     left_for : State
         State the drive went to.
+    by : str
+        What stopped: the tool's ``heartbeat``, or its ``node guarding``.
     """
 
     consumer_s: float
     declared_s: float
     measured_s: float
-    abort_connection: AbortConnection
+    abort_connection: AbortConnection | None
     quick_stop: int | None
     left_for: State
+    by: str = "heartbeat"
 
     def __str__(self) -> str:
         return (
-            f"dead-man proven: heartbeat stopped, voltage off after {1000 * self.measured_s:.0f} ms "
+            f"dead-man proven: {self.by} stopped, voltage off after {1000 * self.measured_s:.0f} ms "
             f"(declared {1000 * self.declared_s:.0f} ms), to {self.left_for.name.replace('_', ' ')}"
         )
 
@@ -81,10 +89,11 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
     Raises
     ------
     SafetyRefusal
-        The drive has no heartbeat supervision, ignores it, or reacts too late; or the computer is too busy to show it.
+        The drive has no supervision, ignores it, or reacts too late; or the computer is too busy to show it.
     """
     node = drive.node
-    _set_consumer(drive)
+    if not _set_consumer(drive):
+        _set_guarding(drive, heartbeat)
     abort_option = _abort_option(drive)
     quick_stop = set_quick_stop(node, QuickStop.DISABLE)
     with node.emergencies_tolerated():
@@ -106,7 +115,7 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
 
 
 def _try(
-    drive: CanopenDrive, heartbeat: Heartbeat, abort_option: AbortConnection, quick_stop: int | None
+    drive: CanopenDrive, heartbeat: Heartbeat, abort_option: AbortConnection | None, quick_stop: int | None
 ) -> DeadManProof | None:
     """Enable, stop the heartbeat and measure; None where this computer stalled, so that nothing is shown."""
     node = drive.node
@@ -126,7 +135,7 @@ def _try(
 
 
 def _stop_and_measure(
-    drive: CanopenDrive, heartbeat: Heartbeat, abort_option: AbortConnection, quick_stop: int | None
+    drive: CanopenDrive, heartbeat: Heartbeat, abort_option: AbortConnection | None, quick_stop: int | None
 ) -> DeadManProof | None:
     clock = drive.node.connection.clock
     stopped = clock.now()
@@ -144,7 +153,8 @@ def _stop_and_measure(
         stalled += max(0.0, passed - before - ROUND_S)
         off = is_safe(state)
         if state is not None and off and passed <= declared:
-            return DeadManProof(1e-3 * CONSUMER_MS, declared, passed, abort_option, quick_stop, state)
+            by = "heartbeat" if heartbeat.guarded_node is None else "node guarding"
+            return DeadManProof(1e-3 * CONSUMER_MS, declared, passed, abort_option, quick_stop, state, by)
         if off or asked > declared:
             if not off:
                 drive.quick_stop()
@@ -159,8 +169,8 @@ def _stop_and_measure(
         drive.node.connection.wait(_POLL_S)
 
 
-def _set_consumer(drive: CanopenDrive) -> None:
-    """Make the drive watch the tool's heartbeat, in its own entry of 0x1016 or a free one."""
+def _set_consumer(drive: CanopenDrive) -> bool:
+    """Make the drive watch the tool's heartbeat, in its own entry of 0x1016 or a free one; False where it cannot."""
     node = drive.node
     try:
         count = node.sdo.read(objects.CONSUMER_HEARTBEAT, 0, size=1)[0]
@@ -175,9 +185,46 @@ def _set_consumer(drive: CanopenDrive) -> None:
         word = (TOOL_NODE << 16 | CONSUMER_MS).to_bytes(4, "little")
         node.write_bytes(objects.CONSUMER_HEARTBEAT, free[0], word)
     except SdoAbort as abort:
+        if abort.code in ABSENT:
+            return False
         raise _refused(
-            "the drive has no consumer heartbeat (0x1016): it would not notice that the tool died", drive
+            "the drive does not take a consumer heartbeat (0x1016): it would not notice that the tool died", drive
         ) from abort
+    return True
+
+
+def _set_guarding(drive: CanopenDrive, heartbeat: Heartbeat) -> None:
+    """Make the drive watch the tool's remote frames (node guarding, CiA 301, 7.2.8.2.2.1).
+
+    It is active only without a heartbeat of the drive (0x1017 = 0), in the NMT state operational, and after one remote
+    frame was answered: so the adapter must be able to send them.
+    """
+    node = drive.node
+    try:
+        node.put(objects.LIFE_TIME_FACTOR, 1e-3 * CONSUMER_MS / PERIOD_S)
+        node.put(objects.GUARD_TIME_MS, 1e3 * PERIOD_S)
+    except SdoAbort as abort:
+        raise _refused(
+            "the drive has neither a consumer heartbeat (0x1016) nor node guarding (0x100C, 0x100D): it would not "
+            "notice that the tool died", drive,
+        ) from abort  # fmt: skip
+    with contextlib.suppress(SdoAbort):
+        if node.get(objects.PRODUCER_HEARTBEAT_MS):
+            node.put(objects.PRODUCER_HEARTBEAT_MS, 0)
+    node.supervision.heartbeat_period_s = None
+    node.supervision.nmt_state = None
+    node.connection.request(HEARTBEAT_ID + node.node, 1)
+    if not node.connection.wait_until(lambda: node.supervision.nmt_state is not None, ANSWER_S):
+        raise _refused(
+            "the drive has no consumer heartbeat (0x1016), and does not answer the remote frames of node guarding",
+            drive, likely="the adapter sends no remote frames, or the drive's guarding is switched off",
+        )  # fmt: skip
+    before = node.supervision.nmt_state
+    if before is not NmtState.OPERATIONAL:
+        send_nmt(node.connection, NmtCommand.START, node.node)
+        if before is NmtState.PRE_OPERATIONAL:
+            node.before_close.append(lambda: send_nmt(node.connection, NmtCommand.PRE_OPERATIONAL, node.node))
+    heartbeat.guarded_node = node.node
 
 
 def set_quick_stop(node: DriveNode, option: int) -> int | None:
@@ -190,8 +237,11 @@ def set_quick_stop(node: DriveNode, option: int) -> int | None:
     return None
 
 
-def _abort_option(drive: CanopenDrive) -> AbortConnection:
-    """Make the drive remove the voltage when the connection is lost, else stop in another way."""
+def _abort_option(drive: CanopenDrive) -> AbortConnection | None:
+    """Make the drive remove the voltage when the connection is lost, else stop in another way.
+
+    None where it has no such object: then only what is seen counts, as ever.
+    """
     node = drive.node
     try:
         option = node.whole(objects.ABORT_CONNECTION)
@@ -203,16 +253,18 @@ def _abort_option(drive: CanopenDrive) -> AbortConnection:
             node.put(objects.ABORT_CONNECTION, AbortConnection.QUICK_STOP)
             option = node.whole(objects.ABORT_CONNECTION)
     except SdoAbort as abort:
+        if abort.code in ABSENT:
+            return None
         raise _refused("the drive does not say what it does when the connection is lost (0x6007)", drive) from abort
     if option not in _STOPPING:
         raise _refused(f"abort connection option code {option} does not stop the machine", drive)
     return AbortConnection(option)
 
 
-def _refused(what: str, drive: CanopenDrive) -> SafetyRefusal:
+def _refused(what: str, drive: CanopenDrive, *, likely: str = "") -> SafetyRefusal:
     return SafetyRefusal(
         what,
         where=f"node {drive.node.node}",
-        likely="the drive's firmware has no heartbeat supervision, or it is switched off",
+        likely=likely or "the drive's firmware has no heartbeat supervision, or it is switched off",
         hint="nothing will be moved over this connection; use the drive's own commissioning over its panel",
     )

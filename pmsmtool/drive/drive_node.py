@@ -22,7 +22,7 @@ from pmsmtool.plain_text import one_line
 STATE_TIMEOUT_S = 2.0
 """A state transition without motion takes milliseconds; charging a DC link may take longer."""
 STORE_TIMEOUT_S = 10.0
-"""Flash memory of a drive may take seconds (CANopen reference, section 6: 3 to 10 s)."""
+"""Flash memory of a drive may take seconds (docs/canopen.md, 6: 3 to 10 s)."""
 STORE_POLL_S = 0.1
 READY_TIMEOUT_S = 3.0
 """After boot-up a node answers SDO requests within this time."""

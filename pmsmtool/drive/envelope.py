@@ -8,7 +8,7 @@ from typing import Literal
 
 from pmsmtool.errors import SafetyRefusal
 from pmsmtool.machine.parameters import MachineParameters
-from pmsmtool.units import format_current
+from pmsmtool.units import format_current, rpm_from_rad_s
 
 Shaft = Literal["free", "locked", "coupled"]
 Load = Literal["none", "gravity"]
@@ -68,13 +68,11 @@ class Envelope:
 
     def lines(self) -> list[str]:
         """Return the envelope as a person reads it before consenting."""
-        rpm = self.speed_max_rad_s * 60.0 / (2.0 * math.pi)
+        rpm = rpm_from_rad_s(self.speed_max_rad_s)
         if self.acceleration_rad_s2 is None:
             gain = "the speed gained until then is not known (no inertia is given)"
         else:
-            gain = (
-                f"until then all torque would add {self.acceleration_rad_s2 * OFF_S * 60.0 / (2.0 * math.pi):.3g} rpm"
-            )
+            gain = f"until then all torque would add {rpm_from_rad_s(self.acceleration_rad_s2 * OFF_S):.3g} rpm"
         travel = "not limited" if math.isinf(self.travel_rad) else f"{math.degrees(self.travel_rad):.4g} deg (mech)"
         energy = "not limited" if math.isinf(self.energy_j) else f"{self.energy_j:.4g} J"
         return [

@@ -21,6 +21,7 @@ from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
+from pmsmtool.drive.motion_objects import Quantity, allowed, current_limits, rated_apk, speed_limits
 from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, Recording, Shape
 from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import (
@@ -31,10 +32,10 @@ from pmsmtool.errors import (
     NotAvailable,
     PmsmtoolError,
     SafetyRefusal,
-    SdoAbort,
     StopNotConfirmed,
 )
 from pmsmtool.trace import Trace
+from pmsmtool.units import rpm_from_rad_s
 
 WATCH_S = 0.05
 """The machine is looked at this often while time passes."""
@@ -95,6 +96,7 @@ class GuardedDrive:
         self._ended = False
         self._start_rad: float | None = None
         self._looked_s = -math.inf
+        self._speed_overshoot = OVERSHOOT
         self._asked_rad_s = 0.0
         self._kept_since_s: float | None = None
         self._pole_pairs = 1.0
@@ -132,12 +134,12 @@ class GuardedDrive:
                 hint="limit the current and the duration instead",
             )
 
-    def _refuse_no_limit(self, rated_apk: float) -> None:
+    def _refuse_no_limit(self, rated: float) -> None:
         """Refuse a current limit so far above the drive's rated current that it limits nothing."""
-        i_max, largest = self.envelope.i_max_apk, RATED_RATIO * rated_apk
+        i_max, largest = self.envelope.i_max_apk, RATED_RATIO * rated
         if not i_max <= largest:  # what is no number is no limit either
             raise SafetyRefusal(
-                f"the current limit of {i_max:.4g} A (peak) is none: the drive is rated {rated_apk:.4g} A (peak), and "
+                f"the current limit of {i_max:.4g} A (peak) is none: the drive is rated {rated:.4g} A (peak), and "
                 f"at most {RATED_RATIO:g} times that, {largest:.4g} A, counts as a limit; nothing was energised",
                 where=f"node {self._node.node}, 0x6075:00",
                 likely="a wrong digit or unit in --i-max, or the drive holds the rated current of a much smaller motor",
@@ -145,24 +147,35 @@ class GuardedDrive:
             )
 
     def _limit_in_drive(self) -> None:
-        """Make the drive itself keep current and speed (0x6073, 0x6080), where it can."""
-        node = self._node
-        try:
-            rated_apk = 1e-3 * node.get(objects.RATED_CURRENT_MA) * math.sqrt(2.0)
-            self._refuse_no_limit(rated_apk)
-            # Rounded up: a permille of the rated current must not cut what the envelope allows.
-            permille = math.ceil(1000.0 * self.envelope.i_max_apk / rated_apk)
-            if permille < node.get(objects.MAX_CURRENT_PERMILLE):
-                self._put_limit(objects.MAX_CURRENT_PERMILLE, permille)
-            rpm = math.ceil(self.envelope.speed_max_rad_s * 60.0 / (2.0 * math.pi))
-            if rpm < node.get(objects.MAX_SPEED_RPM):
-                self._put_limit(objects.MAX_SPEED_RPM, rpm)
-        except SdoAbort as abort:
+        """Make the drive itself keep current and speed, by the first object it has for each (0x6073, 0x6080).
+
+        Where it has none, a drive whose every command is a bounded current goes on: its current is commanded and looked
+        at here, and its speed may not even overshoot.
+        """
+        drive, envelope = self._drive, self.envelope
+        rated = rated_apk(self._node)
+        self._refuse_no_limit(rated)
+        current = self._keep(current_limits(self._node, rated), envelope.i_max_apk)
+        speed = self._keep(speed_limits(self._node), rpm_from_rad_s(envelope.speed_max_rad_s))
+        if not (current and speed) and not drive.commands_bounded_current:
             raise NotAvailable(
                 "the drive has no current and speed limit of its own (0x6073, 0x6075, 0x6080)",
-                where=abort.where,
+                where=f"node {self._node.node}",
                 hint="without them nothing is moved",
-            ) from abort
+            )
+        self._speed_overshoot = OVERSHOOT if speed else 1.0
+
+    def _keep(self, limits: Iterator[Quantity], wanted: float) -> bool:
+        """Lower the drive's own limit to what is wanted (A peak or rpm); False where it has none."""
+        found = allowed(self._node, limits)
+        if found is None:
+            return False
+        limit, now = found
+        # Rounded up: a permille of the rated current must not cut what the envelope allows.
+        counts = math.ceil(wanted / limit.per_count)
+        if counts * limit.per_count < now:
+            self._put_limit(limit.item, counts)
+        return True
 
     def _put_limit(self, item: objects.DriveObject, value: float) -> None:
         self._node.put(item, value)
@@ -404,7 +417,7 @@ class GuardedDrive:
         speed = abs(omega)
         checks = [
             ("current", current, OVERSHOOT * envelope.i_max_apk, "A"),
-            ("speed", speed, OVERSHOOT * envelope.speed_max_rad_s, "rad/s"),
+            ("speed", speed, self._speed_overshoot * envelope.speed_max_rad_s, "rad/s"),
             ("time energised", self.energised_s, envelope.duration_s, "s"),
             ("energy in the winding", self.energy_j, envelope.energy_j, "J"),
         ]

@@ -1,4 +1,4 @@
-"""The tool's own heartbeat: the drive stops when it stays away.
+"""The tool's own heartbeat, or its remote frames of node guarding: the drive stops when they stay away.
 
 It runs on the bus clock as a job of its own (a thread on a real bus), so that its period does not depend on what the
 main thread does. It is sent only while somebody watches the machine: a tool that is killed stops the machine, and so
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from types import TracebackType
 
 from pmsmtool.bus.clock import Ticker
-from pmsmtool.bus.connection import Connection
+from pmsmtool.bus.connection import SEND_PATIENCE_S, Connection
 from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE, NmtState
 from pmsmtool.errors import BusError
 
@@ -31,6 +31,11 @@ class Heartbeat:
         The bus.
     is_watched : callable
         Whether the machine is watched, or off; while it says no, no heartbeat is sent.
+
+    Attributes
+    ----------
+    guarded_node : int or None
+        Node that is asked for its state by remote frames (node guarding) instead of being sent heartbeats.
     """
 
     def __init__(
@@ -43,6 +48,7 @@ class Heartbeat:
         self._last_s = 0.0
         self._longest_s = 0.0
         self._failed = False
+        self.guarded_node: int | None = None
 
     def __enter__(self) -> Heartbeat:
         self.start()
@@ -57,7 +63,7 @@ class Heartbeat:
         """Send the first heartbeat now and one every period."""
         if self._ticker is None:
             self._last_s, self._longest_s = self._connection.clock.now(), 0.0
-            self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)))
+            self._send()
             self._failed = False
             self._ticker = self._connection.clock.every(self._period_s, self._beat)
 
@@ -75,8 +81,15 @@ class Heartbeat:
         if self._ticker is None:
             self.start()
         elif self._failed or self._connection.clock.now() - self._last_s > LATE_PERIODS * self._period_s:
-            self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)))
+            self._send()
             self._failed = False
+
+    def _send(self, patience_s: float = SEND_PATIENCE_S) -> None:
+        if self.guarded_node is None:
+            data = bytes((NmtState.OPERATIONAL,))
+            self._connection.send(HEARTBEAT_ID + TOOL_NODE, data, patience_s=patience_s)
+        else:
+            self._connection.request(HEARTBEAT_ID + self.guarded_node, 1)
 
     def stop(self) -> None:
         """Send no more; the drive notices after its consumer time."""
@@ -94,7 +107,7 @@ class Heartbeat:
         before = self._connection.clock.now()
         # Nobody catches here: the drive notices a lost heartbeat, the next request meets the failed bus.
         try:
-            self._connection.send(HEARTBEAT_ID + TOOL_NODE, bytes((NmtState.OPERATIONAL,)), patience_s=0.0)
+            self._send(0.0)
             self._failed = False
         except BusError:
             self._failed = True

@@ -9,26 +9,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
-from pmsmtool.drive.canopen_drive import RAD_S_PER_MRPM, CanopenDrive
+from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.motion_objects import (
+    POSITION,
+    TorqueTarget,
+    position_units,
+    rated_apk,
+    shown_current,
+    torque_target,
+)
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.recorder import Recorder
-from pmsmtool.errors import DriveTimeout, NotAvailable, SdoAbort
+from pmsmtool.errors import DriveTimeout, NotAvailable
 from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.trace import Trace
+from pmsmtool.units import RAD_S_PER_MRPM
 
 COMMUTATION_ANGLE = DriveObject(0x60EA, 0, "H")
-POSITION = DriveObject(0x6064, 0, "i")
-ENCODER_COUNTS = DriveObject(0x608F, 1, "I")
-MOTOR_TURNS = DriveObject(0x608F, 2, "I")
 ANGLE_COUNTS = 1 << 16
 """Counts of 0x60EA per electrical turn."""
 POLL_PERIOD_S = 1e-3
@@ -39,9 +46,8 @@ QUARTER_TURN = 0.5 * math.pi
 """Torque current flows a quarter turn ahead of the commutation angle; the rotor's d axis settles there."""
 
 
-def rated_apk(node: DriveNode) -> float:
-    """Return the rated current (A peak; 0x6075 taken as rms, the larger of the two readings)."""
-    return 1e-3 * math.sqrt(2.0) * node.get(objects.RATED_CURRENT_MA)
+MOST_STEP, STEP_S = 0.1, 1e-3
+"""A target that the drive takes at once moves by this share of the rated current in this time: CST has no 0x6087."""
 
 
 class StandardDrive(CanopenDrive):
@@ -52,8 +58,11 @@ class StandardDrive(CanopenDrive):
     Attributes
     ----------
     counts_per_turn : float
-        Encoder increments per motor turn (0x608F).
+        Units of position per motor turn (0x608F, 0x6091, 0x6092, 0x60A8, or the maker's own object), negative where the
+        polarity (0x607E) turns it.
     """
+
+    commands_bounded_current = True
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         self.node = DriveNode(connection, node_id, drive_map=drive_map)
@@ -65,16 +74,9 @@ class StandardDrive(CanopenDrive):
         self._last_counts: float | None = None
         self._last_s = 0.0
         self._speed_rad_s = 0.0
-        try:
-            self.counts_per_turn = self.node.get(ENCODER_COUNTS) / max(1.0, self.node.get(MOTOR_TURNS))
-            self._rated_apk = rated_apk(self.node)
-        except SdoAbort as abort:
-            raise NotAvailable(
-                "the drive does not say how many increments its encoder has (0x608F) or what its rated current is "
-                "(0x6075)",
-                where=abort.where,
-                hint="`pmsmtool caps` lists what this drive can give",
-            ) from abort
+        self.counts_per_turn = position_units(self.node)
+        self._rated_apk = rated_apk(self.node)
+        self._current = shown_current(self.node, self._rated_apk)
 
     def read(self, name: str) -> float:
         """Return one parameter; of those the guard scales with, neutral values.
@@ -97,8 +99,8 @@ class StandardDrive(CanopenDrive):
             self._position_rad()
             return self._speed_rad_s
         if name == "i_q_a":
-            # Permille of the rated current: taken as rms, the larger of the two readings, for safety.
-            return 1e-3 * self.node.get(objects.CURRENT_PERMILLE) * self._rated_apk
+            # Taken as rms, the larger of the two readings, for safety.
+            return self._current.per_count * self.node.get(self._current.item)
         if name == "i_d_a":
             return 0.0
         raise NotAvailable(f"the drive does not show {name}", where=f"node {self.node.node}")
@@ -175,10 +177,16 @@ class TorqueCurrent(CanopenDrive):
 
     _rated_apk: float
 
+    @cached_property
+    def target(self) -> TorqueTarget:
+        """What takes the torque current: mode 4, else 10, else the maker's own."""
+        return torque_target(self.node, self._rated_apk)
+
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero torque."""
-        self.node.put(objects.TARGET_TORQUE_PERMILLE, 0)
-        self._set_mode(Mode.PROFILE_TORQUE)
+        self.node.put(self.target.quantity.item, 0)
+        self._asked_a = 0.0
+        self._set_mode(self.target.mode)
         self.may_be_energised = True
         self.node.enable()
 
@@ -186,7 +194,16 @@ class TorqueCurrent(CanopenDrive):
         """Ask for the torque of a q current."""
         if i_d_a or fixed_angle_rad is not None:
             raise NotAvailable("the drive takes no current set-point, only torque", where=f"node {self.node.node}")
-        self.node.put(objects.TARGET_TORQUE_PERMILLE, round(1000.0 * i_q_a / self._rated_apk))
+        steps = 1
+        if self.target.cyclic:  # taken at once: ramped here
+            steps = max(1, math.ceil(abs(i_q_a - self._asked_a) / (MOST_STEP * self._rated_apk)))
+        first = self._asked_a
+        for step in range(1, steps + 1):
+            asked = first + (i_q_a - first) * step / steps
+            self.node.put(self.target.quantity.item, round(asked / self.target.quantity.per_count))
+            self._asked_a = asked
+            if step < steps:
+                self.node.connection.wait(STEP_S)
 
 
 class RecorderDrive(TorqueCurrent):

@@ -12,6 +12,7 @@ from pmsmtool.cia402 import Command, QuickStop, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import STATE_TIMEOUT_S, DriveNode, is_safe
 from pmsmtool.errors import BusError, DriveFault, PmsmtoolError, SdoAbort, StopNotConfirmed
+from pmsmtool.firmware.drive_map import LETTERS
 
 STOP_MARGIN_S = 1.0
 """Beyond the time the deceleration ramp needs."""
@@ -107,6 +108,9 @@ def zero_references(node: DriveNode) -> None:
         with contextlib.suppress(SdoAbort):
             node.command(objects.EXCITATION_COMMAND, 0)
         references = [objects.SET_POINT_D, objects.SET_POINT_Q, *references]
+    own = node.map.motion.get("target_current")
+    if own is not None and _is_maps_drive(node):
+        references.append(objects.DriveObject(own.index, own.sub, LETTERS[own.wire]))
     for reference in references:
         with contextlib.suppress(SdoAbort):
             if node.get(reference) != 0.0:

@@ -14,6 +14,7 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.motion_objects import undecided
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Recording
 from pmsmtool.drive.recorder import Recorder
@@ -42,10 +43,16 @@ class TorqueDrive(TorqueCurrent, StandardDrive):
     """A drive of which only CiA 402 is known, in torque mode: a q current is asked for as torque.
 
     A record is polled: position and current one after the other, with the time at which each row was begun.
+
+    Attributes
+    ----------
+    current_undecided : bool
+        Whether no source says if the drive's amperes are peak or rms; they are read as rms.
     """
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)
+        self.current_undecided = undecided(self.node, self._rated_apk)
         self._polled: tuple[str, ...] = ()
         self._rows: list[list[float]] = []
 

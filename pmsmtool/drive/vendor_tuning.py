@@ -78,6 +78,7 @@ class VendorDrive(StandardDrive):
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)
+        self.commands_bounded_current = False  # it moves by itself
         tuning = self.node.map.vendor_tuning
         if tuning is None:
             raise NotAvailable(

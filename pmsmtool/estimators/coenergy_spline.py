@@ -1,7 +1,7 @@
 """Co-energy of a machine as a tensor-product B-spline of the currents: a flux map that is reciprocal by construction.
 
 W(i_d, i_q) = sum c_ab B_a(i_d) B_b(i_q) of degree 4; psi_d = dW/di_d and psi_q = dW/di_q are linear in c
-(identification reference, 3.3). Basis and derivatives by the recursion of Cox and de Boor (C. de Boor, A Practical
+(docs/identification.md, 3.3). Basis and derivatives by the recursion of Cox and de Boor (C. de Boor, A Practical
 Guide to Splines, DOI 10.1007/978-1-4612-6333-3).
 """
 

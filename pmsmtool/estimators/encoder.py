@@ -1,4 +1,4 @@
-"""Pole pairs, direction and coarse offset of the encoder from a slowly rotated vector (identification reference, 3.6).
+"""Pole pairs, direction and coarse offset of the encoder from a slowly rotated vector (docs/identification.md, 3.6).
 
 The stator vector is turned forward and back through at least one mechanical turn and the rotor follows. The imposed
 electrical angle over the measured mechanical angle is the number of pole pairs, its sign the direction; the mean of
@@ -21,7 +21,7 @@ STAGE = "encoder"
 Vector = NDArray[np.float64]
 
 INTEGER_LIMIT = 0.1
-"""Largest distance of the count from an integer (identification reference, 3.6)."""
+"""Largest distance of the count from an integer (docs/identification.md, 3.6)."""
 LINEARITY_LIMIT_RAD = math.radians(30.0)
 """Largest deviation of p theta_M from the imposed angle (electrical): beyond it the rotor slips or sticks."""
 COUNTS_SHARE = 0.25

@@ -18,11 +18,11 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 
 CHI2_WARN = 1.25
-"""Reduced chi-square above which a result is widened and marked (identification reference, section 4)."""
+"""Reduced chi-square above which a result is widened and marked (docs/identification.md, 4)."""
 CHI2_REFUSE = 3.0
 """Reduced chi-square above which no number is given."""
 CONDITION_LIMIT = 1e6
-"""Largest condition number of a column-scaled Jacobian (identification reference, section 7)."""
+"""Largest condition number of a column-scaled Jacobian (docs/identification.md, 7)."""
 SINGULAR = 1e-14
 """Ratio of eigenvalues of the scaled normal matrix below which it counts as singular."""
 COVERAGE_FACTOR = 1.959963984540054

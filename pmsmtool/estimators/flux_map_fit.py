@@ -1,4 +1,4 @@
-"""A flux map from voltage pulses: co-energy spline regression (identification reference, 3.3).
+"""A flux map from voltage pulses: co-energy spline regression (docs/identification.md, 3.3).
 
 One linear least squares for all spline coefficients, R, the inverter's plateau and the delay of the current sample. A
 coarse pass gives the inverse incremental inductance that weights the fine one: it turns flux residuals into current

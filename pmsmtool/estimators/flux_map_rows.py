@@ -1,4 +1,4 @@
-"""From pulse traces to the linear equations of a flux map (identification reference, 3.3).
+"""From pulse traces to the linear equations of a flux map (docs/identification.md, 3.3).
 
 The flux in the stator frame is an integral of what is known, psi_ab(t_n) = psi_ab(t_0) + integral of u - R i - e, and
 psi_dq(i) = R(-theta_n) psi_ab(t_n) is linear in the spline coefficients, in R, in the plateau of the inverter's error

@@ -5,8 +5,8 @@ own drop d(i) does not know the frequency. At the levels that both sequences hol
 
     v = R i + (f / f_1) g(|i|) sgn(i) + V sgn(i) [+ c sgn(i) / |i|^p] + v0(f)
 
-leaves g free at every level, so no shape is assumed of it; only the rest, the devices, has one (identification
-reference, section 3.1, item 10).
+leaves g free at every level, so no shape is assumed of it; only the rest, the devices, has one (docs/identification.md,
+3.1 no. 10).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Incremental L_d and L_q at a bias from square-wave shots in a frozen frame (identification reference, 3.2).
+"""Incremental L_d and L_q at a bias from square-wave shots in a frozen frame (docs/identification.md, 3.2).
 
 Two half periods per axis separate the delay, the sensor lag and the motion of the rotor from L; the frame's offset from
 the d axis, known from the flux run, mixes the axes and is undone with the measured inverse inductances
@@ -34,7 +34,8 @@ Vector = NDArray[np.float64]
 MODEL_FLOOR = 1e-4
 """Relative standard deviation added for what the model leaves out.
 
-The reference (section 4) takes 3e-4; here bridge, commutation and rotor have terms of their own.
+docs/identification.md, 4 has 3e-4 where nothing better is known; here bridge, commutation and rotor have terms of
+their own.
 """
 FREQUENCY_LIMIT = 0.01
 """Relative difference between two injection frequencies above which both values are reported."""

@@ -16,7 +16,7 @@ Vector = NDArray[np.float64]
 Residual = Callable[[Vector], Vector]
 
 RELATIVE_STEP = 1e-5
-"""Relative step of the central differences (identification reference, section 4)."""
+"""Relative step of the central differences (docs/identification.md, 4)."""
 DAMPING_START = 1e-3
 DAMPING_LIMIT = 1e12
 """Damping at which no step along the steepest descent lowers the cost any more."""

@@ -1,6 +1,6 @@
-"""Inertia, viscous and Coulomb friction: whitened output-error fit on the encoder's position (reference, 3.5).
+"""Inertia, viscous and Coulomb friction: whitened output-error fit on the encoder's position.
 
-    J dw/dt = T_e - B w - T_c sgn(w), with stick-slip
+    J dw/dt = T_e - B w - T_c sgn(w), with stick-slip (docs/identification.md, 3.5)
 
 Pushes by a known current, and coasting with the voltage off; each trace has its own first position and speed. The
 measured currents drive the model, so their noise is torque noise, a random walk in speed. The residual of the

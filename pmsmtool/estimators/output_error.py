@@ -5,8 +5,8 @@
 sampled at t_k. A bridge applies v[k] as two pulses around a quarter and three quarters of its period with nothing
 between them (``Pulses``): a sample that is late inside the zero vector sees no voltage, where a mean voltage would move
 it by u d T_s/L. Computation delay and sampling instant enter only through D, so one number covers both; with D = 1 and
-tau = 0 this is i[k+1] = a i[k] + (1 - a)/R (v[k-1] - v0), a = exp(-R T_s/L) (identification reference, 3.2 and its
-addendum). The model runs free: no measured current enters it.
+tau = 0 this is i[k+1] = a i[k] + (1 - a)/R (v[k-1] - v0), a = exp(-R T_s/L) (docs/identification.md, 3.2).
+The model runs free: no measured current enters it.
 
 A slightly saturated machine bends the response: the measured current is y + c_2 x^2 + c_3 x^3 with x the
 distance of y from the bias, so that L stays the incremental inductance *at* the bias whatever the ripple.

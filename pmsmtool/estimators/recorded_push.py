@@ -1,7 +1,7 @@
 """Resistance, flux linkage, L_q and frame offset from recorded torque pushes, as estimates with intervals.
 
 Currents of several sizes and both signs at every speed, and the way from one to the next
-(``experiments/recorded_push``), separate what single operating points mix (identification reference, section 8). The
+(``experiments/recorded_push``), separate what single operating points mix (docs/identification.md, 8). The
 regression is that of ``resolved_push``; here its values are judged.
 
 The speed is the encoder's own: a speed observer lags by its bandwidth under acceleration, which is proportional to the

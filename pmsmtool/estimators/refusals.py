@@ -1,8 +1,8 @@
 """The named refusals of identification: what was detected, what usually causes it, what to do next.
 
 One table; ``pmsmtool help refusals`` prints it, and every estimator raises through :func:`refuse`, so that a message
-always carries the stage, what was measured, the limit, the likely cause and the next step (identification
-reference, section 7).
+always carries the stage, what was measured, the limit, the likely cause and the next step (docs/identification.md,
+7).
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ A current vector at 30 + k 60 degrees electrical leaves one phase idle; the othe
 
 on the levels above 0.28 of the largest. R is *defined* as the asymptotic slope: the shape of the inverter error near
 zero is not assumed, its tail is 1/|i| and at most one more term out of p = 2, 3, 4, 6, and all five fits are averaged
-with their information weights (identification reference, section 3.1). The last term is what zero errors of the
+with their information weights (docs/identification.md, 3.1). The last term is what zero errors of the
 current sensors leave: the tail belongs to another current than the one that is shown, by the same amount at both signs.
 """
 
@@ -56,7 +56,7 @@ is 0.5. R stays: both signs have the same levels (p90 of 259 other drives 0.139 
 FIT_FROM = 0.28
 """Fraction of the largest level from which on levels enter the fit; the lower ones serve the inverter curve."""
 MODEL_FLOOR = 2e-4
-"""Largest model error of every level, of R I_r: the deliberate one of the identification reference, 3.1."""
+"""Largest model error of every level, of R I_r: the deliberate one of docs/identification.md, 3.1."""
 MODEL_FLOOR_LEAST = 1.2e-4
 """Smallest one. Between them the scatter of the levels decides: with 2e-4 throughout, chi-square was 0.02 to 0.1 on a
 switched inverter, and models without the tail that is there were preferred; with 7e-5, 11 of 13 drives were covered."""

@@ -1,7 +1,7 @@
 """The machine in steady operation as the tracking filter sees it: observations, and the voltages they should show.
 
 Observation k is a window in which the machine ran steadily (s = sinc(omega T_s / 2), the exact sampled-data factor of
-a drive that advances its voltage, identification reference 3.4):
+a drive that advances its voltage, docs/identification.md, 3.4):
 
     u_d = R i_d - s omega L_q i_q + k e_d + h f_d + L_d di_d/dt
     u_q = R i_q + s omega (psi + L_d i_d) + k e_q + h f_q + L_q di_q/dt

@@ -1,6 +1,6 @@
 """Flux linkage from voltage over speed where nothing records at loop rate: a coasting machine, or its voltage limit.
 
-Undriven (identification reference, 3.4 no. 8): without current the voltage is the machine's own,
+Undriven (docs/identification.md, 3.4 no. 8): without current the voltage is the machine's own,
 
     u_q = w psi_q + c_q sgn(w),   u_d = -w psi_d + c_d sgn(w),   psi = hypot(psi_q, psi_d);
 

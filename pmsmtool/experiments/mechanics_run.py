@@ -1,6 +1,6 @@
 """Pushes and coasting in both directions: positions and currents for inertia and friction.
 
-A push from rest, coasting, a push the other way through standstill, coasting (identification reference, 3.5). The shaft
+A push from rest, coasting, a push the other way through standstill, coasting (docs/identification.md, 3.5). The shaft
 coasts with the voltage off: the sampled current of a switched bridge is not the mean of its ripple, which at commanded
 zero current leaves a torque of a part in a thousand of the rated one, as much as a good bearing's friction.
 """

@@ -10,6 +10,7 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.experiments.signals import table
 from pmsmtool.experiments.vector_turn import RAMP_S, come_to_rest, rising, turn_vector
 from pmsmtool.trace import Trace
+from pmsmtool.units import RPM_PER_RAD_S
 
 MAX_POLE_PAIRS = 32
 """A machine with more is not found by turning its vector; the run ends with E_POLE_PAIRS."""
@@ -80,7 +81,7 @@ def dwell_within(dwell_s: float, omega_max_rad_s: float) -> float:
     """
     least_s = SWING * STEP_RAD / omega_max_rad_s
     if least_s > SLOWEST_STEP_S:
-        rpm = 30.0 / math.pi
+        rpm = RPM_PER_RAD_S
         raise IdentificationError(
             "E_EXCITATION",
             f"the slow turn of the shaft needs a speed limit of {rpm * SWING * STEP_RAD / SLOWEST_STEP_S:.3g} rpm, "

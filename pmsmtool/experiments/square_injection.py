@@ -22,6 +22,8 @@ SEARCH_LEAD_S = 0.05
 """Lead of a shot of the search: the ripple is there at once, only the bias still moves."""
 BUS_ALLOWANCE_S = 2.0
 """The injection goes on this much longer than lead and record need: slow adapters arm the recorder late."""
+BIAS_BANDWIDTH_RAD_S = 2.0 * math.pi * 15.0
+"""Bandwidth of the loop that holds the bias (rad/s): far below every injection."""
 FIRST_SHARE = 0.01
 """First amplitude of the search, of the largest voltage: 1 % moves no machine of this population over its limit."""
 NEXT_SHARE = 0.3
@@ -62,7 +64,7 @@ class SquarePlan:
     u_max_v: float
     half_periods: tuple[int, ...] = (6, 9)
     samples: int = SHOT_SAMPLES
-    bias_bandwidth_rad_s: float = 2.0 * math.pi * 15.0
+    bias_bandwidth_rad_s: float = BIAS_BANDWIDTH_RAD_S
     lead_s: float = 0.3
     angle_rad: float = 0.0
 

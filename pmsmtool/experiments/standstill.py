@@ -17,13 +17,13 @@ from pmsmtool.trace import Trace
 NOISE_SAMPLES = 2048
 PHASE_ANGLES_RAD = (0.0, 2.0 * math.pi / 3.0, 4.0 * math.pi / 3.0)
 DC_ANGLE_RAD = math.pi / 2.0
-"""One phase idle (identification reference, 3.1)."""
+"""One phase idle (docs/identification.md, 3.1)."""
 
 MEANS = ("u_d_v", "i_d_a", "u_q_v", "i_q_a", "T_winding_c")
 """What is averaged over a whole window at each level."""
 
 LEVEL_WINDOW = 1600
-"""Control periods averaged at each level (identification reference, 3.1)."""
+"""Control periods averaged at each level (docs/identification.md, 3.1)."""
 REST_RAD = 5e-4
 """Motion of the shaft (mechanical) between two looks that still counts as rest."""
 TRIES = 6

@@ -15,6 +15,7 @@ from typing import Literal
 
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.firmware.map_tables import decode_table, encode_table, shortest_binary32
+from pmsmtool.firmware.motion_objects import MotionObject
 from pmsmtool.firmware.recorder_map import RecorderMap, Recording
 from pmsmtool.firmware.vendor_tuning import VendorTuning
 from pmsmtool.firmware.wire_units import as_peak
@@ -257,6 +258,8 @@ class DriveMap:
         What it can do besides.
     signals : mapping of str to SignalCell
         Live quantities and references, by the names of :data:`SIGNALS`.
+    motion : mapping of str to MotionObject
+        The maker's own objects where motion needs what CiA 402 leaves optional.
     recorder : RecorderMap
         What its recorder can be told to record, where that is not said by ``signals``.
     left_out : mapping of str to str
@@ -276,6 +279,7 @@ class DriveMap:
     more_products: tuple[int, ...] = ()
     capabilities: Capabilities = Capabilities()
     signals: Mapping[str, SignalCell] = field(default_factory=dict)
+    motion: Mapping[str, MotionObject] = field(default_factory=dict)
     recorder: RecorderMap = field(default_factory=RecorderMap)
     left_out: Mapping[str, str] = field(default_factory=dict)
     sources: Mapping[str, str] = field(default_factory=dict)

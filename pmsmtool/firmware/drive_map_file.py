@@ -26,6 +26,8 @@ from pmsmtool.firmware.drive_map import (
     SignalCell,
 )
 from pmsmtool.firmware.map_lines import line_of
+from pmsmtool.firmware.motion_objects import TABLE as MOTION
+from pmsmtool.firmware.motion_objects import dump_motion, parse_motion
 from pmsmtool.firmware.recorder_map import Recording
 from pmsmtool.firmware.recorder_map_file import TABLE as RECORDER
 from pmsmtool.firmware.recorder_map_file import dump_recorder, parse_recorder
@@ -46,7 +48,7 @@ COMMANDS = frozenset({0x6040, 0x6060, 0x6071, 0x607A, 0x60B1, 0x60B2, 0x60FF})
 """Objects whose writing moves the machine: never a parameter."""
 POLE_PAIRS = "motor.pole_pairs"
 _HEAD = ("schema", "name", "vendor", "product", "more_products", "staging")
-_TABLES = ("capabilities", "objects", "signals", RECORDER, "tables", "left_out", "sources", TABLE)
+_TABLES = ("capabilities", "objects", "signals", MOTION, RECORDER, "tables", "left_out", "sources", TABLE)
 _CELL_KEYS = ("index", "sub", "type", "factor", "offset", "unit", "rounding", "form", "gain", "source")
 _TEXT_KEYS = ("type", "unit", "form", "rounding", "gain", "source")
 _SIGNAL_KEYS = ("index", "sub", "type", "unit", "source")
@@ -83,6 +85,7 @@ def dump_drive_map(drive_map: DriveMap) -> str:
             "capabilities": capabilities,
             "objects": {name: _cell_row(cell) for name, cell in drive_map.cells.items()},
             "signals": {name: _signal_row(cell) for name, cell in drive_map.signals.items()},
+            **({MOTION: dump_motion(drive_map.motion)} if drive_map.motion else {}),
             **({RECORDER: recorder} if recorder else {}),
             "tables": {name: {"index": index, "sub": sub} for name, (index, sub) in drive_map.tables.items()},
             **({} if tuning is None else {TABLE: dump_vendor_tuning(tuning, _cell_row)}),
@@ -199,12 +202,16 @@ def _parse_tables(document: Mapping[str, Any], complain: Callable[[tuple[str, ..
     def check_object(row: Any, keys: tuple[str, ...], tell: Complain) -> bool:
         return _check_row(row, keys, sources, tell)
 
+    def check_motion(row: Any, keys: tuple[str, ...], tell: Complain) -> bool:
+        return _check_row(row, keys, sources, tell, commands=True)
+
     signals = {name: _parse_signal(name, row, sources, about("signals", name)) for name, row in live}
     return {
         "cells": {row.name: cells[row.name] for row in EVERY if row.name in cells},
         "tables": {name: _parse_table(name, row, about("tables", name)) for name, row in table("tables").items()},
         "capabilities": capabilities,
         "signals": {name: signal for name, signal in signals.items() if signal is not None},
+        "motion": parse_motion(table(MOTION), sources, complain, check_motion),
         "recorder": parse_recorder(table(RECORDER), capabilities.recorder, _RECORDED, sources, complain, check_object),
         "left_out": _parse_left_out(table("left_out"), cells, complain),
         "sources": sources,

@@ -20,7 +20,10 @@ from pmsmtool.params.catalogue import (
 )
 
 CORE_DIRECTORY = Path(__file__).parent / "core"
-BANNER = "/* Generated from pmsmtool/params/catalogue.py by python -m pmsmtool.firmware.params_header: do not edit. */"
+SPDX = "/* SPDX-License-Identifier: MIT */"
+"""First line of every C file, shipped or generated."""
+BANNER = f"""{SPDX}
+/* Generated from pmsmtool/params/catalogue.py by python -m pmsmtool.firmware.params_header: do not edit. */"""
 _EXACT_IN_BINARY32 = 1 << 24
 _LINE_LENGTH = 120
 

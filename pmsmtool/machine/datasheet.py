@@ -17,7 +17,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K
-from pmsmtool.units import format_quantity
+from pmsmtool.units import RAD_S_PER_RPM, RPM_PER_RAD_S, format_quantity
 
 Between = Literal["line-line", "phase"]
 Connection = Literal["star", "delta"]
@@ -45,7 +45,7 @@ _CONFUSIONS: tuple[tuple[float, str], ...] = (
     (math.sqrt(1.5), "line-line rms and phase peak are mixed"),
     (math.sqrt(6.0), "line-line peak and phase rms are mixed"),
     (2.0, "a line-line amplitude and a peak-to-peak value are mixed"),
-    (60.0 / (2.0 * math.pi), "rpm and rad/s are mixed"),
+    (RPM_PER_RAD_S, "rpm and rad/s are mixed"),
     (3.0 / 2.0, "a power-invariant constant: 3/2 is counted once or twice"),
 )
 _CONFUSION_WIDTH = 0.02
@@ -139,14 +139,13 @@ class DatasheetResult:
     warnings: tuple[str, ...]
 
 
-_RPM = 2.0 * math.pi / 60.0
 _NUMBER = r"\s*([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)\s*"
 _PER_SPEED: dict[str, float] = {
-    "krpm": 1.0 / (1000.0 * _RPM),
-    "1000rpm": 1.0 / (1000.0 * _RPM),
-    "1000min-1": 1.0 / (1000.0 * _RPM),
-    "rpm": 1.0 / _RPM,
-    "min-1": 1.0 / _RPM,
+    "krpm": 1.0 / (1000.0 * RAD_S_PER_RPM),
+    "1000rpm": 1.0 / (1000.0 * RAD_S_PER_RPM),
+    "1000min-1": 1.0 / (1000.0 * RAD_S_PER_RPM),
+    "rpm": 1.0 / RAD_S_PER_RPM,
+    "min-1": 1.0 / RAD_S_PER_RPM,
     "(rad/s)": 1.0,
     "rad/s": 1.0,
 }
@@ -202,7 +201,7 @@ def parse_emf_constant(text: str, between: Between | None, kind: Kind | None = N
     elif (emf := _EMF.fullmatch(plain)) and emf[4] in _PER_SPEED:
         value, written = _scaled(emf[1], emf[2]) * _PER_SPEED[emf[4]], emf[3]
     elif (speed := _SPEED_CONSTANT.fullmatch(plain)) and float(speed[1]) > 0.0:
-        value, written = 1.0 / (float(speed[1]) * _RPM), speed[2]
+        value, written = 1.0 / (float(speed[1]) * RAD_S_PER_RPM), speed[2]
     if not value > 0.0:
         raise ConfigError(f"{text!r} is no back-EMF constant", hint="write it like 58Vrms/krpm, 0.39Vpks/rad or 0.41Wb")
     if between is None:
@@ -366,7 +365,7 @@ def _plausibility(machine: MachineParameters, inverter: InverterParameters) -> l
     if not 1e-4 <= tau_e <= 1.0:
         found.append(f"L/R = {format_quantity(tau_e, 's')} is unusual for a machine (0.1 ms to 1 s): check the units")
     if machine.n_nom_rpm is not None:
-        emf = machine.psi_f_wb * machine.pole_pairs * machine.n_nom_rpm * _RPM
+        emf = machine.psi_f_wb * machine.pole_pairs * machine.n_nom_rpm * RAD_S_PER_RPM
         if emf > inverter.V_max_v:
             found.append(
                 f"the back-EMF at rated speed is {emf:.4g} V peak, above the {inverter.V_max_v:.4g} V "

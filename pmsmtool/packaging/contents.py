@@ -12,8 +12,18 @@ PACKAGE_SUFFIXES = frozenset(
 """Kinds of files the package may hold; a tracked file of another kind fails ``tests/packaging``."""
 
 DATA_FOLDERS: tuple[str, ...] = ("profiles", "firmware-params")
-SOURCE_FOLDERS: tuple[str, ...] = ("pmsmtool", *DATA_FOLDERS, "tests", "benchmarks", ".ci")
-SOURCE_FILES: tuple[str, ...] = ("pyproject.toml", "README.md", ".gitignore")
+SOURCE_FOLDERS: tuple[str, ...] = ("pmsmtool", *DATA_FOLDERS, "tests", "benchmarks", "docs", ".github", ".ci")
+SOURCE_FILES: tuple[str, ...] = (
+    "pyproject.toml",
+    "README.md",
+    "LICENSE",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "CITATION.cff",
+    ".gitignore",
+    ".editorconfig",
+    ".pre-commit-config.yaml",
+)
 
 _GENERATED = frozenset({"__pycache__", "_native", BUNDLE})
 

@@ -289,10 +289,17 @@ def _colours(count: int) -> list[str]:
 def svg(canvas: Canvas) -> str:
     """Return a figure as SVG text without what changes from run to run, ids only where something refers to them."""
     import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     out = io.StringIO()
     metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
     with matplotlib.rc_context(_STYLE):
+        # Lay out once, with the renderer of SVG: with a layout engine, savefig draws the figure twice.
+        FigureCanvasSVG(canvas)
+        canvas.dpi = FigureCanvasSVG.fixed_dpi
+        if engine := canvas.get_layout_engine():
+            engine.execute(canvas)
+            canvas.set_layout_engine(None)
         canvas.savefig(out, format="svg", metadata=metadata)
     text = out.getvalue()
     used = set(_REFERENCE.findall(text))

@@ -181,17 +181,17 @@ class PmsmSimBus(can.BusABC):
         """Take a frame of the line (called by the line)."""
         if self._pulled:
             return
-        flags = frame.flags
+        can_id, data, flags, dlc = frame
         self._queue.append(
             can.Message(
-                timestamp=self.clock.now_ns / NS,
-                arbitration_id=frame.can_id,
-                is_extended_id=bool(flags & EXTENDED),
-                is_remote_frame=bool(flags & REMOTE),
-                is_error_frame=self._deaf,
-                channel=self._key,
-                dlc=frame.dlc if flags & REMOTE else len(frame.data),
-                data=bytearray(frame.data),
+                self.clock.now_ns / NS,
+                can_id,
+                bool(flags & EXTENDED),
+                bool(flags & REMOTE),
+                self._deaf,
+                self._key,
+                dlc if flags & REMOTE else len(data),
+                bytearray(data),
                 is_rx=not own,
             )
         )
@@ -206,6 +206,7 @@ class PmsmSimBus(can.BusABC):
         paced = self._speed is not None or threading.get_ident() not in self._drivers
         clock = self.clock
         deadline = NEVER if timeout is None else clock.now_ns + max(POLL_NS, round(timeout * NS))
+        queue = self._queue
         while True:
             message = self._next_message()
             if message is not None:
@@ -215,7 +216,7 @@ class PmsmSimBus(can.BusABC):
                     return None, True
                 continue
             with clock.held:
-                if self._queue:
+                if queue:
                     continue
                 if clock.now_ns >= deadline:
                     return None, True

@@ -11,6 +11,7 @@ NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
 ``nodes``  number of drives on the line, with consecutive node ids and serial numbers; default 1
 ``drive``  family whose object dictionary the drive shows (``firmware-params``), or the path of a map file; default:
            the reference drive's own
+``eds``    EDS or DCF of a maker's drive, or ``TABLE.csv#FAMILY``: the drive has those objects and no others
 ``tier``   ``inject`` or ``recorder``: the reference drive without its averages, without its excitation too
 ``filter`` time constant (s) of a set-point filter behind the torque slope; default: none
 ``jitter`` how late (s) a process data object is sent at most; default: not late
@@ -34,6 +35,7 @@ from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.faults import load_faults
 from pmsmtool.sim.line import Line
+from pmsmtool.sim.node.face import DriveFace
 from pmsmtool.sim.node.factory import drive_settings
 from pmsmtool.sim.node.family import TIER_HIDES, Face, Reduced
 from pmsmtool.sim.node.lss import UNCONFIGURED
@@ -71,6 +73,7 @@ class Channel:
     nodes: int = 1
     speed: float | None = None
     drive: str | None = None
+    eds: str | None = None
     tier: str | None = None
     filter: float = 0.0
     jitter: float = 0.0
@@ -115,6 +118,7 @@ _KEYS: dict[str, Callable[[str], Any]] = {
     "nodes": _whole(1, 127),
     "speed": _positive,
     "drive": str,
+    "eds": str,
     "tier": _tier,
     "filter": _short_time,
     "jitter": _short_time,
@@ -159,19 +163,31 @@ def _storage(channel: Channel, stem: str, position: int) -> Storage:
     return FileStorage(path if position == 0 else path.with_name(f"{path.stem}-{position + 1}{path.suffix}"))
 
 
-def _face(channel: Channel) -> Face | Reduced | None:
+def _face(channel: Channel, machine_file: MachineFile) -> DriveFace | None:
     """Return what the channel's drives show instead of the reference drive's whole dictionary.
 
     Raises
     ------
     ConfigError
-        There is no such family, or a tier of a family that is not the reference drive.
+        There is no such family or file, or a tier of a family that is not the reference drive.
     """
+    if channel.eds is not None:
+        return _makers_drive(channel, machine_file)
     if channel.drive in (None, OWN_FAMILY):
         return None if channel.tier is None else Reduced(channel.tier)
     if channel.tier is not None:
         raise ConfigError("tier is of the reference drive, not of another family", where=f"channel {channel.name}")
     return Face(_map(str(channel.drive)))
+
+
+def _makers_drive(channel: Channel, machine_file: MachineFile) -> DriveFace:
+    from pmsmtool.sim.foreign.behind import set_up_of
+    from pmsmtool.sim.foreign.drive import ForeignDrive
+    from pmsmtool.sim.foreign.file_rows import read_makers_objects
+
+    if channel.drive is not None or channel.tier is not None:
+        raise ConfigError("eds says what the drive has; drive and tier do, too", where=f"channel {channel.name}")
+    return ForeignDrive(read_makers_objects(str(channel.eds)), set_up_of(machine_file))
 
 
 def _map(drive: str) -> DriveMap:
@@ -221,8 +237,9 @@ def build_line(
         )
     path = machine_path(channel.name)
     machine_file = load_machine_file(path)
-    face = _face(channel)
-    stem = f"{path.stem}-{Path(str(channel.drive)).stem}" if isinstance(face, Face) else path.stem
+    face = _face(channel, machine_file)
+    other = channel.drive if channel.eds is None else channel.eds.replace("#", "-").replace("/", "-")
+    stem = path.stem if face is None or isinstance(face, Reduced) else f"{path.stem}-{Path(str(other)).stem}"
     plan = None if channel.faults is None else load_faults(channel.faults)
     seed = int(machine_file.simulation.get("seed", 0)) if channel.seed is None else channel.seed  # type: ignore[arg-type]
     line = Line(channel.bitrate or bitrate, plan, seed=seed, instant=instant)

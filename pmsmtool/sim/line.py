@@ -136,7 +136,8 @@ class Line:
         self._on_wire = sender, frame
         duration_ns = self._duration_ns(frame)
         self.wire_ns += duration_ns
-        self.clock.at(self.clock.now_ns + duration_ns, self._arrive)
+        clock = self.clock
+        clock.at(clock.now_ns + duration_ns, self._arrive)
 
     def _arrive(self) -> None:
         if self._on_wire is None:

@@ -8,7 +8,6 @@ of switch and diode) is taken out of it for the phase, so that the loop is what 
 from __future__ import annotations
 
 import ctypes
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -17,6 +16,7 @@ from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.sim.kernel import Application, Rotor, Setup, library
+from pmsmtool.units import RAD_S_PER_RPM
 
 NEXT_STEP = "`pmsmtool help simulation` lists the keys of [simulation]"
 
@@ -38,7 +38,7 @@ UNBALANCE_SHARE = 0.5
 WRONG_COMPENSATION = 1.4
 """Plateau of ``compensation = "wrong"`` over the right one."""
 
-RPM = math.pi / 30.0
+RPM = RAD_S_PER_RPM
 """rad/s per rpm."""
 
 

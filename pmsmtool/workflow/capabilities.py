@@ -7,13 +7,23 @@ nothing is said.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import TypeVar
 
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.mapped_recorder_drive import records_pushes
+from pmsmtool.drive.motion_objects import (
+    NO_RATED,
+    position_units,
+    rated_apk,
+    shown_current,
+    torque_target,
+    undecided,
+    watched_by_tool,
+)
 from pmsmtool.drive.objects import SUPPORTED_MODES
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.recorder_choice import described
@@ -21,6 +31,8 @@ from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
 from pmsmtool.firmware.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
+
+T = TypeVar("T")
 
 
 class Tier(StrEnum):
@@ -51,19 +63,21 @@ FEATURES: Mapping[str, str] = {
     "abort option": "abort connection option (0x6007)",
     "quick stop": "quick stop option (0x605A)",
     "limits": "its own current and speed limit (0x6073, 0x6075, 0x6080)",
+    "supervision": "consumer heartbeat (0x1016), or node guarding (0x100C, 0x100D)",
+    "rated current": NO_RATED,
     "set-points": "current set-points for d and q",
     "excitation": "voltage or current injection",
     "averages": "averages inside the drive",
     "recorder": "a recorder of currents and voltages that this program reads",
     "torque mode": "torque mode (0x6502 bit 3 or 9)",
-    "position": "position in increments of a known number per turn (0x6064, 0x608F)",
+    "position": "position in increments of a known number per turn (0x6064 with 0x608F, or in a map of its maker)",
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
     "vendor R": "the maker's identification of R, with its result, in a map that names this drive",
     "vendor L": "the maker's identification of L, with its result, in a map that names this drive",
     "vendor psi": "the maker's identification of psi, with its result, in a map that names this drive",
     "vendor poles": "the maker's identification of the pole pairs, with its result, in a map that names this drive",
     "line voltage": "the DC link (0x6079), or the machine's voltage in the drive map",
-    "current": "its current (0x6078)",
+    "current": "its current (0x6078) or torque (0x6077)",
     "bench supply": "a bench supply whose power a person reads (`pmsmtool identify R --supply`)",
 }
 """What methods need, as a person reads it."""
@@ -71,8 +85,10 @@ FEATURES: Mapping[str, str] = {
 _SAFE = ("heartbeat", "abort option", "quick stop", "limits")
 _INJECT = (*_SAFE, "set-points", "excitation", "recorder")
 _RECORD = (*_SAFE, "recorder", "torque mode")
-_STANDARD = (*_SAFE, "position", "commutation angle")
-_PUSH = (*_SAFE, "torque mode", "position", "current")
+_BOUNDED = ("supervision", "rated current")
+"""What is safe where every command is a current that this program bounds: it replaces limits that the drive lacks."""
+_STANDARD = (*_BOUNDED, "position", "commutation angle")
+_PUSH = (*_BOUNDED, "torque mode", "position", "current")
 _WATCHED = (*_SAFE, "position", "current")
 """What the guard needs while the drive runs by itself."""
 
@@ -123,7 +139,7 @@ NOTES: Mapping[tuple[str, Method], str] = {
     ("psi", Method.RECORDER): "the drive must commutate already",
     ("psi", Method.STANDARD): "where the voltage limit is within the speed limit, or the drive shows its voltage",
     ("mechanics", Method.RECORDER): "J/psi and tau_c/psi",
-    ("mechanics", Method.STANDARD): "J/psi and tau_c/psi; the pole pairs must be known",
+    ("mechanics", Method.STANDARD): "J/psi and tau_c/psi; over the torque constant where the pole pairs are not known",
     ("L", Method.VENDOR): "one inductance for both axes, unless the map has a result for each",
 }
 
@@ -207,6 +223,10 @@ class Capabilities:
         Keys of :data:`FEATURES` it has.
     recorder : str
         What a maker's recorder takes, or why it is not read; empty where the map names none.
+    replaced : tuple of str
+        Limits that the drive does not keep by itself, and what replaces them.
+    current_undecided : bool
+        Whether no source says if its amperes are peak or rms.
     """
 
     identity: Identity
@@ -214,12 +234,14 @@ class Capabilities:
     map_is_drives: bool
     features: frozenset[str]
     recorder: str = ""
+    replaced: tuple[str, ...] = ()
+    current_undecided: bool = False
 
     @property
     def tier(self) -> Tier:
         """The highest tier whose needs are met."""
         for tier, needs in _TIERS:
-            if self.features >= set(needs):
+            if self.features >= {*needs, *self._always}:
                 return tier
         return Tier.VENDOR if any(self.row(name, Method.VENDOR).available for name in NEEDS) else Tier.MANUAL
 
@@ -237,11 +259,15 @@ class Capabilities:
         """Return one way to one quantity."""
         if method not in NEEDS[quantity]:
             return Row(quantity, method, (f"another method: {quantity} has no {method} method",))
-        missing = tuple(FEATURES[need] for need in NEEDS[quantity][method] if need not in self.features)
+        needs = NEEDS[quantity][method]
+        needs = tuple(dict.fromkeys((*self._always, *needs))) if needs else needs
+        missing = tuple(FEATURES[need] for need in needs if need not in self.features)
         expected, note = EXPECTED.get((quantity, method), ()), NOTES.get((quantity, method), "")
         if method is Method.INJECT and "averages" not in self.features:
             expected = FROM_RECORDS.get(quantity, ())  # the others come from drives that average by themselves
             note = "; ".join(part for part in (note, "means are made from records") if part)
+        if self.current_undecided and (quantity, method) == ("mechanics", Method.STANDARD):
+            expected, note = (), f"{note}; {UNDECIDED}"
         if method is Method.RECORDER and not self.drive_map.staging:
             expected = ()  # those were measured with the reference drive's recorder
         return Row(quantity, method, missing, expected, note)
@@ -250,6 +276,11 @@ class Capabilities:
         """Return the first measuring method of a quantity that is available."""
         rows = (self.row(quantity, method) for method in NEEDS[quantity] if method in MEASURING)
         return next((row for row in rows if row.available), None)
+
+    @property
+    def _always(self) -> tuple[str, ...]:
+        """What every motion needs: a reference drive without its own safety is not moved by a lower tier either."""
+        return _SAFE if self.drive_map.staging else ()
 
     def require(self, quantities: Sequence[str], method: Method | None) -> Method:
         """Return the method that gives all the quantities: the one asked for, else the first that does.
@@ -286,13 +317,14 @@ class Capabilities:
         return str(method or (best.method if best else ""))
 
 
+UNDECIDED = "no source says whether its amperes are peak or rms: +-17 % more"
 MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD, Method.VENDOR)
 """Methods that measure, the best first."""
 _TIERS = (
     (Tier.FULL, (*_INJECT, "averages")),
     (Tier.INJECT, _INJECT),
     (Tier.RECORDER, _RECORD),
-    (Tier.STANDARD, (*_SAFE, "torque mode")),
+    (Tier.STANDARD, (*_BOUNDED, "torque mode")),
 )
 
 
@@ -320,21 +352,22 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     drive_map = choose_map(identity, given)
     node.map = drive_map
     modes = _modes(node)
+    rated = _told(lambda: rated_apk(node))
     has = {
         "heartbeat": node.has(0x1016, 1),
         "abort option": node.has(0x6007, 0),
         "quick stop": node.has(0x605A, 0),
         "limits": all(node.has(index, 0) for index in (0x6073, 0x6075, 0x6080)),
-        "position": node.has(0x6064, 0) and node.has(0x608F, 1),
-        "current": node.has(0x6078, 0),
+        "rated current": rated is not None,
+        "position": node.has(0x6064, 0) and bool(_told(lambda: position_units(node))),
+        "current": _told(lambda: shown_current(node, rated or 1.0)) is not None,
         "line voltage": node.has(0x6079, 0) or {"u_d_v", "u_q_v"} <= set(drive_map.signals),
-        "torque mode": drive_map.capabilities.torque_mode
-        and bool(modes & (_bit(Mode.PROFILE_TORQUE) | _bit(Mode.CYCLIC_TORQUE)))
-        and node.has(0x6071, 0),
+        "torque mode": _told(lambda: torque_target(node, rated or 1.0)) is not None,
         "commutation angle": drive_map.capabilities.commutation_angle
         and bool(modes & _bit(Mode.CYCLIC_TORQUE_ANGLE))
         and node.has(0x60EA, 0),
     }
+    has["supervision"] = has["heartbeat"] or (node.has(0x100C, 0) and node.has(0x100D, 0))
     if drive_map.staging:  # only then these objects are what the reference drive has there
         has |= {
             "set-points": node.has(0x2052, 1),
@@ -347,7 +380,17 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     if named:  # whatever starts a drive's own identification is not tried on another drive
         found |= {f"vendor {name}" for name in _vendor_quantities(node, drive_map)}
         found |= {"recorder"} if records_pushes(node) else set()
-    return Capabilities(identity, drive_map, named, frozenset(found), described(node))
+    replaced = () if rated is None or drive_map.staging else tuple(watched_by_tool(node, rated))
+    shown = _told(lambda: undecided(node, rated or 1.0)) or False
+    return Capabilities(identity, drive_map, named, frozenset(found), described(node), replaced, shown)
+
+
+def _told(ask: Callable[[], T]) -> T | None:
+    """Return what the drive tells, None where it does not."""
+    try:
+        return ask()
+    except (NotAvailable, SdoAbort):
+        return None
 
 
 def _vendor_quantities(node: DriveNode, drive_map: DriveMap) -> frozenset[str]:
@@ -378,7 +421,7 @@ def _modes(node: DriveNode) -> int:
 
 def reference_capabilities(identity: Identity) -> Capabilities:
     """Return what the reference drive with everything gives, for tests and documentation."""
-    every = frozenset(_INJECT) | frozenset(_RECORD) | frozenset(_PUSH) | {"averages", "line voltage"}
+    every = frozenset(_SAFE) | frozenset(_INJECT) | frozenset(_RECORD) | frozenset(_PUSH) | {"averages", "line voltage"}
     return Capabilities(identity, reference_map(), True, every)
 
 

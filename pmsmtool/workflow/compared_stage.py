@@ -7,7 +7,8 @@ from collections.abc import Collection
 from dataclasses import replace
 
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.standard_drive import ENCODER_COUNTS, MOTOR_TURNS, RecorderDrive
+from pmsmtool.drive.motion_objects import ENCODER_COUNTS, MOTOR_TURNS
+from pmsmtool.drive.standard_drive import RecorderDrive
 from pmsmtool.errors import ConfigError, Contradiction, SafetyRefusal, SdoAbort
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import default_set

@@ -16,6 +16,7 @@ from pmsmtool.experiments import frequency_response
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.npz_file import npz_bytes
 from pmsmtool.trace import Trace
+from pmsmtool.units import rpm_from_rad_s
 from pmsmtool.workflow.mechanics_stage import in_frame, numbered, torque_doubt, torque_of
 from pmsmtool.workflow.run_directory import RunDirectory
 
@@ -71,7 +72,7 @@ def measure_frequency_response(
         level, SPEED_SHARE * largest, J, 1.5 * pole_pairs * psi, drive.period_s
     )
     say(
-        f"frequency response: random current of {plan.i_q_a:.3g} A at {plan.omega_rad_s * 30.0 / math.pi:.0f} rpm, "
+        f"frequency response: random current of {plan.i_q_a:.3g} A at {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm, "
         f"{plan.duration_s(drive.period_s):.2g} s"
     )
     if planned is not None:

@@ -29,6 +29,7 @@ from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, M
 from pmsmtool.machine.temperature import magnet_tolerance_per_k
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
+from pmsmtool.units import rad_s_from_rpm
 from pmsmtool.workflow import frequency_stage, half_frequency, identify_verdict, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_tolerance
 from pmsmtool.workflow.evaluate import evaluate
@@ -168,7 +169,7 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
     if machine.I_nom_apk is None or machine.n_max_rpm is None:
         raise ConfigError("rated current and largest speed must be known", hint="give --i-max and --speed-max")
     i_max = HEADROOM * machine.I_nom_apk if request.i_max_apk is None else request.i_max_apk
-    speed = machine.n_max_rpm * math.pi / 30.0 if request.speed_max_rad_s is None else request.speed_max_rad_s
+    speed = rad_s_from_rpm(machine.n_max_rpm) if request.speed_max_rad_s is None else request.speed_max_rad_s
     i_d_min = nameplate.limits.i_d_min_apk
     return Envelope(
         i_max_apk=i_max,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.units import format_current
+from pmsmtool.units import format_current, rpm_from_rad_s
 
 LEAST_SPEED_SHARE = 0.03
 """Least speed limit for what turns the shaft, of the drive's largest speed: the first push, a tenth of the rated
@@ -59,7 +59,7 @@ def require_speed(omega_max_rad_s: float, n_max_rpm: float) -> None:
     IdentificationError
         ``E_EXCITATION``: the limit is below its share of the largest speed.
     """
-    least, given = LEAST_SPEED_SHARE * n_max_rpm, omega_max_rad_s * 30.0 / math.pi
+    least, given = LEAST_SPEED_SHARE * n_max_rpm, rpm_from_rad_s(omega_max_rad_s)
     if given < least:
         raise refuse(
             "E_EXCITATION",

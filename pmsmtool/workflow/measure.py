@@ -96,7 +96,10 @@ def starting_gains(limits: Limits) -> dict[str, float]:
     K_p = START_GAIN_SHARE * limits.V_max_v / limits.I_nom_apk
     gains = {"K_p_d_v_per_a": K_p, "K_p_q_v_per_a": K_p}
     gains |= {f"K_i_{axis}_v_per_as": START_INTEGRAL_RATE_RAD_S * K_p for axis in "dq"}
-    return {f"current.{name}": min(gain, BY_NAME[f"current.{name}"].maximum) for name, gain in gains.items()}
+    wanted = {f"current.{name}": gain for name, gain in gains.items()}
+    # the loop that holds a bias takes its gain from the inductances
+    wanted |= {f"motor.L_{axis}_h": K_p / square_injection.BIAS_BANDWIDTH_RAD_S for axis in "dq"}
+    return {name: min(value, BY_NAME[name].maximum) for name, value in wanted.items()}
 
 
 @dataclass(slots=True)

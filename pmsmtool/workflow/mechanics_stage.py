@@ -21,6 +21,7 @@ from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.experiments import mechanics_run, speed_run
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.trace import Trace
+from pmsmtool.units import rpm_from_rad_s
 
 if TYPE_CHECKING:
     from pmsmtool.workflow.evaluate import Evaluation
@@ -78,7 +79,7 @@ def measure_mechanics(
     largest = min(limits.omega_max_rad_s, EMF_SHARE * limits.V_max_v / (pole_pairs * math.hypot(psi, L_q * current)))
     plan = mechanics_run.plan_mechanics(current, SPEED_SHARE * largest, J, 1.5 * pole_pairs * psi)
     say(
-        f"J, B, tau_c: pushes of {plan.i_q_a:.3g} A up to about {plan.omega_rad_s * 30.0 / math.pi:.0f} rpm and "
+        f"J, B, tau_c: pushes of {plan.i_q_a:.3g} A up to about {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm and "
         f"coasting with the voltage off, {plan.duration_s:.2g} s"
     )
     if planned is not None:

@@ -25,6 +25,7 @@ from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import drive_values
 from pmsmtool.sim.monte_carlo import Array, DriveRuns, Variation, cores, simulate_many
 from pmsmtool.sim.scenarios import Scenario, built_in
+from pmsmtool.units import rad_s_from_rpm
 
 BLOCK = 64
 """Drives of one block, which an executor gets as one task: about 0.1 s of work per simulated 0.1 s; fixed, because it
@@ -239,7 +240,7 @@ def _runs(task: SimulationTask, executor: SimulationExecutor | None, threads: in
 
 
 def _quantities(design: Design, run: DriveRuns, torque_nm: float) -> dict[str, Array]:
-    trip_rad_s = design["protection.n_trip_rpm"] * math.pi / 30.0
+    trip_rad_s = rad_s_from_rpm(design["protection.n_trip_rpm"])
     return {
         "simulated_current": 1.0 - run.i_peak_a / design["motor.I_max_apk"],
         "simulated_voltage": 1.0 - run.u_peak / design["inverter.voltage_utilisation"],

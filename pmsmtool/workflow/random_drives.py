@@ -23,6 +23,7 @@ from pmsmtool.machine.parameters import (
     MachineLimits,
     MachineParameters,
 )
+from pmsmtool.units import rpm_from_rad_s
 
 Block = Literal["ideal", "timing", "gains"]
 """Sensors: ideal gains and timing; unknown lag and sampling shift; gains off within their tolerance."""
@@ -77,7 +78,7 @@ SAMPLING_SHIFT_SHARE = (0.0, 0.10)
 
 
 def draw_drive(seed: int, block: Block = "ideal") -> MachineFile:
-    """Return drive number ``seed`` of the population (identification reference, section 1, with a switched inverter).
+    """Return drive number ``seed`` of the population (docs/identification.md, 1, with a switched inverter).
 
     Emf at base speed is 0.60 to 0.75 of U_dc/sqrt(3), the resistive drop at rated current 2 to 12 % and the inductive
     one 12 to 45 % of the emf, L_q/L_d 1 to 2.2; currents are log-uniform.
@@ -95,7 +96,7 @@ def draw_drive(seed: int, block: Block = "ideal") -> MachineFile:
     tau_nom = 1.5 * pole_pairs * psi_f * I_nom
     omega_M = omega_base / pole_pairs
     J = tau_nom * _log_uniform(rng, ACCELERATION_TIME_S) / omega_M
-    n_nom = omega_M * 30.0 / math.pi
+    n_nom = rpm_from_rad_s(omega_M)
     machine = MachineParameters(
         pole_pairs=pole_pairs,
         R_s_ohm=float(rng.uniform(*RESISTIVE_SHARE)) * emf / I_nom,

@@ -16,6 +16,7 @@ from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import speed_run
 from pmsmtool.experiments.shaft_answer import FIRST_S, FIRST_SHARE
 from pmsmtool.trace import Trace
+from pmsmtool.units import rpm_from_rad_s
 from pmsmtool.workflow.limits import Limits
 
 EMF_SHARE = 0.8
@@ -187,11 +188,11 @@ class SpeedStage:
                 "speed.K_p_nms_per_rad": 2.0 * SPEED_LOOP_RAD_S * J,
                 "speed.K_i_nm_per_rad": SPEED_LOOP_RAD_S**2 * J,
                 "speed.tau_max_nm": 1.6 * J * per_ampere * i_run,
-                "speed.acceleration_rpm_per_s": per_ampere * i_run * 30.0 / math.pi,
+                "speed.acceleration_rpm_per_s": rpm_from_rad_s(per_ampere * i_run),
             }
         )
         self.drive.enable()
-        fastest_rpm = largest * 30.0 / math.pi
+        fastest_rpm = rpm_from_rad_s(largest)
         self.say(f"psi_f and fine offset: coasting from up to {fastest_rpm:.0f} rpm, i_d up to {run_i_d:.3g} A")
         plan = speed_run.SpeedPlan(
             largest,

@@ -30,7 +30,8 @@ BIAS_MOST = 0.8
 RIPPLE_LEAST = 0.2
 """Smallest ripple, of the wanted one, that the inverter's knee may leave: below, noise decides."""
 CROSSING = 0.433
-"""A ripple on q reaches the phases at half the bias by sqrt(3)/4 of its peak-to-peak value (reference, 3.2)."""
+"""A ripple on q reaches the phases at half the bias by sqrt(3)/4 of its peak-to-peak value
+(docs/identification.md, 3.2)."""
 U_SHARE = 0.5
 """Largest injection amplitude, of the largest voltage."""
 
@@ -47,7 +48,7 @@ def clear_ripple(wanted_a: float, bias_a: float, knee_a: float, angle_rad: float
 def bias_and_ripple(I_test_apk: float, ripple_share: float, knee_a: float) -> tuple[float, float]:
     """Return the d bias and the ripple, peak to peak (A), of the square wave.
 
-    No phase current may come into the inverter's knee: bias above 2 (0.433 ripple + knee) (identification reference,
+    No phase current may come into the inverter's knee: bias above 2 (0.433 ripple + knee) (docs/identification.md,
     3.2). A steep inverter leaves half the test current; a soft one raises the bias, then lowers the ripple.
 
     Parameters

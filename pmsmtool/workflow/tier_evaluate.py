@@ -24,11 +24,13 @@ from pmsmtool.estimators.rotation_offset import offset_by_turns
 from pmsmtool.estimators.supply_power import resistance_by_supply
 from pmsmtool.estimators.voltage_flux import flux_by_undriven_voltage, flux_by_voltage_limit
 from pmsmtool.files import read_text
+from pmsmtool.firmware.drive_map import TORQUE_FACTOR
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K, magnet_tolerance_per_k
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
+from pmsmtool.units import RPM_PER_RAD_S
 from pmsmtool.workflow.calibration import calibrated_traces
 from pmsmtool.workflow.evaluate import tolerance_on
 from pmsmtool.workflow.identify import (
@@ -57,6 +59,7 @@ SUPPLY_LEVELS = "supply_levels"
 NO_VOLTAGE = "needs injection, or a recorder of voltages at loop rate"
 NO_POLE_PAIRS = "needs the pole pairs: mode 11, an object in the drive's map, or a machine file"
 NO_LINK = "needs the DC link (0x6079) or the machine's voltage"
+UNDECIDED = "no source says whether this drive's amperes are peak or rms: the interval holds for both"
 Voltage = Literal["machine", "link", ""]
 
 
@@ -103,6 +106,8 @@ class TierFacts:
         Where what completes the values comes from (``nameplate.toml``); empty: nothing does.
     traces : tuple of str
         Names of the traces in the order they were taken.
+    current_undecided : bool
+        Whether no source says if the drive's amperes are peak or rms; they were read as rms.
     """
 
     kind: Literal["recorder", "standard"]
@@ -116,6 +121,7 @@ class TierFacts:
     U_dc_v: float = 0.0
     source: str = ""
     traces: tuple[str, ...] = ()
+    current_undecided: bool = False
 
 
 def tier_result(
@@ -206,8 +212,12 @@ def _by_torque(
 ) -> tuple[dict[str, Estimate], dict[str, str]]:
     pushes = [trace for name, trace in traces.items() if name.startswith("torque_push")]
     pole_pairs = facts.pole_pairs
-    estimates = dict(estimate_ratios(pushes, pole_pairs=pole_pairs, tolerance=tolerance))
+    estimates = estimate_ratios(pushes, pole_pairs=pole_pairs or 1, tolerance=tolerance)
+    if facts.current_undecided:
+        estimates = {name: either_reading(estimate) for name, estimate in estimates.items()}
     missing = {"R_s_ohm": NO_POWER, "L_d_h, L_q_h": NO_VOLTAGE}
+    if not pole_pairs:
+        return over_torque_constant(estimates), {**missing, "psi_f_wb": NO_POLE_PAIRS}
     utilisation = UTILISATION if inverter is None else inverter.voltage_utilisation
     try:
         if facts.voltage == "machine":
@@ -229,11 +239,38 @@ def _by_torque(
     return estimates, missing
 
 
+def either_reading(ratio: Estimate) -> Estimate:
+    """Return a ratio to the current that holds whether the drive's amperes are rms, as they were read, or peak.
+
+    Read as peak they are sqrt 2 smaller, and so is the ratio: the middle, and half of what lies between, as systematic.
+    """
+    middle, half = 0.5 * (1.0 + math.sqrt(0.5)), 0.5 * (1.0 - math.sqrt(0.5))
+    systematic = math.hypot(middle * ratio.systematic, half * ratio.value)
+    return replace(
+        ratio, value=middle * ratio.value, std=middle * ratio.std, systematic=systematic, fallback=UNDECIDED
+    )  # fmt: skip
+
+
+def over_torque_constant(ratios: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Return the ratios to the flux linkage of one pole pair as ratios to the torque constant K_T (N m per A peak).
+
+    Without the pole pairs p, K_T = 1.5 p psi_f is what divides inertia and friction: 1.5 psi_f at one pole pair.
+    """
+    names = {"J_per_psi": ("J_per_kt", "kg m2 A/(N m)"), "tau_c_per_psi": ("tau_c_per_kt", "A")}
+    return {
+        names[key][0]: replace(
+            e, value=e.value / TORQUE_FACTOR, std=e.std / TORQUE_FACTOR, systematic=e.systematic / TORQUE_FACTOR,
+            unit=names[key][1],
+        )
+        for key, e in ratios.items()
+    }  # fmt: skip
+
+
 def below_voltage(facts: TierFacts, utilisation: float, psi_f_wb: float) -> str:
     """Return what the flux linkage needs of a run that did not reach the voltage limit."""
     text = f"needs a speed at which the voltage ends, and up to {facts.top_rpm:.0f} rpm it did not"
     if psi_f_wb > 0.0:
-        rpm = 30.0 / math.pi * utilisation * facts.U_dc_v / (psi_f_wb * facts.pole_pairs)
+        rpm = RPM_PER_RAD_S * utilisation * facts.U_dc_v / (psi_f_wb * facts.pole_pairs)
         text += f" (by the given flux linkage it ends at about {rpm:.0f} rpm with {facts.U_dc_v:.4g} V)"
     return f"{text}: allow a larger --speed-max, or lower the DC link"
 
@@ -278,7 +315,7 @@ def evaluated_stage(
         )  # fmt: skip
     if {"psi", "mechanics"} & set(request.quantities) and facts.kind == "standard" and not facts.pushed:
         result = replace(result, missing={**result.missing, "J_per_psi, psi_f_wb": NO_POLE_PAIRS})
-    if not any(TOLD_BY.get(name) in result.estimates for name in request.quantities):
+    if not any(set(TOLD_BY.get(name, ())) & set(result.estimates) for name in request.quantities):
         reasons = [f"{name}: not available: {why}" for name, why in result.missing.items()]
         raise NotAvailable("\n  - ".join(["nothing of what was asked could be told", *reasons]), where=str(run.path))
     designed = tier_machine(known, result.estimates, facts.source).machine

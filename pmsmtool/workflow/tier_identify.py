@@ -15,13 +15,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from pmsmtool.cia402 import HOMING_LOST
-from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope, largest_acceleration
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent, rated_apk
+from pmsmtool.drive.motion_objects import allowed, current_limits, rated_apk, speed_limits
+from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
 from pmsmtool.drive.tier_drives import TorqueDrive
-from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SdoAbort
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, push_both_ways, run_to_voltage
@@ -33,6 +33,7 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import InverterParameters
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
+from pmsmtool.units import RAD_S_PER_RPM
 from pmsmtool.workflow.capabilities import QUANTITIES, Capabilities, Method
 from pmsmtool.workflow.identify import REQUEST, IdentifyRequest, dump_request
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
@@ -63,9 +64,13 @@ DURATION_S = 600.0
 TOP_SHARE = 0.98
 """Speed at which a run-up is given up, of the largest one."""
 NO_LIMIT_RPM = 100_000.0
+OVER_TORQUE_CONSTANT = "J/K_T, tau_c/K_T from polled torque pushes; J/psi and psi need the pole pairs"
+"""What is told without pole pairs: nothing a design goes on from."""
+UNLIMITED_RPM = 1000.0
+"""Largest speed on a drive that has no limit of its own and tells none, unless a person or a machine file says more."""
 HEADROOM = 1.2
 """Largest current of the envelope over the test current."""
-RPM = math.pi / 30.0
+RPM = RAD_S_PER_RPM
 Keep = Callable[[str, Trace], None]
 Say = Callable[[str], None]
 
@@ -159,7 +164,8 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say 
                 keep("voltage_limit", top)
     voltage: Voltage = "machine" if shows_voltage else "link" if U_dc > 0.0 else ""
     return TierFacts(
-        "standard", pushed=True, voltage=voltage, top_rpm=plan.omega_top_rad_s / RPM, U_dc_v=max(0.0, U_dc)
+        "standard", pushed=True, voltage=voltage, top_rpm=plan.omega_top_rad_s / RPM, U_dc_v=max(0.0, U_dc),
+        current_undecided=drive.current_undecided,
     )  # fmt: skip
 
 
@@ -225,9 +231,21 @@ def tier_envelope(drive: CanopenDrive, request: IdentifyRequest, known: MachineF
     ------
     ConfigError
         The drive's largest speed is no limit, and none was given.
+    SafetyRefusal
+        The drive allows no current.
     """
-    rated = rated_apk(drive.node)
-    rpm = drive.node.get(objects.MAX_SPEED_RPM)
+    node = drive.node
+    rated = rated_apk(node)
+    for limit in current_limits(node, rated):  # what the drive allows now is not raised
+        held = allowed(node, iter((limit,)))
+        rated = rated if held is None else min(rated, held[1] / HEADROOM)
+    speed = allowed(node, speed_limits(node))
+    if speed is not None:
+        rpm = speed[1]
+    elif "motor.n_max_rpm" in node.map.cells:
+        rpm = drive.parameters.read_value("motor.n_max_rpm")
+    else:
+        rpm = UNLIMITED_RPM
     if known is not None:
         rated = min(rated, known.machine.I_nom_apk or math.inf)
         rpm = min(rpm, known.machine.n_max_rpm or math.inf)
@@ -236,6 +254,12 @@ def tier_envelope(drive: CanopenDrive, request: IdentifyRequest, known: MachineF
             f"the drive's largest speed (0x6080) is {rpm:.0f} rpm: that is no limit", hint="give --speed-max"
         )
     i_max = HEADROOM * rated if request.i_max_apk is None else request.i_max_apk
+    if not i_max > 0.0:
+        raise SafetyRefusal(
+            "the drive allows no current: its rated current or one of its limits (0x6073, 0x6072) is 0",
+            where=f"node {node.node}", likely="the drive is as it left its factory: the motor is not set up",
+            hint="run the maker's own set-up first",
+        )  # fmt: skip
     return Envelope(
         i_max_apk=i_max,
         speed_max_rad_s=rpm * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,
@@ -269,9 +293,11 @@ def can_measure(
     if turns and {"poles", "encoder"} & set(asked):
         lines.append("pole pairs, direction, offset from a vector turned by the commutation angle")
     pole_pairs = turns or known is not None or "motor.pole_pairs" in found.drive_map.cells
-    pushes = found.row("mechanics", Method.STANDARD).available and bool({"psi", "mechanics"} & set(asked))
-    if pole_pairs and pushes:
+    available = found.row("mechanics", Method.STANDARD).available
+    if available and pole_pairs and {"psi", "mechanics"} & set(asked):
         lines.append("J/psi, tau_c/psi from polled torque pushes, psi from the voltage limit or the coasting machine")
+    elif available and "mechanics" in asked:
+        lines.append(OVER_TORQUE_CONSTANT)
     return lines
 
 
@@ -324,7 +350,8 @@ def tier_stage(
             hint="`pmsmtool commission MACHINE` takes them from a machine file (`pmsmtool machine new` writes one)",
         )
     moves.append(f"the shaft does not come back to where it stood: {HOMING_LOST}")
-    allow_motion([*envelope.lines(), *moves, "nothing is stored in the drive; every changed object is restored"])
+    stored = "nothing is stored in the drive; every changed object is restored"
+    allow_motion([*envelope.lines(), *found.replaced, *moves, stored])
     clock = drive.node.connection.clock
     start = clock.now()
     names: dict[str, None] = {}
@@ -366,8 +393,8 @@ def _standard(
             hold_for_supply(turning, envelope, envelope.i_max_apk / HEADROOM, read_supply, keep, say)
         if turns:
             turn_both_ways(turning, envelope, keep, say)
-    pushes = bool(asked & {"psi", "mechanics"}) and found.row("mechanics", Method.STANDARD).available
-    if not pushes or not (turns or facts.pole_pairs):
+    told = {"psi", "mechanics"} if turns or facts.pole_pairs else {"mechanics"}
+    if not asked & told or not found.row("mechanics", Method.STANDARD).available:
         return facts
     pushing = TorqueDrive(connection, node, drive_map=found.drive_map)
     try:

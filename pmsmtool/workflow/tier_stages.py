@@ -36,7 +36,7 @@ from pmsmtool.workflow.measure import QUANTITIES
 from pmsmtool.workflow.prove.stage import ProofRequest, prove_stage
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 from pmsmtool.workflow.tier_evaluate import NO_POLE_PAIRS
-from pmsmtool.workflow.tier_identify import can_measure, tier_stage
+from pmsmtool.workflow.tier_identify import OVER_TORQUE_CONSTANT, can_measure, tier_stage
 from pmsmtool.workflow.tier_machine import NEEDED, tier_machine
 from pmsmtool.workflow.vendor_identify import chain_stage, vendor_line
 from pmsmtool.workflow.verdicts import blocking
@@ -239,7 +239,8 @@ class TierStages:
     def _measurable(self) -> list[str]:
         if self.found.tier is Tier.INJECT:
             return [", ".join(QUANTITIES)]
-        return [*self._own_line(), *can_measure(self.drive, self.found, self.nameplate)]
+        told = can_measure(self.drive, self.found, self.nameplate)
+        return [*self._own_line(), *(line for line in told if line != OVER_TORQUE_CONSTANT)]
 
     def _own_line(self) -> list[str]:
         """Return what the drive's own identification tells; where a recorder measures with intervals, it is not run."""

@@ -18,11 +18,11 @@ from pmsmtool.workflow.run_directory import Acceptance, Stage
 from pmsmtool.workflow.tier_machine import TierMachine
 from pmsmtool.workflow.verdicts import NOT_ACCEPTED, STEP, Verdicts, verdicts_of
 
-TOLD_BY: Mapping[str, str] = {
-    "R": "R_s_ohm", "L": "L_q_app_h", "psi": "psi_f_wb", "encoder": "offset_rad", "poles": "pole_pairs",
-    "mechanics": "J_per_psi",
+TOLD_BY: Mapping[str, tuple[str, ...]] = {
+    "R": ("R_s_ohm",), "L": ("L_q_app_h",), "psi": ("psi_f_wb",), "encoder": ("offset_rad",), "poles": ("pole_pairs",),
+    "mechanics": ("J_per_psi", "J_per_kt"),
 }  # fmt: skip
-"""Key of the estimate that answers for a quantity."""
+"""Keys of the estimates of which one answers for a quantity."""
 NOT_TOLD = "E_NOT_MEASURED"
 
 
@@ -63,12 +63,12 @@ def judged(
         {name: estimate for name, estimate in at_the_test(estimates).items() if name in JUDGED or name in STANDS_FOR},
         machine,
     )
-    had = [STEP[name] for name, key in TOLD_BY.items() if key in estimates]
+    had = [STEP[name] for name, told in TOLD_BY.items() if set(told) & set(estimates)]
     lacking = {
         STEP[name]: IdentificationError(NOT_TOLD, why, hint="state it in MACHINE, or allow more current and speed")
-        for name, key in TOLD_BY.items()
+        for name, told in TOLD_BY.items()
         for keys, why in missing.items()
-        if key in keys.split(", ") and key not in estimates
+        if told[0] in keys.split(", ") and not set(told) & set(estimates)
     }
     return Judgement(acceptance, verdicts_of([name for name in asked if name in TOLD_BY], lacking, had, acceptance))
 
@@ -84,7 +84,7 @@ def stage_of(
         for name, e in estimates.items()
         if name not in rejected
     )
-    said = {TOLD_BY[name] for name in verdicts.refused}
+    said = {key for name in verdicts.refused for key in TOLD_BY[name]}
     lost = [f"{name} not told: {why}" for name, why in missing.items() if said & set(name.split(", "))]
     unsaid = {name: why for name, why in missing.items() if not said & set(name.split(", "))}
     refused = [f"{name} refused" for name, why in verdicts.refused.items() if why.startswith(NOT_ACCEPTED)]

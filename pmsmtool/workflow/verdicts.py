@@ -23,7 +23,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
 """Evaluations that another one takes values from."""
 KEYS: Mapping[str, tuple[str, ...]] = {
     "R": ("R_s_ohm",), "encoder": ("offset_rad",), "L": ("L_d_h", "L_q_h", "L_q_app_h"), "psi": ("psi_f_wb",),
-    "mechanics": ("J_kgm2", "J_per_psi"), "map": ("flux map",),
+    "mechanics": ("J_kgm2", "J_per_psi", "J_per_kt"), "map": ("flux map",),
 }  # fmt: skip
 """Keys of the machine file (and the map) whose intervals are judged for a quantity."""
 FOLLOWS: Mapping[str, str] = {

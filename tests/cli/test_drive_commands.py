@@ -506,3 +506,22 @@ def test_lss_with_nobody_to_configure(tool: Tool) -> None:
     assert "no unconfigured node" in tool("lss", "scan")[1]
     assert tool("lss", "set-node", "9", "--yes")[0] == 3
     assert tool("lss", "set-node", "1", "--yes")[0] == 2, "the id is taken"
+
+
+@pytest.mark.parametrize("command", ["flash_params", "restore", "param", "monitor"])
+def test_looking_at_a_drive_before_writing_has_a_deadline(
+    command: str, tool: Tool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every answer may come in time and the command still not end; the time of the person's answer does not count."""
+    arguments = {
+        "flash_params": ("flash-params", "set.toml", "--yes"),
+        "restore": ("restore", "--yes"),
+        "param": ("param", "set", "speed.filter_hz=150", "--yes"),
+        "monitor": ("monitor", "--for", "1s"),
+    }[command]
+    Path("set.toml").write_text(ParameterSet({"motor.pole_pairs": 5.0}).to_toml(), encoding="utf-8")
+    assert tool("flash-params", "set.toml", "--yes")[0] == 0
+    limit = "LOOKING_S" if command == "monitor" else "WHOLE_SET_S"
+    monkeypatch.setattr(f"pmsmtool.cli.{command}.{limit}", 1e-3)
+    code, _, told = tool(*arguments)
+    assert code == 3 and "the command takes too long" in told, (code, told)

@@ -28,7 +28,7 @@ def dictionary() -> canopen.ObjectDictionary:
     return canopen.import_od(str(data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds"))
 
 
-ON_OTHER_DRIVES = {"PROFILE_DECELERATION"}
+ON_OTHER_DRIVES = {"PROFILE_DECELERATION", "GUARD_TIME_MS", "LIFE_TIME_FACTOR"}
 """Objects that the tool reads where a drive has them, and the reference drive has not."""
 
 

@@ -19,7 +19,7 @@ from pmsmtool.resources import data_folder
 
 FOLDER = data_folder("firmware-params")
 FAMILIES = sorted(path.parent.name for path in FOLDER.glob("*/map.toml"))
-NAMED = {"epos4", "epos2", "copley", "nanotec", "synapticon", "faulhaber", "elmo", "ingenia", "pmsmsim"}
+NAMED = {"epos4", "epos2", "copley", "nanotec", "synapticon", "faulhaber", "elmo", "ingenia", "pmsmsim", "zeroerr"}
 
 GOOD = """\
 schema = "pmsmtool.drive-map/1"

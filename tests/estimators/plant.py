@@ -8,6 +8,7 @@ Integrated in the stator frame with explicit midpoint steps; nothing here knows 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -19,20 +20,36 @@ Vector = NDArray[np.float64]
 ROOT_3 = math.sqrt(3.0)
 
 
-def inverter_shape(kind: Vector, x: Vector) -> Vector:
-    """Odd shapes with limits +-1, none of which is a finite sum of the estimator's tail terms except by accident."""
-    shapes = [
-        2.0 / np.pi * np.arctan(x),
-        np.tanh(x),
-        np.where(np.abs(x) < 1.0, 0.5 * x, np.sign(x) * (1.0 - 0.5 / np.maximum(np.abs(x), 1.0))),
-        np.sign(x) * -np.expm1(-np.abs(x)),
-        x / np.sqrt(1.0 + x * x),
-        np.clip(x, -1.0, 1.0),
-    ]
-    return np.asarray(np.choose(kind.astype(int), shapes), dtype=np.float64)
+# Odd shapes with limits +-1, none of which is a finite sum of the estimator's tail terms except by accident.
+_SHAPES: tuple[Callable[[Vector], Vector], ...] = (
+    lambda x: 2.0 / np.pi * np.arctan(x),
+    np.tanh,
+    lambda x: np.where(np.abs(x) < 1.0, 0.5 * x, np.sign(x) * (1.0 - 0.5 / np.maximum(np.abs(x), 1.0))),
+    lambda x: np.sign(x) * -np.expm1(-np.abs(x)),
+    lambda x: x / np.sqrt(1.0 + x * x),
+    lambda x: np.minimum(np.maximum(x, -1.0), 1.0),
+)
+SHAPES = len(_SHAPES)
 
 
-SHAPES = 6
+def inverter_shape(kind: float, x: Vector) -> Vector:
+    """One of the shapes."""
+    return _SHAPES[int(kind)](x)
+
+
+def inverter_shapes(kinds: Sequence[tuple[int, NDArray[np.intp]]], x: Vector) -> Vector:
+    """The shape of each column of ``x``, given as pairs of shape and columns: only those that occur are computed."""
+    if len(kinds) == 1:
+        return _SHAPES[kinds[0][0]](x)
+    out = np.empty_like(x)
+    for kind, columns in kinds:
+        out[:, columns] = _SHAPES[kind](x[:, columns])
+    return out
+
+
+def kinds_of(shape: Vector) -> list[tuple[int, NDArray[np.intp]]]:
+    """Shapes that occur, with the columns of each."""
+    return [(int(kind), np.flatnonzero(shape == kind)) for kind in np.unique(shape)]
 
 
 @dataclass
@@ -73,7 +90,7 @@ class Drives:
 
 
 def draw(n: int, rng: np.random.Generator, *, lag_max: float = 0.0, late_max: float = 0.0) -> Drives:
-    """Draw n drives from the population of the identification reference, section 1."""
+    """Draw n drives from the population of docs/identification.md, 1."""
     small = rng.random(n) < 0.55
 
     def pick(a: Vector, b: Vector) -> Vector:
@@ -129,16 +146,13 @@ def repeat(drives: Drives, times: int) -> Drives:
 def curve_points(d: Drives, k: int) -> tuple[Vector, Vector]:
     """True error of one phase of a drive at the phase currents a level run with fine low levels visits."""
     i = 0.866 * np.concatenate([[0.004, 0.008, 0.015, 0.025, 0.036], np.linspace(0.05, 1.0, 20)]) * d.I_r[k]
-    kind = np.full(len(i), d.shape[k])
-    return i, d.dV[k] * inverter_shape(kind, i / d.knee[k]) + d.drop[k] * np.tanh(i / (0.3 * d.knee[k]))
+    return i, d.dV[k] * inverter_shape(d.shape[k], i / d.knee[k]) + d.drop[k] * np.tanh(i / (0.3 * d.knee[k]))
 
 
-def abc(alpha: Vector, beta: Vector) -> Vector:
-    return np.stack([alpha, -0.5 * alpha + 0.5 * ROOT_3 * beta, -0.5 * alpha - 0.5 * ROOT_3 * beta])
-
-
-def alpha_beta(x: Vector) -> tuple[Vector, Vector]:
-    return (2.0 * x[0] - x[1] - x[2]) / 3.0, (x[1] - x[2]) / ROOT_3
+ABC = np.array([[1.0, 0.0], [-0.5, 0.5 * ROOT_3], [-0.5, -0.5 * ROOT_3]])
+"""Phases of a vector (alpha, beta)."""
+ALPHA_BETA = np.array([[2.0, -1.0, -1.0], [0.0, ROOT_3, -ROOT_3]]) / 3.0
+"""Vector of three phases."""
 
 
 @dataclass
@@ -200,46 +214,50 @@ def run(
     i_a, i_b = c * ref_d - s * ref_q, s * ref_d + c * ref_q
     root = np.sqrt(1.0 + 2.0 * d.bend * i_a)
     flux_d = np.where(d.bend > 0.0, (root - 1.0) / np.where(d.bend > 0.0, d.bend, 1.0), i_a) * d.L_d
-    psi_a, psi_b = d.psi + flux_d, d.L_q * i_b
-    lagged = abc(i_a, i_b)
-    kind = np.broadcast_to(d.shape, lagged.shape)
-    error = d.dV * inverter_shape(kind, lagged / d.knee) + d.drop * np.tanh(lagged / (0.3 * d.knee))
-    error_a, error_b = alpha_beta(error)
-    u_a, u_b = d.R * i_a + error_a, d.R * i_b + error_b
+    i, psi = np.stack([i_a, i_b]), np.stack([d.psi + flux_d, d.L_q * i_b])
+    # what is not there is not computed: thousands of steps of a few drives cost what the calls of numpy cost
+    turns, lags, drops, kinds = free or imposed_speed is not None, np.any(d.lag), np.any(d.drop), kinds_of(d.shape)
+
+    def lost(phases: Vector) -> Vector:
+        error = d.dV * inverter_shapes(kinds, phases / d.knee)
+        return error + d.drop * np.tanh(phases / (0.3 * d.knee)) if drops else error
+
+    def currents(psi: Vector, th: Vector) -> Vector:
+        if turns:
+            c, s = np.cos(th), np.sin(th)
+            x_d, x_q = (c * psi[0] + s * psi[1] - d.psi) / d.L_d, (c * psi[1] - s * psi[0]) / d.L_q
+        else:  # the rotor is held at angle 0
+            x_d, x_q = (psi[0] - d.psi) / d.L_d, psi[1] / d.L_q
+        i_d = x_d * (1.0 + 0.5 * d.bend * x_d)
+        i = np.empty((2, n))
+        i[0], i[1] = (c * i_d - s * x_q, s * i_d + c * x_q) if turns else (i_d, x_q)
+        return i
+
+    def derivative(i: Vector, v: Vector) -> Vector:
+        return np.asarray(v - ALPHA_BETA @ lost(ABC @ i) - d.R * i)
+
+    lagged = ABC @ i
+    u_a, u_b = d.R * i + ALPHA_BETA @ lost(lagged)
     x_d, x_q = c * u_a + s * u_b, c * u_b - s * u_a
     pending_a, pending_b = u_a, u_b
     h = d.T_s / substeps
+    half_h = 0.5 * h
     keep = -np.expm1(-h / np.maximum(d.lag, 1e-12))
     late_step = np.round(d.late * substeps).astype(int)
+    taken = [bool(np.any(late_step == step)) for step in range(substeps + 1)]
     sample = np.zeros((3, n))
     angle_at_sample, speed = np.zeros(n), omega.copy()
     out = [np.empty((samples, n)) for _ in range(6)]
 
-    def currents(pa: Vector, pb: Vector, th: Vector) -> tuple[Vector, Vector]:
-        c, s = np.cos(th), np.sin(th)
-        pd, pq = c * pa + s * pb - d.psi, c * pb - s * pa
-        i_d = pd / d.L_d * (1.0 + 0.5 * d.bend * pd / d.L_d)
-        i_q = pq / d.L_q
-        return c * i_d - s * i_q, s * i_d + c * i_q
-
-    def derivative(pa: Vector, pb: Vector, th: Vector, va: Vector, vb: Vector) -> tuple[Vector, Vector, Vector, Vector]:
-        ia, ib = currents(pa, pb, th)
-        phases = abc(ia, ib)
-        error = d.dV * inverter_shape(np.broadcast_to(d.shape, phases.shape), phases / d.knee)
-        error = error + d.drop * np.tanh(phases / (0.3 * d.knee))
-        ea, eb = alpha_beta(error)
-        return va - ea - d.R * ia, vb - eb - d.R * ib, ia, ib
-
     for k in range(-1, samples):
         # samples of this period are taken late by up to a fraction of it; the command they give acts one period later
-        va, vb = pending_a, pending_b
+        v = np.stack([pending_a, pending_b])
         for step in range(substeps + 1):
-            take = late_step == step
             if step < substeps or k < 0:
-                ia, ib = currents(psi_a, psi_b, theta)
-                phases = abc(ia, ib)
-                lagged = np.where(d.lag > 0.0, lagged, phases)
-                if np.any(take) or k < 0:
+                i = currents(psi, theta)
+                if taken[step] or k < 0:
+                    take = late_step == step
+                    lagged = np.where(d.lag > 0.0, lagged, ABC @ i)
                     noisy = lagged + d.adc_noise * rng.standard_normal((3, n))
                     quantised = d.lsb * np.round(noisy / d.lsb)
                     sample = np.where(take, quantised, sample)
@@ -247,12 +265,11 @@ def run(
                     speed = np.where(take, omega, speed)
             if step == substeps:
                 break
-            da, db, ia, ib = derivative(psi_a, psi_b, theta, va, vb)
-            th_mid = theta + 0.5 * h * omega
-            da, db, ia_m, ib_m = derivative(psi_a + 0.5 * h * da, psi_b + 0.5 * h * db, th_mid, va, vb)
-            torque = 1.5 * d.p * (psi_a * ib_m - psi_b * ia_m)
-            psi_a, psi_b = psi_a + h * da, psi_b + h * db
-            lagged = np.where(d.lag > 0.0, lagged + keep * (abc(ia_m, ib_m) - lagged), lagged)
+            middle = currents(psi + half_h * derivative(i, v), theta + half_h * omega)
+            torque = 1.5 * d.p * (psi[0] * middle[1] - psi[1] * middle[0]) if free else zero
+            psi = psi + h * derivative(middle, v)
+            if lags:
+                lagged = np.where(d.lag > 0.0, lagged + keep * (ABC @ middle - lagged), lagged)
             if imposed_speed is not None:
                 theta = theta + h * omega
             elif free:
@@ -264,7 +281,7 @@ def run(
         step_angle = 2.0 * np.pi * d.p / d.encoder_steps
         measured = np.round(angle_at_sample / step_angle) * step_angle
         f = measured + d.offset if frame is None else frame
-        sa, sb = alpha_beta(sample)
+        sa, sb = ALPHA_BETA @ sample
         c, s = np.cos(f), np.sin(f)
         i_d, i_q = c * sa + s * sb, c * sb - s * sa
         K_d, K_q = bandwidth * d.L_d, bandwidth * d.L_q

@@ -42,7 +42,7 @@ def levels_at(
     i = np.array(level_sequence([fraction * d.I_r[k] for fraction in LEVELS if fraction >= least]))
     n = len(i)
     phase = 0.5 * math.sqrt(3.0) * i
-    error = share * d.dV[k] * inverter_shape(np.full(n, d.shape[k]), phase / d.knee[k]) + DEVICES_V * np.sign(i)
+    error = share * d.dV[k] * inverter_shape(d.shape[k], phase / d.knee[k]) + DEVICES_V * np.sign(i)
     v = d.R[k] * (1.0 + ALPHA * (T_c - 20.0)) * i + 2.0 / math.sqrt(3.0) * error + 0.01 * share
     shown = [i + d.sigma_dq[k] * rng.standard_normal(n) / math.sqrt(SAMPLES / 2) for _ in range(2)]
     signals = {
@@ -74,7 +74,7 @@ def test_dead_time_of_any_shape_falls_out(seed: int) -> None:
         two.append(abs(split.R_ohm / d.R[k] - 1.0))
         assert two[-1] < COVERAGE_FACTOR * split.std_ohm / d.R[k]
         assert split.V_device_v == pytest.approx(DEVICES_V, abs=4e-4 * d.dV[k])  # measured 0.6e-4
-        expected = d.dV[k] * inverter_shape(np.full(1, d.shape[k]), split.curve.i_phase_a[-1:] / d.knee[k])[0]
+        expected = d.dV[k] * inverter_shape(d.shape[k], split.curve.i_phase_a[-1:] / d.knee[k])[0]
         assert split.V_dead_v == pytest.approx(expected, rel=4e-4)  # measured 0.9e-4
         single = estimate_resistance(levels, noise_of(d, k), half_width_limit=math.inf)
         assert single.hardness > HARD_RATIO

@@ -47,7 +47,7 @@ def levels_of(
     T = 20.0 + heating_k * np.linspace(0.0, 1.0, n)
     flows = i - zero_a
     phase = 0.5 * math.sqrt(3.0) * flows
-    error = d.dV[k] * inverter_shape(np.full(n, d.shape[k]), phase / d.knee[k])
+    error = d.dV[k] * inverter_shape(d.shape[k], phase / d.knee[k])
     error += d.drop[k] * np.tanh(phase / (0.3 * d.knee[k]))
     v = d.R[k] * (1.0 + ALPHA * (T - 20.0)) * flows + 2.0 / math.sqrt(3.0) * error + offset_v
     halves = [i + d.sigma_dq[k] * rng.standard_normal(n) / math.sqrt(SAMPLES / 2) for _ in range(2)]
@@ -148,7 +148,7 @@ def test_the_inverter_curve_is_the_one_of_the_plant() -> None:
     for k in range(d.n):
         result = estimate_resistance(levels_of(d, k, rng, offset_v=0.02 * d.dV[k]), noise_of(d, k))
         i = result.curve.i_phase_a
-        truth = d.dV[k] * inverter_shape(np.full(len(i), d.shape[k]), i / d.knee[k])
+        truth = d.dV[k] * inverter_shape(d.shape[k], i / d.knee[k])
         truth += d.drop[k] * np.tanh(i / (0.3 * d.knee[k]))
         tolerance = 5e-3 * d.R[k] * d.I_r[k] + 0.01 * (d.dV[k] + d.drop[k])
         assert np.max(np.abs(result.curve.u_error_v - truth)) < tolerance

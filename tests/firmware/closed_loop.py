@@ -34,7 +34,7 @@ def tuned(alpha: float = 2 * math.pi * 400, **changes: float) -> dict[str, float
 
 
 def reference_case(alpha: float, **changes: float) -> dict[str, float]:
-    """Conditions of the governor reference: V_dc 210 V, pole-zero cancellation, no computation delay."""
+    """Conditions of docs/control.md, 1: V_dc 210 V, pole-zero cancellation, no computation delay."""
     values = tuned(alpha, inverter__delay_periods=0.5, governor__alpha_rad_s=alpha, motor__I_max_time_s=3600.0)
     values |= {f"current.K_i_{axis}_v_per_as": alpha * values["motor.R_s_ohm"] for axis in "dq"}
     values |= {"field_weakening.i_d_min_a": -1000.0, "inverter.voltage_utilisation": 1 / math.sqrt(3)}

@@ -1,6 +1,6 @@
 """A second hand at the control core: PI, limits, modulation and look-up in numpy binary32, one operation at a time.
 
-Written from the equations (reference ``simulation-and-lut.md`` section 1), in the core's order of operations, so that
+Written from the equations (``docs/simulation.md``, 1), in the core's order of operations, so that
 every result can be compared bit for bit. Test code only.
 """
 

@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Table1:
-    """Machine, tuning and limits of the reference (V_dc 210 V)."""
+    """Machine, tuning and limits of docs/control.md, 1 (V_dc 210 V)."""
 
     R: float = 0.137
     L_d: float = 0.0023

@@ -1,4 +1,4 @@
-"""The reference governor in closed loop, against the numbers of the governor reference (V_dc 210 V, Table 1)."""
+"""The reference governor in closed loop, under the conditions of docs/control.md, 1 (V_dc 210 V, Table 1)."""
 
 from __future__ import annotations
 
@@ -331,7 +331,7 @@ def test_offset_free_rows_reach_the_reference_under_mismatch(plant: tuple[float,
 
 
 def test_paper_rows_veto_feasible_currents_under_table_2b() -> None:
-    """The known weakness of the printed rows: they see the nominal flux (reference, section 4.2)."""
+    """The known weakness of the printed rows: they see the nominal flux (docs/control.md, 2)."""
     stuck = tried = 0
     m = Table1()
     for rpm, start, target in random_cases(80, 4):

@@ -1,6 +1,6 @@
-"""The polar-coordinate laws in the compiled closed loop against the numbers of the polar-control reference.
+"""The polar-coordinate laws in the compiled closed loop against the numbers stated here.
 
-Machine of the reference (assumed there: the paper's table is missing). Amperes are power-invariant as in the paper.
+Machine of docs/control.md, 3 (assumed: the paper's table is missing). Amperes are power-invariant as in the paper.
 Each target stands beside the value measured with ``pmsmtool reproduce polar-steps`` (``-linear``, ``-noise``,
 ``-ramps``, ``-sweep``, ``-limit``, ``-salient``).
 """

@@ -114,6 +114,20 @@ def test_the_predicted_records_begin_at_their_speed(psi_f_wb: float) -> None:
             assert (begun >= BASE_SPEED[0] - 0.03).all() and (begun <= BASE_SPEED[1] + 0.03).all()  # 12-bit encoder
 
 
+SETTLED = 0.03
+"""Mean predicted i_q before a step, of the step (seed 140098 at 84 degC: 0.010; 0.049 after 64 periods, 1 L/R)."""
+
+
+def test_the_predicted_records_begin_with_settled_loops() -> None:
+    """A healthy warm drive with L/R of 60 periods left the band: 64 periods had not settled the prediction."""
+    made = tune(draw_drive(140098), TuneRequest())
+    warm = conditions(made, T_winding_c=84.0, T_magnet_c=84.0)
+    plan = plan_proof(made, warm)
+    step = next(e for e in plan.experiments if e.name == "unreachable")
+    begun = SimulatedDrives(made, warm, plan, 8, 0).respond(step)[:, SIGNALS.index("i_q_a"), 0]
+    assert abs(begun.mean()) <= SETTLED * step.excitation.amplitude
+
+
 def test_the_prediction_samples_when_the_identified_sensors_do() -> None:
     """A lag of 10 us at 40 kHz left a healthy drive outside its band: 0.1 of a period was the most that was drawn."""
     lag, instant, std = 10e-6, 2e-6, 0.4e-6

@@ -1,4 +1,4 @@
-"""What the kernel is measured against: the scenarios of the reference, and an independent integration of them.
+"""What the kernel is measured against: the scenarios of docs/simulation.md, and an independent integration of them.
 
 The same float32 core runs through ``pmsm_step`` of the library ``pmsm_core``, one call per period; between the samples
 scipy integrates the dq equations (not the stationary-flux form of the kernel) with DOP853, restarted every period.
@@ -34,7 +34,7 @@ MODE_CURRENT = 2
 
 @dataclass(frozen=True)
 class Scenario:
-    """One row of the table in the reference, section 1."""
+    """One row of the table in docs/simulation.md, 1."""
 
     name: str
     pole_pairs: int
@@ -100,7 +100,7 @@ SCENARIOS = (
 
 @cache
 def saturated_map() -> FluxMap:
-    """5.6-kW PM-SyRM of the reference, section 1, as it ships: the map with its interpolation is the machine."""
+    """5.6-kW PM-SyRM of docs/simulation.md, 1, as it ships: the map with its interpolation is the machine."""
     flux_map = load_machine_file(data_folder("profiles") / "saturated-pmsyrm.toml").flux_map
     assert flux_map is not None
     return flux_map

@@ -61,7 +61,7 @@ def steady_voltage(simulation: Simulation, i_d: float, i_q: float) -> complex:
     [(shape, i) for shape in SHAPES for i in (0.3, 6.0) if shape != SIGN or i > 1.0],
 )
 def test_shape_along_d_and_q(shape, i):
-    """0 deg: (2/3)(f(i) + f(i/2)) V; 90 deg: (2/sqrt 3) f(0.866 i) V (identification reference, 'Inverter error')."""
+    """0 deg: (2/3)(f(i) + f(i/2)) V; 90 deg: (2/sqrt 3) f(0.866 i) V (docs/identification.md, 2)."""
     V = U_DC * DEAD / T_S
     f = SHAPES[shape]
     along_d = steady_voltage(open_simulation(lossy(shape)), i, 0.0)

@@ -17,7 +17,7 @@ PERIODS = 400
 
 
 def random_drive(rng: np.random.Generator) -> tuple[Setup, dict[str, float], float]:
-    """Return setup, drive parameters and rated current; ranges as in the identification reference, section 1."""
+    """Return setup, drive parameters and rated current; ranges as in docs/identification.md, 1."""
     U_dc = float(rng.choice([24.0, 48.0, 325.0, 560.0]))
     low = U_dc < 100.0
     I_r = float(np.exp(rng.uniform(np.log(5.0 if low else 3.0), np.log(60.0 if low else 25.0))))

@@ -71,7 +71,7 @@ def test_unstuffed_length_is_the_textbook_number(data: bytes, bits: int) -> None
 
 
 def test_average_sdo_frame_lies_where_the_references_count_it() -> None:
-    """canopen.md section 4: an 8-byte frame has 111 bits unstuffed, 135 worst; SDO traffic averages 114-123."""
+    """docs/canopen.md, 4: an 8-byte frame has 111 bits unstuffed, 135 worst; SDO traffic averages 114-123."""
     random_data = random.Random(1)
     lengths = [frame_bits(0x581, bytes([index % 127 + 1]) + random_data.randbytes(7)) for index in range(2000)]
     assert min(lengths) > 111

@@ -338,9 +338,9 @@ def test_a_map_of_another_drive_is_refused(tmp_path: Path, monkeypatch: pytest.M
 def test_the_plan_is_told_before_anything_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     outcome = CliRunner().invoke(
-        cli, ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=nanotec", "commission", str(PROFILE)], input=""
+        cli, ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=elmo", "commission", str(PROFILE)], input=""
     )
-    assert outcome.exit_code != 0 and "tier standard, map cia402" in outcome.stderr
+    assert outcome.exit_code != 0 and "tier standard, map elmo" in outcome.stderr
     assert "flash, verify: not available: needs a map" in outcome.stderr
     assert not isinstance(outcome.exception, NotAvailable)
 
@@ -362,7 +362,7 @@ def test_what_a_drive_lacks_is_said_before_a_consent_and_leads_on(
 ) -> None:
     """Without MACHINE nothing tells the pole pairs: nobody is asked to let it move, and no --resume is advised."""
     monkeypatch.chdir(tmp_path)
-    bus = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=copley"]
+    bus = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=elmo"]
     outcome = CliRunner().invoke(cli, [*bus, "commission", "--yes"])
     error = outcome.exception
     assert isinstance(error, NotAvailable) and "identify: needs the pole pairs" in str(error)
@@ -373,7 +373,7 @@ def test_what_a_drive_lacks_is_said_before_a_consent_and_leads_on(
     outcome = CliRunner().invoke(cli, [*bus, "commission", str(PROFILE), "--yes", "--json"])
     assert isinstance(outcome.exception, Partial) and json.loads(outcome.stdout)["verdict"] == "PARTIAL"
     stages = {stage["name"]: stage for stage in json.loads(outcome.stdout)["stages"]}
-    assert stages["tune"]["status"] == "not available" and "'cia402' does not take" in stages["tune"]["note"]
+    assert stages["tune"]["status"] == "not available" and "'elmo' does not take" in stages["tune"]["note"]
     assert all(stage["note"] for stage in stages.values() if stage["status"] == "not available")
 
 

@@ -152,14 +152,16 @@ def test_a_reluctance_machine_follows_a_smaller_and_slower_vector(seed: int, tmp
 
 @pytest.mark.parametrize("factor", [0.01, 1000.0])
 def test_the_gains_of_another_motor_serve_nobody(factor: float, tmp_path: Path) -> None:
-    """Far too weak, no phase looked connected; far too strong, the drive tripped at once. They are put back."""
+    """Too weak, no phase looked connected; too strong, the drive tripped, or its bias rang. They are put back."""
     with Connection(PmsmSimBus(CHANNEL)) as connection:
         drive = CanopenDrive(connection, 1)
         names = [f"current.K_{name}" for name in ("p_d_v_per_a", "i_d_v_per_as", "p_q_v_per_a", "i_q_v_per_as")]
         drive.write({name: factor * drive.read(name) for name in names})
+        drive.write({"motor.L_d_h": 0.01 * factor, "motor.L_q_h": 0.01 * factor})
+        names += ["motor.L_d_h", "motor.L_q_h"]
         held = [drive.read(name) for name in names]
-        _, stage = identify(drive, tmp_path, ("poles",))
-        assert stage.status == "pass"
+        _, stage = identify(drive, tmp_path, ("poles", "L"))
+        assert stage.status == "pass" and not stage.refused
         assert [drive.read(name) for name in names] == held
         drive.close()
 

@@ -20,7 +20,7 @@ PROFILE = data_folder("profiles") / "interior-2k2.toml"
 TRUTH = load_machine_file(PROFILE).machine
 RESULTS = """
 [vendor_tuning.results]
-"motor.pole_pairs" = { index = 0x2030, sub = 0, type = "UNSIGNED32", unit = "1" }
+"motor.pole_pairs" = { index = 0x3900, sub = 5, type = "UNSIGNED32", unit = "1" }
 "motor.R_s_ohm" = { index = 0x3900, sub = 1, type = "UNSIGNED32", unit = "mohm line-line" }
 "motor.L_d_h" = { index = 0x3900, sub = 2, type = "UNSIGNED32", unit = "uH" }
 "motor.L_q_h" = { index = 0x3900, sub = 3, type = "UNSIGNED32", unit = "uH" }

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Generated from pmsmtool/params/catalogue.py by python -m pmsmtool.firmware.params_header: do not edit. */
 #ifndef PMSM_PARAMS_H
 #define PMSM_PARAMS_H

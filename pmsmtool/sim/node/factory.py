@@ -10,7 +10,7 @@ import math
 from typing import TYPE_CHECKING
 
 from pmsmtool.params.catalogue import BY_NAME
-from pmsmtool.sim.node.family import Face, Reduced
+from pmsmtool.sim.node.face import DriveFace
 from pmsmtool.sim.node.node import Settings
 from pmsmtool.sim.node.parameter_set import ParameterImage
 from pmsmtool.sim.simulated_machine import settings_of
@@ -93,7 +93,7 @@ def drive_settings(
     position: int,
     *,
     fixed_node_id: bool = False,
-    face: Face | Reduced | None = None,
+    face: DriveFace | None = None,
 ) -> Settings:
     """Return the settings of a drive made for a machine file.
 
@@ -107,8 +107,8 @@ def drive_settings(
         Number of the drive on its line, from 0; counts the serial number up.
     fixed_node_id : bool
         Whether the node id outranks a stored one.
-    face : Face or Reduced, optional
-        The family whose dictionary the drive shows.
+    face : DriveFace, optional
+        What the drive shows instead of its own dictionary.
     """
     values = factory_values(machine_file)
     if face is not None:
@@ -120,7 +120,7 @@ def drive_settings(
     return Settings(
         node_id=node_id,
         serial=serial & 0xFFFFFFFF,
-        name=f"simulated {face.drive_map.name} {name}" if isinstance(face, Face) else f"pmsmsim {name}",
+        name=f"{'pmsmsim' if face is None else face.label} {name}",
         factory=ParameterImage.of_values(values),
         rated_current_ma=max(1, round(1000.0 * i_nom / math.sqrt(2.0))),
         rated_torque_mnm=max(1, round(1000.0 * torque)),

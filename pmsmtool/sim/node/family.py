@@ -14,17 +14,18 @@ from dataclasses import dataclass
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.cia402 import Mode
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.drive_map import Cell, DriveMap, SignalCell, reference_map
+from pmsmtool.firmware.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, SignalCell
 from pmsmtool.firmware.wire_units import WireUnit, wire_unit
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.sim.node import own_identification
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.monitor import Monitor
 from pmsmtool.sim.node.objects import ObjectRow
-from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, Plant, PowerDrive
+from pmsmtool.sim.node.power_drive import Plant, PowerDrive
 from pmsmtool.sim.node.rings import Rings
 from pmsmtool.sim.node.schedule import Schedule
 from pmsmtool.sim.node.trace_rows import TraceRows
+from pmsmtool.units import RAD_S_PER_MRPM
 
 OWN = range(0x2000, 0x6000)
 """Indices of the reference drive's own objects."""
@@ -83,6 +84,16 @@ class Face:
     drive_map: DriveMap
 
     @property
+    def vendor_product(self) -> tuple[int, int]:
+        """Identity that the family's map names."""
+        return self.drive_map.vendor, self.drive_map.product
+
+    @property
+    def label(self) -> str:
+        """Beginning of the device name."""
+        return f"simulated {self.drive_map.name}"
+
+    @property
     def modes(self) -> tuple[Mode, ...]:
         """Modes of operation the family has."""
         has = self.drive_map.capabilities
@@ -113,6 +124,9 @@ class Face:
             kind(self.drive_map, dictionary, plant, schedule)
         own_identification.attach(self.drive_map, dictionary, plant, power, schedule)
 
+    def guarding(self, session: object) -> None:
+        """Return none: a family is shown without node guarding."""
+
 
 @dataclass(frozen=True, slots=True)
 class Reduced:
@@ -127,9 +141,20 @@ class Reduced:
     tier: str
 
     @property
-    def drive_map(self) -> DriveMap:
+    def vendor_product(self) -> tuple[int, int]:
         """The reference drive's: its identity does not tell what it lacks."""
-        return reference_map()
+        return REFERENCE_VENDOR, REFERENCE_PRODUCT
+
+    @property
+    def label(self) -> str:
+        """Beginning of the device name."""
+        return "pmsmsim"
+
+    def attach(self, dictionary: Dictionary, plant: Plant, power: PowerDrive, schedule: Schedule) -> None:
+        """Do nothing: the application is the reference drive's."""
+
+    def guarding(self, session: object) -> None:
+        """Return none."""
 
     def dress(self, dictionary: Dictionary) -> None:
         """Hide what the tier does not have."""

@@ -11,7 +11,7 @@ from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.sim.faults import Absence
 from pmsmtool.sim.node import store as storing
 from pmsmtool.sim.node.drive_core import DriveCore
-from pmsmtool.sim.node.family import Face, Reduced
+from pmsmtool.sim.node.face import DriveFace
 from pmsmtool.sim.node.lss import UNCONFIGURED
 from pmsmtool.sim.node.memory import Memory
 from pmsmtool.sim.node.parameter_set import ParameterImage
@@ -24,6 +24,9 @@ PRODUCT = 0x00000001
 REVISION = 0x00010000
 BOOT_S = 0.03
 """From reset or power-on to the boot-up message."""
+REMOTE = 2
+"""Flag of a remote frame, as ``sim/line.py`` gives it."""
+GUARDED_ID = 0x700
 LAG_NS = 1_000_000
 """The machine may lag this far behind the clock while nobody looks at it, as behind a 1 ms background task."""
 
@@ -59,8 +62,8 @@ class Settings:
         Factory values of 0x6075 (rms) and 0x6076.
     fixed_node_id : bool
         Whether ``node_id`` outranks one stored by LSS (a switch on the drive).
-    face : Face, Reduced or None
-        The family whose dictionary it shows; None: the reference drive's own.
+    face : DriveFace or None
+        What it shows instead of the reference drive's own dictionary.
     set_point_filter_s : float
         Time constant of the filter behind its torque slope, 0 without (s).
     pdo_jitter_s : float
@@ -76,7 +79,7 @@ class Settings:
     rated_current_ma: int
     rated_torque_mnm: int
     fixed_node_id: bool = False
-    face: Face | Reduced | None = None
+    face: DriveFace | None = None
     set_point_filter_s: float = 0.0
     pdo_jitter_s: float = 0.0
     seed: int = 0
@@ -101,7 +104,7 @@ class Node:
         self.memory = memory
         self.factory = settings.factory
         self.face = settings.face
-        family = (VENDOR, PRODUCT) if self.face is None else (self.face.drive_map.vendor, self.face.drive_map.product)
+        family = (VENDOR, PRODUCT) if self.face is None else self.face.vendor_product
         self.identity = (*family, REVISION, settings.serial)
         self.name = settings.name
         self.set_point_filter_s = settings.set_point_filter_s
@@ -298,9 +301,13 @@ class Node:
     # ---- the line ------------------------------------------------------------------------------
 
     def receive(self, can_id: int, data: bytes, flags: int) -> None:
-        """Take a frame of the line; only data frames with 11-bit identifiers mean something to the node."""
-        if self.plugged and not flags and self.session is not None:
+        """Take a frame of the line; data frames with 11-bit identifiers, and the remote frames of node guarding."""
+        if not self.plugged or self.session is None:
+            return
+        if not flags:
             self.session.receive(can_id, data)
+        elif flags == REMOTE and can_id == GUARDED_ID + self.node_id:
+            self.session.asked()
 
     def send(self, can_id: int, data: bytes) -> None:
         """Transmit a frame."""

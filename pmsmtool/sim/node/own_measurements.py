@@ -15,6 +15,7 @@ from pmsmtool.sim.node.dictionary import Dictionary
 from pmsmtool.sim.node.drive_core import Averages, AverageState, Command, ControlMode
 from pmsmtool.sim.node.power_drive import Plant
 from pmsmtool.sim.signals import Signal
+from pmsmtool.units import rad_s_from_rpm
 
 Measured = Generator[float, None, float]
 
@@ -217,7 +218,7 @@ class OwnMeasurements:
     def _flux_linkage(self) -> Measured:
         """Measure the voltage at speed, driving and braking, less the drop at the resistance the drive is set to."""
         limit = self._dictionary["cia402.max_speed"].number()
-        target = SPEED_SHARE * min(limit, self._plant.parameter("motor.n_max_rpm")) * math.pi / 30.0
+        target = rad_s_from_rpm(SPEED_SHARE * min(limit, self._plant.parameter("motor.n_max_rpm")))
         pole_pairs = self._plant.parameter("motor.pole_pairs")
         passed = 0.0
         while passed < RAMP_S or abs(self._speed(pole_pairs) - target) > FULL_CURRENT_AT * target:

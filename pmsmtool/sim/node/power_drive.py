@@ -19,8 +19,8 @@ from pmsmtool.sim.node.emergency import Emergency
 from pmsmtool.sim.node.quick_stop import Stopping
 from pmsmtool.sim.node.schedule import Schedule
 from pmsmtool.sim.signals import Signal
+from pmsmtool.units import RAD_S_PER_MRPM
 
-RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 HEARTBEAT_LOST = 0x8130
 CONNECTION_ENDED = 0x8100
 STANDSTILL_SHARE = 0.002

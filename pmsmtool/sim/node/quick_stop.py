@@ -16,6 +16,7 @@ from pmsmtool.sim.node.dictionary import Dictionary
 from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore
 from pmsmtool.sim.node.schedule import Schedule
 from pmsmtool.sim.signals import Signal
+from pmsmtool.units import RAD_S_PER_RPM
 
 CURRENT_GONE_SHARE = 0.02
 """Share of I_nom below which a ramped-down current counts as zero."""
@@ -29,7 +30,6 @@ _RAMPED = (
     QuickStop.SLOW_DOWN_AND_STAY,
     QuickStop.QUICK_STOP_RAMP_AND_STAY,
 )
-_RAD_S_PER_RPM = 2.0 * math.pi / 60.0
 
 
 class Stopping:
@@ -94,7 +94,7 @@ class Stopping:
             self._timer = None
 
     def _slope_rad_s2(self) -> float:
-        return self._deceleration.number() * _RAD_S_PER_RPM
+        return self._deceleration.number() * RAD_S_PER_RPM
 
     def _poll(self) -> None:
         self._timer = None

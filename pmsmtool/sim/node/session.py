@@ -12,7 +12,7 @@ from pmsmtool.sim.node import store as storing
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.eds import eds_text
 from pmsmtool.sim.node.emergency import Emergency
-from pmsmtool.sim.node.family import Face, Reduced
+from pmsmtool.sim.node.face import DriveFace
 from pmsmtool.sim.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from pmsmtool.sim.node.lss import ANSWER_ID, REQUEST_ID, LssSlave
 from pmsmtool.sim.node.measurement import Measurement
@@ -62,7 +62,7 @@ class Hardware(Plant, Protocol):
     name: str
     rated_current_ma: int
     rated_torque_mnm: int
-    face: Face | Reduced | None
+    face: DriveFace | None
     pdo_lateness: Iterator[float]
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -114,7 +114,7 @@ class Session:
         self.emergency = Emergency(self.dictionary, schedule, self._send_emergency)
         self.power = PowerDrive(self.dictionary, schedule, hardware, self.emergency)
         self.measurement = Measurement(self.dictionary, hardware, self.power)
-        if isinstance(hardware.face, Face):
+        if hardware.face is not None:
             hardware.face.attach(self.dictionary, hardware, self.power, schedule)
         self.sdo = SdoServer(self.dictionary, schedule, self._send_sdo, self._withdraw_sdo)
         self.heartbeat = HeartbeatProducer(self.dictionary, schedule, self.send_state)
@@ -125,6 +125,7 @@ class Session:
             self.dictionary, schedule, self._is_operational, hardware.send, self.emergency.raise_error,
             hardware.pdo_lateness,
         )  # fmt: skip
+        self.guarding = None if hardware.face is None else hardware.face.guarding(self)
         self.lss = self._make_lss()
         self.power.on_state = self.pdo.changed
         self.dictionary["device.eds"].source = lambda: eds_text().encode("ascii")
@@ -373,6 +374,15 @@ class Session:
             self.pdo.sync()
         else:
             self.pdo.receive(can_id, data)
+
+    def asked(self) -> None:
+        """Take a remote frame for the node's state."""
+        if self.guarding is not None and self.nmt is not NmtState.INITIALISING:
+            self.guarding.asked()
+
+    def answer_guarding(self, toggle: int) -> None:
+        """Answer a remote frame with the NMT state."""
+        self.hardware.send(0x700 + self.hardware.node_id, bytes((self.nmt | toggle,)))
 
     def attend(self) -> None:
         """Look after what happened in the core since the last time."""

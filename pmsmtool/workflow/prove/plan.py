@@ -11,8 +11,9 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.units import RAD_S_PER_RPM
 
-RPM = math.pi / 30.0
+RPM = RAD_S_PER_RPM
 
 SIGNALS = ("i_d_a", "i_q_a", "omega_e_rad_s", "u_d_lim_v", "u_q_lim_v")
 """What is recorded of every experiment."""

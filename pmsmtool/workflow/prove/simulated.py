@@ -30,6 +30,7 @@ from pmsmtool.sim.kernel import Params, Part, Setup, Simulation, library
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.signals import Truth
 from pmsmtool.sim.simulated_machine import MODELS, SHAPES, build_setup
+from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 from pmsmtool.workflow.prove.defects import DEFECTS, QUANTITIES, Defect, is_possible
 from pmsmtool.workflow.prove.plan import SIGNALS, Conditions, Experiment, ProofPlan
 from pmsmtool.workflow.sampling_stage import INSTANT, LAG
@@ -62,8 +63,10 @@ OFFSET_SHARE = 0.001
 MISMATCH = 0.002
 """Standard deviations of sensor offsets (of I_max) and of the phases' gains against each other."""
 BASE_SPEED = (-0.03, 0.01)
-"""The shaft coasts while the recorder is armed: relative range of the speed at the first current step."""
+"""Relative range of the speed that is held before current steps: what coasting lets it lose, too."""
 COAST_PERIODS = 64
+"""The speed loop's current is switched off at most this long before a current step: the loops may not have settled.
+At standstill, they settle for so long."""
 PHASES = 64
 """Periods over which the start is drawn: slower tasks of the drive (speed control) are anywhere in their cycle."""
 ALLOWANCES = {"unreachable": 2.0}
@@ -72,6 +75,10 @@ pulses and the flux map decide (with 1.3 one healthy drive of 125 came to 1.13 o
 """
 RUN_IN = 4.0
 """A speed is held for this many time constants of the speed loop before a speed step."""
+HOLD = 6.0
+LONGEST_HOLD = 4096
+"""Time constants L/R for which the current that holds a speed flows before a current step, and most periods: with less,
+what is left of the start shifts the prediction (64 periods, 1 L/R, of a warm winding: i_q by 0.35 of 7.2 A)."""
 
 
 class SimulatedDrives:
@@ -102,6 +109,7 @@ class SimulatedDrives:
         self._T_s = design.machine.inverter.T_s
         self._base_speed: list[float] = []
         self._phase: list[int] = []
+        self._coasting = np.random.default_rng([seed, 2]).integers(1, COAST_PERIODS + 1, runs).tolist()
         self.setups = [*self._drawn(base, machine, conditions, runs, seed)]
 
     def _drawn(
@@ -130,17 +138,22 @@ class SimulatedDrives:
             Signals of ``plan.SIGNALS``.
         """
         drives = [self._start(k, experiment, defect) for k in range(len(self.setups) if runs is None else runs)]
+        in_speed_mode = experiment.excitation.point is Injection.SPEED
         run_in = COAST_PERIODS
-        if experiment.excitation.point is Injection.SPEED:
+        if in_speed_mode:
             crossover = float(self._design.facts.get("speed_crossover_rad_s", 50.0))
             run_in = round((RUN_IN if experiment.base_rad_s else 0.25) / (crossover * self._T_s))
+        elif experiment.base_rad_s:
+            machine = self._nominal.machine
+            slowest_s = max(machine.L_d, machine.L_q) / (machine.R_copper + machine.R_fixed)
+            run_in = min(max(run_in, round(HOLD * slowest_s / self._T_s)), LONGEST_HOLD)
         for row, drive in enumerate(drives):
-            drive.run(self._phase[row] + run_in)
-            if experiment.base_rad_s and experiment.excitation.point is not Injection.SPEED:
+            self._get_ready(drive, row, experiment, run_in)
+            if experiment.base_rad_s and not in_speed_mode:
                 # a light shaft has coasted: the record of the machine begins at its speed (``measured.KEPT``)
                 lost = (1.0 + self._base_speed[row]) * experiment.base_rad_s - drive.signal(Truth.OMEGA_M)
                 drives[row] = self._start(row, experiment, defect, lost)
-                drives[row].run(self._phase[row] + run_in)
+                self._get_ready(drives[row], row, experiment, run_in)
         wanted = [DRIVE_SIGNALS[name][0] for name in SIGNALS]
         for drive in drives:
             _excite(drive, experiment.excitation)
@@ -149,10 +162,22 @@ class SimulatedDrives:
             drive.run(experiment.rows * experiment.decimation)
         return averaged(np.stack(records).transpose(0, 2, 1), experiment)
 
+    def _get_ready(self, drive: Simulation, row: int, experiment: Experiment, run_in: int) -> None:
+        """Let the loops settle; before a step at a speed, the current that held it has just been switched off."""
+        coasts = experiment.base_rad_s and experiment.excitation.point is not Injection.SPEED
+        if coasts:
+            drawn, torque_per_amp = self.setups[row].machine, self._design.machine.machine.torque_nm(0.0, 1.0)
+            friction = drawn.tau_c + drawn.B * experiment.base_rad_s
+            drive.reference.i_q_ref = friction / torque_per_amp if torque_per_amp else 0.0
+        drive.run(self._phase[row] + run_in)
+        if coasts:
+            drive.reference.i_q_ref = 0.0
+            drive.run(self._coasting[row])
+
     def _start(self, row: int, experiment: Experiment, defect: Defect | None, lead_rad_s: float = 0.0) -> Simulation:
         setup = Setup.from_buffer_copy(self.setups[row])
-        speed = experiment.excitation.point is Injection.SPEED
-        share = 0.0 if speed else self._base_speed[row]
+        in_speed_mode = experiment.excitation.point is Injection.SPEED
+        share = 0.0 if in_speed_mode else self._base_speed[row]
         setup.omega_M = (1.0 + share) * experiment.base_rad_s + lead_rad_s
         params = Params()
         simulation = Simulation(setup, self._image, self._scaled(setup))
@@ -162,7 +187,7 @@ class SimulatedDrives:
             kept = bytes(params)
             simulation = Simulation(setup, self._image, self._scaled(setup))
             ctypes.memmove(ctypes.addressof(simulation.params), kept, len(kept))
-        simulation.reference.mode = MODES["speed" if speed else "current"]
+        simulation.reference.mode = MODES["speed" if in_speed_mode else "current"]
         simulation.reference.omega_M_ref = experiment.base_rad_s
         simulation.word(Part.ENABLED).value = 1
         return simulation
@@ -293,7 +318,7 @@ def _cut(design: Design, conditions: Conditions) -> ParameterSet:
     cut = {
         "motor.I_max_apk": conditions.i_max_apk,
         "governor.I_transient_apk": conditions.i_max_apk,
-        "motor.n_max_rpm": conditions.speed_max_rad_s * 30.0 / math.pi,
+        "motor.n_max_rpm": rpm_from_rad_s(conditions.speed_max_rad_s),
     }
     return replace(wanted, values={n: min(v, cut[n]) if n in cut else v for n, v in wanted.values.items()})
 
@@ -369,7 +394,7 @@ def _friction(machine: MachineFile, rng: np.random.Generator) -> tuple[float, fl
     """Draw viscous (N m s) and Coulomb friction (N m)."""
     known = machine.machine
     torque = abs(known.torque_nm(0.0, known.I_nom_apk or known.I_max_apk or 0.0))
-    omega = (known.n_nom_rpm or known.n_max_rpm or 3000.0) * math.pi / 30.0
+    omega = rad_s_from_rpm(known.n_nom_rpm or known.n_max_rpm or 3000.0)
     drawn = []
     for value, largest in ((known.B_nms, FRICTION_SHARE * torque / omega), (known.tau_c_nm, FRICTION_SHARE * torque)):
         factor = math.exp(rng.uniform(-1.0, 1.0) * math.log(FRICTION_FACTOR))

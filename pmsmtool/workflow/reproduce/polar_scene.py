@@ -24,6 +24,7 @@ from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import simulate
 from pmsmtool.sim.kernel import Application
 from pmsmtool.sim.scenarios import Profile, Scenario
+from pmsmtool.units import rpm_from_rad_s
 
 Array = NDArray[np.float64]
 
@@ -298,7 +299,7 @@ def run(
         u_q=u_q,
         v_d=trace["u_d_lim_v"] / PEAK,
         v_q=trace["u_q_lim_v"] / PEAK,
-        speed_rpm=trace["omega_m_rad_s"] * 30.0 / math.pi,
+        speed_rpm=rpm_from_rad_s(trace["omega_m_rad_s"]),
     )
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.machine.key import Value
+from pmsmtool.units import rad_s_from_rpm
 from pmsmtool.workflow.reproduce.figure import Column, Panel, Reproduction, Series, Table, at_most
 from pmsmtool.workflow.reproduce.polar_linear import DELAYED
 from pmsmtool.workflow.reproduce.polar_measures import peak_current_apk
@@ -129,7 +130,7 @@ def _is_reachable(true: Mapping[str, float], rpm: float, torque_nm: float) -> bo
 
     With X = omega L the largest i_q is (sqrt(R^2 + X_d^2) V - omega R psi_f) / (R^2 + X_d X_q).
     """
-    omega, R = rpm * math.pi / 30.0 * machine_file().machine.pole_pairs, true["R_s_ohm"]
+    omega, R = rad_s_from_rpm(rpm) * machine_file().machine.pole_pairs, true["R_s_ohm"]
     X_d, X_q = omega * true["L_d_h"], omega * true["L_q_h"]
     level = (R * R + X_d * X_q) * PEAK * torque_nm / K_T + omega * R * true["psi_f_wb"]
     return abs(level) <= REACH_SHARE * math.hypot(R, X_d) * V_MAX * PEAK

@@ -1,0 +1,251 @@
+"""How a drive of another maker is commanded, limited and watched: CiA 402's objects where they are, else the maker's.
+
+Every question is put to the live drive; the maker's own objects are those of a map that names its identity. Where no
+source says whether a current is peak or rms, it is taken as rms: the smaller physical current for limits and commands,
+the larger one for what is watched.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.cia402 import Mode
+from pmsmtool.drive import objects
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.errors import NotAvailable, SdoAbort
+from pmsmtool.firmware.drive_map import LETTERS
+from pmsmtool.firmware.motion_objects import MotionObject
+from pmsmtool.firmware.wire_units import wire_unit
+
+ENCODER_COUNTS = DriveObject(0x608F, 1, "I")
+MOTOR_TURNS = DriveObject(0x608F, 2, "I")
+POSITION = DriveObject(0x6064, 0, "i")
+MAX_TORQUE_PERMILLE = DriveObject(0x6072, 0, "H")
+TORQUE_PERMILLE = DriveObject(0x6077, 0, "h")
+POLARITY = DriveObject(0x607E, 0, "B")
+GEAR_MOTOR, GEAR_SHAFT = DriveObject(0x6091, 1, "I"), DriveObject(0x6091, 2, "I")
+FEED, FEED_TURNS = DriveObject(0x6092, 1, "I"), DriveObject(0x6092, 2, "I")
+POSITION_UNIT = DriveObject(0x60A8, 0, "I")
+POSITION_TURNED = 0x80
+"""Bit of the polarity that turns position against torque (CiA 402-2, 0x607E)."""
+DEGREE = 0x41
+"""Numerator of an SI unit of position (CiA 303-2); others count increments."""
+RATED_RMS = 1e-3 * math.sqrt(2.0)
+"""A peak per count of 0x6075, taken as mA rms: the larger of the two readings."""
+RPM = math.pi / 30.0
+NO_RATED = "its rated current (0x6075, or the maker's own object in a map that names this drive)"
+NO_COUNTS = "how many increments its encoder has per turn (0x608F, or the maker's own object in a map)"
+_ABSENT = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX)
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A quantity in an object of the live drive.
+
+    Attributes
+    ----------
+    item : DriveObject
+        Where.
+    per_count : float
+        A peak, or rpm, per count.
+    undecided : bool
+        Whether no source says if a current is peak or rms.
+    """
+
+    item: DriveObject
+    per_count: float
+    undecided: bool = False
+
+    def __str__(self) -> str:
+        return f"0x{self.item.index:04X}" + (f":{self.item.sub:02X}" if self.item.sub else "")
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueTarget:
+    """The object that takes a torque current, and the mode of operation in which it acts."""
+
+    quantity: Quantity
+    mode: int
+
+    @property
+    def cyclic(self) -> bool:
+        """Whether the drive takes every value at once: it has no slope of its own (0x6087) in this mode."""
+        return self.mode == Mode.CYCLIC_TORQUE
+
+
+def held(node: DriveNode, item: DriveObject) -> float | None:
+    """Return the number in an object, None where the drive has none."""
+    try:
+        return node.get(item)
+    except SdoAbort as abort:
+        if abort.code in _ABSENT:
+            return None
+        raise
+
+
+def _own(node: DriveNode, name: str) -> Quantity | None:
+    """Return the maker's own object of the map; a fixed number is none."""
+    row: MotionObject | None = node.map.motion.get(name)
+    if row is None or not row.index:
+        return None
+    return Quantity(DriveObject(row.index, row.sub, LETTERS[row.wire]), row.per_count, row.undecided)
+
+
+def rated_current(node: DriveNode) -> Quantity | None:
+    """Return where the rated current stands; None where nobody knows."""
+    if held(node, objects.RATED_CURRENT_MA) is not None:
+        return Quantity(objects.RATED_CURRENT_MA, RATED_RMS)
+    return _own(node, "rated_current")
+
+
+def rated_apk(node: DriveNode) -> float:
+    """Return the rated current (A peak; the larger reading where it is not known to be peak or rms).
+
+    Raises
+    ------
+    NotAvailable
+        The drive does not say.
+    """
+    found = held(node, objects.RATED_CURRENT_MA)
+    if found is not None:
+        return RATED_RMS * found
+    own = _own(node, "rated_current")
+    found = None if own is None else held(node, own.item)
+    if own is None or found is None:
+        raise NotAvailable(
+            f"the drive does not say {NO_RATED}", where=f"node {node.node}",
+            hint="`pmsmtool caps` lists what this drive can give",
+        )  # fmt: skip
+    return own.per_count * found
+
+
+def shown_current(node: DriveNode, rated: float) -> Quantity:
+    """Return where the torque current is shown, in A peak per count; torque counts as current where nothing else does.
+
+    Raises
+    ------
+    NotAvailable
+        The drive shows neither.
+    """
+    own = _own(node, "current")
+    if own is not None and held(node, own.item) is not None:
+        return own
+    if held(node, objects.CURRENT_PERMILLE) is not None:
+        return Quantity(objects.CURRENT_PERMILLE, 1e-3 * rated)
+    signal = node.map.signals.get("i_q_a")
+    if signal is not None and not wire_unit(signal.unit).relative_to:
+        return Quantity(DriveObject(signal.index, signal.sub, LETTERS[signal.wire]), wire_unit(signal.unit).scale)
+    if held(node, TORQUE_PERMILLE) is not None:
+        return Quantity(TORQUE_PERMILLE, 1e-3 * rated)
+    raise NotAvailable("the drive shows neither current (0x6078) nor torque (0x6077)", where=f"node {node.node}")
+
+
+def undecided(node: DriveNode, rated: float) -> bool:
+    """Return whether no source says if the current that is shown is peak or rms; it is read as rms."""
+    shown = shown_current(node, rated)
+    if shown.item in (objects.CURRENT_PERMILLE, TORQUE_PERMILLE) and not shown.undecided:
+        base = rated_current(node)
+        return base is not None and base.undecided
+    return shown.undecided
+
+
+def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
+    """Return what takes a torque current: mode 4, else 10, as 0x6502 announces, else the maker's own.
+
+    Raises
+    ------
+    NotAvailable
+        The drive has no such mode, or no target in it.
+    """
+    modes = int(held(node, objects.SUPPORTED_MODES) or 0)
+    if node.map.capabilities.torque_mode and held(node, objects.TARGET_TORQUE_PERMILLE) is not None:
+        for mode in (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE):
+            if modes >> mode - 1 & 1:
+                return TorqueTarget(Quantity(objects.TARGET_TORQUE_PERMILLE, 1e-3 * rated), mode)
+    own = _own(node, "target_current")
+    if own is not None and held(node, own.item) is not None:
+        return TorqueTarget(own, node.map.motion["target_current"].mode)
+    raise NotAvailable(
+        f"the drive has no torque mode that this program knows (0x6502 = {modes:#x})", where=f"node {node.node}"
+    )
+
+
+def position_units(node: DriveNode) -> float:
+    """Return the units of 0x6064 per turn of the motor, negative where its polarity (0x607E) turns it.
+
+    Raises
+    ------
+    NotAvailable
+        Nothing tells, or a gear (0x6091) stands between and nothing says in which units.
+    """
+    sign = -1.0 if int(held(node, POLARITY) or 0) & POSITION_TURNED else 1.0
+    gear = max(1.0, held(node, GEAR_MOTOR) or 1.0) / max(1.0, held(node, GEAR_SHAFT) or 1.0)
+    unit = int(held(node, POSITION_UNIT) or 0)
+    if unit >> 16 & 0xFF == DEGREE:
+        exponent = unit >> 24
+        return sign * 360.0 / 10.0 ** (exponent - 256 if exponent > 127 else exponent) / gear
+    feed = held(node, FEED) or 1.0
+    if feed > 1.0:
+        return sign * feed / max(1.0, held(node, FEED_TURNS) or 1.0) / gear
+    if gear != 1.0:
+        raise NotAvailable(
+            f"a gear of {gear:.4g} is set (0x6091), and nothing says whether position is of the motor or behind it",
+            where=f"node {node.node}, 0x6091", hint="set it to 1:1, or the feed (0x6092), with the maker's software",
+        )  # fmt: skip
+    counts = held(node, ENCODER_COUNTS)
+    if counts is not None:
+        return sign * counts / max(1.0, held(node, MOTOR_TURNS) or 1.0)
+    row = node.map.motion.get("counts_per_turn")
+    if row is None:
+        raise NotAvailable(f"the drive does not say {NO_COUNTS}", where=f"node {node.node}")
+    own = _own(node, "counts_per_turn")
+    return sign * (row.number if own is None else own.per_count * node.get(own.item))
+
+
+def current_limits(node: DriveNode, rated: float) -> Iterator[Quantity]:
+    """Yield the objects that may limit the current, best first; the drive may lack them.
+
+    0x6072 limits torque, which counts as current: both are shares of the rated one.
+    """
+    yield Quantity(objects.MAX_CURRENT_PERMILLE, 1e-3 * rated)
+    own = _own(node, "current_limit")
+    if own is not None:
+        yield own
+    yield Quantity(MAX_TORQUE_PERMILLE, 1e-3 * rated)
+
+
+def speed_limits(node: DriveNode) -> Iterator[Quantity]:
+    """Yield the objects that may limit the speed, in rpm per count; the drive may lack them."""
+    yield Quantity(objects.MAX_SPEED_RPM, 1.0)
+    own = _own(node, "speed_limit")
+    if own is not None:
+        yield Quantity(own.item, own.per_count / RPM)
+
+
+def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, float] | None:
+    """Return the first limit that the drive has, and what it now allows (A peak or rpm)."""
+    for limit in limits:
+        found = held(node, limit.item)
+        if found is not None:
+            return limit, limit.per_count * found
+    return None
+
+
+def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
+    """Return what the drive does not keep by itself, one line each, with what replaces it."""
+    lines = []
+    if allowed(node, current_limits(node, rated)) is None:
+        lines.append(
+            "current   no limit in the drive (0x6073, 0x6072, or the maker's own): no command asks for more, and this"
+            " program looks"
+        )
+    if allowed(node, speed_limits(node)) is None:
+        lines.append(
+            "speed     no limit in the drive (0x6080): this program looks every 50 ms and removes the voltage at the "
+            "limit itself"
+        )
+    return lines

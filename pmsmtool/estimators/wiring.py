@@ -1,0 +1,153 @@
+"""What the first turn of a shaft says of the wiring: pole pairs, encoder counts and sign, a held shaft, the supply.
+
+The vector's way over the encoder's is the number of pole pairs, and its sign the encoder's, if the counts per turn are
+right. A wrong ratio does not say which of the two is wrong; the more usual mistake is named first, and the other with
+it: four counts per line, and poles given for pole pairs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pmsmtool.trace import Trace
+
+OK, WRONG, NOT_SEEN = "ok", "WRONG", "not seen"
+HELD_SHARE = 0.1
+"""Way of the encoder, of the vector's over the largest pole pairs that count (64), below which the shaft was held."""
+MOST_POLE_PAIRS = 64
+LAG_RAD = math.radians(40.0)
+"""Electrical angle that friction may leave between rotor and vector at the two ends of a way (a tenth of the rated
+current against 3 % of the rated torque: 35 degrees)."""
+COUNT_FACTORS = (4.0, 0.25)
+"""Counts per turn taken for lines, or lines for counts."""
+SUM_LIMIT = 0.1
+"""Sum of the phase currents, of the vector: a gain that is 10 % off makes 15 %, one that is 2 % off 3 %."""
+SAGS = 0.1
+"""Fall of the DC link under the small current, relative, that a supply in current limit makes."""
+U_DC_RANGE = (0.7, 1.4)
+"""DC link over the stated one beyond which it is not the supply that was stated."""
+
+NOT_LED = "the vector does not lead the rotor"
+HELD_BY = "brake shut, or the shaft is held; an encoder that does not count; friction above this torque"
+SLIPS_BY = "friction, cogging or a load beyond this torque; a brake that is half open"
+SIGN_BY = "two motor leads swapped, or the encoder's tracks; identify finds the sign by itself and sets it"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One row of the check.
+
+    Attributes
+    ----------
+    looked_at : str
+        What was looked at.
+    verdict : str
+        ``ok``, ``WRONG``, or ``not seen``: nothing is said of it.
+    shown : str
+        What was seen.
+    likely : str
+        Likely causes of what is wrong, the most likely first.
+    """
+
+    looked_at: str
+    verdict: str
+    shown: str
+    likely: str = ""
+
+
+def judge_turn(turn: Trace, pole_pairs: int, counts_against: bool) -> list[Finding]:
+    """Judge the first turn.
+
+    Parameters
+    ----------
+    turn : Trace
+        ``theta_imposed_rad`` (electrical, unwrapped), ``theta_M_rad`` (mechanical); ``at_rest`` 1 in three rows:
+        before, between and after the ways forward and back.
+    pole_pairs : int
+        As stated.
+    counts_against : bool
+        Whether the drive is set for an encoder that counts against the phase order.
+
+    Returns
+    -------
+    list of Finding
+        Shaft, pole pairs and counts, sign.
+    """
+    way_rad = float(np.ptp(turn["theta_imposed_rad"]))
+    before, between, after = turn["theta_M_rad"][turn["at_rest"] > 0.5]
+    moved = float(np.ptp(turn["theta_M_rad"]))
+    unseen = (Finding("pole pairs", NOT_SEEN, NOT_LED), Finding("encoder sign", NOT_SEEN, NOT_LED))
+    if moved < HELD_SHARE * way_rad / MOST_POLE_PAIRS:
+        due = math.degrees(way_rad / pole_pairs)
+        seen = f"the encoder moved by {math.degrees(moved):.2g} deg, {due:.3g} deg are due"
+        return [Finding("shaft", WRONG, seen, HELD_BY), *unseen]
+    there = between - 0.5 * (before + after)
+    ratio = way_rad / there if there else math.inf
+    missed = abs(ratio * (after - before))
+    if missed > LAG_RAD:
+        back = min(math.degrees(missed), 360.0)
+        seen = f"led there and back, the rotor stands {back:.3g} deg (electrical) or more from where it was"
+        return [Finding("shaft", WRONG, seen, SLIPS_BY), *unseen]
+    against = ratio < 0.0
+    shown, set_for = ("against" if each else "with" for each in (against, counts_against))
+    seen = f"counts {shown} the phase order, the drive is set for {set_for}"
+    return [
+        Finding("shaft", OK, f"led there and back within {math.degrees(missed):.2g} deg (electrical)"),
+        _pole_pairs(abs(ratio), pole_pairs, LAG_RAD / way_rad),
+        Finding("encoder sign", OK, seen)
+        if against == counts_against
+        else Finding("encoder sign", WRONG, seen, SIGN_BY),
+    ]
+
+
+def _pole_pairs(ratio: float, stated: int, same: float) -> Finding:
+    """Return the row of a ratio of electrical to encoder angle, which is known to a share ``same``."""
+    if abs(ratio / stated - 1.0) <= same or round(ratio) == stated:
+        return Finding("pole pairs", OK, f"{ratio:.3g} for the stated {stated}: so are the counts per turn")
+    factor, other = stated / ratio, round(ratio)
+    seen = f"{ratio:.3g} electrical turns per turn of the encoder, {stated} pole pairs are stated"
+    counts = f"counts per turn: the encoder shows {factor:.3g} times the angle"
+    pairs = f"{other} pole pairs"
+    if other < 1 or abs(ratio / other - 1.0) > same:
+        return Finding("encoder counts", WRONG, seen, counts)
+    if any(abs(factor / usual - 1.0) <= same for usual in COUNT_FACTORS):
+        return Finding("encoder counts", WRONG, seen, f"{counts}; or {pairs}")
+    return Finding("pole pairs", WRONG, seen, f"{pairs}; or {counts}")
+
+
+def judge_sensors(vectors: Trace) -> Finding:
+    """Judge whether the three phase currents of three vectors add up to the same, whatever the offsets are.
+
+    Parameters
+    ----------
+    vectors : Trace
+        As of ``phase_check.check_phases``.
+    """
+    total = vectors["i_a_a"] + vectors["i_b_a"] + vectors["i_c_a"]
+    share = float(np.ptp(total) / np.abs(np.mean(vectors["i_d_a"])))
+    seen = f"the phase currents add up to {100.0 * share:.2g} % of the current"
+    if share > SUM_LIMIT:
+        return Finding("current sensors", WRONG, seen, "the gain of one sensor, or two sensors exchanged")
+    return Finding("current sensors", OK, seen)
+
+
+def judge_supply(U_rest_v: float, turn: Trace | None, U_stated_v: float | None) -> Finding:
+    """Judge the DC link (V) at rest against the stated one, and under the current of the first turn against rest."""
+    low, high = U_DC_RANGE
+    stated = "" if U_stated_v is None else f", {U_stated_v:.4g} V are stated"
+    if U_stated_v is not None and not low * U_stated_v <= U_rest_v <= high * U_stated_v:
+        return Finding(
+            "supply", WRONG, f"DC link {U_rest_v:.4g} V{stated}",
+            "supply off, or set to another voltage" if U_rest_v < U_stated_v else "another supply than was stated",
+        )  # fmt: skip
+    if turn is not None:
+        least = float(np.min(turn["U_dc_v"]))
+        if least < (1.0 - SAGS) * U_rest_v:
+            return Finding(
+                "supply", WRONG, f"DC link falls from {U_rest_v:.4g} V to {least:.4g} V under a small current",
+                "the supply is in current limit, or its fuse or pre-charge resistor is still in the way",
+            )  # fmt: skip
+    return Finding("supply", OK, f"DC link {U_rest_v:.4g} V{stated}")

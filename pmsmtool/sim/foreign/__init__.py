@@ -1,0 +1,1 @@
+"""Simulated drives of other makers, from their EDS or DCF; their unit decoding is their own."""

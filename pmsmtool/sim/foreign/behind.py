@@ -1,0 +1,177 @@
+"""What stands behind a foreign drive's objects: the simulated power drive and its machine, in SI and peak values."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from pmsmtool.cia402 import Mode
+from pmsmtool.sim.node.dictionary import Dictionary, Entry
+from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, Plant, PowerDrive
+from pmsmtool.sim.signals import Signal
+
+if TYPE_CHECKING:
+    from pmsmtool.machine.machine_file import MachineFile
+
+INNER_MODES = {3: Mode.PROFILE_VELOCITY, 4: Mode.PROFILE_TORQUE, 9: Mode.CYCLIC_VELOCITY, 10: Mode.CYCLIC_TORQUE}
+"""Modes that move the simulated machine; the others (profiles of position, homing) are taken and hold no current."""
+POSITION_BITS = 32
+NO_SLOPE = 10_000_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class SetUp:
+    """The motor as its maker's set-up tool would have entered it.
+
+    Attributes
+    ----------
+    pole_pairs : int
+    R_s_ohm, L_q_h : float
+        Per phase.
+    i_nom_apk, i_max_apk : float
+        Rated and largest current (A peak).
+    torque_nm : float
+        Rated torque.
+    n_max_rpm : float
+        Largest speed.
+    counts : int
+        Encoder counts per turn.
+    K_p_v_per_a, K_i_v_per_as : float
+        Gains of the current loops.
+    """
+
+    pole_pairs: int
+    R_s_ohm: float
+    L_q_h: float
+    i_nom_apk: float
+    i_max_apk: float
+    torque_nm: float
+    n_max_rpm: float
+    counts: int
+    K_p_v_per_a: float
+    K_i_v_per_as: float
+
+    @property
+    def torque_constant(self) -> float:
+        """Torque per current (N m per A peak)."""
+        return self.torque_nm / self.i_nom_apk
+
+
+def set_up_of(machine_file: MachineFile) -> SetUp:
+    """Return the motor of a machine file as a maker's tool would enter it."""
+    from pmsmtool.sim.drive_kernel import IDEAL_ENCODER_COUNTS
+    from pmsmtool.sim.node.factory import factory_values, set_up_values
+    from pmsmtool.sim.simulated_machine import settings_of
+
+    values = factory_values(machine_file) | set_up_values(machine_file)
+    i_nom = values["motor.I_nom_apk"]
+    bits = settings_of(machine_file).whole("encoder_bits")
+    return SetUp(
+        round(values["motor.pole_pairs"]), values["motor.R_s_ohm"], values["motor.L_q_h"], i_nom,
+        values["motor.I_max_apk"], abs(machine_file.machine.torque_nm(0.0, i_nom)) or 1.0, values["motor.n_max_rpm"],
+        1 << bits if bits else IDEAL_ENCODER_COUNTS,
+        values["current.K_p_q_v_per_a"], values["current.K_i_q_v_per_as"],
+    )  # fmt: skip
+
+
+@dataclass(slots=True)
+class Behind:
+    """The machine and the application that the objects show and command.
+
+    Attributes
+    ----------
+    dictionary, plant, power
+        Of the session.
+    set_up : SetUp
+        The motor.
+    largest_step : float
+        Largest change of a torque command while energised in a cyclic mode, share of the rated torque; for tests.
+    """
+
+    dictionary: Dictionary
+    plant: Plant
+    power: PowerDrive
+    set_up: SetUp
+    largest_step: float = 0.0
+    _torque_nm: float = field(default=0.0, init=False)
+
+    # ---- what is shown --------------------------------------------------------------------------
+
+    def _signal(self, signal: Signal) -> float:
+        self.plant.look()
+        return self.plant.core.signal(signal)
+
+    def position(self, units_per_turn: float) -> float:
+        """Return the angle in units, as a counter of 32 bits."""
+        half = 1 << POSITION_BITS - 1
+        return (round(self._signal(Signal.THETA_M) / (2.0 * math.pi) * units_per_turn) + half) % (2 * half) - half
+
+    def turns_per_s(self) -> float:
+        """Return the mechanical speed."""
+        return self.power.omega_m() / (2.0 * math.pi)
+
+    def i_q_a(self) -> float:
+        """Return the torque current (A peak)."""
+        return self._signal(Signal.I_Q)
+
+    def i_d_a(self) -> float:
+        """Return the flux current (A peak)."""
+        return self._signal(Signal.I_D)
+
+    def torque_nm(self) -> float:
+        """Return what a drive takes for its torque: the torque current times its torque constant."""
+        return self.i_q_a() * self.set_up.torque_constant
+
+    def U_dc_v(self) -> float:
+        """Return the DC link (V)."""
+        return self._signal(Signal.U_DC)
+
+    # ---- what is commanded ----------------------------------------------------------------------
+
+    def _write(self, key: str, number: float) -> None:
+        inner: Entry = self.dictionary[key]
+        self.dictionary.write(inner, inner.encode(number))
+
+    def command_mode(self, mode: int) -> None:
+        """Choose the mode that acts."""
+        self._write("cia402.mode", INNER_MODES.get(mode, Mode.NONE))
+
+    def command_torque(self, torque_nm: float) -> None:
+        """Take a torque reference (N m)."""
+        step = abs(torque_nm - self._torque_nm) / self.set_up.torque_nm
+        if self.power.state.energised and self.dictionary["cia402.mode"].integer() == Mode.CYCLIC_TORQUE:
+            self.largest_step = max(self.largest_step, step)
+        self._torque_nm = torque_nm
+        rated_nm = self.dictionary["cia402.rated_torque"].number() / 1000.0
+        self._write("cia402.target_torque", 1000.0 * torque_nm / rated_nm)
+
+    def command_speed(self, turns_per_s: float) -> None:
+        """Take a speed reference (turns/s)."""
+        self._write("cia402.target_velocity", 2.0 * math.pi * turns_per_s / RAD_S_PER_MRPM)
+
+    def limit_current(self, apk: float) -> None:
+        """Keep the current vector (A peak)."""
+        rated_apk = 1e-3 * math.sqrt(2.0) * self.dictionary["cia402.rated_current"].number()
+        self._write("cia402.max_current", 1000.0 * apk / rated_apk)
+
+    def limit_torque(self, torque_nm: float) -> None:
+        """Keep the torque (N m)."""
+        rated_nm = self.dictionary["cia402.rated_torque"].number() / 1000.0
+        self._write("cia402.max_torque", 1000.0 * torque_nm / rated_nm)
+
+    def limit_speed(self, rpm: float) -> None:
+        """Keep the speed (rpm)."""
+        self._write("cia402.max_speed", rpm)
+
+    def torque_slope(self, permille_per_s: float) -> None:
+        """Move a profile torque no faster (0: at once)."""
+        self._write("cia402.torque_slope", permille_per_s or NO_SLOPE)
+
+    def set_gains(self, K_p_v_per_a: float | None = None, K_i_v_per_as: float | None = None) -> None:
+        """Change the gains of both current loops."""
+        for axis in "dq":
+            if K_p_v_per_a is not None:
+                self._write(f"current.K_p_{axis}_v_per_a", K_p_v_per_a)
+            if K_i_v_per_as is not None:
+                self._write(f"current.K_i_{axis}_v_per_as", K_i_v_per_as)

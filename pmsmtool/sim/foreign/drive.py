@@ -1,0 +1,176 @@
+"""A simulated drive with the object dictionary of a maker's file, over plant and CANopen server of ``sim/node``.
+
+Objects that the file lacks do not exist. Objects with a law (``families``, ``laws``) show and command the simulated
+machine in the maker's units; all others keep what is written within the file's limits. The motor is entered as the
+maker's set-up tool would have done it; everything else holds what the file says.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.sim.foreign.behind import Behind, SetUp
+from pmsmtool.sim.foreign.families import family_of, laws_of, modes_of
+from pmsmtool.sim.foreign.file_rows import MakersObjects
+from pmsmtool.sim.foreign.guarding import NodeGuarding
+from pmsmtool.sim.foreign.laws import Law
+from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+
+if TYPE_CHECKING:
+    from pmsmtool.sim.node.power_drive import Plant, PowerDrive
+    from pmsmtool.sim.node.schedule import Schedule
+    from pmsmtool.sim.node.session import Session
+
+COMMUNICATION = range(0x1000, 0x1200)
+"""Objects whose stored value the node's own server takes over; those of SDO and PDO keep the server's."""
+LAST_COMMUNICATION = 0x2000
+PASSED_ON = (0x603F, 0x6040, 0x6041, 0x6007, 0x605A, 0x605E)
+"""State machine and option codes: numbers of the standard, whoever the maker is."""
+HELD = (0x6072, 0x6073, 0x6087)
+"""Limits whose stored value acts from the start."""
+SERIALS = ((0x1018, 4), (0x2100, 1), (0x6510, 1))
+"""Where makers keep the serial number (EPOS4: 0x2100:01, Copley: 0x6510:01)."""
+
+
+class ForeignDrive:
+    """What a simulated drive shows instead of its own dictionary: a maker's.
+
+    Parameters
+    ----------
+    objects : MakersObjects
+        Of the file.
+    set_up : SetUp
+        The motor.
+
+    Attributes
+    ----------
+    vendor_product : tuple of int
+        Identity; where the file leaves it blank, that of the family it is recognised as.
+    assumed : tuple of str
+        What the simulated drive does that neither file nor standard says.
+    behind : Behind or None
+        The machine behind, while the drive runs; for tests.
+    """
+
+    def __init__(self, objects: MakersObjects, set_up: SetUp) -> None:
+        self.objects = objects
+        self.laws = laws_of(objects, set_up)
+        self._set_up = set_up
+        family = family_of(objects)
+        stated = objects.stored(0x1018, 1), objects.stored(0x1018, 2)
+        self.vendor_product = (stated[0] or family.identity[0], stated[1] or family.identity[1])
+        self.label = f"simulated {objects.name}"
+        own = [f"0x{law.index:04X}:{law.sub:02X} {law.source}" for law in self.laws.values() if "assumed" in law.source]
+        blank = [] if all(stated) else [f"0x1018 blank in the file: taken as {self.vendor_product}"]
+        reaction = [] if objects.has((0x6007, 0)) else ["no 0x6007: a lost master is a fault (0x605E), voltage off"]
+        self.assumed = (*objects.assumed, *own, *blank, *reaction)
+        self.behind: Behind | None = None
+
+    def dress(self, dictionary: Dictionary) -> None:
+        """Put the maker's objects into a dictionary whose application is not hooked up yet."""
+        server = {(entry.row.index, entry.row.sub): entry for entry in dictionary}
+        for index in {index for index, _ in server}:
+            dictionary.hide(index)
+        serial = dictionary["identity.serial"].integer()
+        for (index, sub), row in self.objects.rows.items():
+            kept = server.get((index, sub))
+            if index < LAST_COMMUNICATION and kept is not None and kept.row.type == row.type:
+                if index in COMMUNICATION and index != 0x1018 and row.default:
+                    kept.value = row.default_bytes(0)
+                kept.readable, kept.writable = row.access != "wo", row.access in ("rw", "wo")
+                dictionary.show(kept)
+                continue
+            entry = Entry(row, 0)
+            law = self.laws.get((index, sub))
+            if law is not None and law.set_up is not None:
+                low, high = (-math.inf if row.low is None else row.low), (math.inf if row.high is None else row.high)
+                entry.value = entry.encode(min(max(law.set_up, low), high))  # no more than the drive can give
+            if (index, sub) in SERIALS:
+                entry.value = entry.encode(serial)
+            dictionary.show(entry)
+        dictionary.find(0x6502, 0).value = self._modes_word(dictionary)
+        if not self.objects.has((0x6007, 0)):
+            dictionary["cia402.abort_connection"].put(1)
+
+    def _modes_word(self, dictionary: Dictionary) -> bytes:
+        modes = sum(1 << mode - 1 for mode in modes_of(self.objects) if mode > 0)
+        return dictionary.find(0x6502, 0).encode(modes)
+
+    def attach(self, dictionary: Dictionary, plant: Plant, power: PowerDrive, schedule: Schedule) -> None:
+        """Let the objects show and command the running machine, and what they hold take effect."""
+        self.behind = behind = Behind(dictionary, plant, power, self._set_up)
+        inner = {(e.row.index, e.row.sub): e for e in dictionary.by_key.values() if e.row.index in PASSED_ON}
+        for (index, sub), entry in inner.items():
+            if self.objects.has((index, sub)):
+                _pass_on(dictionary, dictionary.find(index, sub), entry)
+        for law in self.laws.values():
+            _obey(law, dictionary.find(law.index, law.sub), behind)
+        self._hook_modes(dictionary, behind)
+
+    def _hook_modes(self, dictionary: Dictionary, behind: Behind) -> None:
+        mode, display = dictionary.find(0x6060, 0), dictionary.find(0x6061, 0)
+        modes = modes_of(self.objects)
+
+        def choose(data: bytes) -> None:
+            number = int.from_bytes(data[:1], "little", signed=True)
+            if number and number not in modes:
+                raise Refused(AbortCode.VALUE)
+            behind.command_mode(4 if number == -3 else 3 if number == -2 else number)
+            mode.value = bytes(data)
+
+        mode.sink = choose
+        display.source = lambda: mode.value
+        with contextlib.suppress(Refused):
+            choose(mode.value)
+
+    def guarding(self, session: Session) -> NodeGuarding | None:
+        """Return node guarding where the file has its objects."""
+        if not self.objects.has((0x100C, 0), (0x100D, 0)):
+            return None
+        find = session.dictionary.find
+        heartbeat = find(0x1017, 0) if self.objects.has((0x1017, 0)) else None
+        return NodeGuarding(
+            find(0x100C, 0), find(0x100D, 0), heartbeat, session.schedule, session.answer_guarding,
+            lambda: session.power.connection_lost(0), session.power.connection_regained,
+        )  # fmt: skip
+
+
+def _pass_on(dictionary: Dictionary, shown: Entry, inner: Entry) -> None:
+    """Let a maker's object be the application's own, number for number."""
+    if shown.readable and inner.source is not None:
+        shown.source = lambda: shown.encode(inner.number())
+        if not shown.writable:
+            return
+    if inner.writable and shown.writable:
+        take = _taken(shown, lambda number: bool(dictionary.write(inner, inner.encode(number))))
+        with contextlib.suppress(Refused):
+            if shown.row.index != 0x6040 and shown.row.default:
+                take(shown.value)
+        shown.sink = take
+
+
+def _obey(law: Law, entry: Entry, behind: Behind) -> None:
+    show, act = law.show, law.act
+    if show is not None:
+        entry.source = lambda: entry.encode(show(behind))
+    if act is not None:
+        entry.sink = _taken(entry, lambda number: bool(act(behind, number)))
+        if law.set_up is not None or law.index in HELD:
+            act(behind, entry.number())
+
+
+def _taken(entry: Entry, act: Callable[[float], object]) -> Callable[[bytes], None]:
+    def sink(data: bytes) -> None:
+        before, entry.value = entry.value, bytes(data)
+        try:
+            number = 0.0 if entry.code is None else float(entry.code.unpack(data)[0])
+            act(number)
+        except Refused:
+            entry.value = before
+            raise
+
+    return sink

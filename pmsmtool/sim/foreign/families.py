@@ -1,0 +1,186 @@
+"""The makers' own objects, family by family: recognised by what the file has, each law with its source or ``assumed``.
+
+Where no public source says whether a current is peak or rms, one reading is taken and marked ``assumed``; the tool must
+not know which.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from pmsmtool.sim.foreign.behind import Behind, SetUp
+from pmsmtool.sim.foreign.file_rows import MakersObjects
+from pmsmtool.sim.foreign.laws import ASSUMED, Law, position_units, speed_units, standard_laws
+
+PEAK_ASSUMED = f"mA; peak {ASSUMED}"
+RMS = math.sqrt(0.5)
+Laws = Callable[[MakersObjects, SetUp], Iterator[Law]]
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """One maker's way to keep a motor.
+
+    Attributes
+    ----------
+    name : str
+        For people.
+    marks : tuple of (index, sub)
+        Objects by which it is recognised.
+    laws : callable
+        Its own laws; they stand before the standard's.
+    identity : tuple of int
+        Vendor and product where the file leaves them blank (``assumed``).
+    modes : int
+        0x6502 where the file leaves it blank (``assumed``).
+    own_modes : tuple of int
+        Modes of the maker's own, which 0x6502 does not announce.
+    speed_per_rps : float or None
+        Units of 0x606C per turn per second where the maker fixes them.
+    speed_source : str
+        Where that is stated.
+    per_turn : int
+        Units of position per turn where the maker fixes them; 0: the encoder's counts.
+    """
+
+    name: str
+    marks: tuple[tuple[int, int], ...]
+    laws: Laws
+    identity: tuple[int, int] = (0, 0)
+    modes: int = 0
+    own_modes: tuple[int, ...] = ()
+    speed_per_rps: float | None = None
+    speed_source: str = ""
+    per_turn: int = 0
+
+
+def _current(index: int, sub: int, per_apk: float, source: str) -> Law:
+    return Law(index, sub, source, show=lambda behind: per_apk * behind.i_q_a())
+
+
+def _limit(index: int, sub: int, per_apk: float, apk: float, source: str) -> Law:
+    def act(behind: Behind, counts: float) -> None:
+        behind.limit_current(counts / per_apk)
+
+    return Law(index, sub, source, set_up=per_apk * apk, act=act)
+
+
+def _epos4(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
+    """Nominal current x torque constant is the rated torque, in uN m (a published DCF holds exactly that)."""
+    rated_ma, constant = round(1000.0 * motor.i_nom_apk), round(1e6 * motor.torque_constant)
+    yield Law(0x3001, 1, PEAK_ASSUMED, set_up=rated_ma)
+    yield _limit(0x3001, 2, 1000.0, motor.i_max_apk, PEAK_ASSUMED)
+    yield Law(0x3001, 3, "pole pairs", set_up=motor.pole_pairs)
+    yield Law(0x3001, 5, "uN m/A", set_up=constant)
+    yield Law(0x3010, 1, "pulses, four counts each", set_up=motor.counts / 4.0)
+    yield Law(0x6076, 0, "uN m", set_up=rated_ma * constant / 1000.0)
+    for sub in (1, 2):
+        yield _current(0x30D1, sub, 1000.0, PEAK_ASSUMED)
+    yield Law(0x30D0, 0, PEAK_ASSUMED, show=lambda behind: 1000.0 * behind.i_q_a())
+    yield Law(
+        0x30A0, 1, "uV/A", set_up=1e6 * motor.K_p_v_per_a,
+        act=lambda behind, n: behind.set_gains(K_p_v_per_a=1e-6 * n),
+    )  # fmt: skip
+    yield Law(
+        0x30A0, 2, "uV/(A ms)", set_up=1e3 * motor.K_i_v_per_as,
+        act=lambda behind, n: behind.set_gains(K_i_v_per_as=1e-3 * n),
+    )  # fmt: skip
+
+
+def _epos2(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
+    """Current mode -3 takes 0x2030; currents are mA, not shares of a rated one."""
+    yield Law(0x6410, 1, PEAK_ASSUMED, set_up=1000.0 * motor.i_nom_apk)
+    yield _limit(0x6410, 2, 1000.0, motor.i_max_apk, PEAK_ASSUMED)
+    yield Law(0x6410, 3, "pole pairs", set_up=motor.pole_pairs)
+    yield Law(0x6410, 4, "rpm", set_up=motor.n_max_rpm, act=lambda behind, n: behind.limit_speed(n))
+    yield Law(0x2210, 1, "pulses, four counts each", set_up=motor.counts / 4.0)
+    yield _current(0x6078, 0, 1000.0, PEAK_ASSUMED)
+    yield _current(0x2027, 0, 1000.0, PEAK_ASSUMED)
+
+    def push(behind: Behind, counts: float) -> None:
+        behind.command_torque(1e-3 * counts * motor.torque_constant)
+
+    yield Law(0x2030, 0, PEAK_ASSUMED, act=push)
+
+
+def _copley(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
+    """Counts of 0.01 A peak; winding data between two lines (CME 2 user guide)."""
+    source = "Copley Motion Libraries; CME 2 user guide"
+    yield _limit(0x2110, 0, 100.0, motor.i_max_apk, source)
+    yield Law(0x2111, 0, source, set_up=100.0 * motor.i_nom_apk)
+    yield Law(0x2112, 0, source, set_up=1000.0)
+    yield Law(0x6410, 2, source, set_up=motor.pole_pairs)
+    yield Law(0x6410, 7, source, set_up=2.0 * motor.R_s_ohm / 0.01)
+    yield Law(0x6410, 8, source, set_up=2.0 * motor.L_q_h / 1e-5)
+    yield Law(0x6410, 12, source, set_up=motor.torque_constant / 1e-5)
+    yield Law(0x6410, 23, source, set_up=motor.counts)
+    for index in (0x221C, 0x2215):
+        yield _current(index, 0, 100.0, source)
+    yield Law(0x2214, 0, source, show=lambda behind: 100.0 * behind.i_d_a())
+    yield Law(0x2201, 0, source, show=lambda behind: 10.0 * behind.U_dc_v())
+
+
+def _nanotec(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
+    source = f"mA; rms {ASSUMED}"
+    yield Law(0x2030, 0, "pole pairs", set_up=motor.pole_pairs)
+    yield _limit(0x2031, 0, 1000.0 * RMS, motor.i_max_apk, source)
+    yield Law(0x203B, 1, source, set_up=1000.0 * RMS * motor.i_nom_apk)
+    yield Law(0x2039, 1, source, show=lambda behind: 1000.0 * RMS * behind.i_d_a())
+    yield _current(0x2039, 2, 1000.0 * RMS, source)
+
+
+def _faulhaber(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
+    yield Law(0x2333, 1, PEAK_ASSUMED, set_up=1000.0 * motor.i_nom_apk)
+    yield _limit(0x2333, 2, 1000.0, motor.i_max_apk, PEAK_ASSUMED)
+    yield _current(0x6078, 0, 1000.0, PEAK_ASSUMED)
+    yield Law(0x2350, 3, "poles", set_up=2.0 * motor.pole_pairs)
+
+
+def _none(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
+    return iter(())
+
+
+FAMILIES: Sequence[Family] = (
+    Family("EPOS4", ((0x3001, 5), (0x30A0, 1)), _epos4, (0xFB, 0x61500000), 0x0000_0225),
+    Family(
+        "EPOS2", ((0x2030, 0), (0x6410, 5), (0x60F6, 1)), _epos2, (0xFB, 0x63220000), 0x0000_0065, (-3, -2, -1),
+        60.0, "rpm: its largest profile velocity is 25000",
+    ),
+    Family("Copley", ((0x2110, 0), (0x2111, 0), (0x6410, 34)), _copley, (0xAB, 0x20B)),
+    Family("Nanotec", ((0x2030, 0), (0x2031, 0), (0x203B, 1)), _nanotec),
+    Family(
+        "Faulhaber", ((0x2333, 1), (0x2350, 3)), _faulhaber, speed_per_rps=60.0,
+        speed_source="rpm: its largest profile velocity is 30000",
+    ),
+    Family("ZeroErr", ((0x2240, 0), (0x2241, 0), (0x3B69, 0)), _none, per_turn=524_288),
+    Family("Elmo Gold", ((0x2F45, 1), (0x60E0, 0)), _none, (0x9A, 0x30923), 0x0000_03ED),
+)  # fmt: skip
+OTHER = Family("CiA 402", (), _none)
+
+
+def family_of(objects: MakersObjects) -> Family:
+    """Return the family whose objects the file has, else one that keeps to CiA 402."""
+    return next((family for family in FAMILIES if objects.has(*family.marks)), OTHER)
+
+
+def laws_of(objects: MakersObjects, motor: SetUp) -> dict[tuple[int, int], Law]:
+    """Return the law of every object that has one and that the file has; the maker's before the standard's."""
+    family = family_of(objects)
+    per_turn = family.per_turn or position_units(objects, motor.counts)
+    per_rps, speed = speed_units(objects, per_turn)
+    if family.name == "Copley":
+        per_rps, speed = 10.0 * per_turn, "0.1 counts per second (CML)"
+    if family.speed_per_rps is not None:
+        per_rps, speed = family.speed_per_rps, family.speed_source
+    laws = {(law.index, law.sub): law for law in standard_laws(objects, motor, per_turn, per_rps, speed)}
+    laws |= {(law.index, law.sub): law for law in family.laws(objects, motor)}
+    return {address: law for address, law in laws.items() if address in objects.rows}
+
+
+def modes_of(objects: MakersObjects) -> tuple[int, ...]:
+    """Return the modes of operation the drive takes: what 0x6502 announces, and the maker's own."""
+    family = family_of(objects)
+    announced = objects.stored(0x6502) or family.modes
+    return (*(bit + 1 for bit in range(16) if announced >> bit & 1), *family.own_modes)

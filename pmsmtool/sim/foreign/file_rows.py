@@ -1,0 +1,224 @@
+"""The objects of a maker's drive as its file lists them: an EDS, a DCF, or a table of such rows.
+
+What the file lacks does not exist on the simulated drive. Added is only what CiA 301 and CiA 402 make mandatory for the
+modes that the file announces, and the number of entries of a record; each is ``assumed``, and so is every limit that
+contradicts the standard.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.files import read_bytes
+from pmsmtool.firmware.eds import decode, parse_eds, parse_integer
+from pmsmtool.sim.node.objects import TYPES, ObjectRow
+
+FAMILY_MARK = "#"
+"""Between the path of a table and the family whose rows are meant: ``objects.csv#maker``."""
+COLUMNS = ("family", "index", "sub", "name", "type", "access", "default_or_stored", "low", "high")
+"""Columns a table needs."""
+_LONG = {
+    "BOOLEAN": "U8", "INTEGER8": "I8", "INTEGER16": "I16", "INTEGER32": "I32", "INTEGER64": "U64", "UNSIGNED8": "U8",
+    "UNSIGNED16": "U16", "UNSIGNED32": "U32", "UNSIGNED64": "U64", "REAL32": "REAL32", "VISIBLE_STRING": "VSTR",
+    "OCTET_STRING": "VSTR", "UNICODE_STRING": "VSTR", "DOMAIN": "DOMAIN",
+}  # fmt: skip
+_CODES = {kind.code: name for name, kind in TYPES.items()} | {0x01: "U8", 0x0A: "VSTR", 0x0B: "VSTR", 0x15: "U64"}
+"""CiA 301 data types by number and by name; one of 64 bits with a sign is kept as its bytes."""
+_ACCESS = {"ro": "ro", "const": "const", "wo": "wo", "rw": "rw", "rwr": "rw", "rww": "rw"}
+CONSUMER_LIMIT = 0x7FFFFF
+"""Largest entry of 0x1016: a node id above 16 bits of time (CiA 301); files with 65535 leave no room for the node."""
+
+MANDATORY: tuple[tuple[int, int, str, str, str], ...] = (
+    (0x1000, 0, "U32", "const", "0x00020192"),
+    (0x1001, 0, "U8", "ro", "0"),
+    (0x1018, 1, "U32", "ro", "0"),
+    (0x6040, 0, "U16", "rw", "0"),
+    (0x6041, 0, "U16", "ro", "0"),
+    (0x6060, 0, "I8", "rw", "0"),
+    (0x6061, 0, "I8", "ro", "0"),
+    (0x6502, 0, "U32", "ro", ""),
+)
+"""Of every drive (CiA 301, 7.5.2; CiA 402-2, 8 and 10)."""
+BY_MODE: Mapping[int, tuple[tuple[int, int, str, str, str], ...]] = {
+    1: ((0x607A, 0, "I32", "rw", "0"), (0x6081, 0, "U32", "rw", "0"), (0x6083, 0, "U32", "rw", "0")),
+    3: ((0x606C, 0, "I32", "ro", "0"), (0x60FF, 0, "I32", "rw", "0")),
+    4: ((0x6071, 0, "I16", "rw", "0"),),
+    8: ((0x607A, 0, "I32", "rw", "0"), (0x6064, 0, "I32", "ro", "0")),
+    9: ((0x60FF, 0, "I32", "rw", "0"),),
+    10: ((0x6071, 0, "I16", "rw", "0"),),
+}
+"""Mandatory in a mode of operation (CiA 402-2, its table of objects per mode)."""
+DRIVE_PROFILE = 402
+
+
+@dataclass(frozen=True, slots=True)
+class MakersObjects:
+    """What a file says a drive has.
+
+    Attributes
+    ----------
+    name : str
+        Of the file or the family.
+    rows : mapping of (index, sub) to ObjectRow
+        Every object, sorted.
+    assumed : tuple of str
+        What is not the file's, one line each.
+    """
+
+    name: str
+    rows: Mapping[tuple[int, int], ObjectRow]
+    assumed: tuple[str, ...]
+
+    def stored(self, index: int, sub: int = 0) -> int:
+        """Return the whole number that the file says an object holds; 0 where it says none."""
+        row = self.rows.get((index, sub))
+        if row is None or not row.data_type.letter or row.data_type.is_float:
+            return 0
+        return int(row.default_number(1))
+
+    def has(self, *addresses: tuple[int, int]) -> bool:
+        """Whether all the objects are there."""
+        return all(address in self.rows for address in addresses)
+
+
+def read_makers_objects(where: str) -> MakersObjects:
+    """Return the objects of an EDS, a DCF, or of one family of a table (``FILE.csv#FAMILY``).
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, holds no objects, or is no file of a drive (CiA 402).
+    """
+    name, _, family = where.partition(FAMILY_MARK)
+    path = Path(name)
+    data = read_bytes(path, hint="give the EDS or DCF that the drive's maker offers, or TABLE.csv#FAMILY")
+    if path.suffix.lower() == ".csv":
+        found, label = dict(_of_table(data, path, family)), family
+    else:
+        found, label = dict(_of_eds(data, path)), path.stem
+    rows, assumed = _completed(found)
+    profile = MakersObjects(label, rows, assumed)
+    if profile.stored(0x1000) & 0xFFFF not in (0, DRIVE_PROFILE):
+        raise ConfigError(
+            f"the file is of a device of profile {profile.stored(0x1000) & 0xFFFF}, not of a drive (CiA 402)",
+            where=where,
+            likely="a controller of another profile, which is neither simulated nor moved",
+            hint="give the EDS or DCF of a drive",
+        )
+    return profile
+
+
+def _of_eds(data: bytes, path: Path) -> Iterator[tuple[tuple[int, int], ObjectRow]]:
+    eds = parse_eds(data, str(path), 1)
+    identity = {1: eds.vendor, 2: eds.product, 3: eds.revision}
+    for (index, sub), entry in eds.objects.items():
+        value = entry.value or entry.default
+        if index == 0x1018 and not value and identity.get(sub) is not None:
+            value = str(identity[sub])
+        yield (
+            (index, sub),
+            _row(
+                index,
+                sub,
+                entry.name,
+                _CODES.get(entry.data_type, "DOMAIN"),
+                entry.access,
+                value,
+                entry.low,
+                entry.high,
+            ),
+        )
+
+
+def _of_table(data: bytes, path: Path, family: str) -> Iterator[tuple[tuple[int, int], ObjectRow]]:
+    table = csv.DictReader(io.StringIO(decode(data)[0], newline=""))
+    if not set(COLUMNS) <= set(table.fieldnames or ()):
+        raise ConfigError("not a table of objects", where=str(path), hint=f"it needs the columns {', '.join(COLUMNS)}")
+    families: dict[str, None] = {}
+    for fields in table:
+        families[fields["family"]] = None
+        if fields["family"] != family:
+            continue
+        kind = _LONG.get(fields["type"].strip().upper(), "DOMAIN")
+        index, sub = int(fields["index"], 16), int(fields["sub"], 0)
+        low, high = (_limit(fields[key], kind) for key in ("low", "high"))
+        value = fields["default_or_stored"]
+        yield (index, sub), _row(index, sub, fields["name"], kind, fields["access"].lower(), value, low, high)
+    if family not in families:
+        raise ConfigError(
+            f"the table has no rows of family {family!r}", where=str(path),
+            hint=f"write FILE{FAMILY_MARK}FAMILY with one of {', '.join(families)}",
+        )  # fmt: skip
+
+
+def _limit(text: str, kind: str) -> int | float | None:
+    try:
+        value = float(text) if TYPES[kind].is_float else parse_integer(text, 1) if text.strip() else None
+    except ValueError:
+        return None
+    bits = 8 * TYPES[kind].size
+    if kind.startswith("I") and value is not None and (1 << bits - 1) <= value < (1 << bits):
+        return value - (1 << bits)  # a negative limit written in hex
+    return value
+
+
+def _row(
+    index: int, sub: int, name: str, kind: str, access: str, value: str, low: float | None, high: float | None
+) -> ObjectRow:
+    access = _ACCESS.get(access, "ro")
+    if low is not None and high is not None and not low < high and access == "rw":
+        low = high = None if low == high == 0 else low  # both 0: the file's way to say nothing
+    kept = access == "rw" and index >= 0x2000
+    return ObjectRow(index, sub, "", name, kind, access, "T", "", _value(value, kind), low, high, kept)
+
+
+def _value(text: str, kind: str) -> str:
+    """Return a stored value as an object row keeps it: a number that fits its type, or ASCII; blank stays blank."""
+    code = TYPES[kind]
+    if not code.letter:
+        return text.encode("ascii", "replace").decode("ascii")
+    if not text.strip():
+        return "0" if code.is_float else ""  # blank: the file does not say
+    try:
+        if code.is_float:
+            return str(float(text))
+        value = parse_integer(text, 1)
+    except ValueError:
+        return "0"
+    if "$NODEID" in text.upper():
+        return f"$NODEID+{value - 1:#x}"
+    bits = 8 * code.size
+    value %= 1 << bits
+    return str(value - (1 << bits) if kind.startswith("I") and value >> bits - 1 else value)
+
+
+def _completed(
+    found: dict[tuple[int, int], ObjectRow],
+) -> tuple[dict[tuple[int, int], ObjectRow], tuple[str, ...]]:
+    """Add what the standards make mandatory, and say so."""
+    assumed: list[str] = []
+
+    def add(items: Iterable[tuple[int, int, str, str, str]], why: str) -> None:
+        for index, sub, kind, access, value in items:
+            if (index, sub) not in found:
+                found[index, sub] = _row(index, sub, "mandatory", kind, access, value, None, None)
+                assumed.append(f"0x{index:04X}:{sub:02X} {why}")
+
+    add(MANDATORY, "mandatory")
+    announced = int(found[0x6502, 0].default or "0", 0)
+    for mode, items in BY_MODE.items():
+        if announced >> mode - 1 & 1:
+            add(items, f"mandatory in mode {mode}")
+    for index in sorted({index for index, sub in found if sub}):
+        highest = max(sub for at, sub in found if at == index)
+        add([(index, 0, "U8", "const", str(highest))], "number of entries")
+    for (index, sub), row in found.items():
+        if index == 0x1016 and sub and row.high is not None and row.high < CONSUMER_LIMIT:
+            found[index, sub] = replace(row, high=None)
+            assumed.append(f"0x1016:{sub:02X} takes a node id, for which the file's limit leaves no room")
+    return dict(sorted(found.items())), tuple(assumed)

@@ -1,0 +1,53 @@
+"""The first power-on, typed: what is done to a simulated drive is the first wrong row, and the drive is restored."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.machine.profile import machine_path
+from tests.cli.conftest import Tool
+
+STATED = "interior-2k2"
+"""3 pole pairs; a drive from the factory holds 4."""
+
+
+def checked(tool: Tool, extra: str) -> tuple[int, dict[str, tuple[str, str]], str]:
+    Path("sheet.toml").write_text(dump_machine_file(load_machine_file(machine_path(STATED))), encoding="utf-8")
+    text = dump_machine_file(load_machine_file(machine_path(STATED)))
+    lines = text.splitlines()
+    at = lines.index("[simulation]") + 1
+    rest = [line for line in lines[at:] if line.partition(" ")[0] != extra.partition(" ")[0]]
+    Path("drive.toml").write_text("\n".join([*lines[:at], extra, *rest]), encoding="utf-8")
+    code, out, told = tool("-i", "pmsmsim", "-c", "drive.toml?nv=:memory:", "check", "sheet.toml", "--yes", "--json")
+    rows = json.loads(out)["findings"]
+    return code, {row["looked_at"]: (row["verdict"], row["shown"]) for row in rows}, told
+
+
+@pytest.mark.parametrize(
+    ("extra", "wrong"),
+    [
+        ("encoder_bits = 17", ""),
+        ('phase_open = "b"', "phases"),
+        ("leads_swapped = true", "encoder sign"),
+        ("pole_pairs = 4", "pole pairs"),
+        ('rotor = "locked"', "shaft"),
+        ("U_dc_v = 300.0", "supply"),
+        ("encoder_bits = 15", "encoder counts"),
+        ("load_nm = 4.0", "shaft"),
+    ],
+)
+def test_the_first_wrong_row_is_what_was_done(extra: str, wrong: str, tool: Tool) -> None:
+    code, rows, told = checked(tool, extra)
+    assert [name for name, (verdict, _) in rows.items() if verdict == "WRONG"][:1] == ([wrong] if wrong else []), rows
+    assert code == (1 if wrong else 0)
+    assert "duration  at most 15 s" in told and "travel    450 deg" in told
+    assert ("voltage off, drive restored" in told) == (wrong != "supply")
+
+
+def test_nothing_moves_without_consent(tool: Tool) -> None:
+    code, out, told = tool("-i", "pmsmsim", "-c", STATED, "check")
+    assert code == 7 and not out and "current   at most 1.216 Apk" in told

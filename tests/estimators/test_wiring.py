@@ -1,0 +1,85 @@
+"""The verdicts of the first turn, on rows made by hand: what is wrong is named first, the ambiguous with both names."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pmsmtool.estimators.wiring import NOT_SEEN, OK, WRONG, judge_sensors, judge_supply, judge_turn
+from pmsmtool.trace import Trace
+
+
+def turned(pole_pairs: float, *, way_rad: float = 9.0, lag_rad: float = 0.0, U_dc_v: float = 48.0) -> Trace:
+    """A rotor of (apparent) pole pairs led forward and back, ``lag_rad`` behind at both ends."""
+    there = np.linspace(0.0, way_rad, 20)
+    imposed = np.concatenate([[0.0], there, [way_rad], there[::-1], [0.0]])
+    behind = np.concatenate([np.full(22, lag_rad), np.full(21, -lag_rad)])
+    behind[0] = lag_rad
+    at_rest = np.zeros(43)
+    at_rest[[0, 21, 42]] = 1.0
+    theta = (imposed - behind) / pole_pairs
+    signals = {"theta_imposed_rad": imposed, "theta_M_rad": theta, "U_dc_v": np.full(43, U_dc_v), "at_rest": at_rest}
+    return Trace(np.arange(43.0), signals, dict.fromkeys(signals, "1"), {})
+
+
+def wrong(turn: Trace, stated: int, *, against: bool = False) -> list[tuple[str, str]]:
+    return [(row.looked_at, row.likely) for row in judge_turn(turn, stated, against) if row.verdict == WRONG]
+
+
+@given(pole_pairs=st.integers(1, 32), lag_deg=st.floats(-15.0, 15.0))
+def test_the_stated_pole_pairs_are_confirmed_behind_friction(pole_pairs: int, lag_deg: float) -> None:
+    turn = turned(pole_pairs, way_rad=0.9 * math.pi * pole_pairs, lag_rad=math.radians(lag_deg))
+    assert [row.verdict for row in judge_turn(turn, pole_pairs, False)] == [OK, OK, OK]
+
+
+@pytest.mark.parametrize(
+    ("true", "stated", "counts", "named", "other"),
+    [
+        (3, 7, 1.0, "pole pairs", "3 pole pairs"),
+        (4, 8, 1.0, "pole pairs", "4 pole pairs"),  # poles given for pole pairs
+        (5, 6, 1.0, "pole pairs", "5 pole pairs"),
+        (4, 4, 4.0, "encoder counts", "4 times the angle"),
+        (8, 8, 0.25, "encoder counts", "0.25 times the angle"),
+        (4, 4, 0.8, "pole pairs", "0.8 times the angle"),  # 5 pole pairs would show the same
+        (6, 6, 0.8, "encoder counts", "0.8 times the angle"),
+    ],
+)
+def test_a_wrong_ratio_is_named(true: int, stated: int, counts: float, named: str, other: str) -> None:
+    (found,) = wrong(turned(true / counts, way_rad=0.9 * math.pi * stated), stated)
+    assert found[0] == named and other in found[1]
+
+
+@pytest.mark.parametrize(("sign", "against"), [(1, False), (-1, True), (1, True), (-1, False)])
+def test_the_sign_is_held_against_what_the_drive_is_set_for(sign: int, against: bool) -> None:
+    agrees = (sign < 0) == against
+    assert [name for name, _ in wrong(turned(sign * 3), 3, against=against)] == ([] if agrees else ["encoder sign"])
+
+
+@pytest.mark.parametrize("turn", [turned(1e9), turned(3, lag_rad=math.radians(50.0))])
+def test_a_rotor_that_is_held_or_slips_says_nothing_of_the_rest(turn: Trace) -> None:
+    rows = judge_turn(turn, 3, False)
+    assert [(row.looked_at, row.verdict) for row in rows] == [
+        ("shaft", WRONG), ("pole pairs", NOT_SEEN), ("encoder sign", NOT_SEEN),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("rest", "loaded", "stated", "verdict"),
+    [(48.0, 48.0, 48.0, OK), (48.0, 40.0, 48.0, WRONG), (24.0, 24.0, 48.0, WRONG), (75.0, 75.0, 48.0, WRONG),
+     (24.0, 24.0, None, OK)],
+)  # fmt: skip
+def test_the_supply(rest: float, loaded: float, stated: float | None, verdict: str) -> None:
+    assert judge_supply(rest, turned(3, U_dc_v=loaded), stated).verdict == verdict
+
+
+@pytest.mark.parametrize(("gain", "offset", "verdict"), [(1.0, 0.3, OK), (1.02, 0.0, OK), (1.1, 0.0, WRONG)])
+def test_a_sensor_of_another_gain_is_seen_and_an_offset_is_not(gain: float, offset: float, verdict: str) -> None:
+    angles = np.array([0.0, 2.0, 4.0]) * math.pi / 3.0
+    phases = [np.cos(angles - k * 2.0 * math.pi / 3.0) for k in range(3)]
+    signals = {"i_a_a": phases[0] + offset, "i_b_a": gain * phases[1], "i_c_a": phases[2], "i_d_a": np.ones(3)}
+    trace = Trace(np.arange(3.0), signals, dict.fromkeys(signals, "A"), {})
+    assert judge_sensors(trace).verdict == verdict

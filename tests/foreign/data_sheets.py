@@ -1,0 +1,75 @@
+"""Small data sheets of drives, written for the tests: the objects by which families are known, and no more."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+TYPES = {"I8": 2, "I16": 3, "I32": 4, "U8": 5, "U16": 6, "U32": 7}
+Row = tuple[int, int, str, str, str]
+"""Index, sub-index, type, access, stored value."""
+
+COMMON: tuple[Row, ...] = (
+    (0x1000, 0, "U32", "ro", "0x00020192"),
+    (0x1017, 0, "U16", "rw", "0"),
+    (0x6040, 0, "U16", "rw", "0"),
+    (0x6041, 0, "U16", "ro", ""),
+    (0x6060, 0, "I8", "rw", "0"),
+    (0x6061, 0, "I8", "ro", ""),
+    (0x6064, 0, "I32", "ro", ""),
+)
+HEARTBEAT: tuple[Row, ...] = ((0x1016, 1, "U32", "rw", "0"),)
+GUARDING: tuple[Row, ...] = ((0x100C, 0, "U16", "rw", "0"), (0x100D, 0, "U8", "rw", "0"))
+TORQUE: tuple[Row, ...] = ((0x6071, 0, "I16", "rw", "0"), (0x6077, 0, "I16", "ro", ""))
+
+
+def identity(vendor: int, product: int) -> tuple[Row, ...]:
+    """Return 0x1018 with a serial number."""
+    return (
+        (0x1018, 1, "U32", "ro", hex(vendor)), (0x1018, 2, "U32", "ro", hex(product)), (0x1018, 4, "U32", "ro", ""),
+    )  # fmt: skip
+
+
+def epos4(modes: int = 0x225, product: int = 0x65510000) -> tuple[Row, ...]:
+    """Currents and torque constant in 0x3001, torque by mode 10 only, no 0x6073, 0x6075, 0x6078, 0x608F."""
+    return (
+        *COMMON, *HEARTBEAT, *TORQUE, *identity(0xFB, product),
+        (0x3001, 1, "U32", "rw", "8000"), (0x3001, 2, "U32", "rw", "30000"), (0x3001, 3, "U8", "rw", "1"),
+        (0x3001, 5, "U32", "rw", "0"), (0x3010, 1, "U32", "rw", "500"), (0x30A0, 1, "U32", "rw", "1171880"),
+        (0x30A0, 2, "U32", "rw", "3906250"), (0x30D1, 2, "I32", "ro", "0"), (0x6007, 0, "I16", "rw", "3"),
+        (0x605A, 0, "I16", "rw", "6"), (0x605E, 0, "I16", "rw", "2"), (0x606C, 0, "I32", "ro", "0"),
+        (0x6076, 0, "U32", "rw", "0"), (0x6080, 0, "U32", "rw", "50000"), (0x60A9, 0, "U32", "rw", "0x00B44700"),
+        (0x60FF, 0, "I32", "rw", "0"), (0x6502, 0, "U32", "ro", hex(modes)),
+    )  # fmt: skip
+
+
+def copley() -> tuple[Row, ...]:
+    """Node guarding and no heartbeat consumer, no 0x6007, no limits of CiA 402, an unsigned 0x6060."""
+    rows = [row for row in COMMON if row[0] not in (0x6060, 0x6061)]
+    motor = [(0x6410, sub, "U32", "rw", "0") for sub in (12, 23, 34)]
+    return (
+        *rows, *GUARDING, *TORQUE, *identity(0xAB, 0x20B), (0x6060, 0, "U8", "rw", ""), (0x6061, 0, "U8", "ro", ""),
+        (0x2110, 0, "I16", "rw", ""), (0x2111, 0, "I16", "rw", ""), (0x2112, 0, "U16", "rw", ""),
+        (0x221C, 0, "I16", "ro", ""), (0x605A, 0, "I16", "rw", ""), (0x6076, 0, "U32", "rw", ""),
+        (0x6410, 2, "I16", "rw", ""), (0x6410, 7, "U16", "rw", ""), (0x6410, 8, "U16", "rw", ""), *motor,
+        (0x60FF, 0, "I32", "rw", ""), (0x606C, 0, "I32", "ro", ""), (0x6502, 0, "U32", "ro", "1005"),
+    )  # fmt: skip
+
+
+def write_eds(path: Path, rows: Iterable[Row], limits: dict[tuple[int, int], tuple[int, int]] | None = None) -> Path:
+    """Write the rows as an EDS; limits by address."""
+    lines = ["[FileInfo]", "FileName=x.eds", "[DeviceInfo]", "ProductName=drive of a test"]
+    heads: set[int] = set()
+    subs = {index for index, sub, *_ in rows if sub}
+    for index, sub, kind, access, value in sorted(rows):
+        if index in subs and index not in heads:
+            lines += [f"[{index:04X}]", "ParameterName=record", "ObjectType=9"]
+            heads.add(index)
+        lines.append(f"[{index:04X}sub{sub:X}]" if index in subs else f"[{index:04X}]")
+        lines += ["ParameterName=object", "ObjectType=7", f"DataType={TYPES[kind]:#06x}", f"AccessType={access}"]
+        lines.append(f"DefaultValue={value}")
+        if limits and (index, sub) in limits:
+            low, high = limits[index, sub]
+            lines += [f"LowLimit={low}", f"HighLimit={high}"]
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    return path

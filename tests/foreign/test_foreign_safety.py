@@ -1,0 +1,233 @@
+"""Safety on drives as their makers built them: whatever they have is used and proven, what they lack is replaced.
+
+The limits of every class of drive stand in ``tests/drive``; here is what differs where objects are missing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import can
+import pytest
+
+from pmsmtool.bus.connect import connect
+from pmsmtool.cia402 import State
+from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.guard import WATCH_S, guarded
+from pmsmtool.drive.motion_objects import position_units
+from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.errors import DriveFault, LimitExceeded, NotAvailable, SafetyRefusal
+from pmsmtool.firmware.shipped_maps import family_of, load_family
+from pmsmtool.sim.foreign.drive import ForeignDrive
+from pmsmtool.sim.node.node import Node
+from pmsmtool.sim.node.session import Session
+from tests.foreign.data_sheets import GUARDING, HEARTBEAT, Row, copley, epos4, write_eds
+
+ENVELOPE = Envelope(i_max_apk=3.0, speed_max_rad_s=100.0)
+DECLARED_S = 1e-3 * CONSUMER_MS + REACTION_S
+
+
+class Rig:
+    """A foreign drive and the tool's side of it."""
+
+    def __init__(self, drive: TorqueDrive, node: Node) -> None:
+        self.drive, self.simulated = drive, node
+        assert node.session is not None
+        self.session: Session = node.session
+        self.face = cast(ForeignDrive, node.face)
+        self.off_since: float | None = None
+        self.was_on = False
+        self.session.power.on_state = self._noted
+
+    def _noted(self) -> None:
+        energised = self.session.power.state.energised
+        self.was_on |= energised
+        self.off_since = None if energised else self.drive.node.connection.clock.now()
+
+    def number(self, index: int, sub: int = 0) -> int:
+        return self.session.dictionary.find(index, sub).integer()
+
+    def memory(self) -> dict[tuple[int, int], bytes]:
+        entries = [entry for entry in self.session.dictionary if entry.writable and entry.row.index != 0x6040]
+        return {(entry.row.index, entry.row.sub): entry.read() for entry in entries}
+
+
+@contextmanager
+def opened(path: Path, rows: tuple[Row, ...], family: str = "") -> Iterator[Rig]:
+    eds = write_eds(path / "drive.eds", rows)
+    with connect("pmsmsim", f"interior-2k2?nv=:memory:&eds={eds}") as connection:
+        node = cast(Node, connection.bus.line.nodes[0])  # type: ignore[attr-defined]
+        drive_map = load_family(family) if family else family_of(*node.identity[:2])
+        drive = TorqueDrive(connection, 1, drive_map=drive_map)
+        yield Rig(drive, node)
+        drive.close()
+
+
+def test_node_guarding_is_proven_where_there_is_no_heartbeat(tmp_path: Path) -> None:
+    """Vendor 0xAB: no 0x1016, no 0x6007, none of 0x6073, 0x6075, 0x6080; its own limit in its own unit."""
+    with opened(tmp_path, copley()) as rig:
+        before = rig.memory()
+        with guarded(rig.drive, ENVELOPE) as guard:
+            assert guard.proof is not None and str(guard.proof).startswith("dead-man proven: node guarding stopped")
+            assert guard.proof.abort_connection is None and guard.proof.measured_s <= DECLARED_S
+            assert rig.number(0x2110) == 300, "counts of 0.01 A peak"
+            guard.enable()
+            guard.command_current(0.0, 1.0)
+            guard.wait(3.0 * WATCH_S)
+            assert rig.session.power.state is State.OPERATION_ENABLED
+        assert rig.off_since is not None
+        assert [key for key, data in rig.memory().items() if data != before[key]] == []
+
+
+def test_guarding_that_ends_takes_the_voltage_away(tmp_path: Path) -> None:
+    with opened(tmp_path, copley()) as rig:
+        with pytest.raises(DriveFault), guarded(rig.drive, ENVELOPE) as guard:
+            guard.enable()
+            guard.wait(2.0 * WATCH_S)
+            guard._heartbeat.stop()
+            began = rig.drive.node.connection.clock.now()
+            guard.wait(5.0)
+        assert rig.off_since is not None and 0.0 < rig.off_since - began <= DECLARED_S
+
+
+def test_a_drive_without_any_supervision_is_refused(tmp_path: Path) -> None:
+    rows = tuple(row for row in copley() if row not in GUARDING)
+    with opened(tmp_path, rows) as rig:
+        with pytest.raises(SafetyRefusal, match="neither a consumer heartbeat"), guarded(rig.drive, ENVELOPE):
+            pass
+        assert not rig.was_on
+
+
+def test_guarding_that_only_reports_is_refused(tmp_path: Path) -> None:
+    with opened(tmp_path, copley()) as rig:
+        power = rig.session.power
+        power.connection_lost = lambda node: power._emergency.raise_error(0x8130)  # type: ignore[method-assign]
+        with pytest.raises(SafetyRefusal, match="still enabled 350 ms after"), guarded(rig.drive, ENVELOPE):
+            pass
+        assert not power.state.energised
+
+
+def test_an_adapter_without_remote_frames_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with opened(tmp_path, copley()) as rig:
+        bus = rig.drive.node.connection.bus
+        send = bus.send
+
+        def without(message: can.Message, timeout: float | None = None) -> None:
+            if not message.is_remote_frame:
+                send(message, timeout)
+
+        monkeypatch.setattr(bus, "send", without)
+        with pytest.raises(SafetyRefusal, match="does not answer the remote frames") as caught, \
+                guarded(rig.drive, ENVELOPE):  # fmt: skip
+            pass
+        assert "adapter sends no remote frames" in caught.value.likely and not rig.was_on
+
+
+def test_its_own_limit_gets_the_reading_with_the_smaller_current(tmp_path: Path) -> None:
+    """mA, peak or rms unknown: 3 A peak is 2121 mA if rms, and 2.12 A peak if the drive means peak."""
+    with opened(tmp_path, epos4()) as rig:
+        before = rig.memory()
+        with guarded(rig.drive, ENVELOPE) as guard:
+            held = rig.number(0x3001, 2)
+            assert held == math.ceil(3000.0 / math.sqrt(2.0)) and rig.number(0x6080) == 955
+            guard.enable()
+            guard.command_current(0.0, 2.0)
+            guard.wait(0.03)
+            shown = rig.drive.live("i_q_a")
+            assert 0.0 < shown <= 1.1 * 2.0, "what is watched is the larger reading"
+        assert [key for key, data in rig.memory().items() if data != before[key]] == []
+
+
+def test_a_limit_of_its_own_that_is_not_held_is_refused(tmp_path: Path) -> None:
+    with opened(tmp_path, epos4()) as rig:
+        rig.session.dictionary.find(0x3001, 2).sink = lambda data: None
+        with pytest.raises(SafetyRefusal, match="holds the limit") as caught, guarded(rig.drive, ENVELOPE):
+            pass
+        assert "0x3001:02" in caught.value.where and not rig.was_on
+
+
+def test_a_limit_that_limits_nothing_is_refused_by_the_makers_rated_current(tmp_path: Path) -> None:
+    with opened(tmp_path, copley()) as rig:
+        with pytest.raises(SafetyRefusal, match="is none"), guarded(rig.drive, replace(ENVELOPE, i_max_apk=1e4)):
+            pass
+        assert not rig.was_on
+
+
+def test_without_a_speed_limit_the_tool_stops_at_the_limit_itself(tmp_path: Path) -> None:
+    """No 0x6080: not one quarter above, as where the drive limits the speed, too."""
+    with opened(tmp_path, copley()) as rig:
+        envelope, seen = replace(ENVELOPE, speed_max_rad_s=10.0), list[float]()
+        with pytest.raises(LimitExceeded, match="speed") as caught, guarded(rig.drive, envelope) as guard:
+            guard.enable()
+            guard.command_current(0.0, 0.6)
+            for _ in range(100):
+                guard.wait(0.01)
+                seen.append(rig.session.power.omega_m())
+        assert max(seen) < 10.0 + 0.06 * (seen[-1] - seen[-3]) / 0.02, "one look later at most"
+        assert caught.value.exit_code == 5 and not rig.session.power.state.energised
+
+
+def test_a_torque_that_is_taken_at_once_is_ramped_here(tmp_path: Path) -> None:
+    """Mode 10 has no torque slope: at most a tenth of rated per millisecond."""
+    with opened(tmp_path, epos4()) as rig:
+        assert rig.drive.target.mode == 10
+        with guarded(rig.drive, replace(ENVELOPE, i_max_apk=6.0)) as guard:
+            guard.enable()
+            began = rig.drive.node.connection.clock.now()
+            guard.command_current(0.0, 5.0)
+            took = rig.drive.node.connection.clock.now() - began
+        assert rig.face.behind is not None
+        assert 0.05 < rig.face.behind.largest_step <= 0.101
+        assert took >= 0.005
+
+
+@pytest.mark.parametrize(("modes", "mode"), [(0x22D, 4), (0x225, 10)])
+def test_the_mode_is_the_live_drives(tmp_path: Path, modes: int, mode: int) -> None:
+    with opened(tmp_path, epos4(modes)) as rig:
+        assert rig.drive.target.mode == mode
+
+
+def test_a_drive_without_torque_mode_has_no_target(tmp_path: Path) -> None:
+    with opened(tmp_path, epos4(0x25)) as rig, pytest.raises(NotAvailable, match="0x6502 = 0x25"):
+        _ = rig.drive.target
+
+
+@pytest.mark.parametrize(
+    ("rows", "units"),
+    [
+        (((0x608F, 1, "U32", "rw", "2000"), (0x608F, 2, "U32", "rw", "1")), 2000.0),
+        (((0x608F, 1, "U32", "rw", "2000"), (0x607E, 0, "U8", "rw", "0x80")), -2000.0),
+        (((0x608F, 1, "U32", "rw", "2000"), (0x60A8, 0, "U32", "rw", "0xFF410000")), 3600.0),
+        (((0x6092, 1, "U32", "rw", "360"), (0x6091, 1, "U32", "rw", "10"), (0x6091, 2, "U32", "rw", "1")), 36.0),
+    ],
+)
+def test_position_is_counted_as_the_drive_counts(tmp_path: Path, rows: tuple[Row, ...], units: float) -> None:
+    """0x607E, 0x608F, 0x6091, 0x6092 and 0x60A8; drive and tool decode them each for itself."""
+    base = tuple(row for row in epos4() if row[0] != 0x3010)
+    with opened(tmp_path, (*base, *rows, (0x6075, 0, "U32", "rw", ""))) as rig:
+        assert position_units(rig.drive.node) == units
+        angle = rig.drive.live("theta_m_rad")
+        with guarded(rig.drive, ENVELOPE) as guard:
+            guard.enable()
+            guard.command_current(0.0, 1.5)
+            guard.wait(0.1)
+            way = rig.drive.live("theta_m_rad") - angle
+        assert way > 0.1, "torque and position turn the same way, whatever the polarity"
+
+
+def test_a_gear_without_a_feed_is_refused(tmp_path: Path) -> None:
+    rows: tuple[Row, ...] = ((0x608F, 1, "U32", "rw", "2000"), (0x6091, 1, "U32", "rw", "10"))
+    with pytest.raises(NotAvailable, match="gear of 10"), opened(tmp_path, (*epos4(), *rows)):
+        pass
+
+
+def test_heartbeat_stays_the_first_choice(tmp_path: Path) -> None:
+    with opened(tmp_path, (*copley(), *HEARTBEAT)) as rig, guarded(rig.drive, ENVELOPE) as guard:
+        assert guard.proof is not None and guard.proof.by == "heartbeat"
+        assert rig.number(0x100C) == 0

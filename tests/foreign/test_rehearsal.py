@@ -1,0 +1,93 @@
+"""What a drive will give, before it is bought: asked of a node made from its maker's file, without a bus."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from pmsmtool.cli.drive_access import rehearsal_bus
+from pmsmtool.cli.main import cli
+from pmsmtool.cli.options import BusOptions
+from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.sim.channel import parse_channel
+from pmsmtool.workflow.tier_evaluate import either_reading, over_torque_constant
+from tests.foreign.data_sheets import GUARDING, Row, copley, epos4, write_eds
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, [*arguments])
+
+
+def asked(path: Path, rows: tuple[Row, ...]) -> dict[str, object]:
+    outcome = run("caps", "--eds", str(write_eds(path / "my drive&co.eds", rows)), "--json")
+    assert outcome.exit_code == 0, outcome.exception
+    facts: dict[str, object] = json.loads(outcome.stdout)
+    return facts
+
+
+def ways(facts: dict[str, object]) -> dict[tuple[str, str], dict[str, object]]:
+    rows = facts["quantities"]
+    assert isinstance(rows, list)
+    return {(row["quantity"], row["method"]): row for row in rows}
+
+
+def test_what_an_eds_will_give(tmp_path: Path) -> None:
+    facts = asked(tmp_path, epos4())
+    assert facts["tier"] == "standard" and facts["map"] == "epos4" and facts["replaced"] == []
+    row = ways(facts)["mechanics", "standard"]
+    assert row["available"] and row["expected"] == [], "a promise of 1.5 % would be of a current whose kind is known"
+    assert "peak or rms" in str(row["note"])
+
+
+def test_what_replaces_a_missing_limit_is_said(tmp_path: Path) -> None:
+    facts = asked(tmp_path, copley())
+    assert facts["tier"] == "standard" and facts["map"] == "copley"
+    assert "0x6080" in str(facts["replaced"]) and "this program looks" in str(facts["replaced"])
+
+
+def test_without_supervision_nothing_is_moved(tmp_path: Path) -> None:
+    facts = asked(tmp_path, tuple(row for row in copley() if row not in GUARDING))
+    assert facts["tier"] == "manual"
+    assert "consumer heartbeat (0x1016), or node guarding (0x100C, 0x100D)" in str(ways(facts)["psi", "standard"])
+
+
+def test_a_rehearsal_is_a_channel_of_the_simulated_bus(tmp_path: Path) -> None:
+    bus = rehearsal_bus(BusOptions(), eds=str(tmp_path / "a&b c.eds"), machine=tmp_path / "motor.toml")
+    channel = parse_channel(bus.channel)
+    assert bus.simulated() and channel.nv == ":memory:"
+    assert channel.eds == str(tmp_path / "a&b c.eds") and channel.name == str(tmp_path / "motor.toml")
+    assert parse_channel(rehearsal_bus(BusOptions(), eds="t.csv#a b").channel).eds == "t.csv#a b"
+    assert parse_channel(rehearsal_bus(BusOptions(), eds=None, family="epos4").channel).drive == "epos4"
+    with pytest.raises(ConfigError, match="two drives"):
+        rehearsal_bus(BusOptions(), eds="x.eds", family="epos4")
+    with pytest.raises(ConfigError, match="needs no bus"):
+        rehearsal_bus(BusOptions("socketcan", "can0"), eds="x.eds")
+
+
+def test_commission_rehearses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drive that gives nothing: the chain says so before anything moves, as on a real one."""
+    monkeypatch.chdir(tmp_path)
+    for option in (["--rehearse", "faulhaber"], ["--eds", str(write_eds(tmp_path / "x.eds", epos4(0x25)))]):
+        error = run("commission", *option, "--yes").exception
+        assert isinstance(error, NotAvailable) and "identify: needs" in str(error) and "torque mode" in str(error)
+    assert run("commission", "--eds", "x.eds", "--resume", "runs/1").exit_code == 2
+
+
+def test_an_undecided_current_gives_an_interval_of_both_readings() -> None:
+    """Read as rms 1.0; were it peak, it would be 0.707: both lie within, and little else."""
+    found = either_reading(Estimate(1.0, 0.01, 0.015, "kg m2/Wb"))
+    low, high = found.value - found.systematic, found.value + found.systematic
+    assert low < 0.7072 < 1.0 < high and high - low < 0.30 and "peak or rms" in found.fallback
+
+
+def test_without_pole_pairs_the_torque_constant_divides() -> None:
+    """K_T = 1.5 p psi: J/psi of one pole pair over 1.5."""
+    ratios = {"J_per_psi": Estimate(0.03, 3e-4, 3e-4, "kg m2/Wb"), "tau_c_per_psi": Estimate(0.3, 0.1, 0.1, "N m/Wb")}
+    found = over_torque_constant(ratios)
+    assert set(found) == {"J_per_kt", "tau_c_per_kt"}
+    assert found["J_per_kt"].value == pytest.approx(0.02) and found["J_per_kt"].std == pytest.approx(2e-4)
+    assert found["tau_c_per_kt"].unit == "A"
