@@ -110,7 +110,9 @@ def in_python(path: Path, text: str) -> Iterator[Mutation]:
                 yield from between(left, right, symbol, LOGIC[symbol])
         elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
             yield Mutation(path, position(node.lineno, node.col_offset), "not ", "")
-        elif isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
+        elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+            if isinstance(node.value, bool):
+                continue
             at = position(node.lineno, node.col_offset)
             literal = text[at : position(node.end_lineno or 0, node.end_col_offset or 0)]
             yield Mutation(path, at, literal, f"({literal} + 1)" if abs(node.value) <= 1 else f"({literal} * 2)")
