@@ -36,6 +36,8 @@ from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, new_
 from tests.cli.conftest import Tool
 from tests.drive.served import serving
 
+pytestmark = pytest.mark.chain
+
 TOLERANCE = 0.01
 """Largest deviation of an identified value from the truth with ideal sensor gains; measured 0.2 % (benchmarks/
 commissioning.py)."""

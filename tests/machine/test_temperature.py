@@ -6,6 +6,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 import pmsmtool
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K
 from pmsmtool.params.catalogue import BY_NAME
@@ -24,6 +26,7 @@ def numbers(path: Path) -> set[float]:
     return {float(number) for number in re.findall(r"\b\d+\.\d+(?:[eE][+-]?\d+)?", re.sub(r"//.*|/\*.*?\*/", "", text))}
 
 
+@pytest.mark.chain
 def test_no_other_file_of_the_package_writes_a_coefficient_down() -> None:
     """The catalogue had a copy of both: a default that is corrected in one place only."""
     assert numbers(HOME) >= set(COEFFICIENTS)

@@ -40,6 +40,8 @@ from pmsmtool.workflow.prove import stage as proof_stage
 from pmsmtool.workflow.prove.stage import ProofRequest
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 
+pytestmark = pytest.mark.chain
+
 PROFILE = "interior-2k2"
 FEW_MACHINES = ProofRequest(runs=32)
 """The proof's own tests draw as many as the tool; here it is one of the stages."""

@@ -44,6 +44,8 @@ from pmsmtool.workflow.tier_evaluate import replay
 from pmsmtool.workflow.tier_stages import SET_UP, open_tier_drive
 from tests.workflow.audience import Quiet, Told
 
+pytestmark = pytest.mark.chain
+
 PROFILE = data_folder("profiles") / "interior-2k2.toml"
 INJECT_OFF = 2e-3
 """Largest error of an identified value on the inject tier, of R ten times that. Seven seeds of the drive's noise: L at
