@@ -23,6 +23,7 @@ FLOORS: dict[str, int] = {
     "errors": 0,
     "plain_text": 1,
     "cia402": 1,
+    "data_types": 1,
     "files": 1,
     "bus": 2,
     "units": 2,

@@ -34,6 +34,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible, NotAvailable
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
+from pmsmtool.machine.torque import torque_per_ampere
 
 Array = NDArray[np.float64]
 
@@ -210,7 +211,7 @@ def tune_closed(source: MachineFile, request: TuneRequest, drive: ClosedDrive) -
     loops = current_loops(design, drive)
     found = _Projection(source, rated, request, drive, loops).guarantee()
     how = f"{drive.name}: largest torque x speed whose demand is bounded by the voltage limit"
-    rated_nm = TORQUE_FACTOR * source.machine.pole_pairs * source.machine.psi_f_wb * rated.I_nom_apk
+    rated_nm = torque_per_ampere(source.machine.pole_pairs, source.machine.psi_f_wb) * rated.I_nom_apk
     values = {
         **design.values,
         RATED: DesignValue(rated_nm, "torque of the rated current without i_d"),
@@ -227,9 +228,6 @@ def tune_closed(source: MachineFile, request: TuneRequest, drive: ClosedDrive) -
     if drive.bandwidth_hz is not None and not _takes_gains(drive):
         asked[STATED] = drive.bandwidth_hz
     return replace(design, values=values, facts={**design.facts, **found.facts()}, notes=notes, request=asked), found
-
-
-TORQUE_FACTOR = 1.5
 
 
 def _takes_gains(drive: ClosedDrive) -> bool:
@@ -303,7 +301,7 @@ class _Projection:
         self.margin = request.voltage_margin
         self.limit = (1.0 - request.voltage_margin) * self.V_max - dead
         flux = tolerance.factors["psi_f_wb"].half_width if "psi_f_wb" in tolerance.factors else 0.0
-        self.per_ampere = TORQUE_FACTOR * machine.pole_pairs * machine.psi_f_wb * (1.0 - flux)
+        self.per_ampere = torque_per_ampere(machine.pole_pairs, machine.psi_f_wb) * (1.0 - flux)
         if machine.psi_f_wb == 0.0:
             raise DesignInfeasible(
                 "without a magnet there is no torque at i_d = 0",
@@ -362,7 +360,7 @@ class _Projection:
             return self.drive.acceleration_rpm_per_s * self.per_rpm
         # the machine's own torque, at the largest flux
         machine = self.source.machine
-        torque = TORQUE_FACTOR * machine.pole_pairs * self.box.psi[1] * I_apk
+        torque = torque_per_ampere(machine.pole_pairs, self.box.psi[1]) * I_apk
         return machine.pole_pairs * torque / self.least_J
 
     def _rises(self, speeds: int, I_apk: float) -> bool:

@@ -18,6 +18,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at
+from pmsmtool.machine.torque import torque_per_ampere
 
 MODES: Mapping[str, int] = {"off": 0, "lookup": 1, "gradient": 2, "accelerated": 3, "uncompensated": 4}
 """``field_weakening.mode`` of the catalogue."""
@@ -133,7 +134,7 @@ def loss_minimising_i_d(source: MachineFile, rated: Ratings) -> float:
 def torque_constant(machine: MachineParameters, i_d_a: float) -> float:
     """Return dT/di_q (N m/A) at i_d: 1.5 p (psi + (L_d - L_q) i_d)."""
     saliency = machine.L_d_decoupling_h - machine.L_q_decoupling_h
-    return 1.5 * machine.pole_pairs * (machine.psi_f_wb + saliency * i_d_a)
+    return torque_per_ampere(machine.pole_pairs, machine.psi_f_wb + saliency * i_d_a)
 
 
 # -- where the machine ends ----------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from pmsmtool.design.tolerance import Samples
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
+from pmsmtool.machine.torque import air_gap_torque
 
 Array = NDArray[np.float64]
 
@@ -132,7 +133,7 @@ def headroom(machine: MachineParameters, cells: OperatingCells, limits: Headroom
     i_d, i_q, psi_d, psi_q = _fluxes(machine, cells, psi_f, samples)
     v_d, v_q = R * i_d - cells.omega_e * psi_q, R * i_q + cells.omega_e * psi_d
     V_max = limits.utilisation * samples.column("U_dc_v")
-    torque = 1.5 * machine.pole_pairs * (psi_d * i_q - psi_q * i_d)
+    torque = air_gap_torque(machine.pole_pairs, psi_d, psi_q, i_d, i_q)
     current = np.hypot(cells.i_d_a, cells.i_q_a)
     with np.errstate(divide="ignore", invalid="ignore"):
         need = np.where(cells.torque_nm == 0.0, current, current * np.abs(cells.torque_nm / torque))

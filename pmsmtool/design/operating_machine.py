@@ -19,6 +19,7 @@ from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_cells import FluxMapStruct, library
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
+from pmsmtool.machine.torque import air_gap_torque
 
 Array = NDArray[np.float64]
 
@@ -106,7 +107,7 @@ class OperatingMachine:
     def torque_nm(self, i_d_a: ArrayLike, i_q_a: ArrayLike) -> Array:
         """Return 1.5 p (psi_d i_q - psi_q i_d) (N m)."""
         psi_d, psi_q = self.flux(i_d_a, i_q_a)
-        return np.asarray(1.5 * self.pole_pairs * (psi_d * np.asarray(i_q_a) - psi_q * np.asarray(i_d_a)))
+        return air_gap_torque(self.pole_pairs, psi_d, psi_q, np.asarray(i_d_a, float), np.asarray(i_q_a, float))
 
     def voltage_v(self, i_d_a: ArrayLike, i_q_a: ArrayLike, omega_e: ArrayLike) -> Array:
         """Return the amplitude of the steady-state voltage (V peak) at electrical speeds (rad/s)."""

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.torque import torque_per_ampere
 
 SALIENCY_LIMIT = 0.02
 """Largest |L_d - L_q| / mean that is treated as none; 2 % moves the equilibrium current by about 1 % of i_q."""
@@ -73,7 +74,7 @@ class SurfaceMachine:
 
     def current_a(self, torque_nm: float) -> float:
         """Return i_q (A peak) for a torque: T / (1.5 p psi_f)."""
-        return torque_nm / (1.5 * self.pole_pairs * self.psi_f_wb)
+        return torque_nm / torque_per_ampere(self.pole_pairs, self.psi_f_wb)
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from pmsmtool.design.polar_map import stability_map
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.torque import torque_per_ampere
 
 TAU_PERIODS = 10.0
 """Equivalent time constant of the coefficient diagram method, in control periods."""
@@ -132,7 +133,7 @@ def _facts(surface: SurfaceMachine, rated: Ratings, V_max: float) -> dict[str, S
     if omega <= 0.0:
         return {}
     found = design_at(surface, omega, rated.I_nom_apk, V_max)
-    per_ampere = 1.5 * surface.pole_pairs * surface.psi_f_wb
+    per_ampere = torque_per_ampere(surface.pole_pairs, surface.psi_f_wb)
     torque = per_ampere * rated.I_nom_apk
     speeds = [share * rated.base_speed_rpm for share in MAP_SPEED_SHARES]
     torques = [share * torque for share in MAP_CURRENT_SHARES]

@@ -21,6 +21,7 @@ from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
 from pmsmtool.estimators.push_regression import jackknife_variance, regress
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace
 
 STAGE = "inertia over flux linkage"
@@ -72,7 +73,7 @@ def estimate_ratios(
     weakest = min(abs(float(p[1][-1]) / float(p[4][-1])) for p in parts)
     floors = (
         full[0] * math.hypot(tolerance.current_gain, MODEL_FLOOR),
-        math.hypot(full[1] * tolerance.current_gain, FRICTION_FLOOR * 1.5 * pole_pairs * weakest),
+        math.hypot(full[1] * tolerance.current_gain, FRICTION_FLOOR * torque_per_ampere(pole_pairs, weakest)),
     )
     rows = sum(len(p[0]) for p in parts)
     found = {
@@ -125,5 +126,5 @@ def _ratios(parts: Sequence[tuple[Vector, ...]], sense: float, pole_pairs: int) 
     friction = -slowing
     if rise == 0.0:
         raise refuse("E_EXCITATION", "the shaft does not answer the current", stage=STAGE)
-    ratio = 1.5 * pole_pairs / rise
+    ratio = torque_per_ampere(pole_pairs, 1.0) / rise
     return np.array([ratio, friction * ratio])

@@ -13,12 +13,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.firmware.map_tables import decode_table, encode_table, shortest_binary32
 from pmsmtool.firmware.motion_objects import MotionObject
 from pmsmtool.firmware.recorder_map import RecorderMap, Recording
 from pmsmtool.firmware.vendor_tuning import VendorTuning
 from pmsmtool.firmware.wire_units import as_peak
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 
@@ -27,13 +29,8 @@ Form = Literal["value", "time", "rate", "relative", "torque constant"]
 Injecting = Literal["none", "current", "voltage"]
 
 LETTERS: dict[str, str] = {
-    "UNSIGNED8": "B",
-    "UNSIGNED16": "H",
-    "UNSIGNED32": "I",
-    "INTEGER8": "b",
-    "INTEGER16": "h",
-    "INTEGER32": "i",
-    "REAL32": "f",
+    name: DATA_TYPES[name].letter
+    for name in ("UNSIGNED8", "UNSIGNED16", "UNSIGNED32", "INTEGER8", "INTEGER16", "INTEGER32", "REAL32")
 }
 """CiA 301 types a value may have on the wire, with their ``struct`` letters."""
 
@@ -47,10 +44,6 @@ REFERENCE_TABLES = {
     "lut.axis_z": (0x2046, 0),
 }
 """DOMAIN objects of the reference drive's look-up table."""
-
-
-TORQUE_FACTOR = 1.5
-"""Torque over p psi_f i_q with peak currents (amplitude-invariant dq)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +144,7 @@ class Cell:
             return value
         other = self._other(values)
         if self.form == "torque constant":
-            return TORQUE_FACTOR * other * value
+            return torque_per_ampere(other, value)
         divided = (other, value) if self.form == "time" else (value, other)
         return divided[0] / divided[1] if divided[1] else math.inf
 
@@ -163,7 +156,7 @@ class Cell:
         if self.form in ("rate", "relative"):
             return kept * other
         if self.form == "torque constant":
-            return kept / (TORQUE_FACTOR * other) if other else math.inf
+            return kept / torque_per_ampere(other, 1.0) if other else math.inf
         return other / kept if kept else math.inf
 
     def _other(self, values: Mapping[str, float]) -> float:

@@ -11,19 +11,14 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+from pmsmtool.data_types import DATA_TYPES, codes
 from pmsmtool.errors import ConfigError
 
-BOOLEAN, INTEGER8, INTEGER16, INTEGER32 = 0x01, 0x02, 0x03, 0x04
-UNSIGNED8, UNSIGNED16, UNSIGNED32, REAL32 = 0x05, 0x06, 0x07, 0x08
-VISIBLE_STRING, OCTET_STRING, UNICODE_STRING, DOMAIN = 0x09, 0x0A, 0x0B, 0x0F
-REAL64, INTEGER64, UNSIGNED64 = 0x11, 0x15, 0x1B
-"""Data type codes (CiA 301, table 44)."""
-
-INTEGER_BITS = {
-    BOOLEAN: 8, INTEGER8: 8, INTEGER16: 16, INTEGER32: 32, INTEGER64: 64,
-    UNSIGNED8: 8, UNSIGNED16: 16, UNSIGNED32: 32, UNSIGNED64: 64,
-}  # fmt: skip
-SIGNED = frozenset({INTEGER8, INTEGER16, INTEGER32, INTEGER64})
+UNSIGNED8, REAL32, REAL64, VISIBLE_STRING, OCTET_STRING, UNICODE_STRING, DOMAIN = codes(
+    "UNSIGNED8", "REAL32", "REAL64", "VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN"
+)
+INTEGER_BITS = {row.code: 8 * row.size for row in DATA_TYPES.values() if row.is_integer}
+SIGNED = frozenset(row.code for row in DATA_TYPES.values() if row.is_signed)
 _VAR, _DOMAIN_OBJECT = 0x07, 0x02
 _HAVE_SUBS = frozenset({0x06, 0x08, 0x09})  # DEFSTRUCT, ARRAY, RECORD
 

@@ -17,6 +17,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import RAD_S_PER_RPM, RPM_PER_RAD_S, format_quantity
 
 Between = Literal["line-line", "phase"]
@@ -252,7 +253,9 @@ def flux_from_torque(K_t: TorqueConstant, pole_pairs: int) -> tuple[float, str]:
     """Return the flux linkage (Wb peak) and the rule: T = 1.5 p psi I_peak, I of the line."""
     value = K_t.value / math.sqrt(2.0) if K_t.kind == "rms" else K_t.value
     step = " / sqrt 2" if K_t.kind == "rms" else ""
-    return value / (1.5 * pole_pairs), f"{K_t.value:.6g} N m/A {K_t.kind}{step} / (1.5 * {pole_pairs} pole pairs)"
+    return value / torque_per_ampere(
+        pole_pairs, 1.0
+    ), f"{K_t.value:.6g} N m/A {K_t.kind}{step} / (1.5 * {pole_pairs} pole pairs)"
 
 
 def disagreement(psi_e: float, psi_t: float, pole_pairs: int) -> str:
@@ -283,7 +286,7 @@ def machine_from_datasheet(sheet: Datasheet) -> DatasheetResult:
     L_d, L_q = (_inductance(sheet, axis, steps) for axis in ("d", "q"))
     psi_f = _flux(sheet, steps, warnings)
     if sheet.I_nom_apk is not None:
-        torque = 1.5 * sheet.pole_pairs * psi_f * sheet.I_nom_apk
+        torque = torque_per_ampere(sheet.pole_pairs, psi_f) * sheet.I_nom_apk
         steps.append(
             Conversion("(torque)", f"{sheet.I_nom_apk:.5g} Apk", "1.5 p psi I", f"{torque:.4g} N m at i_d = 0")
         )

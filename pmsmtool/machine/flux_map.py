@@ -37,6 +37,7 @@ from pmsmtool.machine.flux_map_cells import (
     per_step,
     pointer,
 )
+from pmsmtool.machine.torque import air_gap_torque
 
 Array = NDArray[np.float64]
 
@@ -153,7 +154,7 @@ class FluxMap:
     def torque_nm(self, pole_pairs: int, i_d_a: ArrayLike, i_q_a: ArrayLike) -> Array:
         """Return 1.5 p (psi_d i_q - psi_q i_d) (N m) on the forward table."""
         psi_d, psi_q = self.flux(i_d_a, i_q_a)
-        return np.asarray(1.5 * pole_pairs * (psi_d * np.asarray(i_q_a) - psi_q * np.asarray(i_d_a)))
+        return air_gap_torque(pole_pairs, psi_d, psi_q, np.asarray(i_d_a, float), np.asarray(i_q_a, float))
 
     def content_hash(self) -> str:
         """Return the SHA-256 of axes, fluxes, kind and inverse nodes: what decides the machine."""

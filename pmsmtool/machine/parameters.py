@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K
+from pmsmtool.machine.torque import air_gap_torque
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +102,7 @@ class MachineParameters:
         """Torque of the linear machine (N m), 1.5 p (psi_d i_q - psi_q i_d)."""
         psi_d = self.psi_f_wb + self.L_d_decoupling_h * i_d_a
         psi_q = self.L_q_decoupling_h * i_q_a
-        return 1.5 * self.pole_pairs * (psi_d * i_q_a - psi_q * i_d_a)
+        return air_gap_torque(self.pole_pairs, psi_d, psi_q, i_d_a, i_q_a)
 
 
 @dataclass(frozen=True, slots=True)

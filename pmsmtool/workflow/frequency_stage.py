@@ -14,6 +14,7 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.frequency_response import FrequencyResponse, estimate_frequency_response
 from pmsmtool.experiments import frequency_response
 from pmsmtool.experiments.frequency_response import FrequencyPlan
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.npz_file import npz_bytes
 from pmsmtool.trace import Trace
 from pmsmtool.units import rpm_from_rad_s
@@ -69,7 +70,7 @@ def measure_frequency_response(
             f"the current limit of {limits.i_max_apk:.4g} A leaves none for the sequence", hint="raise --i-max"
         )
     plan = frequency_response.plan_frequency_response(
-        level, SPEED_SHARE * largest, J, 1.5 * pole_pairs * psi, drive.period_s
+        level, SPEED_SHARE * largest, J, torque_per_ampere(pole_pairs, psi), drive.period_s
     )
     say(
         f"frequency response: random current of {plan.i_q_a:.3g} A at {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm, "

@@ -20,6 +20,7 @@ from pmsmtool.estimators.sampling_instant import Sampling, standstill_instant_s
 from pmsmtool.estimators.switching_ripple import Modulation
 from pmsmtool.experiments import mechanics_run, speed_run
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
+from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
 from pmsmtool.trace import Trace
 from pmsmtool.units import rpm_from_rad_s
 
@@ -77,7 +78,7 @@ def measure_mechanics(
     psi, J, L_q = (drive.read(f"motor.{name}") for name in ("psi_f_wb", "J_kgm2", "L_q_h"))
     current = I_SHARE * limits.I_test_apk
     largest = min(limits.omega_max_rad_s, EMF_SHARE * limits.V_max_v / (pole_pairs * math.hypot(psi, L_q * current)))
-    plan = mechanics_run.plan_mechanics(current, SPEED_SHARE * largest, J, 1.5 * pole_pairs * psi)
+    plan = mechanics_run.plan_mechanics(current, SPEED_SHARE * largest, J, torque_per_ampere(pole_pairs, psi))
     say(
         f"J, B, tau_c: pushes of {plan.i_q_a:.3g} A up to about {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm and "
         f"coasting with the voltage off, {plan.duration_s:.2g} s"
@@ -151,7 +152,7 @@ def mechanics_of(
     return estimate_mechanics(
         parts,
         torque_of(result, pole_pairs),
-        1.5 * pole_pairs * psi.value,
+        torque_per_ampere(pole_pairs, psi.value),
         result.noise.sigma_a,
         torque_doubt(result.flux, displaced, mapped=result.flux_map is not None),
         direction=direction,
@@ -221,9 +222,9 @@ def torque_of(result: Evaluation, pole_pairs: int) -> Torque:
 
         def by_map(i_d: Array, i_q: Array) -> Array:
             psi_d, psi_q = flux_map.flux(i_d, i_q)
-            return np.asarray(1.5 * pole_pairs * ((psi_d + warmer) * i_q - psi_q * i_d))
+            return air_gap_torque(pole_pairs, psi_d + warmer, psi_q, i_d, i_q)
 
         return by_map
     found = result.inductance
     difference = 0.0 if found is None else found.L_d.value - found.L_q.value
-    return lambda i_d, i_q: 1.5 * pole_pairs * (psi + difference * i_d) * i_q
+    return lambda i_d, i_q: torque_per_ampere(pole_pairs, psi + difference * i_d) * i_q

@@ -23,6 +23,7 @@ from pmsmtool.machine.parameters import (
     MachineLimits,
     MachineParameters,
 )
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import rpm_from_rad_s
 
 Block = Literal["ideal", "timing", "gains"]
@@ -93,7 +94,7 @@ def draw_drive(seed: int, block: Block = "ideal") -> MachineFile:
     L_q = float(rng.uniform(*INDUCTIVE_SHARE)) * emf / (omega_base * I_nom)
     pole_pairs = int(rng.integers(POLE_PAIRS[0], POLE_PAIRS[1] + 1))
     psi_f = emf / omega_base
-    tau_nom = 1.5 * pole_pairs * psi_f * I_nom
+    tau_nom = torque_per_ampere(pole_pairs, psi_f) * I_nom
     omega_M = omega_base / pole_pairs
     J = tau_nom * _log_uniform(rng, ACCELERATION_TIME_S) / omega_M
     n_nom = rpm_from_rad_s(omega_M)

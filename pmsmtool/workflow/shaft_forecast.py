@@ -23,6 +23,7 @@ from pmsmtool.estimators.prediction import line_of
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.estimators.shaft_prediction import RoughShaft
 from pmsmtool.experiments import frequency_response, mechanics_run
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import flux_of
 from pmsmtool.workflow.frequency_stage import small_signal_doubt
@@ -130,7 +131,7 @@ def forecast_of(
     """
     pole_pairs = round(encoder.pole_pairs.value)
     J, psi, L_q = (drive.read(f"motor.{name}") for name in ("J_kgm2", "psi_f_wb", "L_q_h"))
-    per_a = 1.5 * pole_pairs * psi
+    per_a = torque_per_ampere(pole_pairs, psi)
     flux = flux_of(traces, resistance, drive.period_s, drive.read("motor.alpha_psi_per_k"), tolerance)
     B, tau_c = shaft_prediction.rough_friction(traces["speeds"], J, per_a, pole_pairs)
     step = encoder_step([traces[name]["theta_M_rad"] for name in ("push_0", "push_1")])

@@ -15,6 +15,7 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import speed_run
 from pmsmtool.experiments.shaft_answer import FIRST_S, FIRST_SHARE
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace
 from pmsmtool.units import rpm_from_rad_s
 from pmsmtool.workflow.limits import Limits
@@ -129,7 +130,7 @@ class SpeedStage:
                 likely="the pushes were too slow for this inverter's dead time",
                 hint="allow a higher --speed-max",
             )
-        return psi, 1.5 * pole_pairs * psi / rate
+        return psi, torque_per_ampere(pole_pairs, psi) / rate
 
     def _acceleration_per_ampere(self, target: float, pole_pairs: int) -> float:
         """Return the acceleration per ampere (rad/s2/A), from pushes that grow until the shaft answers."""
@@ -165,7 +166,7 @@ class SpeedStage:
         largest = min(limits.omega_max_rad_s / 1.1, EMF_SHARE * limits.V_max_v / (flux * pole_pairs))
         # the accelerating current must leave voltage for itself: omega_e L_q i_q stands beside the back-emf
         i_run = min(0.5 * limits.I_test_apk, REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L)))
-        per_ampere = 1.5 * pole_pairs * psi / J
+        per_ampere = torque_per_ampere(pole_pairs, psi) / J
         # a current that is slow because the inverter's error is steep would not be steady in its window
         loop = speed_run.steady_loop(
             self.drive.read("motor.R_s_ohm"),

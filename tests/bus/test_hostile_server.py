@@ -13,6 +13,7 @@ from pmsmtool.cli.drive_access import LOOKING_S
 QUICK = (("info",), ("scan",), ("param", "get", "0x1008", "0x2042"), ("fault", "show"), ("stop",), ("stop", "--all"))
 
 
+@pytest.mark.chain
 @pytest.mark.wall_clock
 @pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6, 7, 9, 10, 11])
 def test_commands_against_a_random_behaviour(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,6 +72,7 @@ class TestLocalNode:
         channel.download(*NUMBER, b"\x01\x02\x03\x04")
         assert channel.read(*NUMBER, size=4) == b"\x01\x02\x03\x04"
 
+    @pytest.mark.chain
     @pytest.mark.parametrize("size", SIZES)
     def test_blobs_fall_back_to_segments(self, local_node: canopen.LocalNode, channel: SdoChannel, size: int) -> None:
         data = random.Random(size).randbytes(size)
@@ -118,6 +119,7 @@ class TestDurand:
         channel.download(*NUMBER, b"\x01\x02\x03\x04")
         assert channel.read(*NUMBER, size=4) == b"\x01\x02\x03\x04"
 
+    @pytest.mark.chain
     @pytest.mark.parametrize("mode", [Mode.SEGMENTED, Mode.BLOCK])
     @pytest.mark.parametrize("size", [size for size in SIZES if size > 4])
     def test_blobs_both_ways(self, durand_node: Any, channel: SdoChannel, size: int, mode: Mode) -> None:

@@ -39,6 +39,7 @@ def body(size: int, seed: int = 1) -> bytes:
     return random.Random(seed).randbytes(size)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("mode", [Mode.AUTO, Mode.SEGMENTED, Mode.BLOCK])
 @pytest.mark.parametrize("size", SIZES)
 def test_every_size_arrives_in_both_directions(
@@ -344,6 +345,7 @@ def test_supervision_ends_the_wait(channel: SdoChannel, bus: ScriptedBus, slave:
 LOSS_RUNS = 300
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(("share", "least"), [(0.001, 0.99), (0.01, 0.9)])
 @pytest.mark.parametrize("direction", ["upload", "download"])
 def test_block_transfers_under_loss_are_right_or_reported(direction: str, share: float, least: float) -> None:

@@ -214,6 +214,7 @@ def turned(path: Path) -> None:
     path.write_text("\n".join(",".join(row) for row in rows), encoding="utf-8")
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     "command",
     [
@@ -233,6 +234,7 @@ def test_a_map_without_a_co_energy_is_used_but_not_silently(
 # ---- what is typed -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("command", "says"),
     [
@@ -295,6 +297,7 @@ def read_only(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.rmtree(above)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("command", WRITERS, ids=lambda command: " ".join(command.split()[:3]))
 def test_read_only_folder(command: str, read_only: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main.run(command.format("writable").split()) == 0  # it is the folder; and all modules are loaded
@@ -317,6 +320,7 @@ def test_read_only_folder(command: str, read_only: Path, capsys: pytest.CaptureF
     assert list(read_only.iterdir()) == []
 
 
+@pytest.mark.chain
 def test_fresh_process_says_the_same(folder: Path) -> None:
     """What the tests above see in one process is what a shell sees."""
     edit(folder / "machine.toml", "R_s_ohm = 0.63", "R_s_ohm = -0.63")

@@ -36,6 +36,8 @@ from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, new_
 from tests.cli.conftest import Tool
 from tests.drive.served import serving
 
+pytestmark = pytest.mark.chain
+
 TOLERANCE = 0.01
 """Largest deviation of an identified value from the truth with ideal sensor gains; measured 0.2 % (benchmarks/
 commissioning.py)."""
@@ -144,33 +146,24 @@ def test_a_machine_that_saturates_is_not_proven_without_its_map(tool: Tool) -> N
 
 
 @pytest.mark.usefixtures("few_machines")
-def test_a_failed_criterion_ends_the_chain_and_resume_goes_on_there(tool: Tool) -> None:
+def test_a_failed_criterion_ends_the_chain_and_resume_goes_on_there_on_the_runs_own_bus(tool: Tool) -> None:
     bus = ("-i", "pmsmsim", "-c", "interior-2k2?nv=drive.nv", "--yes")
     before = backup("interior-2k2?nv=drive.nv")
     directory = identified(Path("run"))
+    remembered = {"interface": "pmsmsim", "channel": "interior-2k2?nv=drive.nv", "bitrate": None, "node": 1}
+    directory.write(replace(directory.read(), bus=remembered))
     measured = (directory.path / "machine.toml").read_bytes()
     code, out, err = tool("commission", *bus, "--resume", "run", "--gain-margin-db", "12", "--bandwidth-hz", "900")
     assert code == 1 and out == "" and "asked for: 45 degree, 12 dB" in err
     assert [(stage.name, stage.status) for stage in directory.read().stages] == [("identify", "pass"), ("tune", "fail")]
     assert ">SIMULATED DRIVE, FAIL: tune: " in (directory.path / "report.html").read_text()
     assert backup("interior-2k2?nv=drive.nv") == before
-    code, out, err = tool("commission", *bus, "--resume", "run")
+    code, out, err = tool("commission", "--resume", "run", "--yes")
     assert code == 0, err
     assert "identify  PASS  as recorded, not run again" in err
     assert out.startswith("SIMULATED DRIVE, PASS: 7 of 7 stages ran")
     assert (directory.path / "machine.toml").read_bytes() == measured
     assert tool("verify", *bus[:-1], "run")[0] == 0
-
-
-@pytest.mark.usefixtures("few_machines")
-def test_a_run_remembers_its_bus(tool: Tool) -> None:
-    directory = identified(Path("run"))
-    record = directory.read()
-    bus = {"interface": "pmsmsim", "channel": "interior-2k2?nv=drive.nv", "bitrate": None, "node": 1}
-    directory.write(replace(record, bus=bus))
-    code, out, err = tool("commission", "--resume", "run", "--yes")
-    assert code == 0, err
-    assert out.startswith("SIMULATED DRIVE, PASS: 7 of 7 stages ran")
     assert tool("commission", "--resume", "run")[0] == 0, "nothing is left to do, so nobody is asked"
 
 

@@ -18,6 +18,8 @@ from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.simulated_machine import settings_of
 from tests.cli.conftest import Tool
 
+pytestmark = pytest.mark.chain
+
 START_RAD = 1.0
 """Mechanical angle at the start; with the estimate's default bandwidth a jump by twice of it is above any trip."""
 CASES: dict[str, dict[str, Value]] = {

@@ -116,6 +116,7 @@ def test_doctor_names_the_wrong_bit_rate(tool: Tool) -> None:
     assert code == 3 and "wrong bit rate" in out and "wrong bit rate" in err
 
 
+@pytest.mark.chain
 def test_doctor_finds_the_bit_rate(tool: Tool) -> None:
     found = loaded(tool("doctor", "--find-bitrate", "--json", channel="interior-2k2?nv=:memory:&bitrate=250000"))
     good = [rate for rate, counts in found["bitrates"].items() if counts["frames"] and not counts["error_frames"]]
@@ -216,6 +217,7 @@ def wanted(tmp_path: Path) -> str:
     return "wanted.toml"
 
 
+@pytest.mark.chain
 def test_flash_verify_backup_restore(tool: Tool, wanted: str, tmp_path: Path) -> None:
     assert tool("backup", "-o", "before.json")[0] == 0
     dry = loaded(tool("flash-params", wanted, "--dry-run", "--json"))
@@ -249,6 +251,7 @@ run(sys.argv[1:])
 """
 
 
+@pytest.mark.chain
 def test_restore_after_a_tool_killed_before_its_journal_goes_back_no_further(tool: Tool, wanted: str) -> None:
     assert tool("flash-params", wanted, "--yes")[0] == 0
     Path("later.toml").write_text(ParameterSet({"motor.R_s_ohm": 0.5}).to_toml())
@@ -278,6 +281,7 @@ def test_restore_refuses_a_journal_when_another_program_wrote_since(
     assert tool("verify", "later.toml")[0] == 0
 
 
+@pytest.mark.chain
 def test_backup_into_a_spare_part(tool: Tool, wanted: str) -> None:
     assert tool("flash-params", wanted, "--yes")[0] == 0
     assert tool("backup", "-o", "one.json")[0] == 0
@@ -323,6 +327,7 @@ def test_faults_on_purpose_leave_the_old_set(tool: Tool, wanted: str, tmp_path: 
     assert tool("verify", wanted)[0] == 1
 
 
+@pytest.mark.chain
 def test_fleet_gets_the_same_set_and_one_table(tool: Tool, wanted: str, tmp_path: Path) -> None:
     fleet = "interior-2k2?nodes=3&nv=fleet.nv"
     assert tool("flash-params", wanted, "--nodes", "1-3", "--check", channel=fleet)[0] == 1

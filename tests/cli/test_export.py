@@ -167,6 +167,7 @@ def test_csv_through_another_drives_map(folder: Path, tmp_path: Path) -> None:
     assert f" {len(every)} of {len(every) + len(cells)} parameters" in warning and "polar.V_ref_ratio" in every
 
 
+@pytest.mark.chain
 def test_a_users_file_keeps_its_other_bytes(folder: Path, tmp_path: Path) -> None:
     base = (data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds").read_bytes()
     theirs = b"; our own line\r\n" + base.replace(b"\n", b"\r\n")

@@ -47,6 +47,7 @@ def profile(name: str, **simulation: Any) -> str:
     return "drive.toml?nv=drive.nv"
 
 
+@pytest.mark.chain
 def test_the_truth_is_found_the_drive_is_as_before_and_the_replay_gives_the_same_bytes(tool: Tool) -> None:
     channel = profile("jercic-2017", inverter_model="switched")
     drive = load_machine_file(Path("drive.toml"))
@@ -77,6 +78,7 @@ def test_the_truth_is_found_the_drive_is_as_before_and_the_replay_gives_the_same
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == files
 
 
+@pytest.mark.chain
 def test_a_drive_that_compensates_its_dead_time_is_measured_without_and_keeps_it(tool: Tool) -> None:
     """As every drive does that was commissioned before; left on, the phases seemed 190 % apart."""
     bus = ("-i", "pmsmsim", "-c", profile("interior-2k2", inverter_model="switched"), "--yes")
@@ -112,6 +114,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 """Faults of the drive or on it: what the simulation has, and the name the run must end with."""
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_bad_machine_is_refused_by_name(case: str, tool: Tool) -> None:
     simulation, name = REFUSED[case]

@@ -64,6 +64,7 @@ def wait_for_current(connection: Connection) -> None:
     connection.wait(0.2)
 
 
+@pytest.mark.chain
 def test_a_killed_tool_leaves_a_stopped_machine() -> None:
     """SIGKILL while 2 A flow: operation is left within the declared 350 ms (measured 194 to 246 ms from the kill)."""
     with serving("--nv", ":memory:") as server, server.connect() as connection:
@@ -123,6 +124,7 @@ def busy(server: Server, seconds: float) -> tuple[subprocess.Popen[str], list[fl
     return process, beats
 
 
+@pytest.mark.chain
 def test_a_tool_that_looks_often_enough_keeps_its_heartbeat() -> None:
     """The main thread computes for 0.06 s between two looks: the heartbeat comes in time, the current flows."""
     with serving("--nv", ":memory:") as server:
@@ -133,6 +135,7 @@ def test_a_tool_that_looks_often_enough_keeps_its_heartbeat() -> None:
         assert len(beats) >= 2 and max(b - a for a, b in itertools.pairwise(beats)) < 1e-3 * CONSUMER_MS
 
 
+@pytest.mark.chain
 def test_a_tool_that_computes_for_two_seconds_lets_the_drive_stop() -> None:
     """Nobody watches the machine meanwhile: the heartbeat stays away, and the tool says why nothing was measured."""
     with serving("--nv", ":memory:") as server:
@@ -164,6 +167,7 @@ def test_a_pulled_cable_stops_the_machine_within_the_declared_time() -> None:
         assert bench.session.power.state is State.SWITCH_ON_DISABLED
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("fault", ['[[drive]]\naction = "unplug"\nat_s = 3.0\n', "[[adapter]]\nat_s = 3.0\n"])
 def test_a_tool_whose_cable_is_pulled_says_so_with_exit_8(tmp_path: Path, fault: str) -> None:
     faults = tmp_path / "faults.toml"
@@ -176,6 +180,7 @@ def test_a_tool_whose_cable_is_pulled_says_so_with_exit_8(tmp_path: Path, fault:
     assert "Traceback" not in said
 
 
+@pytest.mark.chain
 def test_a_served_drive_whose_cable_is_pulled_stops_by_itself(tmp_path: Path) -> None:
     """All connections to the server end at once; who joins again finds the machine stopped for want of a heartbeat."""
     faults = tmp_path / "faults.toml"
@@ -200,6 +205,7 @@ def controlwords(path: Path) -> list[int]:
     return [int.from_bytes(data[4:6], "little") for data in frames if data[:4] == b"\x2b\x40\x60\x00"]
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("missing", ["0x1016", "0x6007"])
 @pytest.mark.parametrize("where", ["pmsmsim", "sim serve"])
 def test_without_supervision_nothing_is_enabled_and_the_exit_is_5(tmp_path: Path, missing: str, where: str) -> None:
@@ -218,6 +224,7 @@ def test_without_supervision_nothing_is_enabled_and_the_exit_is_5(tmp_path: Path
     assert 0x0F not in controlwords(record)
 
 
+@pytest.mark.chain
 def test_with_supervision_the_same_command_does_enable(tmp_path: Path) -> None:
     """So that the test above cannot pass for another reason."""
     record = tmp_path / "bus.asc"

@@ -82,6 +82,7 @@ def script(peer: Peer) -> Answers:
     return found
 
 
+@pytest.mark.chain
 def test_the_same_script_has_the_same_answers() -> None:
     with Connection(PmsmSimBus("interior-2k2?nv=:memory:")) as connection:
         reset_node(connection, NODE)

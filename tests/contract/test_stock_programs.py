@@ -95,6 +95,7 @@ def logged(path: Path) -> Counter[int]:
     return Counter(message.arbitration_id for message in can.LogReader(str(path)))
 
 
+@pytest.mark.chain
 def test_the_logger_sees_heartbeats_in_process(environment: dict[str, str], tmp_path: Path) -> None:
     path = tmp_path / "bus.log"
     logger = stock("can.logger", ["-i", "pmsmsim", "-c", CHANNEL, "-f", str(path)], environment)
@@ -135,6 +136,7 @@ def sdo_program(arguments: Sequence[str], environment: dict[str, str]) -> None:
     assert done.stdout.split() == ["22001"]
 
 
+@pytest.mark.chain
 def test_a_notifier_with_a_logger_sees_sdo_traffic_in_process(environment: dict[str, str], tmp_path: Path) -> None:
     path = tmp_path / "bus.log"
     sdo_program([str(path), EDS, "interface=pmsmsim", f"channel={CHANNEL}"], environment)
@@ -143,6 +145,7 @@ def test_a_notifier_with_a_logger_sees_sdo_traffic_in_process(environment: dict[
     assert found[BEAT] > 0
 
 
+@pytest.mark.chain
 def test_the_logger_sees_heartbeats_and_sdo_traffic_of_a_served_drive(
     environment: dict[str, str], tmp_path: Path, server: Server
 ) -> None:
@@ -157,6 +160,7 @@ def test_the_logger_sees_heartbeats_and_sdo_traffic_of_a_served_drive(
     assert found[BEAT] > 0
 
 
+@pytest.mark.chain
 def test_the_player_replays_requests_and_the_served_drive_answers(
     environment: dict[str, str], tmp_path: Path, server: Server
 ) -> None:

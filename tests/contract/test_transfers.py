@@ -7,6 +7,8 @@ import pytest
 from benchmarks.transfers import LARGEST, RATES, loss_row, size_table, special_sizes
 from pmsmtool.bus.sdo import Mode
 
+pytestmark = pytest.mark.chain
+
 
 @pytest.mark.parametrize(("mode", "largest"), [(Mode.SEGMENTED, 3000), (Mode.BLOCK, LARGEST)])
 def test_special_sizes_arrive_both_ways_at_the_first_try(mode: Mode, largest: int) -> None:

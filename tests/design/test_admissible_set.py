@@ -61,6 +61,7 @@ def test_the_matrix_is_eulers_rule_on_the_controlled_machine() -> None:
         assert demanded == pytest.approx([s_d + rotation[0], s_q + rotation[1]], rel=1e-12)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("model", "eps", "published"),
     [
@@ -82,6 +83,7 @@ def test_what_is_not_finitely_determined_is_said_so(eps: float | None) -> None:
     assert found.text == "not finitely determined"
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(("rpm", "published"), [(0.0, 0), (310.0, 0), (620.0, 14), (800.0, 29)])
 def test_horizons_of_states_that_can_occur_depend_on_speed(rpm: float, published: int) -> None:
     found = horizon(MODULUS_OPTIMUM, rpm * P * math.pi / 30.0, V_MAX, 1e-3, StateBounds(56.0, 2.0))
@@ -89,11 +91,13 @@ def test_horizons_of_states_that_can_occur_depend_on_speed(rpm: float, published
     assert abs(found.k_max - published) <= HORIZON_TOLERANCE
 
 
+@pytest.mark.chain
 def test_all_states_give_the_same_horizon_at_every_speed_but_zero() -> None:
     assert {horizon(MODULUS_OPTIMUM, w, V_MAX, 0.1).k_max for w in (100.0, 300.0, -500.0)} == {18}
     assert horizon(MODULUS_OPTIMUM, 0.0, V_MAX, 0.1).k_max == 0
 
 
+@pytest.mark.chain
 def test_no_state_inside_the_rows_violates_a_later_one() -> None:
     """Random states near the limit, pulled back until the rows of the horizon hold, then predicted on."""
     m, eps = MODULUS_OPTIMUM, 0.01

@@ -36,6 +36,8 @@ from pmsmtool.sim.simulated_machine import with_simulation
 from pmsmtool.workflow.reproduce.closed_drive import closed_drive
 from pmsmtool.workflow.reproduce.closed_node import ClosedNode, Seat
 
+pytestmark = pytest.mark.chain
+
 OFFERS = frozenset((RATED, SLOPE, TORQUE, SPEED))
 SETTINGS = {"thermal_on": False}
 

@@ -53,6 +53,7 @@ def test_second_order_refuses_a_loop_slower_than_the_plant() -> None:
         second_order(5.0, 1e-3, 100.0, 1.0)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("delay", [1.25, 1.5, 2.0, 2.5])
 @pytest.mark.parametrize("gains", GAINS, ids=lambda g: g.method)
 def test_margins_agree_with_python_control(gains: CurrentGains, delay: float) -> None:

@@ -57,6 +57,7 @@ def test_at_rest_only_the_resistance_is_missed() -> None:
     assert euler_error(MODEL, 0.0, V_MAX, 28.0) < 2e-3
 
 
+@pytest.mark.chain
 def test_modes_and_options() -> None:
     source = load_machine_file(PROFILES / "jercic-2017.toml")
     rated = ratings(source, 0.92 * V_MAX)
@@ -147,6 +148,7 @@ def test_field_weakening_numbers_of_the_reference_machine() -> None:
     assert slope == pytest.approx(0.8 * float(design.facts["ramp_that_spends_the_reserve_rpm_per_s"]))
 
 
+@pytest.mark.chain
 def test_a_saturated_machine_gets_its_table() -> None:
     design = tune(load_machine_file(PROFILES / "saturated-pmsyrm.toml"))
     assert design["field_weakening.mode"] == 1.0
@@ -157,6 +159,7 @@ def test_a_saturated_machine_gets_its_table() -> None:
     assert design["governor.observer_gain"] == 0.0
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("mode", ["off", "lookup", "gradient", "uncompensated"])
 def test_other_modes_on_request(mode: str) -> None:
     source = load_machine_file(PROFILES / "jercic-2017.toml")
@@ -216,6 +219,7 @@ def test_tune_says_where_the_machine_ends_and_how_hot_magnets_are() -> None:
     assert float(other["mtpv_from_rpm"]) > 0.0
 
 
+@pytest.mark.chain
 def test_the_paper_mode_reports_its_horizon_over_speed_eps_and_bounds() -> None:
     source = load_machine_file(PROFILES / "jercic-2017.toml")
     facts = tune(source, TuneRequest(governor="paper", bandwidth_hz=4000.0 / (2.0 * math.pi), eps=1e-3)).facts
@@ -225,6 +229,7 @@ def test_the_paper_mode_reports_its_horizon_over_speed_eps_and_bounds() -> None:
     assert 14 < int(facts["k_max_bounded_states_at_775_rpm"]) <= 34
 
 
+@pytest.mark.chain
 def test_no_tightening_is_not_finitely_determined_whatever_the_tolerance_says() -> None:
     source = load_machine_file(PROFILES / "jercic-2017.toml")
     request = TuneRequest(governor="paper", method="second-order", bandwidth_hz=2000.0 / (2.0 * math.pi), eps=0.0)

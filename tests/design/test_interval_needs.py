@@ -47,6 +47,7 @@ def test_the_worst_margin_is_that_of_the_machine_at_the_end_of_the_interval(shar
     assert needs["current_d gain margin"].worst < needs["current_d gain margin"].nominal - 0.3
 
 
+@pytest.mark.chain
 def test_a_warm_winding_is_good_enough_and_a_useless_value_is_not() -> None:
     """8.4 % of R_s: 30 % device share over 70 K. The flux linkage may take the 8 % of V_max that the design keeps."""
     for name in ("interior-2k2", "fast-ipm", "saturated-pmsyrm"):
@@ -89,6 +90,7 @@ def test_a_machine_that_cannot_be_designed_for_is_not_judged() -> None:
     assert not any(need.what.endswith("phase margin") and need.what.startswith("current") for need in strict["L_d_h"])
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("name", ["interior-2k2", "fast-ipm", "saturated-pmsyrm"])
 def test_the_speed_loop_bears_a_wide_interval_of_the_inertia(name: str) -> None:
     """J within 40 % is right to pass: 57.0 to 57.2 deg are left of 60.6, limit 30; within 80 % 24.2 to 25.4 deg."""

@@ -106,16 +106,19 @@ def test_the_reported_bound_is_true_on_a_ten_times_finer_grid(profile: str, stor
     assert error.voltage_v <= 0.02 * table.V_max_v[0]
 
 
+@pytest.mark.chain
 def test_bounds_that_do_not_fit_the_drive_are_refused_with_what_was_reached() -> None:
     with pytest.raises(DesignInfeasible, match="nodes keep the torque within"):
         made("mtpv-test", stored="float32", torque_bound=1e-3)
 
 
+@pytest.mark.chain
 def test_auto_takes_the_smaller_format_only_where_it_must() -> None:
     assert made("interior-2k2").stored == "float32"
     assert made("jercic-2017").stored == "int16"
 
 
+@pytest.mark.chain
 def test_a_table_ends_where_no_speed_can_be_reached() -> None:
     design = made("jercic-2017")
     assert 945.0 < design.table.y[-1] < 955.0  # the set is empty above 945 rpm at i_q > 0, wholly from 952 rpm on
@@ -195,6 +198,7 @@ def test_what_the_drive_makes_of_the_table_keeps_the_bound(stored: StoredFormat)
     assert np.abs(reached - wanted).max() > 0.3 * error.torque_nm  # the table was really asked
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("stored", ["float32", "int16"])
 def test_a_voltage_axis_is_refined_and_bounded_between_its_voltages_too(stored: str) -> None:
     asked = {"U_dc_v": (130.0, 190.0), "torque_bound": 0.05, "voltage_bound": 0.03, "stored": stored}
@@ -222,6 +226,7 @@ def test_a_voltage_axis_is_refined_and_bounded_between_its_voltages_too(stored: 
     assert worst_torque >= 0.5 * error.torque_nm
 
 
+@pytest.mark.chain
 def test_without_bounds_two_voltages_get_the_largest_grid_that_fits_and_it_is_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -303,6 +308,7 @@ def test_every_cell_says_how_much_torque_is_left_or_missing() -> None:
     assert (table.margin_torque_nm[~cut & ~none] >= 0.0).all()
 
 
+@pytest.mark.chain
 def test_hot_and_cold_tables_differ_as_the_machine_does() -> None:
     cold, hot = made("mtpv-test"), made("mtpv-test", T_winding_c=140.0, T_magnet_c=100.0)
     assert hot.table.machine.R == pytest.approx(0.05 * (1.0 + 0.00393 * 120.0))
@@ -329,6 +335,7 @@ def test_loci_follow_the_closed_forms() -> None:
 # -- iron loss -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.chain
 def test_iron_loss_moves_the_optimum_to_the_least_total_loss(tmp_path: Path) -> None:
     """Coefficients proportional to |psi|^2, as a machine has them; every cell against a search along its contour."""
     i_d, i_q = np.linspace(-160.0, 60.0, 23), np.linspace(-160.0, 160.0, 33)
@@ -428,6 +435,7 @@ def run(*arguments: str) -> tuple[int, str]:
     return int(getattr(result.exception, "exit_code", result.exit_code)), result.stdout
 
 
+@pytest.mark.chain
 def test_command(tmp_path: Path) -> None:
     target = tmp_path / "lut.npz"
     source = str(PROFILES / "mtpv-test.toml")

@@ -247,6 +247,7 @@ BENCHES: dict[str, Callable[[], Bench]] = {
 }
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("name", BENCHES)
 def test_every_kind_of_cell_against_brute_force(name: str) -> None:
     bench = BENCHES[name]()

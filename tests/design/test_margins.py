@@ -49,6 +49,7 @@ def design_of(profile: str = "jercic-2017", request: TuneRequest | None = None) 
     return tune(load_machine_file(PROFILES / f"{profile}.toml"), request)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(("delay", "predictor"), [(0.5, False), (1.5, False), (1.8, False), (1.5, True)])
 def test_array_margins_are_those_of_each_loop(delay: float, predictor: bool) -> None:
     T_s, rng = 1.0 / 12e3, np.random.default_rng(3)
@@ -102,6 +103,7 @@ def test_speed_margins_of_other_machines_are_those_of_their_own_loop() -> None:
         assert found["speed_gain"][k] == pytest.approx(one.gain_margin_db, abs=SPEED_TOLERANCE_DB)
 
 
+@pytest.mark.chain
 def test_the_nominal_row_is_the_design_itself() -> None:
     for profile in ("jercic-2017", "saturated-pmsyrm"):
         design = design_of(profile)
@@ -111,6 +113,7 @@ def test_the_nominal_row_is_the_design_itself() -> None:
             assert nominal[f"{loop}_gain"][0] == pytest.approx(design.loops[loop].gain_margin_db, abs=1e-6)
 
 
+@pytest.mark.chain
 def test_the_least_inductance_of_a_map_is_a_corner() -> None:
     design = design_of("saturated-pmsyrm")
     box = replace(tolerance_box(design.machine), factors={})
@@ -213,6 +216,7 @@ class Dying:
             yield function(task)
 
 
+@pytest.mark.chain
 def test_the_result_is_the_same_whoever_works() -> None:
     design = design_of()
     box = tolerance_box(design.machine)
@@ -256,6 +260,7 @@ def run(*arguments: str) -> tuple[int, str]:
     return int(getattr(result.exception, "exit_code", result.exit_code)), result.stdout
 
 
+@pytest.mark.chain
 def test_command(tmp_path: Path) -> None:
     path = tmp_path / "design.toml"
     path.write_text(design_text(design_of()))

@@ -43,6 +43,7 @@ def test_the_bound_depends_on_the_dc_link(U_dc: float, ms: float) -> None:
     assert 1e3 * minimum_time(problem(620.0, U_dc), (0.0, 0.0), (0.0, 28.0)) == pytest.approx(ms, abs=6e-3)
 
 
+@pytest.mark.chain
 def test_both_methods_agree_on_salient_machines_too() -> None:
     rng = np.random.default_rng(11)
     for _ in range(8):
@@ -66,6 +67,7 @@ def test_without_resistance_the_flux_goes_straight() -> None:
     assert minimum_time(machine, start, end) == pytest.approx(expected, rel=1e-8)
 
 
+@pytest.mark.chain
 def test_hexagon_is_never_slower_than_its_circle_nor_faster_than_its_corners() -> None:
     start, end = (0.0, 0.0), (0.0, 28.0)
     circle = minimum_time(problem(620.0), start, end)

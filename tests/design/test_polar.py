@@ -31,6 +31,7 @@ def _evaluate(plant: polar.SecondOrderPlant, s: complex) -> complex:
     return (plant.n1 * s + plant.n0) / (s * s + plant.d1 * s + plant.d0)
 
 
+@pytest.mark.chain
 @given(speeds, currents, st.floats(1.0, 2000.0))
 def test_transfer_functions_are_those_of_the_state_space(omega_e: float, i_q: float, frequency: float) -> None:
     point = polar.equilibrium_without_i_d(SET_A, omega_e, i_q, V_MAX)
@@ -91,6 +92,7 @@ def test_design_at_800_rpm_gives_the_reference_values() -> None:
     assert design.amplitude.a == pytest.approx(934, rel=2e-3)
 
 
+@pytest.mark.chain
 @given(st.floats(600.0, 1500.0), st.floats(0.2, 6.0))
 def test_each_loop_alone_has_the_placed_polynomial(omega_e: float, i_q: float) -> None:
     point = polar.equilibrium_without_i_d(SET_A, omega_e, i_q, V_MAX)

@@ -51,6 +51,7 @@ def test_laws_of_the_linear_range_get_a_table_or_say_what_they_lack(law: str) ->
     assert not int(without["polar.options"]) & LINEAR_RANGE
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("profile", "mode"), [("interior-2k2", 1.0), ("saturated-pmsyrm", 1.0), ("miyajima-2013-assumed", 0.0)]
 )

@@ -87,6 +87,7 @@ def speeds(rng: np.random.Generator, periods: int) -> np.ndarray:
     return np.array(values)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("decoupled", [False, True])
 @pytest.mark.parametrize("delay", [0, 1])
 @pytest.mark.parametrize("filter_s", [0.0, 0.004])
@@ -111,6 +112,7 @@ def test_no_course_leaves_the_bound(decoupled: bool, delay: int, filter_s: float
     assert largest > 0.6  # measured: 0.72 to 0.93 over the eight cases and three seeds
 
 
+@pytest.mark.chain
 def test_the_worst_course_reaches_the_bound() -> None:
     """One machine without magnet, constant speed: the course that pushes with every sign of the response."""
     found = slope_response(replace(POINT, psi=(0.0, 0.0)), LOOPS, OMEGA, 60)

@@ -46,6 +46,7 @@ def saturated() -> MachineFile:
     return replace(SURFACE, flux_map=flux_map, machine=machine)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("profile", sorted(PROFILES.glob("*.toml")), ids=lambda path: path.stem)
 def test_every_profile_gives_a_complete_valid_set(profile: Path) -> None:
     design = tune(load_machine_file(profile))
@@ -80,6 +81,7 @@ def test_text_and_back() -> None:
         assert parse_parameter_set(design.parameter_set().to_toml()).values == design.parameter_set().values
 
 
+@pytest.mark.chain
 def test_same_bytes_for_the_same_machine_wherever_it_lies(tmp_path: Path) -> None:
     source = PROFILES / "saturated-pmsyrm.toml"
     moved = tmp_path / "elsewhere"
@@ -123,6 +125,7 @@ def test_a_bandwidth_beyond_the_delay_is_refused_with_one_that_works() -> None:
     assert loop.phase_margin_deg >= 45.0
 
 
+@pytest.mark.chain
 def test_saturation_lowers_the_bandwidth_until_the_least_inductance_holds() -> None:
     source = saturated()
     least = least_inductance(source, 28.0)

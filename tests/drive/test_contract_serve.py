@@ -32,6 +32,7 @@ class TestServed(DriveContract):
             yield drive
 
 
+@pytest.mark.chain
 def test_main_thread_busy_for_two_seconds_leaves_the_machine_off(server: Server) -> None:
     """Nobody looked at the machine meanwhile: the heartbeat stops, and the drive removes the voltage by itself."""
     with server.connect() as connection:
@@ -45,6 +46,7 @@ def test_main_thread_busy_for_two_seconds_leaves_the_machine_off(server: Server)
             guard.wait(0.0)
 
 
+@pytest.mark.chain
 def test_server_that_dies_is_noticed_within_two_seconds_and_not_confirmed() -> None:
     with serving("--nv", ":memory:") as running, running.connect() as connection:
         drive = CanopenDrive(connection, 1)
@@ -57,6 +59,7 @@ def test_server_that_dies_is_noticed_within_two_seconds_and_not_confirmed() -> N
         assert time.monotonic() - died < 2.0 + 1.0, "noticed within 2 s, the failed stop within another"
 
 
+@pytest.mark.chain
 def test_nobody_listens() -> None:
     with pytest.raises(BusError) as caught:
         connect("socketcand", "vcan0", host="127.0.0.1", port=9, ignore_config=True)

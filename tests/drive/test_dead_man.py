@@ -165,6 +165,7 @@ def test_killed_tool_stops_the_machine(bench: SimBench) -> None:
         assert bench.session.power.state is State.SWITCH_ON_DISABLED
 
 
+@pytest.mark.chain
 def test_heartbeat_on_the_wall_clock_has_its_own_thread() -> None:
     """A main thread busy for a second: the gaps between heartbeats stay far below the consumer time."""
     bus = ScriptedBus(ScriptedSlave())

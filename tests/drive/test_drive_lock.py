@@ -51,6 +51,7 @@ def test_drives_without_a_serial_number_are_told_apart_by_their_place(
         claim(connection(monkeypatch, 0), NODE)
 
 
+@pytest.mark.chain
 def test_a_lock_ends_with_its_owner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path))
     code = (
@@ -78,6 +79,7 @@ def test_a_drive_at_work_is_not_reset_by_nmt(
     assert run(command) == 0
 
 
+@pytest.mark.chain
 @pytest.mark.wall_clock
 def test_of_two_downloads_one_wins(tmp_path: Path) -> None:
     rng = random.Random(5)

@@ -171,6 +171,7 @@ def test_a_kept_speed_proves_the_ramp_and_a_new_parameter_takes_that_back(bench:
         assert bench.drive.stops_by_ramp and option.number() == before
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("moment", [0.8, 0.95, 1.1])
 def test_pulled_cable_is_exit_8_and_says_what_to_do(bench: SimBench, moment: float) -> None:
     def unplug() -> None:
@@ -183,6 +184,7 @@ def test_pulled_cable_is_exit_8_and_says_what_to_do(bench: SimBench, moment: flo
     assert caught.value.exit_code == 8 and "hardware stop" in str(caught.value)
 
 
+@pytest.mark.chain
 def test_drive_behind_a_pulled_cable_stops_by_itself(bench: SimBench) -> None:
     """The dead-man at work: the tool is cut off, the drive leaves operation in the declared time."""
 

@@ -74,6 +74,7 @@ def state_of_drive(server: Server) -> tuple[State | None, bytes]:
     return found
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("delay_s", [0.0, 0.15, 0.6])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_jog_is_stopped_restored_and_130(
@@ -88,6 +89,7 @@ def test_interrupted_jog_is_stopped_restored_and_130(
     assert state_of_drive(server) == (State.SWITCH_ON_DISABLED, bytes(4)), "off, and the heartbeat entry is free again"
 
 
+@pytest.mark.chain
 def test_second_terminal_stops_the_machine_of_the_first(server: Server, tmp_path: Path) -> None:
     process = jogging(server, tmp_path)
     time.sleep(0.3)
@@ -100,6 +102,7 @@ def test_second_terminal_stops_the_machine_of_the_first(server: Server, tmp_path
     assert state_of_drive(server)[0] is State.SWITCH_ON_DISABLED
 
 
+@pytest.mark.chain
 def test_killed_jog_is_stopped_by_the_drive_itself(server: Server, tmp_path: Path) -> None:
     process = jogging(server, tmp_path)
     time.sleep(0.5)

@@ -505,6 +505,7 @@ def test_a_supervision_that_leaves_the_voltage_on_is_refused(rig: Rig) -> None:
     assert not rig.energised
 
 
+@pytest.mark.chain
 def test_a_pulled_cable_is_said_above_all(rig: Rig) -> None:
     """Nothing can be confirmed or restored; the drive stops by itself."""
     declared = 1e-3 * CONSUMER_MS + REACTION_S

@@ -36,6 +36,7 @@ def test_one_record_after_another(opened: Opener) -> None:
         check(rig.record(samples, 2), samples, 2)
 
 
+@pytest.mark.chain
 def test_the_largest_record_fits_and_one_row_more_does_not(opened: Opener) -> None:
     rig = opened()
     check(rig.record(rig.kind.capacity_rows), rig.kind.capacity_rows, 1)
@@ -50,6 +51,7 @@ def test_a_signal_it_has_not_is_named(opened: Opener) -> None:
         rig.recorder.arm(("warp_factor",), 10, 1, 0, at_excitation=False)
 
 
+@pytest.mark.chain
 def test_lost_frames_never_give_a_wrong_record(opened: Opener) -> None:
     """One frame of the drive lost, at 24 places from set-up to data: the right record, or an error that says so."""
     right = wrong = 0

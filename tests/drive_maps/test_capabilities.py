@@ -109,6 +109,7 @@ def test_every_quantity_is_listed_with_every_method() -> None:
             assert expected.drives >= 10 and expected.program.startswith("benchmarks.")
 
 
+@pytest.mark.chain
 def test_what_caps_promises_is_what_is_found_without_a_dead_time() -> None:
     """Torque pushes of the standard tier: without a machine file that names the dead time nothing tells the voltage."""
     promised = {expected.given: expected.half_width for expected in EXPECTED["psi", Method.STANDARD]}
@@ -210,6 +211,7 @@ def test_commission_of_a_drive_that_gives_nothing_is_exit_9(monkeypatch: pytest.
     assert "identify: needs torque mode" in text and "tune: needs pole_pairs, R_s_ohm" in text
 
 
+@pytest.mark.chain
 def test_identify_by_cia402_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     outcome = run("--sim", CHANNEL + "&drive=cia402", "--yes", "identify", "--json")
@@ -251,6 +253,7 @@ def envelope_for(drive: MachineFile) -> Envelope:
     return Envelope(HEADROOM * drive.machine.I_nom_apk, drive.machine.n_max_rpm * math.pi / 30.0)
 
 
+@pytest.mark.chain
 def test_pole_pairs_and_offset_of_a_random_drive_by_cia402(tmp_path: Path) -> None:
     drive, path = machine(tmp_path, 100)
     with connect("pmsmsim", f"{path}?nv=:memory:&drive=cia402") as connection:
@@ -265,6 +268,7 @@ def test_pole_pairs_and_offset_of_a_random_drive_by_cia402(tmp_path: Path) -> No
     assert abs(math.degrees(math.remainder(found["offset_rad"].value - truth, 2.0 * math.pi))) < 0.5
 
 
+@pytest.mark.chain
 def test_flux_linkage_by_a_recorder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """On the profile: its inverter is averaged, so that the test is quick; random drives are the program's."""
     monkeypatch.chdir(tmp_path)
@@ -278,6 +282,7 @@ def test_flux_linkage_by_a_recorder(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert found["R_s_ohm"]["value"] == pytest.approx(truth.R_s_ohm, rel=0.03)
 
 
+@pytest.mark.chain
 def test_a_recorder_drive_that_does_not_commutate_is_refused(tmp_path: Path) -> None:
     drive, path = machine(tmp_path, 105)
     text = path.read_text(encoding="utf-8")

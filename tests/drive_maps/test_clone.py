@@ -45,6 +45,7 @@ def identified(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.chain
 def test_the_clone_of_the_reference_drive(identified: Path) -> None:
     outcome = run("--sim", "interior-2k2?nv=:memory:", "sim", "clone", str(identified), "-o", "twin.toml", "--json")
     assert json.loads(outcome.stdout)["files"] == ["twin.toml", "twin.params.toml", "twin.eds"]
@@ -57,6 +58,7 @@ def test_the_clone_of_the_reference_drive(identified: Path) -> None:
     run("--sim", "twin.toml?nv=twin.nv", "verify", "twin.params.toml")
 
 
+@pytest.mark.chain
 def test_the_clone_can_be_identified(identified: Path) -> None:
     """Its current sensors are noisy, although nothing in the machine file says so; without noise it was refused."""
     run("--sim", "interior-2k2?nv=:memory:", "sim", "clone", str(identified), "-o", "twin.toml")

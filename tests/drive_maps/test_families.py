@@ -79,6 +79,7 @@ def random_design(rng: np.random.Generator) -> dict[str, float]:
     }
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("family", HOLDING)
 def test_what_is_shown_before_is_what_the_drive_holds(family: str) -> None:
     """1000 random designs: bytes, and the SI values they mean, before writing and read back."""
@@ -169,6 +170,7 @@ def test_live_values_in_the_familys_counts() -> None:
         assert dictionary["cia402.target_velocity"].number() == 300_000
 
 
+@pytest.mark.chain
 @settings(max_examples=300, deadline=None)
 @given(
     K_p=st.floats(1e-6, 4000.0), T_n=st.floats(1e-6, 0.06), step=st.sampled_from(["V/A", "mV/A", "0.1 V/A"])

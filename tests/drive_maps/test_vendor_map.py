@@ -185,6 +185,7 @@ def _leaves(table: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple
             yield from _leaves(value, (*path, key))
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("text", [COMMANDS, MODE], ids=["os_command", "mode"])
 def test_any_value_of_any_kind_is_refused_in_words(text: str) -> None:
     """Every key and table of the section in turn holds something else: read, or refused, never anything worse."""

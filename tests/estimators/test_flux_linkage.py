@@ -17,6 +17,8 @@ from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, curve_points, draw, repeat, run
 
+pytestmark = pytest.mark.chain
+
 Change = Callable[[Trace], Mapping[str, np.ndarray]]
 
 D, Q = 0.45, 0.3  # currents of the windows, of the rated one

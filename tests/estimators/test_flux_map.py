@@ -117,6 +117,7 @@ def test_the_even_half_of_the_space_is_even() -> None:
 # ---- accuracy ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("swing", [0.0, 0.8])
 def test_fluxes_and_inductances_of_a_saturated_machine(swing: float) -> None:
     result = plain(swing)
@@ -130,6 +131,7 @@ def test_fluxes_and_inductances_of_a_saturated_machine(swing: float) -> None:
     assert result.identified.mean() > 0.6 and np.isnan(result.L_h[0][~result.identified]).all()
 
 
+@pytest.mark.chain
 def test_the_motion_shows_the_flux_of_the_magnets_when_nothing_else_does() -> None:
     """A wrong anchor is contradicted by a rotor that swings over 46 degrees: chi-square says so."""
     facts = pulses(0.8)[0].meta
@@ -140,6 +142,7 @@ def test_the_motion_shows_the_flux_of_the_magnets_when_nothing_else_does() -> No
     assert wrong.chi2 > 1.3 * plain(0.8).fit.chi2
 
 
+@pytest.mark.chain
 def test_a_frame_that_is_off_is_seen_and_a_held_rotor_is_aligned() -> None:
     off = pulses(0.0, 0.01)
     crooked = estimate(off)
@@ -151,6 +154,7 @@ def test_a_frame_that_is_off_is_seen_and_a_held_rotor_is_aligned() -> None:
     assert math.sqrt(np.mean(errors(aligned)[0] ** 2)) < RMS_LIMIT
 
 
+@pytest.mark.chain
 def test_asymmetry_and_missing_energy_are_reported_not_forced() -> None:
     found = estimate(pulses(plant="strange"))
     assert not found.fit.symmetric and found.asymmetry > 20.0 * plain().asymmetry
@@ -172,6 +176,7 @@ def changed(trace: Trace, **signals: Array) -> Trace:
     return replace(trace, signals={**trace.signals, **signals})
 
 
+@pytest.mark.chain
 def test_traps_are_refused_by_name() -> None:
     good = list(pulses())
     clipped = changed(good[2], flagged=np.where(np.arange(1500) == 900, 1.0, 0.0))

@@ -64,6 +64,7 @@ def split_of(d: Drives, k: int, rng: np.random.Generator) -> tuple[FrequencySpli
     return split_by_frequency(levels, slower, noise_of(d, k), least_current=FIT_FROM), levels
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("seed", range(5))
 def test_dead_time_of_any_shape_falls_out(seed: int) -> None:
     """Over ten seeds the largest error is 0.014 to 0.032 %; one frequency has 0.11 to 1.2 % on the same levels."""

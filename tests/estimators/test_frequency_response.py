@@ -15,6 +15,8 @@ from pmsmtool.estimators.frequency_response import FrequencyResponse, estimate_f
 from pmsmtool.experiments.frequency_response import ROWS, WALK_SHARE, plan_frequency_response
 from pmsmtool.trace import Trace
 
+pytestmark = pytest.mark.chain
+
 Array = NDArray[np.float64]
 
 T_S, DECIMATION, HOLD = 62.5e-6, 4, 8

@@ -17,6 +17,8 @@ from pmsmtool.estimators.sampling_instant import INSTANTS, LAGS, ShownInstant
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, Run, curve_points, draw, repeat, run
 
+pytestmark = pytest.mark.chain
+
 Change = Callable[[Trace], Mapping[str, np.ndarray]]
 
 HALF_PERIODS = (6, 13)

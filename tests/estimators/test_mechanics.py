@@ -102,6 +102,7 @@ def test_the_closed_form_is_the_motion_through_reversal_sticking_and_breaking_aw
     assert np.allclose(no_friction, 1.0 + 3.0 * t + 0.5 * 0.2 / J * t * t, rtol=1e-12)
 
 
+@pytest.mark.chain
 def test_errors_lie_in_their_intervals_and_within_the_limits() -> None:
     """Four drives; the floor of the scale over-covers."""
     inside = []
@@ -116,6 +117,7 @@ def test_errors_lie_in_their_intervals_and_within_the_limits() -> None:
     assert sum(inside) >= 10
 
 
+@pytest.mark.chain
 def test_what_is_not_a_free_shaft_is_refused_by_name() -> None:
     good = run_of(np.random.default_rng(3))
 
@@ -142,6 +144,7 @@ def swinging(trace: Trace, amplitude: float) -> Trace:
     return replace(trace, signals={**trace.signals, "theta_M_rad": theta})
 
 
+@pytest.mark.chain
 def test_torque_that_the_model_does_not_know_widens_the_interval() -> None:
     """A swing of 0.013 N m in one coasting; errors of 8 seeds up to 1.8, fits wider by at least 1.4, 9.3 and 127."""
     for seed in range(5):
@@ -154,6 +157,7 @@ def test_torque_that_the_model_does_not_know_widens_the_interval() -> None:
             assert abs(value.value - true) < 4.0 * value.std
 
 
+@pytest.mark.chain
 def test_torque_noise_that_decides_the_intervals_is_told_once() -> None:
     """A swing of 0.13 N m in one coasting; from what is told on to what is refused."""
     good = run_of(np.random.default_rng(3))
@@ -164,6 +168,7 @@ def test_torque_noise_that_decides_the_intervals_is_told_once() -> None:
     assert {value.fallback for value in (found.J, found.B, found.tau_c)} == {""}
 
 
+@pytest.mark.chain
 def test_a_push_from_rest_whose_current_rises_late_is_fitted() -> None:
     """The friction holds the shaft for a tenth of the push: its first speed is none, and has no slope to be fitted."""
     for seed in range(5):
@@ -192,6 +197,7 @@ def test_pushes_are_sized_by_speed_and_time() -> None:
     assert heavy.unit_s == UNIT_MOST_S and heavy.omega_rad_s < 100.0
 
 
+@pytest.mark.chain
 def test_fits_arrive_where_the_encoder_alone_makes_a_narrow_valley() -> None:
     """A realisation of the bound in which a fit straight from a coarse one made 60 steps without a minimum."""
     rng = np.random.default_rng(77)

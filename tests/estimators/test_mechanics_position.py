@@ -58,6 +58,7 @@ def test_a_shaft_that_stands_still_is_refused() -> None:
         encoder_step([np.zeros(100), turning(17, 20.0)])
 
 
+@pytest.mark.chain
 def test_binary32_makes_no_torque_noise_of_the_coasting() -> None:
     """With a step that is a rounding too small, the residual asks for noise of the coasting: B by ten times worse."""
     rng = np.random.default_rng(5)

@@ -77,6 +77,7 @@ def test_exact_on_its_own_model(backwards: bool) -> None:
     assert found.V_dead_v == pytest.approx(V_DEAD, rel=0.02)
 
 
+@pytest.mark.chain
 def test_intervals_hold_the_truth_with_noise() -> None:
     for seed in range(20):
         pushes = [push(s * level, noise=0.3, seed=1000 * seed + k) for k, level in enumerate(LEVELS) for s in (1, -1)]

@@ -79,6 +79,7 @@ def summary(
     return errors, widths, d.dV / (d.R * d.I_r), results
 
 
+@pytest.mark.chain
 def test_accuracy_and_coverage_over_drives() -> None:
     errors, widths, hardness, _ = summary(80, 1)
     easy = hardness < 3.0
@@ -175,6 +176,7 @@ def test_zeros_of_the_current_sensors_are_no_model_mismatch() -> None:
         assert abs(off.R_s.value / d.R[0] - 1.0) < COVERAGE_FACTOR * off.R_s.std / d.R[0]
 
 
+@pytest.mark.chain
 def test_efficiency_against_the_bound_of_the_same_tail_terms() -> None:
     """sd over noise realisations / Cramer-Rao bound of the model with the two tail terms 1/i and 1/i^2."""
     rng = np.random.default_rng(7)

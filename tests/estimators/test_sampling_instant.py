@@ -61,6 +61,7 @@ def _legs_ripple(u_d: float, u_q: float, i_d: float, i_q: float, sampling: Sampl
     return float(out[0]), float(out[1])
 
 
+@pytest.mark.chain
 @settings(max_examples=12, deadline=None)
 @given(
     st.floats(-40.0, 40.0),
@@ -76,6 +77,7 @@ def test_ripple_is_that_of_the_switched_legs(u_d: float, u_q: float, instant: fl
     assert found == pytest.approx(expected, abs=2e-4)  # measured 2.4e-5 A, the grid of the reference
 
 
+@pytest.mark.chain
 @given(st.floats(-0.1, 0.9), st.floats(0.01, 3.0))
 def test_course_of_a_turning_machine(instant: float, lag: float) -> None:
     t = np.arange(GRID) * T_S / GRID

@@ -22,6 +22,7 @@ these realisations lasts twice as long as the first also where the plan would ma
 KEYS = ("J_kgm2", "B_nms", "tau_c_nm")
 
 
+@pytest.mark.chain
 def test_the_prediction_is_what_the_fit_says_of_random_shafts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shaft_prediction, "RIPPLE", TORQUE_FLOOR)  # that of the realisations
     monkeypatch.setattr(shaft_prediction, "SCALE_FLOOR", 0.0)

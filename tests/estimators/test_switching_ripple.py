@@ -84,6 +84,7 @@ def switched_period(
     return np.array([np.mean(part) for part in turned(v - machine)])
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("i_d", [0.7, -0.7, 2.0])
 def test_the_error_is_that_of_switches_and_diodes(i_d: float) -> None:
     """A small d current on a machine that turns: its ripple passes zero, and the error has a q part."""

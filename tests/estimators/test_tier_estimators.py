@@ -48,6 +48,7 @@ def swing(rng: np.random.Generator, *, sense: float = 1.0) -> list[Trace]:
     return pushes
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("sense", [1.0, -1.0])
 def test_inertia_and_friction_over_the_flux_linkage(sense: float) -> None:
     """Both senses of the encoder; over twelve seeds J/psi was off by at most 0.12 %, tau_c/psi by 2.8 %."""

@@ -272,6 +272,7 @@ def test_off_and_unusable_measurements_remove_the_gates() -> None:
     assert loop.state.integrator.q == 0.0
 
 
+@pytest.mark.chain
 def test_dead_time_compensation_cancels_the_inverter_error() -> None:
     V_dead, i_knee = 8.0, 0.5
     errors = []
@@ -315,6 +316,7 @@ def test_overload_budget_is_used_up_in_its_time_and_recovers() -> None:
     assert slow.state.i2t == pytest.approx(2000 * T_s / 3600, rel=0.02)  # below float's resolution near 1
 
 
+@pytest.mark.chain
 def test_speed_control_runs_up_and_holds() -> None:
     J = 0.01
     values = tuned(speed__K_p_nms_per_rad=J * 60, speed__K_i_nm_per_rad=J * 60 * 15, speed__filter_hz=500.0,

@@ -172,6 +172,7 @@ def test_binary32_text_round_trip(value: float) -> None:
 entries = st.builds(dcf.Entry, st.integers(0, 0xFFFF), st.integers(0, 255), st.binary(max_size=40))
 
 
+@pytest.mark.chain
 @given(st.lists(entries, max_size=20))
 def test_concise_round_trip(items: list[dcf.Entry]) -> None:
     data = dcf.write_concise(items)
@@ -183,6 +184,7 @@ def test_concise_round_trip(items: list[dcf.Entry]) -> None:
         dcf.read_concise(data + b"\0")
 
 
+@pytest.mark.chain
 @settings(max_examples=300)
 @given(st.binary(max_size=300) | st.text(alphabet="[]=;$0129abXxsub \n", max_size=200).map(str.encode))
 def test_nothing_but_a_config_error_comes_out_of_any_bytes(data: bytes) -> None:
@@ -193,6 +195,7 @@ def test_nothing_but_a_config_error_comes_out_of_any_bytes(data: bytes) -> None:
             pass
 
 
+@pytest.mark.chain
 @settings(max_examples=300)
 @given(st.integers(0, len(SHEET) - 1), st.binary(min_size=1, max_size=6))
 def test_a_damaged_sheet_never_crashes(place: int, damage: bytes) -> None:

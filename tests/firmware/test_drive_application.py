@@ -327,6 +327,7 @@ def test_recorder_triggers_and_keeps_the_oldest_row_first() -> None:
         assert (np.diff(np.abs(i_q[k - 3 : k + 3])) > 0).all()
 
 
+@pytest.mark.chain
 def test_recorder_decimates_forces_stops_and_respects_its_memory() -> None:
     bench = Bench(10.0)
     bench.record("THETA_M", depth=10**6, decimation=3)

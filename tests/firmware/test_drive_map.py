@@ -52,6 +52,7 @@ def test_reference_map_is_the_catalogue() -> None:
     assert reference_map().encode(ParameterSet(held)) == encoded
 
 
+@pytest.mark.chain
 @settings(max_examples=500, deadline=None)
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 @example(999999995904.0)  # 1e12 is shorter, its repr is longer

@@ -57,6 +57,7 @@ def _with_table(fmt: int) -> bytes:
 IMAGES = {"no table": pack_image(_values()), "binary32": _with_table(1), "int16": _with_table(2)}
 
 
+@pytest.mark.chain
 @needs_compiler
 @pytest.mark.parametrize("content", IMAGES)
 def test_compiled_memory_is_the_image(content: str, tmp_path: Path) -> None:
@@ -116,6 +117,7 @@ def test_a_prefix_that_is_no_c_name_is_refused(prefix: str) -> None:
         c_files(IMAGES["no table"], prefix=prefix)
 
 
+@pytest.mark.chain
 @settings(max_examples=2000)
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 def test_a_literal_reads_back_to_the_same_bits(value: float) -> None:
@@ -124,6 +126,7 @@ def test_a_literal_reads_back_to_the_same_bits(value: float) -> None:
     assert struct.pack("<f", float(text[:-1])) == struct.pack("<f", value)
 
 
+@pytest.mark.chain
 @needs_compiler
 def test_what_the_core_does_not_read_is_said_and_is_what_a_compiler_does_not_miss(tmp_path: Path) -> None:
     """Without the members that are named, the core compiles; without the others, the compiler misses every one."""

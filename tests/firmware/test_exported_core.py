@@ -39,6 +39,8 @@ from tests.firmware.closed_loop import (
 from tests.firmware.core_twin import Twin, f
 from tests.firmware.governor_twin import GovernedTwin
 
+pytestmark = pytest.mark.chain
+
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler on this machine")
 U_DC = 210.0

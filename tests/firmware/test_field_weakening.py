@@ -23,6 +23,8 @@ from tests.firmware.closed_loop import (
     reference_case,
 )
 
+pytestmark = pytest.mark.chain
+
 V_DC = 210.0
 V_M = 0.92 * V_DC / math.sqrt(3)
 GRADIENT, ACCELERATED, UNCOMPENSATED = 2, 3, 4

@@ -87,6 +87,7 @@ def steady_voltage(i: np.ndarray, omega: np.ndarray | float) -> np.ndarray:
                     m.R * i[..., 1] + omega * (m.L_d * i[..., 0] + m.psi))
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(("double", "distance"), [(True, 1e-5), (False, 2e-3)])  # A; measured 4e-6, 1.5e-4
 def test_paper_mode_is_the_projection_on_the_papers_rows(double: bool, distance: float) -> None:
     k_max, eps = 10, 0.01
@@ -220,6 +221,7 @@ def nearest_reachable(target: tuple[float, float], omega: float) -> np.ndarray:
     return point(high)
 
 
+@pytest.mark.chain
 def test_unreachable_references_settle_on_the_nearest_reachable_current() -> None:
     slow = settled = 0
     times = []
@@ -313,6 +315,7 @@ def test_barred_transfer_comes_to_rest_in_the_corner_of_steady_state_and_current
     assert steady_voltage(end[-1], -825.4457 * RPM) == pytest.approx(0.999 * V_MAX, rel=1e-3)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("plant", [(1, 0.7, 1), (1, 1.43, 1), (1.5, 1, 0.7), (1, 1, 1.1), (1.5, 1, 1)])
 @pytest.mark.parametrize("gain", [0.0, 0.1])
 def test_offset_free_rows_reach_the_reference_under_mismatch(plant: tuple[float, float, float], gain: float) -> None:
@@ -330,6 +333,7 @@ def test_offset_free_rows_reach_the_reference_under_mismatch(plant: tuple[float,
     assert done >= 8
 
 
+@pytest.mark.chain
 def test_paper_rows_veto_feasible_currents_under_table_2b() -> None:
     """The known weakness of the printed rows: they see the nominal flux (docs/control.md, 2)."""
     stuck = tried = 0

@@ -75,6 +75,7 @@ def row_0(loop: Loop, v: tuple[float, float], state: tuple[float, ...]) -> float
     return math.hypot(u_d, u_q)
 
 
+@pytest.mark.chain
 @needs_compiler
 @pytest.mark.parametrize("rpm", [0.0, 310.0, -620.0, 800.0])
 def test_same_inputs_give_the_float_cores_reference(rpm: float, governor: FixedPointGovernor) -> None:
@@ -122,6 +123,7 @@ def test_closed_loops_of_fixed_and_float_stay_together(rpm: float, governor: Fix
     assert changed > 20
 
 
+@pytest.mark.chain
 @needs_compiler
 @pytest.mark.parametrize("arguments", [[], ["odd constants"]])
 def test_nothing_is_undefined_for_any_input(arguments: list[str], tmp_path: Path) -> None:

@@ -113,6 +113,7 @@ def object_image(node: ParameterImage, values: dict[str, float], lut: bytes) -> 
     return node.pack()
 
 
+@pytest.mark.chain
 def test_c_python_and_objects_give_the_same_image_for_random_sets() -> None:
     rng = np.random.default_rng(2026)
     node = ParameterImage.of_values({})
@@ -238,6 +239,7 @@ def test_crc_is_that_of_zlib(data: bytes) -> None:
     assert core().library.pmsm_image_crc32(data, len(data)) == crc32(data) == zlib.crc32(data)
 
 
+@pytest.mark.chain
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 @settings(max_examples=500)
 def test_float_literals_read_back_to_the_same_bits(value: float) -> None:

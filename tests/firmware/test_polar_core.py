@@ -254,6 +254,7 @@ def test_unified_law_on_the_whole_drive() -> None:
     assert not any(one.fails(polar_sweep.NOISY_ERROR_A, polar_sweep.NOISY_RIPPLE_A) for one in cells.values())
 
 
+@pytest.mark.chain
 def test_unified_law_on_random_machines() -> None:
     found = polar_sweep.random_outcomes(UNIFIED_TUNED, 100, 0)
     failed = [k for k, one in enumerate(found) if one.fails(polar_sweep.RANDOM_ERROR_A, polar_sweep.RANDOM_RIPPLE_A)]

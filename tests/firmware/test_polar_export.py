@@ -18,6 +18,8 @@ from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
 from tests.firmware.closed_loop import MODE_TORQUE, Loop
 
+pytestmark = pytest.mark.chain
+
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 PERIODS = 300
 

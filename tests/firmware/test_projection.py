@@ -103,6 +103,7 @@ def smallest_excess(rows: list[Row]) -> float:
     return float(found.x[2]) - 1
 
 
+@pytest.mark.chain
 def test_exact_projection_against_slsqp() -> None:
     double, single = core(double=True), core()
     counts = dict.fromkeys((0, 1, 2, EMPTY), 0)
@@ -168,6 +169,7 @@ def test_smallest_voltage_on_a_row() -> None:
     assert outside > 50
 
 
+@pytest.mark.chain
 def test_half_planes_against_slsqp() -> None:
     rng = np.random.default_rng(8)
     for binding, limit in ((core(double=True), 1e-7), (core(), 1e-3)):

@@ -217,6 +217,7 @@ def test_slow_store_is_waited_for_and_sent_once(tmp_path: Path) -> None:
     assert outcome.stored and outcome.retries == 0
 
 
+@pytest.mark.chain
 def test_store_that_loses_its_answer_is_not_sent_twice(tmp_path: Path) -> None:
     rig = open_rig(tmp_path)
     session = rig.bench.node.session

@@ -17,6 +17,7 @@ from tests.flash.interrupted import How, frames_of, interrupt
 from tests.flash.rig import SMALL, with_tables
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("wanted", "stride", "how"),
     [

@@ -100,6 +100,7 @@ def kill_and_recover(server: Server, home: Path, wanted: Path, delay_s: float, *
     return "old" if now == old else "new"
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("run", range(KILLS))
 def test_killed_download_is_finished_or_taken_back(server: Server, tmp_path: Path, run: int) -> None:
     wanted = tmp_path / "wanted.toml"

@@ -234,6 +234,7 @@ def test_the_inverse_table_is_a_spline_through_solved_nodes(pmsyrm):
         assert np.abs(spline.ev(*at) - found[k]).max() <= 1e-11  # currents up to 47 A; measured 2e-14
 
 
+@pytest.mark.chain
 @settings(max_examples=200, deadline=None)
 @given(st.floats(-26, 26), st.floats(-26, 26))
 def test_round_trip_of_the_shipped_map(i_d, i_q):

@@ -330,6 +330,7 @@ TABLES = st.fixed_dictionaries(
 ).filter(is_consistent)
 
 
+@pytest.mark.chain
 @settings(max_examples=150, deadline=None)
 @given(TABLES, ESTIMATES)
 def test_any_machine_survives_its_file(tables, estimate):

@@ -113,6 +113,7 @@ def _bombs():
     }
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("kind", ["sum of arrays", "one array", "empty elements"])
 def test_streams_that_unpack_to_gigabytes_are_refused_at_the_limit(tmp_path, kind):
     data, said = _bombs()[kind]

@@ -72,6 +72,7 @@ def test_machines_with_little_or_no_magnet_are_read(psi):
     assert parse_machine(MACHINE.replace("psi_f_wb = 0.545", f"psi_f_wb = {psi}")).machine.psi_f_wb == float(psi)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("path", PROFILES, ids=lambda path: path.stem)
 def test_every_profile_and_its_design_are_read(path):
     machine_file = load_machine_file(path)

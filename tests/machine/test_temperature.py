@@ -7,6 +7,8 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 import pmsmtool
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
 from pmsmtool.estimators.flux_linkage import normalised
@@ -28,6 +30,7 @@ def numbers(path: Path) -> set[float]:
     return {float(number) for number in re.findall(r"\b\d+\.\d+(?:[eE][+-]?\d+)?", re.sub(r"//.*|/\*.*?\*/", "", text))}
 
 
+@pytest.mark.chain
 def test_no_other_file_of_the_package_writes_a_coefficient_down() -> None:
     """The catalogue had a copy of both: a default that is corrected in one place only."""
     assert numbers(HOME) >= set(COEFFICIENTS)

@@ -88,6 +88,7 @@ while True:
 """
 
 
+@pytest.mark.chain
 @pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
 def test_a_killed_process_leaves_a_whole_content(tmp_path: Path) -> None:
     """Ten kills at random moments: what is found is one of the contents that were being written, entire."""

@@ -271,6 +271,7 @@ _VALUES = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.chain
 @given(_VALUES)
 @settings(max_examples=100, deadline=None)
 def test_object_bytes_python_image_and_node_image_are_the_same_bytes(values: dict[str, float]) -> None:

@@ -11,6 +11,8 @@ import pytest
 from pmsmtool.sim.node.objects import object_rows
 from tests.node.bench import SERIAL, Bench, open_bench
 
+pytestmark = pytest.mark.chain
+
 ROWS = object_rows()
 FRAMES = 600
 COMMANDS = (0x60, 0x70, 0xA3, 0xA2, 0xA1, 0x00, 0x10, 0x01, 0x11, 0xC1, 0x81, 0x82, 0x03, 0x80)

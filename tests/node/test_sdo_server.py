@@ -184,6 +184,7 @@ def held_by(bench: Bench) -> bytes:
     return bench.node.session.dictionary["lut.table_i_d"].read()
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(("probability", "needed"), [(0.001, 0.99), (0.01, 0.9)])
 def test_block_transfers_under_loss_are_right_or_reported(
     make_bench: BenchMaker, probability: float, needed: float
@@ -403,6 +404,7 @@ def test_a_reset_in_mid_transfer_leaves_no_trace(bench: Bench) -> None:
 _FUZZED_IDS = [0x601, 0x000, 0x7E5, 0x080, 0x701, 0x201, 0x77F]
 
 
+@pytest.mark.chain
 @given(st.lists(st.tuples(st.sampled_from(_FUZZED_IDS), st.binary(max_size=8)), max_size=40))
 @settings(max_examples=100, deadline=None)
 def test_random_frames_never_break_the_node(frames: list[tuple[int, bytes]]) -> None:

@@ -142,6 +142,7 @@ def activate(bench: Bench, image: bytes) -> None:
     client.put(0x2000, 6, 3, "B")
 
 
+@pytest.mark.chain
 def test_a_power_cut_at_every_write_step_leaves_the_old_or_the_new_set(make_bench: BenchMaker) -> None:
     """A set of 14 KiB with tables, compared byte by byte; only the last step brings the new one."""
     first = make_bench()

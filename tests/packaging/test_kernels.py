@@ -36,6 +36,7 @@ def test_every_glob_finds_sources(kernel: Kernel) -> None:
         assert list(PACKAGE.glob(pattern)), f"{kernel.name}: {pattern} finds nothing"
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("kernel", KERNELS, ids=lambda kernel: kernel.name)
 def test_kernel_compiles_without_a_warning_and_exports_only_its_prefix(
     kernel: Kernel, working_compiler: compiler.Compiler, tmp_path: Path
@@ -49,6 +50,7 @@ def test_kernel_compiles_without_a_warning_and_exports_only_its_prefix(
     assert [path.name for path in tmp_path.iterdir()] == [library.name]
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("source", sorted({s for kernel in KERNELS for s in kernel.source_files(PACKAGE)}), ids=str)
 def test_external_symbols_have_the_prefix_and_the_core_needs_no_libc(
     source: Path, working_compiler: compiler.Compiler, tmp_path: Path
@@ -85,6 +87,7 @@ def test_a_missing_function_is_found_when_linking(working_compiler: compiler.Com
         compiler.compile_library(working_compiler, Kernel("x", ("x.c",)), tmp_path, tmp_path / native.library_name("x"))
 
 
+@pytest.mark.chain
 def test_same_source_same_bytes(working_compiler: compiler.Compiler, tmp_path: Path) -> None:
     """Also from another folder: no path of the building machine gets into a library."""
     core = tmp_path / "one" / "pmsmtool" / "firmware" / "core"

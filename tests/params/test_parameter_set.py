@@ -44,12 +44,14 @@ def test_round_trip_with_tables_and_provenance() -> None:
     assert again.provenance == first.provenance and again.name == "née"
 
 
+@pytest.mark.chain
 @settings(max_examples=200, deadline=None)
 @given(st.dictionaries(st.sampled_from(sorted(BY_NAME)), st.floats(allow_nan=False, allow_infinity=False), min_size=1))
 def test_every_number_survives_the_text(values: dict[str, float]) -> None:
     assert parse_parameter_set(ParameterSet(values).to_toml()).values == ParameterSet(values).values
 
 
+@pytest.mark.chain
 @settings(max_examples=300, deadline=None)
 @given(st.text())
 def test_any_text_is_a_set_or_a_config_error(text: str) -> None:

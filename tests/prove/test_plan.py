@@ -45,6 +45,7 @@ def test_everything_the_issue_asks_for_is_there() -> None:
     assert sorted({abs(share) for share in STEPS if share}) == [0.5, 1.0] and sum(STEPS) == 0.0
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("seed", range(6))
 def test_nothing_leaves_the_envelope(seed: int) -> None:
     made = tune(draw_drive(seed), TuneRequest(field_weakening="lookup"))

@@ -49,6 +49,7 @@ def shares(found: Prediction, runs: np.ndarray) -> list[float]:  # type: ignore[
     return [max(line.share for line in judge(found, {KEY: run}).seen) for run in runs]
 
 
+@pytest.mark.chain
 def test_the_band_holds_at_least_what_it_says_of_fresh_responses() -> None:
     """Over 20 predictions, 200 fresh responses each: at least 95 % inside (measured: 99.9 %)."""
     inside = [share <= 1.0 for seed in range(20) for share in shares(prediction(seed), responses(200, 1000 + seed))]

@@ -40,6 +40,8 @@ from pmsmtool.workflow.prove.stage import ProofRequest, _too_slow, prove_stage, 
 from pmsmtool.workflow.report_page import report_page
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 
+pytestmark = pytest.mark.chain
+
 FEW = ProofRequest(runs=32)
 """A third of the machines the tool draws."""
 SHARED = Shared()

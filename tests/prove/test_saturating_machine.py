@@ -32,6 +32,8 @@ from pmsmtool.workflow.prove.simulated import SimulatedDrives
 from pmsmtool.workflow.prove.stage import ProofRequest, prove_stage
 from pmsmtool.workflow.run_directory import Stage
 
+pytestmark = pytest.mark.chain
+
 FEW = ProofRequest(runs=32)
 SHARE = 0.02
 """Standard deviation of the declared values, relative."""

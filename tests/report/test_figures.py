@@ -48,6 +48,7 @@ def lines(canvas: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     }
 
 
+@pytest.mark.chain
 def test_resistance_shows_the_levels_on_their_model(canvases: list[Any]) -> None:
     i = np.array([-4.0, -2.0, 2.0, 4.0])
     factor = math.sqrt(3.0) / 2.0
@@ -61,6 +62,7 @@ def test_resistance_shows_the_levels_on_their_model(canvases: list[Any]) -> None
     assert figures.resistance_figure(trace({"i_d_a": i, "u_d_v": u}), 1.5, CURVE).svg == figure.svg
 
 
+@pytest.mark.chain
 def test_the_fitted_response_is_measured_plus_residual(canvases: list[Any]) -> None:
     n, sigma = 200, 0.02
     current = np.sin(np.arange(n))
@@ -95,6 +97,7 @@ def test_flux_shows_what_each_pair_is_off(canvases: list[Any]) -> None:
     assert deviation[6] - deviation[0] == pytest.approx(1.0, rel=0.01)
 
 
+@pytest.mark.chain
 def test_the_crossings_lie_on_the_curves(canvases: list[Any]) -> None:
     plant = AxisPlant(0.137, 2.3e-3, 1.0 / 12e3, 1.5)
     loop = axis_loop(imc(plant.R, plant.L, 4000.0), plant)

@@ -96,6 +96,7 @@ def test_csv_has_a_line_per_point_and_nothing_for_a_missing_one() -> None:
     assert len(lines) == 7
 
 
+@pytest.mark.chain
 def test_every_panel_is_drawn() -> None:
     figure = figure_of(example(3))
     assert len(figure.axes) == 3

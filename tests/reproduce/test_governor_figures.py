@@ -57,6 +57,7 @@ def cells(found: Reproduction, column: str, table: int = 0, **where: Any) -> lis
     return [row[heads.index(column)] for row in rows]
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("name", MADE)
 def test_every_checked_number_is_within(name: str) -> None:
     found = made(name)
@@ -157,6 +158,7 @@ def test_delay_without_predictor_overshoots() -> None:
     assert max(cells(found, "overshoot", plant="one-period", predictor="yes")) < 0.2
 
 
+@pytest.mark.chain
 def test_same_seed_same_numbers_and_another_seed_others() -> None:
     first, again = (random_steps(7, 12) for _ in range(2))
     assert [table.rows[:2] for table in first.tables] == [table.rows[:2] for table in again.tables]

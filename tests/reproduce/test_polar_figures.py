@@ -41,6 +41,7 @@ def test_every_plotted_figure_of_the_paper_is_there() -> None:
     assert set(ROWS) >= PRINTED_FIGURES  # 1 and 6 are block diagrams
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("name", sorted(ROWS))
 def test_figure_is_within_its_ranges_and_prints_the_baselines(name: str) -> None:
     figure = compute(name)

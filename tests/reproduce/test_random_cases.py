@@ -98,6 +98,7 @@ def test_populations_keep_their_conditions() -> None:
     assert all(mismatched.voltage(np.array(c.target), c.rpm) <= 0.92 * V_max() for c in feasible_for(mismatched, 40, 3))
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(("limit", "eps"), [(math.inf, 0.0), (56.0, 0.0), (56.0, 0.02)])
 def test_nearest_held_current_against_a_search(limit: float, eps: float) -> None:
     plant, radius = plant_of(), np.linspace(0.0, 90.0, 721)
@@ -118,6 +119,7 @@ def test_nearest_held_current_against_a_search(limit: float, eps: float) -> None
     assert compared >= 6
 
 
+@pytest.mark.chain
 def test_no_law_beats_the_least_time() -> None:
     cases = [case for case in reachable(40, 3) if least_time_s(case) > 1e-3][:12]
     bands = [0.02 * case.size for case in cases]

@@ -44,6 +44,7 @@ def test_list_names_every_figure(pmsmtool: Command) -> None:
     assert [one["name"] for one in data["figures"]] == [row.name for row in registry.FIGURES]
 
 
+@pytest.mark.chain
 def test_tables_go_to_stdout_and_files_hold_the_same_bytes_twice(pmsmtool: Command, tmp_path: Path) -> None:
     for name in ("one", "two"):
         done = pmsmtool("jercic-fig12", "-o", str(tmp_path / name))
@@ -61,6 +62,7 @@ def test_tables_go_to_stdout_and_files_hold_the_same_bytes_twice(pmsmtool: Comma
     assert len(stored["panels"][0]["series"][0]["x"]) == 19200
 
 
+@pytest.mark.chain
 def test_json_has_the_checks_and_one_file_can_be_asked_for(pmsmtool: Command, tmp_path: Path) -> None:
     target = tmp_path / "t.csv"
     done = pmsmtool("jercic-fig12", "--json", "-o", str(target), "--plot", str(tmp_path / "t.svg"))

@@ -120,6 +120,7 @@ def test_torque_drives_the_shaft():
     assert slope == pytest.approx(np.mean(torque[settled]) / J, rel=1e-4)
 
 
+@pytest.mark.chain
 def test_energy_is_conserved_from_the_terminals_to_the_shaft():
     """Electrical work = copper heat + field + kinetic energy, for a free rotor and turning voltages."""
     h, n, J = 2e-6, 40_000, 5e-4

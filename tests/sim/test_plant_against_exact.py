@@ -55,11 +55,13 @@ def test_plant_alone_against_the_exact_transition(scenario):
     assert relative_error(found, expected) <= limit
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 def test_closed_loop_against_dop853(scenario):
     assert relative_error(simulate(scenario, PERIODS), reference_run(scenario, PERIODS)) <= CLOSED_LOOP_LIMIT
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(("rpm", "U_dc"), [(620.0, 540.0), (4500.0, 1500.0), (11_000.0, 1900.0)])
 def test_saturated_machine_over_the_speeds(rpm, U_dc):
     """Measured 2.8e-8, 1.5e-7 and 3.5e-7; the DC link is as high as the speed needs."""
@@ -77,6 +79,7 @@ def test_whole_drive_ends_where_the_core_ends(scenario):
     assert relative_error(drive[-600:], core[-600:]) <= 1e-5  # measured 4e-6 (S4, whose start is the slowest)
 
 
+@pytest.mark.chain
 def test_the_reference_itself_has_converged():
     """DOP853 at a hundredfold tolerance gives the same currents, so its own error is far below the limit."""
     scenario = SCENARIOS[2]

@@ -37,6 +37,7 @@ def drive():
     return find_drive("interior-2k2")
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_every_scenario_runs_on_every_profile(profile, name):

@@ -89,6 +89,7 @@ def test_noise_has_its_size_in_every_phase():
     assert np.abs(np.corrcoef(seen)[np.triu_indices(3, 1)]).max() < 0.03
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("tau", [2e-6, 20e-6])
 def test_lag_is_a_first_order_low_pass(tau):
     """Square wave on a locked machine: the sample lags as scipy's filter of the exact current does."""

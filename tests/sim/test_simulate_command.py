@@ -15,6 +15,8 @@ from pmsmtool.resources import data_folder
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 
+pytestmark = pytest.mark.chain
+
 
 def pmsmtool(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "pmsmtool", *arguments], capture_output=True, text=True, check=False)

@@ -60,6 +60,7 @@ def space_vector(i_a, i_b, i_c):
     return 2.0 / 3.0 * (i_a + i_b * np.exp(1j * TURN / 3.0) + i_c * np.exp(-1j * TURN / 3.0))
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("u", "dead", "limit"),
     [

@@ -204,6 +204,7 @@ def test_a_reader_thread_does_not_run_away_with_the_time(bench: Bench) -> None:
     assert any(m.arbitration_id == 0x701 for m in heard)
 
 
+@pytest.mark.chain
 def test_another_thread_can_become_the_one_that_drives_time(bench: Bench) -> None:
     elapsed: list[float] = []
 

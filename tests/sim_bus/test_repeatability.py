@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.chain
+
 SCRIPT = Path(__file__).with_name("repeatable_run.py")
 MODULES = "import can, click, numpy, sys; print(sys.version_info[:2])"
 """What the run needs; an interpreter without them is not compared."""

@@ -243,6 +243,7 @@ def command(*arguments: str, folder: Path) -> Iterator[tuple[subprocess.Popen[st
         process.communicate()
 
 
+@pytest.mark.chain
 def test_the_command_serves_the_real_drive_to_another_process(tmp_path: Path) -> None:
     with command("--port", "0", "--nodes", "2", "--node", "5", folder=tmp_path) as (process, said):
         assert said["schema"] == "pmsmtool.sim-serve/1"
@@ -256,6 +257,7 @@ def test_the_command_serves_the_real_drive_to_another_process(tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("arguments", [["no-such-profile"], ["--speed", "0"], ["--faults", "missing.toml"]])
 def test_the_command_refuses_what_it_cannot_serve(tmp_path: Path, arguments: list[str]) -> None:
     done = subprocess.run(

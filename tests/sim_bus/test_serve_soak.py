@@ -9,6 +9,7 @@ from benchmarks.serve_soak import GROWTH_MB, LONGEST_ANSWER_S, soak
 pytestmark = pytest.mark.wall_clock
 
 
+@pytest.mark.chain
 def test_vanishing_clients_and_a_flood_leave_answers_and_memory_as_they_were() -> None:
     """Before: 1.7 s and 21 MB with these numbers; measured 0.05 s and 0.0 MB."""
     seen = soak(400, 20_000)

@@ -44,6 +44,7 @@ def test_remote_node_reads_and_writes_expedited(drive: canopen.RemoteNode) -> No
         assert drive.sdo[0x2010][2].raw == pytest.approx(value)
 
 
+@pytest.mark.chain
 def test_remote_node_transfers_segmented_and_by_block(drive: canopen.RemoteNode) -> None:
     drive.sdo[0x2000][6].raw = 1
     data = bytes(range(256)) * 20
@@ -72,6 +73,7 @@ def test_network_sees_heartbeat_boot_up_and_emergency(drive: canopen.RemoteNode,
     assert drive.emcy.wait(0x2310, timeout=2.0).register == 3
 
 
+@pytest.mark.chain
 def test_network_scans_and_reads_the_data_sheet_from_the_drive(network: canopen.Network) -> None:
     network.scanner.search(10)
     time.sleep(0.3)

@@ -71,6 +71,7 @@ RELATIVE_STD = {"pdo": {"R_s_ohm": 0.03, "psi_f_wb": 0.003}, "trace": {"R_s_ohm"
 """Limits after 20 s; measured 2.1 % and 0.12 % by process data, 0.43 % and 0.04 % by recordings."""
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("by", ["pdo", "trace"])
 def test_track_follows_it(by: str, bus: Connection) -> None:
     said: list[str] = []
@@ -98,6 +99,7 @@ def test_track_follows_it(by: str, bus: Connection) -> None:
     assert said == [] and drive.node.supervision.foreign_requests == 0
 
 
+@pytest.mark.chain
 def test_it_runs_through_its_points(bus: Connection) -> None:
     node = operated(bus, [])
     seen = []
@@ -136,6 +138,7 @@ def test_it_runs_before_anybody_joins() -> None:
             drive.close()
 
 
+@pytest.mark.chain
 @pytest.mark.wall_clock
 def test_served_to_another_process() -> None:
     with serving("--scenario", "operation") as server:
@@ -148,6 +151,7 @@ def test_served_to_another_process() -> None:
         assert server.process.poll() is None, "the server goes on serving"
 
 
+@pytest.mark.chain
 @pytest.mark.wall_clock
 @pytest.mark.parametrize(("by", "seconds"), [("pdo", 6), ("trace", 8)])
 def test_track_joins_a_served_drive(
@@ -173,6 +177,7 @@ def test_track_joins_a_served_drive(
     assert by == "trace" or len(psi["value"]) > 0.2 * windows, "measured 84 %; the rest are changes of speed"
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("seed", [1, 2])
 def test_psi_by_recordings_keeps_to_its_interval(seed: int) -> None:
     """What the ripple does to the inverter's error is in no model: -0.08 and -0.09 % beside a noise of 0.035 %."""
@@ -188,6 +193,7 @@ def test_psi_by_recordings_keeps_to_its_interval(seed: int) -> None:
     assert abs(float(found.value["psi_f_wb"][-1]) - PSI_F_WB) < 1.96 * float(found.std["psi_f_wb"][-1])
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("by", ["pdo", "trace"])
 def test_what_was_observed_until_an_interrupt_is_kept(
     by: str, bus: Connection, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

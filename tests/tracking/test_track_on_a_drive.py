@@ -74,6 +74,7 @@ def operated(bench: SimBench, by: str) -> tuple[Trace, float]:
     return joined(parts), truth
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("by", ["pdo", "trace"])
 def test_a_machine_in_operation_is_followed(by: str, tmp_path: Path) -> None:
     with sim_bench() as bench:
@@ -149,6 +150,7 @@ def test_a_machine_at_rest_shows_nothing_and_is_refused(here: Path, capsys: pyte
     assert (run / "traces" / "track.npz").is_file(), "what was seen is kept"
 
 
+@pytest.mark.chain
 def test_replay_from_the_command_line(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with sim_bench() as bench:
         observations, _ = operated(bench, "trace")
@@ -164,6 +166,7 @@ def test_replay_from_the_command_line(here: Path, capsys: pytest.CaptureFixture[
     assert "psi_f_wb" in (text := capsys.readouterr().out) and "R_s_ohm" not in text
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("recorded", [(), ("push_0", "push_1", "speeds")])
 def test_a_run_of_another_command_is_refused_by_name(
     recorded: tuple[str, ...], here: Path, capsys: pytest.CaptureFixture[str]

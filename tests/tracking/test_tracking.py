@@ -49,6 +49,7 @@ def warming() -> dict[int, Trace]:
     return {seed: warming_run(machine(), SECONDS, seed) for seed in SEEDS}
 
 
+@pytest.mark.chain
 def test_resistance_and_flux_are_followed_while_they_change(warming: dict[int, Trace]) -> None:
     covered: dict[str, list[float]] = {name: [] for name in TRACKED}
     for seed, trace in warming.items():
@@ -65,6 +66,7 @@ def test_resistance_and_flux_are_followed_while_they_change(warming: dict[int, T
     assert all(np.mean(values) > 0.8 for values in covered.values()), covered
 
 
+@pytest.mark.chain
 def test_the_doubt_of_the_resistance_behind_the_curve_is_counted(warming: dict[int, Trace]) -> None:
     drive = machine()
     identified = replace(drive.inverter, voltage_error_i_apk=(-1.0, 1.0), voltage_error_v=(-1.0, 1.0))
@@ -75,6 +77,7 @@ def test_the_doubt_of_the_resistance_behind_the_curve_is_counted(warming: dict[i
     assert np.sqrt(tied**2 - plain**2) == pytest.approx(np.full(len(tied), drive.std["R_s_ohm"]))
 
 
+@pytest.mark.chain
 def test_an_inverter_error_that_nobody_told_of_is_refused(warming: dict[int, Trace]) -> None:
     """13.8 V of dead time and thresholds against 20 V of R i: R would be off by as much as itself."""
     with pytest.raises(IdentificationError) as caught:
@@ -82,6 +85,7 @@ def test_an_inverter_error_that_nobody_told_of_is_refused(warming: dict[int, Tra
     assert caught.value.reason in ("E_MODEL_MISMATCH", "E_NOT_IDENTIFIABLE")
 
 
+@pytest.mark.chain
 def test_another_machine_is_refused(warming: dict[int, Trace]) -> None:
     other = replace(known(machine()), L_q_h=0.5 * machine().machine.L_q_h)
     with pytest.raises(IdentificationError) as caught:
@@ -89,6 +93,7 @@ def test_another_machine_is_refused(warming: dict[int, Trace]) -> None:
     assert caught.value.reason == "E_MODEL_MISMATCH"
 
 
+@pytest.mark.chain
 def test_one_operating_point_is_refused_naming_the_pair() -> None:
     trace = warming_run(machine(), 3.0, 4, vary=False)
     observations = condense(trace, ROWS)
@@ -99,6 +104,7 @@ def test_one_operating_point_is_refused_naming_the_pair() -> None:
     assert caught.value.reason == "E_NOT_IDENTIFIABLE"
 
 
+@pytest.mark.chain
 def test_flux_alone_is_given_where_resistance_is_not() -> None:
     observations = condense(warming_run(machine(), 3.0, 4, vary=False), ROWS)
     exact = replace(known(machine()), error_share=(1.0, 0.01))

@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,8 @@ from pmsmtool.workflow.export import image_of
 from pmsmtool.workflow.prove import stage as proof_stage
 from pmsmtool.workflow.prove.stage import ProofRequest
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
+
+pytestmark = pytest.mark.chain
 
 PROFILE = "interior-2k2"
 FEW_MACHINES = ProofRequest(runs=32)
@@ -173,32 +176,34 @@ def test_the_drive_holds_the_design_and_the_record_says_so(tmp_path: Path, drive
     assert finish(run, drive, Told(writes=False)).skipped == list(STAGES)
 
 
-@pytest.mark.parametrize("ended_after", STAGES[:-1])
 def test_a_chain_that_ended_goes_on_where_it_ended(
-    ended_after: str, tmp_path: Path, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Ended before every stage in turn: each time the one stage that was missing runs, and no other."""
     run = identified(tmp_path, drive)
-    later = STAGES[STAGES.index(ended_after) + 1 :]
     steps = Commissioning._steps
+    for done, missing in pairwise(STAGES):
 
-    def ending(self: Commissioning) -> dict[str, Callable[[], Stage]]:
-        def end() -> Stage:
-            raise KeyboardInterrupt
+        def ending(self: Commissioning, missing: str = missing) -> dict[str, Callable[[], Stage]]:
+            def end() -> Stage:
+                raise KeyboardInterrupt
 
-        return {**steps(self), later[0]: end}
+            return {**steps(self), missing: end}
 
-    monkeypatch.setattr(Commissioning, "_steps", ending)
-    with pytest.raises(Interrupted):
-        finish(run, drive)
-    record = run.read()
-    assert record.stages[-1].status == "interrupted"
-    assert {key: record.account[key] for key in ("state", "stage", "exit_code")} == {
-        "state": "interrupted", "stage": later[0], "exit_code": 130
-    }  # fmt: skip
-    assert record.account["files"]["machine.toml"] == run.sha256("machine.toml")
+        progress = Noted()
+        monkeypatch.setattr(Commissioning, "_steps", ending)
+        with pytest.raises(Interrupted):
+            Commissioning(run, drive, Told(), progress, prove=FEW_MACHINES).carry_out()
+        ran = [name for name, status in progress.ended if status == "pass"]
+        assert ran == ([] if done == "identify" else [done])
+        record = run.read()
+        assert record.stages[-1].status == "interrupted"
+        assert {key: record.account[key] for key in ("state", "stage", "exit_code")} == {
+            "state": "interrupted", "stage": missing, "exit_code": 130
+        }  # fmt: skip
+        assert record.account["files"]["machine.toml"] == run.sha256("machine.toml")
     monkeypatch.setattr(Commissioning, "_steps", steps)
-    progress = finish(run, drive)
-    assert progress.ended == [(name, "pass") for name in later]
+    assert finish(run, drive).ended == [(STAGES[-1], "pass")]
     assert run.read().account["state"] == "complete"
 
 

@@ -44,6 +44,8 @@ from pmsmtool.workflow.tier_evaluate import replay
 from pmsmtool.workflow.tier_stages import SET_UP, open_tier_drive
 from tests.workflow.audience import Quiet, Told
 
+pytestmark = pytest.mark.chain
+
 PROFILE = data_folder("profiles") / "interior-2k2.toml"
 INJECT_OFF = 2e-3
 """Largest error of an identified value on the inject tier, of R ten times that. Seven seeds of the drive's noise: L at
@@ -228,18 +230,6 @@ def test_without_a_data_sheet_what_is_missing_is_named(tmp_path: Path) -> None:
     assert not (run.path / "machine.toml").exists()
 
 
-def test_a_data_sheet_of_another_machine_is_seen(tmp_path: Path) -> None:
-    sheet = load_machine_file(PROFILE)
-    wrong = replace(sheet, machine=replace(sheet.machine, pole_pairs=4))
-    with opened("&drive=cia402") as (drive, found):
-        run = begin_run(drive, tmp_path, tier=found.tier)
-        running = Commissioning(run, drive, Told(), Quiet(), wrong, capabilities=found)
-        with pytest.raises(Exception, match="pole_pairs: the data sheet states 4, measured 3"):
-            running.carry_out()
-        assert is_safe(drive.node.state())
-    assert verdict(run.path).word == "FAIL"
-
-
 def test_a_file_of_other_pole_pairs_than_the_drive_holds_writes_nothing(tmp_path: Path) -> None:
     """EPOS4 without mode 11: nothing measures the pole pairs, and somebody has set 3 in the drive."""
     sheet = load_machine_file(PROFILE)
@@ -383,7 +373,13 @@ def test_a_measurement_that_is_not_accepted_says_what_to_change(
     monkeypatch.chdir(tmp_path)
     text = PROFILE.read_text(encoding="utf-8").replace("pole_pairs = 3", "pole_pairs = 4")
     Path("wrong.toml").write_text(text, encoding="utf-8")
-    bus = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=cia402"]
-    outcome = CliRunner().invoke(cli, [*bus, "commission", "wrong.toml", "--yes"])
+    channel = "interior-2k2?nv=:memory:&drive=cia402"
+    with PmsmSimBus(channel):  # the drive stays powered when the tool leaves
+        outcome = CliRunner().invoke(cli, ["-i", "pmsmsim", "-c", channel, "commission", "wrong.toml", "--yes"])
+        with Connection(PmsmSimBus(channel)) as connection:
+            assert is_safe(DriveNode(connection, 1).state())
     assert isinstance(outcome.exception, Contradiction) and "correct pole_pairs" in outcome.exception.hint
+    assert "pole_pairs: the data sheet states 4, measured 3" in str(outcome.exception)
+    (run,) = Path("runs").iterdir()
+    assert verdict(run).word == "FAIL"
     assert "--resume" not in outcome.stderr and "begin a new run" in outcome.stderr

@@ -62,6 +62,7 @@ def errors(found: FluxMap, known: np.ndarray, L: dict[str, np.ndarray], truth: F
     return math.sqrt(float(np.mean(off**2))), float(np.abs(off).max()), max(medians)
 
 
+@pytest.mark.chain
 def test_a_free_rotor_gives_a_map_that_design_uses_and_a_replay_repeats(tmp_path: Path) -> None:
     with Connection(PmsmSimBus(f"{PROFILE}?nv=:memory:")) as connection:
         drive = CanopenDrive(connection, 1)
@@ -113,6 +114,7 @@ def measured_machine() -> MachineFile:
     return replace(base, machine=machine, flux_map=flux_map, simulation={**base.simulation, "rotor": "locked"})
 
 
+@pytest.mark.chain
 @pytest.mark.skipif(not MEASURED.is_file(), reason="the measured map is not at hand")
 def test_the_measured_machine_with_its_rotor_held(tmp_path: Path) -> None:
     machine = measured_machine()

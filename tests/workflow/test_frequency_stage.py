@@ -38,6 +38,7 @@ INERTIA_LIMIT, PREDICTED_FACTOR = 0.005, 2.0
 """Measured here: 0.0027, and 1.01 of the predicted deviation."""
 
 
+@pytest.mark.chain
 def test_the_resonance_of_an_elastic_shaft_its_notch_and_its_replay(tmp_path: Path) -> None:
     truth = load_machine_file(machine_path("interior-2k2"))
     path = tmp_path / "elastic.toml"

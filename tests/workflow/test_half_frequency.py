@@ -38,6 +38,8 @@ from pmsmtool.workflow.identify import (
 from pmsmtool.workflow.random_drives import draw_drive
 from pmsmtool.workflow.run_directory import RunDirectory, Stage, new_record
 
+pytestmark = pytest.mark.chain
+
 CHANNEL = "interior-2k2?nv=:memory:"
 HARD_SEEDS = (35342, 35909)
 """Drives with dead time and devices of 6.1 and 3.5 R I."""

@@ -93,6 +93,7 @@ def run(*arguments: str) -> tuple[int, str, BaseException | None]:
     return result.exit_code, result.output, result.exception
 
 
+@pytest.mark.chain
 def test_tune_judges_the_loops_at_the_bandwidth_that_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for hertz in (100.0, 400.0):

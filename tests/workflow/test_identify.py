@@ -39,6 +39,8 @@ from pmsmtool.workflow.random_drives import draw_around
 from pmsmtool.workflow.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.workflow.square_stage import BIAS_MOST, CROSSING, RIPPLE_LEAST, bias_and_ripple
 
+pytestmark = pytest.mark.chain
+
 COARSE_RAD = math.radians(2.0)  # measured: 0.03 to 0.41 deg
 CHANNEL = "interior-2k2?nv=:memory:"
 

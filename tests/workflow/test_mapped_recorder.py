@@ -34,6 +34,8 @@ from pmsmtool.workflow.capabilities import Capabilities, Method, Tier, examine
 from pmsmtool.workflow.tier_identify import identify_recorder
 from pmsmtool.workflow.tier_stages import open_tier_drive
 
+pytestmark = pytest.mark.chain
+
 ADDED = {
     "u_d_v": (19, "0.1 V"),
     "u_q_v": (20, "0.1 V"),

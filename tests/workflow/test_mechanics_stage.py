@@ -21,6 +21,8 @@ from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_o
 from pmsmtool.workflow.limits import Limits
 from pmsmtool.workflow.measure import Measurement
 
+pytestmark = pytest.mark.chain
+
 LIMIT = {"J_kgm2": 0.02, "tau_c_nm": 0.05, "B_nms": 0.08}
 """Measured: 0.11, 0.4 and 0.5 % (fast-ipm), 0.77, 0.78 and 0.75 % (saturated-pmsyrm without its map, which would be
 needed for the torque of a q current; the interval says so)."""

@@ -65,6 +65,7 @@ class Dying:
             yield function(task)
 
 
+@pytest.mark.chain
 def test_the_result_is_the_same_whoever_works(design: Design) -> None:
     alone = judged(design, threads=1)
     assert judged(design, threads=3) == alone
@@ -74,6 +75,7 @@ def test_the_result_is_the_same_whoever_works(design: Design) -> None:
         assert judged(design, executor=pool) == alone
 
 
+@pytest.mark.chain
 def test_a_machine_with_a_flux_map_is_sent_to_another_process() -> None:
     design = tune(load_machine_file(PROFILES / "saturated-pmsyrm.toml"))
     alone = judged(design, BLOCK + 1)
@@ -121,6 +123,7 @@ def test_tripped_drives_are_counted_and_fail(design: Design) -> None:
     assert not found.ok
 
 
+@pytest.mark.chain
 def test_command(design: Design, tmp_path: Path) -> None:
     path = tmp_path / "design.toml"
     path.write_text(design_text(design))

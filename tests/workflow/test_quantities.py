@@ -39,6 +39,7 @@ def identify(folder: Path, quantities: tuple[str, ...]) -> tuple[RunDirectory, S
     return run, stage, nameplate.machine
 
 
+@pytest.mark.chain
 def test_a_refusal_while_measuring_leaves_what_does_not_depend_on_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -64,6 +65,7 @@ def test_a_refusal_while_measuring_leaves_what_does_not_depend_on_it(
     assert (run.path / MACHINE).read_bytes() == machine
 
 
+@pytest.mark.chain
 def test_a_fault_ends_the_run_and_what_was_measured_before_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -85,6 +87,7 @@ def test_a_fault_ends_the_run_and_what_was_measured_before_is_kept(
     assert load_machine_file(run.path / MACHINE).machine.R_s_ohm == pytest.approx(3.6, rel=0.01)
 
 
+@pytest.mark.chain
 def test_the_shaft_that_does_not_rest_costs_its_inertia_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object) -> None:
         raise refuse("E_EXCITATION", "the shaft is not at rest", stage="mechanics")

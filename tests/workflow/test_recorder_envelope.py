@@ -37,6 +37,7 @@ def largest_current_a() -> float:
     return max(float(np.max(np.hypot(record["i_d_a"], record["i_q_a"]))) for record in records)
 
 
+@pytest.mark.chain
 def test_a_strongly_saturated_machine_gives_what_it_can(capsys: pytest.CaptureFixture[str]) -> None:
     assert identified("saturated-pmsyrm") == 10
     printed = capsys.readouterr()
@@ -48,6 +49,7 @@ def test_a_strongly_saturated_machine_gives_what_it_can(capsys: pytest.CaptureFi
     assert largest_current_a() < 1.2 * 12.45 * 1.25, "measured 14.1; 26.0 before"
 
 
+@pytest.mark.chain
 def test_what_the_pushes_cannot_tell_is_exit_9_with_its_reason(capsys: pytest.CaptureFixture[str]) -> None:
     assert identified("fast-ipm", "mechanics") == 9
     told = capsys.readouterr().err

@@ -12,6 +12,8 @@ from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, flux_of
 from pmsmtool.workflow.sampling_stage import timing_estimates, timing_warnings
 
+pytestmark = pytest.mark.chain
+
 SEED = 41023  # 560 V, sampled 4.75 us late (7.1 % of a period) through a lag of 1.0 us
 INSTANT_S, LAG_S = 4.75e-6, 1.03e-6
 

@@ -63,6 +63,7 @@ SLOW_AND_LIGHT = 70189
 """325 V, 0.25 mH: in the 83 ms in which currents settle, 0.17 of the rated one braked it from 990 to 204 rad/s."""
 
 
+@pytest.mark.chain
 def test_a_q_current_that_settles_slowly_does_not_stop_the_shaft() -> None:
     drive = drawn("", SLOW_AND_LIGHT, "ideal")
     traces, nameplate, _ = measured(drive)

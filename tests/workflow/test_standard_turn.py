@@ -117,6 +117,7 @@ def offset_error_deg(drive: MachineFile, traces: dict[str, Trace]) -> float:
     return abs(math.degrees(math.remainder(found["offset_rad"].value - truth, 2.0 * math.pi)))
 
 
+@pytest.mark.chain
 def test_a_rotor_of_little_friction_stays_on_the_first_vector(tmp_path: Path) -> None:
     drive = draw_drive(FALLING)
     kept: list[str] = []
@@ -127,6 +128,7 @@ def test_a_rotor_of_little_friction_stays_on_the_first_vector(tmp_path: Path) ->
     assert offset_error_deg(drive, traces) < 0.5  # measured: 0.02 deg; 2 deg are asked for
 
 
+@pytest.mark.chain
 def test_dead_time_that_drives_the_swing_is_left_by_a_slower_turn(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -28,6 +28,8 @@ from pmsmtool.workflow.tier_identify import tier_stage
 from pmsmtool.workflow.tier_stages import open_tier_drive
 from pmsmtool.workflow.vendor_identify import ANSWERS
 
+pytestmark = pytest.mark.chain
+
 PROFILE = data_folder("profiles") / "interior-2k2.toml"
 ASKED = ("poles", "encoder", "psi", "mechanics")
 SHEET = "as given"

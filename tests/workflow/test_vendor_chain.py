@@ -28,6 +28,8 @@ from pmsmtool.workflow.tier_stages import TierStages, open_tier_drive
 from tests.workflow.audience import Quiet, Told
 from tests.workflow.vendor_rig import PROFILE, TRUTH, channel, filled_in, without_torque
 
+pytestmark = pytest.mark.chain
+
 
 @pytest.fixture(autouse=True)
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

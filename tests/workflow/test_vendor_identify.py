@@ -60,6 +60,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 # ---- on the drive -----------------------------------------------------------------------------------
 
 
+@pytest.mark.chain
 def test_os_commands_are_started_in_order_read_and_restored(tmp_path: Path) -> None:
     with opened(tmp_path, load_family("synapticon")) as (drive, session):
         before = held(session)
@@ -91,6 +92,7 @@ def test_os_commands_are_started_in_order_read_and_restored(tmp_path: Path) -> N
     assert sum(answer.seconds for answer in answers) > 5.0
 
 
+@pytest.mark.chain
 def test_a_mode_of_its_own_is_started_waited_for_and_read(tmp_path: Path) -> None:
     with opened(tmp_path, filled_in()) as (drive, session):
         before = held(session)
@@ -122,6 +124,7 @@ def test_an_open_phase_is_named_by_the_drives_code(phase: str, terminal: str, tm
         assert held(session) == before
 
 
+@pytest.mark.chain
 def test_a_code_that_the_map_does_not_name_is_told_as_a_number(tmp_path: Path) -> None:
     machine = faulty(tmp_path, rotor="locked")
     with (
@@ -139,6 +142,7 @@ def test_a_mode_that_fails_is_the_drives_fault(tmp_path: Path) -> None:
         assert session.power.state is not State.OPERATION_ENABLED
 
 
+@pytest.mark.chain
 def test_a_command_that_takes_too_long_is_given_up_and_the_next_one_is_taken(tmp_path: Path) -> None:
     drive_map = load_family("synapticon")
     tuning = drive_map.vendor_tuning
@@ -180,6 +184,7 @@ def test_ctrl_c_stops_gives_up_and_restores(kind: str, tmp_path: Path) -> None:
         assert abs(session.power.omega_m()) < 1.0 and drive.live("i_q_a") == pytest.approx(0.0, abs=0.1)
 
 
+@pytest.mark.chain
 def test_the_drive_keeps_its_limits_meanwhile(tmp_path: Path) -> None:
     """0x6073 and 0x6080 hold what the envelope allows; the drive's own choices stay below."""
     envelope = Envelope(3.0, 100.0)
@@ -281,6 +286,7 @@ def run(*arguments: str) -> Result:
 SYNAPTICON = "interior-2k2?nv=:memory:&drive=synapticon"
 
 
+@pytest.mark.chain
 def test_identify_by_vendor_says_source_and_no_interval(tmp_path: Path) -> None:
     outcome = run("--sim", SYNAPTICON, "--yes", "identify", "R", "poles", "--method", "vendor", "--json")
     assert outcome.exit_code == 0, outcome.exception

@@ -28,6 +28,8 @@ from pmsmtool.workflow.prove.simulated import as_tested
 from pmsmtool.workflow.random_drives import true_loop_resistance
 from pmsmtool.workflow.run_directory import RunDirectory, new_record
 
+pytestmark = pytest.mark.chain
+
 UNKNOWN_HALF_WIDTH = 0.22
 """R at T_ref of a winding of 5 to 90 degC: 1 - 1/(1 + 0.00393 * 70) = 0.2157, and 0.0148 of the measurement."""
 MEASURED_HALF_WIDTH = 0.016

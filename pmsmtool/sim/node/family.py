@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.cia402 import Mode
+from pmsmtool.data_types import SHORT
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, SignalCell
 from pmsmtool.firmware.wire_units import WireUnit, wire_unit
@@ -57,10 +58,6 @@ RECORDERS: Mapping[str, Callable[[DriveMap, Dictionary, Plant, Schedule], object
     "rings": Rings,
 }
 """Makers' recorders by the kind a map says."""
-_TYPES = {
-    "UNSIGNED8": "U8", "UNSIGNED16": "U16", "UNSIGNED32": "U32", "INTEGER8": "I8", "INTEGER16": "I16",
-    "INTEGER32": "I32", "REAL32": "REAL32",
-}  # fmt: skip
 _LIVE = {
     "position_rad": "live.theta_m_rad",
     "i_q_a": "live.i_q_a",
@@ -239,7 +236,7 @@ class _Parameters:
     def _has(self, cell: Cell) -> bool:
         """Whether the drive itself has the object, in the type of the map."""
         return any(
-            (entry.row.index, entry.row.sub, entry.row.type) == (cell.index, cell.sub, _TYPES[cell.wire])
+            (entry.row.index, entry.row.sub, entry.row.type) == (cell.index, cell.sub, SHORT[cell.wire])
             for entry in self._dictionary
         )
 
@@ -339,4 +336,4 @@ def _target(name: str, dictionary: Dictionary) -> tuple[Entry, float]:
 
 
 def _row(index: int, sub: int, wire: str, name: str, access: str, pdo: str, stored: bool) -> ObjectRow:
-    return ObjectRow(index, sub, "", name, _TYPES[wire], access, pdo, "", "0", None, None, stored)
+    return ObjectRow(index, sub, "", name, SHORT[wire], access, pdo, "", "0", None, None, stored)

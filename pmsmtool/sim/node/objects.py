@@ -15,39 +15,11 @@ import struct
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Final
 
+from pmsmtool.data_types import BY_SHORT, SHORT, DataType
 from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, Parameter, layout_signature
 from pmsmtool.resources import data_folder
 
-
-@dataclass(frozen=True, slots=True)
-class DataType:
-    """A CiA 301 data type: index in the dictionary (7.4.7), bytes on the wire (0: any), struct letter."""
-
-    code: int
-    size: int
-    letter: str
-
-    @property
-    def is_float(self) -> bool:
-        """Whether the type is REAL32."""
-        return self.letter == "f"
-
-
-TYPES: Final[dict[str, DataType]] = {
-    "I8": DataType(0x0002, 1, "b"),
-    "I16": DataType(0x0003, 2, "h"),
-    "I32": DataType(0x0004, 4, "i"),
-    "U8": DataType(0x0005, 1, "B"),
-    "U16": DataType(0x0006, 2, "H"),
-    "U32": DataType(0x0007, 4, "I"),
-    "REAL32": DataType(0x0008, 4, "f"),
-    "VSTR": DataType(0x0009, 0, ""),
-    "DOMAIN": DataType(0x000F, 0, ""),
-    "U64": DataType(0x001B, 8, "Q"),
-}
-_WIRE_NAMES = {"UNSIGNED8": "U8", "UNSIGNED16": "U16", "UNSIGNED32": "U32", "REAL32": "REAL32"}
 _COUNTED = {"ARRAY8": "ARRAY", "RECORD8": "RECORD"}
 
 
@@ -77,7 +49,7 @@ class ObjectRow:
     @property
     def data_type(self) -> DataType:
         """Type of the value."""
-        return TYPES[self.type]
+        return BY_SHORT[self.type]
 
     def default_number(self, node: int) -> float:
         """Return the default as a number, ``$NODEID`` replaced."""
@@ -126,7 +98,7 @@ def _parameter_row(parameter: Parameter) -> ObjectRow:
         sub=parameter.sub,
         key=parameter.name,
         name=parameter.meaning[0].upper() + parameter.meaning[1:],
-        type=_WIRE_NAMES[parameter.wire],
+        type=SHORT[parameter.wire],
         access="rw",
         pdo="R" if parameter.live else "0",
         unit=parameter.unit,

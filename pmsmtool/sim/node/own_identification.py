@@ -11,6 +11,7 @@ from collections.abc import Callable, Generator, Iterator
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import NS, Timer
 from pmsmtool.cia402 import State
+from pmsmtool.data_types import SHORT
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.drive_map import Cell, DriveMap
 from pmsmtool.firmware.vendor_tuning import (
@@ -39,10 +40,6 @@ EXPECTED_S = {"motor.pole_pairs": 4.0, "motor.R_s_ohm": 0.7, "motor.psi_f_wb": 6
 OTHERS_S = 1.0
 IDENTIFICATION_FAILED = 0xFF20
 """Error code of a drive whose set-up mode finds no result."""
-_TYPES = {
-    "UNSIGNED8": "U8", "UNSIGNED16": "U16", "UNSIGNED32": "U32", "INTEGER8": "I8", "INTEGER16": "I16",
-    "INTEGER32": "I32", "REAL32": "REAL32",
-}  # fmt: skip
 
 
 def attach(drive_map: DriveMap, dictionary: Dictionary, plant: Plant, power: PowerDrive, schedule: Schedule) -> None:
@@ -266,7 +263,7 @@ class SetUpMode:
         control.sink, status.source = write, read
 
     def _result(self, name: str, cell: Cell) -> Entry:
-        entry = Entry(_row(cell.index, cell.sub, _TYPES[cell.wire], "ro", "0"), 0)
+        entry = Entry(_row(cell.index, cell.sub, SHORT[cell.wire], "ro", "0"), 0)
         empty = entry.value
         entry.source = lambda: self._found.get(name, empty)
         return entry

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.firmware.recorder_map import Address
 from pmsmtool.firmware.wire_units import wire_unit
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
@@ -29,7 +30,7 @@ SIGNALS = {
     "U_dc_v": Signal.U_DC,
 }
 """Signals of a map, and the core's behind each; the speed is electrical there."""
-_TYPES = {"b": "I8", "B": "U8", "h": "I16", "H": "U16", "i": "I32", "I": "U32"}
+_TYPES = {row.letter: row.short for row in DATA_TYPES.values() if row.is_integer and row.name != "BOOLEAN"}
 
 
 class RecorderFace:

@@ -11,6 +11,7 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import RAD_S_PER_RPM
 
 RPM = RAD_S_PER_RPM
@@ -234,7 +235,7 @@ class _Sizes:
 
     def rise(self, i_q_a: float) -> float:
         """Rise of the electrical speed per control period at i_d = 0 (rad/s); none where the inertia is not known."""
-        return 1.5 * self.p**2 * self.psi * i_q_a / self.J * self.T_s if self.J > 0.0 else 0.0
+        return torque_per_ampere(self.p**2, self.psi) * i_q_a / self.J * self.T_s if self.J > 0.0 else 0.0
 
 
 def _speed_step(s: _Sizes) -> Experiment:

@@ -20,6 +20,7 @@ from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.sim.kernel import Application, Rotor, Setup, Simulation, Target
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.signals import Signal, Truth
@@ -171,7 +172,7 @@ class Plant:
 
     def torque(self, i: Array) -> Array:
         """Return the torque (N m) of currents, shape (..., 2)."""
-        return np.asarray(1.5 * self.pole_pairs * (self.psi + (self.L_d - self.L_q) * i[..., 0]) * i[..., 1])
+        return np.asarray(torque_per_ampere(self.pole_pairs, self.psi + (self.L_d - self.L_q) * i[..., 0]) * i[..., 1])
 
 
 def plant_of(condition: Condition = NOMINAL) -> Plant:

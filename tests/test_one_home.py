@@ -1,0 +1,74 @@
+"""Formulas and tables that have one home: a copy of them anywhere else in the package is found.
+
+The rules work on source text, so each is also shown a line it must refuse.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.data_types import BY_SHORT, DATA_TYPES
+
+PACKAGE = Path(__file__).resolve().parent.parent / "pmsmtool"
+PATTERNS = {
+    "machine/temperature.py": re.compile(r"\b0?\.00393\d*\b|\b3\.93e-0?3\b"),
+    "units.py": re.compile(r"\bpi / (?:30|60)(?:_?000)?\b|\b(?:30|60)(?:\.0)? / \(?(?:2(?:\.0)? \* )?(?:math|np)\.pi"),
+    "machine/torque.py": re.compile(r"\b(?:1\.5|3\.0 / 2\.0|\w*FACTOR) \* (?:\w+\.)*(?:pole_pairs|p)\b"),
+}
+"""Home of each formula, and what a copy of it looks like."""
+TYPE_NAMES = frozenset(DATA_TYPES) | frozenset(BY_SHORT)
+OTHER_NUMBERS = frozenset({"monitor_objects.py"})
+"""A maker's own numbers of the types, which are not those of CiA 301."""
+
+
+def copies(name: str, source: str) -> Iterator[str]:
+    """Yield what of a module (its path below the package) has its home elsewhere."""
+    for home, pattern in PATTERNS.items():
+        if name != home:
+            yield from (f"{name}: {match[0]!r} belongs to {home}" for match in pattern.finditer(source))
+    if name == "data_types.py" or Path(name).name in OTHER_NUMBERS:
+        return
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Dict):
+            keys = {key.value for key in node.keys if isinstance(key, ast.Constant)}
+            if len(keys & TYPE_NAMES) > 2:
+                yield f"{name}:{node.lineno}: a table of data types belongs to data_types.py"
+
+
+def test_nothing_in_the_package_is_a_copy() -> None:
+    found = [
+        copy
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for copy in copies(path.relative_to(PACKAGE).as_posix(), path.read_text(encoding="utf-8"))
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "ALPHA = 0.00393",
+        "rpm = omega * 30.0 / math.pi",
+        "omega = rpm * math.pi / 30.0",
+        "rpm = omega * 60.0 / (2.0 * math.pi)",
+        "_RPM = 2.0 * math.pi / 60.0",
+        "torque = 1.5 * machine.pole_pairs * psi * i_q",
+        "rise = 1.5 * self.p**2 * psi",
+        "LETTERS = {'UNSIGNED8': 'B', 'INTEGER8': 'b', 'REAL32': 'f'}",
+        "SHORT = {'U8': 1, 'I8': 1, 'I16': 2}",
+    ],
+)
+def test_a_copy_is_found(line: str) -> None:
+    assert len(list(copies("design/x.py", line))) == 1
+
+
+@pytest.mark.parametrize(
+    "line", ["loss = 1.5 * R * i**2", "late = 1.5 * (theta[-1] - theta[-2])", "half = math.pi / 3"]
+)
+def test_what_only_looks_like_one_is_not(line: str) -> None:
+    assert list(copies("design/x.py", line)) == []
