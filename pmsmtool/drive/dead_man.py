@@ -240,7 +240,7 @@ def set_quick_stop(node: DriveNode, option: int) -> int | None:
 def _abort_option(drive: CanopenDrive) -> AbortConnection | None:
     """Make the drive remove the voltage when the connection is lost, else stop in another way.
 
-    None where it has no such object: then only what is seen counts, as ever.
+    None where it has no such object: what is seen counts. A drive that follows more than bounded currents must have it.
     """
     node = drive.node
     try:
@@ -253,7 +253,7 @@ def _abort_option(drive: CanopenDrive) -> AbortConnection | None:
             node.put(objects.ABORT_CONNECTION, AbortConnection.QUICK_STOP)
             option = node.whole(objects.ABORT_CONNECTION)
     except SdoAbort as abort:
-        if abort.code in ABSENT:
+        if abort.code in ABSENT and drive.commands_bounded_current:
             return None
         raise _refused("the drive does not say what it does when the connection is lost (0x6007)", drive) from abort
     if option not in _STOPPING:

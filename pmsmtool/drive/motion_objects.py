@@ -51,7 +51,7 @@ class Quantity:
     item : DriveObject
         Where.
     per_count : float
-        A peak, or rpm, per count.
+        A peak, rpm or rad/s, per count.
     undecided : bool
         Whether no source says if a current is peak or rms.
     """
@@ -75,6 +75,15 @@ class TorqueTarget:
     def cyclic(self) -> bool:
         """Whether the drive takes every value at once: it has no slope of its own (0x6087) in this mode."""
         return self.mode == Mode.CYCLIC_TORQUE
+
+
+@dataclass(frozen=True, slots=True)
+class LimitedSpeed:
+    """The object that takes a speed (rad/s per count), the current limit (A peak per count), and the mode."""
+
+    speed: Quantity
+    limit: Quantity
+    mode: int
 
 
 def held(node: DriveNode, item: DriveObject) -> float | None:
@@ -172,6 +181,26 @@ def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
     raise NotAvailable(
         f"the drive has no torque mode that this program knows (0x6502 = {modes:#x})", where=f"node {node.node}"
     )
+
+
+def limited_speed(node: DriveNode) -> LimitedSpeed:
+    """Return a velocity mode of known unit whose current limit this program may set.
+
+    Raises
+    ------
+    NotAvailable
+        The drive has no such mode, its map does not say its unit of speed, or it has no current limit.
+    """
+    own, row = _own(node, "target_speed"), node.map.motion.get("target_speed")
+    limit = _own(node, "current_limit")  # the one that its map names: what it does in this mode is the maker's matter
+    modes = int(held(node, objects.SUPPORTED_MODES) or 0)
+    there = own is not None and limit is not None and None not in (held(node, own.item), held(node, limit.item))
+    if own is None or row is None or limit is None or not there or not modes >> row.mode - 1 & 1:
+        raise NotAvailable(
+            f"the drive has neither a torque mode nor a velocity mode whose unit its map says (0x6502 = {modes:#x})",
+            where=f"node {node.node}",
+        )
+    return LimitedSpeed(own, limit, row.mode)
 
 
 def position_units(node: DriveNode) -> float:

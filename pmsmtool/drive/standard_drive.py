@@ -78,6 +78,11 @@ class StandardDrive(CanopenDrive):
         self._rated_apk = rated_apk(self.node)
         self._current = shown_current(self.node, self._rated_apk)
 
+    @property
+    def rated_apk(self) -> float:
+        """Rated current (A peak)."""
+        return self._rated_apk
+
     def read(self, name: str) -> float:
         """Return one parameter; of those the guard scales with, neutral values.
 

@@ -6,7 +6,9 @@ position and current are polled at up to 1 kHz: all of a drive that knows CiA 40
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 
@@ -14,7 +16,7 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.motion_objects import undecided
+from pmsmtool.drive.motion_objects import LimitedSpeed, limited_speed, torque_target, undecided
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Recording
 from pmsmtool.drive.recorder import Recorder
@@ -48,6 +50,8 @@ class TorqueDrive(TorqueCurrent, StandardDrive):
     ----------
     current_undecided : bool
         Whether no source says if the drive's amperes are peak or rms; they are read as rms.
+    top_rad_s : float
+        Speed that a push must not go beyond, where the drive is told one.
     """
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
@@ -55,6 +59,8 @@ class TorqueDrive(TorqueCurrent, StandardDrive):
         self.current_undecided = undecided(self.node, self._rated_apk)
         self._polled: tuple[str, ...] = ()
         self._rows: list[list[float]] = []
+
+    top_rad_s = math.inf
 
     def live(self, name: str) -> float:
         """Return a live value; the DC link (0x6079) and voltages where the drive or its map shows them."""
@@ -100,3 +106,49 @@ class TorqueDrive(TorqueCurrent, StandardDrive):
             if clock.now() >= end:
                 break
         super().wait(max(0.0, end - clock.now()))
+
+
+class SpeedPushDrive(TorqueDrive):
+    """A drive without a torque mode, pushed in its velocity mode: its current limit is the push.
+
+    The speed that is asked for lies beyond the push, so that the speed loop is saturated and the drive gives the
+    current of its limit; at that speed it would stay. Without a push the limit is zero, also when it is enabled: the
+    speed loop is not proven.
+    """
+
+    @cached_property
+    def push(self) -> LimitedSpeed:
+        """What takes speed and limit."""
+        return limited_speed(self.node)
+
+    def enable(self) -> None:
+        """Bring the drive to operation enabled at no speed and no current."""
+        self.command_current(0.0, 0.0)
+        self._set_mode(self.push.mode)
+        self.may_be_energised = True
+        self.node.enable()
+
+    def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
+        """Let the drive push with a q current towards the top speed."""
+        if i_d_a or fixed_angle_rad is not None:
+            raise NotAvailable("the drive takes no current set-point, only a limit", where=f"node {self.node.node}")
+        limit, speed = self.push.limit, self.push.speed
+        self.node.put(limit.item, 0)
+        self.node.put(speed.item, math.floor(self.top_rad_s / speed.per_count) * _sign(i_q_a) if i_q_a else 0)
+        if i_q_a:
+            self.node.put(limit.item, math.floor(abs(i_q_a) / limit.per_count))
+
+
+def _sign(value: float) -> int:
+    return 1 if value > 0.0 else -1
+
+
+def pushing_drive(connection: Connection, node_id: int, drive_map: DriveMap) -> TorqueDrive:
+    """Return the drive that is pushed by torque where it has such a mode, else by its velocity mode."""
+    drive = TorqueDrive(connection, node_id, drive_map=drive_map)
+    try:
+        torque_target(drive.node, drive.rated_apk)
+        return drive
+    except NotAvailable:
+        drive.close()
+    return SpeedPushDrive(connection, node_id, drive_map=drive_map)

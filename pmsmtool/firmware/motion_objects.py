@@ -18,6 +18,7 @@ DIMENSIONS: Mapping[str, str] = {
     "rated_current": "current",
     "current": "current",
     "target_current": "current",
+    "target_speed": "angular speed",
     "speed_limit": "angular speed",
     "counts_per_turn": "ratio",
 }
@@ -114,7 +115,7 @@ def _object(name: str, row: Mapping[str, Any], tell: Complain) -> MotionObject |
         tell("unit", f"unit {row['unit']!r}: {dimension}, expected {DIMENSIONS[name]}")
         return None
     mode = row.get("mode", 0)
-    if type(mode) is not int or not -128 <= mode <= 127 or (mode != 0) != (name == "target_current"):
+    if type(mode) is not int or not -128 <= mode <= 127 or (mode != 0) != name.startswith("target_"):
         tell("mode", "a target needs the mode of operation in which it acts, the others none")
         return None
     return MotionObject(row["index"], row["sub"], row["type"], row["unit"], row.get("source", ""), mode)

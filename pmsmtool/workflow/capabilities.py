@@ -17,6 +17,7 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.mapped_recorder_drive import records_pushes
 from pmsmtool.drive.motion_objects import (
     NO_RATED,
+    limited_speed,
     position_units,
     rated_apk,
     shown_current,
@@ -70,6 +71,7 @@ FEATURES: Mapping[str, str] = {
     "averages": "averages inside the drive",
     "recorder": "a recorder of currents and voltages that this program reads",
     "torque mode": "torque mode (0x6502 bit 3 or 9)",
+    "push": "torque mode (0x6502 bit 3 or 9), or a velocity mode whose unit a map says, with a current limit",
     "position": "position in increments of a known number per turn (0x6064 with 0x608F, or in a map of its maker)",
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
     "vendor R": "the maker's identification of R, with its result, in a map that names this drive",
@@ -88,7 +90,7 @@ _RECORD = (*_SAFE, "recorder", "torque mode")
 _BOUNDED = ("supervision", "rated current")
 """What is safe where every command is a current that this program bounds: it replaces limits that the drive lacks."""
 _STANDARD = (*_BOUNDED, "position", "commutation angle")
-_PUSH = (*_BOUNDED, "torque mode", "position", "current")
+_PUSH = (*_BOUNDED, "push", "position", "current")
 _WATCHED = (*_SAFE, "position", "current")
 """What the guard needs while the drive runs by itself."""
 
@@ -324,7 +326,7 @@ _TIERS = (
     (Tier.FULL, (*_INJECT, "averages")),
     (Tier.INJECT, _INJECT),
     (Tier.RECORDER, _RECORD),
-    (Tier.STANDARD, (*_BOUNDED, "torque mode")),
+    (Tier.STANDARD, (*_BOUNDED, "push")),
 )
 
 
@@ -352,24 +354,29 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     drive_map = choose_map(identity, given)
     node.map = drive_map
     modes = _modes(node)
-    rated = _told(lambda: rated_apk(node))
     has = {
         "heartbeat": node.has(0x1016, 1),
         "abort option": node.has(0x6007, 0),
         "quick stop": node.has(0x605A, 0),
         "limits": all(node.has(index, 0) for index in (0x6073, 0x6075, 0x6080)),
-        "rated current": rated is not None,
-        "position": node.has(0x6064, 0) and bool(_told(lambda: position_units(node))),
-        "current": _told(lambda: shown_current(node, rated or 1.0)) is not None,
         "line voltage": node.has(0x6079, 0) or {"u_d_v", "u_q_v"} <= set(drive_map.signals),
-        "torque mode": _told(lambda: torque_target(node, rated or 1.0)) is not None,
         "commutation angle": drive_map.capabilities.commutation_angle
         and bool(modes & _bit(Mode.CYCLIC_TORQUE_ANGLE))
         and node.has(0x60EA, 0),
     }
-    has["supervision"] = has["heartbeat"] or (node.has(0x100C, 0) and node.has(0x100D, 0))
-    if drive_map.staging:  # only then these objects are what the reference drive has there
+    rated = None if drive_map.staging else _told(lambda: rated_apk(node))
+    if not drive_map.staging:
+        has |= _motion(node, rated)
+        has["supervision"] = has["heartbeat"] or (node.has(0x100C, 0) and node.has(0x100D, 0))
+    else:  # only then these objects are what the reference drive has there
+        torque = bool(modes & (_bit(Mode.PROFILE_TORQUE) | _bit(Mode.CYCLIC_TORQUE))) and node.has(0x6071, 0)
         has |= {
+            "position": node.has(0x6064, 0) and node.has(0x608F, 1),
+            "current": node.has(0x6078, 0),
+            "torque mode": torque,
+            "push": torque,
+            "supervision": has["heartbeat"],
+            "rated current": has["limits"],
             "set-points": node.has(0x2052, 1),
             "excitation": node.has(0x2050, 0x0E),
             "averages": node.has(0x2063, 3),
@@ -380,9 +387,22 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     if named:  # whatever starts a drive's own identification is not tried on another drive
         found |= {f"vendor {name}" for name in _vendor_quantities(node, drive_map)}
         found |= {"recorder"} if records_pushes(node) else set()
-    replaced = () if rated is None or drive_map.staging else tuple(watched_by_tool(node, rated))
-    shown = _told(lambda: undecided(node, rated or 1.0)) or False
+    replaced = () if rated is None else tuple(watched_by_tool(node, rated))
+    shown = rated is not None and bool(_told(lambda: undecided(node, rated)))
     return Capabilities(identity, drive_map, named, frozenset(found), described(node), replaced, shown)
+
+
+def _motion(node: DriveNode, rated: float | None) -> dict[str, bool]:
+    """Ask a drive of another maker for what motion needs: the standard's objects, else those its map names."""
+    base = rated or 1.0
+    torque = _told(lambda: torque_target(node, base)) is not None
+    return {
+        "rated current": rated is not None,
+        "position": node.has(0x6064, 0) and bool(_told(lambda: position_units(node))),
+        "current": _told(lambda: shown_current(node, base)) is not None,
+        "torque mode": torque,
+        "push": torque or _told(lambda: limited_speed(node)) is not None,
+    }
 
 
 def _told(ask: Callable[[], T]) -> T | None:

@@ -14,7 +14,7 @@ from typing import Literal
 
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
-from pmsmtool.estimators.estimate import SENSOR_GAIN_TOLERANCE, SensorTolerance
+from pmsmtool.estimators.estimate import SENSOR_GAIN_TOLERANCE, SensorTolerance, total_half_width
 from pmsmtool.estimators.flux_linkage import normalised as flux_at_reference
 from pmsmtool.estimators.inertia_ratio import estimate_ratios
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
@@ -242,10 +242,11 @@ def _by_torque(
 def either_reading(ratio: Estimate) -> Estimate:
     """Return a ratio to the current that holds whether the drive's amperes are rms, as they were read, or peak.
 
-    Read as peak they are sqrt 2 smaller, and so is the ratio: the middle, and half of what lies between, as systematic.
+    Read as peak they are sqrt 2 smaller, and so is the ratio: the middle, with half of what lies between. The truth
+    lies near an end, not somewhere between, so that its own interval stands beyond both (added, no root of squares).
     """
     middle, half = 0.5 * (1.0 + math.sqrt(0.5)), 0.5 * (1.0 - math.sqrt(0.5))
-    systematic = math.hypot(middle * ratio.systematic, half * ratio.value)
+    systematic = half * ratio.value + total_half_width(ratio)
     return replace(
         ratio, value=middle * ratio.value, std=middle * ratio.std, systematic=systematic, fallback=UNDECIDED
     )  # fmt: skip

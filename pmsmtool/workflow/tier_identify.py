@@ -20,7 +20,7 @@ from pmsmtool.drive.envelope import Envelope, largest_acceleration
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.motion_objects import allowed, current_limits, rated_apk, speed_limits
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
-from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive.tier_drives import TorqueDrive, pushing_drive
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
@@ -61,6 +61,8 @@ SWING_SHARE = 0.4
 """Speed of the recorded pushes, of the largest one."""
 DURATION_S = 600.0
 """Longest time the machine is energised."""
+ASKED_SHARE = 0.75
+"""Speed that a drive without a torque mode is asked for, of the largest: above the pushes, with room to overshoot."""
 TOP_SHARE = 0.98
 """Speed at which a run-up is given up, of the largest one."""
 NO_LIMIT_RPM = 100_000.0
@@ -150,6 +152,7 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say 
     plan = PolledPushPlan(envelope.i_max_apk / HEADROOM, SWING_SHARE * largest, TOP_SHARE * largest)
     shows_voltage = all(name in drive.node.map.signals for name in ("u_d_v", "u_q_v"))
     U_dc = _link_v(drive)
+    drive.top_rad_s = ASKED_SHARE * largest
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
         say(f"J/psi, tau_c/psi: torque pushes up to {max(plan.shares) * plan.i_test_a:.3g} A, polled")
@@ -396,7 +399,7 @@ def _standard(
     told = {"psi", "mechanics"} if turns or facts.pole_pairs else {"mechanics"}
     if not asked & told or not found.row("mechanics", Method.STANDARD).available:
         return facts
-    pushing = TorqueDrive(connection, node, drive_map=found.drive_map)
+    pushing = pushing_drive(connection, node, found.drive_map)
     try:
         pushed = push_by_torque(pushing, envelope, keep, say)
     finally:

@@ -19,6 +19,7 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.errors import SdoAbort
 from pmsmtool.firmware.drive_map import reference_map
 from pmsmtool.firmware.drive_map_file import dump_drive_map
+from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
 from pmsmtool.sim.bus import PmsmSimBus
 from tests.cli.conftest import Result, Tool
@@ -296,7 +297,8 @@ def test_backup_into_a_spare_part(tool: Tool, wanted: str) -> None:
 @pytest.mark.parametrize("command", [("flash-params",), ("flash-params", "--nodes", "1")])
 def test_a_map_that_is_refused_is_refused_before_the_consent(tool: Tool, wanted: str, command: tuple[str, ...]) -> None:
     channel = "interior-2k2?nv=:memory:&drive=copley"
-    code, _, err = tool(*command, wanted, "--map", "copley", channel=channel)
+    Path("nobodys.toml").write_text(dump_drive_map(replace(load_family("copley"), vendor=0)), encoding="utf-8")
+    code, _, err = tool(*command, wanted, "--map", "nobodys.toml", channel=channel)
     assert code == 2 and "does not say whose drive it is for" in err
     assert "->" not in err and "consent" not in err, "nothing to consent to was shown"
 

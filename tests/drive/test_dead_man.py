@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import can
 import pytest
 
+from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import WallClock
 from pmsmtool.bus.connect import Connection
 from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE
@@ -18,6 +19,7 @@ from pmsmtool.drive.dead_man import CONSUMER_MS, TRIES, prove_dead_man
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat
 from pmsmtool.errors import BusError, SafetyRefusal
+from pmsmtool.sim.node.dictionary import Refused
 from tests.bus.scripted import ScriptedBus, ScriptedSlave
 from tests.drive.bench import ENVELOPE, SimBench, sim_bench
 
@@ -48,25 +50,23 @@ def test_option_that_does_nothing_is_changed_for_the_experiment_and_restored(ben
     assert bench.drive.node.sdo.read(0x6007, 0) == b"\0\0"
 
 
-def test_without_an_abort_option_only_what_is_seen_counts(bench: SimBench) -> None:
-    """Few makers' drives have 0x6007; the voltage must be seen off all the same."""
-    bench.session.dictionary.hide(0x6007)
-    with guarded(bench.drive, ENVELOPE) as guard:
-        assert guard.proof is not None and guard.proof.abort_connection is None
-        assert guard.proof.measured_s <= guard.proof.declared_s
-    bench.session.power.connection_lost = lambda node: None  # type: ignore[method-assign]
-    with pytest.raises(SafetyRefusal, match="still enabled 350 ms after"), guarded(bench.drive, ENVELOPE):
-        pass
-    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+@pytest.mark.parametrize("index", [0x1016, 0x6007])
+def test_drive_without_the_objects_is_refused_before_motion(bench: SimBench, index: int) -> None:
+    def absent() -> bytes:
+        raise Refused(AbortCode.NO_OBJECT)
 
+    def refused(data: bytes) -> None:
+        raise Refused(AbortCode.NO_OBJECT)
 
-def test_drive_without_supervision_is_refused_before_motion(bench: SimBench) -> None:
-    bench.session.dictionary.hide(0x1016)
+    for entry in bench.session.dictionary:
+        if entry.row.index == index:
+            entry.source = absent
+            entry.sink = refused
     states: list[State] = []
     bench.session.power.on_state = lambda: states.append(bench.session.power.state)
     with pytest.raises(SafetyRefusal) as caught, guarded(bench.drive, ENVELOPE):
         pass
-    assert caught.value.exit_code == 5 and "neither a consumer heartbeat (0x1016) nor node" in str(caught.value)
+    assert caught.value.exit_code == 5 and f"0x{index:04X}" in str(caught.value)
     assert State.OPERATION_ENABLED not in states
 
 

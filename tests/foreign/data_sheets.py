@@ -56,6 +56,15 @@ def copley() -> tuple[Row, ...]:
     )  # fmt: skip
 
 
+def faulhaber() -> tuple[Row, ...]:
+    """No torque mode: velocity mode 3 in rpm, current limits in mA, poles instead of pole pairs."""
+    return (
+        *COMMON, *HEARTBEAT, *identity(0x147, 0xC4E), (0x2333, 1, "U16", "rw", ""), (0x2333, 2, "U16", "rw", ""),
+        (0x2350, 3, "U16", "rw", "4"), (0x606C, 0, "I32", "ro", ""), (0x6078, 0, "I16", "ro", ""),
+        (0x608F, 1, "U32", "ro", "4096"), (0x60FF, 0, "I32", "rw", ""), (0x6502, 0, "U32", "ro", "0x25"),
+    )  # fmt: skip
+
+
 def write_eds(path: Path, rows: Iterable[Row], limits: dict[tuple[int, int], tuple[int, int]] | None = None) -> Path:
     """Write the rows as an EDS; limits by address."""
     lines = ["[FileInfo]", "FileName=x.eds", "[DeviceInfo]", "ProductName=drive of a test"]

@@ -21,13 +21,13 @@ from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import WATCH_S, guarded
 from pmsmtool.drive.motion_objects import position_units
-from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive.tier_drives import SpeedPushDrive, TorqueDrive, pushing_drive
 from pmsmtool.errors import DriveFault, LimitExceeded, NotAvailable, SafetyRefusal
 from pmsmtool.firmware.shipped_maps import family_of, load_family
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.node.node import Node
 from pmsmtool.sim.node.session import Session
-from tests.foreign.data_sheets import GUARDING, HEARTBEAT, Row, copley, epos4, write_eds
+from tests.foreign.data_sheets import GUARDING, HEARTBEAT, Row, copley, epos4, faulhaber, write_eds
 
 ENVELOPE = Envelope(i_max_apk=3.0, speed_max_rad_s=100.0)
 DECLARED_S = 1e-3 * CONSUMER_MS + REACTION_S
@@ -64,7 +64,8 @@ def opened(path: Path, rows: tuple[Row, ...], family: str = "") -> Iterator[Rig]
     with connect("pmsmsim", f"interior-2k2?nv=:memory:&eds={eds}") as connection:
         node = cast(Node, connection.bus.line.nodes[0])  # type: ignore[attr-defined]
         drive_map = load_family(family) if family else family_of(*node.identity[:2])
-        drive = TorqueDrive(connection, 1, drive_map=drive_map)
+        assert drive_map is not None
+        drive = pushing_drive(connection, 1, drive_map)
         yield Rig(drive, node)
         drive.close()
 
@@ -195,7 +196,37 @@ def test_the_mode_is_the_live_drives(tmp_path: Path, modes: int, mode: int) -> N
 
 def test_a_drive_without_torque_mode_has_no_target(tmp_path: Path) -> None:
     with opened(tmp_path, epos4(0x25)) as rig, pytest.raises(NotAvailable, match="0x6502 = 0x25"):
-        _ = rig.drive.target
+        rig.drive.command_current(0.0, 1.0)
+
+
+def test_without_a_torque_mode_the_current_limit_is_the_push(tmp_path: Path) -> None:
+    """Velocity mode: enabled with no current at all, pushed by the limit, and everything brought back."""
+    with opened(tmp_path, faulhaber()) as rig:
+        assert isinstance(rig.drive, SpeedPushDrive)
+        rig.drive.top_rad_s = 75.0
+        before, at_enable = rig.memory(), list[int]()
+        note = rig.session.power.on_state
+
+        def noted() -> None:
+            note()
+            at_enable.append(rig.number(0x2333, 2) if rig.session.power.state.energised else 0)
+
+        rig.session.power.on_state = noted
+        with guarded(rig.drive, ENVELOPE) as guard:
+            guard.enable()
+            guard.command_current(0.0, 2.0)
+            guard.wait(0.1)
+            assert rig.number(0x2333, 2) == 1414 and rig.number(0x60FF) == 716
+            assert 1.6 < rig.drive.live("i_q_a") < 2.1 and rig.session.power.omega_m() > 5.0
+            guard.command_current(0.0, -2.0)
+            guard.wait(0.05)
+            assert rig.drive.live("i_q_a") < -1.0 and rig.number(0x60FF) == -716
+            guard.command_current(0.0, 0.0)
+            assert rig.number(0x2333, 2) == 0
+            with pytest.raises(LimitExceeded, match="current"):
+                guard.command_current(0.0, 3.1)
+        assert set(at_enable) == {0}, "the speed loop is not proven when it is enabled"
+        assert [key for key, data in rig.memory().items() if data != before[key]] == []
 
 
 @pytest.mark.parametrize(

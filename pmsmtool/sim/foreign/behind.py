@@ -20,6 +20,8 @@ RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 """Not the tool's: a mistake in its units must not agree with itself here."""
 POSITION_BITS = 32
 NO_SLOPE = 10_000_000.0
+SPEED_RAD_S, SPEED_INTEGRAL = 60.0, 0.25
+"""Bandwidth of the speed loop as a set-up tool leaves it, and its integral rate as a share of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,8 @@ class SetUp:
         Encoder counts per turn.
     K_p_v_per_a, K_i_v_per_as : float
         Gains of the current loops.
+    J_kgm2 : float
+        Inertia, for the speed loop.
     """
 
     pole_pairs: int
@@ -53,6 +57,7 @@ class SetUp:
     counts: int
     K_p_v_per_a: float
     K_i_v_per_as: float
+    J_kgm2: float
 
     @property
     def torque_constant(self) -> float:
@@ -74,6 +79,7 @@ def set_up_of(machine_file: MachineFile) -> SetUp:
         values["motor.I_max_apk"], abs(machine_file.machine.torque_nm(0.0, i_nom)) or 1.0, values["motor.n_max_rpm"],
         1 << bits if bits else IDEAL_ENCODER_COUNTS,
         values["current.K_p_q_v_per_a"], values["current.K_i_q_v_per_as"],
+        settings_of(machine_file).number("J_kgm2"),
     )  # fmt: skip
 
 
@@ -165,6 +171,12 @@ class Behind:
     def limit_speed(self, rpm: float) -> None:
         """Keep the speed (rpm)."""
         self._write("cia402.max_speed", rpm)
+
+    def tune_speed_loop(self) -> None:
+        """Leave the gains of the speed loop that its maker's tool would have found."""
+        K_p = SPEED_RAD_S * self.set_up.J_kgm2
+        self._write("speed.K_p_nms_per_rad", K_p)
+        self._write("speed.K_i_nm_per_rad", SPEED_INTEGRAL * SPEED_RAD_S * K_p)
 
     def torque_slope(self, permille_per_s: float) -> None:
         """Move a profile torque no faster (0: at once)."""

@@ -19,6 +19,7 @@ from pmsmtool.sim.foreign.file_rows import MakersObjects
 from pmsmtool.sim.foreign.guarding import NodeGuarding
 from pmsmtool.sim.foreign.laws import Law
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+from pmsmtool.sim.node.objects import ObjectRow
 
 if TYPE_CHECKING:
     from pmsmtool.sim.node.power_drive import Plant, PowerDrive
@@ -67,7 +68,12 @@ class ForeignDrive:
         own = [f"0x{law.index:04X}:{law.sub:02X} {law.source}" for law in self.laws.values() if "assumed" in law.source]
         blank = [] if all(stated) else [f"0x1018 blank in the file: taken as {self.vendor_product}"]
         reaction = [] if objects.has((0x6007, 0)) else ["no 0x6007: a lost master is a fault (0x605E), voltage off"]
-        self.assumed = (*objects.assumed, *own, *blank, *reaction)
+        beyond = [
+            f"0x{law.index:04X}:{law.sub:02X} cannot hold this motor's {law.set_up:.0f}"
+            for law in self.laws.values()
+            if law.set_up is not None and not _holds(objects.rows[law.index, law.sub], law.set_up)
+        ]
+        self.assumed = (*objects.assumed, *own, *blank, *reaction, *beyond)
         self.behind: Behind | None = None
 
     def dress(self, dictionary: Dictionary) -> None:
@@ -87,7 +93,7 @@ class ForeignDrive:
             entry = Entry(row, 0)
             law = self.laws.get((index, sub))
             if law is not None and law.set_up is not None:
-                low, high = (-math.inf if row.low is None else row.low), (math.inf if row.high is None else row.high)
+                low, high = _bounds(row)
                 entry.value = entry.encode(min(max(law.set_up, low), high))  # no more than the drive can give
             if (index, sub) in SERIALS:
                 entry.value = entry.encode(serial)
@@ -109,6 +115,7 @@ class ForeignDrive:
                 _pass_on(dictionary, dictionary.find(index, sub), entry)
         for law in self.laws.values():
             _obey(law, dictionary.find(law.index, law.sub), behind)
+        behind.tune_speed_loop()
         self._hook_modes(dictionary, behind)
 
     def _hook_modes(self, dictionary: Dictionary, behind: Behind) -> None:
@@ -137,6 +144,15 @@ class ForeignDrive:
             find(0x100C, 0), find(0x100D, 0), heartbeat, session.schedule, session.answer_guarding,
             lambda: session.power.connection_lost(0), session.power.connection_regained,
         )  # fmt: skip
+
+
+def _bounds(row: ObjectRow) -> tuple[float, float]:
+    return (-math.inf if row.low is None else row.low), (math.inf if row.high is None else row.high)
+
+
+def _holds(row: ObjectRow, value: float) -> bool:
+    low, high = _bounds(row)
+    return low <= value <= high
 
 
 def _pass_on(dictionary: Dictionary, shown: Entry, inner: Entry) -> None:
