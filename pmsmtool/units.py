@@ -97,6 +97,7 @@ _UNITS: tuple[Unit, ...] = (
     Unit("kg m2 A/(N m)", "inertia over torque constant"),
     Unit("N m/Wb", "torque over flux linkage"),
     Unit("N m s", "viscous friction", ("Nms", "Nm s", "Nms/rad"), True),
+    Unit("N m s2", "drag over speed squared", ("Nms2", "Nm s2"), True),
     Unit("degC", "temperature", ("°C",)),
     Unit("K", "temperature difference"),
     Unit("1/K", "temperature coefficient", ("/K",)),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pmsmtool.cia402 import Mode
 from pmsmtool.sim.node.dictionary import Dictionary, Entry
-from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, Plant, PowerDrive
+from pmsmtool.sim.node.power_drive import Plant, PowerDrive
 from pmsmtool.sim.signals import Signal
 
 if TYPE_CHECKING:
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 INNER_MODES = {3: Mode.PROFILE_VELOCITY, 4: Mode.PROFILE_TORQUE, 9: Mode.CYCLIC_VELOCITY, 10: Mode.CYCLIC_TORQUE}
 """Modes that move the simulated machine; the others (profiles of position, homing) are taken and hold no current."""
+RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
+"""Not the tool's: a mistake in its units must not agree with itself here."""
 POSITION_BITS = 32
 NO_SLOPE = 10_000_000.0
 
