@@ -45,8 +45,8 @@ LIMITS = ("current", "speed")
 @click.option("--rehearse", metavar="FAMILY", help="Rehearse: MACHINE, simulated, behind the map of a drive family.")
 @click.option("--eds", metavar="FILE", help="Rehearse: MACHINE, simulated, behind the EDS or DCF of its drive.")
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
-@click.option("--flux-map", is_flag=True, help="Measure the flux map too, and design with it: for a machine that "
-              "saturates.")  # fmt: skip
+@click.option("--flux-map", is_flag=True, help="Measure the flux map, and design with it, whether the machine "
+              "saturates or not.")  # fmt: skip
 @click.option("--bandwidth-hz", type=float, metavar="HZ", help="Bandwidth of the current loops.  [default: modulus "
               "optimum, lowered to the margins]")  # fmt: skip
 @click.option("--phase-margin-deg", type=float, default=45.0, metavar="DEG", help="Least phase margin of the design.")

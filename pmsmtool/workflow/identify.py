@@ -32,6 +32,7 @@ from pmsmtool.trace_file import read_trace, trace_npz
 from pmsmtool.units import rad_s_from_rpm
 from pmsmtool.workflow import frequency_stage, half_frequency, identify_verdict, map_stage, mechanics_stage
 from pmsmtool.workflow.calibration import calibrated_tolerance
+from pmsmtool.workflow.cogging_file import cogging_estimates, save_cogging
 from pmsmtool.workflow.evaluate import evaluate
 from pmsmtool.workflow.identified_machine import machine_of
 from pmsmtool.workflow.limits import HEADROOM, Limits, require_speed, unused_current
@@ -340,13 +341,15 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         target, prefix = place_of(run, text)
         made = map_stage.save_map(target, kept.flux_map)
         made |= frequency_stage.save_response(target, kept.frequency_response)
+        if kept.encoder is not None:
+            made |= save_cogging(target, kept.mechanics, kept.encoder.direction)
         target.save(MACHINE, text)
         files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
     files |= {name: "" for name in (PREDICTED, REFUSED) if (run.path / name).is_file()}
     fallen = [f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback]
     facts = [
         {**identify_verdict.value_facts(name, estimate), "accepted": name not in rejected}
-        for name, estimate in (found | parts | timing).items()
+        for name, estimate in (found | parts | timing | cogging_estimates(kept.mechanics)).items()
     ]
     summary = identify_verdict.summary_of(kept, {name: e for name, e in found.items() if name not in rejected})
     return Stage(

@@ -117,7 +117,7 @@ def whole_run(drive: MachineFile, tool: Tool, *options: str) -> tuple[int, str, 
     ("name", "model", "options"),
     [
         ("jercic-2017", "switched", ()),
-        ("saturated-pmsyrm", "averaged", ("--flux-map",)),
+        ("saturated-pmsyrm", "averaged", ()),
     ],
 )
 @pytest.mark.usefixtures("few_machines")
