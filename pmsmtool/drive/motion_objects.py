@@ -20,6 +20,7 @@ from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.firmware.drive_map import LETTERS
 from pmsmtool.firmware.motion_objects import MotionObject
 from pmsmtool.firmware.wire_units import wire_unit
+from pmsmtool.units import RPM_PER_RAD_S
 
 ENCODER_COUNTS = DriveObject(0x608F, 1, "I")
 MOTOR_TURNS = DriveObject(0x608F, 2, "I")
@@ -36,7 +37,6 @@ DEGREE = 0x41
 """Numerator of an SI unit of position (CiA 303-2); others count increments."""
 RATED_RMS = 1e-3 * math.sqrt(2.0)
 """A peak per count of 0x6075, taken as mA rms: the larger of the two readings."""
-RPM = math.pi / 30.0
 NO_RATED = "its rated current (0x6075, or the maker's own object in a map that names this drive)"
 NO_COUNTS = "how many increments its encoder has per turn (0x608F, or the maker's own object in a map)"
 _ABSENT = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX)
@@ -252,7 +252,7 @@ def speed_limits(node: DriveNode) -> Iterator[Quantity]:
     yield Quantity(objects.MAX_SPEED_RPM, 1.0)
     own = _own(node, "speed_limit")
     if own is not None:
-        yield Quantity(own.item, own.per_count / RPM)
+        yield Quantity(own.item, own.per_count * RPM_PER_RAD_S)
 
 
 def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, float] | None:

@@ -17,6 +17,7 @@ from pmsmtool.estimators.wiring import NOT_SEEN, OK, WRONG, Finding, judge_senso
 from pmsmtool.experiments import standstill
 from pmsmtool.experiments.first_turn import lead_half_a_turn
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.units import rad_s_from_rpm
 from pmsmtool.workflow.compared_stage import held_values
 from pmsmtool.workflow.limits import Limits
 from pmsmtool.workflow.measure import COMPENSATION, starting_gains
@@ -51,7 +52,7 @@ def envelope_of(nameplate: MachineFile, i_max_apk: float | None, speed_max_rad_s
     rated = nameplate.machine.I_nom_apk or i_max_apk or 0.0
     largest = HEADROOM * CURRENT_SHARE * rated
     n_max = nameplate.machine.n_max_rpm
-    fastest = n_max * math.pi / 30.0 if n_max else SPEED_RAD_S
+    fastest = rad_s_from_rpm(n_max) if n_max else SPEED_RAD_S
     speed = min(fastest, max(SPEED_RAD_S, SPEED_SHARE * fastest))
     return Envelope(
         i_max_apk=largest if i_max_apk is None else min(i_max_apk, largest),

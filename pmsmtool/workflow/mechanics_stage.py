@@ -22,7 +22,7 @@ from pmsmtool.experiments import mechanics_run, speed_run
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
 from pmsmtool.trace import Trace
-from pmsmtool.units import rpm_from_rad_s
+from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 
 if TYPE_CHECKING:
     from pmsmtool.workflow.evaluate import Evaluation
@@ -97,7 +97,7 @@ def _come_to_rest(drive: Drive, reached_rad_s: float) -> None:
     """Stop the shaft by the speed controller; the speed is electrical."""
     drive.command_speed(0.0)
     band = REST_SHARE * reached_rad_s
-    rate = drive.read("speed.acceleration_rpm_per_s") * math.pi / 30.0 * drive.read("motor.pole_pairs")
+    rate = rad_s_from_rpm(drive.read("speed.acceleration_rpm_per_s")) * drive.read("motor.pole_pairs")
     ramp_s = min(speed_run.RAMP_MOST_S, speed_run.RAMP_DOUBT * reached_rad_s / rate) if rate > 0.0 else 0.0
     waited = speed_run.reach(drive, 0.0, limit_s=speed_run.REACH_LIMIT_S + ramp_s, band_rad_s=band)
     if waited >= speed_run.REACH_LIMIT_S + ramp_s:

@@ -24,10 +24,10 @@ from pmsmtool.estimators.rotation_offset import offset_by_turns
 from pmsmtool.estimators.supply_power import resistance_by_supply
 from pmsmtool.estimators.voltage_flux import flux_by_undriven_voltage, flux_by_voltage_limit
 from pmsmtool.files import read_text
-from pmsmtool.firmware.drive_map import TORQUE_FACTOR
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K, magnet_tolerance_per_k
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 from pmsmtool.units import RPM_PER_RAD_S
@@ -257,10 +257,11 @@ def over_torque_constant(ratios: Mapping[str, Estimate]) -> dict[str, Estimate]:
 
     Without the pole pairs p, K_T = 1.5 p psi_f is what divides inertia and friction: 1.5 psi_f at one pole pair.
     """
+    per_psi = torque_per_ampere(1.0, 1.0)
     names = {"J_per_psi": ("J_per_kt", "kg m2 A/(N m)"), "tau_c_per_psi": ("tau_c_per_kt", "A")}
     return {
         names[key][0]: replace(
-            e, value=e.value / TORQUE_FACTOR, std=e.std / TORQUE_FACTOR, systematic=e.systematic / TORQUE_FACTOR,
+            e, value=e.value / per_psi, std=e.std / per_psi, systematic=e.systematic / per_psi,
             unit=names[key][1],
         )
         for key, e in ratios.items()

@@ -13,21 +13,19 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pmsmtool.data_types import BY_SHORT
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import read_bytes
 from pmsmtool.firmware.eds import decode, parse_eds, parse_integer
-from pmsmtool.sim.node.objects import TYPES, ObjectRow
+from pmsmtool.sim.node.objects import ObjectRow
 
 FAMILY_MARK = "#"
 """Between the path of a table and the family whose rows are meant: ``objects.csv#maker``."""
 COLUMNS = ("family", "index", "sub", "name", "type", "access", "default_or_stored", "low", "high")
 """Columns a table needs."""
-_LONG = {
-    "BOOLEAN": "U8", "INTEGER8": "I8", "INTEGER16": "I16", "INTEGER32": "I32", "INTEGER64": "U64", "UNSIGNED8": "U8",
-    "UNSIGNED16": "U16", "UNSIGNED32": "U32", "UNSIGNED64": "U64", "REAL32": "REAL32", "VISIBLE_STRING": "VSTR",
-    "OCTET_STRING": "VSTR", "UNICODE_STRING": "VSTR", "DOMAIN": "DOMAIN",
-}  # fmt: skip
-_CODES = {kind.code: name for name, kind in TYPES.items()} | {0x01: "U8", 0x0A: "VSTR", 0x0B: "VSTR", 0x15: "U64"}
+_KEPT_AS = {"BOOL": "U8", "I64": "U64", "OSTR": "VSTR", "USTR": "VSTR"}
+_LONG = {kind.name: _KEPT_AS.get(short, short) for short, kind in BY_SHORT.items()}
+_CODES = {kind.code: _KEPT_AS.get(short, short) for short, kind in BY_SHORT.items()}
 """CiA 301 data types by number and by name; one of 64 bits with a sign is kept as its bytes."""
 _ACCESS = {"ro": "ro", "const": "const", "wo": "wo", "rw": "rw", "rwr": "rw", "rww": "rw"}
 CONSUMER_LIMIT = 0x7FFFFF
@@ -158,10 +156,10 @@ def _of_table(data: bytes, path: Path, family: str) -> Iterator[tuple[tuple[int,
 
 def _limit(text: str, kind: str) -> int | float | None:
     try:
-        value = float(text) if TYPES[kind].is_float else parse_integer(text, 1) if text.strip() else None
+        value = float(text) if BY_SHORT[kind].is_float else parse_integer(text, 1) if text.strip() else None
     except ValueError:
         return None
-    bits = 8 * TYPES[kind].size
+    bits = 8 * BY_SHORT[kind].size
     if kind.startswith("I") and value is not None and (1 << bits - 1) <= value < (1 << bits):
         return value - (1 << bits)  # a negative limit written in hex
     return value
@@ -179,7 +177,7 @@ def _row(
 
 def _value(text: str, kind: str) -> str:
     """Return a stored value as an object row keeps it: a number that fits its type, or ASCII; blank stays blank."""
-    code = TYPES[kind]
+    code = BY_SHORT[kind]
     if not code.letter:
         return text.encode("ascii", "replace").decode("ascii")
     if not text.strip():
