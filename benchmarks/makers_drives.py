@@ -28,10 +28,15 @@ from pmsmtool.cli.main import cli
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.sim.foreign.behind import set_up_of
+from pmsmtool.sim.foreign.drive import ForeignDrive
+from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.workflow.random_drives import draw_drive
 
 TOLD = ("J_per_psi", "J_per_kt")
+POLES = ("0x2350:03",)
+"""Objects without whose number a drive does not commutate: Faulhaber takes 2 or 4 poles."""
 
 
 def files_of(sources: list[str], families: list[str]) -> Iterator[str]:
@@ -67,12 +72,19 @@ def identified(channel: str) -> tuple[int, dict[str, Any], str]:
     return outcome.exit_code, values, "" if outcome.exit_code in (0, 10) else repr(error)
 
 
+def too_much_for(file: str, machine: MachineFile) -> str:
+    """Return which numbers of the motor the drive cannot hold by the file's limits; currents may be cut."""
+    drive = ForeignDrive(read_makers_objects(file), set_up_of(machine))
+    return "; ".join(line for line in drive.assumed if "cannot hold" in line and line.startswith(POLES))
+
+
 def row_of(file: str, name: str, machine: MachineFile) -> tuple[list[str], bool]:
     """Return one row of the table, and whether every truth lay within its interval."""
     began = time.perf_counter()
     caps = CliRunner().invoke(cli, ["caps", "--eds", file, "--json"])
     facts = json.loads(caps.stdout) if caps.stdout.startswith("{") else {}
-    code, values, reason = identified(f"{name}?nv=:memory:&eds={file}")
+    beyond = too_much_for(file, machine) if facts else ""
+    code, values, reason = (2, {}, beyond) if beyond else identified(f"{name}?nv=:memory:&eds={file}")
     if not facts and isinstance(caps.exception, PmsmtoolError):
         reason = caps.exception.what
     told, good = [], True

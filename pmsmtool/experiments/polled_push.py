@@ -66,8 +66,10 @@ def push_both_ways(drive: Drive, plan: PolledPushPlan, keep: Callable[[str, Trac
     """
     rate = acceleration_per_ampere(drive, plan.i_test_a, lambda way, _: way > ANSWER_RAD)
     count = 0
+    # the shortest ramp takes a light shaft to its speed with less than the test current
+    largest = min(plan.i_test_a, plan.omega_m_rad_s / (rate * LEAST_RAMP_S * max(plan.shares)))
     for share in plan.shares:
-        current = share * plan.i_test_a
+        current = share * largest
         ramp_s = max(LEAST_RAMP_S, plan.omega_m_rad_s / (rate * current))
         for sign, ramps in ((1.0, 1.0), (-1.0, 2.0), (1.0, 2.0), (-1.0, 1.0)):
             keep(f"torque_push_{count}", _polled(drive, sign * current, ramps * ramp_s))
