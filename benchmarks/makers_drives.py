@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from pmsmtool.cli.main import cli
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.sim.foreign.behind import set_up_of
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
@@ -53,9 +55,10 @@ def files_of(sources: list[str], families: list[str]) -> Iterator[str]:
 
 
 def truth_of(machine: MachineFile) -> dict[str, float]:
-    """Return what the simulated machine has, by the keys of :data:`TOLD`."""
+    """Return what the simulated machine has, by the keys of :data:`TOLD`, at the temperature of its magnets."""
     number = settings_of(machine).number
-    J, psi, pole_pairs = number("J_kgm2"), number("psi_f_wb"), number("pole_pairs")
+    J, pole_pairs = number("J_kgm2"), number("pole_pairs")
+    psi = magnet_flux_at(replace(machine.machine, psi_f_wb=number("psi_f_wb")), number("T_magnet_c"))
     return {"J_per_psi": J / psi, "J_per_kt": J / (1.5 * pole_pairs * psi)}
 
 
