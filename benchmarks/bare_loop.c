@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The least a closed-loop simulation can be: one PI controller in float and one stationary-flux RK4 step in double
  * per period, two outputs, everything in registers of one function. benchmarks/simulation.py compiles it with the
  * kernel's own flags and times both in one process; nothing else uses it.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Cost of simulating many drives: per drive and control period against the single drive, and how it scales.
 
 Run from the repository: ``python benchmarks/batch_simulation.py``. 256 drives x 1 s of the whole firmware, governor and

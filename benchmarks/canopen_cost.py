@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """CPU cost of CANopen traffic on the simulated bus, as a ratio to canopen's LocalNode on python-can's virtual bus.
 
 Run from the repository: ``python benchmarks/canopen_cost.py``. Both drives live in this process. The stock client

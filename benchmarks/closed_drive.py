@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The guarantee of a closed drive over random drives: no demand above its bound, no saturation, no current beyond.
 
 Run from the repository: ``python -m benchmarks.closed_drive [--drives 100] [--first 1]``; about 0.4 s of one core per

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Commission simulated drives from factory memory: four machines, averaged and switched inverter.
 
     python -m benchmarks.commissioning

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Instructions of the control core on Cortex-M3, M4F and M7, counted under emulation, against the budgets.
 
 Run from the repository with ``pip install ziglang==0.14.1 unicorn``: ``python benchmarks/core_cost.py``

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Cost of a flux-map evaluation in C, as a ratio to scipy's spline of the same map in the same run.
 
 Run from the repository: ``python benchmarks/flux_map_cost.py``. Forward is both fluxes and the 2 x 2 Jacobian (what a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Random CAN frames and damaged files, at the tool and at the drive: no crash, no hang, no error that is not ours.
 
 Run from the repository: ``python benchmarks/fuzz.py [N] [NAME...]`` (default 100 000 of each). Seeds are fixed, so

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The reference governor at full size: what the tests check on samples, over hundreds to thousands of random cases.
 
 Run from the repository: ``python benchmarks/governor_cases.py [--scale 1.0]``; about two minutes of one core.

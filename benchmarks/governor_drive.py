@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Cost of simulating the whole drive of Jercic et al. 2017, per period, as a ratio to the bare loop of the same run.
 
 Run from the repository: ``python benchmarks/governor_drive.py``; some seconds. The drive runs its whole firmware on a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How far the numbers of the random governor figures move with the seed.
 
 Run from the repository: ``python benchmarks/governor_seeds.py [--seeds 5] [--cases 300]``; about half a minute of one

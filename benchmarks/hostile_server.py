@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A drive and a socketcand server that do anything: every reading command and ``stop`` against random behaviours.
 
 Run from the repository: ``python benchmarks/hostile_server.py [N] [FIRST] [PROCESSES]`` (default 500 behaviours from

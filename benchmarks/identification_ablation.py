@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What each effect of the plant does to the estimates: one identification without it, one with it.
 
     python -m benchmarks.identification_ablation

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Identify many random drives over CANopen frames and say how often the truth lies in the printed interval.
 
     python -m benchmarks.identification_coverage --drives 200 --around jercic-2017 interior-2k2 \

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Interrupt every writing or moving command at many moments, by Ctrl-C and by pulling the adapter.
 
     python -m benchmarks.interrupted_commands                                   # all commands, both ways, 50 moments

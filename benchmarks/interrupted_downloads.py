@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Interrupt a download after every frame (the full set: at 500 random frames), by power cut and by killing the tool.
 
 Run from the repository: ``python benchmarks/interrupted_downloads.py [--stride N]``. Every run asserts that the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Interrupt ``identify`` by Ctrl-C at many moments and look at the drive afterwards.
 
     python -m benchmarks.interrupted_identification --moments 50

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Kill ``pmsmtool flash-params`` with SIGKILL at random moments, over a bus to a drive in another process.
 
 Run from the repository: ``python benchmarks/killed_downloads.py [N]`` (default 50). Each run asserts that the drive

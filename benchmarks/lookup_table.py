@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Cost and error of a look-up table against motulator's reference generator and scipy's SLSQP per point, in one run.
 
 Run from the repository: ``python benchmarks/lookup_table.py [--map FILE] [--motulator PYTHON]``; PYTHON is an

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Downloads of the full set with 16 KiB of tables, and uploads of 64 KiB traces, under frame loss.
 
 Run from the repository: ``python benchmarks/loss.py [N]`` (default 200 of each). Every download that reports success is

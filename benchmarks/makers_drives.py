@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Drives as their makers built them: what `caps` and `identify` give on nodes made from makers' EDS and DCF files.
 
     python -m benchmarks.makers_drives TABLE.csv [--family NAME ...] [--machine PROFILE] [--drives 5 --first 300]

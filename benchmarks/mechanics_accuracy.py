@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Identify inertia and friction of random drives over CANopen frames, and say how far off they are.
 
     python -m benchmarks.mechanics_accuracy --drives 100 --first 1000

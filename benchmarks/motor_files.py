@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Commission random drives with wrong and with right motor files, and count what passes, what is written, what is said.
 
     python -m benchmarks.motor_files --drives 24 --first 91000

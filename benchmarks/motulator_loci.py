@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Table of motulator's reference generator, for ``lookup_table.py``: run by a Python that has motulator >= 0.18.
 
 ``python motulator_loci.py IN.npz OUT.npz``. IN holds the flux map (i_d_a, i_q_a, psi_d_wb, psi_q_wb), the axes and the

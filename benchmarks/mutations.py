@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Change one operator at a time and see whether the tests of its room notice.
 
     python -m benchmarks.mutations --count 60

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What other tools' formulas make of the same traces, beside ours.
 
     python -m benchmarks.peer_formulas --drives 20

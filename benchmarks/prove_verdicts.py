@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How often `prove` passes healthy drives and catches spoiled ones, over random simulated drives on CANopen frames.
 
     python -m benchmarks.prove_verdicts --drives 300

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Identify machines that have one effect of real machines each, from none to the top of its range.
 
     python -m benchmarks.real_effects --results effects.jsonl --keep runs

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Every checked number of ``pmsmtool reproduce``: figure, row, printed, expected, target, measured, source.
 
 Run from the repository: ``python -m benchmarks.reproduced_rows [--seed 1] [--only NAME ...]``; about two minutes of one

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A served drive among clients that vanish, flood it or never read: time of its answers, memory of the server.
 
 Run from the repository: ``python benchmarks/serve_soak.py [CLIENTS [FRAMES [SECONDS]]]`` (default 10 000 vanishing

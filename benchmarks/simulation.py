@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Cost and accuracy of the simulation, as ratios to a bare C loop compiled in the same run.
 
 Run from the repository: ``python benchmarks/simulation.py`` (``--accuracy`` adds the comparison with scipy's DOP853

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Standard deviation of R, L and psi_f over their Cramer-Rao bounds, from many realisations of noise on stored traces.
 
     python -m benchmarks.standstill_bounds --drives 10 --realisations 20 --write benchmarks/tables/standstill_bounds.txt

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Time from the prompt to the output, in fresh processes: ``python benchmarks/start_up.py [-n RUNS]``.
 
 Times of a machine are only comparable within one run, so each is printed as a ratio to ``python -c pass`` too. The

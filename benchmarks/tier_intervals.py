@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Identify random drives at the tiers below the full one and say how wide and how true the printed intervals are.
 
     python -m benchmarks.tier_intervals standard --drives 200 --first 5000 --speed 1.35

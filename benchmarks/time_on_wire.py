@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Time on the wire: what jobs take on a paced simulated bus, as a multiple of the least their frames need.
 
 Run from the repository: ``python benchmarks/time_on_wire.py``. The time of a job is the virtual time that passed on the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Track R(T) and psi(T) of random machines that warm up while they run, and say how often the interval holds the truth.
 
     python -m benchmarks.tracking_coverage --drives 80

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """SDO transfers between the tool's channel and the simulated drive: every size that is special, and lost frames.
 
 Run from the repository: ``python benchmarks/transfers.py`` (a quarter of an hour; ``--quick``: a minute). Two tables:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Two tools write to one drive at the same time: one wins, the other is told who.
 
 Run from the repository: ``python benchmarks/two_tools.py [N] [SEED]`` (default 50 races). The drive is served by

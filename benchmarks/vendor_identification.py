@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Let simulated drives identify their machines by themselves and say how far what they answer is from the truth.
 
     python -m benchmarks.vendor_identification --drives 40 --first 8000

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Identify the shipped machines with windings and magnets of 5 to 90 degC, and say what is accepted and how far off.
 
     python -m benchmarks.warm_winding

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Run the whole command `pmsmtool commission FILE --yes` on random drives and judge verdicts and values.
 
     python -m benchmarks.whole_commission --drives 200 --first 120000 --results results.jsonl

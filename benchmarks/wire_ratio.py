@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Time of transfers over the wire's minimum: (virtual wire time + measured CPU time) / wire minimum.
 
 Run from the repository: ``python benchmarks/wire_ratio.py``. The simulated bus counts every frame bit by bit, so its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Run `pmsmtool check FILE --yes` on random drives, healthy and miswired, and count right names and false alarms.
 
     python -m benchmarks.wiring_check --miswired 400 --healthy 200 --first 300000

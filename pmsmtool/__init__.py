@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """pmsmtool: commission permanent-magnet synchronous motor drives over CANopen.
 
 The names below are the documented Python interface; they are imported when first used, because importing

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``python -m pmsmtool``."""
 
 from pmsmtool.cli.main import main

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """CiA 402: states, modes, controlword and statusword, option codes; one source for tool and simulated drive.
 
 Numbers follow IEC 61800-7-201 (CiA 402-2): statusword tables and the finite-state automaton of power drive systems.

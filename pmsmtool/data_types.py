@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The one table of CiA 301 data types (CiA 301, table 44): name, code, bytes and ``struct`` letter of each."""
 
 from __future__ import annotations

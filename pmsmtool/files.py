@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Reading and writing whole files: how large one may be, and how the old one stays until the new one is there.
 
 Every file that comes from outside is read here, so that its size is checked before its content is in memory. Every

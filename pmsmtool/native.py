@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Find and load the compiled kernels: plain shared libraries, no ``Python.h``, one file for all Pythons."""
 
 from __future__ import annotations

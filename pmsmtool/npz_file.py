@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """NumPy archives with deterministic bytes, and their reading with one clear error each."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Text from outside - drives, files, back ends, servers - made harmless: no control characters, no endless length."""
 
 from __future__ import annotations

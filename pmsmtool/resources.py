@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Folders of the installation and of the user, found the same way from a wheel and from a checkout."""
 
 from __future__ import annotations

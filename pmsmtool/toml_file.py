@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Reading TOML: the one reader behind every TOML file, so that each bad file ends in the same clear error."""
 
 from __future__ import annotations

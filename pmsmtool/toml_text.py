@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Deterministic TOML text: the one writer behind every generated TOML file.
 
 Same tables, same bytes: keys in the order given, floats as the shortest text that reads back to the same

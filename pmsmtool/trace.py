@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Trace: named signals over one time base, with units and the facts needed to read them."""
 
 from __future__ import annotations

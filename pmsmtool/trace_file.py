@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Traces as files: ``.npz`` (fast, exact) and ``.csv`` (for everything else), same trace, same bytes.
 
 NPZ: one array per signal, ``t_s``, and the members ``_units`` and ``_meta`` (JSON). CSV: row 1 names, row 2 units, then

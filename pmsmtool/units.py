@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The closed catalogue of units, and quantities as people write them.
 
 Inside, every number is SI without a prefix (rpm, degC and ns are kept where a file or an object says so). At the

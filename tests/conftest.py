@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What holds for every test."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A folder of its own and the simulated bus, for command lines that run in the test's process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A small part of ``benchmarks/fuzz.py``: damaged files of every kind end in one of our errors, never in another."""
 
 import json

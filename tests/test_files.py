@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Whole files: what is too large is not read; what is written is there as a whole, and no planted link is followed."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The plan of the house, enforced: who may import whom, what the pure rooms never touch, how long a file may get.
 
 The rules work on source text, so each is also shown a line it must refuse.

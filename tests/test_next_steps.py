@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """No reader of a file refuses one without a next step: damaged files of every format, each error with its hint.
 
 Two ways: every reader is given files damaged at random, and every function of a reader's module that makes an error

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """NumPy archives: deterministic bytes, and one clear error per kind of damage."""
 
 import io

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Formulas and tables that have one home: a copy of them anywhere else in the package is found.
 
 The rules work on source text, so each is also shown a line it must refuse.

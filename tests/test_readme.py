@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The README says what is so: its blocks, its first session, its tables, its command reference, its Python names."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Habits of the repository: licence lines, citations that a reader can follow, markers that workflows use."""
 
 from __future__ import annotations
@@ -67,3 +68,11 @@ def test_workflow_hooks_and_guide_use_markers_that_exist() -> None:
     for name in (".github/workflows/tests.yml", "CONTRIBUTING.md"):
         (selection,) = re.findall(r'-m "([^"]+)"', (ROOT / name).read_text(encoding="utf-8"))
         assert set(re.findall(r"not (\w+)", selection)) == known == {"chain", "slow_install", "wall_clock"}
+
+
+def test_every_source_names_its_licence() -> None:
+    rooms = ("pmsmtool", "tests", "benchmarks")
+    sources = [path for room in rooms for ending in ("py", "c", "h") for path in (ROOT / room).rglob(f"*.{ending}")]
+    heads = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")[:200] for path in sources}
+    assert len(heads) > 700
+    assert [name for name, head in heads.items() if "SPDX-License-Identifier: MIT" not in head] == []

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Every bad TOML file ends in one clear error, whatever the parser beneath makes of it."""
 
 from __future__ import annotations

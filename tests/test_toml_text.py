@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The TOML writer: what it writes reads back, and the same tables give the same bytes."""
 
 import tomllib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Trace files: exact round trips, deterministic bytes, one clear error each."""
 
 import csv

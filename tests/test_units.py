@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Units: what people write, what comes back, and errors that teach."""
 
 import math

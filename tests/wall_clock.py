@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Tests that live on the wall clock: a computer that stood still meanwhile has shown nothing, so they are repeated.
 
 Only where a stall was seen, in this process or in a served drive: a test that fails on a computer that runs has failed.

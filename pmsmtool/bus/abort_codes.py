@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """SDO abort codes (CiA 301, section 7.2.4.3.17, table 22) and what they mean to a person."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """One clock per bus: real on real buses, virtual on the simulated one.
 
 Whoever waits or measures a time-out on a bus reads the clock that the bus owns, ``clock_of(bus)``, and never the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Opening a CAN bus: python-can's own configuration honoured, the trace of ``--trace-can``, errors that say why."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Connection to a CAN bus: one clock, one place where frames arrive, one where they are sent.
 
 On the simulated bus time is virtual and whoever waits for a frame takes it from the bus himself

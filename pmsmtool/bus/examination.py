@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Examination of a bus: what is heard, what answers, how fast, and what that tells about the wiring."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Length of a classic CAN frame on the wire, bit by bit (ISO 11898-1:2015, 10.4 and 10.5).
 
 Start of frame to the end of the CRC is stuffed: after five equal bits one opposite bit is inserted. CRC delimiter,

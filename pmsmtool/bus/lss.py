@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Layer setting services: find nodes that have no id yet, and give them one (CiA 305).
 
 One slave is configured at a time. The fast scan finds one unconfigured slave by asking for its

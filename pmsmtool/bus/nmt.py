@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Network management: commands to nodes, states they report, waiting for their boot-up (CiA 301, section 7.2.8)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Who is on the bus: every node that answers a read of its device type, or was heard."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The SDO channel: one client for one node that cannot report a refused write as success.
 
 What the stock clients get wrong and this one does not (numbers of ``docs/canopen.md``, 2): every answer is matched by

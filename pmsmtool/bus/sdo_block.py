@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """SDO block transfers with recovery of gaps, lost acknowledgements and lost ends.
 
 A gap is acknowledged after the sub-block, not at once; the peer repeats from there. When everything

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """SDO transfers by segments, and the uploads of up to four bytes that need none.
 
 A segment names no object: whatever is late from a transfer given up before looks like one of this. ``SdoChannel``

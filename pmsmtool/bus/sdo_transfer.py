@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What an SDO transfer is made of: modes, retry policies, the result, the attempt under way."""
 
 from __future__ import annotations

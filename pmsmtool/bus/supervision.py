@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Supervision of one node: heartbeat, boot-ups, emergencies, and other masters on the bus.
 
 Callbacks only take notes; :meth:`Supervision.check` raises. The SDO channel calls it whenever it

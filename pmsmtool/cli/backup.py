@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool backup``: everything a drive holds, in one file."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool caps``: what this very drive can give, and what is missing for the rest."""
 
 from __future__ import annotations

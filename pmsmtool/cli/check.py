@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool check``: the first power-on."""
 
 from __future__ import annotations

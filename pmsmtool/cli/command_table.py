@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The table of commands. To add one: write ``pmsmtool/cli/<command>.py`` and add a row here.
 
 The row is all that ``pmsmtool --help`` and completion read; the module is imported when its command runs.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool commission``: from an unknown machine to flashed and proven parameters, in one command."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool completion``: the shell's completion script."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The two consents: the motion envelope before anything moves, the list of differences before anything is written.
 
 Each is asked on its own. ``--yes`` answers them on a simulated bus; on a real one only together with ``--i-max``,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool doctor``: adapters, wiring, bit rate, round trip."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """From bus options to an open bus, a node or a drive."""
 
 from __future__ import annotations

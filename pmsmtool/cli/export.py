@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool export``: a design or a parameter set in the forms other programs take."""
 
 from __future__ import annotations

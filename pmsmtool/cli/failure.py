@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """From an exception to what a person reads and to the exit code a script reads."""
 
 from __future__ import annotations

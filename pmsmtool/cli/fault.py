@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool fault``: faults decoded, and reset on purpose."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool flash-params``: a parameter set into a drive, as a transaction."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the writing commands share: plan, consent, download, one result."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """One parameter set into several drives of a bus, with one consent and one table of results."""
 
 from __future__ import annotations

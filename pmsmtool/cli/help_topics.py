@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool help``: topics that belong to no single command."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool identify``: measure the machine on its drive, or recompute a run from its traces."""
 
 from __future__ import annotations

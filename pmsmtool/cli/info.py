@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool info``: what one drive says about itself."""
 
 from __future__ import annotations

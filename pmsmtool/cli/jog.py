@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool jog``: a short motion within limits."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A click group that imports a command's module only when that command runs."""
 
 from __future__ import annotations

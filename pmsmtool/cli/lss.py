@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool lss``: nodes without an id."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool lut``: current references over torque and speed."""
 
 from __future__ import annotations

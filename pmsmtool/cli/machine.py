@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool machine``: machine files from what is printed on paper."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The command ``pmsmtool``: global options, lazy commands, errors to exit codes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool margins``: what a design tolerates, over what the machine may be."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool monitor``: live values of a drive."""
 
 from __future__ import annotations

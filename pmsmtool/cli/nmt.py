@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool nmt``: network management commands."""
 
 from __future__ import annotations

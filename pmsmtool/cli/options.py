@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Options that many commands share: the bus, the output, the motion envelope; and quantities with units.
 
 The same options stand before the command and after it (``pmsmtool -n 5 scan`` and ``pmsmtool scan -n 5``). What

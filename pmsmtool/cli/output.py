@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a command prints: data on stdout (text or one JSON object), everything else on stderr."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Files a command writes, and the run directory or file it is given."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool param``: parameters by catalogue name or object."""
 
 from __future__ import annotations

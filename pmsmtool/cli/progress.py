@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How far a chain of stages has come: a live line on a terminal, one line per stage everywhere."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool prove``: the machine itself shows whether it does what the design promises."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The command reference of the README, from the commands themselves: ``python -m pmsmtool.cli.reference [--write]``.
 
 Without ``--write`` the text is printed; with it the part of README.md between the two markers is replaced. A test

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool report``: the page a person reads and signs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool reproduce``: figures and tables of the papers, with the numbers beside the plot."""
 
 from __future__ import annotations

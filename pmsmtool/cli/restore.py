@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool restore``: bring a backup, or an interrupted download, back."""
 
 from __future__ import annotations

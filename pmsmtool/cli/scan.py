@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool scan``: who is on the bus."""
 
 from __future__ import annotations

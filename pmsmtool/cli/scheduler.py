@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Who does the work of a batch: this process, a pool of processes, or a Dask cluster."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool sim``: simulated drives for other programs."""
 
 from __future__ import annotations

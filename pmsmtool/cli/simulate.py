@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool simulate``: the closed loop in the embedded simulator."""
 
 from __future__ import annotations

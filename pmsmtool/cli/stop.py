@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool stop``: stop now, confirmed, and nothing else."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The readings of a bench supply: typed by a person while a current flows, or the simulated supply's."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool track``: resistance and flux linkage of a machine in operation, followed over time."""
 
 from __future__ import annotations

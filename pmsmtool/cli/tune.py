@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool tune``: from a machine file to a design and its parameter set."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool verify``: compare what a drive holds, byte by byte."""
 
 from __future__ import annotations

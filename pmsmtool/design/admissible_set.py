@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Prediction model of the reference governor and its horizon: how many voltage rows describe all of them.
 
 State x = (i_d, i_q, I_ed, I_eq, v_d, v_q) with the integrated errors I_e (A s) and the held reference v, forward

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The bandwidth of the current loops: as asked for, or the modulus optimum lowered until the margins hold."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The governor of a drive that cannot be reflashed: the admissible set projected onto what it offers.
 
 A closed drive takes no governed reference. It offers a limit of its torque (0x6072) or current, a slope of its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Current controllers per axis: PI gains from a bandwidth, and what the sampled loop makes of them.
 
 The axis plant is 1 / (L s + R) behind a zero-order hold, discretised exactly, with the computation delay of the

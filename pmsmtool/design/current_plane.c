@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Points and curves of the current plane; see current_plane.h. */
 #include "current_plane.h"
 

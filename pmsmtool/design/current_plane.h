@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The current plane of one machine: torque, flux and voltage at a point, and curves through it.
  *
  * Amplitude-invariant dq quantities, SI; t = psi_d i_q - psi_q i_d is the torque over 1.5 p. At electrical

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The design as a value, and its text ``design.toml``: machine embedded, every number with unit, method and margin."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Numbers of field weakening: weights, step length, rate and overshoot; and the limits of the linear machine.
 
 Section 4 of Jercic et al. 2017 (DOI 10.1080/00051144.2018.1453441), corrected: the voltage ellipse of (33) is centred

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Numbers of the reference governor: horizon, tightening and options, each with its reason.
 
 Jercic, Iles, Zarko, Matusko 2017 (DOI 10.1080/00051144.2018.1453441) with a tightened steady-state row, without which

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Limit headroom of many machines at once: what the nominal references need of voltage, current and copper loss.
 
 The references are those of least loss for the nominal machine, as a look-up table holds them; every sample runs them

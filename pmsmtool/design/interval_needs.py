@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What an interval costs the design: the worst margin and headroom while one value moves over its total interval.
 
 A value is good enough when the default design keeps what is asked of it wherever the value lies in its interval: the

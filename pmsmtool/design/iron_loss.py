@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Iron-loss maps: P_fe = c_h f + c_e f^2 over the current plane, f the electrical frequency in Hz.
 
 Format: ``.npz`` with the axes ``i_d_a``, ``i_q_a`` (A peak, increasing) and the grids ``c_h_w_per_hz`` (hysteresis) and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The verdict on measured responses by a prediction, and what a deviation looks most like."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The table a drive needs: axes, voltages and temperatures chosen from machine file and request."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* What a table is worth between its nodes: torque and limits of the linearly interpolated currents.
  *
  * The interpolation is the drive's (firmware/core/lookup.c): linear along each axis, corners without a point left

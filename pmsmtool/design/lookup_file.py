@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Look-up tables as files and as drive parameters.
 
 ``.npz``: axes ``torque_nm`` and ``speed_rpm`` (``flux_wb`` for a flux table), ``U_dc_v`` when there is more than one

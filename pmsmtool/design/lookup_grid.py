@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The table as the drive uses it: stored numbers, the error between its nodes, and a grid that keeps it in bounds.
 
 A table is exact at its nodes and linear between them; over the kinks where another limit takes over the currents

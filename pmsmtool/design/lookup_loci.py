@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """One-dimensional loci of a table: MTPA over current, MTPV over speed, and the largest torque over speed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Figures of a table: loci in the current plane, torque over speed, and where it has how much margin."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Current references of least loss over torque x speed x voltage.
  *
  * Constant-torque contours: along t = T* the squared voltage is R^2 h + 2 R w T* + w^2 g with h = |i|^2, g = |psi|^2,

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Current references of least loss over torque x speed x voltage; see lookup_table.c. */
 #ifndef PMSM_LOOKUP_TABLE_H
 #define PMSM_LOOKUP_TABLE_H

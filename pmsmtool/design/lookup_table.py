@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Current references of least loss over torque x speed x DC-link voltage, or torque x flux limit.
 
 The kernel (``lookup_table.c``) solves every cell in double precision; here are the table as a value, its margins and

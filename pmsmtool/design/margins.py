@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Margins of a design over its tolerance box: loop margins and limit headroom, kept apart.
 
 Interval corners give the worst case of the 95 % box with the corner that causes it, random samples give percentiles.

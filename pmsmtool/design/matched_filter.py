@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How much of a known change of shape a response shows, against what else varies: generalised least squares.
 
 The weights are the change over the covariance of simulated runs (matched filter; Kay, Fundamentals of Statistical

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Shortest possible current transfer under a voltage limit: the bound every controller is held against.
 
 di/dt = F i + G u + e at constant speed, |u| <= V_max (circle) or u inside the inverter's hexagon, which stands still in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The loops of a design, made again from the gains that stand in it: to draw them, and to judge other gains."""
 
 from __future__ import annotations

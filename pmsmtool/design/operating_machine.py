@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The machine at given temperatures: what a steady operating point is computed from.
 
 R(T) and psi(T) are those of ``machine/temperature``. A flux map is shifted along psi_d by the change of psi_f, its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Design of current control with the voltage amplitude and phase as inputs, for a surface machine.
 
 Miyajima, Fujimoto, Fujitsuna, "Control method for SPMSM in polar coordinates" (2013): v = j V_a exp(j delta), so

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The laws of control in polar coordinates by name, and the option bits of the drive (``firmware/core/polar.c``)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Control in polar coordinates over speed and torque: conditioning, controllability, stability, gain schedules.
 
 Miyajima, Fujimoto, Fujitsuna 2013, section IV.A: the inputs (V_a, delta) span the current plane wherever V_a is not

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Parameters of control in polar coordinates (``polar.py``): which law, its speeds, and what the true loop makes of it.
 
 The times are those of Miyajima et al. 2013 and of the laws built on it, in control periods: they were found at 0.1 ms.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The predicted bands of responses, what is derived from them, and what they look like when something is wrong.
 
 A prediction is made of simulated runs of one design on machines drawn from their intervals. The band of an

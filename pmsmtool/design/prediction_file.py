@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A prediction as the arrays of the ``.npz`` file that is committed before the first step."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Ratings, protections, inverter and encoder: what the machine file gives, and what is assumed where it is silent.
 
 Every assumption is the value's method, so that it stands in the design file beside the number.

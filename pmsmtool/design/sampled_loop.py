@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Exact margins of a sampled feedback loop with a real rational loop transfer function L(z).
 
 On the unit circle |N|^2 - |D|^2 and Im(N D*) / sin(theta) are polynomials in c = cos(theta), so *all* gain and phase

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How far a closed drive's voltage demand can stray from its steady state, for every course of reference and speed.
 
 Nothing is assumed of the reference but that it moves in stairs of a limited height, and of the speed that it changes at

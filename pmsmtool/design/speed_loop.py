@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Speed controller: PI gains from the inertia and the sum of the small time constants, and the exact sampled loop.
 
 The path runs at the control period (current loop, speed estimate, filter), the controller every ``decimation``

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a machine may be besides its nominal numbers: a box of tolerances, its corners and random samples from it.
 
 Each parameter has a relative (or absolute) standard deviation and a systematic half width; its 95 % interval is

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Constant-torque contours. One starts at its point of least current and runs the way |psi| falls; started at the
  * demagnetising end or at i_d = 0 it could end on another branch.
  */

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Contours of constant torque in the domain of a machine, each from its point of least current. */
 #ifndef PMSM_TORQUE_CONTOUR_H
 #define PMSM_TORQUE_CONTOUR_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Least and largest torque of the domain under a voltage limit.
  *
  * Torque has no extreme inside the plane, so the limits lie on the border of the admissible set: on an arc of the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """From a machine file and a request to a complete design: every row of the parameter catalogue, with its reason.
 
 What only some designs need (tables, polar control, flux maps) is imported where it is used: every command that designs

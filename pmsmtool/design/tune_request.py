@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What can be asked of a design, checked as a whole."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Loop margins of many machines at once: the loops of ``current_loop`` and ``speed_loop``, evaluated as arrays.
 
 Crossings are bracketed on a grid of frequencies and refined on the loop itself (Illinois), so they are as exact as the

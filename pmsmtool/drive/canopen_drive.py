@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The drive port over CANopen: CiA 402 for states and modes, the reference drive's objects for the rest."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Objects of a drive that the guard lets be changed: what they held before, and how it is brought back."""
 
 from __future__ import annotations

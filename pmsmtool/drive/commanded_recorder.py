@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the makers' recorders have in common: started by command, read when they stand still, no averages.
 
 None of them has a CRC over its data. What each of them has is a count; a record whose count, length or state does not

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Proof of the dead-man: the drive stops by itself when the tool dies.
 
 Nothing moves before this was shown: the consumer heartbeat time 0x1016 is set, or node guarding (0x100C, 0x100D) where

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """One program per drive: a lock file per serial number, which the system frees when its owner ends or dies.
 
 Two programs on one SDO channel corrupt each other's transfers, and both roll back. The lock lets the first one win and

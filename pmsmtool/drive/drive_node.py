@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A drive as a CANopen node: typed objects, identity, CiA 402 states, reset and store."""
 
 from __future__ import annotations

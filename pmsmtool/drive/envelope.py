@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The motion envelope: what a person allows the machine to do, shown before anything moves."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The guard: the only way an experiment gets a drive.
 
 It keeps the motion envelope before and during every command, in the tool and in the drive, notes

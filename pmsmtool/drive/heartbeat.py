@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The tool's own heartbeat, or its remote frames of node guarding: the drive stops when they stay away.
 
 It runs on the bus clock as a job of its own (a thread on a real bus), so that its period does not depend on what the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Ctrl-C that waits: work that must not be left half done is finished first, within a time that is said."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A drive of another maker whose map names enough of its recorder: torque pushes recorded at its own loop's rate.
 
 Position, speed and current are polled as on any drive of the standard tier; what is recorded comes from the recorder

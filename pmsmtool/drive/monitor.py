@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The monitor of Novanta/Ingenia Summit drives behind the recorder's port: rows read block by block from one register.
 
 The drive has no CRC over its rows. What it has is a count of the bytes left: every block must take exactly its own

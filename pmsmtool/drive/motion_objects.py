@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How a drive of another maker is commanded, limited and watched: CiA 402's objects where they are, else the maker's.
 
 Every question is put to the live drive; the maker's own objects are those of a map that names its identity. Where no

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The objects the tool uses: standard ones (CiA 301, CiA 402) and those of the reference drive.
 
 Parameters stand in the catalogue and reach a drive through its map; these are the ones around them.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Parameters of a drive, read and written as bytes; a set is taken over as a whole where the drive can.
 
 The reference drive stages: writes go to a copy, are read back from it, validated against the CRC-32

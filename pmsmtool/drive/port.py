@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a drive can do for the tool: the port every transport and every simulated drive implements."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Live quantities as process data: the drive sends them by itself (TPDOs, CiA 301, section 7.5.2.35 on).
 
 The transmit PDOs 2 to 4 are borrowed: what they were is noted first and brought back at the end, with

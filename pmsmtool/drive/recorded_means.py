@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A drive that injects and records but takes no window averages: means are made from records of its trace recorder."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The drive's trace recorder and its window averages (objects 0x2060 to 0x2064 of the reference drive)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Which recorder a drive has, by what its map says."""
 
 from __future__ import annotations

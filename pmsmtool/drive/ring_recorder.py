@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The data recorder of maxon EPOS2 drives behind the recorder's port: a ring of words for each variable, in one buffer.
 
 A ring is read from its oldest sample on. The recorder is triggered by command with nothing kept from before, so that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The trace of Copley Controls amplifiers behind the recorder's port: numbered variables, a row of them per sample.
 
 The trace stops by itself when its buffer is full; a shorter record is stopped when it is long enough. Data read while

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Drives without the reference drive's objects behind the same port: CiA 402 modes and what their map shows.
 
 :class:`StandardDrive` needs mode 11 with the commutation angle 0x60EA; it turns a current vector and reads the encoder.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Stopping a drive, confirmed from its statusword or said aloud that it is not."""
 
 from __future__ import annotations

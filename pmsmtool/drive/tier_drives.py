@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Drives by what they have besides the reference drive's objects: parameters only, or torque by CiA 402.
 
 :class:`ParameterDrive` is read, written and compared, and never moved. :class:`TorqueDrive` is pushed by torque while

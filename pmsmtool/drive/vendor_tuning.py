@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A drive's own identification, started and read: OS commands of CiA 301, or a mode of operation of its maker's.
 
 The drive moves the machine by itself. Of the envelope it keeps its own limits (0x6073, 0x6080); the rest is watched by

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What repeats with the angle of the shaft, from coasting with the voltage off: cogging torque and encoder error.
 
 On a shaft that coasts with the speed w a torque T cos(n theta) moves the position by -T cos(n theta)/(J (n w)^2), an

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Output-error fit of one axis from several square-wave shots: L with delay, sensor lag, saturation and motion.
 
 Free in every fit: ln L, R, the delay D (a real number), the time constant of the current sensor and per shot the

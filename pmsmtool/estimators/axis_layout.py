@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The parameter vector of an axis fit: which effects are in it, where each value sits, and the weak priors on them."""
 
 from __future__ import annotations

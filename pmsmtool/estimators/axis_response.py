@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """One square-wave shot on one axis and its simulation: what the machine, inverter and sensor make of the voltage."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Co-energy of a machine as a tensor-product B-spline of the currents: a flux map that is reciprocal by construction.
 
 W(i_d, i_q) = sum c_ab B_a(i_d) B_b(i_q) of degree 4; psi_d = dW/di_d and psi_q = dW/di_q are linear in c

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Second methods beside the first: what they say, and whether the two agree within their intervals.
 
 The flux linkage is measured with d currents while the shaft coasts. The same run holds q currents of both signs for a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Pole pairs, direction and coarse offset of the encoder from a slowly rotated vector (docs/identification.md, 3.6).
 
 The stator vector is turned forward and back through at least one mechanical turn and the rotor follows. The imposed

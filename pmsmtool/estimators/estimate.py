@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """From a fit to an :class:`~pmsmtool.machine.parameters.Estimate`: gates, verdicts and intervals.
 
 The statistical part comes from the fit, the systematic part from the declared tolerances of the sensors. They are kept

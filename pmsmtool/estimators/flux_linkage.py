@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """PM flux linkage, encoder offset and a check of L_q from a coasting shaft (docs/identification.md, 3.4).
 
 For a drive that turns its voltage by the delay times the speed, the command is

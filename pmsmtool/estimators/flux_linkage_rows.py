@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The windows of a speed run as the flux estimator needs them: paired, gated, and without what is known."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A flux map from voltage pulses: co-energy spline regression (docs/identification.md, 3.3).
 
 One linear least squares for all spline coefficients, R, the inverter's plateau and the delay of the current sample. A

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """From a fitted co-energy to a flux map that design can use: coverage, intervals, tests, and what lies outside."""
 
 from __future__ import annotations

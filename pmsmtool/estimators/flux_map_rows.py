@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """From pulse traces to the linear equations of a flux map (docs/identification.md, 3.3).
 
 The flux in the stator frame is an integral of what is known, psi_ab(t_n) = psi_ab(t_0) + integral of u - R i - e, and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """R_s from DC levels at two control frequencies, extrapolated to zero: dead time of any shape falls out.
 
 What the dead time takes from a period does not depend on the period's length, so its voltage is f g(i); the devices'

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Mechanical frequency response, and a second mass where the data support one.
 
 The response is acceleration per torque: the second difference of the position over the torque of the measured currents,

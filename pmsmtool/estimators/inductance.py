@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Incremental L_d and L_q at a bias from square-wave shots in a frozen frame (docs/identification.md, 3.2).
 
 Two half periods per axis separate the delay, the sensor lag and the motion of the rotor from L; the frame's offset from

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Inertia and Coulomb friction over the flux linkage, from torque pushes of known current: no voltage is needed.
 
 With i_d = 0 the torque is 1.5 p psi i_q. Divided by J and integrated over a push, the mechanical speed is

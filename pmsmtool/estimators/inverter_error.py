@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The voltage error of one inverter phase as data: what the drive loses between command and terminal."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Least squares: a Levenberg-Marquardt that is the same everywhere, and a column-scaled linear solve.
 
 Own code instead of an optimiser from elsewhere so that a replay gives the same bytes on every version of every

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Inertia, viscous and Coulomb friction: whitened output-error fit on the encoder's position.
 
     J dw/dt = T_e - B w - T_c sgn(w), with stick-slip (docs/identification.md, 3.5)

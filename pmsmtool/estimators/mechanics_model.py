@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Whitened residual of the positions of pushes and coasting: the model behind estimate and prediction.
 
 Sigma = s_theta^2 I + s_T^2 G G', G_kj = (k - j - 1/2) T^2/J for j < k (docs/identification.md, 3.5).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Motion of a shaft with viscous and Coulomb friction, in closed form where the torque is constant over intervals."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a recorded position is good for: the encoder's step, and the rounding of binary32, which grows with the angle.
 
 A recorder that carries angles as REAL32 rounds them to 24 bits: beyond 256 rad to 3e-5 rad, more than a step of an

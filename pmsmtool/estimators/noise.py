@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Noise and offset of the current measurement from a trace at zero current.
 
 Every gate of identification compares a residual with this number, never with the scatter of its own fit.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Exact discrete model of one axis at standstill, with a delay that is a real number and a first-order sensor.
 
     L di/dt = u - v0 - R i,    tau dy/dt = i - y,    u(t) = v[k] on [t_k + D T_s, t_k+1 + D T_s)

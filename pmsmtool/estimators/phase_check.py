@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Is the motor there, are its phases and sensors alike? Three small vectors before any larger current; then pairs.
 
 At five percent of the rated current dead time hides an unbalance of the winding: the small vectors find what is not

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the run will be good for, from its first small shot: standard deviations before the machine moves.
 
 R from the design matrix of the levels and the noise at rest, L from the information of a triangle of the planned

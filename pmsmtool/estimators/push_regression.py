@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The regression over torque pushes and its spread between the pushes."""
 
 from __future__ import annotations

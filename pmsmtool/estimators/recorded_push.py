@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Resistance, flux linkage, L_q and frame offset from recorded torque pushes, as estimates with intervals.
 
 Currents of several sizes and both signs at every speed, and the way from one to the next

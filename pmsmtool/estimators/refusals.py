@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The named refusals of identification: what was detected, what usually causes it, what to do next.
 
 One table; ``pmsmtool help refusals`` prints it, and every estimator raises through :func:`refuse`, so that a message

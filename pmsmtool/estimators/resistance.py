@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """R_s and the inverter's voltage error from many DC levels of alternating sign.
 
 A current vector at 30 + k 60 degrees electrical leaves one phase idle; the other two carry +-0.866 i. The voltage is

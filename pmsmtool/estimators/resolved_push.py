@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Recorded torque pushes resolved in time: one regression over all short blocks, the rise of the current included.
 
 A block of a few samples gives one complex row (d + j q), with x = w T_s / 2, e = i / abs(i) and the true angle of the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Lines of a mechanical frequency response: transforms of torque and acceleration, and the local polynomial method.
 
 The method takes the transient of a record apart from the response and gives each line its noise (Pintelon and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Interval of the encoder offset from a slowly turned vector, where no finer experiment follows.
 
 Every electrical turn of the run gives an offset of its own, the mean of the forward and the backward run; their

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """When the currents are sampled: what a late instant and a slow sensor make of the ripple, and how u_d shows it.
 
 In the middle of the zero vector a current passes its mean. A sample that is late by d, or a sensor with the time

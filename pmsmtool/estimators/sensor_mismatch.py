@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Gains of the three phase current sensors over their mean, from pairs of phases, and traces without their mismatch.
 
 The currents of a machine add up to nothing, those of sensors with the gains 1 + g_x (sum of the g_x zero) do not:

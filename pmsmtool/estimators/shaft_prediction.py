@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How well a planned run will know inertia, friction and frequency response, from what is roughly known before it.
 
 The plan is simulated with the rough shaft, and the Cramer-Rao bound of the same whitened model that the estimator fits

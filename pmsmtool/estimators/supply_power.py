@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Loop resistance from the power of a bench supply at several currents, where the drive shows no voltage.
 
 At a rotor that rests on a current vector of length i the supply gives

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the ripple of pulse-width modulation does to an inverter's voltage error near a zero crossing.
 
 Dead time t_d acts at the two edges of each leg, and there the current differs from its sampled value. At the rising

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """R(T) and psi(T) followed during operation, by an unscented Kalman filter on means of voltage, current and speed.
 
 The model is in ``tracking_model``. R and psi walk at random; size and tail of the inverter's error, the inductances and

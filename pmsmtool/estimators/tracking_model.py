@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The machine in steady operation as the tracking filter sees it: observations, and the voltages they should show.
 
 Observation k is a window in which the machine ran steadily (s = sinc(omega T_s / 2), the exact sampled-data factor of

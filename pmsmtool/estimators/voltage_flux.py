@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Flux linkage from voltage over speed where nothing records at loop rate: a coasting machine, or its voltage limit.
 
 Undriven (docs/identification.md, 3.4 no. 8): without current the voltage is the machine's own,

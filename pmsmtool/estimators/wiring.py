@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the first turn of a shaft says of the wiring: pole pairs, encoder counts and sign, a held shaft, the supply.
 
 The vector's way over the encoder's is the number of pole pairs, and its sign the encoder's, if the counts per turn are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The first turn of a shaft nobody has seen turn yet: a small vector leads it half a turn at the most, and back."""
 
 from __future__ import annotations

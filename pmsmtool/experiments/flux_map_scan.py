@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Fill the current plane with voltage pulses that turn at a current: the traces a flux map is made from.
 
 The drive applies +-V on an axis of the rotor frame and turns it when the current leaves its band (Hinkkanen et al.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Random torque on a steady speed: currents and positions for the mechanical frequency response.
 
 The speed keeps its sign, so that Coulomb friction is a constant and the response is linear. A binary sequence on the q

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """DC levels again at half the drive's control frequency: dead time halves with it, resistance and devices do not."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Pushes and coasting in both directions: positions and currents for inertia and friction.
 
 A push from rest, coasting, a push the other way through standstill, coasting (docs/identification.md, 3.5). The shaft

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Torque pushes on a drive that only shows position and current at up to 1 kHz, and the speed its voltage ends at."""
 
 from __future__ import annotations

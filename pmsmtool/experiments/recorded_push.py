@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Torque pushes both ways, recorded at loop rate: what a drive without injection can still be asked for.
 
 The shaft swings between two speeds under constant torque currents of several sizes and both signs, so that the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Turn a current vector slowly forward and back: the rotor follows, and the encoder is counted."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How fast the shaft answers a torque current: short pushes forth and back that grow until it moves."""
 
 from __future__ import annotations

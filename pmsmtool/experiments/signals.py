@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Signals of the drive as the estimators read them: one name each, and one flag for samples that must not be used."""
 
 from __future__ import annotations

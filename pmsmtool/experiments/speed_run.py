@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Windows at steady currents while the shaft coasts: means for the flux linkage and the fine encoder offset.
 
 The speed controller brings the shaft to a speed; then a current vector is held in the rotor frame and the shaft coasts.

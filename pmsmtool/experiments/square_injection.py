@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Square-wave voltage on a current bias in a frozen frame: the drive generates and records it."""
 
 from __future__ import annotations

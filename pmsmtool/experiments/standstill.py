@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Experiments with a current vector at a fixed electrical angle: noise, phase check, DC levels.
 
 Set-points only: what is measured goes back as traces, nothing is estimated here.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Hold a current vector at several lengths while a person reads the bench supply: copper loss of a resting rotor."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Lead a current vector onto a rotor that stands anywhere: neither angle nor pole pairs are known yet.
 
 Current that is switched on at some angle lets the rotor fall onto it from up to half an electrical turn away, and with

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Turn a current vector so that the rotor goes with it, and does not swing on it afterwards.
 
 On a current vector a rotor is a mass on a spring, and only friction damps it: of ``Omega``, by which the speed of the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The control core from Python: ctypes structures read from the core's own headers, and the loaded libraries.
 
 The structures follow the C declarations word for word (:func:`parse_structs`), so a member added to a header is a

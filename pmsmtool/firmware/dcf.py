@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Write device configuration files: values laid into the text of an EDS or DCF, and concise DCF (CiA 306-1, CiA 302-2).
 
 A user's file keeps every byte that is not a changed ``ParameterValue``: comments, vendor keys, order, line ends.

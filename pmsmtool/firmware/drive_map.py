@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The map of a drive: which object holds which catalogue value, in which type, scale and form.
 
 No standard says what a current-loop gain is; every drive has its own objects. One :class:`Cell` says it

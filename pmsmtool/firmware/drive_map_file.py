@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Map files (``firmware-params/<family>/map.toml``): written, read back, and refused with file and line.
 
 A wrong map writes a wrong number into a drive that moves a machine, so that everything that can be told from the file

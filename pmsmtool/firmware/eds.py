@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Read electronic data sheets as they are: any encoding, loose spelling, vendor keys (CiA 306-1).
 
 What is unambiguous is accepted with a warning that names file and line; what cannot be understood is left out of the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A parameter set as C: a const instance of ``pmsm_params`` with its look-up words, and the core that runs it.
 
 The generated files are the ones the simulated drive runs (``firmware/core``, copied byte for byte) plus

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The example that is exported beside the control core: every call of the core around a machine at standstill."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Constants of the fixed-point governor (``firmware/fixed_point``) from a parameter set.
 
 Bases are powers of two at least twice the largest value the drive's own limits allow, so that Q4.27 leaves a factor of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The packed parameter image: one sequence of little-endian four-byte words for C, Python and the drive.
 
 The scalars of the catalogue come first, in catalogue order (that is the C struct ``pmsm_params``), then the look-up

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """On which line of a TOML text a key stands."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The look-up table's axes and tables as bytes of a DOMAIN, and binary32 with as few digits as it needs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Objects of the monitor in Novanta/Ingenia Summit drives: a recorder whose data register is read again and again.
 
 Addresses, types and bits: ingeniamc/ingenialink-python@626d4d7 tests/resources/den-net-e_2.8.0_v3.xdf (CANopen index

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Table ``[motion]`` of a drive map: the maker's own objects for what CiA 402 leaves optional, and motion needs.
 
 A current whose manual does not say peak or rms is written ``mA peak-or-rms``. It is then taken as rms everywhere: that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Generate the C side of the catalogue: ``pmsm_params.h`` (struct) and ``pmsm_params_table.c`` (bounds).
 
 ``python -m pmsmtool.firmware.params_header`` rewrites both files in ``firmware/core``; a test compares them with the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the recorder of a drive can be told to record, as its map says it: the table ``[recorder]``."""
 
 from __future__ import annotations

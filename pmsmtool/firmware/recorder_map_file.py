@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``[recorder]`` of a map file: written, read back, and refused with file and line.
 
 A wrong number here records another quantity than its name says, and nothing later can tell: a channel must have its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Objects of the data recorder in maxon EPOS2 drives: up to four variables, a ring of words for each.
 
 RIVeR-Lab/EposLib@8be4584 (maxon's command library: GatewayDrive2ToEpos2.cpp, DcsCanOpenCommunicationDef.h) says what is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The drive maps that come with the program, by family name and by a drive's identity."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Objects of the trace in Copley Controls amplifiers: up to six numbered variables, a row of them per sample.
 
 Copley Motion Libraries, CML_AmpDef.h and the trace methods of the class Amp (Linkeway/BIRL_modular_robot@e0f9380), with

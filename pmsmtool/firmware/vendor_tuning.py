@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How a drive's own identification is started and where its results stand: facts of a drive map, nothing is moved here.
 
 Two kinds are known. ``os_command``: the OS command object of CiA 301 (0x1023, with its mode 0x1024) takes the number of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``[vendor_tuning]`` of a map file: written, read back, and refused with file and line.
 
 A wrong number here starts something unknown in a drive that moves a machine, so that everything must be said: which

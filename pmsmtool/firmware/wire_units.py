@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Units in which drives count: what one count of an object is worth, as a person reads it in a data sheet.
 
 ``uV/A``, ``10 mohm line-line``, ``mA rms``, ``0.1 V``, ``rev/s``: an optional number, a unit, and its kind:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The download: a transaction from what a drive holds to what it shall hold.
 
 Gate, journal, staged write with read-back, activation, marks (0x1020 last), one store, reset,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Journal, backup and snapshot: one file format, exact bytes, never half written.
 
 A journal is on disk, synced, before the first write to a drive; it holds what the drive held. It

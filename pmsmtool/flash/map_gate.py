@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The gate before the first motion and the first write through a map: it must be this drive's.
 
 A parameter set is only as right as the map that scales it. The reference drive shows the layout of its own set

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a download would change: old bytes, new bytes, and what the drive will really hold.
 
 Pure: bytes read from a drive go in, a plan comes out; nothing here speaks to a bus.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Backups of a drive, and plans that bring one back."""
 
 from __future__ import annotations

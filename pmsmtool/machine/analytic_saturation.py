@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """An analytic saturating machine with cross-saturation: i(psi) in closed form, reciprocal by construction.
 
 The machine of the profile ``saturated-pmsyrm``. The currents are the gradient of one field energy, so the flux map made

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A machine file from a datasheet or meter readings: every conversion is shown, contradictions are flagged.
 
 Datasheets mix line-line and phase, star and delta, rms and peak, mechanical and electrical. Whatever is given

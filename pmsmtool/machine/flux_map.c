@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Flux map: evaluation and construction of the cells; see flux_map.h. */
 #include "flux_map.h"
 

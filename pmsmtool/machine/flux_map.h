@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Flux map of a saturated machine: psi(i) and i(psi) as tensor-product cubic cells.
  *
  * Units: currents in A, flux linkages in Wb, both peak phase values in rotor (dq) coordinates,

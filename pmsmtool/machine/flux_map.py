@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Flux map of a saturated machine: grids of psi(i), and the two tables everything evaluates.
 
 The machine of a map is *the map plus its interpolation*. Two tables are built, once per map

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Tensor-product cells of a flux map: built in C, evaluated in numpy with the same operations as in C.
 
 The layout and the continuation outside the table are those of ``flux_map.h``; the numpy evaluation here

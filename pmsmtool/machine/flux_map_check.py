@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Checks of a flux map, with numbers: reciprocity, monotonicity, rotation, asymmetry.
 
 A map from measurements or finite elements is never perfect; a map with swapped axes, a turned frame or bad cells is

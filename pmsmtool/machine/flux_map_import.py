@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Flux maps from and to files: ``.npz``, ``.mat``, ``.csv``, real grids or complex ones.
 
 Accepted names (case and underscores do not matter): currents ``i_d_a i_d id``, ``i_q_a i_q iq``; fluxes

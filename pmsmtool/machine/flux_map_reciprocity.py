@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Reciprocity of a flux map: loop integrals of the co-energy, and the nearest map that has one.
 
 A lossless machine has a co-energy W(i) with psi = grad W, so d psi_d/d i_q = d psi_q/d i_d and the integral of

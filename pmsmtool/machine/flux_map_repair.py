@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Repairs of a flux map, each on request and each saying what it changed.
 
 Every function returns a new map whose metadata lists the repairs (``meta["repairs"]``), or the text it would list.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A flux map as another machine of the same kind has it: other inductances and another magnet, nothing fitted again.
 
 psi_d' = k_psi psi_f + k_d (psi_d - psi_f), psi_q' = k_q psi_q. The inverse table i(psi), which is the simulated

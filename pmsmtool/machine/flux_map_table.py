@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A flux map inside a TOML file: the table ``[flux_map]``."""
 
 from __future__ import annotations

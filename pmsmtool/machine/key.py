@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """One key of a file: its unit, bounds and meaning. The tables of keys are validation and documentation in one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The machine file: one TOML text that holds what is known of a machine, its inverter and their doubt.
 
 ``parse_machine`` lists everything that is wrong at once; ``dump_machine_file`` writes the same file, same bytes. A

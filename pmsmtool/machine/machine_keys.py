@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Keys of a machine file, table by table: validation and documentation in one (``machine_file_keys``)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Reading the tables of a machine file: everything that is wrong is found in one pass."""
 
 from __future__ import annotations

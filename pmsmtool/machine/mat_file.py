@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Numeric arrays of MATLAB files, level 5 (what ``save`` writes unless told ``-v7.3`` or ``-v4``).
 
 Read here, because the common reader ends the whole process with a segmentation fault on some damaged files

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The machine and its inverter as numbers: what design, simulation and the drive agree on.
 
 Amplitude-invariant (peak) dq quantities, SI, electrical angle; torque = 1.5 p (psi_d i_q - psi_q i_d),

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The machine files that ship with the package, and how a machine is named: a file, a run directory or a profile."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Keys of ``[simulation]``: what only the simulated drive may know. Design commands validate them and look away.
 
 The truth the drive is simulated with: sensor errors, inverter details, temperatures, load, faults. A key

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The one home of R(T), psi(T) and the temperature coefficients.
 
 R(T) = R_s + R_winding alpha_R (T - T_ref): only the copper part of the loop warms with the winding; where the split is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The one home of the torque: T = 1.5 p (psi_d i_q - psi_q i_d) for amplitude-invariant dq quantities."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Clarke and Park transformations, amplitude-invariant (peak), for numbers and arrays of any shape.
 
 alpha along phase a; d at the electrical angle theta_e from alpha; q ahead of d by pi/2. The zero component is

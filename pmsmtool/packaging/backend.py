@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The build backend (PEP 517, PEP 660) of this package.
 
 setuptools makes the metadata out of ``pyproject.toml``; this module adds what it cannot do: a C compiler that

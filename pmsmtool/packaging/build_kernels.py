@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Compile the kernels of a checkout: ``python -m pmsmtool.packaging.build_kernels``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Find a C compiler that really works, or the pinned zig, and compile a kernel with it."""
 
 from __future__ import annotations

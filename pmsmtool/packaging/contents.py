@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What goes into a wheel and a source archive: plain rules over the tree, no list to keep by hand."""
 
 from __future__ import annotations

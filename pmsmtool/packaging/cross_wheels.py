@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Build and check the wheels of every platform on one machine.
 
 ``python -m pmsmtool.packaging.cross_wheels --out DIR``, in a checkout; needs the extra ``cross`` (the pinned

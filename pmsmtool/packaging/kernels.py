@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The list of compiled kernels: what is built from which sources. To add a kernel, add a row."""
 
 from __future__ import annotations

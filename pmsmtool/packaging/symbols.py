@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Read what a shared library or object file exports: ELF, PE and Mach-O, 64-bit little-endian, with struct alone.
 
 Enough to check a cross-built wheel on a machine that has no binutils for the target. Layouts: System V ABI

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Platforms a wheel is built for, and the platform this Python runs on."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Write wheels and source archives: same content, same bytes (no dates, sorted entries)."""
 
 from __future__ import annotations

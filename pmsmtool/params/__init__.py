@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: MIT
 """Parameters of the drive: the catalogue, sets of values, differences between sets."""

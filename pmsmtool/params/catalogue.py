@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The catalogue: one row per parameter of the drive, the one source for all its appearances.
 
 A row yields the member of the C parameter struct (``firmware/core/pmsm_params.h`` is generated

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Differences between two sets of drive parameters, entry by entry in catalogue order."""
 
 from __future__ import annotations

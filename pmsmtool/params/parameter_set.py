@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """ParameterSet: catalogue names with SI values, where each came from, and the text form ``params.toml``.
 
 The text is canonical: groups and keys in catalogue order, shortest decimals, one content hash over

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The table *data sheet | drive | measured* of a recorded identification, as text; nothing is judged here."""
 
 from __future__ import annotations

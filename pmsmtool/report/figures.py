@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Figures of a commissioning report: what was measured, with the model that was fitted to it, as inline SVG.
 
 Same data, same bytes: no date, ids from a fixed salt, text kept as text.

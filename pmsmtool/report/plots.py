@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Figures of traces: matplotlib's Figure class only, the same bytes for the same trace.
 
 matplotlib is imported inside the functions: commands without a plot do not pay for it.

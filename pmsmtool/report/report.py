@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The commissioning report: one self-contained HTML page, verdict first.
 
 The page is made from the record of a run and from figures drawn elsewhere; nothing is measured or decided here.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The first thing a reader sees of a run: whether all that was asked for ran and held its criteria, and on which drive.
 
 A run passes only when every stage it must have ran and passed, and nothing its result follows from stayed unchecked.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A bench supply that feeds one simulated drive: voltage and current as a person reads them off its display.
 
 The power is what machine and inverter take at standstill: copper, the devices' drops and slopes (switch and diode carry

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """python-can interface ``pmsmsim``: a simulated drive on a virtual bus, in this process and without hardware.
 
 ``can.Bus(interface="pmsmsim", channel="NAME[?seed=N&nv=FILE&faults=FILE&bitrate=B]")``; see ``sim/channel.py`` for the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Channel strings of the simulated bus: ``NAME[?key=value&...]``, and the line they describe.
 
 NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:

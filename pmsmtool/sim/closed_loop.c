@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The closed loop; see closed_loop.h. */
 #include "closed_loop.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The closed loop: sample, drive application, computation delay, inverter, machine; N periods in one call.
  *
  * Period k starts at t_k. Currents and angle are sampled there (the currents sampling_shift later or

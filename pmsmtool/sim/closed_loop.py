@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Closed-loop simulation: machine, parameters and scenario in, a trace out."""
 
 from __future__ import annotations

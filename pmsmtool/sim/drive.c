@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The drive's application at PWM rate: sensors, trips, quick stop, what the control core is asked to do. */
 #include "drive.h"
 

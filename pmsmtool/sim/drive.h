@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The simulated drive's application: everything around the control core that a real drive's
  * firmware has at PWM rate - sensor processing, excitation, trace recorder, window averages, trips.
  * The CANopen node (Python) reads and writes these structs between calls; it never loops over periods.

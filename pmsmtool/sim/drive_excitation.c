@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Excitation: the signals an identification experiment asks the drive to generate (object 0x2050).
  *
  * Armed, the bias is held and the wave is off; running, the wave is on; aborted, the gates stay off until the next

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The simulated drive behind the CANopen node: ``node.drive_core.DriveCore`` on the kernel.
 
 Every method reads or writes a few words of the C structs; time passes only in :meth:`KernelCore.run`, N control periods

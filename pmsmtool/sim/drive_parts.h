@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The parts of the drive's application, one file each. Internal to sim/. */
 #ifndef PMSM_DRIVE_PARTS_H
 #define PMSM_DRIVE_PARTS_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Trace recorder (objects 0x2060 to 0x2062) and window averages (0x2063).
  *
  * A row belongs to one period: what was sampled at its start and what was computed from it.

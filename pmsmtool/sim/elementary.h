@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Elementary functions in double from +, -, *, / and the square root alone.
  *
  * The bytes of a simulation must not depend on the C library, whose sin, exp and log differ in the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Carries the faults of a plan (``sim/faults.py``) out on one simulated line."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Faults on purpose: what a simulated bus and drive do wrong, from a TOML file, the same for the same seed.
 
 :data:`EXAMPLE` shows every table and key. A frame is corrupted behind the CAN controller (a gateway, a driver): one bit

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Averaged and switch-level inverter: what the legs are at each instant; see inverter.h. */
 #include "inverter.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The inverter: duty ratios and gate release in, leg voltages of the plant out.
  *
  * Two models behind one switch, both written apart from every estimator.

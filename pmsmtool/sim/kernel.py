@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The simulation kernel ``pmsm_sim`` through ctypes: mirrored structs, declared functions, owned memory.
 
 Field names and their meaning are those of ``closed_loop.h``, ``plant.h``, ``inverter.h``, ``sensors.h``, ``drive.h``;

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Legs whose voltage depends on the sign of their current: diodes, thresholds, open phases; see leg_circuit.h.
  *
  * A leg with v_out < v_in has a dead band. While its current flows the source is the one of its direction; when the

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Three legs as sources whose voltage depends on the direction of their current. Internal to sim/. */
 #ifndef PMSM_LEG_CIRCUIT_H
 #define PMSM_LEG_CIRCUIT_H

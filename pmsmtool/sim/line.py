@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The simulated CAN line: one wire with arbitration and frame times, the drives on it, the programs attached to it.
 
 Frames queue for the wire, the lowest identifier goes first when it becomes free, and a frame arrives everywhere at the

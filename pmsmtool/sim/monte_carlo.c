@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Many drives over all cores; see monte_carlo.h. */
 #if !defined(_WIN32) && !defined(_POSIX_C_SOURCE)
 #define _POSIX_C_SOURCE 200112L /* strict C99 hides the threads otherwise */

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Many drives in one call over all cores: the same parameters and the same course of events, each with its own machine
  * and sensors.
  *

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Many drives at once: the same parameters and the same scenario on machines that differ, in one call over all cores.
 
 Every drive runs exactly as :func:`pmsmtool.sim.closed_loop.simulate` runs it alone (``monte_carlo.c``): the numbers

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A served drive in operation: a program of its own runs the machine through speeds and loads, nobody on the bus does.
 
 As in a plant: whoever joins may look, and may stop it. After a stop or a fault it stays off until it is served again.

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The machine: one RK4 step of stator flux, speed and angle per interval; see plant.h.
  *
  * psi_dq = R(-theta_e) psi_ab, i_ab = R(theta_e) i_dq(psi_dq), psi_ab' = u_ab - R i_ab.

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The machine as it is: stator flux, rotor, temperatures.
  *
  * State is the stator flux linkage in the stationary frame, psi' = u - R i(psi, theta), integrated by one

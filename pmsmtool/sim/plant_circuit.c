@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The machine between the steps: start, temperatures, and what the legs' circuit asks of it; see plant.h. */
 #include <stddef.h>
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* One point of the machine's trajectory: fluxes, angle and the currents they give. Internal to sim/. */
 #ifndef PMSM_PLANT_POINT_H
 #define PMSM_PLANT_POINT_H

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What happens in a simulation: built-in scenarios and TOML scenario files (:data:`FILE_EXAMPLE`)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Sensors and the random numbers of the simulated drive; see sensors.h. */
 #include "sensors.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* What the drive gets to see of the machine: currents, DC link, angle, temperatures, each with its faults.
  *
  * A current sample is  gain (i through a first-order lag) + offset + noise, clipped to the full scale and rounded to

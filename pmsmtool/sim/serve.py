@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Offers simulated drives to other processes: a socketcand server in raw mode, on the wall clock.
 
 Every client hears the drives and the other clients, as programs on one bus do. python-can's stock ``socketcand``

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The numbers by which the simulated drive and its plant name their signals (``drive.h``, ``closed_loop.h``)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """From a machine file to the kernel's setup: the truth of ``[simulation]`` over what ``[machine]`` says.
 
 Resistance: ``R_s_ohm`` is the loop. The devices' share (``device_slope_ohm``, in the switched model of an IGBT the mean

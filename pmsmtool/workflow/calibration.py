@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Scales of the drive's sensors against an instrument: ``--cal V_dc=540V:537V:0.5V``.
 
 No experiment on the machine sees the gain of its own current or DC-link measurement. An instrument does: what it reads

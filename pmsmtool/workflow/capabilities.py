@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a drive can give: quantity x method x expected interval x what is missing, decided from map and drive.
 
 The map says what a family can do, the drive itself must confirm it: supported modes (0x6502) and objects that answer.

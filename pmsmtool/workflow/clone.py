@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A simulated drive in the image of a real one: its identified machine, its parameters, its data sheet.
 
 The clone's truth is what identification found, or a draw from its intervals: a design made from the same machine

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The design stage of a drive that cannot be reflashed: its limits keep it out of saturation, and what that costs.
 
 The governor is projected onto what the drive offers (``design/closed_drive.py``); the stage is judged by the guarantee.

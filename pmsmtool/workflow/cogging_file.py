@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Cogging torque as a result: one value per order, and a table over the encoder's angle for firmware to compensate."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The whole chain: identify, tune, lut, margins, flash, verify, prove; one run directory, resumable at every stage.
 
 A stage that is recorded as passed is not run again. The chain ends at the first stage that does not pass, whatever

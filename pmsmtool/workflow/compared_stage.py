@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The gate between identification and everything that stands on it: MACHINE, the drive and the measurement agree."""
 
 from __future__ import annotations

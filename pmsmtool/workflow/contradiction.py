@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a machine file states, what the drive holds and what was measured, side by side, before anything is written.
 
 A measured value beyond the joint interval of measurement and data sheet contradicts the file. So does a value that was

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The stages that compute: control, look-up table, margins. Files of the run in, files of the run and criteria out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """From the stored traces of a run to the identified machine: pure arithmetic, the same bytes at every replay."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A parameter set in the forms other programs take: DCF, concise DCF, C, CSV.
 
 Every value goes through the drive's map, so the bytes in a file are the bytes ``flash-params`` would send. Same set,

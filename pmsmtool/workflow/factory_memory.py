@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A simulated drive as it leaves the factory: its non-volatile memory erased before the bus is opened."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The check of a first power-on: small currents and half a turn say what is miswired, before anything larger does."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The stages that write and compare: flash, verify."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The frequency response's part of an identification: random torque on the drive, the response from its traces."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The second control frequency of the resistance: asked for, measured, and what it makes of R and the inverter."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A design as a drive will hold it: gains in its counts, one pair where it has no more, and the loops these make.
 
 A loop whose gains the drive has no object for is not judged: its margins would be those of numbers nobody writes.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The machine file that an identification leaves: accepted values in place of the nameplate's."""
 
 from __future__ import annotations

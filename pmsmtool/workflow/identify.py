@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Identify the machine on a drive: envelope and consent, the experiments, and the machine file from their traces.
 
 What the estimates are is decided from the stored traces alone (``evaluate``), so that :func:`replay` gives the same

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What is recorded of an identification: values with their intervals, whether they are accepted, and what to know."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the experiments of an identification may use: current, speed and voltage."""
 
 from __future__ import annotations

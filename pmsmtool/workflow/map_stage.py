@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The flux map's part of an identification: its pulses on the drive, its estimate from the traces, its files."""
 
 from __future__ import annotations

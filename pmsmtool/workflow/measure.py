@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The order of the experiments on one drive: each uses what the ones before it found, and leaves its traces.
 
 Noise and phases at five percent of the rated current come first, then resistance and inverter, pole pairs and offset,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The mechanics' part of an identification: current steps on the drive, inertia and friction from their trace."""
 
 from __future__ import annotations

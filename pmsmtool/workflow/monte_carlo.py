@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Margins by simulation: a design's drive in closed loop on many machines of its tolerance box.
 
 The analytic part (``design.margins``) judges loops and steady references; here the whole firmware runs, governor and

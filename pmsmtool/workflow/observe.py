@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a machine in operation shows to whoever commands nothing: by process data, or recording after recording.
 
 By process data transmit PDOs are borrowed, by recordings the drive's recorder; what either of them was is brought back.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Where parameters come from: a parameter set, a design, a run directory, a device configuration file or a table."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``predicted.json`` of a run: every standard deviation that was said before the machine moved for it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What recorded torque pushes do not tell of some machines, although a number comes out: said by name, not given."""
 
 from __future__ import annotations

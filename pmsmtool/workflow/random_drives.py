@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Drives drawn at random, to judge identification and design by numbers instead of examples.
 
 Two draws. :func:`draw_drive` takes a whole drive from the population below; :func:`draw_around` varies a given

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Whether a design reaches the machine's ratings: one that ends below them fails, unless a person accepts the limit."""
 
 from __future__ import annotations

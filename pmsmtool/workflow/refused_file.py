@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What was refused while it was measured, in the run: a replay is to give the same reasons."""
 
 from __future__ import annotations

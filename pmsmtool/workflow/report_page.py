@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """From a run directory to its report: the files of the run are read, figures drawn from them, the page rendered.
 
 Nothing is measured, and no number is made that the run does not hold.

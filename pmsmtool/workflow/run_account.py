@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How a run ended, in its own record: a run that did not come to its end says so to whoever opens it years later.
 
 An account is begun before anything moves and closed on every way out, so a run whose account is still open was killed,

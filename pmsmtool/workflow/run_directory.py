@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The run directory ``runs/<utc>-<serial>/``: the record of what was done to one drive.
 
 ``run.json`` carries the date, the operator, the drive, the versions, both consents and one entry per stage; the

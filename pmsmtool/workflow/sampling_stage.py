@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the instant at which currents are sampled does to the other estimates of a run, and how it is told."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How good inertia, friction and frequency response will be: said after the rough pushes, before the runs for them.
 
 Before the first push nothing is known of the shaft, so that nothing can be predicted of it. Afterwards the rough

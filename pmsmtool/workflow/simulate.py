@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Simulate a design, a machine file or a profile: find the drive, find the scenario, run it."""
 
 from __future__ import annotations

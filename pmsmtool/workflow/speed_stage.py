@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The flux linkage's part of an identification: what turns the shaft, from the first push to coasting with current."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The inductances' part of an identification: the bias that holds the rotor, and square waves of voltage on it."""
 
 from __future__ import annotations

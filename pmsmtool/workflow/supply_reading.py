@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """R of a drive that shows no voltage: a current vector is held while a person reads the power of the bench supply."""
 
 from __future__ import annotations

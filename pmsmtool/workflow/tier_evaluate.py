@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the traces of a tier without injection tell: estimates, the machine file, and the judged stage.
 
 Everything follows from the stored traces, the request and :class:`TierFacts`, so that :func:`replay` gives the same

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Identification on drives without injection: what CiA 402 alone gives, and what a recorder adds.
 
 ``standard``: pole pairs, direction and encoder offset from a vector turned by the commutation angle 0x60EA; inertia and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The machine file of a tier that measures a part of it: what was measured, and the rest as it was given, by source.
 
 Nothing is made up: a value that was neither measured nor given is named as lacking, and there is no machine file.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The chain's stages on a drive that gives less than all: each runs as far as tier and map go, or says what it needs.
 
 A stage that cannot run raises ``NotAvailable``; the chain records it as not available and goes on. What runs is judged

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What is recorded of an identification without injection: each value judged for itself, as with injection."""
 
 from __future__ import annotations

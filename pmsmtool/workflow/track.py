@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Follow R(T) and psi(T) of a machine in operation: observations from the drive or from stored traces, then the filter.
 
 A run keeps the observations and what was known, so that a replay gives the same numbers.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Identification by the drive itself (``identify --method vendor``): its own measurements, started and read.
 
 Same guard, same consent, same dead-man as every experiment of ours; the drive chooses currents and speeds by itself.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a drive's own identification says of the machine, as it came: its source is ``vendor``, and it has no interval.
 
 Its maker states none, and one of ours would be a guess. What stands on such a value says so: ``margins`` names the

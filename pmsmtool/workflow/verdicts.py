@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The one place where a quantity is accepted or refused: each for itself, whatever became of the others.
 
 A quantity that was asked for is accepted when its experiment ran, its estimator gave a value and the interval of the

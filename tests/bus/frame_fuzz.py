@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Random frames at the tool: whatever a node sends, a transfer ends in time with bytes or with an error of ours."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A scripted slave on a virtual-time bus: a correct SDO server of its own, and every way to be a bad one.
 
 Written from CiA 301 for the tests only, so that the client is not checked against the simulated

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Adapters as they are: echoes, silence after unplugging, missing states, altered buffers, spinning, bus-off.
 
 These run on the wall clock with the connection's own reader thread.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Every wait and every length is bounded, whatever the server does; and late frames are of the past."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Random frames, a few thousand here; ``benchmarks/fuzz.py`` takes a hundred thousand."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A fixed part of ``benchmarks/hostile_server.py``: random servers and drives against commands that read, and stop."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The tool's SDO channel and NMT against slaves of other people's stacks; their deviations are named.
 
 canopen's LocalNode is always there; durand where it is installed (``pip install durand``). Both run on python-can's

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The SDO channel against a scripted slave: sizes, every fault of the stock client, losses."""
 
 from __future__ import annotations

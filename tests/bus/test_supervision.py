@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Supervision of a node: reset, silence, emergencies, a second master and our own echo."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Command lines of one process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Bad input through the command line: one clear message each, the documented exit code, and nothing written."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The first power-on, typed: what is done to a simulated drive is the first wrong row, and the drive is restored."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``commission`` from the command line: two machines, another process, Ctrl-C, and everything that can be wrong.
 
 The README's own session is a third machine; ``benchmarks/whole_commission.py`` draws any number.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The two consents: who may answer them, and what happens where nobody can."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A reversed encoder and two swapped leads, on every level of drive: found, taken over, and no fault on the way.
 
 The rotor stands far from the encoder's zero: a speed estimate that meets the new sign there sees it jump by two turns.

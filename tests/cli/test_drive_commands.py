@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The commands that look at, move and write a drive, on the simulated one; the table of bad buses and bad drives."""
 
 from __future__ import annotations

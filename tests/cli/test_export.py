@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Exports: the bytes a drive would get, in every form; same set, same bytes; refused without a half-written file."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Whoever consents to an alignment, to new encoder parameters or to a reset reads, once, that homing is lost."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``identify`` from the command line: the numbers, the replay, the refusals by name, and what must not happen."""
 
 from __future__ import annotations

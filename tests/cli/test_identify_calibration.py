@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``--cal``: a scale against an instrument leaves the instrument's tolerance; three kinds of interval stay apart."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the drive cannot be made to do: one healthy run, its traces spoilt in one way each, and replayed.
 
 Every trap is named. What does not depend on its trace is given all the same (exit code 10); else none is (6).

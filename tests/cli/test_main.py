@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The frame of the command line: start-up, options, exit codes, consents, help."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A map is for one drive: nothing is written or moved through the map of another, and what is only read is marked."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Shared options: before a command, after it, from the environment."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What commands print: JSON forms, tables, streams."""
 
 from __future__ import annotations

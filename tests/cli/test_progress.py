@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Progress of a chain: one line per stage for a log, a live line for a person, nothing when quiet."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The report: one page that needs nothing else, made from the run's files alone, the same bytes every time."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A run that did not come to its end says so in its own folder, and its report says it, too."""
 
 from __future__ import annotations

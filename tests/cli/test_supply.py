@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``identify R --supply``: the bench supply that a person reads, here the simulated one's display or typed numbers."""
 
 from __future__ import annotations

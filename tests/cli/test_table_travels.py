@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A look-up table on its way: from ``lut`` through every export into the drive and back, the same everywhere."""
 
 from __future__ import annotations

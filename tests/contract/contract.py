@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What every CANopen slave owes the tool: one class, run on every way to a slave and on stacks that are not ours.
 
 A slave is reached with the tool's own connection and SDO channel, and with raw frames where the channel would hide what

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Slaves that are not ours, made from the simulated drive's own object table: durand, and canopen's LocalNode."""
 
 from __future__ import annotations

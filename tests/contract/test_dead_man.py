@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The dead-man with the real thing: the tool killed, kept busy, its cable pulled, the drive without supervision.
 
 ``pmsmtool jog`` holds a current in a process of its own; the drive is served by another. Until the tool is gone this

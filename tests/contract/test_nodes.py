@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The contract on every way to the simulated drive, and on stacks that are not ours with their deviations."""
 
 from __future__ import annotations

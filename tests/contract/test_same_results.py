@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The same script of requests has the same answers in this process and from ``sim serve`` in another one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Programs as python-can and canopen ship them, each in its own process, with no line of pmsmtool on their side."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A sample of ``benchmarks/transfers.py``: special sizes in every mode, and lossy channels, on the simulated drive."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Operating points by brute force: dense search zoomed in, on its own evaluation of the machine.
 
 Nothing here comes from the product: the machine is a function of currents, the map is scipy's spline, and every

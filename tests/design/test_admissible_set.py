@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Prediction model and horizon: printed entries, published horizons, and no violation that the horizon did not see."""
 
 from __future__ import annotations

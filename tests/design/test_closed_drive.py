@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The governor of a drive that cannot be reflashed: its guarantee on simulated nodes, its cost, its way."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Current loops: gains of the papers, margins against python-control and against the loop's own poles."""
 
 from __future__ import annotations

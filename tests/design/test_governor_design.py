@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Numbers of governor and field weakening against the reference's own."""
 
 from __future__ import annotations

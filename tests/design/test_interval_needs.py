@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What an interval costs the design: against the margins and voltages of the machines at its ends."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Tables as the drive uses them: the reported bound is true, files and words carry the same numbers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the three panels of a table's figure show: read back from the artists, against the table's own arrays."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Look-up tables: closed forms of the literature, and every kind of cell against brute force."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Margins over the tolerance box: arrays against single loops, executors against each other, headroom by physics."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The minimum-time bound: two methods against each other, against the reference's numbers and against a brute force."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Polar-coordinate design against the reference's derived numbers, identities and an independent state space."""
 
 from __future__ import annotations

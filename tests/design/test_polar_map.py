@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Conditioning, controllability, stability and gains over speed and torque against reference and state space."""
 
 from __future__ import annotations

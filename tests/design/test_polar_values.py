@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Parameters of the polar laws, from machine file to parameter set."""
 
 from __future__ import annotations

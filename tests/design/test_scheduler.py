@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The same numbers on a Dask cluster on loopback, with a worker killed midway."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The bound of a closed drive's demand, against every course that can be thought of for it and the worst one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Speed loops: textbook gains, and the lifted multirate loop against a plain simulation of its parts."""
 
 from __future__ import annotations

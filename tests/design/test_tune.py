@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Designs: complete, explained, reproducible, refused when they cannot hold."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A complete simulated drive (machine, inverter, firmware) in this process, and the tool's side of it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Recorders for the tests of this folder."""
 
 from __future__ import annotations

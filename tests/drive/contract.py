@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What every drive owes the port, whatever bus it stands behind."""
 
 from __future__ import annotations

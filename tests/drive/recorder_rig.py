@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A recorder of every kind on a simulated drive whose DC link ripples: what one after the other must show."""
 
 from __future__ import annotations

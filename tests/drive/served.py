@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A simulated drive in a process of its own, joined over socketcand."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The drive contract on the simulated drive in this process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The drive contract over socketcand, the drive in another process on the wall clock."""
 
 from __future__ import annotations

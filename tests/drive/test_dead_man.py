@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The dead-man: proven before motion, refused where the drive cannot, and true when it matters."""
 
 from __future__ import annotations

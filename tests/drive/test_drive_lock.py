@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """One program per drive: who comes second is told who was first, and a lock ends with its owner."""
 
 from __future__ import annotations

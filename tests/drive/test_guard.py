@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The guard: limits, Ctrl-C at any moment, pulled cables, and a drive that holds what it held."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A moving command in a process of its own, interrupted or killed; the drive in another one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """One contract for every drive class: each limit stops the machine in its time, restores the drive, and is named.
 
 What the drive shows is set behind the tool's back, so that the same excess can be shown to every class, and so that a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Recorders of makers: started by command, counted instead of checked by a CRC; what each of them must refuse."""
 
 from __future__ import annotations

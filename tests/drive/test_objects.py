@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The objects the tool uses are those of the reference drive's EDS."""
 
 from __future__ import annotations

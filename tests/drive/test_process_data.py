@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Live quantities as process data: sent by the drive, and its PDOs as before afterwards."""
 
 from __future__ import annotations

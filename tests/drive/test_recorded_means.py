@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Means made from records: two windows of one record, and rows that no harmonic of a turning machine folds onto."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Makers' recorders under the guard: every setting is again what somebody else had left in the drive."""
 
 from __future__ import annotations

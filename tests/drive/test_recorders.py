@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """One contract for every kind of recorder: a DOMAIN with its CRC, blocks by count, numbered rows, rings of words."""
 
 from __future__ import annotations

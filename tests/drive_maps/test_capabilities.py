@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What drives can give: decided from map and drive, shown by ``caps``, and exit 9 with what is missing."""
 
 from __future__ import annotations

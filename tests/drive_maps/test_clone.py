@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``sim clone``: the simulated image of a drive holds its machine, its parameters and its data sheet."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Simulated drives of every mapped family: what is shown before is what they hold; the gate before the first write."""
 
 from __future__ import annotations

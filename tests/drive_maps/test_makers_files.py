@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Every row of a shipped map against makers' own files, where a table of their objects lies beside the checkout."""
 
 from __future__ import annotations

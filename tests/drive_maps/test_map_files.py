@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Map files: every shipped one can be used, every kind of mistake is refused with file and line."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Table ``[motion]`` of a map: read, written back, and refused with the line; a current of unknown kind."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``[vendor_tuning]`` of map files: read back as written, and every kind of mistake refused with file and line."""
 
 from __future__ import annotations

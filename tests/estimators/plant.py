@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A drive for judging estimators, written apart from them: many machines at once, small steps, ugly on purpose.
 
 Three phases with an inverter error of a drawn shape per phase current, a current sensor with lag, noise and

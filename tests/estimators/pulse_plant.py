@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A saturating machine under hysteresis pulses, in plain numpy: what a flux-map scan records, i(psi) in closed form.
 
 Independent of the simulated drive: the flux is integrated exactly in the stator frame, the rotor moves as it is told.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Cogging torque and encoder error from coasting traces with a known truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Pole pairs, direction, coarse offset; the three-vector phase check; noise; the table of refusals."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """psi_f and the encoder offset on drives outside the estimator's model class."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The flux-map regression on a machine in closed form: accuracy, alignment, tests of symmetry, and every refusal."""
 
 from __future__ import annotations

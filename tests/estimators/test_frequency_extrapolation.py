@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """R_s from levels at two control frequencies, on dead-time shapes that no tail of the fit describes."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Frequency response of simulated shafts: rigid ones give no resonance, elastic ones theirs; refusals by name."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Incremental L_d and L_q on drives with lag, late sampling, saturation, a free rotor and odd inverters."""
 
 import math

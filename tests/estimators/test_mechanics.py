@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Inertia and friction from pushes and coasting: closed-form motion, accuracy, intervals over many drives, refusals."""
 
 from __future__ import annotations

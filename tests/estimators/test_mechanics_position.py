@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The encoder's step and the rounding of positions that a recorder carries in binary32."""
 
 from __future__ import annotations

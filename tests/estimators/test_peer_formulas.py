@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The formulas of other tools are exact where their assumptions hold, and off where they do not: the table is fair."""
 
 import math

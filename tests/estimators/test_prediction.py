@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The prediction from the first small shot: its size, and when it stops a run."""
 
 import math

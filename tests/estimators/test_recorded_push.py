@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Recorded torque pushes: exact on data of the model, refused where they cannot tell."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A refusal names no option, command or setting that does not exist."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """R_s from DC levels on inverter shapes outside the estimator's model class."""
 
 import math

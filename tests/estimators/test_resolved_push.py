@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Pushes resolved in time: a plant with the rise of the current, a lagging frame and an error along and across it."""
 
 from __future__ import annotations

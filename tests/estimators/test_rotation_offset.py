@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Offset of a slowly turned vector by electrical turns: its value, its spread, its doubt about friction."""
 
 from __future__ import annotations

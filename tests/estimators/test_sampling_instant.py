@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The sampling instant's model against time-domain integrations written down independently of it."""
 
 import itertools

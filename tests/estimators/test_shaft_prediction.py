@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Predicted deviations of inertia and friction against those that the fits of random shafts give."""
 
 from __future__ import annotations

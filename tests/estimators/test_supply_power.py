@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Resistance from a bench supply's readings: truth, rounding, the current gain's doubt, and what is refused."""
 
 from __future__ import annotations

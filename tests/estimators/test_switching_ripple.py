@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Ripple at the switching edges against legs switched and integrated in small steps."""
 
 import math

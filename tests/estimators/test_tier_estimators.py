@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Estimators of the lower tiers on traces whose truth is written down: values, intervals, refusals."""
 
 from __future__ import annotations

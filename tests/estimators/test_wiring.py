@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The verdicts of the first turn, on rows made by hand: what is wrong is named first, the ambiguous with both names."""
 
 from __future__ import annotations

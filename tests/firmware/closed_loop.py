@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The core around a linear machine, period by period. Test code only."""
 
 from __future__ import annotations

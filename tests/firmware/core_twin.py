@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A second hand at the control core: PI, limits, modulation and look-up in numpy binary32, one operation at a time.
 
 Written from the equations (``docs/simulation.md``, 1), in the core's order of operations, so that

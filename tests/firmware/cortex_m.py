@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Cortex-M processors for tests and benchmarks: compile C for thumb, run it in an emulator, count instructions.
 
 The compiler is ``arm-none-eabi-gcc`` where it is installed, else the ziglang package; the emulator is the unicorn

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The fixed-point governor behind floating-point signals, for closed loops. Test code only."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Prediction rows of the governor, built from the matrices of Jercic et al. 2017 ((20), (27)). Test code only."""
 
 from __future__ import annotations

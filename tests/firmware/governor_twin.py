@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A second hand at the reference governor: rows, projections, line search, minimum-time direction in numpy binary32.
 
 One operation at a time in the core's order, so that the governed reference can be compared bit for bit. Test code only.

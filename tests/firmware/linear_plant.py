@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A linear PMSM in the stationary frame for closed loops around the core: exact over each period. Test code only."""
 
 from __future__ import annotations

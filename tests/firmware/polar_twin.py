@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A second hand at the polar-coordinate laws: all six in numpy binary32, one operation at a time.
 
 Written from the equations of reference ``polar-control.md`` in the core's order of operations, so that every result can

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A second hand at the projections of the core, in numpy binary32 and in the core's order of operations.
 
 Used by ``governor_twin`` to compare the governed core bit for bit. Test code only.

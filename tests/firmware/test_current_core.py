@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The control core against its numpy twin (bit for bit) and against what it should achieve."""
 
 from __future__ import annotations

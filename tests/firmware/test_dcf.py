@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Data sheets as they are: read what can be read, change nothing but the values, crash on nothing."""
 
 from __future__ import annotations

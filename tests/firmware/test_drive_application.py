@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The simulated drive's application around the core: sensors, excitation, recorder, averages, trips, quick stop."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The drive map: bytes of every value, scaled integers, integral times, tables, map files."""
 
 from __future__ import annotations

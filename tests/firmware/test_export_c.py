@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The exported C compiles without a warning, and its memory is the image, byte for byte."""
 
 from __future__ import annotations

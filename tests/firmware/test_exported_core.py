@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The exported C against the simulated drive's core and the numpy twins, bit for bit over closed loops.
 
 On the host with any C compiler; on Cortex-M3 (soft float), M4F and M7 under emulation where the tools are installed.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Field weakening by optimisation: Table 2 of Jercic et al. 2017, steady optima, empty sets, iteration counts."""
 
 from __future__ import annotations

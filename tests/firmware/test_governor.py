@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The reference governor in closed loop, under the conditions of docs/control.md, 1 (V_dc 210 V, Table 1)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The fixed-point governor against the float core: same inputs, closed loops, extremes, refusals."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The governed core against its numpy twin, bit for bit over closed loops."""
 
 from __future__ import annotations

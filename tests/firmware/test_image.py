@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The parameter image: the same bytes and the same verdicts in C and in Python, whatever the values."""
 
 from __future__ import annotations

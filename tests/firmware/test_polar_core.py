@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The polar-coordinate laws in the compiled closed loop against the numbers stated here.
 
 Machine of docs/control.md, 3 (assumed: the paper's table is missing). Amperes are power-invariant as in the paper.

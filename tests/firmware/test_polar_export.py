@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A tuned polar design, exported as C and compiled by itself, gives the bits of the drive's core."""
 
 from __future__ import annotations

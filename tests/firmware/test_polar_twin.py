@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The polar laws against their numpy twin, bit for bit over closed loops."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Projection on intersections of ellipses and of half planes against a general solver and the optimality conditions."""
 
 from __future__ import annotations

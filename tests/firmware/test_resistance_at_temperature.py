@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The core's resistance over temperature against the design's: both heat the copper part of the loop only."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Downloads that end at a chosen frame: the drive loses its supply, the tool is killed, a person presses Ctrl-C."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A simulated drive on a line, and the tool's side of a download to it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The download as a transaction: what arrives, what comes back, what survives."""
 
 from __future__ import annotations

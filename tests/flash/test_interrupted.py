@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Interrupted downloads: old or new, never mixed, and a way back or forward.
 
 Every 13th or 67th frame here; ``benchmarks/interrupted_downloads.py`` takes every frame.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Real SIGKILLs: ``pmsmtool flash-params`` against a drive in another process, killed at any moment."""
 
 from __future__ import annotations

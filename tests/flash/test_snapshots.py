@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Snapshots from outside: one that is not this drive's is not compared, a damaged one blocks nothing and is kept."""
 
 import json

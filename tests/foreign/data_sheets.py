@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Small data sheets of drives, written for the tests: the objects by which families are known, and no more."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A drive made from its maker's file: what the file lacks is not there, what it says counts, units are the drive's."""
 
 from __future__ import annotations

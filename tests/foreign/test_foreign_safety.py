@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Safety on drives as their makers built them: whatever they have is used and proven, what they lack is replaced.
 
 The limits of every class of drive stand in ``tests/drive``; here is what differs where objects are missing.

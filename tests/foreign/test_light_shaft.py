@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Torque pushes on a shaft so light that the shortest ramp at the test current would go beyond its speed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a drive will give, before it is bought: asked of a node made from its maker's file, without a bus."""
 
 from __future__ import annotations

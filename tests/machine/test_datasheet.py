@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Datasheets: one machine, printed in every usual way, always gives the same file; contradictions are named."""
 
 import itertools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Flux maps: cells against scipy, C against numpy, the inverse against the forward table, what lies outside."""
 
 import ctypes

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Checks and repairs of flux maps: planted faults are found with their size, repairs undo them and say so."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Flux maps from files: every accepted form gives the same map, every bad file one clear error."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Machine files: round trips, defaults, and every violation at once with its place."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """MATLAB files: the same content as scipy reads, and every damaged file one clear error."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Numbers no machine has are refused, all at once, with file, key, limit and cause; those of real ones are not."""
 
 import pytest

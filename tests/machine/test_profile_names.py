@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How a machine is named: a file, a run directory, a profile."""
 
 from __future__ import annotations

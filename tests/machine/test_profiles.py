@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The shipped profiles: they load, they say what they were made from, and their numbers are consistent."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The temperature coefficients have one home; who needs a default takes it from there."""
 
 from __future__ import annotations

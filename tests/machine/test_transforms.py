@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Clarke and Park: conventions, round trips, power."""
 
 import math

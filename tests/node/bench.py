@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A simulated line with simple drives on it, and raw access to it."""
 
 from __future__ import annotations

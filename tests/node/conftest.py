@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Fixtures: benches with simulated drives."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A scripted SDO client on raw frames, written from CiA 301 for these tests; shares no code with the tool's."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A small drive application for tests of the node: first-order currents and speed, no machine model behind it."""
 
 from __future__ import annotations

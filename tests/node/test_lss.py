@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """LSS slave with a scripted master and with the stock one of canopen."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Excitation, recorder, averages and live values over SDO."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Non-volatile memory: power may fail after every write step."""
 
 import os

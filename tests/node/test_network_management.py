@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """NMT, boot-up, heartbeats both ways, emergency messages, error history, identity."""
 
 from __future__ import annotations

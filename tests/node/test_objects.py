@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The object table and the data sheet generated from it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Staging, validation and activation of the parameter set, direct writes, image and look-up table."""
 
 from __future__ import annotations

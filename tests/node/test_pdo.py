@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Process data objects: mapping rules, transmission types, inhibit and event timers, reception."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The CiA 402 state machine, modes and references on SDO frames."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Random but well-aimed traffic: every object, every service, every state; the node stays a node."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The SDO server on raw frames: every kind of transfer, sizes, losses, time-outs and abort codes."""
 
 from __future__ import annotations

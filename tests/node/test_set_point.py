@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Set-point slope, its cadence and filter, and late process data: what a closed drive does to its master's wishes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Storing, restoring and losing parameters: groups, time, power cuts at every write step."""
 
 from __future__ import annotations

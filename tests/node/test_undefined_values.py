@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Commands and choices of the simulated drives: every value the protocol does not define is refused, by its abort code.
 
 A node that takes 2 where 1 is defined lets a tool pass that no real drive would obey.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Which compiler a build takes, and what it requires where there is none."""
 
 from __future__ import annotations

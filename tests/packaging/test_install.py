@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The real installations: pip, a fresh environment, a copy of the sources; a wheel by the system's compiler, and an
 editable installation by ziglang.
 

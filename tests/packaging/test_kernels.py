@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The compiled kernels: what they export, what they need, and that a warning stops a development build."""
 
 from __future__ import annotations

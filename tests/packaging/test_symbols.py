@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Reading exports: on libraries that a compiler makes here, and on PE and Mach-O files made by hand."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What is in a wheel and in a source archive, and that the same tree gives the same bytes."""
 
 from __future__ import annotations

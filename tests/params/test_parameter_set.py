@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The parameter set: canonical text, content hash, bounds, differences."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The filter against the covariance written out, and against what it must not see."""
 
 from __future__ import annotations

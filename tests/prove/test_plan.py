@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The experiments fit the design, the voltage and the envelope, and what does not fit is left out with its reason."""
 
 from __future__ import annotations

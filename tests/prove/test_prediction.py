@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Band, verdict and cause on responses that are made up, so that what must come out is known."""
 
 from __future__ import annotations

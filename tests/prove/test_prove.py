@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``prove`` on a simulated drive: healthy, spoiled, refused, declined, interrupted; also from the command line."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``prove`` on a machine that saturates: its flux map is drawn within the intervals, and it is led back gently."""
 
 from __future__ import annotations

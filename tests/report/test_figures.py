@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The figures show the data and the model that was fitted to it, not something else."""
 
 from __future__ import annotations

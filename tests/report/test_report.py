@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The report says PASS only when everything passed, and shows every number with its interval."""
 
 from __future__ import annotations

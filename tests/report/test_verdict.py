@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A run passes only when all of it ran on measured values; what it ran on, and an unsafe end, come first."""
 
 from __future__ import annotations

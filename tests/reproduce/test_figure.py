@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The contract of a reproduced figure: what counts as within, what is shown, what the registry promises."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Governor and field-weakening figures on reduced sizes: the checked numbers hold, and so does what is said of them."""
 
 from __future__ import annotations

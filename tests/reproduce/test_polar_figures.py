@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Figures of the polar-coordinate paper: every expected number within its range, baselines beside every comparison."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The drive the figures are made with, and the random cases it is asked for."""
 
 from __future__ import annotations

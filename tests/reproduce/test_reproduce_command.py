@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool reproduce`` as a command."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Settling, overshoot and paired differences on data whose answer is known."""
 
 from __future__ import annotations

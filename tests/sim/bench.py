@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A simulated drive for tests: one linear machine, everything ideal until a test changes it."""
 
 from __future__ import annotations

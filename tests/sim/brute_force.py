@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A switch-level inverter on a locked linear machine, written a second time: explicit steps of a few nanoseconds.
 
 Nothing is shared with the kernel: gate signals come from comparing the duty ratio with a carrier, dead time from a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the kernel is measured against: the scenarios of docs/simulation.md, and an independent integration of them.
 
 The same float32 core runs through ``pmsm_step`` of the library ``pmsm_core``, one call per period; between the samples

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The averaged inverter: shapes of the voltage error, open phases, delays, and the magnetics behind the terminals."""
 
 from __future__ import annotations

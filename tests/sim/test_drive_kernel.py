@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The kernel as the node sees it: modes, excitation, recorder, averages, trips, early returns."""
 
 from __future__ import annotations

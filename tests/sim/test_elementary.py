@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The kernel's own sine, cosine, exponential, logarithm: against numpy in extended precision."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Every key of ``[simulation]`` moves something, and only where it should: off, the drive is ideal."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Rotor, friction, load, coupling: against closed forms and energy."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Many drives in one call: each as it would run alone, whatever the number of threads; machines that differ."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The plant alone against the matrix exponential, and the closed loop against DOP853."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Many different drives, all effects mixed: the numbers stay finite, and every inverter event is resolved."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Scenarios: built-in ones on every profile, files with everything that can be wrong in them, and the trace."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Sensors: gain, offset, lag, noise, grid, encoder, shunts; and the same bytes for the same seed."""
 
 from __future__ import annotations

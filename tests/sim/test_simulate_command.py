@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool simulate`` as a program, and the figures it draws."""
 
 from __future__ import annotations

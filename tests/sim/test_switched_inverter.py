@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The switch-level inverter: against an independent fine-step simulation, and where theory gives a number."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A short life of a simulated drive on a lossy bus, worked with the tool; prints hashes of every frame and of a trace.
 
 ``python tests/sim_bus/repeatable_run.py SEED`` from the root of the checkout. The guard proves the dead-man, holds a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """PmsmSimBus as python-can sees it: time, frames, filters, threads, several programs on one line."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Channel strings, profiles, memory files, and the lines built from them."""
 
 from __future__ import annotations

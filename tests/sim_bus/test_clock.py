@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The two clocks behind one interface; the virtual one is exact, repeatable and unimpressed by Ctrl-C."""
 
 from __future__ import annotations

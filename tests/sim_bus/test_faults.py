@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Faults on purpose: each kind does what its file says, the same for the same seed."""
 
 from __future__ import annotations

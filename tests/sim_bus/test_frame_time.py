@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Frame lengths against a bit-by-bit frame builder written from the standard, and the figures of the references."""
 
 import random

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The node over the simulated machine: trips, aborts, recordings and averages that only the kernel can produce."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Same seed, same frames and same trace bytes: twice, in fresh processes, on other Python versions."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``pmsmtool sim serve``: another process, the wall clock, several programs, the socketcand protocol to the letter."""
 
 from __future__ import annotations

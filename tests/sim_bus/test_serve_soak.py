@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A small part of ``benchmarks/serve_soak.py``: clients that vanish leave nothing behind, a flood delays nobody."""
 
 from __future__ import annotations

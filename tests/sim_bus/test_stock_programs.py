@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Stock python-can and canopen programs on the simulated bus: no line of pmsmtool on their side."""
 
 from __future__ import annotations

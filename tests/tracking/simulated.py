@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A machine that warms up while it runs, recorded by the kernel: what the tracking filter is judged on."""
 
 from __future__ import annotations

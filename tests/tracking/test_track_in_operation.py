@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A served drive that runs by itself (``sim serve --scenario operation``), for a person who wants to try ``track``."""
 
 from __future__ import annotations

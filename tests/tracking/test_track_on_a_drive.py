@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``track`` on a simulated drive in operation, by process data and by recordings; replay; the command line."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The tracking filter on a machine that warms up: errors, coverage, and every refusal."""
 
 from __future__ import annotations

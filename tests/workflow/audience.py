@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Who a chain talks to in tests: a person who agrees, and a progress that shows nothing."""
 
 from __future__ import annotations

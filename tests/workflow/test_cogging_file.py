@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Cogging as values and as a table over the encoder's angle."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The chain without identification: from an identified machine to a drive that is proven, and every way out."""
 
 from __future__ import annotations

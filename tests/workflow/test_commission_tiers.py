@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The chain on drives of every tier and mapped family: partial, and each stage that did not run with its reason."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The gate before anything is written: what contradicts, what a data sheet may be off, what stays unchecked."""
 
 from __future__ import annotations

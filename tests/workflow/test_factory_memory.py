@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A commissioning of a simulated drive starts from factory memory, unless the channel names a memory file."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``identify map`` over CANopen: a free rotor through the whole chain, a held one with the measured machine."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``identify frf`` over CANopen on an elastic shaft: its closed form, the notch of ``tune``, and the replay."""
 
 from __future__ import annotations

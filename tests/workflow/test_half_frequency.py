@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """R at half the control frequency on simulated drives: what it gives, and that every way out puts it back."""
 
 from __future__ import annotations

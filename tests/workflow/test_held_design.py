@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A design as a drive will hold it: what is judged is what is written, and nothing else is judged."""
 
 from __future__ import annotations

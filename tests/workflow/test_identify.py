@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Identification as a program sees it: Ctrl-C at any moment, the request and its record, the square wave's bias."""
 
 from __future__ import annotations

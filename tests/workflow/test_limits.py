@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the experiments may use must leave something."""
 
 from __future__ import annotations

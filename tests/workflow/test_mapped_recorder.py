@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Recorded pushes through a maker's trace: only where a map of the drive's own identity names all that they need."""
 
 from __future__ import annotations

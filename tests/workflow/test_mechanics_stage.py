@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Inertia and friction of simulated drives over frames: one with much reluctance torque, and one that saturates."""
 
 from __future__ import annotations

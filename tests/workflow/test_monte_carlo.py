@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Margins by simulation: the same bytes whoever works, and what is judged."""
 
 from __future__ import annotations

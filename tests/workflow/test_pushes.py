@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The pushes that tell flux and inertia roughly, on a drive whose current comes late: a large dead time holds it up."""
 
 from __future__ import annotations

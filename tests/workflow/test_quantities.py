@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Each quantity its own verdict: what one refusal leaves, live, in the chain and in a replay."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Random drives follow from their seed, are valid machine files, and stay inside the declared ranges."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Recorded pushes on the two shipped machines whose current leaves its reference at speed: planned within the envelope.
 
 Their d current was kicked to 1.3 and 1.7 times the envelope's largest current, which ended in a trip of the drive and

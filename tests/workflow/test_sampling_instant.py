@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Sampling instant and sensor lag that nobody told: R, L and psi_f of a whole identification over CANopen."""
 
 from functools import cache

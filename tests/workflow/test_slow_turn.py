@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The rotor on a slowly turning vector: what it swings by, on a mass that only friction damps, and on a whole drive."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The current loop of the flux run against an inverter whose error is large beside the winding's voltage."""
 
 import math

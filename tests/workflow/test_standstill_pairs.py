@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The windows of the three phase pairs, on a drive whose current comes to its set-point late."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``identify --replay`` on runs of the lower tiers: the same numbers from the stored traces, and others where asked."""
 
 from __future__ import annotations

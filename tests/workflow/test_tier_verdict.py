@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Without injection a value is judged by what its interval costs the design, and each quantity by itself."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """`commission` on a drive that identifies its machine by itself: what is measured, taken over and refused."""
 
 from __future__ import annotations

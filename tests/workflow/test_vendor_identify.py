@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Identification by the drive itself: started, watched, read, restored; on OS commands and on a mode of its own."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A winding that is not at the reference temperature: R is accepted, at the temperature of the test and at T_ref."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Simulated drives that identify their machine by themselves, and maps that say how."""
 
 from __future__ import annotations

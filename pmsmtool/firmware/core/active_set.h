@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Exact projection in steps: rows can be added to what is solved already. Internal to the core. */
 #ifndef PMSM_ACTIVE_SET_H
 #define PMSM_ACTIVE_SET_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Current controller: PI with decoupling, emf feed-forward and realizable-reference anti-windup.
  *
  *   u_d = K_p e_d + x_d - omega_e L_q i_q          e = reference - i

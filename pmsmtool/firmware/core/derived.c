@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Constants of the active parameter set. */
 #include "pmsm_period.h"
 

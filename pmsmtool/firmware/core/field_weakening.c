@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Field weakening as an optimisation, Jercic et al. 2017, section 4:
  *
  *   minimise h1 (T* - T(x))^2 + h2 (i_d - i_dLM)^2   subject to |v(x)| <= V_m, |x| <= I_m               (43), (44)

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Reference governor (Jercic, Iles, Zarko, Matusko, Automatika 58:4 (2017) 439-449, DOI 10.1080/00051144.2018.1453441).
  *
  * The governed reference v is the nearest to the request r for which the demanded voltage stays inside its limit, now

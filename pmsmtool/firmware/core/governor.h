@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The governor's parts: rows of a period, solvers on them, observer. Internal to the core. */
 #ifndef PMSM_GOVERNOR_H
 #define PMSM_GOVERNOR_H

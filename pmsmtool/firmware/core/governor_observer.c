@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* What the governor knows of the voltage beside the model: a first-order filter of what acted over the last period.
  *
  * While the current moves fast a wrong inductance looks like a lost voltage: the filter then holds. A jump of the speed

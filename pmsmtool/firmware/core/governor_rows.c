@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The governor's rows |M_j v + c_j| <= V_j: voltage now, predicted, in the steady state; current. */
 #include "governor.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Solvers on the governor's rows: exact, linearised, line search. */
 #include "active_set.h"
 #include "governor.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Exact projection on intersections of half planes in the plane, by the same exchange as for ellipses. */
 #include "active_set.h"
 

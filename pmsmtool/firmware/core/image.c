@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* The packed parameter image: check, take, give. Byte order is handled here, so any target may be used. */
 #include "pmsm_image.h"
 #include "pmsm_modes.h"

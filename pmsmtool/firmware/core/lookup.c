@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Currents of a torque from the tables behind the parameters: linear in each axis, clamped at the ends. */
 #include "pmsm_period.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Minimum-time direction: steer the stator flux straight to where the target will be.
  *
  * With the flux a now and b at the target (rotor frame), the stator sees the way m(T) = e^(j w T) b - a + D T, D the

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* From a voltage demand to duty ratios: limit, delay-compensating angle, zero sequence, legs, and what came of it. */
 #include "pmsm_period.h"
 

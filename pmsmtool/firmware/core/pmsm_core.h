@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* One PWM period of the drive's control: pmsm_step().
  *
  * Order inside a period: transform the sampled currents, (every N_fw) field weakening or look-up,

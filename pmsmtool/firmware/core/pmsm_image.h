@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Check, take and give the packed parameter image (the bytes of object 0x2001). */
 #ifndef PMSM_IMAGE_H
 #define PMSM_IMAGE_H

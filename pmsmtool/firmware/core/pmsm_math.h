@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Arithmetic of the core: square root, sine and cosine, small vector helpers. Internal.
  *
  * Nothing here needs a libm: the square root is the correctly rounded machine instruction, sine and cosine are

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Meaning of the mode and option members of pmsm_params. */
 #ifndef PMSM_MODES_H
 #define PMSM_MODES_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* What the parts of one period hand to each other. Internal to the core.
  *
  * step.c fills it, reference.c and governor.c turn a request into a reference, current.c (or polar.c) into a voltage,

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Nearest point of a plane to the intersection of ellipses |M v + c| <= V: what the reference governor and the field
  * weakening solve. Every loop is bounded; nothing is allocated.
  */

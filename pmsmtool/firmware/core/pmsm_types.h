@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Types and build switches of the control core.
  *
  * The core is what a drive runs at every PWM period: portable C99, no allocation, no libm but the

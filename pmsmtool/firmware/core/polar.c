@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Current control with voltage amplitude and phase as inputs, selected by polar.mode (Miyajima, Fujimoto, Fujitsuna:
  * current control method with control inputs in polar coordinates for SPMSM based on linearized model).
  *

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Parts of the polar-coordinate laws. Internal. Voltage v = (-V_a sin(delta), V_a cos(delta)). */
 #ifndef PMSM_POLAR_H
 #define PMSM_POLAR_H

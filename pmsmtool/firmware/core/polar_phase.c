@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Voltage phase (and amplitude) control of Miyajima, Fujimoto, Fujitsuna: PID controllers that place the poles of the
  * model linearised at the present equilibrium, rescheduled every period. Derivation: the linearised plant is
  * (n1 s + n0)/(s^2 + 2 alpha s + alpha^2 + omega^2), the target (s^2 + 2 sigma s + m)^2 with m = alpha^2 + omega^2: two

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Law 6: state feedback to the equilibrium that holds the reference, with a disturbance observer. One law from
  * standstill to deep field weakening, for both signs of speed and torque, for L_d = L_q and L_d != L_q; there is no
  * integrator.

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Exact projection on intersections of ellipses in the plane.
  *
  * At the optimum at most two rows are active (an LP-type problem of dimension 2), so rows are exchanged one at a time.

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* From what is asked for (speed, torque) to a current request, within the current the machine may carry. */
 #include "pmsm_period.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* One PWM period. */
 #include "pmsm_period.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Reference governor in Q4.27, see the header. A product of two Q27 numbers is Q54; squares are compared as Q54. */
 #include "pmsm_governor_q.h"
 

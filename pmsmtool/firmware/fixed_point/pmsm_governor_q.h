@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT */
 /* Reference governor in fixed point, for processors without floating point: line search with offset-free rows.
  *
  * Every quantity is Q4.27 of its base value (currents of I_base, voltages of U_base, electrical speed of omega_base);

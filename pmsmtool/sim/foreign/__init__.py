@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: MIT
 """Simulated drives of other makers, from their EDS or DCF; their unit decoding is their own."""

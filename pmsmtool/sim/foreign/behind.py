@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What stands behind a foreign drive's objects: the simulated power drive and its machine, in SI and peak values."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A simulated drive with the object dictionary of a maker's file, over plant and CANopen server of ``sim/node``.
 
 Objects that the file lacks do not exist. Objects with a law (``families``, ``laws``) show and command the simulated

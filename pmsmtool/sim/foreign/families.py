@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The makers' own objects, family by family: recognised by what the file has, each law with its source or ``assumed``.
 
 Where no public source says whether a current is peak or rms, one reading is taken and marked ``assumed``; the tool must

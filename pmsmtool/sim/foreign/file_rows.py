@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The objects of a maker's drive as its file lists them: an EDS, a DCF, or a table of such rows.
 
 What the file lacks does not exist on the simulated drive. Added is only what CiA 301 and CiA 402 make mandatory for the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Node guarding of a simulated drive: the remote frame it answers, and life guarding (CiA 301, 7.2.8.2.2.1)."""
 
 from __future__ import annotations

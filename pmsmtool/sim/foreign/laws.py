@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the objects of a maker's drive mean to the machine behind them: unit, set-up value, what is shown, what acts.
 
 This is the simulated drive's own decoding. It shares nothing with the drive maps of the tool, so that a map with a

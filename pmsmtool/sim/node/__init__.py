@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: MIT
 """The simulated drive's communication half: object dictionary, SDO server, state machines, memory."""

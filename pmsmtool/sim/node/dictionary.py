@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The object dictionary at run time: typed entries with range checks, and hooks of the application behind them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the CANopen node needs from the simulated drive's application (``pmsmtool/sim/drive.h``).
 
 The node decides when something may happen and speaks CANopen; everything that happens every control period (control

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The simulated drive's electronic data sheet (CiA 306-1), generated from its object table and the catalogue.
 
 ``python -m pmsmtool.sim.node.eds`` rewrites ``firmware-params/pmsmsim/pmsmsim.eds`` and, beside it, ``map.toml``, the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Emergency messages, error register and error history (CiA 301: 7.2.7, objects 0x1001, 0x1003, 0x1014, 0x1015)."""
 
 from __future__ import annotations

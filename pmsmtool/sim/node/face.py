@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a simulated drive needs of the dictionary that it shows instead of its own."""
 
 from __future__ import annotations

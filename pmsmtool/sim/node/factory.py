@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the simulated drive leaves its factory with: ratings of its inverter, and harmless controller gains.
 
 Nothing here tells the tool about the machine: motor data are the catalogue's defaults, except what is written on the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The same simulated drive behind the object dictionary of another family: scaled integers, quantised gains.
 
 A face hides the reference drive's own objects and shows those a drive map names (``firmware-params/<family>``). What

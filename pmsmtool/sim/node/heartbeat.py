@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Heartbeat producer and consumer (CiA 301: 7.2.8.2.2, objects 0x1016 and 0x1017)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """LSS slave: node id over the bus (CiA 305): switching, configuration, inquiry, identification, fastscan."""
 
 from __future__ import annotations

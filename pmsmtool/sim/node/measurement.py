@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Excitation, trace recorder, window averages and live values of the node (objects 0x2050 to 0x2070).
 
 The node checks and translates; what happens every control period is the core's. Trace channels, the trigger source

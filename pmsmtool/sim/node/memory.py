@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Non-volatile memory of the simulated drive: two slots, written page by page, never torn.
 
 A store goes into the slot that does not hold the newest valid content: its header is erased, the pages are written,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The monitor of a simulated Novanta/Ingenia drive: its objects over the recorder of the drive behind.
 
 Rows are REAL32 in the family's units. Reading the data register takes a block of 512 bytes out of the memory, whether

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The simulated drive as hardware on the line: power, reset, identity, memory, and its machine running behind it."""
 
 from __future__ import annotations

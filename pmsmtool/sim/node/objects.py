@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The rows of the simulated drive's object dictionary: its own table plus the parameter catalogue.
 
 ``firmware-params/pmsmsim/objects.csv`` holds everything that is not a parameter; every row of ``params/catalogue.py``

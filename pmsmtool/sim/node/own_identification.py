@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A simulated drive's own identification behind the objects that its map names: OS commands, or a mode of its own.
 
 What is measured, and how, stands in ``own_measurements``. Here it is started, told how far it is, given up when the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a simulated drive measures by itself: simple methods of its own, with their own errors, taking their time.
 
 Each measurement is a generator that yields how long it waits (s) while the machine moves, and returns its result. The

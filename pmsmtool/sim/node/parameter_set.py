@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The drive's parameter set: active values, a staging copy, and the commands between them (objects 0x2000, 0x2001).
 
 While a set is staged, writes to the parameters, the look-up DOMAINs and the image go to the staging copy and are read

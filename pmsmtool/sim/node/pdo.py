@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Process data objects of the node: four each way, freely mapped (CiA 301: 7.2.2, 7.5.2.35 to 7.5.2.38)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The CiA 402 power drive system of the node: state machine, modes, references, reactions.
 
 Torque values travel in permille of the rated torque 0x6076 (mN m), currents in permille of the rated current 0x6075

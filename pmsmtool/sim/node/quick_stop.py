@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """How the simulated drive comes to rest: quick stop and fault reaction with a ramp.
 
 In the speed and torque modes the machine is braked: by the ramp 0x6085 where the speed controller is tuned and the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the simulated makers' recorders have in common: registers, and the recorder of the drive behind them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The data recorder of a simulated maxon EPOS2 drive: a ring of words per variable, at a period of its own.
 
 Its period is counted in the map's unit and need not be a multiple of the control period: a sample is what the drive

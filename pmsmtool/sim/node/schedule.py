@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The node's share of the bus clock: everything it planned is forgotten at a reset."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The node's SDO server: expedited, segmented and block transfers, both ways (CiA 301, 7.2.4).
 
 Written apart from every client, so that the two cannot share a mistake. Differences to common servers, on purpose:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Everything of the node that a reset forgets: one session lasts from boot-up to the next reset."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Storing and restoring: objects 0x1010 and 0x1011 over the non-volatile memory.
 
 What is stored is a list of (object, bytes): communication, application (CiA 402) and parameter set can be stored and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The trace of a simulated Copley amplifier: numbered variables, rows of 32-bit counts.
 
 It runs until its memory is full or it is stopped. Data read while it runs are torn: the row being written is half old.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The position of a drive that is no reference drive: a record does not change it.
 
 The reference drive takes whole turns off its angle when a record begins, so that binary32 resolves it. A face over it

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What may be wrong with a drive: what a failed proof is explained by, and what each changes in simulation."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The planned experiments on the machine: recorded by the drive, within the guard.
 
 A record counts only if it begins at its speed. A machine that does not get there, or does not stay, ends the proof by

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Which experiments prove a design, and how large: sized from the design, the drive's conditions and the envelope."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The Monte Carlo prediction: the drive's own firmware on machines drawn from their intervals.
 
 What varies: the machine's parameters (statistical and systematic part; a machine that saturates has its flux map scaled

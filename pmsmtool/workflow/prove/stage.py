@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``prove``: refuse a drive that holds another set, predict, commit, measure, compare; everything in a run directory.
 
 The prediction is written, synced to the disk and named by its hash before the first step. Traces and prediction stay

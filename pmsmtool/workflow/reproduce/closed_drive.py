@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The governor of a closed drive on a simulated node of the standard tier: what it promises, and what it costs."""
 
 from __future__ import annotations

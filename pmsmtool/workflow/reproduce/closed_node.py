@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A simulated drive of the standard tier under a torque that its master asks for, while a load machine sets the speed.
 
 The node is operated through its object dictionary, what it did is read from the simulation itself.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Figure 10 of Jercic et al. 2017: a step of i_q under a voltage limit, by the paper's governor and by others."""
 
 from __future__ import annotations

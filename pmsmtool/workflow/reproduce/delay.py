@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A period of computation delay: what the one-step predictor makes of it, on the model and on other plants."""
 
 from __future__ import annotations

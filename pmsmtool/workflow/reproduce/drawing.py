@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A reproduction as a figure and as files. matplotlib is imported when something is drawn."""
 
 from __future__ import annotations

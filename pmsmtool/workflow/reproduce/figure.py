@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What a reproduced figure or table is: tables, checked numbers and panels, without a word about how they are shown.
 
 A figure is a function ``(seed: int, ...) -> Reproduction`` with its own keyword arguments for smaller sizes; a row of

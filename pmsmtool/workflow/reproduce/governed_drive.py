@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The machine of Jercic et al. 2017 under different current control laws, at equal bandwidth, delay and voltage limit.
 
 Every law is what ``tune`` makes of the profile ``jercic-2017`` for a bandwidth and a governor mode; the simulated plant

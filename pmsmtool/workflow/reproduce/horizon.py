@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The horizon k_max of Jercic et al. 2017, (28)-(30), which the paper does not state; and its matrices (15)-(27)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """At and beyond the linear modulation limit: overmodulation up to six-step, and torque that no voltage can hold."""
 
 from __future__ import annotations

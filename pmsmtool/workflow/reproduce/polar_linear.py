@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Figs 7 to 10 of Miyajima et al. 2013: linear range at 0 and 400 rpm, without and with noise; the improved laws."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """What the polar-coordinate figures measure in a response; power-invariant amperes as in the paper."""
 
 from __future__ import annotations

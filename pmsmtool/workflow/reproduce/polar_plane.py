@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Over speed and torque: equilibria, conditioning and controllability, stability of the true loop, gain schedules."""
 
 from __future__ import annotations

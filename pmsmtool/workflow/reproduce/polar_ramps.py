@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Transitions between linear range and field weakening: torque and speed ramps, every law beside the baselines."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Laws on a machine with L_d != L_q: the paper's are refused, the improved ones tested beside the baselines."""
 
 from __future__ import annotations

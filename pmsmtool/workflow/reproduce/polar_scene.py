@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Machine, controllers and runs of the polar-coordinate figures; every run is one call of the compiled closed loop.
 
 The paper counts power-invariantly: its amperes and volts are sqrt(3/2) times the peak values of the drive. Everything

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Figs 2 to 5 of Miyajima et al. 2013: torque steps 1 -> 4.5 -> 1 N m at 800 rpm, and the same for every other law."""
 
 from __future__ import annotations

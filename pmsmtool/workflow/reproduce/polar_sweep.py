@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The unified law over six speeds, four loads and random machines, with the baselines in the same runs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Random current steps of the machine of Jercic et al. 2017 and what a law makes of them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Random current steps: reachable ones against minimum time, unreachable ones, a plant that is not the model."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The figures ``pmsmtool reproduce`` knows. To add one: write its function in a module here and add a row.
 
 A row is all that ``--list`` reads; the module is imported when its figure is asked for.

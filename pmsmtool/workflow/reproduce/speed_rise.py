@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A speed that rises under a held current reference, without field weakening: what the governor is really for."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Settling, overshoot, and paired differences with bootstrap intervals."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Field weakening of Jercic et al. 2017: Table 2 with figure 11, the sweep of figure 12, and the ramps N_FW allows."""
 
 from __future__ import annotations
