@@ -49,7 +49,8 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, evaluate
-from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of
+from pmsmtool.workflow.identify import envelope_of, nameplate_of
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.limits import Limits
 from pmsmtool.workflow.measure import Measurement
 from pmsmtool.workflow.random_drives import draw_around, draw_drive, true_loop_resistance

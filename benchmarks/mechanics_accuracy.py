@@ -40,7 +40,8 @@ from pmsmtool.machine.machine_file import dump_machine_file
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import evaluate
-from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of
+from pmsmtool.workflow.identify import envelope_of, nameplate_of
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.limits import Limits
 from pmsmtool.workflow.measure import Measurement
 from pmsmtool.workflow.random_drives import draw_drive

@@ -46,7 +46,8 @@ from pmsmtool.sim.drive_kernel import KernelCore
 from pmsmtool.sim.kernel import Params
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.workflow.commission import begin_run
-from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplate_of
+from pmsmtool.workflow.identify import identify_stage, nameplate_of
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.prove import stage as proving
 from pmsmtool.workflow.prove.simulated import predict_proof
 from pmsmtool.workflow.random_drives import draw_drive

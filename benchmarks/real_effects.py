@@ -28,8 +28,8 @@ from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
-from pmsmtool.workflow.identify import MACHINE, replay
 from pmsmtool.workflow.random_drives import draw_drive
+from pmsmtool.workflow.replay import MACHINE, replay
 from pmsmtool.workflow.run_directory import RunDirectory
 
 BASES = ("interior-2k2", "fast-ipm", "random-7", "random-12")

@@ -167,7 +167,7 @@ def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDr
 
 
 def _kept_nameplate(run: RunDirectory) -> Path | None:
-    from pmsmtool.workflow.identify import NAMEPLATE
+    from pmsmtool.workflow.replay import NAMEPLATE
 
     path = run.path / NAMEPLATE
     return path if path.is_file() else None
@@ -180,8 +180,7 @@ def _asked(
     from pmsmtool.design.tune_request import TuneRequest
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.workflow.identify import IdentifyRequest
-    from pmsmtool.workflow.measure import QUANTITIES
+    from pmsmtool.workflow.identify_request import QUANTITIES, IdentifyRequest
 
     wanted = IdentifyRequest(
         quantities=(*QUANTITIES, "map") if flux_map else QUANTITIES,

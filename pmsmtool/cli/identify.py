@@ -19,7 +19,7 @@ from pmsmtool.cli.output import Output
 if TYPE_CHECKING:
     from pmsmtool.cli.consent import Consent
     from pmsmtool.workflow.capabilities import Capabilities
-    from pmsmtool.workflow.identify import IdentifyRequest
+    from pmsmtool.workflow.identify_request import IdentifyRequest
     from pmsmtool.workflow.run_directory import RunDirectory, Stage
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
@@ -101,14 +101,13 @@ def identify_command(
     from pmsmtool.errors import NotAvailable
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.workflow.calibration import calibrated_tolerance
-    from pmsmtool.workflow.identify import IdentifyRequest
-    from pmsmtool.workflow.measure import NEEDS, QUANTITIES
+    from pmsmtool.workflow.identify_request import NEEDS, QUANTITIES, IdentifyRequest
 
     declared = None if sensor_tol is None else SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol)
     if replay is not None:
         if half_frequency:
             raise click.UsageError("--half-frequency measures; with --replay the traces of the run decide")
-        from pmsmtool.workflow.identify import MACHINE, REPLAYED
+        from pmsmtool.workflow.replay import MACHINE, REPLAYED
         from pmsmtool.workflow.run_directory import RunDirectory
         from pmsmtool.workflow.tier_evaluate import replay as recompute
 

@@ -5,15 +5,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 from pmsmtool.errors import SafetyRefusal
 from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.shaft import Brake, Load, Shaft
 from pmsmtool.units import format_current, rpm_from_rad_s
-
-Shaft = Literal["free", "locked", "coupled"]
-Load = Literal["none", "gravity"]
-Brake = Literal["open", "drive", "none"]
 
 OFF_S = 0.5
 """Longest time from a tool that fails to the voltage being off: freshness of a look, one heartbeat period, the drive's

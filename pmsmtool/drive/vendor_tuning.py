@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.sdo import Retry
@@ -29,6 +28,7 @@ from pmsmtool.firmware.vendor_tuning import (
     FAILED_WITH_CODE,
     OS_COMMAND,
     OS_COMMAND_MODE,
+    VendorAnswer,
     VendorStep,
     VendorTuning,
 )
@@ -41,31 +41,6 @@ COMMAND_MODE = DriveObject(OS_COMMAND_MODE, 0, "B")
 
 Wait = Callable[[float], None]
 """Lets time pass; the guard's."""
-
-
-@dataclass(frozen=True, slots=True)
-class VendorAnswer:
-    """What a drive answered to one step.
-
-    Attributes
-    ----------
-    step : str
-        Name of the step.
-    data : bytes
-        Bytes of its results as they came, OS commands with their status in front; empty where there is none.
-    seconds : float
-        Time it took (s).
-    values : dict of str to float
-        Results by catalogue name, SI.
-    relative_to : dict of str to float
-        What they were counted relative to.
-    """
-
-    step: str
-    data: bytes
-    seconds: float
-    values: dict[str, float]
-    relative_to: dict[str, float]
 
 
 class VendorDrive(StandardDrive):

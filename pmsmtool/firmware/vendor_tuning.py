@@ -134,3 +134,28 @@ class VendorTuning:
                 wanted |= set(step.uses)
         chosen = (step for step in self.steps.values() if step.name in wanted or step.name not in self.results)
         return tuple(step for step in chosen if turning or not step.turns)
+
+
+@dataclass(frozen=True, slots=True)
+class VendorAnswer:
+    """What a drive answered to one step.
+
+    Attributes
+    ----------
+    step : str
+        Name of the step.
+    data : bytes
+        Bytes of its results as they came, OS commands with their status in front; empty where there is none.
+    seconds : float
+        Time it took (s).
+    values : dict of str to float
+        Results by catalogue name, SI.
+    relative_to : dict of str to float
+        What they were counted relative to.
+    """
+
+    step: str
+    data: bytes
+    seconds: float
+    values: dict[str, float]
+    relative_to: dict[str, float]

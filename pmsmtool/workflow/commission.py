@@ -40,7 +40,8 @@ from pmsmtool.workflow.compared_stage import check_accepted, compared, refusal
 from pmsmtool.workflow.contradiction import DATA_SHEET
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
-from pmsmtool.workflow.identify import IdentifyRequest, identify_stage, nameplate_of
+from pmsmtool.workflow.identify import identify_stage, nameplate_of
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.prove.stage import ProofRequest, not_proven, prove_stage
 from pmsmtool.workflow.rated_limits import within_ratings
 from pmsmtool.workflow.report_page import report_page

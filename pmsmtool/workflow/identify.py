@@ -1,114 +1,48 @@
 # SPDX-License-Identifier: MIT
-"""Identify the machine on a drive: envelope and consent, the experiments, and the machine file from their traces.
+"""Identify the machine on a drive: envelope and consent, then the experiments, whose traces go into a run.
 
-What the estimates are is decided from the stored traces alone (``evaluate``), so that :func:`replay` gives the same
-bytes years later. Nothing is stored in the drive.
+What the estimates are is decided from the stored traces alone (``replay``). Nothing is stored in the drive.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import json
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft, largest_acceleration
+from pmsmtool.drive.envelope import Envelope, largest_acceleration
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
-from pmsmtool.errors import ConfigError, DriveFault, IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal
-from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.estimators.resistance import copper_of
+from pmsmtool.errors import ConfigError, DriveFault, IdentificationError, PmsmtoolError, SafetyRefusal
 from pmsmtool.experiments.rotation import dwell_within
-from pmsmtool.files import read_text
-from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, MachineLimits, MachineParameters
-from pmsmtool.machine.temperature import magnet_tolerance_per_k
 from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace, trace_npz
+from pmsmtool.trace_file import trace_npz
 from pmsmtool.units import rad_s_from_rpm
-from pmsmtool.workflow import frequency_stage, half_frequency, identify_verdict, map_stage, mechanics_stage
-from pmsmtool.workflow.calibration import calibrated_tolerance
-from pmsmtool.workflow.cogging_file import cogging_estimates, save_cogging
-from pmsmtool.workflow.evaluate import evaluate
-from pmsmtool.workflow.identified_machine import machine_of
+from pmsmtool.workflow import (
+    frequency_measure,
+    half_frequency_measure,
+    map_measure,
+    map_stage,
+    mechanics_measure,
+)
+from pmsmtool.workflow.identify_request import (
+    REQUEST,
+    IdentifyRequest,
+    dump_request,
+    steps_of,
+)
 from pmsmtool.workflow.limits import HEADROOM, Limits, require_speed, unused_current
-from pmsmtool.workflow.measure import NEEDS, QUANTITIES, Measurement, starting_gains, steps_of
+from pmsmtool.workflow.measure import Measurement, starting_gains
 from pmsmtool.workflow.predicted_file import PREDICTED, dump_predicted
-from pmsmtool.workflow.refused_file import REFUSED, dump_refused, refused_in
+from pmsmtool.workflow.refused_file import REFUSED, dump_refused
+from pmsmtool.workflow.replay import NAMEPLATE, evaluated_stage
 from pmsmtool.workflow.run_account import status_of, text_of
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
-from pmsmtool.workflow.sampling_stage import timing_estimates, with_timing
-from pmsmtool.workflow.verdicts import verdicts_of
-
-MACHINE = "machine.toml"
-NAMEPLATE = "nameplate.toml"
-REQUEST = "request.json"
-"""What was asked, as far as the estimates depend on it: a replay is to give the same bytes."""
-REPLAYED = "replayed"
-"""Folder of a run for what a replay makes of it once a design stands on its machine file."""
-_MADE_FROM_MACHINE = ("design.toml", "params.toml")
-
-
-@dataclass(frozen=True, slots=True)
-class IdentifyRequest:
-    """What is asked, and what the machine may do meanwhile; None leaves the choice to the drive's own ratings.
-
-    Attributes
-    ----------
-    quantities : tuple of str
-        Out of ``R L psi encoder poles inverter mechanics map frf``.
-    i_max_apk, speed_max_rad_s : float or None
-        Envelope (A peak, rad/s mechanical).
-    shaft, load, brake : str
-        What hangs on the shaft and may happen to it.
-    half_frequency : bool
-        Whether R and inverter are measured at half the control frequency, too.
-    map_if_saturated : bool
-        Whether a machine that the run over speeds shows to saturate is mapped, too.
-    tolerance : SensorTolerance
-        Declared sensor tolerances.
-    """
-
-    quantities: tuple[str, ...] = QUANTITIES
-    i_max_apk: float | None = None
-    speed_max_rad_s: float | None = None
-    shaft: Shaft = "free"
-    load: Load = "none"
-    brake: Brake = "none"
-    half_frequency: bool = False
-    map_if_saturated: bool = False
-    tolerance: SensorTolerance = field(default_factory=SensorTolerance)
-
-    def check(self) -> None:
-        """Refuse what cannot be asked.
-
-        Raises
-        ------
-        ConfigError
-            An unknown quantity.
-        NotAvailable
-            A quantity that needs a turning shaft, on a shaft that must not turn.
-        """
-        unknown = [name for name in self.quantities if name not in NEEDS]
-        if unknown or not self.quantities:
-            raise ConfigError(
-                f"cannot identify {', '.join(unknown) or 'nothing'}", hint=f"choose from {', '.join(NEEDS)}, or all"
-            )
-        if self.half_frequency and self.quantities == ("poles",):
-            raise ConfigError(
-                "pole pairs alone do not measure R", hint="leave --half-frequency out, or identify R, too"
-            )
-        turning = [name for name in self.quantities if name != "map" and set(NEEDS[name]) & {"rotation", "speeds"}]
-        if turning and self.shaft == "locked":
-            raise NotAvailable(
-                f"{', '.join(turning)} cannot be identified on a locked shaft: the rotor must turn",
-                hint="free the shaft, or identify R, inverter and map only",
-            )
 
 
 def nameplate_of(drive: Drive, name: str) -> MachineFile:
@@ -191,17 +125,17 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
     allowed = [*envelope.lines(), *unused_current(envelope.i_max_apk, nameplate, pulses="map" in steps)]
     lines = [*allowed, f"the rotor aligns with current vectors: it may jump by half an electrical turn; {HOMING_LOST}"]
     if request.half_frequency:
-        lines.append(half_frequency.PLAN_LINE)
+        lines.append(half_frequency_measure.PLAN_LINE)
     if "rotation" in steps:
         lines.append("the shaft turns slowly through one turn each way")
     if "speeds" in steps:
         lines.append("the shaft is pushed both ways and coasts with current from four speeds in each direction")
     if "coasting" in steps:
-        lines.append(mechanics_stage.PLAN_LINE)
+        lines.append(mechanics_measure.PLAN_LINE)
     if "response" in steps:
-        lines.append(frequency_stage.PLAN_LINE)
+        lines.append(frequency_measure.PLAN_LINE)
     if "map" in steps:
-        lines += map_stage.plan_lines(nameplate)
+        lines += map_measure.plan_lines(nameplate)
     elif request.map_if_saturated and "speeds" in steps:
         lines.append(map_stage.IF_SATURATED)
     lines.append("nothing is stored in the drive; every changed object is restored")
@@ -297,176 +231,3 @@ def _measure(
         finally:
             if measurement.refused:
                 run.save(REFUSED, dump_refused(measurement.refused))
-
-
-def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: IdentifyRequest) -> Stage:
-    """Estimate from the stored traces, write ``machine.toml``, and judge every value.
-
-    Where a design or a parameter set was already made from the machine file, another one does not take its place: it
-    goes into the folder ``replayed``, with the map and the response that belong to it.
-
-    Raises
-    ------
-    IdentificationError
-        A trap was seen; no machine file is written.
-    """
-    traces = stored_traces(run)
-    evaluation = evaluate(
-        traces,
-        nameplate.inverter.T_s,
-        copper=copper_of(nameplate.machine),
-        alpha_psi_per_k=nameplate.machine.alpha_psi_per_k,
-        U_dc_v=nameplate.inverter.U_dc_v,
-        tolerance=replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(nameplate.machine)),
-        ended=refused_in(run),
-    )
-    parts = half_frequency.split_estimates(evaluation.split, nameplate.inverter.U_dc_v, request.tolerance)
-    timing = timing_estimates(evaluation.inductance, evaluation.shown, request.tolerance)
-    conditions = identify_verdict.conditions_of(evaluation, request) | half_frequency.split_conditions(
-        evaluation.split, parts
-    )
-    found = evaluation.estimates()
-    designed = machine_of(evaluation, nameplate, conditions)
-    acceptance = identify_verdict.acceptance_of(evaluation, found, designed, request.quantities)
-    had = identify_verdict.had_of(evaluation)
-    verdicts = verdicts_of(request.quantities, evaluation.refused, had, acceptance)
-    if not verdicts.accepted:
-        evaluation.whole()
-    rejected = {key for key, line in acceptance.items() if not line.ok}
-    kept = evaluation if "flux map" not in rejected else replace(evaluation, flux_map=None, map_estimates={})
-    machine = machine_of(kept, nameplate, conditions, rejected)
-    machine = with_timing(machine, timing)
-    text = dump_machine_file(machine)
-    files = {}
-    if verdicts.accepted:
-        target, prefix = place_of(run, text)
-        made = map_stage.save_map(target, kept.flux_map)
-        made |= frequency_stage.save_response(target, kept.frequency_response)
-        if kept.encoder is not None:
-            made |= save_cogging(target, kept.mechanics, kept.encoder.direction)
-        target.save(MACHINE, text)
-        files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
-    files |= {name: "" for name in (PREDICTED, REFUSED) if (run.path / name).is_file()}
-    fallen = [f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback]
-    facts = [
-        {**identify_verdict.value_facts(name, estimate), "accepted": name not in rejected}
-        for name, estimate in (found | parts | timing | cogging_estimates(kept.mechanics)).items()
-    ]
-    summary = identify_verdict.summary_of(kept, {name: e for name, e in found.items() if name not in rejected})
-    return Stage(
-        "identify",
-        verdicts.status,
-        0.0,
-        values=[*facts, *map(identify_verdict.check_facts, evaluation.checks)],
-        # what is refused is no criterion of the values that go on
-        acceptance=[line for line in acceptance.values() if line.ok or verdicts.status == "fail"],
-        fallbacks=[*verdicts.lines(), *fallen],
-        files={**files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
-        note="; ".join(identify_verdict.warnings_of(evaluation, request)),
-        summary="; ".join(filter(None, (summary, *(f"{name} refused" for name in verdicts.refused)))),
-        refused=dict(verdicts.refused),
-    )
-
-
-def place_of(run: RunDirectory, text: str) -> tuple[RunDirectory, str]:
-    """Return where a machine file goes, and the beginning of its name in the run: beside one a design was made from."""
-    return (run, "") if _may_write(run, text) else (_beside(run), f"{REPLAYED}/")
-
-
-def _may_write(run: RunDirectory, text: str) -> bool:
-    """Whether a machine file may stand in the run: nothing was made from it yet, or it is the one that was used."""
-    if not any((run.path / name).is_file() for name in _MADE_FROM_MACHINE):
-        return True
-    recorded = run.read().stage("identify")
-    used = run.sha256(MACHINE) if (run.path / MACHINE).is_file() else recorded and recorded.files.get(MACHINE)
-    return hashlib.sha256(text.encode()).hexdigest() == used
-
-
-def _beside(run: RunDirectory) -> RunDirectory:
-    folder = run.path / REPLAYED
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be made: {error.strerror or error}",
-            where=str(folder),
-            hint="check your rights there and the space on the disk",
-        ) from error
-    return RunDirectory(folder)
-
-
-def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibration: Sequence[str] = ()) -> Stage:
-    """Recompute every estimate of a run from its traces.
-
-    Parameters
-    ----------
-    run : RunDirectory
-        Of ``identify`` or ``commission``. When the machine file becomes another one, the stage is recorded anew; a run
-        with a design keeps its own and its record, and the other one goes beside it (:data:`REPLAYED`).
-    tolerance : SensorTolerance, optional
-        Replaces the sensor tolerances that the run was made with.
-    calibration : sequence of str
-        Scales against an instrument (``workflow/calibration.py``).
-
-    Raises
-    ------
-    ConfigError
-        The run has no nameplate, no record of what was asked, or no traces.
-    IdentificationError
-        A trap is seen in the traces.
-    """
-    request = asked_again(run, (NAMEPLATE, REQUEST), tolerance, calibration)
-    recorded = run.read().stage("identify")
-    stage = evaluated_stage(run, load_machine_file(run.path / NAMEPLATE), request)
-    if recorded is not None and MACHINE in stage.files and recorded.files.get(MACHINE) != run.sha256(MACHINE):
-        run.save(REQUEST, dump_request(request))
-        run.add(replace(stage, seconds=recorded.seconds))
-    return stage
-
-
-def asked_again(
-    run: RunDirectory, needed: Sequence[str], tolerance: SensorTolerance | None, calibration: Sequence[str]
-) -> IdentifyRequest:
-    """Return what a run was asked, with the tolerances of its replay; refuse a run without the files this needs."""
-    for name in needed:
-        if not (run.path / name).is_file():
-            raise ConfigError(f"the run has no {name}", where=str(run.path), hint="it is not a run of identify")
-    request = parse_request(read_text(run.path / REQUEST), where=str(run.path / REQUEST))
-    if tolerance is not None:
-        request = replace(request, tolerance=tolerance)
-    return replace(request, tolerance=calibrated_tolerance(request.tolerance, calibration))
-
-
-def dump_request(request: IdentifyRequest) -> str:
-    """Return a request as JSON: what an estimate depends on besides traces and nameplate."""
-    facts = asdict(request)
-    if math.isinf(request.tolerance.U_dc_v):
-        del facts["tolerance"]["U_dc_v"]  # comes from the nameplate, and JSON has no infinity
-    return json.dumps(facts, indent=1) + "\n"
-
-
-def parse_request(text: str, *, where: str) -> IdentifyRequest:
-    """Return the request of a run.
-
-    Raises
-    ------
-    ConfigError
-        It is not what :func:`dump_request` writes.
-    """
-    try:
-        facts = json.loads(text)
-        tolerance = SensorTolerance(**facts.pop("tolerance"))
-        request = IdentifyRequest(tolerance=tolerance, **{**facts, "quantities": tuple(facts["quantities"])})
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ConfigError(
-            f"the recorded request is damaged: {error}",
-            where=where,
-            hint="identify again; or take the file from a copy of the run",
-        ) from error
-    request.check()
-    return request
-
-
-def stored_traces(run: RunDirectory) -> dict[str, Trace]:
-    """Return the traces of a run by name."""
-    return {path.stem: read_trace(path) for path in sorted((run.path / "traces").glob("*.npz"))}

@@ -21,7 +21,7 @@ from pmsmtool.workflow.run_directory import Acceptance
 from pmsmtool.workflow.sampling_stage import timing_warnings
 
 if TYPE_CHECKING:
-    from pmsmtool.workflow.identify import IdentifyRequest
+    from pmsmtool.workflow.identify_request import IdentifyRequest
 
 
 def acceptance_of(

@@ -9,7 +9,7 @@ goes into its parameters, so that its own control fits the machine; the guard pu
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -27,9 +27,10 @@ from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.experiments.vector_turn import RAMP_S
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.trace import Trace
-from pmsmtool.workflow import frequency_stage, map_stage, mechanics_stage, shaft_forecast
+from pmsmtool.workflow import frequency_measure, map_measure, mechanics_measure, shaft_forecast
 from pmsmtool.workflow.evaluate import flux_of, resistance_of, tolerance_on
-from pmsmtool.workflow.half_frequency import measure_at_half_frequency
+from pmsmtool.workflow.half_frequency_measure import measure_at_half_frequency
+from pmsmtool.workflow.identify_request import steps_of
 from pmsmtool.workflow.limits import Limits
 from pmsmtool.workflow.predicted_file import entry
 from pmsmtool.workflow.shaft_forecast import ShaftForecast, forecast_of
@@ -58,29 +59,6 @@ SATURATED = 0.01
 of the saturated profile, below 0.0035 of linear drives, 0.007 to 0.02 beside 5 % of iron loss."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 RIPPLE_SHARE = 0.25
-
-QUANTITIES = ("R", "L", "psi", "encoder", "poles", "inverter", "mechanics")
-"""What is measured unless something is asked for: all that current and speed control need."""
-NEEDS: Mapping[str, tuple[str, ...]] = {
-    "R": ("levels",),
-    "inverter": ("levels",),
-    "poles": ("rotation",),
-    "encoder": ("levels", "rotation", "square", "speeds"),
-    "L": ("levels", "rotation", "square"),
-    "psi": ("levels", "rotation", "square", "speeds"),
-    "mechanics": ("levels", "rotation", "square", "speeds", "coasting"),
-    "map": ("levels", "rotation", "square", "speeds", "map"),
-    "frf": ("levels", "rotation", "square", "speeds", "response"),
-}
-"""Experiments behind each quantity."""
-HELD = ("levels", "map")
-"""Experiments that a held rotor allows."""
-
-
-def steps_of(quantities: Iterable[str], held: bool = False) -> set[str]:
-    """Return the experiments behind quantities; of a held rotor only those that it allows."""
-    steps = {step for quantity in quantities for step in NEEDS[quantity]}
-    return steps & set(HELD) if held else steps
 
 
 _Found = TypeVar("_Found")
@@ -181,7 +159,7 @@ class Measurement:
             known = resistance
             self._attempt(
                 "map",
-                lambda: map_stage.measure_map(self.drive, self.limits, noise, known, self.held, self.keep, self.say),
+                lambda: map_measure.measure_map(self.drive, self.limits, noise, known, self.held, self.keep, self.say),
             )
             if turned and encoder is not None:
                 self.say("flux linkage after the pulses: two windows of the run over speeds once more")
@@ -255,7 +233,7 @@ class Measurement:
 
             self._attempt(
                 "mechanics",
-                lambda: mechanics_stage.measure_mechanics(self.drive, self.limits, self.keep, self.say, pushes),
+                lambda: mechanics_measure.measure_mechanics(self.drive, self.limits, self.keep, self.say, pushes),
             )
             self._tell_spent()
         if "response" in steps:
@@ -270,7 +248,7 @@ class Measurement:
 
             self._attempt(
                 "frf",
-                lambda: frequency_stage.measure_frequency_response(
+                lambda: frequency_measure.measure_frequency_response(
                     self.drive, self.limits, self.keep, self.say, sequence
                 ),
             )

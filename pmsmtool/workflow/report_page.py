@@ -26,8 +26,8 @@ from pmsmtool.report.report import Change, Figure, render
 from pmsmtool.report.verdict import COMPLETE, Verdict, is_simulated, verdict_of
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import Evaluation, evaluate, shots_of
-from pmsmtool.workflow.identify import stored_traces
 from pmsmtool.workflow.prove.stage import read_proof, responses
+from pmsmtool.workflow.replay import stored_traces
 from pmsmtool.workflow.run_account import account_lines
 from pmsmtool.workflow.run_directory import RunDirectory, RunRecord
 

@@ -34,20 +34,14 @@ from pmsmtool.trace_file import read_trace
 from pmsmtool.units import RPM_PER_RAD_S
 from pmsmtool.workflow.calibration import calibrated_traces
 from pmsmtool.workflow.evaluate import tolerance_on
-from pmsmtool.workflow.identify import (
-    MACHINE,
-    NAMEPLATE,
-    REQUEST,
-    IdentifyRequest,
-    asked_again,
-    dump_request,
-    place_of,
-)
-from pmsmtool.workflow.identify import replay as replay_injection
+from pmsmtool.workflow.identify_request import REQUEST, IdentifyRequest, dump_request
 from pmsmtool.workflow.push_limits import not_told, without
+from pmsmtool.workflow.replay import MACHINE, NAMEPLATE, asked_again, place_of
+from pmsmtool.workflow.replay import replay as replay_injection
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 from pmsmtool.workflow.tier_machine import tier_machine
 from pmsmtool.workflow.tier_verdict import TOLD_BY, judged, stage_of
+from pmsmtool.workflow.vendor_machine import ANSWERS
 
 FACTS = "tier.json"
 """What the estimates depend on besides traces, request and nameplate."""
@@ -334,7 +328,7 @@ def evaluated_stage(
 
 
 def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibration: Sequence[str] = ()) -> Stage:
-    """Recompute every estimate of a run from its traces, whatever its tier; as ``workflow.identify.replay``.
+    """Recompute every estimate of a run from its traces, whatever its tier; as ``workflow.replay.replay``.
 
     Raises
     ------
@@ -343,8 +337,6 @@ def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibrat
     IdentificationError
         A trap is seen in the traces.
     """
-    from pmsmtool.workflow.vendor_identify import ANSWERS  # which runs the stage of this module
-
     if (run.path / ANSWERS).is_file():
         raise ConfigError(
             "the run holds what the drive identified by itself: nothing of that can be recomputed",

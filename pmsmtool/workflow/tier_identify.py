@@ -36,7 +36,7 @@ from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
 from pmsmtool.units import RAD_S_PER_RPM
 from pmsmtool.workflow.capabilities import QUANTITIES, Capabilities, Method
-from pmsmtool.workflow.identify import REQUEST, IdentifyRequest, dump_request
+from pmsmtool.workflow.identify_request import REQUEST, IdentifyRequest, dump_request
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 from pmsmtool.workflow.supply_reading import hold_for_supply
 from pmsmtool.workflow.tier_evaluate import (

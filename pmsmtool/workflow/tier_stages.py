@@ -32,9 +32,10 @@ from pmsmtool.workflow.capabilities import Capabilities, Method, Tier
 from pmsmtool.workflow.closed_stage import LIMITS, closed_stage, guaranteed, why_no_limits
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.workflow.flash_stages import flash_stage, verify_stage
-from pmsmtool.workflow.identify import MACHINE, NAMEPLATE, IdentifyRequest, identify_stage, nameplate_of
-from pmsmtool.workflow.measure import QUANTITIES
+from pmsmtool.workflow.identify import identify_stage, nameplate_of
+from pmsmtool.workflow.identify_request import QUANTITIES, IdentifyRequest
 from pmsmtool.workflow.prove.stage import ProofRequest, prove_stage
+from pmsmtool.workflow.replay import MACHINE, NAMEPLATE
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 from pmsmtool.workflow.tier_evaluate import NO_POLE_PAIRS
 from pmsmtool.workflow.tier_identify import OVER_TORQUE_CONSTANT, can_measure, tier_stage

@@ -25,7 +25,7 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.temperature import loop_coefficient_per_k
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
-from pmsmtool.workflow.identify import stored_traces
+from pmsmtool.workflow.replay import stored_traces
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 
 OBSERVATIONS, KNOWN = "track", "track.json"

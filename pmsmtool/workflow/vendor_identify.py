@@ -16,19 +16,21 @@ from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.vendor_tuning import VendorAnswer, VendorDrive
+from pmsmtool.drive.vendor_tuning import VendorDrive
 from pmsmtool.errors import NotAvailable
 from pmsmtool.firmware.drive_map_file import map_hash
-from pmsmtool.firmware.vendor_tuning import RESULTS, VendorStep
+from pmsmtool.firmware.vendor_tuning import RESULTS, VendorAnswer, VendorStep
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.machine_keys import MEASURABLE
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.units import format_quantity
 from pmsmtool.workflow.capabilities import Capabilities, Method
-from pmsmtool.workflow.identify import MACHINE, IdentifyRequest
+from pmsmtool.workflow.identify_request import IdentifyRequest
+from pmsmtool.workflow.replay import MACHINE
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage
 from pmsmtool.workflow.tier_identify import can_measure, tier_envelope, tier_stage
 from pmsmtool.workflow.vendor_machine import (
+    ANSWERS,
     NO_INTERVAL,
     SOURCE,
     VendorMachine,
@@ -40,8 +42,6 @@ from pmsmtool.workflow.vendor_machine import (
 )
 from pmsmtool.workflow.verdicts import KEYS
 
-ANSWERS = "vendor_tuning.json"
-"""What the drive answered, byte by byte."""
 BY_ITSELF = "the drive chooses currents and speeds by itself: it keeps its limits 0x6073 and 0x6080, the tool watches"
 Known = tuple[MachineFile, str] | None
 Allow = Callable[[Sequence[str]], None]

@@ -12,10 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pmsmtool.drive.vendor_tuning import VendorAnswer
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.firmware.drive_map import Cell
-from pmsmtool.firmware.vendor_tuning import OS_COMMAND, VendorTuning
+from pmsmtool.firmware.vendor_tuning import OS_COMMAND, VendorAnswer, VendorTuning
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.machine_keys import MEASURABLE
 from pmsmtool.machine.parameters import Estimate
@@ -149,3 +148,7 @@ def answer_facts(tuning: VendorTuning, answer: VendorAnswer) -> dict[str, Any]:
     if tuning.kind == "os_command":
         facts |= {"object": f"0x{OS_COMMAND:04X}", "command": tuning.steps[answer.step].command}
     return facts | {"values": answer.values}
+
+
+ANSWERS = "vendor_tuning.json"
+"""What the drive answered, byte by byte."""

@@ -35,9 +35,9 @@ from pmsmtool.sim.simulated_machine import with_simulation
 from pmsmtool.workflow.capabilities import Capabilities, Tier, examine
 from pmsmtool.workflow.closed_stage import LIMITS, NO_BANDWIDTH, NO_INERTIA, why_no_limits
 from pmsmtool.workflow.commission import Commissioning, begin_run, due_stages
-from pmsmtool.workflow.identify import REPLAYED
 from pmsmtool.workflow.prove.stage import ProofRequest
 from pmsmtool.workflow.rated_limits import NAMES
+from pmsmtool.workflow.replay import REPLAYED
 from pmsmtool.workflow.report_page import report_page, verdict
 from pmsmtool.workflow.reproduce.closed_node import ClosedNode
 from pmsmtool.workflow.run_directory import RunDirectory

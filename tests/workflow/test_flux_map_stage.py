@@ -33,10 +33,12 @@ from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
-from pmsmtool.workflow import map_stage
+from pmsmtool.workflow import map_measure, map_stage
 from pmsmtool.workflow.design_stages import lut_stage, margins_stage, tune_stage
-from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, identify_stage, nameplate_of, replay, stored_traces
+from pmsmtool.workflow.identify import envelope_of, identify_stage, nameplate_of
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.limits import Limits
+from pmsmtool.workflow.replay import replay, stored_traces
 from pmsmtool.workflow.run_directory import RunDirectory, new_record
 
 PROFILE = "saturated-pmsyrm"
@@ -74,8 +76,8 @@ def test_a_free_rotor_gives_a_map_that_design_uses_and_a_replay_repeats(tmp_path
         stage = identify_stage(run, drive, nameplate_of(drive, "bench"), request, said.extend, said.append)
         run.add(stage)
         drive.close()
-    assert map_stage.PLAN_LINE in said and any("predicted deviation of a flux" in line for line in said)
-    assert said.index(map_stage.PLAN_LINE) < next(k for k, line in enumerate(said) if "trains" in line)
+    assert map_measure.PLAN_LINE in said and any("predicted deviation of a flux" in line for line in said)
+    assert said.index(map_measure.PLAN_LINE) < next(k for k, line in enumerate(said) if "trains" in line)
     machine = load_machine_file(run.path / "machine.toml")
     truth = load_machine_file(machine_path(PROFILE)).flux_map
     assert machine.flux_map is not None and truth is not None and machine.machine.flux_map == map_stage.MAP_FILE
@@ -142,7 +144,7 @@ def test_the_measured_machine_with_its_rotor_held(tmp_path: Path) -> None:
             def keep(name: str, trace: Trace) -> None:
                 trains.append(trace)
 
-            map_stage.measure_map(guard, limits, noise, resistance, True, keep, lambda text: None)
+            map_measure.measure_map(guard, limits, noise, resistance, True, keep, lambda text: None)
         drive.close()
     psi_f = machine.machine.psi_f_wb * (1.0 - 0.0012 * 5.0)
     # the offset of the encoder as the drive has it: the map is aligned by its symmetry

@@ -20,10 +20,13 @@ from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.workflow.frequency_stage import PLAN_LINE, RESPONSE_FILE
+from pmsmtool.workflow.frequency_measure import PLAN_LINE
+from pmsmtool.workflow.frequency_stage import RESPONSE_FILE
 from pmsmtool.workflow.identified_machine import RESONANCE
-from pmsmtool.workflow.identify import MACHINE, IdentifyRequest, identify_stage, nameplate_of, replay
+from pmsmtool.workflow.identify import identify_stage, nameplate_of
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.predicted_file import PREDICTED
+from pmsmtool.workflow.replay import MACHINE, replay
 from pmsmtool.workflow.run_directory import RunDirectory, new_record
 
 J, J_LOAD, STIFFNESS, DAMPING = 0.006, 0.009, 2000.0, 0.02

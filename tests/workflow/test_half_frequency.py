@@ -25,18 +25,12 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_m
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.simulated_machine import Settings, device_slope_ohm
 from pmsmtool.workflow.evaluate import evaluate
-from pmsmtool.workflow.half_frequency import TRACE, measure_at_half_frequency
-from pmsmtool.workflow.identify import (
-    MACHINE,
-    IdentifyRequest,
-    dump_request,
-    identify_stage,
-    nameplate_of,
-    parse_request,
-    replay,
-    stored_traces,
-)
+from pmsmtool.workflow.half_frequency import TRACE
+from pmsmtool.workflow.half_frequency_measure import measure_at_half_frequency
+from pmsmtool.workflow.identify import identify_stage, nameplate_of
+from pmsmtool.workflow.identify_request import IdentifyRequest, dump_request, parse_request
 from pmsmtool.workflow.random_drives import draw_drive
+from pmsmtool.workflow.replay import MACHINE, replay, stored_traces
 from pmsmtool.workflow.run_directory import RunDirectory, Stage, new_record
 
 pytestmark = pytest.mark.chain

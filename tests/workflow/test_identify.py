@@ -25,18 +25,10 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace_file import read_trace
 from pmsmtool.workflow.evaluate import tolerance_on
-from pmsmtool.workflow.identify import (
-    MACHINE,
-    REPLAYED,
-    REQUEST,
-    IdentifyRequest,
-    dump_request,
-    identify_stage,
-    nameplate_of,
-    parse_request,
-    replay,
-)
+from pmsmtool.workflow.identify import identify_stage, nameplate_of
+from pmsmtool.workflow.identify_request import REQUEST, IdentifyRequest, dump_request, parse_request
 from pmsmtool.workflow.random_drives import draw_around
+from pmsmtool.workflow.replay import MACHINE, REPLAYED, replay
 from pmsmtool.workflow.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.workflow.square_stage import BIAS_MOST, CROSSING, RIPPLE_LEAST, bias_and_ripple
 

@@ -14,7 +14,8 @@ from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import MachineLimits
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.resources import data_folder
-from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of, plan_lines
+from pmsmtool.workflow.identify import envelope_of, nameplate_of, plan_lines
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.limits import LEAST_SPEED_SHARE, Limits, require_speed, unused_current
 
 GIVEN = {"I_nom_apk": 5.0, "i_max_apk": 6.0, "omega_max_rad_s": 300.0, "V_max_v": 28.0}

@@ -18,7 +18,8 @@ from pmsmtool.resources import data_folder
 from pmsmtool.sim.simulated_machine import settings_of, with_simulation
 from pmsmtool.trace import Trace
 from pmsmtool.workflow.evaluate import evaluate
-from pmsmtool.workflow.identify import IdentifyRequest, envelope_of, nameplate_of
+from pmsmtool.workflow.identify import envelope_of, nameplate_of
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.limits import Limits
 from pmsmtool.workflow.measure import Measurement
 

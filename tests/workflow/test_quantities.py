@@ -15,9 +15,11 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.workflow import mechanics_stage
-from pmsmtool.workflow.identify import MACHINE, IdentifyRequest, identify_stage, nameplate_of, replay
+from pmsmtool.workflow import mechanics_measure
+from pmsmtool.workflow.identify import identify_stage, nameplate_of
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.refused_file import REFUSED, refused_in
+from pmsmtool.workflow.replay import MACHINE, replay
 from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage, new_record
 from pmsmtool.workflow.square_stage import SquareStage
 from pmsmtool.workflow.verdicts import DESIGNED_FROM, ESSENTIAL, STEP, blocking, verdicts_of
@@ -93,7 +95,7 @@ def test_the_shaft_that_does_not_rest_costs_its_inertia_only(tmp_path: Path, mon
     def refused(*_: object) -> None:
         raise refuse("E_EXCITATION", "the shaft is not at rest", stage="mechanics")
 
-    monkeypatch.setattr(mechanics_stage, "_come_to_rest", refused)
+    monkeypatch.setattr(mechanics_measure, "_come_to_rest", refused)
     _, stage, _ = identify(tmp_path, IdentifyRequest().quantities)
     assert set(stage.refused) == {"mechanics"} and stage.status == "partial"
     assert all(line.ok for line in stage.acceptance)

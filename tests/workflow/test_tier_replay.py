@@ -22,12 +22,13 @@ from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow.capabilities import Capabilities, examine
 from pmsmtool.workflow.commission import begin_run
-from pmsmtool.workflow.identify import MACHINE, NAMEPLATE, REPLAYED, IdentifyRequest
+from pmsmtool.workflow.identify_request import IdentifyRequest
+from pmsmtool.workflow.replay import MACHINE, NAMEPLATE, REPLAYED
 from pmsmtool.workflow.run_directory import RunDirectory, Stage
 from pmsmtool.workflow.tier_evaluate import FACTS, TierFacts, below_voltage, parse_facts, replay
 from pmsmtool.workflow.tier_identify import tier_stage
 from pmsmtool.workflow.tier_stages import open_tier_drive
-from pmsmtool.workflow.vendor_identify import ANSWERS
+from pmsmtool.workflow.vendor_machine import ANSWERS
 
 pytestmark = pytest.mark.chain
 

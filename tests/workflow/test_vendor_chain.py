@@ -21,7 +21,7 @@ from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.workflow.capabilities import Capabilities, Tier, examine
 from pmsmtool.workflow.commission import Commissioning, begin_run
-from pmsmtool.workflow.identify import IdentifyRequest
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.prove.stage import ProofRequest
 from pmsmtool.workflow.report_page import report_page, verdict
 from pmsmtool.workflow.run_directory import RunDirectory, Stage

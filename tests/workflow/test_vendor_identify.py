@@ -17,7 +17,7 @@ from pmsmtool.cia402 import Command, State
 from pmsmtool.cli.main import cli
 from pmsmtool.drive import objects
 from pmsmtool.drive.envelope import Envelope
-from pmsmtool.drive.vendor_tuning import VendorAnswer, VendorDrive
+from pmsmtool.drive.vendor_tuning import VendorDrive
 from pmsmtool.errors import (
     ConfigError,
     DriveFault,
@@ -30,7 +30,7 @@ from pmsmtool.errors import (
 )
 from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.firmware.shipped_maps import load_family
-from pmsmtool.firmware.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
+from pmsmtool.firmware.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE, VendorAnswer
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.sim.node.session import Session
 from pmsmtool.workflow.vendor_identify import identify_vendor

@@ -16,17 +16,11 @@ from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace_file import trace_npz
 from pmsmtool.workflow.contradiction import compare
-from pmsmtool.workflow.identify import (
-    MACHINE,
-    NAMEPLATE,
-    IdentifyRequest,
-    identify_stage,
-    nameplate_of,
-    replay,
-    stored_traces,
-)
+from pmsmtool.workflow.identify import identify_stage, nameplate_of
+from pmsmtool.workflow.identify_request import IdentifyRequest
 from pmsmtool.workflow.prove.simulated import as_tested
 from pmsmtool.workflow.random_drives import true_loop_resistance
+from pmsmtool.workflow.replay import MACHINE, NAMEPLATE, replay, stored_traces
 from pmsmtool.workflow.run_directory import RunDirectory, new_record
 
 pytestmark = pytest.mark.chain

@@ -24,7 +24,7 @@ from pmsmtool.design.prediction import Array, Prediction
 from pmsmtool.design.prediction_file import from_arrays, to_arrays
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.envelope import Brake, Envelope, Load, Shaft, largest_acceleration
+from pmsmtool.drive.envelope import Envelope, largest_acceleration
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.errors import (
@@ -38,6 +38,7 @@ from pmsmtool.errors import (
 )
 from pmsmtool.files import write_file
 from pmsmtool.flash.restore import plan_download
+from pmsmtool.machine.shaft import Brake, Load, Shaft
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: MIT
+"""What an identification is asked: quantities, the experiments behind them, and the request as a run keeps it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+
+from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.machine.shaft import Brake, Load, Shaft
+
+QUANTITIES = ("R", "L", "psi", "encoder", "poles", "inverter", "mechanics")
+"""What is measured unless something is asked for: all that current and speed control need."""
+NEEDS: Mapping[str, tuple[str, ...]] = {
+    "R": ("levels",),
+    "inverter": ("levels",),
+    "poles": ("rotation",),
+    "encoder": ("levels", "rotation", "square", "speeds"),
+    "L": ("levels", "rotation", "square"),
+    "psi": ("levels", "rotation", "square", "speeds"),
+    "mechanics": ("levels", "rotation", "square", "speeds", "coasting"),
+    "map": ("levels", "rotation", "square", "speeds", "map"),
+    "frf": ("levels", "rotation", "square", "speeds", "response"),
+}
+"""Experiments behind each quantity."""
+HELD = ("levels", "map")
+"""Experiments that a held rotor allows."""
+
+
+def steps_of(quantities: Iterable[str], held: bool = False) -> set[str]:
+    """Return the experiments behind quantities; of a held rotor only those that it allows."""
+    steps = {step for quantity in quantities for step in NEEDS[quantity]}
+    return steps & set(HELD) if held else steps
+
+
+REQUEST = "request.json"
+"""What was asked, as far as the estimates depend on it: a replay is to give the same bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifyRequest:
+    """What is asked, and what the machine may do meanwhile; None leaves the choice to the drive's own ratings.
+
+    Attributes
+    ----------
+    quantities : tuple of str
+        Out of ``R L psi encoder poles inverter mechanics map frf``.
+    i_max_apk, speed_max_rad_s : float or None
+        Envelope (A peak, rad/s mechanical).
+    shaft, load, brake : str
+        What hangs on the shaft and may happen to it.
+    half_frequency : bool
+        Whether R and inverter are measured at half the control frequency, too.
+    map_if_saturated : bool
+        Whether a machine that the run over speeds shows to saturate is mapped, too.
+    tolerance : SensorTolerance
+        Declared sensor tolerances.
+    """
+
+    quantities: tuple[str, ...] = QUANTITIES
+    i_max_apk: float | None = None
+    speed_max_rad_s: float | None = None
+    shaft: Shaft = "free"
+    load: Load = "none"
+    brake: Brake = "none"
+    half_frequency: bool = False
+    map_if_saturated: bool = False
+    tolerance: SensorTolerance = field(default_factory=SensorTolerance)
+
+    def check(self) -> None:
+        """Refuse what cannot be asked.
+
+        Raises
+        ------
+        ConfigError
+            An unknown quantity.
+        NotAvailable
+            A quantity that needs a turning shaft, on a shaft that must not turn.
+        """
+        unknown = [name for name in self.quantities if name not in NEEDS]
+        if unknown or not self.quantities:
+            raise ConfigError(
+                f"cannot identify {', '.join(unknown) or 'nothing'}", hint=f"choose from {', '.join(NEEDS)}, or all"
+            )
+        if self.half_frequency and self.quantities == ("poles",):
+            raise ConfigError(
+                "pole pairs alone do not measure R", hint="leave --half-frequency out, or identify R, too"
+            )
+        turning = [name for name in self.quantities if name != "map" and set(NEEDS[name]) & {"rotation", "speeds"}]
+        if turning and self.shaft == "locked":
+            raise NotAvailable(
+                f"{', '.join(turning)} cannot be identified on a locked shaft: the rotor must turn",
+                hint="free the shaft, or identify R, inverter and map only",
+            )
+
+
+
+
+def dump_request(request: IdentifyRequest) -> str:
+    """Return a request as JSON: what an estimate depends on besides traces and nameplate."""
+    facts = asdict(request)
+    if math.isinf(request.tolerance.U_dc_v):
+        del facts["tolerance"]["U_dc_v"]  # comes from the nameplate, and JSON has no infinity
+    return json.dumps(facts, indent=1) + "\n"
+
+
+
+
+def parse_request(text: str, *, where: str) -> IdentifyRequest:
+    """Return the request of a run.
+
+    Raises
+    ------
+    ConfigError
+        It is not what :func:`dump_request` writes.
+    """
+    try:
+        facts = json.loads(text)
+        tolerance = SensorTolerance(**facts.pop("tolerance"))
+        request = IdentifyRequest(tolerance=tolerance, **{**facts, "quantities": tuple(facts["quantities"])})
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ConfigError(
+            f"the recorded request is damaged: {error}",
+            where=where,
+            hint="identify again; or take the file from a copy of the run",
+        ) from error
+    request.check()
+    return request
