@@ -23,14 +23,14 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from pmsmtool.design.design_file import Design
-from pmsmtool.design.margins import margin_report
+from pmsmtool.design.loops.margins import margin_report
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.proof.simulated_margins import torque_reversals, variations
 from pmsmtool.sim.closed_loop import open_simulation
 from pmsmtool.sim.monte_carlo import Variation, cores, simulate_many
 from pmsmtool.sim.scenarios import Scenario
-from pmsmtool.workflow.monte_carlo import torque_reversals, variations
 
 PROFILES = Path(__file__).resolve().parent.parent / "profiles"
 MACHINES = ("jercic-2017", "saturated-pmsyrm")

@@ -18,14 +18,14 @@ import numpy as np
 
 from pmsmtool.design.closed_drive import ClosedDrive, Guarantee, tune_closed
 from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DesignInfeasible
-from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.papers.closed_node import STANDARD, ClosedNode, Nodes, Seat
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.simulated_machine import with_simulation
-from pmsmtool.workflow.reproduce.closed_node import STANDARD, ClosedNode, Nodes, Seat
 
 Rng = np.random.Generator
 DURATION_S = 0.6

@@ -28,19 +28,20 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+from pmsmtool.commissioning.report_page import report_page
 from pmsmtool.design.design_file import design_text, parse_design
-from pmsmtool.design.lookup_file import SCHEMA as LOOK_UP_SCHEMA
-from pmsmtool.design.lookup_file import table_parameters
+from pmsmtool.design.lookup.file import SCHEMA as LOOK_UP_SCHEMA
+from pmsmtool.design.lookup.file import table_parameters
 from pmsmtool.design.tune import tune
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive_maps.dcf import Entry as Written
+from pmsmtool.drive_maps.dcf import read_concise, update_dcf, values_of, write_concise
+from pmsmtool.drive_maps.drive_map import reference_map
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
+from pmsmtool.drive_maps.eds import parse_eds
+from pmsmtool.drive_maps.map_tables import look_up_words
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.firmware.dcf import Entry as Written
-from pmsmtool.firmware.dcf import read_concise, update_dcf, values_of, write_concise
-from pmsmtool.firmware.drive_map import reference_map
-from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
-from pmsmtool.firmware.eds import parse_eds
 from pmsmtool.firmware.image import crc32
-from pmsmtool.firmware.map_tables import look_up_words
 from pmsmtool.flash.journal import Entry, Snapshot, check_sum, parse_snapshot
 from pmsmtool.flash.restore import check_snapshot, restore_plan
 from pmsmtool.machine.flux_map import FluxMap
@@ -51,12 +52,11 @@ from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.params.catalogue import layout_signature
 from pmsmtool.params.parameter_set import default_set, parse_parameter_set
 from pmsmtool.resources import data_folder
+from pmsmtool.run_directory import Acceptance, Stage, new_record
 from pmsmtool.sim.faults import EXAMPLE, parse_faults
 from pmsmtool.sim.scenarios import load_scenario
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
-from pmsmtool.workflow.report_page import report_page
-from pmsmtool.workflow.run_directory import Acceptance, Stage, new_record
 from tests.bus.frame_fuzz import transfers
 from tests.flash.rig import with_tables
 from tests.node.test_random_requests import FRAMES, test_after_any_requests_a_power_cycle_brings_a_healthy_node

@@ -22,12 +22,12 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.papers.governed_drive import IDEAL, PROFILE
 from pmsmtool.sim.closed_loop import image_of
 from pmsmtool.sim.kernel import Part, Simulation, Target
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import RPM, build_setup, with_simulation
-from pmsmtool.workflow.reproduce.governed_drive import IDEAL, PROFILE
 
 PERIODS = 12_000
 REPEATS = 9

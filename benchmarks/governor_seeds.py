@@ -22,10 +22,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from pmsmtool.workflow.reproduce.figure import Check
-from pmsmtool.workflow.reproduce.governed_drive import FAST, MODULUS_OPTIMUM, NOMINAL, GovernedDrive
-from pmsmtool.workflow.reproduce.random_cases import SLOW_S, least_time_s, reachable, run_cases
-from pmsmtool.workflow.reproduce.random_steps import (
+from pmsmtool.papers.figure import Check
+from pmsmtool.papers.governed_drive import FAST, MODULUS_OPTIMUM, NOMINAL, GovernedDrive
+from pmsmtool.papers.random_cases import SLOW_S, least_time_s, reachable, run_cases
+from pmsmtool.papers.random_steps import (
     BACK,
     BEST,
     DURATION_S,
@@ -34,7 +34,7 @@ from pmsmtool.workflow.reproduce.random_steps import (
     random_steps,
     unreachable_references,
 )
-from pmsmtool.workflow.reproduce.statistics import BAND, RESAMPLES
+from pmsmtool.papers.statistics import BAND, RESAMPLES
 
 TABLE = Path(__file__).resolve().parent / "tables" / "settling_tail.txt"
 LARGE_SEED = 1001

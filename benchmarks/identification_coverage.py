@@ -9,7 +9,7 @@
     python -m benchmarks.identification_coverage --drives 400 --keep FOLDER --measure-only
     python -m benchmarks.identification_coverage --drives 400 --keep FOLDER --bridge 0.2
 
-Drives follow from their seeds (``workflow/random_drives.py``); the tool sees their nameplate only. Printed per
+Drives follow from their seeds (``sim/random_drives.py``); the tool sees their nameplate only. Printed per
 quantity: error quantiles, how often the statistical and the total (printed) 95 % interval holds the truth, with its
 Clopper-Pearson interval, and every refusal by name. ``R_at_T_ohm`` is the loop at the temperature of the measurement:
 the share of devices and copper, which no experiment sees, enters ``R_s_ohm`` only. The thresholds of the bridge's
@@ -45,15 +45,15 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, statistical_half_width, total_half_width
+from pmsmtool.identification.evaluate import Evaluation, evaluate
+from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.measurement.identify import envelope_of, nameplate_of
+from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.measure import Measurement
+from pmsmtool.sim.random_drives import draw_around, draw_drive, true_loop_resistance
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
-from pmsmtool.workflow.evaluate import Evaluation, evaluate
-from pmsmtool.workflow.identify import envelope_of, nameplate_of
-from pmsmtool.workflow.identify_request import IdentifyRequest
-from pmsmtool.workflow.limits import Limits
-from pmsmtool.workflow.measure import Measurement
-from pmsmtool.workflow.random_drives import draw_around, draw_drive, true_loop_resistance
 
 QUANTITIES = ("R_at_T_ohm", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "offset_rad")
 ELECTRICAL = ("R", "L", "psi", "encoder", "poles", "inverter")

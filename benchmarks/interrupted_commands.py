@@ -36,13 +36,13 @@ import can
 from benchmarks.commissioning import commanded, powered, prepared
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cia402 import Command, State, state_of
+from pmsmtool.commissioning.export import image_of
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.firmware.image import crc32
 from pmsmtool.flash.restore import take_backup
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.workflow.export import image_of
 
 PROFILE = "interior-2k2"
 LIMIT_OBJECTS = ((0x6073, 0), (0x6080, 0), (0x1016, 1), (0x6007, 0))

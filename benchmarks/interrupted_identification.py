@@ -24,9 +24,9 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.errors import Interrupted
-from pmsmtool.workflow.identify import identify_stage, nameplate_of
-from pmsmtool.workflow.identify_request import IdentifyRequest
-from pmsmtool.workflow.run_directory import RunDirectory, new_record
+from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.run_directory import RunDirectory, new_record
 
 OBJECTS = ((0x6073, 0), (0x6080, 0), (0x1016, 1), (0x6007, 0), (0x6060, 0))
 

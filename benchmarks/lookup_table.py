@@ -29,8 +29,8 @@ from scipy.optimize import minimize
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from pmsmtool.design.lookup_loci import STANDSTILL_V
-from pmsmtool.design.lookup_table import LookupTable, electrical_speed, speed_table, torque_limits
+from pmsmtool.design.lookup.loci import STANDSTILL_V
+from pmsmtool.design.lookup.table import LookupTable, electrical_speed, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.machine.analytic_saturation import BridgeSaturation
 from pmsmtool.machine.flux_map import FluxMap

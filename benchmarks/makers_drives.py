@@ -5,7 +5,7 @@
     python -m benchmarks.makers_drives drive.eds other.dcf
 
 A table has the columns of ``sim/foreign/file_rows.py``; every family in it is a node. `identify` runs at its default
-options with consent, on the machine of a profile, or on random ones from their seeds (``workflow/random_drives.py``).
+options with consent, on the machine of a profile, or on random ones from their seeds (``sim/random_drives.py``).
 One row per node: the tier and the map, whether the shaft moved, what was told, its error and half width against the
 simulated truth, and for what was not told the first reason. Exit code 1 where a truth lies outside its interval.
 """
@@ -34,8 +34,8 @@ from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.sim.foreign.behind import set_up_of
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
+from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import settings_of
-from pmsmtool.workflow.random_drives import draw_drive
 
 TOLD = ("J_per_psi", "J_per_kt")
 POLES = ("0x2350:03",)

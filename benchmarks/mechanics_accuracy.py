@@ -4,7 +4,7 @@
     python -m benchmarks.mechanics_accuracy --drives 100 --first 1000
     python -m benchmarks.mechanics_accuracy --bound 200
 
-Drives follow from their seeds (``workflow/random_drives.py``, switched inverter, ideal gains and timing); the tool sees
+Drives follow from their seeds (``sim/random_drives.py``, switched inverter, ideal gains and timing); the tool sees
 their nameplate only. An error of the flux linkage goes into all three values one to one; ``J/psi`` is the error without
 it. Every standard deviation is compared with the one that was said before the machine moved for it. ``--rows FILE``
 keeps a line per drive and goes on from there; without drives the table is made of what it holds.
@@ -34,17 +34,17 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import IdentificationError, PmsmtoolError
 from pmsmtool.estimators.estimate import statistical_half_width, total_half_width
-from pmsmtool.estimators.mechanics import BLOCKS, TORQUE_FLOOR, estimate_mechanics
-from pmsmtool.estimators.mechanics_motion import positions
+from pmsmtool.estimators.shaft.mechanics import BLOCKS, TORQUE_FLOOR, estimate_mechanics
+from pmsmtool.estimators.shaft.motion import positions
+from pmsmtool.identification.evaluate import evaluate
+from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import dump_machine_file
+from pmsmtool.measurement.identify import envelope_of, nameplate_of
+from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.measure import Measurement
+from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace import Trace
-from pmsmtool.workflow.evaluate import evaluate
-from pmsmtool.workflow.identify import envelope_of, nameplate_of
-from pmsmtool.workflow.identify_request import IdentifyRequest
-from pmsmtool.workflow.limits import Limits
-from pmsmtool.workflow.measure import Measurement
-from pmsmtool.workflow.random_drives import draw_drive
 
 KEYS = ("J_kgm2", "tau_c_nm", "B_nms")
 PREDICTED_KEYS = (*KEYS, "psi_f_wb", "R_s_ohm", "L_d_h", "L_q_h")

@@ -25,19 +25,19 @@ from pathlib import Path
 
 from benchmarks.commissioning import prepared
 from pmsmtool.bus.connect import Connection
+from pmsmtool.commissioning.commission import Commissioning, Silent, begin_run
+from pmsmtool.commissioning.report_page import verdict
+from pmsmtool.commissioning.tier_stages import open_tier_drive
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.errors import Declined, PmsmtoolError, exit_code_of
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.measurement.capabilities import examine
+from pmsmtool.proof.stage import ProofRequest
 from pmsmtool.report.comparison import unchecked
+from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.workflow.capabilities import examine
-from pmsmtool.workflow.commission import Commissioning, Silent, begin_run
-from pmsmtool.workflow.prove.stage import ProofRequest
-from pmsmtool.workflow.random_drives import data_sheet, draw_drive
-from pmsmtool.workflow.report_page import verdict
-from pmsmtool.workflow.run_directory import RunDirectory, Stage
-from pmsmtool.workflow.tier_stages import open_tier_drive
+from pmsmtool.sim.random_drives import data_sheet, draw_drive
 
 LEVELS = {"full": "", "inject": "&tier=inject", "recorder": "&tier=recorder", "standard": "&drive=cia402"}
 ERRORS: dict[str, tuple[tuple[str, ...], float]] = {

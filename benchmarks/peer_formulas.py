@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 
 from benchmarks.identification_coverage import drawn, evaluated, measured, truth_of
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.estimators.axis_response import initial_inductance
-from pmsmtool.estimators.inductance import bare_shot
+from pmsmtool.estimators.injection.axis_response import initial_inductance
+from pmsmtool.estimators.injection.inductance import bare_shot
 from pmsmtool.estimators.resistance import single_point_resistance, two_point_resistance
+from pmsmtool.identification.evaluate import Evaluation, shots_of
 from pmsmtool.trace import Trace
-from pmsmtool.workflow.evaluate import Evaluation, shots_of
 
 Vector = NDArray[np.float64]
 Traces = Mapping[str, Trace]

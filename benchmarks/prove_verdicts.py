@@ -5,7 +5,7 @@
     python -m benchmarks.prove_verdicts --drives 40 --first 5000 --kinds gain_low gain_high
     python -m benchmarks.prove_verdicts --drives 300 --declared
 
-Drives follow from their seeds (``workflow/random_drives.py``, switched inverter). Each is identified first, over the
+Drives follow from their seeds (``sim/random_drives.py``, switched inverter). Each is identified first, over the
 bus as the tool does it; a drive that is refused there is counted apart. With ``--declared`` identification is skipped:
 the tool is given the true parameters off by draws from the intervals that it declares (:data:`DECLARED`). Then it
 designs, flashes over the bus, and proves. Every drive is proven healthy, and once more with one defect that its objects
@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from pmsmtool.bus.connect import connect
+from pmsmtool.commissioning.commission import begin_run
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.prediction import Prediction
 from pmsmtool.design.tune import tune
@@ -41,17 +42,16 @@ from pmsmtool.errors import DesignInfeasible, PmsmtoolError
 from pmsmtool.flash.download import Download
 from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.restore import marks_of, plan_download
+from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.proof import stage as proving
+from pmsmtool.proof.simulated import predict_proof
+from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.drive_kernel import KernelCore
 from pmsmtool.sim.kernel import Params
+from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import settings_of
-from pmsmtool.workflow.commission import begin_run
-from pmsmtool.workflow.identify import identify_stage, nameplate_of
-from pmsmtool.workflow.identify_request import IdentifyRequest
-from pmsmtool.workflow.prove import stage as proving
-from pmsmtool.workflow.prove.simulated import predict_proof
-from pmsmtool.workflow.random_drives import draw_drive
-from pmsmtool.workflow.run_directory import RunDirectory, Stage, new_record
 
 DECLARED: dict[str, tuple[float, float]] = {
     "R_s_ohm": (0.005, 0.016),

@@ -13,8 +13,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from pmsmtool.workflow.reproduce.figure import Check
-from pmsmtool.workflow.reproduce.registry import FIGURES, reproduce
+from pmsmtool.papers.figure import Check
+from pmsmtool.papers.registry import FIGURES, reproduce
 
 TABLE = Path(__file__).resolve().parent / "tables" / "reproduce.txt"
 

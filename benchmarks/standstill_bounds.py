@@ -3,7 +3,7 @@
 
     python -m benchmarks.standstill_bounds --drives 10 --realisations 20 --write benchmarks/tables/standstill_bounds.txt
 
-Random drives (``workflow/random_drives.py``) are identified once. The residual of the best fit is taken out of their
+Random drives (``sim/random_drives.py``) are identified once. The residual of the best fit is taken out of their
 square-wave records and of their coasting windows, white noise of the measured size is put in, and the estimate is made
 again; the DC levels get the noise of their means. Each deviation from the mean of its drive is divided by the bound of
 the same record: for L that of the best model, all its nuisance parameters free, for R that of the tail 1/|i|, 1/|i|^2
@@ -23,15 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.identification_coverage import Choice, Refusal, drawn, evaluated, kept
-from pmsmtool.estimators.axis_response import SKIP_SAMPLES
 from pmsmtool.estimators.estimate import scaled_covariance
-from pmsmtool.estimators.flux_linkage import LEVEL_RATIO
-from pmsmtool.estimators.flux_linkage_rows import pairs_of
+from pmsmtool.estimators.flux.linkage import LEVEL_RATIO
+from pmsmtool.estimators.flux.linkage_rows import pairs_of
+from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES
 from pmsmtool.estimators.resistance import FIT_FROM, MEAN_NOISE_FACTOR
+from pmsmtool.identification.evaluate import Evaluation, flux_of, inductance_of, resistance_of
 from pmsmtool.machine.parameters import InverterParameters
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.trace import Trace
-from pmsmtool.workflow.evaluate import Evaluation, flux_of, inductance_of, resistance_of
 
 ASKED = {"R": 1.5, "L_d": 1.3, "L_q": 1.3, "psi_f": 1.5, "psi_f, curvature free": 1.5}
 """Largest standard deviation over bound, and the rows of the table."""

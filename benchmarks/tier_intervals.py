@@ -6,7 +6,7 @@
     python -m benchmarks.tier_intervals recorder --drives 200 --first 5000
     python -m benchmarks.tier_intervals inject --drives 200 --first 7200
 
-Drives follow from their seeds (``workflow/random_drives.py``). The simulated node has the objects of its tier only:
+Drives follow from their seeds (``sim/random_drives.py``). The simulated node has the objects of its tier only:
 ``drive=cia402`` with the master's commutation angle, or the reference drive without excitation (``tier=recorder``) or
 averages (``tier=inject``). ``supply``: R of the standard tier from the readings of the simulated bench supply
 (``sim/bench_supply.py``). ``--speed`` is the largest speed that is allowed, over the nameplate's: the flux linkage of
@@ -39,23 +39,23 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.recorded_means import RecordingDrive
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.experiments.supply_levels import ReadSupply
-from pmsmtool.firmware.shipped_maps import load_family
+from pmsmtool.identification.evaluate import evaluate
+from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.tier_evaluate import TierFacts, TierResult, tier_result
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.measurement.identify import envelope_of, nameplate_of
+from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.measure import Measurement
+from pmsmtool.measurement.supply_reading import hold_for_supply
+from pmsmtool.measurement.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
+from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
-from pmsmtool.workflow.evaluate import evaluate
-from pmsmtool.workflow.identify import envelope_of, nameplate_of
-from pmsmtool.workflow.identify_request import IdentifyRequest
-from pmsmtool.workflow.limits import Limits
-from pmsmtool.workflow.measure import Measurement
-from pmsmtool.workflow.random_drives import draw_drive
-from pmsmtool.workflow.supply_reading import hold_for_supply
-from pmsmtool.workflow.tier_evaluate import TierFacts, TierResult, tier_result
-from pmsmtool.workflow.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
 
 CHANNELS = {
     "standard": "&drive=cia402",

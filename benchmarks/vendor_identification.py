@@ -3,7 +3,7 @@
 
     python -m benchmarks.vendor_identification --drives 40 --first 8000
 
-The drives of ``benchmarks/tier_intervals.py`` (``workflow/random_drives.py``) behind the objects of the synapticon map,
+The drives of ``benchmarks/tier_intervals.py`` (``sim/random_drives.py``) behind the objects of the synapticon map,
 read by ``identify --method vendor``. The values have no interval, so that nothing is judged: the table says what a
 simple method on such drives is worth, and that what is stored is what was answered. One inductance stands for both
 axes; it is compared with L_d, on which the simulated rotor is held. Every error is printed on stderr.
@@ -22,13 +22,13 @@ from benchmarks.tier_intervals import truth_of
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.vendor_tuning import VendorDrive
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.firmware.shipped_maps import load_family
+from pmsmtool.identification.vendor_machine import PHASE_INDUCTANCE, vendor_estimates
 from pmsmtool.machine.machine_file import dump_machine_file
-from pmsmtool.workflow.random_drives import draw_drive
-from pmsmtool.workflow.tier_identify import HEADROOM
-from pmsmtool.workflow.vendor_identify import identify_vendor
-from pmsmtool.workflow.vendor_machine import PHASE_INDUCTANCE, vendor_estimates
+from pmsmtool.measurement.tier_identify import HEADROOM
+from pmsmtool.measurement.vendor_identify import identify_vendor
+from pmsmtool.sim.random_drives import draw_drive
 
 FAMILY = "synapticon"
 

@@ -3,7 +3,7 @@
 
     python -m benchmarks.whole_commission --drives 200 --first 120000 --results results.jsonl
 
-Drives follow from their seeds (``workflow/random_drives.py``: switched inverter, half of the encoders reversed, half of
+Drives follow from their seeds (``sim/random_drives.py``: switched inverter, half of the encoders reversed, half of
 the machines with two leads swapped, 5 to 90 degC, three kinds of sensors in turn). FILE is a data sheet within its
 tolerances, and the drive's memory holds the set of another motor. The command runs in the process, over frames, with
 its default options. Every result is appended to the file as it comes; a seed in the file is not run again, and
@@ -25,16 +25,16 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.commissioning import QUANTITIES, commanded, errors_of, prepared
+from pmsmtool.commissioning.report_page import verdict
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.params.catalogue import layout_signature
+from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.node.factory import factory_values, set_up_values
 from pmsmtool.sim.node.memory import FileStorage, Memory
 from pmsmtool.sim.node.parameter_set import ParameterImage
 from pmsmtool.sim.node.store import IMAGE_KEY, SIGNATURE_KEY, encode
-from pmsmtool.workflow.random_drives import Block, data_sheet, draw_drive
-from pmsmtool.workflow.report_page import verdict
-from pmsmtool.workflow.run_directory import RunDirectory
+from pmsmtool.sim.random_drives import Block, data_sheet, draw_drive
 
 BLOCKS: tuple[Block, ...] = ("ideal", "timing", "gains")
 OTHER = 1_000_000

@@ -3,7 +3,7 @@
 
     python -m benchmarks.wiring_check --miswired 400 --healthy 200 --first 300000
 
-Drives follow from their seeds (``workflow/random_drives.py``); FILE is a data sheet within its tolerances. A miswired
+Drives follow from their seeds (``sim/random_drives.py``); FILE is a data sheet within its tolerances. A miswired
 one is named rightly when the first row that is wrong is about what was done to it.
 """
 
@@ -19,7 +19,7 @@ from pathlib import Path
 from benchmarks.commissioning import prepared
 from benchmarks.motor_files import wrong_file
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.workflow.random_drives import data_sheet, draw_drive
+from pmsmtool.sim.random_drives import data_sheet, draw_drive
 
 WIRED: dict[str, tuple[dict[str, object], str]] = {
     "phase a open": ({"phase_open": "a"}, "phases"),

@@ -12,8 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pmsmtool.bus.connect import connect as connect
+    from pmsmtool.commissioning.commission import commission as commission
+    from pmsmtool.commissioning.parameter_source import load_parameters as load_parameters
+    from pmsmtool.commissioning.report_page import report_page as report_page
     from pmsmtool.design.design_file import load_design as load_design
-    from pmsmtool.design.margins import margin_report as margin_report
+    from pmsmtool.design.loops.margins import margin_report as margin_report
     from pmsmtool.design.tolerance import tolerance_box as tolerance_box
     from pmsmtool.design.tune import tune as tune
     from pmsmtool.design.tune_request import TuneRequest as TuneRequest
@@ -29,9 +32,6 @@ if TYPE_CHECKING:
     from pmsmtool.machine.parameters import MachineParameters as MachineParameters
     from pmsmtool.params.parameter_set import ParameterSet as ParameterSet
     from pmsmtool.trace import Trace as Trace
-    from pmsmtool.workflow.commission import commission as commission
-    from pmsmtool.workflow.parameter_source import load_parameters as load_parameters
-    from pmsmtool.workflow.report_page import report_page as report_page
 
 __version__ = "0.1.0"
 
@@ -45,18 +45,18 @@ _HOME = {
     "MachineFile": "pmsmtool.machine.machine_file",
     "load_machine_file": "pmsmtool.machine.machine_file",
     "ParameterSet": "pmsmtool.params.parameter_set",
-    "load_parameters": "pmsmtool.workflow.parameter_source",
+    "load_parameters": "pmsmtool.commissioning.parameter_source",
     "TuneRequest": "pmsmtool.design.tune_request",
     "tune": "pmsmtool.design.tune",
     "load_design": "pmsmtool.design.design_file",
     "tolerance_box": "pmsmtool.design.tolerance",
-    "margin_report": "pmsmtool.design.margins",
+    "margin_report": "pmsmtool.design.loops.margins",
     "connect": "pmsmtool.bus.connect",
     "CanopenDrive": "pmsmtool.drive.canopen_drive",
     "Envelope": "pmsmtool.drive.envelope",
     "guarded": "pmsmtool.drive.guard",
-    "commission": "pmsmtool.workflow.commission",
-    "report_page": "pmsmtool.workflow.report_page",
+    "commission": "pmsmtool.commissioning.commission",
+    "report_page": "pmsmtool.commissioning.report_page",
 }
 """Public name -> module that defines it."""
 

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import fuzz
 from pmsmtool.errors import ConfigError, PmsmtoolError
-from pmsmtool.workflow.run_directory import RunDirectory
+from pmsmtool.run_directory import RunDirectory
 
 EACH = 30
 

@@ -9,9 +9,9 @@ import pytest
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import read_bytes, read_text, write_file
+from pmsmtool.run_directory import RunDirectory
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import write_trace
-from pmsmtool.workflow.run_directory import RunDirectory
 
 
 def test_a_file_larger_than_the_limit_is_refused(tmp_path):

@@ -18,33 +18,33 @@ import numpy as np
 import pytest
 
 from pmsmtool import errors
+from pmsmtool.commissioning.parameter_source import load_parameters
 from pmsmtool.design.design_file import design_text, load_machine_or_design, parse_design
-from pmsmtool.design.iron_loss import load_iron_loss_map
-from pmsmtool.design.lookup_file import table_parameters
-from pmsmtool.design.prediction_file import from_arrays
+from pmsmtool.design.lookup.file import table_parameters
+from pmsmtool.design.lookup.iron_loss import load_iron_loss_map
 from pmsmtool.design.tune import tune
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive_maps.dcf import Entry as Written
+from pmsmtool.drive_maps.dcf import read_concise, update_dcf, values_of, write_concise
+from pmsmtool.drive_maps.drive_map import reference_map
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
+from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.errors import ConfigError, PmsmtoolError, next_step
-from pmsmtool.firmware.dcf import Entry as Written
-from pmsmtool.firmware.dcf import read_concise, update_dcf, values_of, write_concise
-from pmsmtool.firmware.drive_map import reference_map
-from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
-from pmsmtool.firmware.eds import parse_eds
 from pmsmtool.flash.journal import Entry, Snapshot, parse_snapshot, read_snapshot
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz, load_flux_map
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
 from pmsmtool.npz_file import read_npz
 from pmsmtool.params.parameter_set import default_set, parse_parameter_set, read_parameter_set
+from pmsmtool.proof.prediction_file import from_arrays
 from pmsmtool.resources import data_folder
+from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.channel import parse_channel
 from pmsmtool.sim.faults import EXAMPLE, load_faults, parse_faults
 from pmsmtool.sim.scenarios import FILE_EXAMPLE, load_scenario
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_csv, trace_npz
-from pmsmtool.workflow.parameter_source import load_parameters
-from pmsmtool.workflow.run_directory import RunDirectory, new_record
 
 ROOT = Path(__file__).resolve().parents[1]
 ATTEMPTS = 60
@@ -195,10 +195,10 @@ def test_every_refused_file_comes_with_a_next_step(name: str, tmp_path: Path) ->
 
 READERS = (
     "machine/machine_file", "machine/flux_map_import", "machine/flux_map_table", "machine/mat_file", "trace_file",
-    "sim/scenarios", "sim/faults", "sim/channel", "sim/simulated_machine", "firmware/dcf", "firmware/eds",
-    "firmware/drive_map_file", "firmware/drive_map", "params/parameter_set", "design/design_file",
-    "design/prediction_file", "design/iron_loss", "design/lookup_file", "npz_file", "toml_file", "flash/journal",
-    "workflow/parameter_source",
+    "sim/scenarios", "sim/faults", "sim/channel", "sim/simulated_machine", "drive_maps/dcf", "drive_maps/eds",
+    "drive_maps/drive_map_file", "drive_maps/drive_map", "params/parameter_set", "design/design_file",
+    "proof/prediction_file", "design/lookup/iron_loss", "design/lookup/file", "npz_file", "toml_file", "flash/journal",
+    "commissioning/parameter_source",
 )  # fmt: skip
 
 
@@ -231,12 +231,12 @@ INSIDE = {"encode", "decode"}
 @pytest.mark.parametrize("module", READERS)
 def test_every_reader_adds_a_next_step(module: str) -> None:
     source = (ROOT / "pmsmtool" / f"{module}.py").read_text(encoding="utf-8")
-    assert [name for name in bare_functions(source) if not (module == "firmware/drive_map" and name in INSIDE)] == []
+    assert [name for name in bare_functions(source) if not (module == "drive_maps/drive_map" and name in INSIDE)] == []
 
 
 ERRORS = {name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, PmsmtoolError)}
 ELSEWHERE = {
-    "design/closed_drive", "design/lookup_design", "design/tolerance", "design/tune_request", "machine/flux_map",
+    "design/closed_drive", "design/lookup/design", "design/tolerance", "design/tune_request", "machine/flux_map",
     "machine/machine_reader",
 }  # fmt: skip
 """Modules whose step is added by the command line (by option) or by the reader of the file."""

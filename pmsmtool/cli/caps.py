@@ -13,7 +13,7 @@ from pmsmtool.cli.options import BusOptions, bus_options, examples, output_optio
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
-    from pmsmtool.workflow.capabilities import Capabilities, Row
+    from pmsmtool.measurement.capabilities import Capabilities, Row
 
 
 @click.command(
@@ -37,9 +37,9 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
 
     With --eds no bus is needed: a simulated drive with exactly the file's objects is asked, a motor set up in it.
     """
-    from pmsmtool.firmware.shipped_maps import GENERIC
+    from pmsmtool.drive_maps.shipped_maps import GENERIC
     from pmsmtool.flash.map_gate import other_drive
-    from pmsmtool.workflow.capabilities import examine
+    from pmsmtool.measurement.capabilities import examine
 
     given = None if map_file is None else read_map(map_file)
     if eds is not None:
@@ -57,7 +57,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
 
 
 def _facts(found: Capabilities) -> dict[str, Any]:
-    from pmsmtool.firmware.drive_map_file import map_hash
+    from pmsmtool.drive_maps.drive_map_file import map_hash
 
     return {
         "identity": found.identity,

@@ -40,7 +40,7 @@ def check_command(bus: BusOptions, motion: MotionOptions, out: Output, machine_f
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.errors import CheckFailed, Partial
     from pmsmtool.estimators.wiring import NOT_SEEN, WRONG
-    from pmsmtool.workflow.first_check import check_wiring, envelope_of
+    from pmsmtool.measurement.first_check import check_wiring, envelope_of
 
     with open_drive(bus) as drive:
         stated = _stated(drive, machine_file)
@@ -76,7 +76,7 @@ def check_command(bus: BusOptions, motion: MotionOptions, out: Output, machine_f
 def _stated(drive: CanopenDrive, path: Path | None) -> MachineFile:
     """Return what is stated of the machine; of two rated currents the smaller one."""
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.workflow.identify import nameplate_of
+    from pmsmtool.measurement.identify import nameplate_of
 
     held = nameplate_of(drive, "held by the drive")
     if path is None:

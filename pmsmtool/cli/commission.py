@@ -20,16 +20,17 @@ from pmsmtool.cli.progress import StageProgress
 
 if TYPE_CHECKING:
     from pmsmtool.drive.canopen_drive import CanopenDrive
+    from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.errors import Partial
-    from pmsmtool.firmware.drive_map import DriveMap
+    from pmsmtool.measurement.capabilities import Capabilities
     from pmsmtool.report.verdict import Verdict
-    from pmsmtool.workflow.capabilities import Capabilities
-    from pmsmtool.workflow.run_directory import RunDirectory
+    from pmsmtool.run_directory import RunDirectory
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 STAGES = ("identify", "tune", "lut", "margins", "flash", "verify", "prove")
 LIMITS = ("current", "speed")
-"""As in ``workflow.commission`` and ``workflow.rated_limits``, which take too long to import for ``--help``."""
+"""As in ``commissioning.commission`` and ``commissioning.rated_limits``, which take too long to import for
+``--help``."""
 
 
 @click.command(
@@ -107,10 +108,10 @@ def commission_command(
     speed, else PARTIAL (exit 10), with the reason for every stage that did not run.
     """
     from pmsmtool.cli.consent import refuse_unattended
+    from pmsmtool.commissioning.commission import Commissioning, begin_run
+    from pmsmtool.commissioning.compared_stage import check_accepted
     from pmsmtool.errors import ConfigError
-    from pmsmtool.workflow.commission import Commissioning, begin_run
-    from pmsmtool.workflow.compared_stage import check_accepted
-    from pmsmtool.workflow.run_directory import RunDirectory
+    from pmsmtool.run_directory import RunDirectory
 
     if rehearse is not None or eds is not None:
         if resume is not None:
@@ -153,9 +154,9 @@ def commission_command(
 def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDrive, Capabilities]]:
     """Open the drive with what it has; without a map, the one of its identity is used."""
     from pmsmtool.cli.drive_access import claimed_node
+    from pmsmtool.commissioning.tier_stages import open_tier_drive
     from pmsmtool.drive.drive_node import DriveNode
-    from pmsmtool.workflow.capabilities import examine
-    from pmsmtool.workflow.tier_stages import open_tier_drive
+    from pmsmtool.measurement.capabilities import examine
 
     with bus.connect() as connection:
         node = DriveNode(connection, claimed_node(connection, bus.node))
@@ -167,7 +168,7 @@ def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDr
 
 
 def _kept_nameplate(run: RunDirectory) -> Path | None:
-    from pmsmtool.workflow.replay import NAMEPLATE
+    from pmsmtool.identification.replay import NAMEPLATE
 
     path = run.path / NAMEPLATE
     return path if path.is_file() else None
@@ -179,8 +180,8 @@ def _asked(
     """Check and collect what is asked of the chain, before anything is opened."""
     from pmsmtool.design.tune_request import TuneRequest
     from pmsmtool.estimators.estimate import SensorTolerance
+    from pmsmtool.identification.request import QUANTITIES, IdentifyRequest
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.workflow.identify_request import QUANTITIES, IdentifyRequest
 
     wanted = IdentifyRequest(
         quantities=(*QUANTITIES, "map") if flux_map else QUANTITIES,
@@ -213,7 +214,7 @@ def _as_begun(bus: BusOptions, run: RunDirectory) -> BusOptions:
 
 
 def _erase_memory(bus: BusOptions, out: Output) -> None:
-    from pmsmtool.workflow.factory_memory import erase_memory
+    from pmsmtool.sim.factory_memory import erase_memory
 
     channel = bus.channel
     if channel is None and bus.interface is None:
@@ -267,8 +268,8 @@ class _Person:
 @contextmanager
 def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
     """Write the report whatever ends the chain; a run that was declined before anything moved leaves no trace."""
+    from pmsmtool.commissioning.commission import write_report
     from pmsmtool.errors import Declined
-    from pmsmtool.workflow.commission import write_report
 
     try:
         yield
@@ -311,7 +312,7 @@ def _next_step(run: RunDirectory, error: BaseException) -> str:
 
 def _show(run: RunDirectory, out: Output, *, ended: bool = False) -> Verdict:
     """Show the verdict; of a run that an error ended as one object with ``--json``, else beside the error."""
-    from pmsmtool.workflow.report_page import verdict
+    from pmsmtool.commissioning.report_page import verdict
 
     record, found = run.read(), verdict(run.path)
     stages = [

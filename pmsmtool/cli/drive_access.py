@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pmsmtool.bus.connection import Connection
     from pmsmtool.drive.canopen_drive import CanopenDrive
     from pmsmtool.drive.drive_node import DriveNode
-    from pmsmtool.firmware.drive_map import DriveMap
+    from pmsmtool.drive_maps.drive_map import DriveMap
 
 
 LOOKING_S = 30.0
@@ -42,9 +42,9 @@ def map_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def read_map(path: Path | None) -> DriveMap:
     """Return the drive map of a file or a shipped family, the reference drive's without one."""
-    from pmsmtool.firmware.drive_map import reference_map
-    from pmsmtool.firmware.drive_map_file import parse_drive_map
-    from pmsmtool.firmware.shipped_maps import family_names, load_family
+    from pmsmtool.drive_maps.drive_map import reference_map
+    from pmsmtool.drive_maps.drive_map_file import parse_drive_map
+    from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 
     if path is None:
         return reference_map()
@@ -115,7 +115,7 @@ def open_node(
 
 def _refuse_another_family(node: DriveNode) -> None:
     """Say which map a known drive needs, instead of failing at its first object."""
-    from pmsmtool.firmware.shipped_maps import family_of
+    from pmsmtool.drive_maps.shipped_maps import family_of
 
     shown = _vendor_product(node)
     if shown is None:

@@ -17,7 +17,7 @@ from pmsmtool.cli.output import Output
 from pmsmtool.files import read_bytes, write_file
 
 if TYPE_CHECKING:
-    from pmsmtool.firmware.drive_map import DriveMap
+    from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.params.parameter_set import ParameterSet
 
 _SOURCE = click.argument("design", type=click.Path(path_type=Path))
@@ -55,7 +55,7 @@ def _written(command: Callable[..., bytes | str]) -> Callable[..., None]:
 
 def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
     """Read the set and say what the drive has no object for."""
-    from pmsmtool.workflow.parameter_source import load_parameters
+    from pmsmtool.commissioning.parameter_source import load_parameters
 
     wanted = load_parameters(design, drive_map)
     missing = drive_map.missing(wanted)
@@ -84,7 +84,7 @@ def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
 @_written
 def dcf_command(design: Path, into: Path | None, node_id: int, map_file: Path | None, out: Output) -> bytes:
     """Write a device configuration file (CiA 306)."""
-    from pmsmtool.workflow.export import dcf_file
+    from pmsmtool.commissioning.export import dcf_file
 
     drive_map = read_map(map_file)
     if into is None and map_file is not None:
@@ -105,7 +105,7 @@ def cdcf_command(design: Path, map_file: Path | None, out: Output) -> bytes:
 
     A complete set is framed by the staging commands of the drive, which then takes it as a whole.
     """
-    from pmsmtool.workflow.export import concise_dcf
+    from pmsmtool.commissioning.export import concise_dcf
 
     drive_map = read_map(map_file)
     return concise_dcf(_parameters(design, drive_map, out), drive_map=drive_map)
@@ -119,9 +119,9 @@ def cdcf_command(design: Path, map_file: Path | None, out: Output) -> bytes:
 @_written
 def header_command(design: Path, prefix: str, out: Output) -> str:
     """Write one C header with the parameters as a static constant."""
+    from pmsmtool.commissioning.export import image_of
+    from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.firmware.export_c import header_file
-    from pmsmtool.workflow.export import image_of
-    from pmsmtool.workflow.parameter_source import load_parameters
 
     wanted = load_parameters(design)
     return header_file(image_of(wanted), prefix=prefix, design_id=wanted.content_hash())
@@ -147,9 +147,9 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, out: O
     the configuration, and which values it does not read: those of sampling, encoder and trips are for your application.
     """
     from pmsmtool.cli.output_file import make_folder
+    from pmsmtool.commissioning.export import image_of
+    from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.firmware.export_c import c_files, not_read_by_core
-    from pmsmtool.workflow.export import image_of
-    from pmsmtool.workflow.parameter_source import load_parameters
 
     wanted = load_parameters(design)
     files = c_files(image_of(wanted), prefix=prefix, design_id=wanted.content_hash())
@@ -173,7 +173,7 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, out: O
 @_written
 def csv_command(design: Path, map_file: Path | None, out: Output) -> str:
     """Write a table: value asked for and held, unit, object, type, bytes, meaning."""
-    from pmsmtool.workflow.export import csv_text
+    from pmsmtool.commissioning.export import csv_text
 
     drive_map = read_map(map_file)
     return csv_text(_parameters(design, drive_map, out), drive_map=drive_map)
@@ -186,7 +186,7 @@ def csv_command(design: Path, map_file: Path | None, out: Output) -> str:
 @_written
 def params_command(design: Path, out: Output) -> str:
     """Write the parameter set that flash-params sends."""
-    from pmsmtool.workflow.export import checked
-    from pmsmtool.workflow.parameter_source import load_parameters
+    from pmsmtool.commissioning.export import checked
+    from pmsmtool.commissioning.parameter_source import load_parameters
 
     return checked(load_parameters(design)).to_toml()

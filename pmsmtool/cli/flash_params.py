@@ -49,8 +49,8 @@ def flash_params_command(
     cut or a killed tool, the same command or `pmsmtool restore` finishes.
     """
     from pmsmtool.cli.flash_session import carry_out
+    from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.flash.download import set_named
-    from pmsmtool.workflow.parameter_source import load_parameters
 
     drive_map = read_map(map_file)
     wanted = load_parameters(source, drive_map)

@@ -13,7 +13,7 @@ from pmsmtool.cli.options import NODE, BusOptions, MotionOptions
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
-    from pmsmtool.firmware.drive_map import DriveMap
+    from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.flash.download import Download, Outcome
     from pmsmtool.params.parameter_set import ParameterSet
 

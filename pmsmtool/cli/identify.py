@@ -18,9 +18,9 @@ from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
     from pmsmtool.cli.consent import Consent
-    from pmsmtool.workflow.capabilities import Capabilities
-    from pmsmtool.workflow.identify_request import IdentifyRequest
-    from pmsmtool.workflow.run_directory import RunDirectory, Stage
+    from pmsmtool.identification.request import IdentifyRequest
+    from pmsmtool.measurement.capabilities import Capabilities
+    from pmsmtool.run_directory import RunDirectory, Stage
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 
@@ -100,16 +100,16 @@ def identify_command(
     """
     from pmsmtool.errors import NotAvailable
     from pmsmtool.estimators.estimate import SensorTolerance
-    from pmsmtool.workflow.calibration import calibrated_tolerance
-    from pmsmtool.workflow.identify_request import NEEDS, QUANTITIES, IdentifyRequest
+    from pmsmtool.identification.calibration import calibrated_tolerance
+    from pmsmtool.identification.request import NEEDS, QUANTITIES, IdentifyRequest
 
     declared = None if sensor_tol is None else SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol)
     if replay is not None:
         if half_frequency:
             raise click.UsageError("--half-frequency measures; with --replay the traces of the run decide")
-        from pmsmtool.workflow.replay import MACHINE, REPLAYED
-        from pmsmtool.workflow.run_directory import RunDirectory
-        from pmsmtool.workflow.tier_evaluate import replay as recompute
+        from pmsmtool.identification.replay import MACHINE, REPLAYED
+        from pmsmtool.identification.tier_evaluate import replay as recompute
+        from pmsmtool.run_directory import RunDirectory
 
         run = RunDirectory(replay)
         run.read()
@@ -156,7 +156,7 @@ def _choose(
 
     from pmsmtool.cli.drive_access import open_node, read_map
     from pmsmtool.flash.map_gate import check_motion
-    from pmsmtool.workflow.capabilities import MEASURING, Method, examine, with_supply
+    from pmsmtool.measurement.capabilities import MEASURING, Method, examine, with_supply
 
     with open_node(bus) as node:
         found = examine(node, None if map_file is None else read_map(map_file))
@@ -174,7 +174,7 @@ def _choose(
 
 def _tell_more(found: Capabilities, request: IdentifyRequest, out: Output) -> None:
     """Name what the drive would measure by itself besides."""
-    from pmsmtool.workflow.vendor_identify import vendor_quantities
+    from pmsmtool.measurement.vendor_identify import vendor_quantities
 
     more = [name for name in vendor_quantities(found) if name not in request.quantities]
     if more:
@@ -198,10 +198,10 @@ def _measure_without_injection(
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.cli.drive_access import choose_node
     from pmsmtool.cli.supply_prompt import supply_reader
-    from pmsmtool.workflow.run_directory import RunDirectory, new_record
-    from pmsmtool.workflow.tier_identify import tier_stage
-    from pmsmtool.workflow.tier_stages import open_tier_drive
-    from pmsmtool.workflow.vendor_identify import vendor_stage
+    from pmsmtool.commissioning.tier_stages import open_tier_drive
+    from pmsmtool.measurement.tier_identify import tier_stage
+    from pmsmtool.measurement.vendor_identify import vendor_stage
+    from pmsmtool.run_directory import RunDirectory, new_record
 
     identity = found.identity
     with bus.connect() as connection:
@@ -242,9 +242,9 @@ def _measure(
     from pmsmtool import __version__
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.cli.drive_access import choose_node
-    from pmsmtool.workflow.identify import identify_stage, nameplate_of
-    from pmsmtool.workflow.run_directory import RunDirectory, new_record
-    from pmsmtool.workflow.tier_stages import open_tier_drive
+    from pmsmtool.commissioning.tier_stages import open_tier_drive
+    from pmsmtool.measurement.identify import identify_stage, nameplate_of
+    from pmsmtool.run_directory import RunDirectory, new_record
 
     with bus.connect() as connection:
         drive = open_tier_drive(connection, choose_node(connection, bus.node), found)
@@ -274,7 +274,7 @@ def _measure(
 def _accounted(run: RunDirectory, out: Output) -> Iterator[Callable[[str], None]]:
     """Have the run say how it ended, whatever ends it; one that was declined before anything moved leaves no trace."""
     from pmsmtool.errors import Declined
-    from pmsmtool.workflow.run_account import accounted
+    from pmsmtool.measurement.run_account import accounted
 
     try:
         with accounted(run, "identify", out.note) as say:
@@ -345,7 +345,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
             hint=f"the accepted values stand in {where}; `pmsmtool help refusals` explains each name",
             missing=refused,
         )
-    from pmsmtool.workflow.commission import NOT_ACCEPTED
+    from pmsmtool.commissioning.commission import NOT_ACCEPTED
 
     broken = [f"{line.what}: {line.measured}, limit {line.limit}" for line in stage.acceptance if not line.ok]
     raise IdentificationError("E_NOT_ACCEPTED", "; ".join(refused or broken), where=str(run.path), hint=NOT_ACCEPTED)

@@ -15,7 +15,7 @@ from pmsmtool.cli.output_file import save_figure
 from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
-    from pmsmtool.design.lookup_design import LookupDesign
+    from pmsmtool.design.lookup.design import LookupDesign
 
 _TEMPERATURE = Quantity("temperature")
 
@@ -67,10 +67,10 @@ def lut_command(
     with the limit that binds and the margins of every cell. Without bounds, the largest grid that fits the drive's
     memory is taken and named; exit code 1 when bounds that are given do not fit it.
     """
-    from pmsmtool.design.iron_loss import load_iron_loss_map
-    from pmsmtool.design.lookup_design import LookupRequest, design_table
-    from pmsmtool.design.lookup_file import table_csv, table_facts, table_npz
-    from pmsmtool.design.lookup_loci import loci
+    from pmsmtool.design.lookup.design import LookupRequest, design_table
+    from pmsmtool.design.lookup.file import table_csv, table_facts, table_npz
+    from pmsmtool.design.lookup.iron_loss import load_iron_loss_map
+    from pmsmtool.design.lookup.loci import loci
     from pmsmtool.machine.flux_map_check import check_flux_map
     from pmsmtool.machine.profile import machine_path
 
@@ -88,7 +88,7 @@ def lut_command(
     write_file(path.with_suffix(".csv"), table_csv(made.table))
     written = [path, path.with_suffix(".csv")]
     if plot_path is not None:
-        from pmsmtool.design.lookup_plot import lookup_figure
+        from pmsmtool.report.lookup_plot import lookup_figure
 
         save_figure(lookup_figure(made.table, lines), plot_path)
         written.append(plot_path)

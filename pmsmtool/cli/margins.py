@@ -15,9 +15,9 @@ from pmsmtool.cli.output_file import inside
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
-    from pmsmtool.design.margins import MarginReport, Spread
+    from pmsmtool.design.loops.margins import MarginReport, Spread
+    from pmsmtool.proof.simulated_margins import Observed, SimulatedMargins
     from pmsmtool.sim.scenarios import Scenario
-    from pmsmtool.workflow.monte_carlo import Observed, SimulatedMargins
 
 _TEMPERATURE = Quantity("temperature")
 _VOLTAGE = Quantity("voltage")
@@ -78,11 +78,11 @@ def margins_command(
     percentile, or when more than 5 % of the simulated drives trip.
     """
     from pmsmtool.cli.scheduler import executor
+    from pmsmtool.commissioning.held_design import why_not_judged
     from pmsmtool.design.design_file import load_design
-    from pmsmtool.design.margins import MarginRequest, margin_report
+    from pmsmtool.design.loops.margins import MarginRequest, margin_report
     from pmsmtool.design.tolerance import tolerance_box
     from pmsmtool.errors import CheckFailed, NotAvailable
-    from pmsmtool.workflow.held_design import why_not_judged
 
     file = inside(design, "design.toml")
     source = load_design(file)
@@ -97,7 +97,7 @@ def margins_command(
             progress=lambda done, wanted: out.status(f"{done} of {wanted} samples"),
         )  # fmt: skip
         if drives:
-            from pmsmtool.workflow.monte_carlo import simulated_margins
+            from pmsmtool.proof.simulated_margins import simulated_margins
 
             # the kernel has threads of its own: processes would only add copies
             own = scheduler in ("local", "processes")
@@ -131,7 +131,7 @@ def margins_command(
 def _scenario(name: str | None, source: Design) -> Scenario | None:
     if name is None:
         return None
-    from pmsmtool.workflow.simulate import SimulatedDrive, find_scenario
+    from pmsmtool.sim.simulate import SimulatedDrive, find_scenario
 
     return find_scenario(name, SimulatedDrive(source.machine, source.parameter_set(), "design"))
 

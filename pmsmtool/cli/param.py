@@ -33,8 +33,8 @@ from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
+    from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.errors import PmsmtoolError
-    from pmsmtool.firmware.drive_map import DriveMap
     from pmsmtool.params.diff import Difference
     from pmsmtool.params.parameter_set import ParameterSet
 
@@ -191,7 +191,7 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
 @output_options
 def help_command(out: Output, names: tuple[str, ...]) -> None:
     """Explain parameters: meaning, unit, bounds, factory value, object."""
-    from pmsmtool.firmware.drive_map import reference_map
+    from pmsmtool.drive_maps.drive_map import reference_map
     from pmsmtool.params.catalogue import BY_NAME
 
     rows = [BY_NAME[name] for text in names for name, _ in _resolve(text, reference_map()) if name]
@@ -336,7 +336,7 @@ def _device_set(node: DriveNode) -> ParameterSet:
 
 
 def _without_defaults(held: ParameterSet) -> ParameterSet:
-    from pmsmtool.firmware.drive_map import reference_map
+    from pmsmtool.drive_maps.drive_map import reference_map
     from pmsmtool.params.parameter_set import ParameterSet, default_set
 
     factory = reference_map().quantised(default_set()).values
@@ -345,8 +345,8 @@ def _without_defaults(held: ParameterSet) -> ParameterSet:
 
 
 def _side(text: str, drive_map: DriveMap) -> ParameterSet:
+    from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.params.parameter_set import default_set
-    from pmsmtool.workflow.parameter_source import load_parameters
 
     return default_set() if text == "default" else load_parameters(Path(text), drive_map)
 

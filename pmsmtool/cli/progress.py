@@ -12,11 +12,11 @@ from pmsmtool.plain_text import plain
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from pmsmtool.workflow.run_directory import Stage
+    from pmsmtool.run_directory import Stage
 
 
 class StageProgress:
-    """Tells the stages on standard error; implements ``workflow.commission.Progress``.
+    """Tells the stages on standard error; implements ``commissioning.commission.Progress``.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, example
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
-    from pmsmtool.workflow.run_directory import RunDirectory, Stage
+    from pmsmtool.run_directory import RunDirectory, Stage
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 
@@ -55,10 +55,10 @@ def prove_command(
     from dataclasses import asdict
 
     from pmsmtool.cli.consent import Consent, ask_motion
+    from pmsmtool.commissioning.commission import begin_run, write_report
     from pmsmtool.design.design_file import design_text, load_design
-    from pmsmtool.workflow.commission import begin_run, write_report
-    from pmsmtool.workflow.prove.stage import ProofRequest, not_proven, prove_stage
-    from pmsmtool.workflow.run_directory import RunDirectory
+    from pmsmtool.proof.stage import ProofRequest, not_proven, prove_stage
+    from pmsmtool.run_directory import RunDirectory
 
     path = design / "design.toml" if design.is_dir() else design
     made = load_design(path)
@@ -106,8 +106,8 @@ def _proven(run: RunDirectory, out: Output, prove: Callable[[Callable[[str], Non
     """Carry the proof out and record it; a run that was made for it and saw no prediction leaves no trace."""
     import shutil
 
-    from pmsmtool.workflow.prove.stage import FOLDER as PROOFS
-    from pmsmtool.workflow.run_account import accounted
+    from pmsmtool.measurement.run_account import accounted
+    from pmsmtool.proof.stage import FOLDER as PROOFS
 
     try:
         with accounted(run, "prove", out.note) as say:

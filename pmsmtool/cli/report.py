@@ -29,7 +29,7 @@ def report_command(run: Path, path: Path | None, out: Output) -> None:
     Every figure is drawn again from the files of the run. The exit code says whether the page was written, not whether
     the run was good.
     """
-    from pmsmtool.workflow.report_page import how_it_ended, report_page, verdict
+    from pmsmtool.commissioning.report_page import how_it_ended, report_page, verdict
 
     path = run / "report.html" if path is None else path
     write_file(path, report_page(run))

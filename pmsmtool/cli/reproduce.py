@@ -13,7 +13,7 @@ from pmsmtool.cli.options import FILE, FilePath, WholeNumber, examples, output_o
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
-    from pmsmtool.workflow.reproduce.figure import Reproduction
+    from pmsmtool.papers.figure import Reproduction
 
 _SEED = WholeNumber("seed", 0, 2**32 - 1)
 _SUFFIXES = (".json", ".csv", ".txt")
@@ -53,7 +53,7 @@ def reproduce_command(
         raise click.UsageError("all figures need a folder: -o DIR")
     from pmsmtool.cli.output_file import figure_format
     from pmsmtool.errors import CheckFailed
-    from pmsmtool.workflow.reproduce.registry import FIGURES, find, reproduce
+    from pmsmtool.papers.registry import FIGURES, find, reproduce
 
     if figure_path is not None:
         figure_format(figure_path)
@@ -91,7 +91,7 @@ def _check_file(path: Path | None) -> None:
 
 
 def _list(out: Output) -> None:
-    from pmsmtool.workflow.reproduce.registry import FIGURES
+    from pmsmtool.papers.registry import FIGURES
 
     rows = [{"name": r.name, "title": r.title, "source": r.source, "run_s": r.run_s} for r in FIGURES]
     shown = [(r.name, r.title, f"{r.run_s:g}", r.source) for r in FIGURES]
@@ -127,7 +127,7 @@ def _series(found: Reproduction) -> list[Mapping[str, Any]]:
 
 
 def _text(found: Reproduction) -> Iterator[str]:
-    from pmsmtool.workflow.reproduce.drawing import tables_of
+    from pmsmtool.papers.drawing import tables_of
 
     yield f"{found.name}: {found.title}"
     yield found.source
@@ -143,7 +143,7 @@ def _text(found: Reproduction) -> Iterator[str]:
 def _write(found: Reproduction, path: Path | None, figure_path: Path | None, out: Output) -> None:
     from pmsmtool.cli.output_file import make_folder, save_figure
     from pmsmtool.files import write_file
-    from pmsmtool.workflow.reproduce.drawing import csv_text, figure_of
+    from pmsmtool.papers.drawing import csv_text, figure_of
 
     targets: list[Path] = []
     if path is not None and path.suffix.lower() in _SUFFIXES and not path.is_dir():

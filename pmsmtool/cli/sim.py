@@ -180,8 +180,8 @@ def clone_command(
     from pmsmtool.files import write_file
     from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
     from pmsmtool.machine.profile import machine_path
-    from pmsmtool.workflow.capabilities import examine
-    from pmsmtool.workflow.clone import clone_drive
+    from pmsmtool.measurement.capabilities import examine
+    from pmsmtool.measurement.clone import clone_drive
 
     machine_file = load_machine_file(machine_path(machine))
     with open_node(bus) as node:

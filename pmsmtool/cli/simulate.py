@@ -69,7 +69,7 @@ def simulate_command(
         raise click.UsageError("nothing to write: give -o, --plot or --json")
     from pmsmtool.cli.output_file import figure_format
     from pmsmtool.errors import ConfigError
-    from pmsmtool.workflow.simulate import find_drive, find_scenario, run_scenario
+    from pmsmtool.sim.simulate import find_drive, find_scenario, run_scenario
 
     if path is not None and path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(f"{path.name} has no trace format", where=str(path), hint="use .npz or .csv")

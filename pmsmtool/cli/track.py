@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pmsmtool.drive.canopen_drive import CanopenDrive
+    from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.errors import Interrupted
     from pmsmtool.estimators.tracking_model import Known
-    from pmsmtool.firmware.drive_map import DriveMap
+    from pmsmtool.identification.track import Tracked
     from pmsmtool.machine.machine_file import MachineFile
+    from pmsmtool.run_directory import RunDirectory
     from pmsmtool.trace import Trace
-    from pmsmtool.workflow.run_directory import RunDirectory
-    from pmsmtool.workflow.track import Tracked
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 QUANTITIES = {"R": "R_s_ohm", "psi": "psi_f_wb"}
@@ -68,7 +68,7 @@ def track_command(
     operating points do not show is refused by name (exit code 6): R needs current, psi needs speed, both need change.
     --replay takes a run of track; runs of identify and commission hold no such observations (exit code 9).
     """
-    from pmsmtool.workflow.track import follow
+    from pmsmtool.identification.track import follow
 
     wanted = tuple(QUANTITIES[name] for name in dict.fromkeys(quantities or QUANTITIES))
     if replay is not None:
@@ -90,8 +90,8 @@ class Watch:
 
 def _stored(replay: Path, machine: Path | None) -> tuple[Any, Known, MachineFile, RunDirectory]:
     from pmsmtool.design.design_file import load_machine_or_design
-    from pmsmtool.workflow.run_directory import RunDirectory
-    from pmsmtool.workflow.track import KNOWN, known_of, load_known, replay_observations
+    from pmsmtool.identification.track import KNOWN, known_of, load_known, replay_observations
+    from pmsmtool.run_directory import RunDirectory
 
     run = RunDirectory(replay)
     run.read()
@@ -111,12 +111,12 @@ def _live(
     drive_map: DriveMap,
 ) -> tuple[RunDirectory, Tracked]:
     """Observe the drive and follow what it showed; the run keeps what was seen, whatever ends it."""
+    from pmsmtool.commissioning.commission import begin_run
     from pmsmtool.errors import PmsmtoolError
+    from pmsmtool.identification.track import follow, known_of, track_stage
     from pmsmtool.machine.machine_file import dump_machine_file
-    from pmsmtool.workflow.commission import begin_run
-    from pmsmtool.workflow.identify import nameplate_of
-    from pmsmtool.workflow.run_account import accounted
-    from pmsmtool.workflow.track import follow, known_of, track_stage
+    from pmsmtool.measurement.identify import nameplate_of
+    from pmsmtool.measurement.run_account import accounted
 
     with ExitStack() as bus_open:
         drive = bus_open.enter_context(open_drive(bus, drive_map))
@@ -145,8 +145,8 @@ def _observed(
 ) -> Trace:
     """Observe, and have the run keep it also when something ends it early."""
     from pmsmtool.drive.interruption import interrupts_deferred
-    from pmsmtool.workflow.observe import GIVEN_BACK, Observations, observe_process_data, observe_recordings
-    from pmsmtool.workflow.track import keep
+    from pmsmtool.identification.track import keep
+    from pmsmtool.measurement.observe import GIVEN_BACK, Observations, observe_process_data, observe_recordings
 
     seen = Observations()
     try:
@@ -175,7 +175,7 @@ def _interrupted(run: RunDirectory) -> Interrupted:
 
 
 def _kept(run: RunDirectory) -> bool:
-    from pmsmtool.workflow.track import OBSERVATIONS
+    from pmsmtool.identification.track import OBSERVATIONS
 
     return (run.path / f"traces/{OBSERVATIONS}.npz").is_file()
 

@@ -18,7 +18,7 @@ from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
-    from pmsmtool.firmware.drive_map import DriveMap
+    from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
 
 
@@ -143,8 +143,8 @@ def _design(source: MachineFile, drive_map: DriveMap, asked: dict[str, Any]) -> 
     if drive_map.staging:
         _refuse_for_reflashed(drive_map.name, {"drive_bandwidth_hz": bandwidth_hz, **limits})
         return tune(source, TuneRequest(**asked))
+    from pmsmtool.commissioning.held_design import held_design
     from pmsmtool.design.closed_drive import ClosedDrive, tune_closed
-    from pmsmtool.workflow.held_design import held_design
 
     options = {name.removeprefix("limit_"): f"--{name.replace('_', '-')}" for name in _LIMITS}
     with options_named(options | {"bandwidth_hz": "--drive-bandwidth-hz"}):

@@ -31,10 +31,10 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
     Bytes only. Whether the machine behaves as designed is what `pmsmtool prove` shows.
     """
     from pmsmtool.cli.flash_session import checked_identity, plan_facts
+    from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.errors import VerifyMismatch
     from pmsmtool.flash.journal import read_snapshot
     from pmsmtool.flash.restore import check_snapshot, plan_download, plan_restore
-    from pmsmtool.workflow.parameter_source import load_parameters
 
     drive_map = read_map(map_file)
     backup = source.suffix == ".json"

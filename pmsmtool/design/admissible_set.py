@@ -19,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.design.current_loop import CurrentGains
+from pmsmtool.design.loops.current_loop import CurrentGains
 from pmsmtool.errors import DesignInfeasible
 
 Array = NDArray[np.float64]

@@ -23,9 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
-from pmsmtool.design.lookup_table import RPM, torque_limits
+from pmsmtool.design.lookup.table import RPM, torque_limits
+from pmsmtool.design.loops.open_loops import (
+    CURRENT_GAINS,
+    CURRENT_LOOPS,
+    SPEED_LOOP,
+    lacking_gains,
+    one_pair,
+    with_gains,
+)
 from pmsmtool.design.minimum_time import TransferProblem, minimum_time
-from pmsmtool.design.open_loops import CURRENT_GAINS, CURRENT_LOOPS, SPEED_LOOP, lacking_gains, one_pair, with_gains
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import Ratings, ratings
 from pmsmtool.design.slope_response import CurrentLoops, MachineBox, SlopeResponse, slope_response

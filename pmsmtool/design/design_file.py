@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from pmsmtool.design.sampled_loop import LoopMargins
+from pmsmtool.design.loops.sampled_loop import LoopMargins
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
 from pmsmtool.machine.key import Key, check_table, did_you_mean

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from pmsmtool.design.design_file import DesignValue, Scalar
-from pmsmtool.design.lookup_table import RPM, torque_limits
+from pmsmtool.design.lookup.table import RPM, torque_limits
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import ConfigError

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.design.admissible_set import Horizon, PredictionModel, StateBounds, horizon
-from pmsmtool.design.current_loop import CurrentGains
 from pmsmtool.design.design_file import DesignValue, Scalar
-from pmsmtool.design.lookup_table import RPM
+from pmsmtool.design.lookup.table import RPM
+from pmsmtool.design.loops.current_loop import CurrentGains
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.design.lookup_table import CUT, NONE, electrical_speed, speed_table
+from pmsmtool.design.lookup.table import CUT, NONE, electrical_speed, speed_table
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.design.tolerance import Samples

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from pmsmtool.design.design_file import DesignValue, Scalar
-from pmsmtool.design.lookup_table import RPM
+from pmsmtool.design.lookup.table import RPM
 from pmsmtool.design.polar import (
     AMPLITUDE_SIGMA_RAD_S,
     CDM_GAMMA,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.design.design_file import DesignValue
-from pmsmtool.design.lookup_table import RPM, torque_limits
+from pmsmtool.design.lookup.table import RPM, torque_limits
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile

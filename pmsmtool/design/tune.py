@@ -10,16 +10,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from pmsmtool.design.bandwidth import CurrentChoice, choose_current
-from pmsmtool.design.current_loop import maximum_delay_periods
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.design.field_weakening import design_field_weakening
 from pmsmtool.design.governor import design_governor
-from pmsmtool.design.lookup_table import RPM
-from pmsmtool.design.ratings import Ratings, rating_values, ratings
-from pmsmtool.design.sampled_loop import LoopMargins, margins
-from pmsmtool.design.speed_loop import (
+from pmsmtool.design.lookup.table import RPM
+from pmsmtool.design.loops.bandwidth import CurrentChoice, choose_current
+from pmsmtool.design.loops.current_loop import maximum_delay_periods
+from pmsmtool.design.loops.sampled_loop import LoopMargins, margins
+from pmsmtool.design.loops.speed_loop import (
     Notch,
     SpeedGains,
     SpeedMethod,
@@ -30,6 +29,7 @@ from pmsmtool.design.speed_loop import (
     symmetric_optimum,
     symmetric_ratio,
 )
+from pmsmtool.design.ratings import Ratings, rating_values, ratings
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
@@ -182,8 +182,8 @@ def _design_table(
     source: MachineFile, request: TuneRequest, rated: Ratings
 ) -> tuple[_Part, dict[str, tuple[float, ...]]]:
     """The table of the look-up mode, with the tightest bound that fits the drive."""
-    from pmsmtool.design.lookup_design import LookupRequest, design_table
-    from pmsmtool.design.lookup_file import lut_values
+    from pmsmtool.design.lookup.design import LookupRequest, design_table
+    from pmsmtool.design.lookup.file import lut_values
 
     made = design_table(source, rated, LookupRequest(), request.voltage_margin)
     values, tables = lut_values(made.table, made.stored)

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from pmsmtool.design.current_loop import Method
 from pmsmtool.design.design_file import Scalar
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING_MODES
 from pmsmtool.design.governor import MODES as GOVERNOR_MODES
+from pmsmtool.design.loops.current_loop import Method
+from pmsmtool.design.loops.speed_loop import SpeedMethod
 from pmsmtool.design.polar_laws import LAWS as POLAR_LAWS
-from pmsmtool.design.speed_loop import SpeedMethod
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.key import Key, KeyKind, check_table
 

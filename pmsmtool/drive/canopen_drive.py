@@ -12,9 +12,9 @@ from pmsmtool.drive import objects, stop
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Excitation, Halves, Injection, Recording, Shape
-from pmsmtool.drive.recorder import Recorder
+from pmsmtool.drive.recorders.reference import Recorder
+from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError, DriveFault, NotAvailable, SdoAbort
-from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.trace import Trace

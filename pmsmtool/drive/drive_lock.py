@@ -19,8 +19,8 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.bus.supervision import SecondMaster
 from pmsmtool.drive import objects
+from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.errors import ConfigError, SdoAbort
-from pmsmtool.firmware.drive_map import reference_map
 from pmsmtool.plain_text import one_line
 from pmsmtool.resources import user_folder
 

@@ -16,8 +16,8 @@ from pmsmtool.cia402 import EXCITATION_ABORTED, Command, State, command_towards_
 from pmsmtool.drive import objects
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.errors import DriveFault, DriveTimeout, SdoAbort
-from pmsmtool.firmware.drive_map import DriveMap, reference_map
 from pmsmtool.plain_text import one_line
 
 STATE_TIMEOUT_S = 2.0

@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.bus.connection import Connection
-from pmsmtool.drive.commanded_recorder import CommandedRecorder
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import signal_unit
 from pmsmtool.drive.port import Recording
-from pmsmtool.drive.recorder_choice import recorder_of
+from pmsmtool.drive.recorders.choice import recorder_of
+from pmsmtool.drive.recorders.commanded import CommandedRecorder
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S, RecorderDrive
 from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import BusError, NotAvailable, SdoAbort
 from pmsmtool.estimators.recorded_push import DELAY_DOUBT
-from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.trace import Trace
 
 RECORDED = {

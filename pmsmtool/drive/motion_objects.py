@@ -17,10 +17,10 @@ from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive_maps.drive_map import LETTERS
+from pmsmtool.drive_maps.motion_objects import MotionObject
+from pmsmtool.drive_maps.wire_units import wire_unit
 from pmsmtool.errors import NotAvailable, SdoAbort
-from pmsmtool.firmware.drive_map import LETTERS
-from pmsmtool.firmware.motion_objects import MotionObject
-from pmsmtool.firmware.wire_units import wire_unit
 from pmsmtool.units import RPM_PER_RAD_S
 
 ENCODER_COUNTS = DriveObject(0x608F, 1, "I")

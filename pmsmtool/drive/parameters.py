@@ -15,10 +15,10 @@ from enum import IntEnum
 from pmsmtool.bus.sdo import Mode, Retry
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.map_tables import look_up_words
 from pmsmtool.errors import BusError, DriveFault, DriveTimeout, NotAvailable, SdoAbort, VerifyMismatch
-from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.firmware.image import ImageStatus, crc32, pack_image, unpack_image
-from pmsmtool.firmware.map_tables import look_up_words
 from pmsmtool.params.catalogue import SCHEMA_VERSION, layout_signature
 from pmsmtool.params.parameter_set import TABLE_NAMES
 

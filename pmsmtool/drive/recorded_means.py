@@ -11,8 +11,8 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.port import Halves
-from pmsmtool.drive.recorder import Recorder
-from pmsmtool.firmware.drive_map import DriveMap
+from pmsmtool.drive.recorders.reference import Recorder
+from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.trace import Trace
 
 LOOK, AT_REST, TURNING = 32, 256, 128

@@ -30,9 +30,9 @@ from pmsmtool.drive.motion_objects import (
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
-from pmsmtool.drive.recorder import Recorder
+from pmsmtool.drive.recorders.reference import Recorder
+from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import DriveTimeout, NotAvailable
-from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.trace import Trace
 from pmsmtool.units import RAD_S_PER_MRPM
 

@@ -12,8 +12,8 @@ from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.cia402 import Command, QuickStop, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import STATE_TIMEOUT_S, DriveNode, is_safe
+from pmsmtool.drive_maps.drive_map import LETTERS
 from pmsmtool.errors import BusError, DriveFault, PmsmtoolError, SdoAbort, StopNotConfirmed
-from pmsmtool.firmware.drive_map import LETTERS
 
 STOP_MARGIN_S = 1.0
 """Beyond the time the deceleration ramp needs."""

@@ -20,11 +20,11 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.motion_objects import LimitedSpeed, limited_speed, torque_target, undecided
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Recording
-from pmsmtool.drive.recorder import Recorder
+from pmsmtool.drive.recorders.reference import Recorder
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S, StandardDrive, TorqueCurrent
+from pmsmtool.drive_maps.drive_map import LETTERS, DriveMap
+from pmsmtool.drive_maps.wire_units import wire_unit
 from pmsmtool.errors import NotAvailable, SdoAbort
-from pmsmtool.firmware.drive_map import LETTERS, DriveMap
-from pmsmtool.firmware.wire_units import wire_unit
 from pmsmtool.trace import Trace
 
 DC_LINK_MV = objects.DriveObject(0x6079, 0, "I")

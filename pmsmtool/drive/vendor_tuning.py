@@ -16,9 +16,8 @@ from pmsmtool.cia402 import Command, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.standard_drive import StandardDrive
-from pmsmtool.errors import BusError, DriveFault, DriveTimeout, NotAvailable, SdoAbort
-from pmsmtool.firmware.drive_map import DriveMap
-from pmsmtool.firmware.vendor_tuning import (
+from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.vendor_tuning import (
     ABORT,
     COMMAND_BYTES,
     DATA_AT,
@@ -32,6 +31,7 @@ from pmsmtool.firmware.vendor_tuning import (
     VendorStep,
     VendorTuning,
 )
+from pmsmtool.errors import BusError, DriveFault, DriveTimeout, NotAvailable, SdoAbort
 
 POLL_S = 0.1
 """The drive is asked this often whether it has finished; the guard looks at the machine in between."""

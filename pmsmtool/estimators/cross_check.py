@@ -21,11 +21,11 @@ from itertools import pairwise
 import numpy as np
 
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance
-from pmsmtool.estimators.flux_linkage_rows import Corrected
+from pmsmtool.estimators.flux.linkage_rows import Corrected
 from pmsmtool.machine.parameters import Estimate
 
 RIPPLE_DOUBT = 0.2
-"""Standard deviation of the ripple's share of the inverter error, relative: twice that of ``flux_linkage``. Of 52
+"""Standard deviation of the ripple's share of the inverter error, relative: twice that of ``flux.linkage``. Of 52
 random drives whose dead time takes more than 3 R I, 51 agree with it."""
 LAG_STD = 0.2
 """Relative standard deviation of the lag of the speed: the shaft has just begun to accelerate, and the lag of the
@@ -112,7 +112,7 @@ def driven_flux_linkage(
     across_wb : float
         What the frame, which is off the d axis, shows of the flux linkage in the d voltage (Wb).
     curvature : float
-        Of the d axis, as ``flux_linkage.FluxResult`` has it.
+        Of the d axis, as ``flux.linkage.FluxResult`` has it.
     lag_s : float
         Delay of the drive's speed behind the rotor's (s).
     tolerance : SensorTolerance

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.flux_linkage_rows import mean_inverter_error
+from pmsmtool.estimators.flux.linkage_rows import mean_inverter_error
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
 

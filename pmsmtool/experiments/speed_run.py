@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
-from pmsmtool.estimators.flux_linkage_rows import fastest_pair
+from pmsmtool.estimators.flux.linkage_rows import fastest_pair
 from pmsmtool.experiments.signals import readable, table
 from pmsmtool.trace import Trace
 

@@ -13,11 +13,11 @@ import json
 from pathlib import Path
 
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.drive_map_file import map_hash
+from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
 from pmsmtool.errors import ConfigError, SafetyRefusal
 from pmsmtool.files import read_text, write_file
-from pmsmtool.firmware.drive_map import DriveMap
-from pmsmtool.firmware.drive_map_file import map_hash
-from pmsmtool.firmware.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
 from pmsmtool.flash.journal import JournalFolder
 
 _RIGHTS = "check your rights there and the space on the disk"

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from pmsmtool.cia402 import HOMING_LOST
+from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.diff import table_unit
 from pmsmtool.params.parameter_set import ParameterSet

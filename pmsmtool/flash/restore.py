@@ -12,8 +12,8 @@ from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
-from pmsmtool.firmware.drive_map import DriveMap
 from pmsmtool.flash.download import Outcome
 from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
 from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read

@@ -37,10 +37,10 @@ KERNELS: tuple[Kernel, ...] = (
     Kernel("pmsm_core", (_CORE,)),
     Kernel("pmsm_core_f64", (_CORE,), ("PMSM_REAL_DOUBLE",)),
     Kernel("pmsm_sim", ("sim/*.c", "machine/*.c", _CORE)),
-    Kernel("pmsm_design", ("design/*.c", "machine/*.c")),
+    Kernel("pmsm_design", ("design/lookup/*.c", "machine/*.c")),
 )
 
-INCLUDE_FOLDERS: tuple[str, ...] = ("firmware/core", "machine", "sim", "design")
+INCLUDE_FOLDERS: tuple[str, ...] = ("firmware/core", "machine", "sim", "design/lookup")
 """Searched for quoted includes only, so that no header here can hide one of the C library."""
 
 HEADERS: tuple[str, ...] = tuple(f"{folder}/*.h" for folder in INCLUDE_FOLDERS)

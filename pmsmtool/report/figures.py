@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.design.loops.sampled_loop import LoopMargins, SampledLoop
 from pmsmtool.design.prediction import Prediction
-from pmsmtool.design.sampled_loop import LoopMargins, SampledLoop
-from pmsmtool.estimators.axis_fit import AxisFit
-from pmsmtool.estimators.axis_response import SKIP_SAMPLES
-from pmsmtool.estimators.flux_linkage import FluxResult
+from pmsmtool.estimators.flux.linkage import FluxResult
+from pmsmtool.estimators.injection.axis_fit import AxisFit
+from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.report.report import Figure
 from pmsmtool.trace import Trace

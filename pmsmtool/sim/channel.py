@@ -29,10 +29,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
+from pmsmtool.drive_maps.drive_map_file import parse_drive_map
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
-from pmsmtool.firmware.drive_map_file import parse_drive_map
-from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.faults import load_faults
 from pmsmtool.sim.line import Line
@@ -44,7 +44,7 @@ from pmsmtool.sim.node.memory import FileStorage, Memory, RamStorage, Storage
 from pmsmtool.sim.node.node import Node
 
 if TYPE_CHECKING:
-    from pmsmtool.firmware.drive_map import DriveMap
+    from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.sim.node.drive_core import DriveCore
 

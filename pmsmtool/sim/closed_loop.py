@@ -84,7 +84,7 @@ def image_of(machine_file: MachineFile, params: ParameterSet) -> bytes:
     values = drive_values(machine_file, params)
     if not params.tables:
         return pack_image(values)
-    from pmsmtool.firmware.map_tables import encode_table, look_up_words
+    from pmsmtool.drive_maps.map_tables import encode_table, look_up_words
 
     encoded = {name: encode_table(name, params.tables[name], values) for name in TABLE_NAMES if name in params.tables}
     return pack_image(values, look_up_words(encoded))

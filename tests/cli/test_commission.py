@@ -21,19 +21,19 @@ import pytest
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli import consent
+from pmsmtool.commissioning import commission
+from pmsmtool.commissioning.commission import STAGES
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
-from pmsmtool.firmware.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, reference_map
-from pmsmtool.firmware.drive_map_file import dump_drive_map
+from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, reference_map
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map
 from pmsmtool.flash.restore import take_backup
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.report.verdict import NEEDED
 from pmsmtool.resources import data_folder
+from pmsmtool.run_directory import RunDirectory, RunRecord, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.workflow import commission
-from pmsmtool.workflow.commission import STAGES
-from pmsmtool.workflow.random_drives import true_loop_resistance
-from pmsmtool.workflow.run_directory import RunDirectory, RunRecord, Stage, new_record
+from pmsmtool.sim.random_drives import true_loop_resistance
 from tests.cli.conftest import Tool
 from tests.drive.served import serving
 

@@ -17,10 +17,10 @@ import pytest
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.cli.main import run
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive_maps.drive_map import reference_map
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import SdoAbort
-from pmsmtool.firmware.drive_map import reference_map
-from pmsmtool.firmware.drive_map_file import dump_drive_map
-from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
 from pmsmtool.sim.bus import PmsmSimBus
 from tests.cli.conftest import Result, Tool

@@ -18,19 +18,19 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli, run
+from pmsmtool.commissioning.export import concise_dcf, csv_text, image_of
+from pmsmtool.commissioning.parameter_source import load_parameters
 from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design
 from pmsmtool.design.tune import tune
+from pmsmtool.drive_maps.dcf import read_concise
+from pmsmtool.drive_maps.drive_map import Cell, DriveMap, reference_map
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.dcf import read_concise
-from pmsmtool.firmware.drive_map import Cell, DriveMap, reference_map
-from pmsmtool.firmware.drive_map_file import dump_drive_map
 from pmsmtool.firmware.export_c import FLAGS, image_of_json
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.resources import data_folder
-from pmsmtool.workflow.export import concise_dcf, csv_text, image_of
-from pmsmtool.workflow.parameter_source import load_parameters
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 

@@ -17,9 +17,9 @@ from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
+from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.workflow.random_drives import true_loop_resistance
-from pmsmtool.workflow.run_directory import RunDirectory
+from pmsmtool.sim.random_drives import true_loop_resistance
 from tests.cli.conftest import Tool
 
 TOLERANCE = 0.01

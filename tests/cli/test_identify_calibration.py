@@ -14,11 +14,11 @@ import pytest
 from pmsmtool.cli.main import run
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.identification.calibration import calibrated_tolerance
+from pmsmtool.identification.evaluate import tolerance_on
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
-from pmsmtool.workflow.calibration import calibrated_tolerance
-from pmsmtool.workflow.evaluate import tolerance_on
-from pmsmtool.workflow.random_drives import true_loop_resistance
+from pmsmtool.sim.random_drives import true_loop_resistance
 from tests.simulated_bus import settle
 
 GAIN = 1.01

@@ -37,9 +37,9 @@ from pmsmtool.errors import (
     VerifyMismatch,
 )
 from pmsmtool.machine.machine_keys import machine_file_keys
+from pmsmtool.measurement.run_account import accounted
+from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.scenarios import BUILT_IN, SCHEDULES
-from pmsmtool.workflow.run_account import accounted
-from pmsmtool.workflow.run_directory import RunDirectory, new_record
 
 ROOT = Path(__file__).resolve().parents[2]
 SLOW = ("numpy", "scipy", "can", "canopen", "matplotlib", "rich", "jinja2", "tomlkit", "filterpy")

@@ -12,9 +12,9 @@ import pytest
 
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.cli.main import run
-from pmsmtool.firmware.drive_map import DriveMap, reference_map
-from pmsmtool.firmware.drive_map_file import dump_drive_map
-from pmsmtool.firmware.shipped_maps import load_family
+from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.node import node
 from tests.cli.conftest import Result, Tool

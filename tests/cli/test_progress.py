@@ -10,7 +10,7 @@ import pytest
 
 from pmsmtool.cli.output import Output
 from pmsmtool.cli.progress import StageProgress
-from pmsmtool.workflow.run_directory import Stage
+from pmsmtool.run_directory import Stage
 
 PASSED = Stage("tune", "pass", 0.0, summary="current loops 637 Hz")
 PASSED_BEFORE = Stage("identify", "pass", 1.0)

@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.cli.main import run as program
-from pmsmtool.design.lookup_design import LookupRequest
-from pmsmtool.design.open_loops import open_loops
+from pmsmtool.commissioning import report_page
+from pmsmtool.commissioning.design_stages import lut_stage, tune_stage
+from pmsmtool.design.lookup.design import LookupRequest
+from pmsmtool.design.loops.open_loops import open_loops
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.report.verdict import Verdict
 from pmsmtool.resources import data_folder
-from pmsmtool.workflow import report_page
-from pmsmtool.workflow.design_stages import lut_stage, tune_stage
-from pmsmtool.workflow.run_directory import Acceptance, RunDirectory, Stage, new_record
+from pmsmtool.run_directory import Acceptance, RunDirectory, Stage, new_record
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_a_failed_stage_makes_the_verdict(made: Path, tmp_path: Path) -> None:
 
 def test_the_loops_drawn_are_those_of_the_design(made: Path) -> None:
     from pmsmtool.design.design_file import load_design
-    from pmsmtool.design.sampled_loop import margins
+    from pmsmtool.design.loops.sampled_loop import margins
 
     design = load_design(made / "design.toml")
     loops = open_loops(design)

@@ -14,9 +14,9 @@ import pytest
 
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.errors import StopNotConfirmed
-from pmsmtool.workflow import identify
-from pmsmtool.workflow.run_account import RunAccount, account_lines
-from pmsmtool.workflow.run_directory import RunDirectory
+from pmsmtool.measurement import identify
+from pmsmtool.measurement.run_account import RunAccount, account_lines
+from pmsmtool.run_directory import RunDirectory
 from tests.cli.conftest import Tool
 
 IDENTIFY = ("-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:", "--yes", "identify", "R")

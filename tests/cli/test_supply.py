@@ -16,7 +16,7 @@ from pmsmtool.cli.supply_prompt import supply_reader
 from pmsmtool.errors import Declined, NotAvailable
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.workflow.capabilities import EXPECTED, Method
+from pmsmtool.measurement.capabilities import EXPECTED, Method
 
 CHANNEL = "interior-2k2?nv=:memory:&drive=cia402"
 

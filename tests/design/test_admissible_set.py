@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.design.admissible_set import PredictionModel, StateBounds, horizon
-from pmsmtool.design.current_loop import imc, second_order
+from pmsmtool.design.loops.current_loop import imc, second_order
 from pmsmtool.errors import DesignInfeasible
 
 R, L_D, L_Q, PSI, P, T_S = 0.137, 2.3e-3, 2.1e-3, 0.41, 4, 1.0 / 12e3

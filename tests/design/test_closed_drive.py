@@ -27,15 +27,15 @@ from pmsmtool.design.closed_drive import (
 )
 from pmsmtool.design.design_file import Design, design_text, parse_design
 from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, NotAvailable
-from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.papers.closed_drive import closed_drive
+from pmsmtool.papers.closed_node import ClosedNode, Seat
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.simulated_machine import with_simulation
-from pmsmtool.workflow.reproduce.closed_drive import closed_drive
-from pmsmtool.workflow.reproduce.closed_node import ClosedNode, Seat
 
 pytestmark = pytest.mark.chain
 

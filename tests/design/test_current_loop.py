@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pmsmtool.design.current_loop import (
+from pmsmtool.design.loops.current_loop import (
     AxisPlant,
     CurrentGains,
     Method,
@@ -19,7 +19,7 @@ from pmsmtool.design.current_loop import (
     modulus_optimum,
     second_order,
 )
-from pmsmtool.design.sampled_loop import SampledLoop, margins
+from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.errors import DesignInfeasible
 
 R, L_D, L_Q, T_S = 0.137, 2.3e-3, 2.1e-3, 1.0 / 12e3

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from pmsmtool.design.admissible_set import PredictionModel
-from pmsmtool.design.current_loop import imc
 from pmsmtool.design.field_weakening import (
     empty_above_rpm,
     limit_facts,
@@ -30,7 +29,8 @@ from pmsmtool.design.governor import (
     design_governor,
     euler_error,
 )
-from pmsmtool.design.lookup_table import torque_limits
+from pmsmtool.design.lookup.table import torque_limits
+from pmsmtool.design.loops.current_loop import imc
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.tune import tune

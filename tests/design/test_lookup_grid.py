@@ -16,11 +16,10 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.design import lookup_design
-from pmsmtool.design.iron_loss import load_iron_loss_map
-from pmsmtool.design.lookup_design import LookupDesign, LookupRequest, design_table
-from pmsmtool.design.lookup_file import lut_values, lut_words, table_csv, table_facts, table_npz
-from pmsmtool.design.lookup_grid import (
+from pmsmtool.design.lookup import design as lookup_design
+from pmsmtool.design.lookup.design import LookupDesign, LookupRequest, design_table
+from pmsmtool.design.lookup.file import lut_values, lut_words, table_csv, table_facts, table_npz
+from pmsmtool.design.lookup.grid import (
     InterpolationError,
     StoredFormat,
     as_stored,
@@ -28,8 +27,9 @@ from pmsmtool.design.lookup_grid import (
     lsb_a,
     table_words,
 )
-from pmsmtool.design.lookup_loci import loci
-from pmsmtool.design.lookup_table import CUT, RPM, LookupTable, electrical_speed, flux_table, speed_table, torque_limits
+from pmsmtool.design.lookup.iron_loss import load_iron_loss_map
+from pmsmtool.design.lookup.loci import loci
+from pmsmtool.design.lookup.table import CUT, RPM, LookupTable, electrical_speed, flux_table, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.design.ratings import ratings
 from pmsmtool.errors import ConfigError, DesignInfeasible

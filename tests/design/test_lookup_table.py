@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pmsmtool.design.lookup_table import (
+from pmsmtool.design.lookup.table import (
     CUT,
     NONE,
     LookupTable,

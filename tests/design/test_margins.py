@@ -14,9 +14,9 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.design.current_loop import AxisPlant, axis_loop, imc, second_order
 from pmsmtool.design.design_file import Design, design_text
-from pmsmtool.design.margins import (
+from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc, second_order
+from pmsmtool.design.loops.margins import (
     BLOCK,
     BLOCKS_PER_TASK,
     Blocks,
@@ -27,13 +27,13 @@ from pmsmtool.design.margins import (
     margin_problem,
     margin_report,
 )
+from pmsmtool.design.loops.sampled_loop import margins
+from pmsmtool.design.loops.speed_loop import SpeedGains, SpeedMethod, SpeedPath, speed_loop
+from pmsmtool.design.loops.vector_margins import current_response, vector_margins
 from pmsmtool.design.operating_machine import at_temperature
-from pmsmtool.design.sampled_loop import margins
-from pmsmtool.design.speed_loop import SpeedGains, SpeedMethod, SpeedPath, speed_loop
 from pmsmtool.design.tolerance import NORMAL_95, Samples, tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
-from pmsmtool.design.vector_margins import current_response, vector_margins
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import load_machine_file
 

@@ -16,13 +16,13 @@ from click.testing import CliRunner
 from pmsmtool.cli.main import cli
 from pmsmtool.cli.scheduler import executor
 from pmsmtool.design.design_file import design_text
-from pmsmtool.design.margins import BLOCK, margin_report
+from pmsmtool.design.loops.margins import BLOCK, margin_report
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.errors import BusError, NotAvailable
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.workflow import monte_carlo
-from pmsmtool.workflow.monte_carlo import simulated_margins, torque_reversals
+from pmsmtool.proof import simulated_margins as monte_carlo
+from pmsmtool.proof.simulated_margins import simulated_margins, torque_reversals
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 

@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from pmsmtool.design.current_loop import AxisPlant, axis_loop, imc
-from pmsmtool.design.sampled_loop import margins
-from pmsmtool.design.speed_loop import (
+from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
+from pmsmtool.design.loops.sampled_loop import margins
+from pmsmtool.design.loops.speed_loop import (
     Notch,
     SpeedGains,
     SpeedPath,

@@ -13,13 +13,13 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.design.bandwidth import choose_current, least_inductance
-from pmsmtool.design.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.design.design_file import Design, design_text, load_design, parse_design
-from pmsmtool.design.lookup_table import torque_limits
+from pmsmtool.design.lookup.table import torque_limits
+from pmsmtool.design.loops.bandwidth import choose_current, least_inductance
+from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
+from pmsmtool.design.loops.sampled_loop import margins
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import base_speed_rpm, dead_time_compensation, ratings
-from pmsmtool.design.sampled_loop import margins
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible
@@ -28,7 +28,7 @@ from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import InverterParameters, MachineLimits, MachineParameters
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import parse_parameter_set
-from pmsmtool.workflow.random_drives import draw_drive
+from pmsmtool.sim.random_drives import draw_drive
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 

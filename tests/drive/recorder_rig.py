@@ -14,11 +14,11 @@ import pytest
 
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.recorder import Recorder
-from pmsmtool.drive.recorder_choice import recorder_of
-from pmsmtool.firmware import monitor_objects, ring_objects, trace_objects
-from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
-from pmsmtool.firmware.shipped_maps import load_family
+from pmsmtool.drive.recorders.choice import recorder_of
+from pmsmtool.drive.recorders.reference import Recorder
+from pmsmtool.drive_maps import copley_objects, epos2_objects, ingenia_objects
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.node.dictionary import Entry
 from pmsmtool.trace import Trace
@@ -64,11 +64,11 @@ class Kind:
 KINDS = {
     "domain": Kind("pmsmsim", ("U_dc_v", "u_q_v"), 8192, (0x2060, 9), 0x2062),
     "index": Kind(
-        "ingenia", ("U_dc_v", "u_q_v"), 1024, (monitor_objects.BYTES_LEFT[0], 0), monitor_objects.DATA, row_counts=8
+        "ingenia", ("U_dc_v", "u_q_v"), 1024, (ingenia_objects.BYTES_LEFT[0], 0), ingenia_objects.DATA, row_counts=8
     ),
-    "rows": Kind("copley", ("U_dc_v", "i_q_a"), 1024, trace_objects.RECORDED[:2], trace_objects.DATA, quantum_v=0.1),
+    "rows": Kind("copley", ("U_dc_v", "i_q_a"), 1024, copley_objects.RECORDED[:2], copley_objects.DATA, quantum_v=0.1),
     "rings": Kind(
-        "epos2", ("U_dc_v", "i_q_a"), 256, ring_objects.RECORDED[:2], ring_objects.BUFFER, quantum_v=0.01,
+        "epos2", ("U_dc_v", "i_q_a"), 256, epos2_objects.RECORDED[:2], epos2_objects.BUFFER, quantum_v=0.01,
         completed=RINGS,
     ),
 }  # fmt: skip

@@ -32,17 +32,17 @@ from pmsmtool.drive.recorded_means import RecordedMeans
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveFault, Interrupted, LimitExceeded, PmsmtoolError, SafetyRefusal, StopNotConfirmed
 from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
-from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
-from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.session import Session
 from tests.drive.bench import COMMANDS
-from tests.workflow.test_mapped_recorder import completed
-from tests.workflow.vendor_rig import filled_in
+from tests.measurement.test_mapped_recorder import completed
+from tests.measurement.vendor_rig import filled_in
 
 ENVELOPE = Envelope(i_max_apk=3.0, speed_max_rad_s=100.0)
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from pmsmtool.bus.connect import connect
-from pmsmtool.drive.commanded_recorder import CommandedRecorder
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.recorder_choice import recorder_of
+from pmsmtool.drive.recorders.choice import recorder_of
+from pmsmtool.drive.recorders.commanded import CommandedRecorder
+from pmsmtool.drive_maps import copley_objects, epos2_objects, ingenia_objects
+from pmsmtool.drive_maps.drive_map_file import parse_drive_map
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveTimeout, NotAvailable, VerifyMismatch
-from pmsmtool.firmware import monitor_objects, ring_objects, trace_objects
-from pmsmtool.firmware.drive_map_file import parse_drive_map
-from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.profile import machine_path
 from tests.drive.recorder_rig import KINDS, RIPPLE_HZ, RIPPLE_V, STEP_V, T_S, WHOLE_NS, Opener, Rig
 
@@ -60,16 +60,16 @@ def test_it_says_what_it_can_take_and_how_fast(commanded: Rig) -> None:
 @COMMANDED
 def test_a_recorder_that_does_not_fill_ends_in_time(commanded: Rig) -> None:
     where = {
-        "monitor": monitor_objects.FORCE_TRIGGER,
-        "trace": trace_objects.RECORDED,
-        "data recorder": ring_objects.CONTROL,
+        "monitor": ingenia_objects.FORCE_TRIGGER,
+        "trace": copley_objects.RECORDED,
+        "data recorder": epos2_objects.CONTROL,
     }
     assert isinstance(commanded.recorder, CommandedRecorder)
     entry = commanded.entry(*where[commanded.recorder.what][:2])
     entry.sink = lambda data: None
     if entry.source is not None:
         entry.source = lambda: entry.encode(0)
-        commanded.entry(*trace_objects.STATUS[:2]).source = lambda: b"\x01\0"  # runs and runs
+        commanded.entry(*copley_objects.STATUS[:2]).source = lambda: b"\x01\0"  # runs and runs
     with pytest.raises(DriveTimeout, match="does not finish"):
         commanded.record(100)
 
@@ -77,8 +77,8 @@ def test_a_recorder_that_does_not_fill_ends_in_time(commanded: Rig) -> None:
 def _ran_on(rig: Rig) -> None:
     """The drive takes the stop, says that it stands, and records on."""
     control, status = {
-        "rows": (trace_objects.START, trace_objects.STATUS),
-        "rings": (ring_objects.CONTROL, ring_objects.STATUS),
+        "rows": (copley_objects.START, copley_objects.STATUS),
+        "rings": (epos2_objects.CONTROL, epos2_objects.STATUS),
     }[rig.node.map.capabilities.recorder]
     entry, told = rig.entry(*control[:2]), rig.entry(*status[:2])
     sink, source = entry.sink, told.source
@@ -113,10 +113,10 @@ def test_the_drive_says_a_signal_of_the_map_is_none_of_its(commanded: Rig) -> No
 @pytest.mark.parametrize(
     ("address", "lie", "complaint"),
     [
-        (ring_objects.LARGEST, 400, "has not taken"),
-        (ring_objects.FIRST, 300, "cannot begin at 300"),
-        (ring_objects.RECORDED, 9, "9 of at most 256 are there"),
-        (ring_objects.RECORDED, 999, "999 of at most 256 are there"),
+        (epos2_objects.LARGEST, 400, "has not taken"),
+        (epos2_objects.FIRST, 300, "cannot begin at 300"),
+        (epos2_objects.RECORDED, 9, "9 of at most 256 are there"),
+        (epos2_objects.RECORDED, 999, "999 of at most 256 are there"),
     ],
 )
 def test_rings_that_cannot_be_are_refused(
@@ -192,7 +192,7 @@ def test_the_shipped_map_of_epos2_says_which_line_is_missing() -> None:
 @MONITOR_ONLY
 def test_a_block_that_came_twice_is_refused(commanded: Rig) -> None:
     """The drive counts on, but gives the first block again: the count betrays it when it does not match the bytes."""
-    entry = commanded.entry(monitor_objects.DATA, 0)
+    entry = commanded.entry(ingenia_objects.DATA, 0)
     honest = entry.source
     assert honest is not None
     first: list[bytes] = []
@@ -208,7 +208,7 @@ def test_a_block_that_came_twice_is_refused(commanded: Rig) -> None:
 
 @MONITOR_ONLY
 def test_another_row_length_is_refused(commanded: Rig) -> None:
-    entry = commanded.entry(monitor_objects.ROW_BYTES[0], 0)
+    entry = commanded.entry(ingenia_objects.ROW_BYTES[0], 0)
     entry.source = lambda: entry.encode(12)
     with pytest.raises(VerifyMismatch, match="has not taken"):
         commanded.record(100)
@@ -216,5 +216,5 @@ def test_another_row_length_is_refused(commanded: Rig) -> None:
 
 def test_mapping_words_are_the_makers() -> None:
     """u_q: register 0x06F of axis 1, a float (8) of 4 bytes; as the maker's library arranges it."""
-    assert monitor_objects.mapping_word(0x206F, "REAL32", 4) == 0x106F_0804
-    assert monitor_objects.mapped_index(0x106F_0804) == 0x206F
+    assert ingenia_objects.mapping_word(0x206F, "REAL32", 4) == 0x106F_0804
+    assert ingenia_objects.mapped_index(0x106F_0804) == 0x206F

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from pmsmtool.drive.commanded_recorder import numbered
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
 from pmsmtool.drive.port import Recording
+from pmsmtool.drive.recorders.commanded import numbered
+from pmsmtool.drive_maps import epos2_objects as rings
+from pmsmtool.drive_maps import ingenia_objects as monitor
+from pmsmtool.drive_maps.recorder_map import Address
 from pmsmtool.errors import Interrupted, VerifyMismatch
-from pmsmtool.firmware import monitor_objects as monitor
-from pmsmtool.firmware import ring_objects as rings
-from pmsmtool.firmware.recorder_map import Address
 from tests.drive.recorder_rig import KINDS, Rig, rig_of
 
 ENVELOPE = Envelope(i_max_apk=5.0, speed_max_rad_s=100.0, duration_s=60.0)

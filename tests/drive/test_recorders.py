@@ -7,10 +7,10 @@ import pytest
 
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.monitor import MonitorRecorder
-from pmsmtool.drive.recorder_choice import recorder_of
+from pmsmtool.drive.recorders.choice import recorder_of
+from pmsmtool.drive.recorders.ingenia import MonitorRecorder
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import BusError, NotAvailable, PmsmtoolError, SdoAbort, VerifyMismatch
-from pmsmtool.firmware.shipped_maps import load_family
 from tests.drive.recorder_rig import T_S, Opener, check
 
 LOST_FRAME = """[[frame]]

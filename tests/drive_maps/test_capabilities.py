@@ -21,14 +21,12 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, IdentificationError, Interrupted, NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
-from pmsmtool.firmware.shipped_maps import family_names, load_family
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.resources import data_folder
-from pmsmtool.sim.simulated_machine import settings_of
-from pmsmtool.workflow.capabilities import (
+from pmsmtool.measurement.capabilities import (
     EXPECTED,
     FEATURES,
     NEEDS,
@@ -39,8 +37,10 @@ from pmsmtool.workflow.capabilities import (
     examine,
     reference_capabilities,
 )
-from pmsmtool.workflow.random_drives import draw_drive
-from pmsmtool.workflow.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
+from pmsmtool.measurement.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
+from pmsmtool.resources import data_folder
+from pmsmtool.sim.random_drives import draw_drive
+from pmsmtool.sim.simulated_machine import settings_of
 
 COMMANDS = (0x604000, 0x206007)
 """Controlword and the recorder's command: nothing a restore would bring back."""

@@ -15,12 +15,12 @@ from pmsmtool.bus.connect import connect
 from pmsmtool.cli.main import cli
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.estimators.estimate import total_half_width
-from pmsmtool.firmware.shipped_maps import load_family
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.measurement.clone import drawn_truth
 from pmsmtool.resources import data_folder
-from pmsmtool.workflow.clone import drawn_truth
 
 
 def run(*arguments: str) -> Result:

@@ -20,10 +20,10 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.stop import quick_stop
+from pmsmtool.drive_maps.drive_map import REFERENCE_VENDOR, DriveMap, reference_map
+from pmsmtool.drive_maps.drive_map_file import parse_drive_map
+from pmsmtool.drive_maps.shipped_maps import family_names, family_of, load_family
 from pmsmtool.errors import ConfigError, DriveFault, SafetyRefusal, SdoAbort
-from pmsmtool.firmware.drive_map import REFERENCE_VENDOR, DriveMap, reference_map
-from pmsmtool.firmware.drive_map_file import parse_drive_map
-from pmsmtool.firmware.shipped_maps import family_names, family_of, load_family
 from pmsmtool.flash.download import Download
 from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.map_gate import check_map, memory_of, remember_map

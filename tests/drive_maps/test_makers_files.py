@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pmsmtool.firmware.drive_map import DriveMap
-from pmsmtool.firmware.shipped_maps import family_of, load_family
+from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.shipped_maps import family_of, load_family
 
 TABLE = Path(__file__).resolve().parents[2].parent / "shared" / "reference" / "drive-objects.csv"
 needs_table = pytest.mark.skipif(not TABLE.is_file(), reason="no table of makers' objects beside the checkout")

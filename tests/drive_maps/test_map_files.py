@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, reference_map
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map, map_hash, parse_drive_map
+from pmsmtool.drive_maps.map_lines import line_of
+from pmsmtool.drive_maps.wire_units import counted_in, wire_unit
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, reference_map
-from pmsmtool.firmware.drive_map_file import dump_drive_map, map_hash, parse_drive_map
-from pmsmtool.firmware.map_lines import line_of
-from pmsmtool.firmware.wire_units import counted_in, wire_unit
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.resources import data_folder

@@ -7,8 +7,8 @@ import math
 
 import pytest
 
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.drive_map_file import dump_drive_map, parse_drive_map
 
 GOOD = """\
 schema = "pmsmtool.drive-map/1"

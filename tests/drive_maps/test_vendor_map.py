@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
+from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map, map_hash, parse_drive_map
+from pmsmtool.drive_maps.shipped_maps import family_names, load_family
+from pmsmtool.drive_maps.vendor_tuning import SET_UP
+from pmsmtool.drive_maps.wire_units import counted_in
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.drive_map import DriveMap
-from pmsmtool.firmware.drive_map_file import dump_drive_map, map_hash, parse_drive_map
-from pmsmtool.firmware.shipped_maps import family_names, load_family
-from pmsmtool.firmware.vendor_tuning import SET_UP
-from pmsmtool.firmware.wire_units import counted_in
 from pmsmtool.resources import data_folder
 from pmsmtool.toml_text import toml_text
 

@@ -11,8 +11,8 @@ import pytest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.cross_check import cross_check
 from pmsmtool.estimators.estimate import statistical_half_width
-from pmsmtool.estimators.flux_linkage import MAGNET_CHANGE, FluxResult, check_magnet, estimate_flux_linkage
-from pmsmtool.estimators.flux_linkage_rows import fastest_pair, mean_inverter_error
+from pmsmtool.estimators.flux.linkage import MAGNET_CHANGE, FluxResult, check_magnet, estimate_flux_linkage
+from pmsmtool.estimators.flux.linkage_rows import fastest_pair, mean_inverter_error
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace

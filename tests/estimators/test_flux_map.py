@@ -13,10 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.coenergy_spline import CoenergySpline, basis, break_points
-from pmsmtool.estimators.flux_map_fit import MagnetFlux, fit_coenergy
-from pmsmtool.estimators.flux_map_result import FluxMapResult, estimate_flux_map
-from pmsmtool.estimators.flux_map_rows import Frame, smooth_angle
+from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline, basis, break_points
+from pmsmtool.estimators.flux.map_fit import MagnetFlux, fit_coenergy
+from pmsmtool.estimators.flux.map_result import FluxMapResult, estimate_flux_map
+from pmsmtool.estimators.flux.map_rows import Frame, smooth_angle
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import ResistanceResult

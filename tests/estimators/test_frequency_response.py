@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.frequency_response import FrequencyResponse, estimate_frequency_response
+from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse, estimate_frequency_response
 from pmsmtool.experiments.frequency_response import ROWS, WALK_SHARE, plan_frequency_response
 from pmsmtool.trace import Trace
 

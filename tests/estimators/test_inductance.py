@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.axis_layout import Motion
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, Verdict
-from pmsmtool.estimators.inductance import EDGE_STD, FrameAhead, InductanceResult, estimate_inductances
+from pmsmtool.estimators.injection.axis_layout import Motion
+from pmsmtool.estimators.injection.inductance import EDGE_STD, FrameAhead, InductanceResult, estimate_inductances
+from pmsmtool.estimators.injection.sampling_instant import INSTANTS, LAGS, ShownInstant
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.sampling_instant import INSTANTS, LAGS, ShownInstant
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, Run, curve_points, draw, repeat, run
 

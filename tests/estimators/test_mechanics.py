@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from benchmarks.mechanics_accuracy import realisation
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.mechanics import NOTED, RIPPLE_MOST, MechanicsResult, estimate_mechanics
-from pmsmtool.estimators.mechanics_motion import positions
+from pmsmtool.estimators.shaft.mechanics import NOTED, RIPPLE_MOST, MechanicsResult, estimate_mechanics
+from pmsmtool.estimators.shaft.motion import positions
 from pmsmtool.experiments.mechanics_run import UNIT_LEAST_S, UNIT_MOST_S, plan_mechanics
 from pmsmtool.trace import Trace
 

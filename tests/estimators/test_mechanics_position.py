@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from benchmarks.mechanics_accuracy import realisation
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import CHI2_WARN
-from pmsmtool.estimators.mechanics import estimate_mechanics
-from pmsmtool.estimators.mechanics_position import encoder_step, position_std, rounding_rad
+from pmsmtool.estimators.shaft.mechanics import estimate_mechanics
+from pmsmtool.estimators.shaft.position import encoder_step, position_std, rounding_rad
 from pmsmtool.trace import Trace
 
 STEP_LIMIT = 0.01

@@ -16,7 +16,7 @@ from pmsmtool.cli.identify import identify_command
 from pmsmtool.cli.main import cli
 from pmsmtool.cli.track import track_command
 from pmsmtool.estimators.refusals import REFUSALS
-from pmsmtool.workflow.identify_request import NEEDS
+from pmsmtool.identification.request import NEEDS
 
 SETTINGS = {
     "amplitude": "--i-max",

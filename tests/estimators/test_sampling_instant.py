@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pmsmtool.estimators.output_error import AxisModel, Pulses, respond
-from pmsmtool.estimators.sampling_instant import (
+from pmsmtool.estimators.injection.output_error import AxisModel, Pulses, respond
+from pmsmtool.estimators.injection.sampling_instant import (
     CoastingPairs,
     Sampling,
     course_s2,
@@ -18,7 +18,7 @@ from pmsmtool.estimators.sampling_instant import (
     shown_instant,
     standstill_instant_s,
 )
-from pmsmtool.estimators.switching_ripple import Modulation
+from pmsmtool.estimators.injection.switching_ripple import Modulation
 
 T_S = 50e-6
 U_DC = 300.0

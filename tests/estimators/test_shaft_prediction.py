@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks.mechanics_accuracy import realisation
-from pmsmtool.estimators import shaft_prediction
-from pmsmtool.estimators.mechanics import TORQUE_FLOOR, estimate_mechanics
-from pmsmtool.estimators.mechanics_position import encoder_step
-from pmsmtool.estimators.shaft_prediction import PushPlan, RoughShaft, predict_mechanics, rough_friction
+from pmsmtool.estimators.shaft import shaft_prediction
+from pmsmtool.estimators.shaft.mechanics import TORQUE_FLOOR, estimate_mechanics
+from pmsmtool.estimators.shaft.position import encoder_step
+from pmsmtool.estimators.shaft.shaft_prediction import PushPlan, RoughShaft, predict_mechanics, rough_friction
 from pmsmtool.trace import Trace
 
 CURRENT_A = 4.0

@@ -10,9 +10,9 @@ import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
-from pmsmtool.estimators.inertia_ratio import estimate_ratios
+from pmsmtool.estimators.flux.voltage_flux import DEAD_TIME, flux_by_undriven_voltage, flux_by_voltage_limit
 from pmsmtool.estimators.recorded_push import estimate_pushes
-from pmsmtool.estimators.voltage_flux import DEAD_TIME, flux_by_undriven_voltage, flux_by_voltage_limit
+from pmsmtool.estimators.shaft.inertia_ratio import estimate_ratios
 from pmsmtool.trace import Trace
 
 POLE_PAIRS = 4

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.firmware.core_binding import core
-from pmsmtool.workflow.reproduce.governed_drive import DELAYED, NOMINAL, Condition, GovernedDrive, Law
+from pmsmtool.papers.governed_drive import DELAYED, NOMINAL, Condition, GovernedDrive, Law
 from tests.firmware.closed_loop import (
     BEST,
     CURRENT_ROW,

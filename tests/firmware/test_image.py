@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.firmware.core_binding import core, params_values
-from pmsmtool.firmware.drive_map import reference_map
 from pmsmtool.firmware.image import (
     SCALAR_BYTES,
     SCALAR_WORDS,

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.firmware.core_binding import core
-from pmsmtool.workflow.reproduce import (
+from pmsmtool.papers import (
     polar_limit,
     polar_linear,
     polar_ramps,
@@ -22,8 +22,8 @@ from pmsmtool.workflow.reproduce import (
     polar_steps,
     polar_sweep,
 )
-from pmsmtool.workflow.reproduce.polar_measures import TorqueStep
-from pmsmtool.workflow.reproduce.polar_scene import (
+from pmsmtool.papers.polar_measures import TorqueStep
+from pmsmtool.papers.polar_scene import (
     CONVENTIONAL,
     CONVENTIONAL_ON_MEASUREMENT,
     K_T,

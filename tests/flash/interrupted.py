@@ -141,8 +141,8 @@ def assert_whole(session: object, old: bytes, new: bytes) -> None:
 
 def _image_after(old: bytes, wanted: ParameterSet, root: Path) -> bytes:
     """The image the drive will hold, made without the download."""
-    from pmsmtool.firmware.drive_map import reference_map
-    from pmsmtool.firmware.map_tables import look_up_words
+    from pmsmtool.drive_maps.drive_map import reference_map
+    from pmsmtool.drive_maps.map_tables import look_up_words
 
     image = ParameterImage.of_bytes(old)
     for name, value in wanted.values.items():

@@ -10,7 +10,7 @@ from pathlib import Path
 from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.port import Identity
-from pmsmtool.firmware.drive_map import DriveMap, reference_map
+from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.image import crc32
 from pmsmtool.flash.download import Download, Outcome
 from pmsmtool.flash.journal import JournalFolder

@@ -12,6 +12,7 @@ import pytest
 from pmsmtool.bus.supervision import SecondMaster
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive_maps.drive_map import Cell, DriveMap, reference_map
 from pmsmtool.errors import (
     ConfigError,
     DriveFault,
@@ -21,7 +22,6 @@ from pmsmtool.errors import (
     SdoAbort,
     VerifyMismatch,
 )
-from pmsmtool.firmware.drive_map import Cell, DriveMap, reference_map
 from pmsmtool.flash.journal import MARKS, JournalFolder
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.sim.line import Frame

@@ -23,8 +23,8 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import WATCH_S, guarded
 from pmsmtool.drive.motion_objects import position_units
 from pmsmtool.drive.tier_drives import SpeedPushDrive, TorqueDrive, pushing_drive
+from pmsmtool.drive_maps.shipped_maps import family_of, load_family
 from pmsmtool.errors import DriveFault, LimitExceeded, NotAvailable, SafetyRefusal
-from pmsmtool.firmware.shipped_maps import family_of, load_family
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.node.node import Node
 from pmsmtool.sim.node.session import Session

@@ -12,7 +12,7 @@ import pytest
 
 import pmsmtool
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
-from pmsmtool.estimators.flux_linkage import normalised
+from pmsmtool.estimators.flux.linkage import normalised
 from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K, magnet_tolerance_per_k
 from pmsmtool.params.catalogue import BY_NAME

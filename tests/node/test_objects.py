@@ -10,8 +10,8 @@ from pathlib import Path
 import canopen
 import pytest
 
-from pmsmtool.firmware.drive_map import reference_map
-from pmsmtool.firmware.drive_map_file import parse_drive_map
+from pmsmtool.drive_maps.drive_map import reference_map
+from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.params.catalogue import CATALOGUE, WIRE_SIZE, layout_signature
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.node.dictionary import Dictionary

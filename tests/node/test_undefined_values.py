@@ -10,8 +10,8 @@ import pytest
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
-from pmsmtool.firmware import monitor_objects, ring_objects, trace_objects
-from pmsmtool.firmware.recorder_map import Address
+from pmsmtool.drive_maps import copley_objects, epos2_objects, ingenia_objects
+from pmsmtool.drive_maps.recorder_map import Address
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.objects import object_rows
@@ -74,17 +74,17 @@ def test_only_the_signature_stores_and_restores(bench: Bench, index: int, sub: i
 
 FACES: dict[str, dict[Address, tuple[int, ...]]] = {
     "ingenia": {
-        monitor_objects.ENABLE: (0, 1),
-        monitor_objects.REMOVE_DATA: (1,),
-        monitor_objects.FORCE_TRIGGER: (1,),
-        monitor_objects.TRIGGER_KIND: (0, 1),
-        monitor_objects.MAPPED: tuple(range(17)),
+        ingenia_objects.ENABLE: (0, 1),
+        ingenia_objects.REMOVE_DATA: (1,),
+        ingenia_objects.FORCE_TRIGGER: (1,),
+        ingenia_objects.TRIGGER_KIND: (0, 1),
+        ingenia_objects.MAPPED: tuple(range(17)),
     },
-    "copley": {trace_objects.START: (0, 1)},
+    "copley": {copley_objects.START: (0, 1)},
     "epos2": {
-        ring_objects.CONTROL: (1, 2, 0xFFFE),
-        ring_objects.CONFIGURATION: tuple(range(16)),
-        ring_objects.USED: tuple(range(5)),
+        epos2_objects.CONTROL: (1, 2, 0xFFFE),
+        epos2_objects.CONFIGURATION: tuple(range(16)),
+        epos2_objects.USED: tuple(range(5)),
     },
 }
 

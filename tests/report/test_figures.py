@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pmsmtool.design.current_loop import AxisPlant, axis_loop, imc
-from pmsmtool.design.sampled_loop import margins
-from pmsmtool.estimators.axis_fit import AxisFit
-from pmsmtool.estimators.axis_layout import Timing
-from pmsmtool.estimators.axis_response import SKIP_SAMPLES
-from pmsmtool.estimators.flux_linkage import estimate_flux_linkage
+from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
+from pmsmtool.design.loops.sampled_loop import margins
+from pmsmtool.estimators.flux.linkage import estimate_flux_linkage
+from pmsmtool.estimators.injection.axis_fit import AxisFit
+from pmsmtool.estimators.injection.axis_layout import Timing
+from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.report import figures
 from pmsmtool.trace import Trace

@@ -9,10 +9,10 @@ import pytest
 
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.measurement.capabilities import examine
 from pmsmtool.report.report import render
 from pmsmtool.report.verdict import COMPLETE, NEEDED, on_which_drive, verdict_of
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.workflow.capabilities import examine
 
 
 def stage(name: str, status: str = "pass", **more: Any) -> dict[str, Any]:

@@ -27,8 +27,8 @@ from pmsmtool.sim.node.drive_core import (
     Trigger,
 )
 from pmsmtool.sim.signals import Signal, Truth
+from pmsmtool.sim.simulate import find_drive
 from pmsmtool.sim.simulated_machine import with_simulation
-from pmsmtool.workflow.simulate import find_drive
 
 QUIET = {"sensor_noise_apk": 0.0, "thermal_on": False}
 

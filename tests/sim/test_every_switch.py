@@ -11,8 +11,8 @@ import pytest
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
 from pmsmtool.sim.scenarios import Scenario
+from pmsmtool.sim.simulate import SimulatedDrive, find_drive, run_scenario
 from pmsmtool.trace import Trace
-from pmsmtool.workflow.simulate import SimulatedDrive, find_drive, run_scenario
 
 IDEAL: Mapping[str, Value] = {
     "inverter_model": "averaged",

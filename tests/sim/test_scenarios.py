@@ -14,7 +14,9 @@ from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, TRUE_SIGNALS, drive_values, image_of, simulate
+from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.scenarios import BUILT_IN, FILE_EXAMPLE, Scenario, built_in, load_scenario
+from pmsmtool.sim.simulate import find_drive, find_scenario, run_scenario
 from pmsmtool.sim.simulated_machine import (
     DRIVE_FAULTS,
     WRONG_COMPENSATION,
@@ -23,8 +25,6 @@ from pmsmtool.sim.simulated_machine import (
     with_simulation,
 )
 from pmsmtool.units import UNITS
-from pmsmtool.workflow.random_drives import draw_drive
-from pmsmtool.workflow.simulate import find_drive, find_scenario, run_scenario
 
 PROFILES = sorted(path.stem for path in data_folder("profiles").glob("*.toml"))
 

@@ -134,7 +134,7 @@ def test_list_names_the_scenarios():
 
 NOT_FOR_A_SIMULATION = (
     *("scipy", "matplotlib", "can", "canopen", "rich", "jinja2"),
-    *("pmsmtool.design.polar", "pmsmtool.design.lookup_design", "pmsmtool.machine.flux_map_check"),
+    *("pmsmtool.design.polar", "pmsmtool.design.lookup.design", "pmsmtool.machine.flux_map_check"),
 )
 
 

@@ -18,8 +18,18 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.stop import quick_stop
 from pmsmtool.errors import ExitCode
+from pmsmtool.identification.track import follow, known_of
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.measurement.identify import nameplate_of
+from pmsmtool.measurement.observe import (
+    GIVEN_BACK,
+    SAMPLES_PER_WINDOW,
+    Observations,
+    observe_process_data,
+    observe_recordings,
+)
+from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.channel import build_line, parse_channel
 from pmsmtool.sim.drive_kernel import KernelCore
@@ -27,16 +37,6 @@ from pmsmtool.sim.node.node import Node
 from pmsmtool.sim.operation import POINT_S, POINTS, START_S, Operation, operate
 from pmsmtool.sim.signals import Truth
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
-from pmsmtool.workflow.identify import nameplate_of
-from pmsmtool.workflow.observe import (
-    GIVEN_BACK,
-    SAMPLES_PER_WINDOW,
-    Observations,
-    observe_process_data,
-    observe_recordings,
-)
-from pmsmtool.workflow.run_directory import RunDirectory
-from pmsmtool.workflow.track import follow, known_of
 from tests.drive.served import serving
 from tests.simulated_bus import settle
 

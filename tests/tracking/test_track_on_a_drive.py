@@ -11,21 +11,13 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.cli.main import run as program
+from pmsmtool.commissioning.commission import begin_run
 from pmsmtool.design.tune import tune
 from pmsmtool.drive import objects
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
-from pmsmtool.resources import data_folder
-from pmsmtool.sim.signals import Truth
-from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import trace_npz
-from pmsmtool.workflow.commission import begin_run
-from pmsmtool.workflow.observe import Observations, joined, observe_process_data, observe_recordings
-from pmsmtool.workflow.run_directory import RunDirectory
-from pmsmtool.workflow.track import (
+from pmsmtool.identification.track import (
     dump_known,
     follow,
     keep,
@@ -35,6 +27,14 @@ from pmsmtool.workflow.track import (
     systematic_of,
     track_stage,
 )
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.measurement.observe import Observations, joined, observe_process_data, observe_recordings
+from pmsmtool.resources import data_folder
+from pmsmtool.run_directory import RunDirectory
+from pmsmtool.sim.signals import Truth
+from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import trace_npz
 from tests.drive.bench import SimBench, sim_bench
 from tests.simulated_bus import settle
 

@@ -22,9 +22,9 @@ from pmsmtool.estimators.tracking_model import (
     steady,
     windows,
 )
+from pmsmtool.identification.track import follow
+from pmsmtool.measurement.observe import NAMES, without_gaps
 from pmsmtool.trace import Trace
-from pmsmtool.workflow.observe import NAMES, without_gaps
-from pmsmtool.workflow.track import follow
 from tests.tracking.simulated import known, machine, true_values, warming_run
 
 SECONDS = 8.0

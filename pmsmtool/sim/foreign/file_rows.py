@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pmsmtool.data_types import BY_SHORT
+from pmsmtool.drive_maps.eds import decode, parse_eds, parse_integer
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import read_bytes
-from pmsmtool.firmware.eds import decode, parse_eds, parse_integer
 from pmsmtool.sim.node.objects import ObjectRow
 
 FAMILY_MARK = "#"

@@ -10,8 +10,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 
-from pmsmtool.firmware.drive_map import reference_map
-from pmsmtool.firmware.drive_map_file import dump_drive_map
+from pmsmtool.drive_maps.drive_map import reference_map
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.node.objects import ObjectRow, object_rows
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.cia402 import Mode
 from pmsmtool.data_types import SHORT
+from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, SignalCell
+from pmsmtool.drive_maps.wire_units import WireUnit, wire_unit
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, SignalCell
-from pmsmtool.firmware.wire_units import WireUnit, wire_unit
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.sim.node import own_identification
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused

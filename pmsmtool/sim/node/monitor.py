@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.firmware import monitor_objects as objects
-from pmsmtool.firmware.drive_map import DriveMap, SignalCell
-from pmsmtool.firmware.recorder_map import Address
+from pmsmtool.drive_maps import ingenia_objects as objects
+from pmsmtool.drive_maps.drive_map import DriveMap, SignalCell
+from pmsmtool.drive_maps.recorder_map import Address
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.power_drive import Plant
 from pmsmtool.sim.node.recorder_face import SIGNALS, RecorderFace

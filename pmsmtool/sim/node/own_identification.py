@@ -13,9 +13,8 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import NS, Timer
 from pmsmtool.cia402 import State
 from pmsmtool.data_types import SHORT
-from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.drive_map import Cell, DriveMap
-from pmsmtool.firmware.vendor_tuning import (
+from pmsmtool.drive_maps.drive_map import Cell, DriveMap
+from pmsmtool.drive_maps.vendor_tuning import (
     ABORT,
     COMMAND_BYTES,
     DONE,
@@ -26,6 +25,7 @@ from pmsmtool.firmware.vendor_tuning import (
     OS_COMMAND_MODE,
     VendorTuning,
 )
+from pmsmtool.errors import ConfigError
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.own_measurements import Measured, MeasurementFailed, OwnMeasurements

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.data_types import DATA_TYPES
-from pmsmtool.firmware.recorder_map import Address
-from pmsmtool.firmware.wire_units import wire_unit
+from pmsmtool.drive_maps.recorder_map import Address
+from pmsmtool.drive_maps.wire_units import wire_unit
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.drive_core import RecorderSetup, RecorderState
 from pmsmtool.sim.node.objects import ObjectRow

@@ -12,10 +12,10 @@ from collections.abc import Callable
 import numpy as np
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.firmware import ring_objects as objects
-from pmsmtool.firmware.drive_map import LETTERS, DriveMap
-from pmsmtool.firmware.recorder_map import Address, Channel
-from pmsmtool.firmware.wire_units import wire_unit
+from pmsmtool.drive_maps import epos2_objects as objects
+from pmsmtool.drive_maps.drive_map import LETTERS, DriveMap
+from pmsmtool.drive_maps.recorder_map import Address, Channel
+from pmsmtool.drive_maps.wire_units import wire_unit
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.power_drive import Plant
 from pmsmtool.sim.node.recorder_face import RecorderFace, whole

@@ -11,9 +11,9 @@ from collections.abc import Callable
 import numpy as np
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.firmware import trace_objects as objects
-from pmsmtool.firmware.drive_map import DriveMap
-from pmsmtool.firmware.recorder_map import Address, Channel
+from pmsmtool.drive_maps import copley_objects as objects
+from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.recorder_map import Address, Channel
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.power_drive import Plant

@@ -1,0 +1,488 @@
+# SPDX-License-Identifier: MIT
+"""The whole chain: identify, tune, lut, margins, flash, verify, prove; one run directory, resumable at every stage.
+
+A stage that is recorded as passed is not run again. The chain ends at the first stage that does not pass, whatever
+it had done is recorded, and the drive is off: experiments run inside the guard, a download rolls back by itself, and
+what is left is asked of the statusword.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+from pmsmtool import __version__
+from pmsmtool.commissioning.compared_stage import check_accepted, compared, refusal
+from pmsmtool.commissioning.contradiction import DATA_SHEET
+from pmsmtool.commissioning.design_stages import lut_stage, margins_stage, tune_stage
+from pmsmtool.commissioning.flash_stages import flash_stage, verify_stage
+from pmsmtool.commissioning.rated_limits import within_ratings
+from pmsmtool.commissioning.report_page import report_page
+from pmsmtool.commissioning.tier_stages import TierStages
+from pmsmtool.design.design_file import load_design
+from pmsmtool.design.lookup.design import LookupRequest
+from pmsmtool.design.loops.margins import MarginRequest
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.port import Identity
+from pmsmtool.drive.stop import quick_stop
+from pmsmtool.errors import (
+    CheckFailed,
+    ConfigError,
+    IdentificationError,
+    Interrupted,
+    NotAvailable,
+    PmsmtoolError,
+    SafetyRefusal,
+    VerifyMismatch,
+)
+from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.verdicts import blocking
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.measurement.capabilities import Capabilities, Tier
+from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.measurement.run_account import RunAccount, status_of, text_of
+from pmsmtool.proof.stage import ProofRequest, not_proven, prove_stage
+from pmsmtool.report.verdict import RAN
+from pmsmtool.run_directory import RunDirectory, RunRecord, Stage, new_record
+
+FROM_TABLE = TuneRequest(field_weakening="lookup")
+"""The chain's default design: the drive takes its current references from the table the chain makes and checks."""
+STAGES = ("identify", "tune", "lut", "margins", "flash", "verify", "prove")
+
+
+class Person(Protocol):
+    """Who consents; each method returns when agreed, else it raises ``Declined``."""
+
+    def allow_motion(self, lines: Sequence[str]) -> None:
+        """Agree to the motion envelope."""
+
+    def allow_writing(self, lines: Sequence[str]) -> None:
+        """Agree to the list of differences."""
+
+
+class Progress(Protocol):
+    """Who is told how far the chain has come."""
+
+    def skip(self, stage: Stage, number: int, count: int) -> None:
+        """Tell how a stage ended that was run before."""
+
+    def begin(self, name: str, number: int, count: int) -> None:
+        """Tell that a stage begins."""
+
+    def say(self, text: str) -> None:
+        """Tell a step inside the stage."""
+
+    def end(self, stage: Stage, number: int, count: int) -> None:
+        """Tell how the stage ended."""
+
+
+def proof_within(asked: IdentifyRequest) -> ProofRequest:
+    """Return the proof that keeps within what identification was allowed."""
+    return ProofRequest(asked.i_max_apk, asked.speed_max_rad_s, asked.shaft, asked.load, asked.brake)
+
+
+def due_stages(run: RunDirectory, record: RunRecord) -> tuple[str, ...]:
+    """Return the stages still to be run: from the first that has not passed, or whose files are gone, to the last.
+
+    Raises
+    ------
+    ConfigError
+        A file is not what its stage left.
+    """
+    expected: dict[str, str] = {}
+    position = -1
+    for k, name in enumerate(STAGES):
+        places = [place for place, stage in enumerate(record.stages) if stage.name == name]
+        latest = record.stages[places[-1]] if places else None
+        fresh = latest is not None and latest.status in SETTLED and places[-1] > position
+        if latest is None or not fresh or not all((run.path / file).is_file() for file in latest.files):
+            _check_unchanged(run, expected, OUTPUTS.get(name, ()))
+            return STAGES[k:]
+        position = places[-1]
+        expected |= latest.files
+    _check_unchanged(run, expected, ())
+    return ()
+
+
+NOTHING_GIVEN = (
+    "write a machine file from a data sheet or a meter (`pmsmtool machine new`) and begin anew with it: `pmsmtool "
+    "commission MACHINE`; `pmsmtool caps` lists what this drive can give"
+)
+NOTHING_TAKEN = (
+    "`pmsmtool caps` lists what this drive can give; `pmsmtool tune MACHINE -o design.toml` designs for the machine "
+    "alone"
+)
+"""Next steps after a run of which nothing was available: the same run gives the same again."""
+SETTLED = ("pass", "partial", "not available")
+"""How a stage may have ended that is not run again."""
+OUTPUTS: Mapping[str, tuple[str, ...]] = {
+    "identify": ("machine.toml",),
+    "tune": ("design.toml",),
+    "lut": ("lut.npz", "lut.csv", "design.toml", "params.toml"),
+}
+"""Files a stage writes, also half-way: a run that was killed may hold them before they are recorded."""
+
+
+def _check_unchanged(run: RunDirectory, expected: Mapping[str, str], rewritten: Sequence[str]) -> None:
+    changed = [name for name, digest in expected.items() if name not in rewritten and run.sha256(name) != digest]
+    if changed:
+        raise ConfigError(
+            f"{', '.join(changed)}: not what the stage left that wrote it",
+            where=str(run.path),
+            likely="edited after the run",
+            hint="delete the file to have its stage run again, or use tune, lut and flash-params one by one",
+        )
+
+
+@dataclass(slots=True)
+class Commissioning:
+    """One run of the chain.
+
+    Parameters
+    ----------
+    run : RunDirectory
+        Where everything goes; its record names the drive.
+    drive : CanopenDrive
+        The drive; off.
+    person : Person
+        Gives the two consents.
+    progress : Progress
+        Is told.
+    nameplate : MachineFile, optional
+        What is known of the machine; the drive's own ratings and set when not given.
+    identify, tune, lookup, margins, prove
+        What is asked.
+    capabilities : Capabilities, optional
+        What a drive below the full tier has: its stages run as far as that goes, and those that cannot run are
+        recorded as not available. Without, everything is expected, and the chain ends where something is missing.
+    drive_bandwidth_hz : float, optional
+        Bandwidth of the current control of a drive that keeps its own.
+    accept_contradictions : tuple of str
+        Quantities of the machine file whose contradiction a person accepts.
+    require : tuple of str
+        Stages without which the run fails; kept in its record, so that they hold when it is resumed.
+    accept_limits : tuple of str
+        Limits of the design (:data:`~pmsmtool.commissioning.rated_limits.NAMES`) accepted below the machine's ratings.
+    """
+
+    run: RunDirectory
+    drive: CanopenDrive
+    person: Person
+    progress: Progress
+    nameplate: MachineFile | None = None
+    identify: IdentifyRequest = field(default_factory=IdentifyRequest)
+    tune: TuneRequest = FROM_TABLE
+    lookup: LookupRequest = field(default_factory=LookupRequest)
+    margins: MarginRequest = field(default_factory=MarginRequest)
+    prove: ProofRequest | None = None
+    capabilities: Capabilities | None = None
+    drive_bandwidth_hz: float | None = None
+    accept_contradictions: tuple[str, ...] = ()
+    require: tuple[str, ...] = ()
+    accept_limits: tuple[str, ...] = ()
+    _account: RunAccount | None = field(default=None, init=False)
+
+    def carry_out(self) -> None:
+        """Run what is due.
+
+        Raises
+        ------
+        PmsmtoolError
+            Whatever ended the chain; it is recorded.
+        StopNotConfirmed
+            The machine may be energised; outranks whatever ended the chain.
+        """
+        check_accepted(self.accept_contradictions)
+        record = self.run.read()
+        self._check_drive(record)
+        self.require = required_of(record, self.require)
+        if self.require:
+            self.run.write(replace(record, request={**record.request, "require": self.require}))
+        self._account = account = RunAccount(self.run, self.progress.say)
+        with account.kept():
+            try:
+                self._refuse_required(record)
+                self._carry_out_due(record, account)
+            except KeyboardInterrupt:
+                raise Interrupted("the machine is off") from None
+            finally:
+                self._make_sure()
+
+    def _carry_out_due(self, record: RunRecord, account: RunAccount) -> None:
+        due = due_stages(self.run, record)
+        for number, name in enumerate(STAGES, 1):
+            if name in due:
+                account.begin(name)
+                self._carry_out(name, number)
+            elif (ended := record.stage(name)) is not None:
+                self.progress.skip(ended, number, len(STAGES))
+        self._refuse_nothing()
+
+    def _refuse_nothing(self) -> None:
+        """Refuse a run of which nothing was available: it is not green."""
+        record = self.run.read()
+        stages = [stage for name in STAGES if (stage := record.stage(name)) is not None]
+        if not any(stage.status in RAN for stage in stages):
+            raise NotAvailable(
+                "\n  - ".join(["nothing of the chain can be done", *(f"{s.name}: {s.note}" for s in stages)]),
+                where=f"node {self.drive.identity.node}",
+                hint=NOTHING_GIVEN if self.nameplate is None else NOTHING_TAKEN,
+            )
+
+    def _refuse_required(self, record: RunRecord) -> None:
+        """Refuse, before anything moves or is written, what cannot give a stage that is required."""
+        reasons = {} if self.tier is None else self.tier.unavailable()
+        reasons |= {stage.name: stage.note for stage in record.stages if stage.status == "not available"}
+        lines = [f"{name}: not available: {reasons[name]}" for name in self.require if name in reasons]
+        if lines:
+            raise _required(lines, self.run)
+
+    def _check_drive(self, record: RunRecord) -> None:
+        found = drive_facts(self.drive.identity)
+        wrong = [
+            f"{key} {found[key]} instead of {record.drive[key]}" for key in IDENTITY if found[key] != record.drive[key]
+        ]
+        if wrong:
+            raise SafetyRefusal(
+                f"another drive answers than the run was begun with: {', '.join(wrong)}",
+                where=f"node {self.drive.identity.node}, 0x1018",
+                likely="drives were swapped, or this is the run of another drive",
+                hint="begin a new run for this drive; nothing was moved and nothing written",
+            )
+
+    def _carry_out(self, name: str, number: int) -> None:
+        clock = self.drive.node.connection.clock
+        self.progress.begin(name, number, len(STAGES))
+        start = clock.now()
+        try:
+            stage = replace(self._steps()[name](), seconds=clock.now() - start)
+            if name == "identify":
+                stage = self._compared(self._without_map(stage))
+        except BaseException as error:
+            if isinstance(error, NotAvailable) and self.tier is not None:
+                self._not_available(name, number, error, clock.now() - start)
+                return
+            failed = Stage(name, status_of(error), clock.now() - start, note=text_of(error))
+            # The error that ended the stage outranks a record that cannot be written.
+            with contextlib.suppress(ConfigError):
+                self.run.add(failed)
+            self.progress.end(failed, number, len(STAGES))
+            raise
+        self._settle(stage, number)
+
+    def _settle(self, stage: Stage, number: int) -> None:
+        """Record a stage; raises its error where its criteria are not met, or where it is required and missing."""
+        self.run.add(stage)
+        self.progress.end(stage, number, len(STAGES))
+        if stage.status not in SETTLED:
+            raise _not_good(stage, self.run)
+        if stage.status == "not available" and stage.name in self.require:
+            raise _required([f"{stage.name}: not available: {stage.note}"], self.run)
+
+    def _without_map(self, stage: Stage) -> Stage:
+        """Return the stage saying that a flux map was asked for and is not there."""
+        if "map" not in self.identify.quantities or any(name.startswith("flux_map") for name in stage.files):
+            return stage
+        return replace(stage, not_checked=[*stage.not_checked, "flux map: asked for, not available, NOT CHECKED"])
+
+    def _compared(self, stage: Stage) -> Stage:
+        """Return the stage with data sheet, drive and measurement side by side: the gate before anything is written."""
+        known = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
+        if known is None and self.tier is not None and self.tier.found.tier is not Tier.INJECT:
+            known = self.tier.known()
+        loaded = self.identify.shaft == "coupled"
+        return compared(stage, self.drive, known, loaded=loaded, accept=self.accept_contradictions)
+
+    def _not_available(self, name: str, number: int, error: NotAvailable, seconds: float) -> None:
+        files = {file: "" for file in OUTPUTS.get(name, ()) if (self.run.path / file).is_file()}
+        self._settle(Stage(name, "not available", seconds, note=error.what, files=files), number)
+
+    @property
+    def tier(self) -> TierStages | None:
+        """The stages of a drive below the full tier; None for one that has everything, safe or (then refused) not."""
+        if self.capabilities is None or self.capabilities.tier is Tier.FULL or self.capabilities.unsafe:
+            return None
+        return TierStages(self.run, self.drive, self.capabilities, self.nameplate, self.drive_bandwidth_hz)
+
+    def _say(self, line: str) -> None:
+        """Tell a line, and the account of the run what it is about."""
+        (self.progress if self._account is None else self._account).say(line)
+
+    def _steps(self) -> dict[str, Callable[[], Stage]]:
+        say, tier, person = self._say, self.tier, self.person
+        if tier is not None:
+            asked = self.prove or proof_within(self.identify)
+            return {
+                "identify": lambda: tier.identify(self.identify, person.allow_motion, say),
+                "tune": lambda: within_ratings(self.run, tier.tune(self.tune), self.accept_limits),
+                "lut": lambda: tier.lut(self.lookup),
+                "margins": lambda: tier.margins(self.margins),
+                "flash": lambda: tier.flash(person.allow_writing, say),
+                "verify": tier.verify,
+                "prove": lambda: tier.prove(asked, person.allow_motion, say),
+            }
+        return {
+            "identify": self._identify,
+            "tune": lambda: within_ratings(self.run, tune_stage(self.run, self.tune), self.accept_limits),
+            "lut": lambda: lut_stage(self.run, self.lookup),
+            "margins": lambda: margins_stage(self.run, self.margins),
+            "flash": lambda: flash_stage(self.run, self.drive, self.person.allow_writing, say),
+            "verify": lambda: verify_stage(self.run, self.drive),
+            "prove": self._prove,
+        }
+
+    def _identify(self) -> Stage:
+        identity = self.drive.identity
+        known = self.nameplate or nameplate_of(self.drive, identity.name or f"drive {identity.serial:#010x}")
+        stage = identify_stage(self.run, self.drive, known, self.identify, self.person.allow_motion, self._say)
+        # without a file that a person gave, the drive's own set would stand in: it may be another machine's
+        stops = blocking(stage.refused, given=self.nameplate is not None)
+        return replace(stage, status="fail") if stops else stage
+
+    def _prove(self) -> Stage:
+        design = load_design(self.run.path / "design.toml")
+        asked = self.prove or proof_within(self.identify)
+        return prove_stage(self.run, self.drive, design, asked, self.person.allow_motion, self._say)
+
+    def _make_sure(self) -> None:
+        """Leave the machine off, confirmed, where this program may have energised it."""
+        if self.drive.may_be_energised:
+            quick_stop(self.drive.node)
+
+
+def required_of(record: RunRecord, more: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the stages a run must have: those it was begun with, and more."""
+    return tuple(dict.fromkeys((*record.request.get("require", ()), *more)))
+
+
+def _required(lines: Sequence[str], run: RunDirectory) -> CheckFailed:
+    return CheckFailed(
+        f"required, and cannot be had: {'; '.join(lines)}",
+        where=str(run.path),
+        hint="provide what is missing, or begin a new run without --require",
+    )
+
+
+def _not_good(stage: Stage, run: RunDirectory) -> PmsmtoolError:
+    """Return the error of a stage whose criteria are not met, with its exit code."""
+    broken = [f"{line.what}: {line.measured}, limit {line.limit}" for line in stage.acceptance if not line.ok]
+    what = f"{stage.name}: {'; '.join(broken) or stage.note}"
+    where = str(run.path)
+    if (contradicted := refusal(stage, run)) is not None:
+        return contradicted
+    if stage.name == "identify":
+        what = "; ".join(f"{name}: {reason}" for name, reason in stage.refused.items()) or what
+        return IdentificationError("E_NOT_ACCEPTED", what, where=where, hint=NOT_ACCEPTED)
+    if stage.name == "verify":
+        return VerifyMismatch(what, where=where, hint="flash again: commission --resume " + where)
+    if stage.name == "prove":
+        return not_proven(stage, run)
+    return CheckFailed(what, where=where, hint=f"pmsmtool report {where}")
+
+
+NOT_ACCEPTED = (
+    "where it disagrees with the machine file, correct that; where an interval is too wide, allow more (--i-max, "
+    "--speed-max); then begin a new run"
+)
+IDENTITY = ("vendor", "product", "serial")
+"""What must agree before a run is resumed."""
+
+
+def drive_facts(identity: Identity) -> dict[str, Any]:
+    """Return a drive's identity as the record keeps it."""
+    return asdict(identity)
+
+
+def begin_run(
+    drive: CanopenDrive,
+    runs: Path,
+    *,
+    command: Sequence[str] = ("commission",),
+    bus: Mapping[str, Any] | None = None,
+    tier: str = "",
+) -> RunDirectory:
+    """Make the run directory of a drive below ``runs``; raises ``ConfigError`` when it cannot be written."""
+    record = new_record(
+        command,
+        drive={**drive_facts(drive.identity), **({"tier": tier, "map": drive.node.map.name} if tier else {})},
+        bus={**(bus or {}), "node": drive.identity.node},
+        versions={"pmsmtool": __version__, **{name: version(name) for name in ("numpy", "scipy", "python-can")}},
+    )
+    return RunDirectory.create(runs, drive.identity.serial, record)
+
+
+def write_report(run: RunDirectory) -> None:
+    """Write ``report.html`` of a run from its files."""
+    run.save("report.html", report_page(run.path))
+
+
+class Silent:
+    """A progress nobody is told of."""
+
+    def skip(self, stage: Stage, number: int, count: int) -> None:
+        """Say nothing."""
+
+    def begin(self, name: str, number: int, count: int) -> None:
+        """Say nothing."""
+
+    def say(self, text: str) -> None:
+        """Say nothing."""
+
+    def end(self, stage: Stage, number: int, count: int) -> None:
+        """Say nothing."""
+
+
+def commission(
+    drive: CanopenDrive,
+    runs: Path,
+    person: Person,
+    *,
+    progress: Progress | None = None,
+    nameplate: MachineFile | None = None,
+    identify: IdentifyRequest | None = None,
+    tune: TuneRequest | None = None,
+    capabilities: Capabilities | None = None,
+) -> RunDirectory:
+    """Take a drive from unknown machine to proven parameters, in a new run directory with its report.
+
+    Parameters
+    ----------
+    drive : CanopenDrive
+        The drive; off.
+    runs : Path
+        Folder of the run directories.
+    person : Person
+        Consents to every motion and to the differences.
+    progress : Progress, optional
+        Is told.
+    nameplate : MachineFile, optional
+        What is known of the machine; the drive's own ratings and set when not given.
+    identify, tune : optional
+        What is asked; the defaults of their classes.
+    capabilities : Capabilities, optional
+        Of a drive below the full tier (``measurement.capabilities.examine``,
+        ``commissioning.tier_stages.open_tier_drive``).
+
+    Raises
+    ------
+    PmsmtoolError
+        Whatever ended the chain; it is recorded and reported, and :meth:`Commissioning.carry_out` goes on there.
+    """
+    run = begin_run(drive, runs)
+    chain = Commissioning(
+        run, drive, person, progress or Silent(), nameplate, identify or IdentifyRequest(), tune or FROM_TABLE,
+        capabilities=capabilities,
+    )  # fmt: skip
+    try:
+        chain.carry_out()
+    except BaseException:
+        with contextlib.suppress(Exception):  # what ended the chain outranks a page that cannot be written
+            write_report(run)
+        raise
+    write_report(run)
+    return run

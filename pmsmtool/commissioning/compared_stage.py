@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: MIT
+"""The gate between identification and everything that stands on it: MACHINE, the drive and the measurement agree."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection
+from dataclasses import replace
+
+from pmsmtool.commissioning.contradiction import ACCEPTABLE, DATA_SHEET, HELD, ORDER, compare
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.motion_objects import ENCODER_COUNTS, MOTOR_TURNS
+from pmsmtool.drive.standard_drive import RecorderDrive
+from pmsmtool.errors import ConfigError, Contradiction, SafetyRefusal, SdoAbort
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.params.parameter_set import default_set
+from pmsmtool.report.comparison import contradictions
+from pmsmtool.run_directory import RunDirectory, Stage
+
+CONTRADICTS = "machine file, drive and measurement contradict each other; nothing was written"
+LEAST_COUNTS = 64
+"""Fewer increments per turn are a drive's unset 0x608F (1 : 1), not an encoder's."""
+_KEYS = {"encoder_counts": "[encoder] bits", "J_per_psi": "J_kgm2 or psi_f_wb", "L_phase_h": "L_d_h and L_q_h"}
+"""Keys of a machine file to correct, where a row is not called by one."""
+
+
+def check_accepted(names: Collection[str]) -> None:
+    """Refuse contradictions that nobody may accept.
+
+    Raises
+    ------
+    ConfigError
+        A name of no quantity.
+    SafetyRefusal
+        A quantity that limits are computed from, or that decides how the machine commutates.
+    """
+    unknown = [name for name in names if name not in ORDER and name not in _NEVER]
+    if unknown:
+        raise ConfigError(
+            f"--accept-contradiction {', '.join(unknown)}: no such quantity",
+            hint=f"choose from {', '.join(ACCEPTABLE)}",
+        )
+    refused = [name for name in names if name not in ACCEPTABLE]
+    if refused:
+        raise SafetyRefusal(
+            f"a contradiction of {', '.join(refused)} cannot be accepted: commutation or a limit follows from it",
+            likely="the machine file is that of another motor, or a value in it has another meaning",
+            hint=f"correct the machine file; accepted can be {', '.join(ACCEPTABLE)}",
+        )
+
+
+_NEVER = (
+    "offset_rad", "direction", "bits", "I_nom_apk", "I_max_apk", "n_nom_rpm", "n_max_rpm", "i_d_min_apk", "i_trip_apk",
+    "I_cont_apk", "U_dc_v",
+)  # fmt: skip
+"""Keys of a machine file that are not compared, and that must not be waved through all the same."""
+
+
+def held_values(drive: CanopenDrive) -> dict[str, float]:
+    """Return what a drive holds of the machine, by key; what it does not show is left out."""
+    held = {}
+    for key in HELD:
+        if f"motor.{key}" in drive.node.map.cells:
+            with contextlib.suppress(SdoAbort):
+                held[key] = drive.parameters.read_value(f"motor.{key}")
+    with contextlib.suppress(SdoAbort):
+        if drive.node.has(ENCODER_COUNTS.index, ENCODER_COUNTS.sub):
+            counts = drive.node.get(ENCODER_COUNTS) / max(1.0, drive.node.get(MOTOR_TURNS))
+            if counts >= LEAST_COUNTS:
+                held["encoder_counts"] = counts
+    return held
+
+
+def compared(
+    stage: Stage,
+    drive: CanopenDrive,
+    known: tuple[MachineFile, str] | None,
+    *,
+    loaded: bool = False,
+    accept: Collection[str] = (),
+) -> Stage:
+    """Return the identification stage with its comparison; it fails where a value contradicts.
+
+    Parameters
+    ----------
+    stage : Stage
+        As identification ended it.
+    drive : CanopenDrive
+        The drive; what it holds is read.
+    known : MachineFile and what it is called, optional
+        What the design takes where nothing was measured.
+    loaded, accept
+        As in ``contradiction.compare``.
+    """
+    defaults = None
+    if drive.node.map.staging:
+        factory = default_set().values
+        defaults = {key: factory[f"motor.{key}"] for key in HELD}
+    rows = compare(
+        None if known is None else known[0],
+        held_values(drive),
+        [value for value in stage.values if value.get("accepted", True)],
+        defaults=defaults,
+        used=("pole_pairs",) if isinstance(drive, RecorderDrive) else (),
+        loaded=loaded,
+        accept=accept,
+        source="" if known is None else known[1],
+    )
+    stage = replace(stage, comparison=[row.facts() for row in rows])
+    wrong = contradictions(stage.comparison)
+    if not wrong:
+        return stage
+    lines = [str(row["text"]) for row in wrong]
+    return replace(stage, status="fail", note="\n".join([*lines, *([stage.note] if stage.note else [])]))
+
+
+def refusal(stage: Stage, run: RunDirectory) -> Contradiction | None:
+    """Return the error of a stage whose comparison has contradictions; None without any."""
+    wrong = contradictions(stage.comparison)
+    if not wrong:
+        return None
+    names = [str(row["name"]) for row in wrong]
+    hint = f"correct {', '.join(_KEYS.get(name, name) for name in names)} in the machine file and begin a new run"
+    if any(row["source"] != DATA_SHEET for row in wrong):
+        hint = "give a machine file of this motor (`pmsmtool machine new` writes one) and begin a new run"
+    elif all(name in ACCEPTABLE for name in names):
+        hint += f"; or, knowing why, add {' '.join(f'--accept-contradiction {name}' for name in names)}"
+    return Contradiction(
+        "\n  - ".join([CONTRADICTS, *(str(row["text"]) for row in wrong)]),
+        where=str(run.path),
+        likely="; ".join(dict.fromkeys(str(row["cause"]) for row in wrong if row["cause"])),
+        hint=hint,
+    )

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: MIT
+"""The stages that compute: control, look-up table, margins. Files of the run in, files of the run and criteria out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from pmsmtool.commissioning.held_design import Designed, why_not_judged
+from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design
+from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
+from pmsmtool.design.lookup.design import LookupDesign, LookupRequest, design_table
+from pmsmtool.design.lookup.file import lut_values, table_csv, table_facts, table_npz
+from pmsmtool.design.lookup.loci import loci
+from pmsmtool.design.loops.margins import JUDGED_PERCENTILE, MarginRequest, Spread, margin_report
+from pmsmtool.design.loops.sampled_loop import LoopMargins
+from pmsmtool.design.ratings import ratings
+from pmsmtool.design.tolerance import tolerance_box
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.errors import NotAvailable
+from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.run_directory import Acceptance, RunDirectory, Stage
+
+SHOWN = (
+    "current.K_p_d_v_per_a", "current.K_i_d_v_per_as", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as",
+    "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad",
+)  # fmt: skip
+"""Values of a design that the record names; all of them stand in ``design.toml``."""
+MARGIN_SAMPLES = 4096
+"""Random machines drawn from the tolerance box: the 5 % quantile to about +-0.7 % of probability; 0.4 s."""
+SPEED_PHASE_MARGIN_DEG = 40.0
+"""Least phase margin of the speed loop: below it a step rings visibly (30 % overshoot)."""
+
+
+def tune_stage(run: RunDirectory, request: TuneRequest, designed: Designed = tune) -> Stage:
+    """Design the control of the identified machine; writes ``design.toml``.
+
+    Not available where the drive takes no gains: then nothing of the loops is judged.
+
+    Raises
+    ------
+    DesignInfeasible
+        The margins asked for cannot be met.
+    """
+    design = designed(load_machine_file(run.path / "machine.toml"), request)
+    run.save("design.toml", design_text(design))
+    if reason := why_not_judged(design):
+        return Stage(
+            "tune", "not available", 0.0, note=reason, files={"design.toml": ""}, fallbacks=design.notes
+        )  # fmt: skip
+    criteria = [line for name, loop in design.loops.items() for line in _loop_criteria(name, loop, request)]
+    values: list[Mapping[str, Any]] = [
+        {"name": n, "value": design[n], "method": design.values[n].method} for n in SHOWN
+    ]
+    current = [loop for name, loop in design.loops.items() if name.startswith("current")]
+    hertz = float(design.facts["current_bandwidth_rad_s"]) / (2.0 * math.pi)
+    phase, gain = min(loop.phase_margin_deg for loop in current), min(loop.gain_margin_db for loop in current)
+    summary = f"current loops {hertz:.4g} Hz, {phase:.1f} deg, {gain:.1f} dB"
+    if "speed" in design.loops:
+        loop = design.loops["speed"]
+        summary += f"; speed loop {loop.crossover_rad_s / (2.0 * math.pi):.4g} Hz, {loop.phase_margin_deg:.1f} deg"
+    return _stage("tune", summary, criteria, values=values, files=("design.toml",), fallbacks=design.notes)
+
+
+def _loop_criteria(name: str, loop: LoopMargins, request: TuneRequest) -> list[Acceptance]:
+    current = name.startswith("current")
+    phase = request.phase_margin_deg if current else SPEED_PHASE_MARGIN_DEG
+    lines = [_at_least(f"{name}: phase margin", loop.phase_margin_deg, phase, "deg", loop.stable)]
+    if current:
+        lines.append(_at_least(f"{name}: gain margin", loop.gain_margin_db, request.gain_margin_db, "dB", loop.stable))
+    return lines
+
+
+def _at_least(what: str, value: float, least: float, unit: str, stable: bool) -> Acceptance:
+    measured = f"{value:.1f} {unit}" if stable else "unstable"
+    return Acceptance(what, measured, f">= {least:g} {unit}", stable and value >= least)
+
+
+def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
+    """Make the look-up table of the design.
+
+    Writes ``lut.npz``, ``lut.csv``, the design with it, and ``params.toml``, the set that is flashed. The table goes
+    into the drive when the design takes its references from one (``field_weakening.mode``).
+
+    Raises
+    ------
+    DesignInfeasible
+        Not even a table within the widest of ``lookup.design.BOUNDS`` fits the drive's memory.
+    """
+    design = load_design(run.path / "design.toml")
+    margin = design["field_weakening.margin"]
+    rated = ratings(design.machine, (1.0 - margin) * design.machine.inverter.V_max_v)
+    made = design_table(design.machine, rated, request, margin)
+    table, error = made.table, made.error
+    used = design["field_weakening.mode"] == FIELD_WEAKENING["lookup"]
+    if used:
+        design = with_table(design, made)
+    run.save("lut.npz", table_npz(table, table_facts(table, made.stored, error), loci(table)))
+    run.save("lut.csv", table_csv(table))
+    run.save("design.toml", design_text(design))
+    run.save("params.toml", design.parameter_set().to_toml())
+    torque = float(max(abs(table.torque_nm[0]), table.torque_nm[-1]))
+    criteria = [
+        _at_most("torque error between nodes", error.torque_nm / torque, made.torque_bound),
+        _at_most(
+            "voltage beyond the limit between nodes", error.voltage_v / float(table.V_max_v.min()), made.voltage_bound
+        ),
+    ]
+    shape = " x ".join(map(str, table.i_d_a.shape))
+    names, counts = table.binding_counts()
+    values: list[Mapping[str, Any]] = [
+        {"name": "cells", "value": shape, "method": made.stored},
+        *({"name": f"cells bound by {name}", "value": count} for name, count in zip(names, counts, strict=True)),
+    ]
+    files = ("lut.npz", "lut.csv", "design.toml", "params.toml")
+    summary = f"{shape} cells, {made.stored}; torque to {torque:.4g} N m, speed to {table.y[-1]:.5g} rpm"
+    notes = made.notes if used else (*made.notes, "the table is for reading: this design finds its references itself")
+    return _stage("lut", summary, criteria, values=values, files=files, fallbacks=notes)
+
+
+def _at_most(what: str, value: float, largest: float) -> Acceptance:
+    return Acceptance(what, f"{100.0 * value:.2g} %", f"<= {100.0 * largest:g} %", value <= largest)
+
+
+def margins_stage(run: RunDirectory, request: MarginRequest) -> Stage:
+    """Judge the design over what the machine may be: interval corners and random samples; writes nothing.
+
+    Raises
+    ------
+    NotAvailable
+        The drive takes no gains, so there is no loop to judge.
+    """
+    design = load_design(run.path / "design.toml")
+    if reason := why_not_judged(design):
+        raise NotAvailable(reason, hint="the maker's tool sets and judges the loops of such a drive")
+    report = margin_report(design, tolerance_box(design.machine), request, samples=MARGIN_SAMPLES)
+    criteria = [line for spread in report.loops for line in _spread_criteria(spread)]
+    criteria += [line for spread in report.headroom for line in _spread_criteria(spread)]
+    phase = min((s for s in report.loops if s.name.endswith("phase")), key=lambda s: s.worst)
+    gain = min(
+        (s for s in report.loops if s.name.startswith("current") and s.name.endswith("gain")), key=lambda s: s.worst
+    )
+    summary = (
+        f"over {report.corners} corners and {report.samples} samples: phase {phase.worst:.1f} deg ({phase.name}), "
+        f"gain {gain.worst:.1f} dB ({gain.name})"
+    )
+    values = [_spread_value(spread) for spread in (*report.loops, *report.headroom)]
+    return _stage("margins", summary, criteria, values=values, files=(), fallbacks=report.notes)
+
+
+def _spread_criteria(spread: Spread) -> list[Acceptance]:
+    if spread.least is None:
+        return []
+    limit = f">= {spread.least:g} {spread.unit}"
+    found = {"worst corner": spread.worst, "5 % of samples": spread.percentiles[JUDGED_PERCENTILE]}
+    return [
+        Acceptance(f"{spread.name}: {where}", f"{value:.1f} {spread.unit}", limit, value >= spread.least)
+        for where, value in found.items()
+    ]
+
+
+def _spread_value(spread: Spread) -> Mapping[str, Any]:
+    percentiles = {f"p{percentile:g}": value for percentile, value in spread.percentiles.items()}
+    return {
+        "name": spread.name, "unit": spread.unit, "value": spread.nominal, "worst": spread.worst,
+        "at": spread.worst_cell, "least": spread.least, **percentiles,
+    }  # fmt: skip
+
+
+def with_table(design: Design, made: LookupDesign) -> Design:
+    """Return a design with a look-up table in it."""
+    values, tables = lut_values(made.table, made.stored)
+    how = f"look-up table, {made.stored}, error-bounded grid"
+    entries = {**design.values, **{name: DesignValue(value, how) for name, value in values.items()}}
+    return replace(design, values={row.name: entries[row.name] for row in CATALOGUE}, tables=tables)
+
+
+def _stage(
+    name: str,
+    summary: str,
+    criteria: list[Acceptance],
+    *,
+    values: list[Mapping[str, Any]],
+    files: tuple[str, ...],
+    fallbacks: tuple[str, ...] = (),
+) -> Stage:
+    good = all(line.ok for line in criteria)
+    return Stage(
+        name,
+        "pass" if good else "fail",
+        0.0,
+        values=values,
+        acceptance=criteria,
+        files=dict.fromkeys(files, ""),
+        fallbacks=fallbacks,
+        summary=summary,
+        note="" if good else f"{sum(not line.ok for line in criteria)} of {len(criteria)} criteria are not met",
+    )

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: MIT
+"""Where parameters come from: a parameter set, a design, a run directory, a device configuration file or a table."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from pmsmtool.design import design_file
+from pmsmtool.design.design_file import parse_design
+from pmsmtool.design.loops.open_loops import SMALLER, smaller_gains
+from pmsmtool.drive_maps.dcf import values_of
+from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
+from pmsmtool.drive_maps.eds import parse_eds
+from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.files import read_bytes, read_text
+from pmsmtool.params import parameter_set
+from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
+from pmsmtool.toml_file import parse_toml
+
+NEXT_STEP = "give a parameter set, a design, a DCF, a table of `lut`, or a run directory"
+
+_IN_A_RUN = ("params.toml", "design.toml")
+_DCF_SUFFIXES = (".dcf", ".eds")
+
+
+@next_step(NEXT_STEP)
+def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterSet:
+    """Return the parameter set that a file or a run directory holds.
+
+    Parameters
+    ----------
+    path : Path
+        ``params.toml``, ``design.toml`` (told apart by their schema), a ``.dcf``, a run directory, or a look-up table
+        as ``lut`` writes it (``.npz``): that gives the table alone.
+    drive_map : DriveMap, optional
+        What the objects of a DCF mean, the reference drive's when not given; of a design or a set for a drive with one
+        pair of current gains the smaller of both axes are taken.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, is none of these, or what is wrong with it.
+    """
+    path = _file(path)
+    if path.suffix.lower() in _DCF_SUFFIXES:
+        return _from_dcf(path, drive_map or reference_map())
+    if path.suffix.lower() == ".npz":
+        from pmsmtool.design.lookup.file import table_parameters
+        from pmsmtool.npz_file import read_npz
+
+        return table_parameters(read_npz(path), str(path))
+    text = read_text(path)
+    schema = parse_toml(text, where=str(path)).get("schema")
+    if schema == design_file.SCHEMA:
+        return _for_drive(parse_design(text, where=str(path)).parameter_set(), drive_map)
+    if schema == parameter_set.SCHEMA:
+        return _for_drive(parse_parameter_set(text, str(path)), drive_map)
+    raise ConfigError(
+        f"schema is {schema!r}, expected {design_file.SCHEMA!r} or {parameter_set.SCHEMA!r}",
+        where=str(path),
+        hint="give design.toml or params.toml as `tune` writes them",
+    )
+
+
+def _for_drive(found: ParameterSet, drive_map: DriveMap | None) -> ParameterSet:
+    if drive_map is None or drive_map.staging:
+        return found
+    gains = smaller_gains(found.values, drive_map.cells)
+    provenance = {**found.provenance, **dict.fromkeys(gains, SMALLER)}
+    return replace(found, values={**found.values, **gains}, provenance=provenance)
+
+
+def _file(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    found = next((path / name for name in _IN_A_RUN if (path / name).is_file()), None)
+    if found is None:
+        raise ConfigError("there is no design in this folder", where=str(path), hint="`pmsmtool tune` writes one")
+    return found
+
+
+def _from_dcf(path: Path, drive_map: DriveMap) -> ParameterSet:
+    sheet = parse_eds(read_bytes(path), str(path))
+    values = values_of(sheet)
+    names = (*drive_map.cells, *drive_map.tables)
+    found = {name: values[drive_map.address(name)] for name in names if drive_map.address(name) in values}
+    if not found:
+        raise ConfigError(
+            f"holds no parameter of the drive family {drive_map.name}",
+            where=str(path),
+            likely="an EDS without values, or the file of another drive",
+        )
+    return drive_map.decode(found)

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: MIT
+"""From a run directory to its report: the files of the run are read, figures drawn from them, the page rendered.
+
+Nothing is measured, and no number is made that the run does not hold.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pmsmtool.design.design_file import load_design
+from pmsmtool.design.loops.open_loops import open_loops
+from pmsmtool.errors import IdentificationError
+from pmsmtool.identification.evaluate import Evaluation, evaluate, shots_of
+from pmsmtool.identification.replay import stored_traces
+from pmsmtool.measurement.run_account import account_lines
+from pmsmtool.npz_file import read_npz
+from pmsmtool.proof.judgement import judge
+from pmsmtool.proof.stage import read_proof, responses
+from pmsmtool.report import figures
+from pmsmtool.report.report import Change, Figure, render
+from pmsmtool.report.verdict import COMPLETE, Verdict, is_simulated, verdict_of
+from pmsmtool.run_directory import RunDirectory, RunRecord
+from pmsmtool.trace import Trace
+
+NOT_CHECKED = (
+    "Behaviour: the drive's bytes were compared, its step responses were not.",
+    "Scale of the sensors: current and voltage gains are taken from the declared tolerances, nothing in the drive can "
+    "measure them.",
+    "The hardware stop (safe torque off, mains, emergency stop): the stops of this run went over the bus.",
+    "Continuous torque and temperatures under load.",
+    "Saturation beyond the bias points that are named, cogging and slot harmonics, iron losses.",
+)
+"""What a reader of a green report must not assume."""
+SERVED = ("socketcand", "virtual", "udp_multicast")
+"""Interfaces of python-can behind which another program may stand instead of a drive."""
+ANY_DRIVE = (
+    "Whether a real drive answered: the bus is {}, and only a simulated drive of this program names itself (0x1008)."
+)
+ONE_STAGE = ("identify", "track", "prove")
+"""Commands whose run is one stage of the same name."""
+CHAINS = ("commission", "fleet")
+"""Commands whose run is a full commissioning."""
+NOTHING_COMPARED = "What the drive holds and how it behaves: neither was compared with the design."
+
+
+def report_page(path: Path) -> str:
+    """Return the report of a run as one self-contained HTML page.
+
+    Raises
+    ------
+    ConfigError
+        There is no run in the folder, or one of its files is damaged.
+    """
+    run = RunDirectory(path)
+    record = run.read()
+    drawn = [
+        *_identification_figures(run, record),
+        *_design_figures(run.path / "design.toml"),
+        *_margin_figures(record),
+        *_table_figures(run.path / "lut.npz"),
+        *_proof_figures(run, record),
+    ]
+    not_checked = NOT_CHECKED[1:] if record.passed("prove") else NOT_CHECKED
+    if not any(record.passed(stage) for stage in ("flash", "verify", "prove")):
+        not_checked = (NOTHING_COMPARED, *NOT_CHECKED[1:])
+    if not is_simulated(asdict(record)) and record.bus.get("interface") in SERVED:
+        not_checked = (ANY_DRIVE.format(record.bus["interface"]), *not_checked)
+    return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=not_checked,
+                  complete=_complete(record), ended=account_lines(record.account))  # fmt: skip
+
+
+def verdict(path: Path) -> Verdict:
+    """Return the verdict of a run; raises ``ConfigError`` when there is none in the folder."""
+    record = RunDirectory(path).read()
+    return verdict_of(asdict(record), _complete(record))
+
+
+def _complete(record: RunRecord) -> Sequence[str]:
+    """Return the stages that a run must have: of a command of one stage that one, else those of a commissioning."""
+    command = next((word for word in record.command if word in (*ONE_STAGE, *CHAINS)), "")
+    others = {stage.name for stage in record.stages} - {command}
+    return (command,) if command in ONE_STAGE and not others else COMPLETE
+
+
+def how_it_ended(path: Path) -> list[str]:
+    """Return how a run ended that did not come to its end; raises ``ConfigError`` when there is none in the folder."""
+    return account_lines(RunDirectory(path).read().account)
+
+
+def _identification_figures(run: RunDirectory, record: RunRecord) -> Iterator[Figure]:
+    """Draw what the traces of the run say, evaluated again; of a run that was refused, what can be evaluated."""
+    traces = stored_traces(run)
+    if "zero_current" not in traces:
+        return
+    period_s = traces["zero_current"].period_s
+    identified = record.stage("identify")
+    complete = identified is not None and identified.status in ("pass", "partial")
+    found = _evaluated(traces, period_s, complete=complete)
+    if found is None:
+        return
+    resistance, inductance, flux = found.resistance, found.inductance, found.flux
+    if resistance is not None:
+        yield figures.resistance_figure(traces["levels"], resistance.R_measured.value, resistance.curve)
+    if inductance is not None and found.encoder is not None:
+        shots = {axis: shots_of(traces, axis, round(found.encoder.pole_pairs.value))[0] for axis in "dq"}
+        yield figures.inductance_figure(shots, inductance.axes, found.noise.sigma_a)
+    if flux is not None:
+        yield figures.flux_figure(flux)
+
+
+_EXPERIMENTS = (("phase_vectors",), ("levels",), ("rotation",), ("square",), ("push",), ("speeds",))
+"""How the names of their traces begin, in the order the experiments are made."""
+
+
+def _evaluated(traces: Mapping[str, Trace], period_s: float, *, complete: bool) -> Evaluation | None:
+    """Evaluate the traces, leaving out the last experiments until nothing is refused; None when all is.
+
+    ``complete`` says that the run was not ended in the middle of its last experiment.
+    """
+    begun = [k for k, names in enumerate(_EXPERIMENTS) if any(trace.startswith(names) for trace in traces)]
+    count = max(begun, default=0) + (1 if complete else 0)
+    for last in range(count, -1, -1):
+        kept = ("zero_current", *(name for names in _EXPERIMENTS[:last] for name in names))
+        with contextlib.suppress(IdentificationError):
+            return evaluate({name: trace for name, trace in traces.items() if name.startswith(kept)}, period_s)
+    return None
+
+
+def _design_figures(path: Path) -> Iterator[Figure]:
+    if path.is_file():
+        design = load_design(path)
+        loops = open_loops(design)
+        if loops:
+            yield figures.bode_figure(loops, {name: design.loops[name] for name in loops})
+
+
+def _margin_figures(record: RunRecord) -> Iterator[Figure]:
+    stage = record.stage("margins")
+    for ending, title in (("phase", "Phase margin"), ("gain", "Gain margin")):
+        rows = {}
+        unit = ""
+        for value in stage.values if stage else ():
+            if str(value["name"]).endswith(ending) and "p5" in value:
+                least = math.nan if value["least"] is None else float(value["least"])
+                rows[str(value["name"])] = (float(value["p5"]), float(value["p50"]), float(value["p95"]), least)
+                unit = str(value["unit"])
+        if rows:
+            caption = (
+                f"{title} over the tolerance box of the machine: 5 % to 95 % of the random machines, their median, and "
+                "the least value asked for."
+            )
+            yield figures.band_figure(rows, unit, caption)
+
+
+def _table_figures(path: Path) -> Iterator[Figure]:
+    if not path.is_file():
+        return
+    arrays = read_npz(path)
+    if "largest_speed_rpm" not in arrays:
+        return
+    lines = {
+        name: (arrays[f"{name}_i_d_a"], arrays[f"{name}_i_q_a"])
+        for name in ("mtpa", "largest", "mtpv")
+        if f"{name}_i_d_a" in arrays and np.isfinite(arrays[f"{name}_i_d_a"]).any()
+    }
+    binding = [str(name) for name in np.unique(arrays["binding"])]
+    I_max = float(json.loads(str(arrays["meta"]))["I_max_apk"])
+    yield figures.envelope_figure(arrays["largest_speed_rpm"], arrays["largest_torque_nm"], lines, I_max, binding)
+
+
+def _proof_figures(run: RunDirectory, record: RunRecord) -> Iterator[Figure]:
+    """Draw the latest proof: what was committed before the first step, and what was measured, verdict first."""
+    stage = record.stage("prove")
+    names = [name for name in (stage.files if stage else {}) if name.endswith("/prediction.npz")]
+    if not names or not (run.path / names[0]).is_file():
+        return
+    prediction, traces = read_proof((run.path / names[0]).parent)
+    found = responses(traces, prediction)
+    judgement = judge(prediction, found)
+    for number, (experiment, text) in enumerate(zip(prediction.t_s, prediction.facts["experiments"], strict=True), 1):
+        measured = {signal: values for (name, signal), values in found.items() if name == experiment}
+        shares = [line.share for line in judgement.seen if line.what.startswith(f"{experiment}: ")]
+        verdict = "not run" if not shares else "inside its band" if max(shares) <= 1.0 else "OUTSIDE its band"
+        caption = f"Proof {number}, {verdict}: {text}. Grey: the band predicted and committed before the first step."
+        yield figures.proof_figure(prediction, experiment, measured, caption)
+
+
+def _changes(record: RunRecord) -> Sequence[Change]:
+    stage = record.stage("flash")
+    return [] if stage is None else [_change(row) for row in stage.values if "held" in row]
+
+
+def _change(row: Mapping[str, Any]) -> Change:
+    old, asked, held = (f"{float(row[key]):.7g}" for key in ("old", "asked", "held"))
+    return Change(str(row["name"]), old, asked, held, str(row["unit"]))

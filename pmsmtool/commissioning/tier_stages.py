@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: MIT
+"""The chain's stages on a drive that gives less than all: each runs as far as tier and map go, or says what it needs.
+
+A stage that cannot run raises ``NotAvailable``; the chain records it as not available and goes on. What runs is judged
+by the same criteria as on the reference drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pmsmtool.bus.connection import Connection
+from pmsmtool.commissioning.closed_stage import LIMITS, closed_stage, guaranteed, why_no_limits
+from pmsmtool.commissioning.design_stages import lut_stage, margins_stage, tune_stage
+from pmsmtool.commissioning.flash_stages import flash_stage, verify_stage
+from pmsmtool.design.design_file import load_design
+from pmsmtool.design.lookup.design import LookupRequest
+from pmsmtool.design.loops.margins import MarginRequest
+from pmsmtool.design.loops.open_loops import CURRENT_LOOPS, lacking_gains
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
+from pmsmtool.drive.recorded_means import RecordingDrive
+from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
+from pmsmtool.drive.tier_drives import ParameterDrive
+from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.flash.journal import JournalFolder
+from pmsmtool.flash.map_gate import check_map, check_motion
+from pmsmtool.identification.replay import MACHINE, NAMEPLATE
+from pmsmtool.identification.request import QUANTITIES, IdentifyRequest
+from pmsmtool.identification.tier_evaluate import NO_POLE_PAIRS
+from pmsmtool.identification.tier_machine import NEEDED, tier_machine
+from pmsmtool.identification.verdicts import blocking
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.measurement.capabilities import Capabilities, Method, Tier
+from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.measurement.tier_identify import OVER_TORQUE_CONSTANT, can_measure, tier_stage
+from pmsmtool.measurement.vendor_identify import chain_stage, vendor_line
+from pmsmtool.params.parameter_set import read_parameter_set
+from pmsmtool.proof.stage import ProofRequest, prove_stage
+from pmsmtool.run_directory import RunDirectory, Stage
+
+DATA_SHEET = "as given"
+SET_UP = "the drive's own set, from its maker's set-up"
+RECORDER_STEPS = ("speed_step",)
+"""Experiments of a proof that need no excitation: a speed reference while the drive records."""
+PREDICTED = ("speed.K_p_nms_per_rad", "speed.filter_hz")
+"""What a predicted speed step stands on besides the gains of the current loops."""
+NOT_SHOWN = (
+    "; the guarantee of its limits bounds a voltage that it does not record (on a simulated node: `pmsmtool reproduce "
+    "closed-drive`)"
+)
+FOR_READING = "the drive takes no table: it is for reading"
+Allow = Callable[[Sequence[str]], None]
+Say = Callable[[str], None]
+
+
+def open_tier_drive(connection: Connection, node: int, found: Capabilities) -> CanopenDrive:
+    """Return the port that fits what a drive has.
+
+    Raises
+    ------
+    ConfigError
+        The map is that of another drive: nothing is moved or written through it.
+    NotAvailable
+        It lacks what even its tier needs.
+    """
+    check_motion(found.drive_map, found.identity)
+    kinds: dict[Tier, type[CanopenDrive]] = {
+        Tier.FULL: CanopenDrive,
+        Tier.INJECT: RecordingDrive,
+        Tier.RECORDER: RecorderDrive,
+        Tier.STANDARD: StandardDrive,
+    }
+    kind = CanopenDrive if found.unsafe else kinds.get(found.tier, ParameterDrive)
+    if kind is RecorderDrive and not found.drive_map.staging:
+        kind = MappedRecorderDrive
+    return kind(connection, node, drive_map=found.drive_map)
+
+
+@dataclass(frozen=True, slots=True)
+class TierStages:
+    """The stages of one run on one drive below the full tier.
+
+    Parameters
+    ----------
+    run : RunDirectory
+        Where everything goes.
+    drive : CanopenDrive
+        As :func:`open_tier_drive` gives it.
+    found : Capabilities
+        What the drive has.
+    nameplate : MachineFile or None
+        What is known of the machine.
+    drive_bandwidth_hz : float or None
+        Bandwidth of the current control of a drive that keeps its own, where it is known.
+    """
+
+    run: RunDirectory
+    drive: CanopenDrive
+    found: Capabilities
+    nameplate: MachineFile | None
+    drive_bandwidth_hz: float | None = None
+
+    def plan_lines(self) -> list[str]:
+        """Return what the chain will do, one line per stage, before anything moves."""
+        drive_map, tier = self.found.drive_map, self.found.tier
+        known = self.known()
+        lines = [f"tier {tier}, map {drive_map.name}: {len(drive_map.cells)} parameters"]
+        lines.append("identify: " + ("; ".join(self._measurable()) or f"not available: {self._nothing()}"))
+        rest = "what is measured"
+        if known is not None:
+            rest = f"{rest}, the rest {known[1]}" if self._measurable() else f"values {known[1]}"
+        design = f"on {rest}" if self._complete(known) else f"not available: {_machine_needed(NEEDED)}"
+        lines.append(f"tune, lut, margins: {design}")
+        lacking = lacking_gains(drive_map.cells)[CURRENT_LOOPS]
+        if not drive_map.staging and lacking and self.drive_bandwidth_hz is None and self._complete(known):
+            lines[-1] = f"lut: {design}; {FOR_READING}"
+            needs = f"needs the gains of the current loops: the map has no object for {', '.join(lacking)}"
+            lines.append(f"tune, margins: not available: {needs}")
+        if not drive_map.staging:
+            reason = why_no_limits(drive_map, self.drive_bandwidth_hz)
+            lines.append(f"{LIMITS}: " + (f"not available: {reason}" if reason else "judged by what they guarantee"))
+        flash = self._no_writing()
+        lines.append("flash, verify: " + (f"not available: {flash}" if flash else "what the map has an object for"))
+        proof = self._no_proof()
+        lines.append("prove: " + (f"not available: {proof}" if proof else self._provable()))
+        return lines
+
+    def unavailable(self) -> dict[str, str]:
+        """Return the stages that drive and map cannot give, with the reason, as known before anything moves."""
+        writing, proof = self._no_writing(), self._no_proof()
+        reasons = {"flash": writing, "verify": writing, "prove": proof}
+        if self.known() is None:
+            reasons["identify"] = self._nothing()
+        return {name: reason for name, reason in reasons.items() if reason}
+
+    # ---- the stages -----------------------------------------------------------------------------
+
+    def identify(self, request: IdentifyRequest, allow: Allow, say: Say) -> Stage:
+        """Measure what the tier can; the machine file is completed by what was given.
+
+        Where nothing can be measured and a machine file was given, the stage is not available and that file stands in
+        the run, its values as given.
+
+        Raises
+        ------
+        NotAvailable
+            Nothing can be measured, and no machine file was given.
+        PmsmtoolError
+            As the experiments end.
+        """
+        known = self.known()
+        if self.found.tier is Tier.INJECT:
+            return self._by_injection(request, allow, say)
+        if known is not None:
+            self.run.save(NAMEPLATE, dump_machine_file(known[0]))
+        reason = self._nothing()
+        if self._own_line() and request.shaft != "locked":
+            asked = replace(request, quantities=tuple(self._quantities()))
+            return _stopped(chain_stage(self.run, self.drive, self.found, asked, allow, say, known=known))
+        if not reason and request.shaft == "locked":
+            reason = "needs a rotor that may turn, and the shaft is locked"
+        if not reason:
+            asked = replace(request, quantities=tuple(self._quantities()))
+            return _stopped(tier_stage(self.run, self.drive, self.found, asked, allow, say, known=known))
+        if known is not None:
+            made = tier_machine(known[0], {}, known[1])
+            assert made.machine is not None
+            self.run.save(MACHINE, dump_machine_file(made.machine))
+            return Stage(
+                "identify", "not available", 0.0, values=made.given_values(known[1]), files={MACHINE: ""}, note=reason
+            )
+        raise NotAvailable(reason, where=f"node {self.found.identity.node}")
+
+    def tune(self, request: TuneRequest) -> Stage:
+        """Design the control, and the limits of a drive that keeps its own; one pair of gains where it has no more."""
+        if not (self.run.path / MACHINE).is_file():
+            raise NotAvailable(
+                _machine_needed(self._lacking()), hint="begin a new run with it: `pmsmtool commission MACHINE`"
+            )
+        drive_map = self.found.drive_map
+        if drive_map.staging:
+            return tune_stage(self.run, request)
+        return closed_stage(self.run, request, drive_map, self.drive_bandwidth_hz)
+
+    def lut(self, request: LookupRequest) -> Stage:
+        """Make the table of the design."""
+        self._need_design()
+        stage = lut_stage(self.run, request)
+        if self.found.drive_map.tables:
+            return stage
+        notes = [FOR_READING, *_without_base(self.run, self.found.drive_map)]
+        return replace(stage, fallbacks=(*stage.fallbacks, *notes), summary=f"{stage.summary}; {FOR_READING}")
+
+    def margins(self, request: MarginRequest) -> Stage:
+        """Judge the design over what the machine may be, as far as the drive takes its gains."""
+        self._need_design()
+        return margins_stage(self.run, request)
+
+    def flash(self, allow: Allow, say: Say) -> Stage:
+        """Write what the map has an object for."""
+        self._need_design()
+        self._refuse(self._no_writing())
+        return flash_stage(self.run, self.drive, allow, say)
+
+    def verify(self) -> Stage:
+        """Compare what was written."""
+        self._need_design()
+        self._refuse(self._no_writing())
+        return verify_stage(self.run, self.drive)
+
+    def prove(self, request: ProofRequest, allow: Allow, say: Say) -> Stage:
+        """Prove what the drive can show."""
+        self._need_design()
+        self._refuse(self._no_proof())
+        if self.found.tier is Tier.RECORDER:
+            request = replace(request, experiments=RECORDER_STEPS)
+        return prove_stage(self.run, self.drive, load_design(self.run.path / "design.toml"), request, allow, say)
+
+    # ---- what there is --------------------------------------------------------------------------
+
+    def known(self) -> tuple[MachineFile, str] | None:
+        """Return what completes the measured values; the encoder is the drive's own where its set can be read."""
+        known = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
+        if not self.found.drive_map.staging:
+            return known
+        if known is None:
+            name = self.found.identity.name or f"drive {self.found.identity.serial:#010x}"
+            known = nameplate_of(self.drive, name), SET_UP
+        offset, reverse = (self.drive.read(f"encoder.{name}") for name in ("offset_rad", "reversed"))
+        encoder = replace(known[0].encoder, offset_rad=offset, direction=-1 if reverse else 1)
+        return replace(known[0], encoder=encoder), known[1]
+
+    def _complete(self, known: Any) -> bool:
+        return known is not None or self.found.tier is Tier.INJECT
+
+    def _measurable(self) -> list[str]:
+        if self.found.tier is Tier.INJECT:
+            return [", ".join(QUANTITIES)]
+        told = can_measure(self.drive, self.found, self.nameplate)
+        return [*self._own_line(), *(line for line in told if line != OVER_TORQUE_CONSTANT)]
+
+    def _own_line(self) -> list[str]:
+        """Return what the drive's own identification tells; where a recorder measures with intervals, it is not run."""
+        return [] if self.found.tier in (Tier.INJECT, Tier.RECORDER) else vendor_line(self.found)
+
+    def _quantities(self) -> list[str]:
+        return [
+            name
+            for name in QUANTITIES
+            if any(self.found.row(name, m).available for m in (Method.RECORDER, Method.STANDARD))
+        ]
+
+    def _nothing(self) -> str:
+        if self._measurable():
+            return ""
+        missing = self.found.row("mechanics", Method.STANDARD).missing
+        return f"needs {', '.join(missing)}" if missing else NO_POLE_PAIRS
+
+    def _lacking(self) -> tuple[str, ...]:
+        stage = self.run.read().stage("identify")
+        measured = {str(value["name"]) for value in (stage.values if stage else ())}
+        return tuple(name for name in NEEDED if name not in measured)
+
+    def _need_design(self) -> None:
+        if not (self.run.path / "design.toml").is_file():
+            raise NotAvailable(
+                "needs a design, and there is none without a whole machine file",
+                hint="begin a new run with one: `pmsmtool commission MACHINE`",
+            )
+
+    def _no_writing(self) -> str:
+        """Return why nothing can be written, empty when something can."""
+        drive_map = self.found.drive_map
+        if not drive_map.cells:
+            return f"needs a map with objects for parameters: {drive_map.name!r} has none"
+        if not self.found.map_is_drives:
+            return f"needs a map that names this drive's vendor and product (0x1018): {drive_map.name!r} does not"
+        try:
+            check_map(drive_map, self.found.identity, JournalFolder(self.found.identity))
+        except ConfigError as error:
+            return error.what
+        return ""
+
+    def _no_proof(self) -> str:
+        if self.found.drive_map.staging and self.found.tier in (Tier.INJECT, Tier.RECORDER):
+            return ""
+        cells = self.found.drive_map.cells
+        reason = "the drive's current-loop gains cannot be read"
+        if not lacking_gains(cells)[CURRENT_LOOPS]:
+            lacking = ", ".join(name for name in PREDICTED if name not in cells)
+            reason = f"the response of its speed loop cannot be predicted: the map has no object for {lacking}"
+        design = self.run.path / "design.toml"
+        return reason + (NOT_SHOWN if design.is_file() and guaranteed(load_design(design)) else "")
+
+    def _provable(self) -> str:
+        if self.found.tier is Tier.INJECT:
+            return "speed step, current steps, unreachable reference, field weakening"
+        return "speed step; the others need excitation"
+
+    def _by_injection(self, request: IdentifyRequest, allow: Allow, say: Say) -> Stage:
+        known = self.nameplate or nameplate_of(self.drive, self.found.identity.name)
+        stage = identify_stage(self.run, self.drive, known, request, allow, say)
+        return replace(stage, fallbacks=(*stage.fallbacks, "means are made from records: the drive has no averages"))
+
+    def _refuse(self, reason: str) -> None:
+        if reason:
+            raise NotAvailable(reason, where=f"node {self.found.identity.node}")
+
+
+def _stopped(stage: Stage) -> Stage:
+    """Return a stage that fails where pole pairs or angle are refused; what else is lacking is as given, unchecked."""
+    return replace(stage, status="fail") if blocking(stage.refused, given=True) else stage
+
+
+def _without_base(run: RunDirectory, drive_map: DriveMap) -> list[str]:
+    """Leave out of the set what the drive counts relative to a value the set does not have; say so."""
+    wanted = read_parameter_set(run.path / "params.toml")
+    cells = (cell for cell in drive_map.cells.values() if cell.name in wanted.values)
+    left = {cell.name: cell.gain for cell in cells if cell.gain and cell.gain not in wanted.values}
+    if left:
+        values = {name: value for name, value in wanted.values.items() if name not in left}
+        run.save("params.toml", replace(wanted, values=values).to_toml())
+    return [f"{name} stays as it is: counted relative to {base} (`pmsmtool tune --map`)" for name, base in left.items()]
+
+
+def _machine_needed(names: Sequence[str]) -> str:
+    what = ", ".join(names) or "ratings and the inverter"
+    return f"needs {what}: give a machine file (`pmsmtool machine new` takes a data sheet or a meter)"

@@ -1,0 +1,413 @@
+# SPDX-License-Identifier: MIT
+"""Margins of a design over its tolerance box: loop margins and limit headroom, kept apart.
+
+Interval corners give the worst case of the 95 % box with the corner that causes it, random samples give percentiles.
+Random samples come in blocks that are seeded one by one: the result is the same whatever executor draws them, with
+however many workers.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.design.design_file import Design
+from pmsmtool.design.headroom import Headroom, HeadroomLimits, OperatingCells, headroom, operating_cells
+from pmsmtool.design.loops.bandwidth import least_inductance
+from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop
+from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
+from pmsmtool.design.loops.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, speed_loop
+from pmsmtool.design.loops.vector_margins import (
+    Response,
+    VectorMargins,
+    current_response,
+    speed_response,
+    vector_margins,
+)
+from pmsmtool.design.ratings import ratings
+from pmsmtool.design.tolerance import Samples, ToleranceBox
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
+
+Array = NDArray[np.float64]
+
+BLOCK = 2048
+"""Random samples of one block (40 ms of work); fixed, because it decides the numbers."""
+
+BLOCKS_PER_TASK = 4
+"""Blocks that an executor gets as one task: 0.16 s of work, next to which the 3 ms of a Dask task are negligible."""
+
+PERCENTILES = (1.0, 5.0, 50.0, 95.0)
+"""Reported percentiles."""
+
+JUDGED_PERCENTILE = 5.0
+"""A requested margin must hold at this percentile of the random samples, and at every corner."""
+
+CELLS_NAMED = 8
+"""Cells beyond a limit that are named, the most frequent first."""
+
+_PREDICTOR_OPTION = 1 << 4
+_AXES = ("d", "q")
+
+
+class BlockExecutor(Protocol):
+    """What is used of a ``concurrent.futures.Executor``."""
+
+    def map(self, function: Callable[[BlockTask], Blocks], tasks: Iterable[BlockTask], /) -> Iterator[Blocks]:
+        """Apply a function to tasks, results in their order."""
+
+
+@dataclass(frozen=True, slots=True)
+class MarginRequest:
+    """Least margins; None is reported and not judged.
+
+    Attributes
+    ----------
+    phase_margin_deg, gain_margin_db : float
+        Of the current loops, worst corner and fifth percentile.
+    speed_phase_margin_deg : float or None
+        Of the speed loop.
+    voltage_headroom, current_headroom, thermal_headroom : float or None
+        Ratios of the limits.
+    """
+
+    phase_margin_deg: float = 30.0
+    gain_margin_db: float = 4.0
+    speed_phase_margin_deg: float | None = 30.0
+    voltage_headroom: float | None = None
+    current_headroom: float | None = None
+    thermal_headroom: float | None = None
+
+    def least(self, quantity: str) -> float | None:
+        """Return what is asked of a quantity by its name."""
+        if quantity.startswith("speed"):
+            return self.speed_phase_margin_deg if quantity.endswith("phase") else None
+        return {
+            "phase": self.phase_margin_deg,
+            "gain": self.gain_margin_db,
+            "voltage": self.voltage_headroom,
+            "current": self.current_headroom,
+            "thermal": self.thermal_headroom,
+        }.get(quantity.rpartition("_")[2])
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """One quantity over the box.
+
+    Attributes
+    ----------
+    name, unit : str
+        ``current_d_phase`` (deg), ``current_d_gain`` (dB), ``current_d_delay`` (us), likewise q and speed;
+        ``headroom_voltage``, ``headroom_current``, ``headroom_thermal`` (1).
+    nominal, worst : float
+        At the nominal machine, and the least over the corners.
+    worst_sample : mapping of str to float
+        The corner that causes it.
+    worst_cell : str
+        Operating point, for headroom.
+    percentiles : mapping of float to float
+        Of the random samples; empty without.
+    least : float or None
+        What was asked.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    worst: float
+    worst_sample: Mapping[str, float]
+    worst_cell: str
+    percentiles: Mapping[float, float]
+    least: float | None
+
+    @property
+    def ok(self) -> bool:
+        """Whether what was asked holds at every corner and at the judged percentile."""
+        if self.least is None:
+            return True
+        return self.worst >= self.least and self.percentiles.get(JUDGED_PERCENTILE, math.inf) >= self.least
+
+
+@dataclass(frozen=True, slots=True)
+class CellRisk:
+    """An operating point that some machines cannot hold: shares of samples beyond each limit."""
+
+    cell: str
+    voltage: float
+    current: float
+
+
+@dataclass(frozen=True, slots=True)
+class MarginReport:
+    """Margins of a design over its box.
+
+    Attributes
+    ----------
+    loops, headroom : tuple of Spread
+        Loop margins; limit headroom.
+    cells : tuple of CellRisk
+        Operating points beyond a limit, over the random samples where there are any, else over the corners.
+    unreachable : tuple of str
+        Operating points up to rated torque that the nominal machine does not reach.
+    corners, samples : int
+        How many were evaluated.
+    notes : tuple of str
+        What was assumed.
+    """
+
+    loops: tuple[Spread, ...]
+    headroom: tuple[Spread, ...]
+    cells: tuple[CellRisk, ...]
+    unreachable: tuple[str, ...]
+    corners: int
+    samples: int
+    notes: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether everything that was asked holds."""
+        return all(spread.ok for spread in (*self.loops, *self.headroom))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarginProblem:
+    """Everything a block needs, small enough to be sent to a worker."""
+
+    machine: MachineParameters
+    plants: Mapping[str, AxisPlant]
+    least: Mapping[str, float]
+    gains: Mapping[str, CurrentGains]
+    predictor: bool
+    speed: SampledLoop | None
+    speed_crossover: float
+    cells: OperatingCells
+    limits: HeadroomLimits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockTask:
+    """Blocks ``first .. first + blocks - 1`` of the random samples, ``samples`` in all blocks together."""
+
+    problem: MarginProblem
+    box: ToleranceBox
+    samples: int
+    seed: int
+    first: int
+    blocks: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockResult:
+    """Quantities of a block, shape (n,) each, with the worst cell of each headroom and the cells beyond limits."""
+
+    values: Mapping[str, Array]
+    cells: Mapping[str, NDArray[np.intp]]
+    beyond: Mapping[str, Array]
+
+
+def margin_problem(design: Design) -> MarginProblem:
+    """Collect what the evaluation needs from a design."""
+    source = design.machine
+    margin = design["field_weakening.margin"]
+    rated = ratings(source, (1.0 - margin) * source.inverter.V_max_v)
+    T_s, delay = source.inverter.T_s, design["inverter.delay_periods"]
+    machine = source.machine
+    plants = {
+        axis: AxisPlant(machine.R_s_ohm, L, T_s, delay)
+        for axis, L in zip(_AXES, (machine.L_d_h, machine.L_q_h), strict=True)
+    }
+    gains = {
+        axis: CurrentGains(
+            design[f"current.K_p_{axis}_v_per_a"], design[f"current.K_i_{axis}_v_per_as"],
+            design["governor.alpha_rad_s"], Method.IMC,
+        )
+        for axis in _AXES
+    }  # fmt: skip
+    predictor = bool(int(design["current.options"]) & _PREDICTOR_OPTION) and delay >= 1.0
+    limits = HeadroomLimits(
+        design["inverter.voltage_utilisation"], design["motor.I_max_apk"], design["protection.I_cont_apk"],
+        design["protection.T_winding_max_c"],
+    )  # fmt: skip
+    speed = _speed(design, source, gains["q"], plants["q"], predictor)
+    crossover = 0.0 if speed is None else margins(speed).crossover_rad_s
+    least = least_inductance(source, rated.I_max_apk)
+    cells = operating_cells(source, rated, margin)
+    return MarginProblem(machine, plants, least, gains, predictor, speed, crossover, cells, limits)
+
+
+def _speed(
+    design: Design, source: MachineFile, gains: CurrentGains, plant: AxisPlant, predictor: bool
+) -> SampledLoop | None:
+    J = source.machine.J_kgm2
+    if J is None or design["speed.K_p_nms_per_rad"] == 0.0:
+        return None
+    path = SpeedPath(
+        J, source.machine.B_nms or 0.0, axis_loop(gains, plant, plant if predictor else None),
+        int(design["speed.decimation"]), design["encoder.pll_bandwidth_rad_s"], design["speed.filter_hz"],
+        Notch(design["speed.notch_hz"], design["speed.notch_zeta_num"], design["speed.notch_zeta_den"]),
+    )  # fmt: skip
+    K_p, K_i = design["speed.K_p_nms_per_rad"], design["speed.K_i_nm_per_rad"]
+    return speed_loop(SpeedGains(K_p, K_i, 0.0, SpeedMethod.SYMMETRIC_OPTIMUM), path)
+
+
+def evaluate(problem: MarginProblem, samples: Samples) -> BlockResult:
+    """Evaluate every quantity on every sample."""
+    values: dict[str, Array] = {}
+    responses: dict[str, Response] = {}
+    R = samples.column("R_s_ohm") * resistance_at(problem.machine, samples.column("T_winding_c"))
+    for axis in _AXES:
+        plant = problem.plants[axis]
+        span = problem.least.get(axis, plant.L) - plant.L
+        L = samples.column(f"L_{axis}_h") * (plant.L + samples.column("operating_point") * span)
+        model = (plant.R, plant.L) if problem.predictor else None
+        responses[axis] = current_response(problem.gains[axis], R, L, plant.T_s, plant.delay_periods, model)
+        alpha = problem.gains[axis].K_p / plant.L
+        _store(values, f"current_{axis}", vector_margins(responses[axis], plant.T_s, alpha))
+    if problem.speed is not None:
+        plant = problem.plants["q"]
+        model = (plant.R, plant.L) if problem.predictor else None
+        here = np.array([[plant.R]]), np.array([[plant.L]])
+        nominal = current_response(problem.gains["q"], *here, plant.T_s, plant.delay_periods, model)
+        psi = magnet_flux_at(problem.machine, samples.column("T_magnet_c")) / (problem.machine.psi_f_wb or 1.0)
+        gain = samples.column("psi_f_wb") * psi / samples.column("J_kgm2")
+        loop = speed_response(problem.speed, gain, responses["q"], nominal)
+        _store(values, "speed", vector_margins(loop, problem.speed.T_s, problem.speed_crossover))
+    found = headroom(problem.machine, problem.cells, problem.limits, samples)
+    return _with_headroom(values, found)
+
+
+def _store(values: dict[str, Array], name: str, found: VectorMargins) -> None:
+    values[f"{name}_phase"] = found.phase_deg
+    values[f"{name}_gain"] = found.gain_db
+    values[f"{name}_delay"] = 1e6 * found.delay_s
+
+
+def _with_headroom(values: dict[str, Array], found: Headroom) -> BlockResult:
+    parts = {"headroom_voltage": found.voltage, "headroom_current": found.current}
+    worst = {name: np.argmin(part, axis=1) for name, part in parts.items()}
+    values |= {name: part.min(axis=1) for name, part in parts.items()}
+    values["headroom_thermal"] = found.thermal
+    beyond = {name: (part < 0.0).sum(axis=0).astype(np.float64) for name, part in parts.items()}
+    return BlockResult(values, worst, beyond)
+
+
+Blocks = tuple[BlockResult, ...]
+"""Results of the blocks of a task, in their order."""
+
+
+def evaluate_blocks(task: BlockTask) -> Blocks:
+    """Draw and evaluate the blocks of a task (a module-level function, so that any executor can send it)."""
+    return tuple(
+        evaluate(task.problem, task.box.draw(min(BLOCK, task.samples - block * BLOCK), task.seed, block))
+        for block in range(task.first, task.first + task.blocks)
+    )
+
+
+def margin_report(
+    design: Design,
+    box: ToleranceBox,
+    request: MarginRequest | None = None,
+    *,
+    samples: int = 0,
+    seed: int = 0,
+    executor: BlockExecutor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> MarginReport:
+    """Evaluate a design over its tolerance box; of its loops those that it names (``Design.loops``).
+
+    Parameters
+    ----------
+    design : Design
+        What is judged.
+    box : ToleranceBox
+        What the machine may be (``tolerance.tolerance_box``).
+    request : MarginRequest, optional
+        What must hold.
+    samples : int
+        Random samples; 0 for corners only.
+    seed : int
+        Of the random samples.
+    executor : optional
+        Anything with ``map`` (``concurrent.futures``, Dask); this process where none is given.
+    progress : callable, optional
+        Told the random samples done and wanted.
+    """
+    request = MarginRequest() if request is None else request
+    problem = margin_problem(design)
+    nominal = evaluate(problem, box.nominal(design.machine))
+    corners = box.corners()
+    at_corners = evaluate(problem, corners)
+    blocks = []
+    for block in _draw(problem, box, samples, seed, executor):
+        blocks.append(block)
+        if progress is not None:
+            progress(min(len(blocks) * BLOCK, samples), samples)
+    random = {name: np.concatenate([b.values[name] for b in blocks]) for name in nominal.values} if blocks else {}
+    spreads = []
+    judged = {"headroom", *(name.partition("_")[0] for name in design.loops)}
+    for name in nominal.values:
+        if name.partition("_")[0] not in judged:
+            continue
+        row = int(np.argmin(at_corners.values[name]))
+        cell = problem.cells.name(int(at_corners.cells[name][row])) if name in at_corners.cells else ""
+        shares = {p: float(np.percentile(random[name], p)) for p in PERCENTILES} if blocks else {}
+        spreads.append(
+            Spread(
+                name, _UNITS[name.rpartition("_")[2]], float(nominal.values[name][0]),
+                float(at_corners.values[name][row]), corners.describe(row), cell, shares, request.least(name),
+            )
+        )  # fmt: skip
+    return MarginReport(
+        tuple(s for s in spreads if not s.name.startswith("headroom")),
+        tuple(s for s in spreads if s.name.startswith("headroom")),
+        _risks(problem, blocks or [at_corners]),
+        problem.cells.unreachable,
+        len(corners),
+        samples,
+        box.notes,
+    )
+
+
+_UNITS = {"phase": "deg", "gain": "dB", "delay": "us", "voltage": "1", "current": "1", "thermal": "1"}
+
+
+def _draw(
+    problem: MarginProblem, box: ToleranceBox, samples: int, seed: int, executor: BlockExecutor | None
+) -> Iterator[BlockResult]:
+    blocks = math.ceil(samples / BLOCK)
+
+    def task(first: int, most: int) -> BlockTask:
+        return BlockTask(problem, box, samples, seed, first, min(most, blocks - first))
+
+    done = 0
+    if executor is not None:
+        try:
+            for results in executor.map(
+                evaluate_blocks, [task(first, BLOCKS_PER_TASK) for first in range(0, blocks, BLOCKS_PER_TASK)]
+            ):
+                done += len(results)
+                yield from results
+        except concurrent.futures.BrokenExecutor:
+            pass  # a worker died: blocks are seeded one by one, so doing the rest here gives the same numbers
+    for first in range(done, blocks):
+        yield from evaluate_blocks(task(first, 1))
+
+
+def _risks(problem: MarginProblem, blocks: list[BlockResult]) -> tuple[CellRisk, ...]:
+    count = sum(len(block.values["headroom_thermal"]) for block in blocks)
+    shares = {name: sum(b.beyond[name] for b in blocks) / count for name in ("headroom_voltage", "headroom_current")}
+    voltage, current = np.asarray(shares["headroom_voltage"]), np.asarray(shares["headroom_current"])
+    order = np.argsort(-np.maximum(voltage, current), kind="stable")[:CELLS_NAMED]
+    return tuple(
+        CellRisk(problem.cells.name(int(k)), float(voltage[k]), float(current[k]))
+        for k in order
+        if max(voltage[k], current[k]) > 0.0
+    )

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: MIT
+"""The loops of a design, made again from the gains that stand in it: to draw them, and to judge other gains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+
+from pmsmtool.design.design_file import Design, DesignValue, Scalar
+from pmsmtool.design.loops.bandwidth import least_inductance
+from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop, maximum_delay_periods
+from pmsmtool.design.loops.sampled_loop import LoopMargins, SampledLoop, margins
+from pmsmtool.design.loops.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, speed_loop
+
+CURRENT_GAINS = (
+    "current.K_p_d_v_per_a", "current.K_i_d_v_per_as", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as",
+)  # fmt: skip
+"""What the current loops are made of, besides machine and delay."""
+SPEED_GAINS = ("speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad", "speed.filter_hz")
+"""What the speed loop is made of, besides the current loop, machine and delays."""
+ONE_PAIR = {CURRENT_GAINS[2]: CURRENT_GAINS[0], CURRENT_GAINS[3]: CURRENT_GAINS[1]}
+"""Gains of q that serve both axes on a drive without an object for those of d."""
+SMALLER = "the smaller of both axes: the drive has one pair"
+CURRENT_LOOPS, SPEED_LOOP = "current", "speed"
+_FACTS = {
+    CURRENT_LOOPS: ("current_bandwidth_rad_s", "maximum_delay_d_periods", "maximum_delay_q_periods"),
+    SPEED_LOOP: ("speed_crossover_rad_s",),
+}
+
+
+def open_loops(design: Design) -> dict[str, SampledLoop]:
+    """Return the open loops that a design is judged by, from the gains that stand in it."""
+    machine = design.machine.machine
+    predicts = bool(design.request.get("predictor", False))
+    loops = {}
+    for axis in "dq":
+        plant = _plant(design, axis)
+        loops[f"current_{axis}"] = axis_loop(_gains(design, axis), plant, plant if predicts else None)
+    if SPEED_LOOP in design.loops and machine.J_kgm2 is not None:
+        notch = Notch(design["speed.notch_hz"], design["speed.notch_zeta_num"], design["speed.notch_zeta_den"])
+        path = SpeedPath(
+            machine.J_kgm2, machine.B_nms or 0.0, loops["current_q"], int(design["speed.decimation"]),
+            design["encoder.pll_bandwidth_rad_s"], design["speed.filter_hz"], notch,
+        )  # fmt: skip
+        gain = SpeedGains(
+            design["speed.K_p_nms_per_rad"], design["speed.K_i_nm_per_rad"], 0.0, SpeedMethod.SYMMETRIC_OPTIMUM
+        )
+        loops[SPEED_LOOP] = speed_loop(gain, path)
+    return {name: loop for name, loop in loops.items() if name in design.loops}
+
+
+def lacking_gains(offers: Collection[str]) -> dict[str, tuple[str, ...]]:
+    """Return by loop the gains that a drive has no object for.
+
+    Parameters
+    ----------
+    offers : collection of str
+        Catalogue names it has an object for; those of q serve both axes where d has none.
+    """
+    served = {*offers, *(d for q, d in ONE_PAIR.items() if q in offers)}
+    needs = {CURRENT_LOOPS: CURRENT_GAINS, SPEED_LOOP: SPEED_GAINS}
+    return {loop: tuple(name for name in names if name not in served) for loop, names in needs.items()}
+
+
+def smaller_gains(values: Mapping[str, float], offers: Collection[str]) -> dict[str, float]:
+    """Return the gains of a drive that has one pair for both axes: the smaller of each, so that both keep margins.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Gains by catalogue name; where only one axis has one there is nothing to choose.
+    offers : collection of str
+        Catalogue names the drive has an object for.
+    """
+    return {
+        name: min(values[q], values[d])
+        for q, d in ONE_PAIR.items()
+        if q in offers and d not in offers and {q, d} <= set(values)
+        for name in (q, d)
+    }
+
+
+def one_pair(design: Design, offers: Collection[str]) -> dict[str, DesignValue]:
+    """Return what :func:`smaller_gains` makes of a design's gains."""
+    gains = {name: design[name] for name in CURRENT_GAINS}
+    return {name: DesignValue(value, SMALLER) for name, value in smaller_gains(gains, offers).items()}
+
+
+def with_gains(design: Design, gains: Mapping[str, DesignValue], judged: Collection[str]) -> Design:
+    """Return a design with other gains, judged by the loops they make.
+
+    Parameters
+    ----------
+    design : Design
+        With the gains as designed, without a predictor.
+    gains : mapping of str to DesignValue
+        What the drive will hold instead.
+    judged : collection of str
+        ``current``, ``speed``: loops whose gains are known. Of the others nothing is said; their facts go too.
+    """
+    kept = {name: loop for name, loop in design.loops.items() if name.startswith(tuple(judged))}
+    changed = replace(design, values={**design.values, **gains}, loops=kept)
+    if gains:
+        found = {name: margins(loop) for name, loop in open_loops(changed).items()}
+        kept = {**found, **_saturated(changed)}
+        changed = replace(changed, loops=kept)
+    values = {name: value if value.loop in kept else replace(value, loop="") for name, value in changed.values.items()}
+    facts = {name: fact for name, fact in design.facts.items() if name not in _facts_without(judged)}
+    if gains and CURRENT_LOOPS in judged:
+        alpha = min(changed[f"current.K_p_{axis}_v_per_a"] / _plant(design, axis).L for axis in "dq")
+        values["governor.alpha_rad_s"] = DesignValue(alpha, "bandwidth of the current loops")
+        facts["current_bandwidth_rad_s"] = alpha
+        for axis in "dq":
+            facts[f"maximum_delay_{axis}_periods"] = maximum_delay_periods(_gains(changed, axis), _plant(design, axis))
+    if SPEED_LOOP in kept:
+        facts["speed_crossover_rad_s"] = kept[SPEED_LOOP].crossover_rad_s
+    ordered: dict[str, Scalar] = {name: facts[name] for name in design.facts if name in facts}
+    return replace(changed, values=values, facts={**ordered, **facts})
+
+
+def _facts_without(judged: Collection[str]) -> set[str]:
+    return {fact for loop, facts in _FACTS.items() if loop not in judged for fact in facts}
+
+
+def _plant(design: Design, axis: str) -> AxisPlant:
+    machine, inverter = design.machine.machine, design.machine.inverter
+    L = machine.L_d_h if axis == "d" else machine.L_q_h
+    return AxisPlant(machine.R_s_ohm, L, inverter.T_s, inverter.delay_periods)
+
+
+def _gains(design: Design, axis: str) -> CurrentGains:
+    alpha = float(design.facts.get("current_bandwidth_rad_s", math.nan))
+    return CurrentGains(
+        design[f"current.K_p_{axis}_v_per_a"], design[f"current.K_i_{axis}_v_per_as"], alpha, Method.IMC
+    )
+
+
+def _saturated(design: Design) -> dict[str, LoopMargins]:
+    """Return the margins at each axis' least inductance, of a machine with a flux map."""
+    names = [axis for axis in "dq" if f"current_{axis}_saturated" in design.loops]
+    least = least_inductance(design.machine, design["motor.I_max_apk"]) if names else {}
+    return {
+        f"current_{axis}_saturated": margins(
+            axis_loop(_gains(design, axis), replace(_plant(design, axis), L=least[axis]))
+        )
+        for axis in names
+    }

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: MIT
+"""Speed controller: PI gains from the inertia and the sum of the small time constants, and the exact sampled loop.
+
+The path runs at the control period (current loop, speed estimate, filter), the controller every ``decimation``
+periods with its torque held between. The loop is lifted to the controller's period exactly, so the margins contain
+the multirate hold, the current loop's own delay, the speed estimate and the feedback filter.
+
+Source: symmetric optimum after Kessler (1958), C. Kessler, Regelungstechnik 6; textbook form K_p = J / (a T_sum),
+K_i = K_p / (a^2 T_sum), phase margin atan(a) - atan(1/a).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.design.loops.sampled_loop import SampledLoop
+from pmsmtool.errors import DesignInfeasible
+
+Array = NDArray[np.float64]
+System = tuple[Array, Array, Array, float]
+"""A, b, c, d of a single-input single-output system, x(k+1) = A x + b u, y = c x + d u."""
+
+PLL_DAMPING = 1.0
+"""Damping of the drive's speed estimate, a double pole at ``encoder.pll_bandwidth_rad_s``."""
+
+
+class SpeedMethod(StrEnum):
+    """Rule that gives the speed gains."""
+
+    SYMMETRIC_OPTIMUM = "symmetric-optimum"
+    POLE_PLACEMENT = "pole-placement"
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedGains:
+    """Gains of the speed controller, torque over mechanical speed.
+
+    Attributes
+    ----------
+    K_p : float
+        Proportional gain (N m s/rad).
+    K_i : float
+        Integral gain (N m/rad).
+    omega_c : float
+        Crossover (symmetric optimum) or natural frequency (placement) they were designed for (rad/s).
+    method : SpeedMethod
+        Rule that gave them.
+    """
+
+    K_p: float
+    K_i: float
+    omega_c: float
+    method: SpeedMethod
+
+
+@dataclass(frozen=True, slots=True)
+class Notch:
+    """Notch at the controller's period; ``hz`` = 0 is off."""
+
+    hz: float = 0.0
+    zeta_num: float = 0.05
+    zeta_den: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedPath:
+    """Everything between the speed controller's torque and the speed it sees.
+
+    Attributes
+    ----------
+    J, B : float
+        Inertia (kg m2) and viscous friction (N m s).
+    current : SampledLoop
+        Loop of the q axis; its closed form is the torque path.
+    decimation : int
+        Control periods per controller period.
+    pll_rad_s : float
+        Natural frequency of the speed estimate (rad/s).
+    filter_hz : float
+        Cut-off of the first-order feedback filter (Hz).
+    notch : Notch
+        Notch on the torque.
+    """
+
+    J: float
+    B: float
+    current: SampledLoop
+    decimation: int
+    pll_rad_s: float
+    filter_hz: float
+    notch: Notch = Notch()
+
+    @property
+    def T_speed(self) -> float:
+        """Period of the speed controller (s)."""
+        return self.decimation * self.current.T_s
+
+
+def small_time_constants(path: SpeedPath, alpha_current: float) -> float:
+    """Return T_sum (s): current loop 1/alpha and delay, speed estimate, filter, half the controller's hold."""
+    estimate = 2.0 * PLL_DAMPING / path.pll_rad_s
+    feedback = 1.0 / (2.0 * math.pi * path.filter_hz)
+    return 1.0 / alpha_current + path.current.delay_s + estimate + feedback + 0.5 * path.T_speed
+
+
+def symmetric_optimum(J: float, T_sum: float, a: float) -> SpeedGains:
+    """Place the crossover 1 / (a T_sum) at the phase maximum atan(a) - atan(1/a).
+
+    Raises
+    ------
+    DesignInfeasible
+        When a <= 1: the crossover would lie beyond the small time constants.
+    """
+    if a <= 1.0:
+        raise DesignInfeasible(
+            f"a crossover of {1.0 / (a * T_sum):.4g} rad/s lies beyond the small time constants, {T_sum * 1e3:.3g} ms",
+            hint=f"ask for a speed bandwidth below {1.0 / (2.0 * math.pi * T_sum):.3g} Hz, or a faster speed estimate",
+        )
+    K_p = J / (a * T_sum)
+    return SpeedGains(K_p, K_p / (a * a * T_sum), 1.0 / (a * T_sum), SpeedMethod.SYMMETRIC_OPTIMUM)
+
+
+def symmetric_ratio(phase_margin_rad: float) -> float:
+    """Return a with atan(a) - atan(1/a) = phase margin: a = (1 + sin PM) / cos PM."""
+    return (1.0 + math.sin(phase_margin_rad)) / math.cos(phase_margin_rad)
+
+
+def pole_placement(J: float, B: float, omega_n: float, zeta: float) -> SpeedGains:
+    """Place J s^2 + (B + K_p) s + K_i: K_p = 2 zeta w_n J - B, K_i = w_n^2 J.
+
+    Raises
+    ------
+    DesignInfeasible
+        When friction alone damps more than asked.
+    """
+    K_p = 2.0 * zeta * omega_n * J - B
+    if K_p <= 0.0:
+        raise DesignInfeasible(
+            f"placing w_n = {omega_n:.4g} rad/s, zeta = {zeta:.3g} needs K_p = {K_p:.4g} N m s/rad",
+            likely="the viscous friction is larger than the damping asked for",
+            hint=f"ask for w_n above {B / (2.0 * zeta * J):.4g} rad/s",
+        )
+    return SpeedGains(K_p, omega_n**2 * J, omega_n, SpeedMethod.POLE_PLACEMENT)
+
+
+def speed_loop(gains: SpeedGains, path: SpeedPath) -> SampledLoop:
+    """Return the loop at the controller's period, broken at the torque."""
+    T = path.T_speed
+    parts = (_torque_path(path.current), _mechanics(path), _speed_estimate(path), _feedback_filter(path))
+    num, den = _rational(_lift(_series(*parts), path.decimation))
+    for factor_num, factor_den in (
+        ((gains.K_p, gains.K_i * T - gains.K_p), (1.0, -1.0)),
+        notch_coefficients(path.notch, T),
+    ):
+        num, den = _product(num, factor_num), _product(den, factor_den)
+    return SampledLoop(tuple(num.tolist()), tuple(den.tolist()), T, path.current.delay_s + 0.5 * T)
+
+
+def notch_coefficients(notch: Notch, T: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return num, den of (s^2 + 2 zeta_num w s + w^2) / (s^2 + 2 zeta_den w s + w^2) by the prewarped bilinear rule."""
+    if notch.hz == 0.0:
+        return (1.0,), (1.0,)
+    g = math.tan(math.pi * notch.hz * T)
+    if not 0.0 < notch.hz * T < 0.5:
+        raise DesignInfeasible(
+            f"a notch at {notch.hz:.4g} Hz is not below half the speed controller's rate, {0.5 / T:.4g} Hz",
+            where="speed.notch_hz",
+            hint="lower speed.decimation",
+        )
+    middle = 2.0 * (g * g - 1.0)
+    num = (1.0 + 2.0 * notch.zeta_num * g + g * g, middle, 1.0 - 2.0 * notch.zeta_num * g + g * g)
+    den = (1.0 + 2.0 * notch.zeta_den * g + g * g, middle, 1.0 - 2.0 * notch.zeta_den * g + g * g)
+    return num, den
+
+
+def _torque_path(current: SampledLoop) -> System:
+    """Closed current loop, reference to current, from the loop transfer function: L / (1 + L)."""
+    return _companion(np.asarray(current.num), np.asarray(np.polyadd(current.den, current.num), dtype=np.float64))
+
+
+def _mechanics(path: SpeedPath) -> System:
+    """Torque to speed, torque linear between samples: w(k+1) = a w(k) + b (t(k) + t(k+1)) / 2, b exact."""
+    T = path.current.T_s
+    y = path.B * T / path.J
+    a = math.exp(-y)
+    b = T / path.J * (1.0 if y == 0.0 else -math.expm1(-y) / y)
+    return _companion(np.array([0.5 * b, 0.5 * b]), np.array([1.0, -a]))
+
+
+def _speed_estimate(path: SpeedPath) -> System:
+    """Tracking filter on the sampled position with a double pole at z0 = exp(-w_n T); output w^ after its update.
+
+    e = th - (th^ + T w^), th^ += T w^ + (1 - z0^2) e, w^ += (1 - z0)^2 / T e. The position rises over a period by the
+    mean of the speeds at its ends; the part of the later one is moved from the state (th - th^, w^) to the output.
+    """
+    T = path.current.T_s
+    z0 = math.exp(-path.pll_rad_s * T)
+    keep, gain = z0 * z0, (1.0 - z0) ** 2 / T
+    A = np.array([[keep, -T * keep], [gain, 1.0 - T * gain]])
+    half_step = 0.5 * T * np.array([keep, gain])
+    return A, A @ half_step + half_step, np.array([0.0, 1.0]), float(half_step[1])
+
+
+def _feedback_filter(path: SpeedPath) -> System:
+    x = 2.0 * math.pi * path.filter_hz * path.current.T_s
+    share = x / (1.0 + x)
+    return _companion(np.array([share, 0.0]), np.array([1.0, share - 1.0]))
+
+
+def _companion(num: Array, den: Array) -> System:
+    """Return a controllable realisation of num / den."""
+    num = np.concatenate((np.zeros(den.size - num.size), num)) / den[0]
+    den = den / den[0]
+    order = den.size - 1
+    A = np.zeros((order, order))
+    A[0] = -den[1:]
+    A[np.arange(1, order), np.arange(order - 1)] = 1.0
+    b = np.zeros(order)
+    b[0] = 1.0
+    return A, b, num[1:] - num[0] * den[1:], float(num[0])
+
+
+def _series(*systems: System) -> System:
+    A, b, c, d = systems[0]
+    for A2, b2, c2, d2 in systems[1:]:
+        n, m = A.shape[0], A2.shape[0]
+        joined = np.zeros((n + m, n + m))
+        joined[:n, :n], joined[n:, n:], joined[n:, :n] = A, A2, np.outer(b2, c)
+        A, b = joined, np.concatenate((b, b2 * d))
+        c, d = np.concatenate((d2 * c, c2)), d2 * d
+    return A, b, c, d
+
+
+def _lift(system: System, periods: int) -> System:
+    """Hold the input for some periods and look at the output once per hold."""
+    A, b, c, d = system
+    held = np.zeros_like(b)
+    for _ in range(periods):
+        held = A @ held + b
+    return np.linalg.matrix_power(A, periods), held, c, d
+
+
+def _rational(system: System) -> tuple[Array, Array]:
+    A, b, c, d = system
+    den = np.poly(A)
+    num = np.poly(A - np.outer(b, c)) + (d - 1.0) * den
+    return np.real(num), np.real(den)
+
+
+def _product(p: Array, q: tuple[float, ...]) -> Array:
+    return np.asarray(np.polymul(p, q), dtype=np.float64)

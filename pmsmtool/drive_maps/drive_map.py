@@ -1,0 +1,373 @@
+# SPDX-License-Identifier: MIT
+"""The map of a drive: which object holds which catalogue value, in which type, scale and form.
+
+No standard says what a current-loop gain is; every drive has its own objects. One :class:`Cell` says it
+for one value: ``raw = round((SI - offset) / factor)``, little endian, in a CiA 301 type. What the
+drive will really hold is :meth:`DriveMap.quantised`; it is shown before anything is written.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from pmsmtool.data_types import DATA_TYPES
+from pmsmtool.drive_maps.map_tables import decode_table, encode_table, shortest_binary32
+from pmsmtool.drive_maps.motion_objects import MotionObject
+from pmsmtool.drive_maps.recorder_map import RecorderMap, Recording
+from pmsmtool.drive_maps.vendor_tuning import VendorTuning
+from pmsmtool.drive_maps.wire_units import as_peak
+from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
+
+Rounding = Literal["nearest", "down", "up"]
+Form = Literal["value", "time", "rate", "relative", "torque constant"]
+Injecting = Literal["none", "current", "voltage"]
+
+LETTERS: dict[str, str] = {
+    name: DATA_TYPES[name].letter
+    for name in ("UNSIGNED8", "UNSIGNED16", "UNSIGNED32", "INTEGER8", "INTEGER16", "INTEGER32", "REAL32")
+}
+"""CiA 301 types a value may have on the wire, with their ``struct`` letters."""
+
+REFERENCE_VENDOR = 0x706D736D
+REFERENCE_PRODUCT = 0x00000001
+REFERENCE_TABLES = {
+    "lut.i_d_a": (0x2042, 0),
+    "lut.i_q_a": (0x2043, 0),
+    "lut.axis_x": (0x2044, 0),
+    "lut.axis_y": (0x2045, 0),
+    "lut.axis_z": (0x2046, 0),
+}
+"""DOMAIN objects of the reference drive's look-up table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Where and how a drive keeps one value.
+
+    Attributes
+    ----------
+    name : str
+        Catalogue name.
+    index, sub : int
+        The object.
+    wire : str
+        CiA 301 type.
+    factor, offset : float
+        SI value = raw factor + offset.
+    rounding : str
+        ``nearest``, or towards the safe side: ``down``, ``up`` (integers only).
+    gain : str
+        Empty, or the catalogue name of the other value the form needs.
+    unit : str
+        What one count is worth (``drive_maps/wire_units.py``), as in the drive's manual.
+    form : str
+        ``value``; ``time``: the drive keeps gain / value (an integral time T_n = K_p / K_i); ``rate``: value / gain
+        (an integral rate K_i / K_p, a torque slope / rated torque); ``relative``: value / gain of the same unit (a
+        torque / rated torque); ``torque constant``: 1.5 p psi_f instead of the flux linkage (``gain`` is the number of
+        pole pairs).
+    source : str
+        Key of ``DriveMap.sources`` that confirms the object.
+    """
+
+    name: str
+    index: int
+    sub: int
+    wire: str
+    factor: float = 1.0
+    offset: float = 0.0
+    rounding: Rounding = "nearest"
+    gain: str = ""
+    unit: str = ""
+    form: Form = "value"
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if self.gain and self.form == "value":
+            object.__setattr__(self, "form", "time")  # a gain alone has always meant an integral time
+
+    @property
+    def size(self) -> int:
+        """Bytes on the wire."""
+        return struct.calcsize("<" + LETTERS[self.wire])
+
+    def encode(self, value: float, values: Mapping[str, float]) -> bytes:
+        """Return the bytes of an SI value.
+
+        Parameters
+        ----------
+        values : mapping
+            The set the value belongs to; asked for ``gain``.
+
+        Raises
+        ------
+        ConfigError
+            The value does not fit the type, or the gain is missing.
+        """
+        raw = self.counts(value, values)
+        letter = LETTERS[self.wire]
+        if letter != "f":
+            raw = self._rounded(raw)
+        try:
+            return struct.pack("<" + letter, raw if letter == "f" else int(raw))
+        except (struct.error, OverflowError, ValueError) as error:
+            raise ConfigError(
+                f"{value:.9g} does not fit {self.wire} in steps of {self.factor:g}",
+                where=f"{self.name} -> 0x{self.index:04X}:{self.sub:02X}",
+            ) from error
+
+    def counts(self, value: float, values: Mapping[str, float]) -> float:
+        """Return an SI value in counts of the object, not rounded yet."""
+        return (self._formed(value, values) - self.offset) / self.factor
+
+    def decode(self, data: bytes, values: Mapping[str, float]) -> float:
+        """Return the SI value of the object's bytes, with the fewest digits that give these bytes again."""
+        if len(data) != self.size:
+            raise ConfigError(
+                f"{len(data)} bytes are no {self.wire}", where=f"{self.name} -> 0x{self.index:04X}:{self.sub:02X}"
+            )
+        letter = LETTERS[self.wire]
+        raw = struct.unpack("<" + letter, data)[0]
+        if letter == "f":
+            raw = shortest_binary32(raw)
+        # fifteen digits: one count more or less shows, the product's last bit does not
+        return self._meant(float(f"{raw * self.factor + self.offset:.15g}"), values)
+
+    def _formed(self, value: float, values: Mapping[str, float]) -> float:
+        """What the drive keeps for a value."""
+        if self.form == "value":
+            return value
+        other = self._other(values)
+        if self.form == "torque constant":
+            return torque_per_ampere(other, value)
+        divided = (other, value) if self.form == "time" else (value, other)
+        return divided[0] / divided[1] if divided[1] else math.inf
+
+    def _meant(self, kept: float, values: Mapping[str, float]) -> float:
+        """What a kept number means; the inverse of :meth:`_formed`."""
+        if self.form == "value":
+            return kept
+        other = self._other(values)
+        if self.form in ("rate", "relative"):
+            return kept * other
+        if self.form == "torque constant":
+            return kept / torque_per_ampere(other, 1.0) if other else math.inf
+        return other / kept if kept else math.inf
+
+    def _other(self, values: Mapping[str, float]) -> float:
+        if self.gain not in values:
+            raise ConfigError(f"needs {self.gain} in the same set", where=self.name)
+        return values[self.gain]
+
+    def _rounded(self, raw: float) -> float:
+        if not math.isfinite(raw):
+            return raw
+        if self.rounding == "nearest":
+            return round(raw)
+        return math.floor(raw) if self.rounding == "down" else math.ceil(raw)
+
+
+@dataclass(frozen=True, slots=True)
+class SignalCell:
+    """Where a drive shows or takes a quantity of its running control.
+
+    Attributes
+    ----------
+    index, sub : int
+        The object.
+    wire : str
+        CiA 301 type.
+    unit : str
+        What one count is worth (``drive_maps/wire_units.py``).
+    source : str
+        Key of ``DriveMap.sources``.
+    """
+
+    index: int
+    sub: int
+    wire: str
+    unit: str
+    source: str = ""
+
+    @property
+    def size(self) -> int:
+        """Bytes on the wire."""
+        return struct.calcsize("<" + LETTERS[self.wire])
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What a family can do besides holding parameters; the drive itself must confirm it.
+
+    Attributes
+    ----------
+    torque_mode, velocity_mode : bool
+        CiA 402 modes 4 or 10, and 3 or 9.
+    commutation_angle : bool
+        Mode 11 with the commutation angle 0x60EA.
+    pdo : bool
+        Live quantities as process data.
+    recorder : str
+        ``none``, or how it is read: one of :data:`~pmsmtool.drive_maps.recorder_map.Recording`.
+    injection : str
+        ``none``, ``current`` or ``voltage`` set-points for d and q.
+    averages : bool
+        Window averages inside the drive, and a voltage whose acting period is known.
+    """
+
+    torque_mode: bool = False
+    velocity_mode: bool = False
+    commutation_angle: bool = False
+    pdo: bool = False
+    recorder: Recording = "none"
+    injection: Injecting = "none"
+    averages: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DriveMap:
+    """All cells of one drive family.
+
+    Attributes
+    ----------
+    name : str
+        Family name.
+    vendor, product : int
+        Identity 0x1018:01, 02 a drive must show before anything is written.
+    cells : mapping of str to Cell
+        By catalogue name, in catalogue order.
+    tables : mapping of str to (index, sub)
+        DOMAIN objects of the look-up table; empty where the drive has none.
+    staging : bool
+        Whether the drive takes a whole set at once (objects 0x2000, 0x2001 of the reference drive).
+    more_products : tuple of int
+        Further product codes of the family.
+    capabilities : Capabilities
+        What it can do besides.
+    signals : mapping of str to SignalCell
+        Live quantities and references, by the names of :data:`SIGNALS`.
+    motion : mapping of str to MotionObject
+        The maker's own objects where motion needs what CiA 402 leaves optional.
+    recorder : RecorderMap
+        What its recorder can be told to record, where that is not said by ``signals``.
+    left_out : mapping of str to str
+        What is not mapped and why, by catalogue or signal name.
+    sources : mapping of str to str
+        Where the facts come from.
+    vendor_tuning : VendorTuning or None
+        How the drive's own identification is started and read.
+    """
+
+    name: str
+    vendor: int
+    product: int
+    cells: Mapping[str, Cell]
+    tables: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    staging: bool = False
+    more_products: tuple[int, ...] = ()
+    capabilities: Capabilities = Capabilities()
+    signals: Mapping[str, SignalCell] = field(default_factory=dict)
+    motion: Mapping[str, MotionObject] = field(default_factory=dict)
+    recorder: RecorderMap = field(default_factory=RecorderMap)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)
+    vendor_tuning: VendorTuning | None = None
+
+    def is_for(self, vendor: int, product: int) -> bool:
+        """Whether a drive of this identity belongs to the family."""
+        return vendor == self.vendor and product in (self.product, *self.more_products)
+
+    @next_step("ask for values the drive can hold (`pmsmtool tune`), or correct type and unit in its map")
+    def encode(self, wanted: ParameterSet) -> dict[str, bytes]:
+        """Return the bytes of every entry the drive has an object for, in the order they are written.
+
+        Raises
+        ------
+        ConfigError
+            Entries that do not fit; all of them.
+        """
+        encoded: dict[str, bytes] = {}
+        wrong: list[str] = []
+        for name, value in wanted.values.items():
+            if name in self.cells:
+                try:
+                    encoded[name] = self.cells[name].encode(value, wanted.values)
+                except ConfigError as error:
+                    wrong.append(f"{error.where}: {error.what}")
+        if wrong:
+            raise ConfigError(f"{len(wrong)} value(s) do not fit the drive", where=self.name, violations=wrong)
+        for name, table in wanted.tables.items():
+            if name in self.tables:
+                encoded[name] = encode_table(name, table, wanted.values)
+        return encoded
+
+    @next_step("compare type and size in the drive's map with its manual")
+    def decode(self, found: Mapping[str, bytes]) -> ParameterSet:
+        """Return the set that a drive's bytes mean."""
+        values: dict[str, float] = {}
+        # Gains first: an integral time is decoded with its gain.
+        for cell in sorted(self.cells.values(), key=lambda cell: bool(cell.gain)):
+            if cell.name in found:
+                values[cell.name] = cell.decode(found[cell.name], values)
+        tables = {n: decode_table(n, found[n], values) for n in TABLE_NAMES if found.get(n)}
+        return ParameterSet(values, tables, name=self.name)
+
+    def missing(self, wanted: ParameterSet) -> tuple[str, ...]:
+        """Return the entries of a set that this drive has no object for."""
+        return tuple(n for n in [*wanted.values, *wanted.tables] if n not in self.cells and n not in self.tables)
+
+    def quantised(self, wanted: ParameterSet) -> ParameterSet:
+        """Return what the drive will really hold of a set."""
+        return self.decode(self.encode(wanted))
+
+    def address(self, name: str) -> tuple[int, int]:
+        """Return index and sub-index of an entry."""
+        if name in self.tables:
+            return self.tables[name]
+        cell = self.cells[name]
+        return cell.index, cell.sub
+
+
+SIGNALS: dict[str, str] = {
+    "position_rad": "angle",
+    "omega_M_rad_s": "angular speed",
+    "torque_nm": "torque",
+    "i_q_a": "current",
+    "i_d_a": "current",
+    "u_q_v": "voltage",
+    "u_d_v": "voltage",
+    "U_dc_v": "voltage",
+    "target_torque_nm": "torque",
+    "target_omega_M_rad_s": "angular speed",
+}
+"""Live quantities and references a map may name, with their dimension; mechanical angles and speeds."""
+
+REFERENCE_CAPABILITIES = Capabilities(
+    torque_mode=True, velocity_mode=True, pdo=True, recorder="domain", injection="voltage", averages=True
+)
+REFERENCE_SIGNALS = {
+    "omega_M_rad_s": SignalCell(0x606C, 0, "INTEGER32", "mrpm"),
+    "torque_nm": SignalCell(0x6077, 0, "INTEGER16", "permille of 0x6076"),
+    "i_q_a": SignalCell(0x2070, 2, "REAL32", "A peak"),
+    "i_d_a": SignalCell(0x2070, 1, "REAL32", "A peak"),
+    "u_q_v": SignalCell(0x2070, 6, "REAL32", "V"),
+    "u_d_v": SignalCell(0x2070, 5, "REAL32", "V"),
+    "U_dc_v": SignalCell(0x2070, 8, "REAL32", "V"),
+    "target_torque_nm": SignalCell(0x6071, 0, "INTEGER16", "permille of 0x6076"),
+    "target_omega_M_rad_s": SignalCell(0x60FF, 0, "INTEGER32", "mrpm"),
+}
+
+
+def reference_map() -> DriveMap:
+    """Return the map of the reference drive, which is the parameter catalogue itself."""
+    cells = {row.name: Cell(row.name, row.index, row.sub, row.wire, unit=as_peak(row.unit)) for row in CATALOGUE}
+    return DriveMap(
+        "pmsmsim", REFERENCE_VENDOR, REFERENCE_PRODUCT, cells, REFERENCE_TABLES, staging=True,
+        capabilities=REFERENCE_CAPABILITIES, signals=REFERENCE_SIGNALS,
+    )  # fmt: skip

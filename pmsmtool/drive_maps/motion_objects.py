@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: MIT
+"""Table ``[motion]`` of a drive map: the maker's own objects for what CiA 402 leaves optional, and motion needs.
+
+A current whose manual does not say peak or rms is written ``mA peak-or-rms``. It is then taken as rms everywhere: that
+is the smaller physical current for a limit or a command, and the larger one for what is watched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pmsmtool.drive_maps.wire_units import wire_unit
+
+TABLE = "motion"
+DIMENSIONS: Mapping[str, str] = {
+    "current_limit": "current",
+    "rated_current": "current",
+    "current": "current",
+    "target_current": "current",
+    "target_speed": "angular speed",
+    "speed_limit": "angular speed",
+    "counts_per_turn": "ratio",
+}
+"""Rows the table may have, and what each counts."""
+UNDECIDED = " peak-or-rms"
+"""End of a unit of current whose kind no source says."""
+_KEYS = ("index", "sub", "type", "unit", "mode", "number", "source")
+
+Complain = Callable[[str, str], None]
+CheckObject = Callable[[Any, tuple[str, ...], Complain], bool]
+
+
+@dataclass(frozen=True, slots=True)
+class MotionObject:
+    """Where a drive keeps, shows or takes one of :data:`DIMENSIONS`.
+
+    Attributes
+    ----------
+    index, sub, wire, unit, source
+        As of a signal of the map; ``index`` 0 where the maker fixes the ``number``.
+    mode : int
+        Mode of operation in which a target acts; 0: none is needed.
+    number : float
+        The value itself where no object holds it; 0: an object does.
+    """
+
+    index: int = 0
+    sub: int = 0
+    wire: str = "UNSIGNED32"
+    unit: str = "1"
+    source: str = ""
+    mode: int = 0
+    number: float = 0.0
+
+    @property
+    def undecided(self) -> bool:
+        """Whether no source says if the current is peak or rms."""
+        return self.unit.endswith(UNDECIDED)
+
+    @property
+    def per_count(self) -> float:
+        """SI value of one count; of an undecided current as if it were rms."""
+        return wire_unit(_decided(self.unit)).scale
+
+
+def _decided(unit: str) -> str:
+    return unit.removesuffix(UNDECIDED) + " rms" if unit.endswith(UNDECIDED) else unit
+
+
+def parse_motion(
+    table: Mapping[str, Any],
+    sources: Mapping[str, str],
+    complain: Callable[[tuple[str, ...], str], None],
+    check_object: CheckObject,
+) -> dict[str, MotionObject]:
+    """Return the rows that can be used; tells what is wrong with the others."""
+    good: dict[str, MotionObject] = {}
+    for name, row in table.items():
+
+        def tell(key: str, what: str, name: str = name) -> None:
+            complain((TABLE, name, key) if key else (TABLE, name), f"{name}: {what}")
+
+        if name not in DIMENSIONS:
+            tell("", f"no such row; there are {', '.join(DIMENSIONS)}")
+        elif isinstance(row, dict) and "number" in row:
+            found = _fixed(row, sources, tell)
+            good |= {} if found is None else {name: found}
+        elif check_object(row, _KEYS, tell):
+            found = _object(name, row, tell)
+            good |= {} if found is None else {name: found}
+    return good
+
+
+def _fixed(row: Mapping[str, Any], sources: Mapping[str, str], tell: Complain) -> MotionObject | None:
+    number, source = row["number"], row.get("source", "")
+    if type(number) not in (int, float) or not 0.0 < number < 2.0**32:
+        tell("number", "number must be positive")
+    elif source not in sources:
+        tell("source", "a fixed number needs a source in [sources]")
+    elif set(row) - {"number", "source"}:
+        tell("", "a fixed number has a source and nothing else")
+    else:
+        return MotionObject(number=float(number), source=source)
+    return None
+
+
+def _object(name: str, row: Mapping[str, Any], tell: Complain) -> MotionObject | None:
+    try:
+        dimension = wire_unit(_decided(row["unit"])).dimension
+    except ValueError as error:
+        tell("unit", f"unit {row['unit']!r}: {error}")
+        return None
+    if dimension != DIMENSIONS[name]:
+        tell("unit", f"unit {row['unit']!r}: {dimension}, expected {DIMENSIONS[name]}")
+        return None
+    mode = row.get("mode", 0)
+    if type(mode) is not int or not -128 <= mode <= 127 or (mode != 0) != name.startswith("target_"):
+        tell("mode", "a target needs the mode of operation in which it acts, the others none")
+        return None
+    return MotionObject(row["index"], row["sub"], row["type"], row["unit"], row.get("source", ""), mode)
+
+
+def dump_motion(rows: Mapping[str, MotionObject]) -> dict[str, dict[str, Any]]:
+    """Return the table as a map file holds it."""
+
+    def row(item: MotionObject) -> dict[str, Any]:
+        if item.number:
+            return {"number": item.number, "source": item.source}
+        found: dict[str, Any] = {"index": item.index, "sub": item.sub, "type": item.wire, "unit": item.unit}
+        found |= {"mode": item.mode} if item.mode else {}
+        return found | ({"source": item.source} if item.source else {})
+
+    return {name: row(item) for name, item in rows.items()}

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: MIT
+"""The drive maps that come with the program, by family name and by a drive's identity."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+
+from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.drive_map_file import parse_drive_map
+from pmsmtool.errors import ConfigError
+from pmsmtool.resources import data_folder
+
+MAP_NAME = "map.toml"
+GENERIC = "cia402"
+"""Family of a drive of which nothing but CiA 402 is known."""
+UNKNOWN_VENDOR = 0
+"""Vendor of a map whose maker's number no source confirmed: it fits no real drive until a person fills it in."""
+
+
+def family_names() -> tuple[str, ...]:
+    """Return the families with a shipped map."""
+    return tuple(sorted(path.parent.name for path in data_folder("firmware-params").glob(f"*/{MAP_NAME}")))
+
+
+def load_family(name: str) -> DriveMap:
+    """Return the shipped map of a family.
+
+    Raises
+    ------
+    ConfigError
+        There is no such family.
+    """
+    if name not in family_names():
+        near = get_close_matches(name, family_names(), 1)
+        raise ConfigError(
+            f"no drive family {name!r}" + (f", did you mean {near[0]}?" if near else ""),
+            hint=f"one of {', '.join(family_names())}, or the path of a map file",
+        )
+    path = data_folder("firmware-params") / name / MAP_NAME
+    return parse_drive_map(path.read_text(encoding="utf-8"), str(path))
+
+
+def family_of(vendor: int, product: int) -> DriveMap | None:
+    """Return the shipped map of a drive's identity, None when there is none."""
+    if vendor == UNKNOWN_VENDOR:
+        return None
+    maps = (load_family(name) for name in family_names())
+    return next((drive_map for drive_map in maps if drive_map.is_for(vendor, product)), None)

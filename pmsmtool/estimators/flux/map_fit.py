@@ -1,0 +1,391 @@
+# SPDX-License-Identifier: MIT
+"""A flux map from voltage pulses: co-energy spline regression (docs/identification.md, 3.3).
+
+One linear least squares for all spline coefficients, R, the inverter's plateau and the delay of the current sample. A
+coarse pass gives the inverse incremental inductance that weights the fine one: it turns flux residuals into current
+residuals of the measured noise. Symmetry in i_q and reciprocity are tested on freer models, never assumed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
+from pmsmtool.estimators.flux.map_rows import (
+    KNEES,
+    NUISANCES,
+    Frame,
+    NormalEquations,
+    PulseIntegrals,
+    Whitener,
+    integrate_pulses,
+    normal_equations,
+)
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.trace import Trace
+
+Array = NDArray[np.float64]
+
+PIECES = (15, 17)
+"""Break points along i_d and i_q. On the measured PM-SyRM map the spline's own floor is below 0.03 % of the range."""
+COARSE_PIECES = (9, 11)
+"""For weights and alignment."""
+SKEW_PIECES = (4, 4)
+ALIGNMENTS = 3
+"""Turns of the frame onto the axis of symmetry; each leaves a percent of the angle."""
+INDUCTANCE_FLOOR = 0.2
+"""Smallest inductance in the weights, of the median."""
+COUPLING_MOST = 0.7
+"""Largest |L_dq|/sqrt(L_dd L_qq) in the weights: beyond, a bad first pass would decide them."""
+ROUGHNESS = 1e-7
+"""Weight of the squared third differences, of the mean diagonal: pins what data leave open. The reference's 1e-10 lets
+the rim of the disc swing until a flux falls with its current; 1e-6 bends the map (0.03 -> 0.05 % rms of the range)."""
+RIDGE = 1e-13
+"""The same for the constant of W."""
+R_STD = 0.01
+"""Relative standard deviation of R in the fit: it follows the winding's temperature."""
+INVERTER_STD = 0.1
+"""Standard deviation of the factor on the measured inverter curve."""
+RAMP_STD = 0.3
+"""Standard deviation of each further shape of the error, of the measured plateau."""
+DELAY_STD_SHARE = 0.1
+"""Standard deviation of the delay of the current sample, of the control period."""
+ANCHOR = 1e4
+"""Weight of the flux at zero current, of the mean diagonal: the run over speeds knows it, the motion under pulses
+hardly does; its deviation is added to the result's."""
+SYMMETRIC_SHARE = 0.001
+"""Asymmetry (rms, of the flux range) that counts as none whatever its standard deviation: what the fit leaves."""
+SYMMETRIC_SIGMA = 3.0
+DISC_POINTS = 25
+"""Points per axis of the grid on which symmetry is looked at."""
+
+
+@dataclass(frozen=True, slots=True)
+class MagnetFlux:
+    """psi_d where another experiment measured it, at the temperature of the pulses.
+
+    Attributes
+    ----------
+    psi_wb, std_wb : float
+        Mean of psi_d over the points (Wb), and its standard deviation.
+    i_d_a, i_q_a : tuple of float
+        The points (A); a run with i_d of both signs means the mean of psi_d there, not psi_d at zero current.
+    weight : tuple of float
+        Their weights, of sum one.
+    """
+
+    psi_wb: float
+    std_wb: float
+    i_d_a: tuple[float, ...] = (0.0,)
+    i_q_a: tuple[float, ...] = (0.0,)
+    weight: tuple[float, ...] = (1.0,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoenergyFit:
+    """A fitted co-energy.
+
+    Attributes
+    ----------
+    spline : CoenergySpline
+        Its space.
+    c : ndarray, shape (k,)
+        Coefficients.
+    covariance : ndarray, shape (k, k)
+        Of the coefficients, widened by the residual.
+    R_ohm, inverter, delay_s : float
+        Resistance, factor on the inverter curve and delay of the current sample that fit.
+    sigma_a : float
+        Noise of one sample (A).
+    chi2 : float
+        Reduced chi-square of the current residual against the noise.
+    n : int
+        Residuals.
+    symmetric : bool
+        Whether W is even in i_q.
+    asymmetry, asymmetry_std : float
+        Rms of the flux that breaks the symmetry in the free fit, and what noise alone would show (Wb).
+    axis_rad, axis_std_rad : float
+        Angle of the symmetry axis from the frame's d axis (rad electrical), and its standard deviation.
+    skew : FittedSkew
+        Flux that has no co-energy.
+    frame : Frame
+        The angles used.
+    magnet_std_wb : float
+        Standard deviation of the flux at zero current (Wb).
+    """
+
+    spline: CoenergySpline
+    c: Array
+    covariance: Array
+    R_ohm: float
+    inverter: float
+    delay_s: float
+    sigma_a: float
+    chi2: float
+    n: int
+    symmetric: bool
+    asymmetry: float
+    asymmetry_std: float
+    axis_rad: float
+    axis_std_rad: float
+    skew: FittedSkew
+    frame: Frame
+    magnet_std_wb: float
+
+    def flux(self, i_d_a: Array, i_q_a: Array) -> Array:
+        """Return psi_d, psi_q (Wb), shape (2, n)."""
+        return self.spline.flux(self.c, i_d_a, i_q_a)
+
+    def inductance(self, i_d_a: Array, i_q_a: Array) -> Array:
+        """Return L_dd, L_dq, L_qq (H), shape (3, n)."""
+        return self.spline.inductance(self.c, i_d_a, i_q_a)
+
+    @property
+    def misfit_a(self) -> float:
+        """Current residual that noise does not explain (A rms): the spline, or an effect that no column has."""
+        return self.sigma_a * math.sqrt(max(0.0, self.chi2 - 1.0))
+
+    def flux_std(self, i_d_a: Array, i_q_a: Array) -> Array:
+        """Return the standard deviations of psi_d, psi_q (Wb), shape (2, n): of the fit, and its misfit as flux."""
+        fitted = np.stack([self._std(i_d_a, i_q_a, 1, 0), self._std(i_d_a, i_q_a, 0, 1)])
+        L_dd, L_dq, L_qq = self.inductance(i_d_a, i_q_a)
+        misfit = self.misfit_a * np.stack([np.hypot(L_dd, L_dq), np.hypot(L_dq, L_qq)])
+        return np.asarray(np.sqrt(fitted**2 + misfit**2 + np.array([[self.magnet_std_wb], [0.0]]) ** 2))
+
+    def inductance_std(self, i_d_a: Array, i_q_a: Array) -> Array:
+        """Return the standard deviations of L_dd, L_dq, L_qq (H), shape (3, n).
+
+        The misfit of the flux changes sign from break point to break point, so its slope is the misfit over their
+        distance.
+        """
+        fitted = np.stack([self._std(i_d_a, i_q_a, *order) for order in ((2, 0), (1, 1), (0, 2))])
+        L_dd, L_dq, L_qq = self.inductance(i_d_a, i_q_a)
+        misfit_d, misfit_q = self.misfit_a * np.hypot(L_dd, L_dq), self.misfit_a * np.hypot(L_dq, L_qq)
+        h_d, h_q = _spacing(self.spline.breaks_d, i_d_a), _spacing(self.spline.breaks_q, i_q_a)
+        misfit = np.stack([misfit_d / h_d, np.sqrt(misfit_d * misfit_q / (h_d * h_q)), misfit_q / h_q])
+        return np.asarray(np.hypot(fitted, misfit))
+
+    def _std(self, i_d_a: Array, i_q_a: Array, by_d: int, by_q: int) -> Array:
+        rows = self.spline.derivative(i_d_a, i_q_a, by_d, by_q)
+        variance = np.sum((rows @ self.covariance) * rows, axis=1)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _spacing(breaks: Array, x: Array) -> Array:
+    """Return the distance of the break points around each x."""
+    at = np.clip(np.searchsorted(breaks, x, side="right") - 1, 0, len(breaks) - 2)
+    return np.diff(breaks)[at]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedSkew:
+    """psi_d + skew(i) and psi_q of a fit that need not have a co-energy.
+
+    Attributes
+    ----------
+    gradient : ndarray
+        Coefficients of its co-energy part.
+    spline, c
+        Space and coefficients of what is added to psi_d.
+    """
+
+    gradient: Array
+    spline: CoenergySpline
+    c: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Priors:
+    """What other experiments know of the columns behind the spline: means and standard deviations."""
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+
+def fit_coenergy(
+    traces: Sequence[Trace],
+    frame: Frame,
+    curve: InverterCurve,
+    *,
+    R_ohm: float,
+    sigma_a: float,
+    magnet: MagnetFlux,
+    align: bool = False,
+) -> CoenergyFit:
+    """Fit the co-energy.
+
+    Parameters
+    ----------
+    traces : sequence of Trace
+        Pulses in the rotor frame (``experiments.flux_map_scan``).
+    frame : Frame
+        Angles.
+    curve : InverterCurve
+        Voltage error of one phase.
+    R_ohm : float
+        Loop resistance at the temperature of the pulses (ohm).
+    sigma_a : float
+        Noise of one sample of i_d or i_q (A).
+    magnet : MagnetFlux
+        Flux at zero current; a held rotor shows increments only.
+    align : bool
+        Turn the frame onto the axis of symmetry: where the offset of the encoder is not known better.
+    """
+    T_s = float(traces[0].meta["control_period_s"])
+    ramps = np.zeros(len(KNEES))
+    plateau = float(np.max(np.abs(curve.u_error_v)))
+    priors = Priors(
+        (R_ohm, 1.0, *ramps, 0.0),
+        (R_STD * R_ohm, INVERTER_STD, *(ramps + RAMP_STD * plateau + 1e-9), DELAY_STD_SHARE * T_s),
+    )
+    for _ in range(ALIGNMENTS if align else 1):
+        pulses = [integrate_pulses(trace, frame, curve, R_ohm) for trace in traces]
+        i = np.concatenate([p.i for p in pulses], axis=1)
+        coarse = CoenergySpline.over(i[0], i[1], COARSE_PIECES)
+        sums = normal_equations(pulses, coarse, _flat(pulses))
+        x, covariance = _solve(sums, coarse, priors, magnet, _unit(sums, coarse, priors, magnet, sigma_a))
+        whiten = _by_inductance(coarse, x[: coarse.size], i)
+        if align:
+            frame = replace(frame, offset_rad=frame.offset_rad - _symmetry(coarse, x, covariance, i)[2])
+    return _fine_fit(pulses, i, frame, whiten, priors, sigma_a, magnet)
+
+
+def _fine_fit(
+    pulses: Sequence[PulseIntegrals],
+    i: Array,
+    frame: Frame,
+    whiten: Whitener,
+    priors: Priors,
+    sigma_a: float,
+    magnet: MagnetFlux,
+) -> CoenergyFit:
+    spline = CoenergySpline.over(i[0], i[1], PIECES)
+    skew = CoenergySpline.over(i[0], i[1], SKEW_PIECES)
+    with_skew = normal_equations(pulses, spline, whiten, skew)
+    k, own = spline.size, spline.size + len(NUISANCES)
+    sums = NormalEquations(with_skew.A[:own, :own], with_skew.b[:own], with_skew.c, with_skew.n)
+    unit = _unit(sums, spline, priors, magnet, sigma_a)
+    x, covariance = _solve(sums, spline, priors, magnet, unit)
+    asymmetry, asymmetry_std, axis, axis_std = _symmetry(spline, x, covariance, i)
+    symmetric = asymmetry <= max(SYMMETRIC_SIGMA * asymmetry_std, SYMMETRIC_SHARE * _span(spline, x, i))
+    free, _ = _solve(with_skew, spline, priors, magnet, unit)
+    if symmetric:
+        x, covariance = _solve(sums, spline, priors, magnet, unit, even=True)
+    return CoenergyFit(
+        spline, x[:k], covariance[:k, :k], float(x[k]), float(x[k + 1]), float(x[own - 1]), sigma_a,
+        sums.squares(x) / (sigma_a**2 * (sums.n - len(x))), sums.n, symmetric, asymmetry, asymmetry_std, axis, axis_std,
+        FittedSkew(free[:k], skew, free[own:]), frame, magnet.std_wb,
+    )  # fmt: skip
+
+
+def _flat(pulses: Sequence[PulseIntegrals]) -> Whitener:
+    """Return equal weights that make of flux about what the currents are (1/H), for the first pass."""
+    swing = max(float(np.ptp(p.volt_seconds)) for p in pulses)
+    current = max(float(np.ptp(p.i)) for p in pulses)
+    return lambda i: np.broadcast_to(np.eye(2) * (current / swing), (i.shape[1], 2, 2))
+
+
+def _by_inductance(spline: CoenergySpline, c: Array, i: Array) -> Whitener:
+    """Return L^-1: the noise of psi(i + n) is L n, so these rows have the noise of the current."""
+    median = np.median(spline.inductance(c, i[0][::8], i[1][::8]), axis=1)
+
+    def whiten(at: Array) -> Array:
+        L_dd, L_dq, L_qq = spline.inductance(c, at[0], at[1])
+        L_dd = np.maximum(L_dd, INDUCTANCE_FLOOR * median[0])
+        L_qq = np.maximum(L_qq, INDUCTANCE_FLOOR * median[2])
+        most = COUPLING_MOST * np.sqrt(L_dd * L_qq)
+        L_dq = np.clip(L_dq, -most, most)
+        det = L_dd * L_qq - L_dq**2
+        return np.moveaxis(np.array([[L_qq, -L_dq], [-L_dq, L_dd]]) / det, 2, 0)
+
+    return whiten
+
+
+def _unit(sums: NormalEquations, spline: CoenergySpline, priors: Priors, magnet: MagnetFlux, sigma_a: float) -> float:
+    """Return the standard deviation of a whitened residual: the noise, or what the fit leaves if that is more."""
+    x, _ = _solve(sums, spline, priors, magnet, sigma_a)
+    return max(sigma_a, math.sqrt(max(0.0, sums.squares(x)) / (sums.n - len(x))))
+
+
+def _solve(
+    sums: NormalEquations,
+    spline: CoenergySpline,
+    priors: Priors,
+    magnet: MagnetFlux,
+    unit: float,
+    *,
+    even: bool = False,
+) -> tuple[Array, Array]:
+    """Return the solution and its covariance, with priors and regularisation; ``unit`` is one residual's deviation."""
+    k, size = spline.size, len(sums.b)
+    A, b = sums.A.copy(), sums.b.copy()
+    for column, (mean, std) in enumerate(zip(priors.mean, priors.std, strict=True), start=k):
+        weight = (unit / std) ** 2
+        A[column, column] += weight
+        b[column] += weight * mean
+    zero = np.zeros(1)
+    mean_diagonal = float(np.trace(sums.A[:k, :k])) / k
+    there = np.array(magnet.weight) @ spline.derivative(np.array(magnet.i_d_a), np.array(magnet.i_q_a), 1, 0)
+    for known, value in ((there, magnet.psi_wb), (spline.derivative(zero, zero, 0, 1)[0], 0.0)):
+        row = np.zeros(size)
+        row[:k] = known
+        weight = ANCHOR * mean_diagonal / float(row @ row)
+        A += weight * np.outer(row, row)
+        b += weight * value * row
+    A[:k, :k] += mean_diagonal * (ROUGHNESS * spline.roughness() + RIDGE * np.eye(k))
+    behind = np.arange(k + len(NUISANCES), size)
+    A[behind, behind] += ROUGHNESS * mean_diagonal * max(1.0, float(np.max(np.diag(sums.A)[behind], initial=0.0)))
+    P = np.eye(size)
+    if even:
+        fold = spline.even()
+        P = np.zeros((size, fold.shape[1] + size - k))
+        P[:k, : fold.shape[1]] = fold
+        P[k:, fold.shape[1] :] = np.eye(size - k)
+        A, b = P.T @ A @ P, P.T @ b
+    scale = 1.0 / np.sqrt(np.diag(A))  # columns of unit length: spline, R, inverter and delay differ by many decades
+    scaled = A * np.outer(scale, scale)
+    inverse = np.linalg.inv(scaled)
+    x = P @ (scale * np.linalg.solve(scaled, scale * b))
+    return x, unit**2 * (P @ (inverse * np.outer(scale, scale)) @ P.T)
+
+
+def disc(i: Array, points: int = DISC_POINTS) -> tuple[Array, Array]:
+    """Return i_d, i_q of a grid over the disc that the data fill (A), i_q of both signs."""
+    radius = 0.95 * min(float(np.max(np.abs(i[0]))), float(np.max(np.abs(i[1]))))
+    axis = np.linspace(-radius, radius, points)
+    i_d, i_q = (grid.ravel() for grid in np.meshgrid(axis, axis, indexing="ij"))
+    keep = (np.hypot(i_d, i_q) <= radius) & (i_d >= np.min(i[0])) & (i_d <= np.max(i[0]))
+    return i_d[keep], i_q[keep]
+
+
+def _span(spline: CoenergySpline, x: Array, i: Array) -> float:
+    return float(np.max(np.ptp(spline.flux(x[: spline.size], *disc(i)), axis=1)))
+
+
+def _symmetry(spline: CoenergySpline, x: Array, covariance: Array, i: Array) -> tuple[float, float, float, float]:
+    """Return the asymmetry in i_q (Wb), what noise shows, and the angle of the symmetry axis with its deviation."""
+    k = spline.size
+    i_d, i_q = disc(i)
+    rows = []
+    for order, sign in (((1, 0), -1.0), ((0, 1), 1.0)):
+        up, down = spline.derivative(i_d, i_q, *order), spline.derivative(i_d, -i_q, *order)
+        rows.append(0.5 * (up + sign * down))
+    broken = np.concatenate(rows)
+    a = broken @ x[:k]
+    C = covariance[:k, :k]
+    noise = np.sum((broken @ C) * broken, axis=1)
+    rms, expected = math.sqrt(float(np.mean(a**2))), math.sqrt(max(0.0, float(np.mean(noise))))
+    # a symmetric map seen from a frame that is turned: change J psi - L J i per radian
+    psi, (L_dd, L_dq, L_qq) = spline.flux(x[:k], i_d, i_q), spline.inductance(x[:k], i_d, i_q)
+    on_q = psi[0] + L_dq * i_q - L_qq * i_d
+    # without its mean: a held rotor shows no constant of psi_q
+    per_radian = np.concatenate([-psi[1] + L_dd * i_q - L_dq * i_d, on_q - np.mean(on_q)])
+    power = float(per_radian @ per_radian)
+    pick = (per_radian @ broken) / power
+    return rms, expected, float(per_radian @ a) / power, math.sqrt(max(0.0, float(pick @ C @ pick)))

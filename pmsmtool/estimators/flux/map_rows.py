@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: MIT
+"""From pulse traces to the linear equations of a flux map (docs/identification.md, 3.3).
+
+The flux in the stator frame is an integral of what is known, psi_ab(t_n) = psi_ab(t_0) + integral of u - R i - e, and
+psi_dq(i) = R(-theta_n) psi_ab(t_n) is linear in the spline coefficients, in R, in the plateau of the inverter's error
+and in a small delay of the current sample. Integration in the stator frame makes the motion of a free rotor exact and
+shows the magnet's flux as far as the rotor turned; the constant of each short segment is projected out, so nothing
+drifts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.trace import Trace
+
+Array = NDArray[np.float64]
+
+SEGMENT = 150
+"""Samples that share one constant: long enough for a pulse, short enough for what R and inverter leave to add up."""
+SEGMENT_LEAST = 40
+GAUSS = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
+"""Points of an interval at which the inverter's error is averaged."""
+STEPS_LEFT = 0.6
+"""Largest rms between measured and smooth angle, in steps of the encoder; steps alone leave 0.29."""
+ROUNDING = 1e-6
+"""Of an angle recorded in binary32, as a second difference of the electrical angle."""
+KNEES = (0.5, 1.0, 2.0)
+"""Further shapes of the inverter's error, a ramp to a plateau each: knees in steps of the current between two samples.
+A fast current, with the ripple of a high duty ratio, rounds the curve that was measured at rest."""
+NUISANCES = ("R_ohm", "inverter", *(f"ramp_{knee:g}_v" for knee in KNEES), "delay_s")
+"""Columns behind the spline coefficients."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """How the recorded angle becomes the angle of the d axis: theta_e = direction p theta_M - offset.
+
+    Attributes
+    ----------
+    pole_pairs : int
+        Pole pairs times direction.
+    drive_offset_rad : float
+        Offset the drive used while it recorded.
+    offset_rad : float
+        The right one.
+    """
+
+    pole_pairs: int
+    drive_offset_rad: float
+    offset_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PulseIntegrals:
+    """One trace as integrals; arrays of shape (2, n) unless stated.
+
+    Attributes
+    ----------
+    i : ndarray
+        Currents in the rotor frame (A).
+    theta : ndarray, shape (n,)
+        Electrical angle of the d axis (rad).
+    volt_seconds, current_seconds : ndarray
+        Integrals of voltage and current up to each sample, stator frame (V s, A s).
+    error_seconds : tuple of ndarray
+        Integrals of the inverter's measured error and of one volt of each further shape, stator frame (V s).
+    volts_before : ndarray
+        Voltage of the interval before each sample, stator frame (V).
+    first : int
+        First row whose voltages are all known.
+    """
+
+    i: Array
+    theta: Array
+    volt_seconds: Array
+    current_seconds: Array
+    error_seconds: tuple[Array, ...]
+    volts_before: Array
+    first: int
+
+
+def integrate_pulses(trace: Trace, frame: Frame, curve: InverterCurve, R_ohm: float) -> PulseIntegrals:
+    """Return the integrals of a trace.
+
+    Parameters
+    ----------
+    trace : Trace
+        ``i_d_a i_q_a u_d_v u_q_v omega_e_rad_s theta_M_rad`` in the drive's rotor frame; ``meta["voltage_lag"]``.
+    frame : Frame
+        Angles.
+    curve : InverterCurve
+        Voltage error of one phase.
+    R_ohm : float
+        Loop resistance, for the torque that smooths the angle (ohm).
+    """
+    lag = int(trace.meta.get("voltage_lag", 1))
+    T_s = float(trace.meta["control_period_s"])
+    turned = frame.pole_pairs * trace["theta_M_rad"] - frame.drive_offset_rad
+    i_s = turn(turned, np.stack([trace["i_d_a"], trace["i_q_a"]]))
+    # what is computed at t_k acts lag periods later, in the frame the drive expected there
+    u_s = turn(turned + (lag + 0.5) * T_s * trace["omega_e_rad_s"], np.stack([trace["u_d_v"], trace["u_q_v"]]))
+    acting = np.zeros_like(u_s)
+    acting[:, lag:] = u_s[:, : u_s.shape[1] - lag]
+    acting = acting[:, :-1]
+    before = np.zeros_like(u_s)
+    before[:, 1:] = acting
+    mean_current = 0.5 * (i_s[:, :-1] + i_s[:, 1:])
+    step = float(np.median(np.max(np.abs(np.diff(i_s)), axis=0)))
+    shapes = (curve, *(ramp(knee * step) for knee in KNEES))
+    error_seconds = tuple(_cumulated(T_s * mean_error(shape, i_s)) for shape in shapes)
+    volt_seconds, current_seconds = _cumulated(T_s * acting), _cumulated(T_s * mean_current)
+    flux = volt_seconds - R_ohm * current_seconds - error_seconds[0]
+    theta = smooth_angle(turned, i_s, flux, T_s) + frame.drive_offset_rad - frame.offset_rad
+    return PulseIntegrals(
+        i=turn(-theta, i_s),
+        theta=theta,
+        volt_seconds=volt_seconds,
+        current_seconds=current_seconds,
+        error_seconds=error_seconds,
+        volts_before=before,
+        first=lag + 2,
+    )
+
+
+def ramp(knee_a: float) -> InverterCurve:
+    """Return an error curve that rises to one volt at a current and stays there."""
+    return InverterCurve(np.array([knee_a, 2.0 * knee_a]), np.ones(2), 0.0)
+
+
+def mean_error(curve: InverterCurve, i: Array) -> Array:
+    """Return the error of each interval in the stator frame (V), shape (2, n - 1), of the interpolated current."""
+    still = np.zeros(i.shape[1] - 1)
+    error = np.zeros((2, i.shape[1] - 1))
+    for share in GAUSS:
+        at = (1.0 - share) * i[:, :-1] + share * i[:, 1:]
+        error += 0.5 * np.stack(curve.error_dq_v(at[0], at[1], still))
+    return error
+
+
+def smooth_angle(theta: Array, i: Array, flux: Array, T_s: float) -> Array:
+    """Return the electrical angle without the steps of the encoder, where a rigid rotor explains it.
+
+    J theta'' = k (psi x i) + constant - friction sgn(theta') is linear in 1/J, in the two unknown constants of the
+    stator flux and in the friction: one least squares over the train. Magnet flux times a step of a coarse encoder is a
+    percent of the flux range of many machines; the fit has some eight parameters for two thousand samples. Where what
+    it leaves is more than steps can be (an elastic shaft, cogging), the measured angle stays.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (n,)
+        Measured angle (rad electrical).
+    i, flux : ndarray, shape (2, n)
+        Current (A) and integral of the voltage behind R (V s), stator frame.
+    T_s : float
+        Sampling period (s).
+    """
+    # second differences: of a turning rotor every first one is many steps; what binary32 rounds is none
+    steps = np.abs(np.diff(theta, 2))
+    steps = steps[steps > ROUNDING * max(1.0, float(np.max(np.abs(theta))))]
+    if len(steps) == 0:
+        return theta
+    one_step = float(np.min(steps))
+    t = np.linspace(-1.0, 1.0, len(theta))
+    torque = flux[0] * i[1] - flux[1] * i[0]
+    columns = [np.ones_like(t), t, t * t, *(_twice_summed(x) for x in (torque, i[0], i[1]))]
+    smooth = _fitted(columns, theta)
+    smooth = _fitted([*columns, _twice_summed(np.sign(np.gradient(smooth)))], theta)
+    left = float(np.sqrt(np.mean(np.square(theta - smooth))))
+    return smooth if left <= STEPS_LEFT * one_step else theta
+
+
+def _twice_summed(x: Array) -> Array:
+    once = np.cumsum(x)
+    return np.cumsum(once - 0.5 * x)
+
+
+def _fitted(columns: Sequence[Array], y: Array) -> Array:
+    A = np.stack([column / max(float(np.max(np.abs(column))), 1e-300) for column in columns], axis=1)
+    x, *_ = np.linalg.lstsq(A, y, rcond=None)
+    return np.asarray(A @ x)
+
+
+def turn(angle: Array, x: Array) -> Array:
+    """Return vectors (2, n) turned by angles (n,)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * x[0] - s * x[1], s * x[0] + c * x[1]])
+
+
+def _cumulated(per_interval: Array) -> Array:
+    return np.concatenate([np.zeros((2, 1)), np.cumsum(per_interval, axis=1)], axis=1)
+
+
+@dataclass(slots=True)
+class NormalEquations:
+    """Sums of the whitened rows: x minimises x' A x - 2 b' x + c.
+
+    Attributes
+    ----------
+    A : ndarray, shape (k, k)
+    b : ndarray, shape (k,)
+    c : float
+    n : int
+        Residuals, the projected constants taken off.
+    """
+
+    A: Array
+    b: Array
+    c: float = 0.0
+    n: int = 0
+
+    @classmethod
+    def empty(cls, size: int) -> NormalEquations:
+        """Return sums of nothing."""
+        return cls(np.zeros((size, size)), np.zeros(size))
+
+    def add(self, rows: Array, target: Array) -> None:
+        """Add rows (n, k) with their targets (n,)."""
+        self.A += rows.T @ rows
+        self.b += rows.T @ target
+        self.c += float(target @ target)
+
+    def squares(self, x: Array) -> float:
+        """Return the sum of squared residuals at x."""
+        return float(self.c - 2.0 * (self.b @ x) + x @ self.A @ x)
+
+
+Whitener = Callable[[Array], Array]
+"""From currents (2, n) to the matrices (n, 2, 2) that turn flux residuals into residuals of equal weight."""
+
+
+def normal_equations(
+    traces: Sequence[PulseIntegrals], spline: CoenergySpline, whiten: Whitener, skew: CoenergySpline | None = None
+) -> NormalEquations:
+    """Add up the equations of all traces.
+
+    Parameters
+    ----------
+    traces : sequence of PulseIntegrals
+        The data.
+    spline : CoenergySpline
+        The space of W.
+    whiten : callable
+        Weights of the two rows of a sample.
+    skew : CoenergySpline, optional
+        A coarse space of flux that has no co-energy, put on psi_d behind all other columns: the test of reciprocity.
+    """
+    size = spline.size + len(NUISANCES) + (0 if skew is None else skew.size)
+    sums = NormalEquations.empty(size)
+    for trace in traces:
+        rows, target, constants = _rows(trace, spline, whiten, skew)
+        for start in range(trace.first, len(trace.theta), SEGMENT):
+            part = slice(start, min(start + SEGMENT, len(trace.theta)))
+            if part.stop - part.start < SEGMENT_LEAST:
+                continue
+            x, y = rows[part].reshape(-1, size), target[part].ravel()
+            q, _ = np.linalg.qr(constants[part].reshape(-1, 2))
+            sums.add(x - q @ (q.T @ x), y - q @ (q.T @ y))
+            sums.n += len(y) - 2
+    return sums
+
+
+def _rows(
+    trace: PulseIntegrals, spline: CoenergySpline, whiten: Whitener, skew: CoenergySpline | None
+) -> tuple[Array, Array, Array]:
+    """Rows (n, 2, k), targets (n, 2) and the columns (n, 2, 2) of a segment's constant, whitened."""
+
+    def seen(vector: Array) -> Array:
+        return turn(-trace.theta, vector).T
+
+    i_d, i_q = trace.i
+    parts = [
+        np.stack([spline.derivative(i_d, i_q, 1, 0), spline.derivative(i_d, i_q, 0, 1)], axis=1),
+        seen(trace.current_seconds)[:, :, None],
+        *(seen(error)[:, :, None] for error in trace.error_seconds),
+        seen(trace.volts_before)[:, :, None],
+    ]
+    if skew is not None:
+        field = skew.derivative(i_d, i_q, 0, 0)
+        parts.append(np.stack([field, np.zeros_like(field)], axis=1))
+    c, s = np.cos(trace.theta), np.sin(trace.theta)
+    constants = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)
+    w = whiten(trace.i)
+
+    def weighted(x: Array) -> Array:
+        # two products of the wide array instead of thousands of small matrix products
+        return np.stack([w[:, k, :1] * x[:, 0] + w[:, k, 1:] * x[:, 1] for k in range(2)], axis=1)
+
+    rows, target = weighted(np.concatenate(parts, axis=2)), weighted(seen(trace.volt_seconds)[:, :, None])
+    return rows, target[:, :, 0], weighted(constants)

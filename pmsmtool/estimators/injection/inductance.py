@@ -1,0 +1,434 @@
+# SPDX-License-Identifier: MIT
+"""Incremental L_d and L_q at a bias from square-wave shots in a frozen frame (docs/identification.md, 3.2).
+
+Two half periods per axis separate the delay, the sensor lag and the motion of the rotor from L; the frame's offset from
+the d axis, known from the flux run, mixes the axes and is undone with the measured inverse inductances
+
+    1/L_d' = cos^2 eps / L_d + sin^2 eps / L_q,    1/L_q' = sin^2 eps / L_d + cos^2 eps / L_q,
+
+each with the angle at which the rotor stood during its own shots.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, Verdict, chi2_gate, condition_gate, ljung_box
+from pmsmtool.estimators.injection.axis_fit import AxisFit, fit_axis
+from pmsmtool.estimators.injection.axis_layout import Motion
+from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, VoltageError
+from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstant
+from pmsmtool.estimators.injection.switching_ripple import LEG_ANGLES
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.noise import Noise
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.trace import Trace
+
+Vector = NDArray[np.float64]
+
+MODEL_FLOOR = 1e-4
+"""Relative standard deviation added for what the model leaves out.
+
+docs/identification.md, 4 has 3e-4 where nothing better is known; here bridge, commutation and rotor have terms of
+their own.
+"""
+FREQUENCY_LIMIT = 0.01
+"""Relative difference between two injection frequencies above which both values are reported."""
+ROTOR_LIMIT_RAD = math.radians(2.0)
+"""Rotor motion in one shot (electrical, beyond one encoder step): mixes the axes by sin^2(2 deg) = 0.12 %."""
+INSTANT_LIMIT = 10.0
+"""Standard deviations by which square waves and turning machine may differ about the sampling instant before the
+interval includes what the difference makes (40 drives: at most 1.1 and, with a dead time of 5.5 % of the period, 4.0;
+with 2 kohm of iron loss, where L_q came out 12 % wrong, 41)."""
+CHI2_HOPELESS = 300.0
+"""Reduced chi-square above which no number is given. Between it and the usual limit the interval is widened (ripple of
+3 % of a DC link: 37, L_d 0.1 % off) ..."""
+IN_STEP = 0.2
+"""... where a smaller part of the residual than this repeats with the square wave (that ripple: 0.01; a current that is
+clipped: 1.0)."""
+EDGE_STD = 0.05
+"""Standard deviation of the instant at which a leg's error depends on its current (T_s): a fifth of its distance."""
+MINIMUM_PERIODS = 20
+"""Full periods of the square wave below which a shot is not an excitation."""
+CURVE_POINTS = 256
+ANISOTROPY_LIMIT = 0.03
+"""(1/L_d - 1/L_q) over the mean below which the axis angle cannot be told from the inductances."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAhead:
+    """Angle of the frozen frame ahead of the rotor's d axis during the shots of each axis (rad electrical).
+
+    Attributes
+    ----------
+    d_rad, q_rad : float
+        During the shots on d and on q: an injection may shake the rotor loose from its friction.
+    std_rad : float
+        Standard deviation of both (they share the encoder offset).
+    """
+
+    d_rad: float
+    q_rad: float
+    std_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class InductanceResult:
+    """Incremental inductances and what came with them.
+
+    Attributes
+    ----------
+    L_d, L_q : Estimate
+        Incremental inductances at the bias stated in the estimate (H).
+    axes : mapping of str to AxisFit
+        Fits of the frame's own axes, before the offset is undone.
+    delay : float
+        Sample to acting voltage, mean of both axes (T_s).
+    lag_s : float
+        Time constant of the current sensor (s).
+    by_frequency : mapping of str to tuple of (float, float)
+        Per axis: injection frequency (Hz) and inductance (H) of every shot.
+    frequency_dependent : tuple of str
+        Axes whose inductances differ by more than 1 % between the injection frequencies.
+    axis_angle_rad, axis_angle_std_rad : float
+        Angle of the frame ahead of the axis of largest 1/L, from the cross responses; NaN for a round machine.
+    whiteness : mapping of str to float
+        Ljung-Box p-value of the residual of each axis.
+    verdict : Verdict
+        ``warn`` above the chi-square limit or when frequency dependent.
+    sampling : Sampling or None
+        When and how currents are sampled, by the best model; None where the flux run did not show the instant.
+    samplings : tuple of (float, Sampling)
+        The same by every model that counts, with its weight.
+    apart_s : float
+        How far the instants of square waves and turning machine lie apart where they contradict each other, else 0 (s).
+    """
+
+    L_d: Estimate
+    L_q: Estimate
+    axes: Mapping[str, AxisFit]
+    delay: float
+    lag_s: float
+    by_frequency: Mapping[str, tuple[tuple[float, float], ...]]
+    frequency_dependent: tuple[str, ...]
+    axis_angle_rad: float
+    axis_angle_std_rad: float
+    whiteness: Mapping[str, float]
+    verdict: Verdict
+    sampling: Sampling | None = None
+    samplings: tuple[tuple[float, Sampling], ...] = ()
+    apart_s: float = 0.0
+
+
+def estimate_inductances(
+    d_shots: Sequence[Trace],
+    q_shots: Sequence[Trace],
+    noise: Noise,
+    R_ohm: float,
+    *,
+    frame: FrameAhead | None = None,
+    inverter: InverterCurve | None = None,
+    motion: Motion | None = None,
+    instant: ShownInstant | None = None,
+    U_dc_v: float = math.inf,
+    tolerance: SensorTolerance | None = None,
+) -> InductanceResult:
+    """Incremental inductances from square-wave shots.
+
+    Parameters
+    ----------
+    d_shots, q_shots : sequence of Trace
+        ``i_d_a i_q_a theta_M_rad`` (and ``flagged``) and the voltage of their axis, in a frozen frame;
+        ``meta["half_period"]`` in samples, ``meta["fixed_angle_rad"]``, ``meta["pole_pairs"]``, ``meta["T_winding_c"]``
+        where there is a sensor.
+    noise : Noise
+        From the zero-current trace.
+    R_ohm : float
+        Loop resistance (ohm).
+    frame : FrameAhead or None
+        Where the rotor stood, with the encoder offset of the flux run. None: taken from the cross responses where the
+        machine is salient enough, and said so in ``fallback``.
+    inverter : InverterCurve or None
+        Voltage error from the DC levels.
+    motion : Motion or None
+        How the rotor follows an injection on q, from the flux run and the pushes; None: free in the fit.
+    instant : ShownInstant or None
+        What the flux run shows of the instant at which currents are sampled.
+    U_dc_v : float
+        DC link (V): height of the bridge's pulses; infinite: the mean voltage is taken for all of a period.
+    tolerance : SensorTolerance
+        Declared sensor tolerances.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``, ``E_CLIPPED``, ``E_ROTOR_MOVED``, ``E_MODEL_MISMATCH``, ``E_NOT_IDENTIFIABLE``.
+    """
+    tolerance = tolerance or SensorTolerance()
+    cross: dict[str, tuple[float, float]] = {}
+    shots: dict[str, list[Shot]] = {}
+    traces = {"d": d_shots, "q": q_shots}
+    for axis, records in traces.items():
+        stage = f"inductance, {axis} axis"
+        found = (_shot(record, axis, inverter, U_dc_v, stage) for record in records)
+        shots[axis] = sorted(found, key=lambda shot: shot.half_period)
+    fits = _fitted(shots, noise.sigma_a, R_ohm, motion, instant)
+    for axis, fit in fits.items():
+        condition_gate(fit.condition, f"L_{axis} and the delay", f"inductance, {axis} axis")
+        cross[axis] = _cross_response(shots[axis][0], fit, noise.sigma_a)
+    misfit, apart_s = dict.fromkeys(fits, 0.0), 0.0
+    if instant is not None and _contradicted(fits, instant):
+        # what a turning machine shows is then not the instant alone, and square waves alone may err as well
+        alone = _fitted(shots, noise.sigma_a, R_ohm, motion, None)
+        misfit = {axis: abs(alone[axis].L_h - fit.L_h) for axis, fit in fits.items()}
+        apart_s = max(abs(instant.distance(fit.delay, fit.lag_s)) for fit in fits.values()) * instant.std_s
+    widen = {axis: _widening(fit, shots[axis], f"inductance, {axis} axis") for axis, fit in fits.items()}
+    angle, angle_std = _axis_angle(fits, cross)
+    fallback = ""
+    if frame is None:
+        if math.isfinite(angle):
+            frame, fallback = FrameAhead(angle, angle, angle_std), "frame offset from the cross responses"
+        else:
+            frame, fallback = FrameAhead(0.0, 0.0, 0.0), "frame offset unknown, machine nearly round: axes as they are"
+    values, stds = _unmix(fits, {axis: factor for axis, (_, factor) in widen.items()}, frame)
+    biases = {"d": _bias(d_shots, frame.d_rad), "q": _bias(q_shots, frame.q_rad)}
+    by_frequency = {
+        axis: tuple(
+            (1.0 / (2 * shot.half_period * shot.period_s), L)
+            for shot, L in zip(shots[axis], fits[axis].L_by_shot_h, strict=True)
+        )
+        for axis in fits
+    }
+    dependent = tuple(
+        axis
+        for axis, fit in fits.items()
+        if max(fit.L_by_shot_h) - min(fit.L_by_shot_h) > FREQUENCY_LIMIT * fit.L_by_shot_h[0]
+    )
+    estimates = {
+        axis: Estimate(
+            value=values[axis],
+            std=math.hypot(
+                stds[axis],
+                misfit[axis],
+                MODEL_FLOOR * values[axis],
+                tolerance.voltage_scale_std * values[axis],
+                _commutation_std(shots[axis]),
+            ),
+            systematic=math.hypot(
+                tolerance.impedance * values[axis], R_ohm * tolerance.encoder_latency_s * (instant is not None)
+            ),
+            unit="H",
+            n=fits[axis].n,
+            chi2=fits[axis].chi2,
+            T_c=_temperature(traces[axis]),
+            method="square wave on d bias, output error, incremental",
+            i_d_apk=biases[axis][0],
+            i_q_apk=biases[axis][1],
+            fallback=fallback,
+        )
+        for axis in fits
+    }
+    warned = bool(dependent) or any(verdict is Verdict.WARN for verdict, _ in widen.values())
+    return InductanceResult(
+        L_d=estimates["d"],
+        L_q=estimates["q"],
+        axes=fits,
+        delay=0.5 * (fits["d"].delay + fits["q"].delay),
+        lag_s=0.5 * (fits["d"].lag_s + fits["q"].lag_s),
+        by_frequency=by_frequency,
+        frequency_dependent=dependent,
+        axis_angle_rad=angle,
+        axis_angle_std_rad=angle_std,
+        whiteness={axis: min(ljung_box(residual) for residual in fit.residuals) for axis, fit in fits.items()},
+        verdict=Verdict.WARN if warned else Verdict.PASS,
+        # the q axis was fitted with what the d axis says
+        sampling=None if instant is None else instant.sampling(fits["q"].delay, fits["q"].lag_s),
+        samplings=()
+        if instant is None
+        else tuple((weight, instant.sampling(delay, lag)) for weight, delay, lag in fits["q"].places),
+        apart_s=apart_s,
+    )
+
+
+def _fitted(
+    shots: Mapping[str, Sequence[Shot]],
+    sigma_a: float,
+    R_ohm: float,
+    motion: Motion | None,
+    instant: ShownInstant | None,
+) -> dict[str, AxisFit]:
+    """Fit both axes, d first."""
+    fits: dict[str, AxisFit] = {}
+    for axis in "dq":
+        torque = axis == "q"
+        fits[axis] = fit_axis(
+            shots[axis], sigma_a, R_ohm, torque=torque, motion=motion, other=fits.get("d"), instant=instant
+        )
+    return fits
+
+
+def _contradicted(fits: Mapping[str, AxisFit], instant: ShownInstant) -> bool:
+    """Whether square waves contradict what the turning machine shows of the sampling instant: iron loss does that."""
+    return any(abs(instant.distance(fit.delay, fit.lag_s)) > INSTANT_LIMIT for fit in fits.values())
+
+
+def _widening(fit: AxisFit, shots: Sequence[Shot], stage: str) -> tuple[Verdict, float]:
+    """Return the verdict of a fit and the factor on its standard deviation.
+
+    A residual in step with the square wave belongs to the model, and the usual limit holds; one that is not is noise of
+    another kind, and widens.
+    """
+    if CHI2_REFUSE < fit.chi2 < CHI2_HOPELESS:
+        parts = zip(fit.residuals, shots, strict=True)
+        if max(_in_step(residual, 2 * shot.half_period) for residual, shot in parts) < IN_STEP:
+            return Verdict.WARN, math.sqrt(fit.chi2)
+    return chi2_gate(fit.chi2, stage)
+
+
+def _in_step(residual: Vector, period: int) -> float:
+    """Part of a residual's power that repeats with a period (samples)."""
+    count = len(residual) // period
+    mean = residual[: count * period].reshape(count, period).mean(axis=0)
+    return float(mean @ mean) / period / float(np.mean(residual**2))
+
+
+def _bias(traces: Sequence[Trace], ahead_rad: float) -> tuple[float, float]:
+    """Mean current in the rotor's own frame (A)."""
+    i_d, i_q = (float(np.mean([np.mean(trace[name]) for trace in traces])) for name in ("i_d_a", "i_q_a"))
+    c, s = math.cos(ahead_rad), math.sin(ahead_rad)
+    return c * i_d - s * i_q, s * i_d + c * i_q
+
+
+def _commutation_std(shots: Sequence[Shot]) -> float:
+    """What an inverter error that depends on the current adds to L (H).
+
+    What depends on the current acts at one switching edge (``VoltageError``); where that edge lies is known to
+    :data:`EDGE_STD` of a period, and a slope de/di there looks like an inductance of |de/di| T_s times that.
+    """
+    worst = 0.0
+    for shot in shots:
+        if shot.error is not None:
+            low, high = float(np.min(shot.i_a)), float(np.max(shot.i_a))
+            for part in (shot.error.early_v, shot.error.late_v):
+                rise = np.interp([low, high], shot.error.i_a, part)
+                slope = abs(float(rise[1] - rise[0])) / (high - low)
+                worst = max(worst, EDGE_STD * slope * shot.period_s)
+    return worst
+
+
+def bare_shot(trace: Trace, axis: str) -> Shot:
+    """Return a record as a shot, unchecked and without an inverter's error."""
+    other = "q" if axis == "d" else "d"
+    signals = trace[f"u_{axis}_v"], trace[f"i_{axis}_a"], trace[f"i_{other}_a"]
+    return Shot(*signals, int(trace.meta["half_period"]), trace.period_s)
+
+
+def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, U_dc_v: float, stage: str) -> Shot:
+    half_period = int(trace.meta["half_period"])
+    if len(trace) < SKIP_SAMPLES + 2 * half_period * MINIMUM_PERIODS:
+        raise refuse(
+            "E_EXCITATION",
+            f"{len(trace)} samples hold fewer than {MINIMUM_PERIODS} periods of {2 * half_period}",
+            stage=stage,
+        )
+    if "flagged" in trace.signals and np.any(trace["flagged"] > 0.0):
+        raise refuse("E_CLIPPED", f"{int(np.sum(trace['flagged'] > 0.0))} samples limited or clipped", stage=stage)
+    _check_rotor(float(trace.meta["pole_pairs"]) * trace["theta_M_rad"], stage)
+    other = "q" if axis == "d" else "d"
+    i, cross = trace[f"i_{axis}_a"], trace[f"i_{other}_a"]
+    error = None
+    if inverter is not None:
+        margin = 0.2 * float(np.ptp(i))
+        grid = np.linspace(float(np.min(i)) - margin, float(np.max(i)) + margin, CURVE_POINTS)
+        frame = float(trace.meta["fixed_angle_rad"])
+        error = VoltageError(grid, *inverter.along_axis(frame, axis, grid, float(np.mean(cross)), float(np.mean(i))))
+    height_v = _pulse_height(float(trace.meta["fixed_angle_rad"]), axis, U_dc_v)
+    return Shot(trace[f"u_{axis}_v"], i, cross, half_period, trace.period_s, error, height_v)
+
+
+def _pulse_height(frame_rad: float, axis: str, U_dc_v: float) -> float:
+    """Mean voltage along an axis while the legs differ (V): a command u makes pulses of the share u over this."""
+    legs = np.cos(frame_rad + (0.0 if axis == "d" else 0.5 * math.pi) - LEG_ANGLES)
+    return U_dc_v / float(np.ptp(legs))
+
+
+def _check_rotor(theta_e: Vector, stage: str) -> None:
+    moves = np.abs(np.diff(theta_e))
+    moves = moves[moves > 1e-9]
+    step = float(np.min(moves)) if len(moves) else 0.0
+    span = float(np.ptp(theta_e)) - step
+    if span > ROTOR_LIMIT_RAD:
+        raise refuse(
+            "E_ROTOR_MOVED",
+            f"the rotor moved by {math.degrees(span):.2g} deg (electrical), "
+            f"limit {math.degrees(ROTOR_LIMIT_RAD):g} deg",
+            stage=stage,
+        )
+
+
+def _cross_response(shot: Shot, fit: AxisFit, sigma_a: float) -> tuple[float, float]:
+    """Current of the other axis per current of the injected one, and its standard deviation."""
+    slow = shot.slow_basis()
+    main = shot.i_a[SKIP_SAMPLES:] + fit.residuals[0] * sigma_a  # the modelled current carries no noise
+    main = main - slow @ (slow.T @ main)
+    other = shot.cross_a[SKIP_SAMPLES:]
+    other = other - slow @ (slow.T @ other)
+    power = float(main @ main)
+    return float(main @ other) / power, sigma_a / math.sqrt(power)
+
+
+def _axis_angle(fits: Mapping[str, AxisFit], cross: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
+    """Angle of the frame ahead of the axis of largest inverse inductance, from all four responses (rad)."""
+    g_d, g_q = 1.0 / fits["d"].L_h, 1.0 / fits["q"].L_h
+    weights = [1.0 / (g_d * cross["d"][1]) ** 2, 1.0 / (g_q * cross["q"][1]) ** 2]
+    g_dq = (weights[0] * g_d * cross["d"][0] + weights[1] * g_q * cross["q"][0]) / sum(weights)
+    std = 1.0 / math.sqrt(sum(weights))
+    difference = math.hypot(g_d - g_q, 2.0 * g_dq)
+    if difference < ANISOTROPY_LIMIT * (g_d + g_q):
+        return math.nan, math.nan
+    # frame ahead by eps: G' = R(-eps) G R(eps), so 2 g_dq = -(g_d - g_q)_true sin(2 eps)
+    return 0.5 * math.atan2(-2.0 * g_dq, g_d - g_q), std / difference
+
+
+def _unmix(
+    fits: Mapping[str, AxisFit], widen: Mapping[str, float], frame: FrameAhead
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Undo the frame offset; standard deviations by first-order propagation."""
+
+    def unmixed(L_d: float, L_q: float, shift: float) -> tuple[float, float]:
+        s_d, s_q = math.sin(frame.d_rad + shift) ** 2, math.sin(frame.q_rad + shift) ** 2
+        g_d, g_q = 1.0 / L_d, 1.0 / L_q
+        determinant = 1.0 - s_d - s_q
+        return determinant / ((1.0 - s_q) * g_d - s_d * g_q), determinant / ((1.0 - s_d) * g_q - s_q * g_d)
+
+    eps = max(frame.d_rad, frame.q_rad, key=abs)
+    if abs(eps) > math.radians(30.0):
+        raise refuse(
+            "E_NOT_IDENTIFIABLE",
+            f"the frame is {math.degrees(eps):.3g} deg off the d axis: L_d and L_q cannot be told apart",
+            stage="inductance",
+            likely="wrong encoder offset",
+            hint="check the coupling of the encoder and its increments per turn, then repeat",
+        )
+    L = {axis: fit.L_h for axis, fit in fits.items()}
+    std = {axis: fit.std_h * widen[axis] for axis, fit in fits.items()}
+    values = unmixed(L["d"], L["q"], 0.0)
+    shifted = [
+        unmixed(L["d"] + std["d"], L["q"], 0.0),
+        unmixed(L["d"], L["q"] + std["q"], 0.0),
+        unmixed(L["d"], L["q"], frame.std_rad),
+    ]
+    spread = [math.sqrt(sum((row[k] - values[k]) ** 2 for row in shifted)) for k in (0, 1)]
+    return {"d": values[0], "q": values[1]}, {"d": spread[0], "q": spread[1]}
+
+
+def _temperature(traces: Sequence[Trace]) -> float:
+    values = [float(trace.meta["T_winding_c"]) for trace in traces if "T_winding_c" in trace.meta]
+    values += [float(np.mean(trace["T_winding_c"])) for trace in traces if "T_winding_c" in trace.signals]
+    return float(np.mean(values)) if values else math.nan

@@ -1,0 +1,364 @@
+# SPDX-License-Identifier: MIT
+"""Inertia, viscous and Coulomb friction: whitened output-error fit on the encoder's position.
+
+    J dw/dt = T_e - B w - T_c sgn(w), with stick-slip (docs/identification.md, 3.5)
+
+Pushes by a known current, and coasting with the voltage off; each trace has its own first position and speed. The
+measured currents drive the model, so their noise is torque noise, a random walk in speed. The residual of the
+position is whitened with Sigma = s_theta^2 I + s_T^2 G G', G_kj = (k - j - 1/2) T^2/J for j < k; without it friction
+wanders by several standard deviations. Torque that neither model nor noise explains (an inverter's ripple between the
+samples, cogging) counts as more noise of the torque, until the residual agrees with it or it is too much. Every
+interval is solved in closed form, with the instant of a reversal.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.angle_harmonics import AngleHarmonics, angle_harmonics
+from pmsmtool.estimators.estimate import (
+    CHI2_WARN,
+    SensorTolerance,
+    chi2_gate,
+    condition_gate,
+    information_bound,
+    information_weights,
+)
+from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt, linear_solve
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.shaft.model import SHAFT, Problem, Run, whitener
+from pmsmtool.estimators.shaft.position import encoder_step, position_std
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.trace import Trace
+
+Array = NDArray[np.float64]
+Torque = Callable[[Array, Array], Array]
+"""Torque (N m) of arrays of i_d, i_q (A)."""
+
+STAGE = "mechanics"
+BLOCKS = 250
+"""Positions of a trace in the fit; the currents between two are averaged."""
+TRACES_LEAST = 4
+"""A push and a coasting in each direction."""
+REST_SHARE = 0.005
+"""Way of the shaft, of a trace's whole, from which on it is fitted."""
+STEP_SHARE = 0.1
+"""Part of a push within which its step may be limited."""
+COARSE_RIPPLES = (0.3, 0.03, 3e-3)
+"""Least noise of the torque in the first fits, of the push's, one after the other: with an encoder's resolution alone
+the cost is a narrow, bent valley in which a fit from rough starting values, or straight from the first of these, does
+not arrive (1 of 160 realisations, and 1 of 33 random drives)."""
+FITS_MOST = 8
+"""Fits after it; the second whitens with the inertia of the first, more only where the torque's noise grows."""
+TORQUE_FLOOR = 1e-3
+"""Deviation of a block's torque beyond the noise of the currents, of the push's: ripple that samples do not show."""
+COASTING_FLOOR = 1e-4
+"""The same of a coasting, from where it grows."""
+GROWTH_MOST = 2.5
+"""Largest growth of the torque's noise from one fit to the next: a fit that has not arrived asks for too much."""
+COGGING_FITS = 2
+"""Fits where there is cogging: its torque takes the inertia of the one before."""
+RIPPLE_MOST = 0.15
+"""Largest deviation of a block's torque, of the push's: above, the shaft is not what the model says."""
+UNEXPLAINED = 2.0
+"""Growth of the torque's noise in pushes or coasting from which on it is more than the model's."""
+DRAG_PENALTY = 16.0
+"""Price of the drag in the information criterion: it is there from four standard deviations on, and a shaft without it
+keeps the intervals of B and tau_c."""
+NOTED = 0.01
+"""Deviation of a block's torque, of the push's, from which on a reader is told why the intervals are wide: the healthy
+default machine has 0.0035 to 0.0039 (`identify all`), which leaves J at 0.07 % where its tolerance is 1.4 %."""
+NOISY_TORQUE = "cogging, a load or a gear on the shaft, an elastic coupling, an encoder that is off centre"
+SCALE_FLOOR = 3e-4
+"""Relative deviation of the torque's scale beyond that of the flux linkage and of the samples' displacement."""
+NO_HARMONICS = AngleHarmonics()
+METHOD = "pushes and coasting, output error on position, whitened"
+
+
+@dataclass(frozen=True, slots=True)
+class MechanicsResult:
+    """What a run of current steps says of the shaft.
+
+    Attributes
+    ----------
+    J, B, tau_c : Estimate
+        Inertia (kg m2), viscous (N m s) and Coulomb friction (N m).
+    fit_std : tuple of float
+        Standard deviations of the three by the fit alone, without the torque's scale that they share.
+    ripple : float
+        Deviation of a block's torque that the residual asked for, of the push's.
+    unexplained : bool
+        Whether that is so much more than the currents' noise and the floor that it widens the intervals notably.
+    harmonics : AngleHarmonics
+        Cogging torque and encoder error that were taken out.
+    drag : Estimate or None
+        Torque per square of the speed (N m s2), where the data ask for it: it is in neither B nor tau_c.
+    chi2 : float
+        Reduced chi-square of the whitened position.
+    condition : float
+        Condition number of the scaled, whitened Jacobian.
+    """
+
+    J: Estimate
+    B: Estimate
+    tau_c: Estimate
+    fit_std: tuple[float, float, float]
+    ripple: float
+    chi2: float
+    condition: float
+    unexplained: bool
+    harmonics: AngleHarmonics = NO_HARMONICS
+    drag: Estimate | None = None
+
+    @property
+    def note(self) -> str:
+        """What a reader should know of the torque's noise; empty where it is too small to be worth it."""
+        lines = []
+        if self.drag is not None:
+            lines.append(f"drag over the square of the speed, {self.drag.value:.3g} N m s2, is in neither B nor tau_c")
+        if self.harmonics.acceleration_rad_s2:
+            orders = ", ".join(f"{h.order}" for h in self.harmonics.acceleration_rad_s2)
+            torque = max(h.amplitude for h in self.harmonics.acceleration_rad_s2) * self.J.value
+            lines.append(f"cogging of {torque:.3g} N m (orders per turn: {orders}) was taken out of J, B and tau_c")
+        if self.unexplained and self.ripple >= NOTED:
+            lines.append(
+                f"J, B and tau_c: torque noise of {100.0 * self.ripple:.2g} % of the push's, counted in their "
+                f"intervals; likely {NOISY_TORQUE}"
+            )
+        return "; ".join(lines)
+
+
+def estimate_mechanics(
+    runs: Sequence[Trace],
+    torque: Torque,
+    torque_per_a: float,
+    sigma_a: float,
+    scale_std: float,
+    *,
+    direction: int = 1,
+    tolerance: SensorTolerance | None = None,
+) -> MechanicsResult:
+    """Estimate inertia and friction.
+
+    Parameters
+    ----------
+    runs : sequence of Trace
+        ``theta_M_rad`` of pushes and coasting in both directions; of a push ``i_d_a i_q_a flagged``, too, in the frame
+        of the d axis; ``meta["coasting"]``: no torque.
+    torque : callable
+        Torque of the currents, by flux linkage or flux map at the temperature of the run.
+    torque_per_a : float
+        Its slope over i_q (N m/A), for the noise.
+    sigma_a : float
+        Noise of one sample of i_q (A).
+    scale_std : float
+        Relative standard deviation of that torque's scale: it goes into all three one to one.
+    direction : int
+        Sign of the encoder's count along the phase order.
+    tolerance : SensorTolerance
+        Declared sensor tolerances.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_CLIPPED``, ``E_EXCITATION``, ``E_NOT_IDENTIFIABLE``, ``E_NOT_CONVERGED``, ``E_MODEL_MISMATCH``.
+    """
+    tolerance = tolerance or SensorTolerance()
+    if len(runs) < TRACES_LEAST:
+        raise refuse("E_EXCITATION", f"{len(runs)} traces, {TRACES_LEAST} needed", stage=STAGE)
+    runs = [_window(run) for run in runs]
+    flagged = sum(int(np.sum(run["flagged"] > 0.0)) for run in runs if not run.meta["coasting"])
+    if flagged:
+        raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
+    step = encoder_step([run["theta_M_rad"] for run in runs])
+    harmonics = angle_harmonics([(run.t_s, direction * run["theta_M_rad"]) for run in runs if run.meta["coasting"]])
+
+    def blocks_of(J_kgm2: float) -> list[Run]:
+        return [_blocks(run, torque, torque_per_a, sigma_a, direction, step, harmonics, J_kgm2) for run in runs]
+
+    blocks = blocks_of(0.0)
+    start = _start(blocks)
+    if harmonics.acceleration_rad_s2:
+        for _ in range(COGGING_FITS - 1):  # the torque over the angle is known as an acceleration
+            start = np.delete(_fit(blocks_of(math.exp(start[0])), start)[0].x, SHAFT)
+        blocks = blocks_of(math.exp(start[0]))
+    with_drag, chi2, noisy = _fit(blocks, start)
+    before, noise = _noise(blocks), _noise(noisy)
+    unexplained = any(noise[kind] > UNEXPLAINED * max(before[kind], COASTING_FLOOR) for kind in noise)
+    without = _minimum(noisy, np.delete(with_drag.x, SHAFT), _scale(blocks, SHAFT))
+    bound, condition = information_bound(without.jacobian)
+    condition_gate(condition, "B and tau_c", STAGE)
+    _, widen = chi2_gate(chi2, STAGE)
+    share = float(information_weights([without.cost, with_drag.cost + DRAG_PENALTY])[1])
+    of_drag, _ = information_bound(with_drag.jacobian)
+    values, deviations = [], []
+    for k in range(SHAFT):
+        pair = without.x[k], with_drag.x[k]
+        mean = (1.0 - share) * pair[0] + share * pair[1]
+        parts = (float(bound[k]) ** 2, float(of_drag[k]) ** 2)
+        spread = share * (1.0 - share) * float(pair[1] - pair[0]) ** 2
+        values.append(float(mean))
+        deviations.append(widen * math.sqrt((1.0 - share) * parts[0] + share * parts[1] + spread))
+    J, B, tau_c = math.exp(values[0]), values[1], values[2]
+    stds = (J * deviations[0], deviations[1], deviations[2])
+    drag = None
+    if share > 0.5:
+        drag = Estimate(float(with_drag.x[SHAFT]), widen * float(of_drag[SHAFT]), 0.0, "N m s2", method=METHOD)
+    n = sum(len(block.theta) for block in blocks)
+    scale_std = math.hypot(scale_std, SCALE_FLOOR)
+    estimates = [
+        Estimate(
+            value,
+            math.hypot(std, scale_std * value),
+            tolerance.inertia * abs(value),
+            unit,
+            n=n,
+            chi2=chi2,
+            method=METHOD,
+        )
+        for value, std, unit in zip((J, B, tau_c), stds, ("kg m2", "N m s", "N m"), strict=True)
+    ]
+    ripple = max(noise.values())
+    J_found, B_found, tau_found = estimates
+    return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, condition, unexplained, harmonics, drag)
+
+
+def _window(run: Trace) -> Trace:
+    """Return a trace from where the shaft moves and the step of the current is over.
+
+    At rest, the first speed leaves no slope for a fit to go down; and a step may meet the voltage limit.
+    """
+    theta = run["theta_M_rad"]
+    first = int(np.argmax(np.abs(theta - theta[0]) > REST_SHARE * np.ptp(theta)))
+    if not run.meta["coasting"]:
+        limited = np.nonzero(run["flagged"][: round(STEP_SHARE * len(run))] > 0.0)[0]
+        first = max(first, int(limited[-1]) + 1 if len(limited) else 0)
+    return replace(run, t_s=run.t_s[first:], signals={name: values[first:] for name, values in run.signals.items()})
+
+
+def _blocks(
+    run: Trace,
+    torque: Torque,
+    torque_per_a: float,
+    sigma_a: float,
+    direction: int,
+    step: float,
+    harmonics: AngleHarmonics,
+    J_kgm2: float,
+) -> Run:
+    """Return a trace in blocks without the encoder's error; cogging as a torque of pushes, out of a coasting's way.
+
+    Cogging goes through periods within a block of a coasting, where only the position shows it.
+    """
+    rows = max(1, (len(run) - 1) // BLOCKS)
+    count = (len(run) - 1) // rows
+    shown = direction * run["theta_M_rad"]
+    theta_std = position_std(shown[: count * rows + 1 : rows], step)
+    if run.meta["coasting"]:
+        way = harmonics.shaft(harmonics.without_ripple(run.t_s, shown))
+        return Run(way[: count * rows + 1 : rows], np.zeros(count), rows * run.period_s, theta_std, 0.0, True)
+    theta = harmonics.shaft(shown)[: count * rows + 1 : rows]
+    tau = torque(run["i_d_a"], run["i_q_a"]) + harmonics.torque_nm(shown, J_kgm2)
+    mean = (0.5 * (tau[:-1] + tau[1:]))[: count * rows].reshape(count, rows).mean(axis=1)
+    noise = math.hypot(abs(torque_per_a) * sigma_a / math.sqrt(rows), TORQUE_FLOOR * float(np.max(np.abs(mean))))
+    return Run(theta, mean, rows * run.period_s, theta_std, noise, False)
+
+
+def _start(runs: Sequence[Run]) -> Array:
+    """Return ln J, B, tau_c and each trace's first position and speed, from a regression of torque on motion."""
+    rows, torques, states = [], [], []
+    for run in runs:
+        t = run.T * np.arange(len(run.theta))
+        # a parabola follows a push or a coasting closely enough for a start; halves of it tell the friction's slope
+        for part in (slice(0, len(t) // 2), slice(len(t) // 2, None)):
+            a, b, _ = np.polyfit(t[part], run.theta[part], 2)
+            omega = b + 2.0 * a * float(np.mean(t[part]))
+            rows.append([2.0 * a, omega, math.copysign(1.0, omega)])
+            torques.append(float(np.mean(run.torque[part])))
+        first = np.polyfit(t[: len(t) // 4], run.theta[: len(t) // 4], 2)
+        states += [run.theta[0], float(first[1])]
+    x, _, _, _ = linear_solve(np.array(rows), np.array(torques), np.ones(len(rows)))
+    if not x[0] > 0.0:
+        raise refuse("E_NOT_IDENTIFIABLE", f"J = {x[0]:.3g} kg m2", stage=STAGE, likely="the shaft is held or driven")
+    return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
+
+
+def _scale(runs: Sequence[Run], shared: int) -> Array:
+    """Sizes of the parameters."""
+    speed = max(float(np.max(np.abs(np.diff(run.theta)))) / run.T for run in runs)
+    largest = max(float(np.max(np.abs(run.torque))) for run in runs)
+    common = (1.0, largest / speed, largest, largest / speed**2)[:shared]
+    return np.array([*common, *(value for run in runs for value in (1.0, speed))])
+
+
+def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, Sequence[Run]]:
+    """Return the fit with drag, its reduced chi-square, and the runs with the torque's noise that it took."""
+    largest = max(float(np.max(np.abs(run.torque))) for run in runs)
+    scale = _scale(runs, SHAFT + 1)
+    x = np.insert(start, SHAFT, 0.0)
+    for share in COARSE_RIPPLES:
+        x = _minimum([replace(run, torque_std=max(run.torque_std, share * largest)) for run in runs], x, scale).x
+    for count in range(FITS_MOST):
+        fit = _minimum(runs, x, scale)
+        x = fit.x
+        chi2 = fit.cost / fit.dof
+        noise = _noise(runs)
+        ripple = max(noise.values())
+        noisier = _noisier(runs, fit.residual, largest)
+        if ripple > RIPPLE_MOST:
+            raise refuse(
+                "E_MODEL_MISMATCH",
+                f"torque off by {100.0 * ripple:.2g} % of the push's, and more, from one {1e3 * runs[0].T:.2g} ms to "
+                f"the next, limit {100.0 * RIPPLE_MOST:g} %",
+                stage=STAGE,
+                likely=NOISY_TORQUE,
+                hint="`identify R L psi encoder poles inverter frf` finds the resonance of an elastic shaft, and J",
+            )
+        if fit.converged:
+            if count and noisier is runs:
+                break
+            runs = noisier  # before a minimum the residual says nothing of the noise
+    if not fit.converged:
+        raise refuse("E_NOT_CONVERGED", f"{fit.iterations} steps without a minimum", stage=STAGE)
+    return fit, chi2, runs
+
+
+def _noise(runs: Sequence[Run]) -> dict[bool, float]:
+    """Deviation of a block's torque in pushes (False) and coasting (True), of the push's torque."""
+    largest = max(float(np.max(np.abs(run.torque))) for run in runs)
+    return {
+        kind: max((run.torque_std for run in runs if run.coasting is kind), default=0.0) / largest
+        for kind in (False, True)
+    }
+
+
+def _minimum(runs: Sequence[Run], x: Array, scale: Array) -> Fit:
+    factors = [whitener(run, math.exp(float(x[0]))) for run in runs]
+    problem = Problem(runs, factors, RELATIVE_STEP * scale, len(x) - 2 * len(runs))
+    return levenberg_marquardt(problem.residual, x, scale, cost_tolerance=1e-4, derivative=problem.jacobian)
+
+
+def _noisier(runs: Sequence[Run], residual: Array, largest: float) -> Sequence[Run]:
+    """Return the runs with as much more noise of the torque as the residual asks for; the same where it agrees.
+
+    Every push by itself, one through standstill asks for more than one from rest; coasting together.
+    """
+    ends = np.cumsum([len(run.theta) for run in runs])
+    parts = np.split(residual, ends[:-1])
+    coasting = np.concatenate([part for part, run in zip(parts, runs, strict=True) if run.coasting])
+    own = [coasting if run.coasting else part for part, run in zip(parts, runs, strict=True)]
+    more = [
+        min(math.sqrt(chi2), GROWTH_MOST) if (chi2 := float(part @ part) / len(part)) > CHI2_WARN else 1.0
+        for part in own
+    ]
+    if max(more) == 1.0:
+        return runs
+    return [
+        run if factor == 1.0 else replace(run, torque_std=factor * max(run.torque_std, COASTING_FLOOR * largest))
+        for run, factor in zip(runs, more, strict=True)
+    ]

@@ -1,0 +1,431 @@
+# SPDX-License-Identifier: MIT
+"""From the stored traces of a run to the identified machine: pure arithmetic, the same bytes at every replay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import numpy as np
+
+from pmsmtool.errors import ConfigError, IdentificationError
+from pmsmtool.estimators.cross_check import CrossCheck, cross_check
+from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.flux.linkage import FluxResult, check_magnet, estimate_flux_linkage
+from pmsmtool.estimators.flux.map_result import FluxMapResult
+from pmsmtool.estimators.frequency_extrapolation import FrequencySplit
+from pmsmtool.estimators.injection.axis_layout import Motion
+from pmsmtool.estimators.injection.axis_response import initial_inductance
+from pmsmtool.estimators.injection.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
+from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstant
+from pmsmtool.estimators.injection.switching_ripple import Modulation
+from pmsmtool.estimators.noise import Noise, estimate_noise
+from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases
+from pmsmtool.estimators.resistance import (
+    R_MEASURED,
+    Copper,
+    ResistanceResult,
+    estimate_resistance,
+    resistance_warmed,
+    settled_levels,
+)
+from pmsmtool.estimators.sensor_mismatch import SensorMismatch, estimate_mismatch, widened, without_mismatch
+from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
+from pmsmtool.estimators.shaft.mechanics import MechanicsResult
+from pmsmtool.identification import frequency_response
+from pmsmtool.identification.calibration import calibrated_traces
+from pmsmtool.identification.flux_map import flux_map_of, map_estimates
+from pmsmtool.identification.half_frequency import resistance_at_two_frequencies
+from pmsmtool.identification.mechanics import mechanics_of
+from pmsmtool.identification.sampling import resistance_as_sampled
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
+from pmsmtool.trace import Trace
+
+MOTION_STD = 0.2
+"""Relative standard deviation of the rotor's answer to an injection as the pushes show it: friction takes part."""
+RELUCTANCE_STD = 0.3
+"""Standard deviation of what reluctance takes from it, relative: the inductances are rough and incremental."""
+FIXED = ("levels", "square_")
+"""Beginnings of the names of traces whose current vector keeps its angle."""
+MOSFET_LINK_V = 100.0
+"""Below this DC link bridges are made of MOSFETs, which have no threshold."""
+
+
+_Found = TypeVar("_Found")
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """What the traces of a run say; None where an experiment was not run, or is in ``refused`` with its reason.
+
+    ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics`` and ``frf``.
+    """
+
+    noise: Noise
+    phases: PhaseCheck | None = None
+    mismatch: SensorMismatch | None = None
+    pairs: PairCheck | None = None
+    resistance: ResistanceResult | None = None
+    split: FrequencySplit | None = None
+    encoder: EncoderResult | None = None
+    inductance: InductanceResult | None = None
+    flux: FluxResult | None = None
+    mechanics: MechanicsResult | None = None
+    flux_map: FluxMapResult | None = None
+    frequency_response: FrequencyResponse | None = None
+    map_estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    refused: Mapping[str, IdentificationError] = field(default_factory=dict)
+
+    def whole(self) -> Evaluation:
+        """Return this; raises the first refusal where there is one (``IdentificationError``)."""
+        for refusal in self.refused.values():
+            raise refusal
+        return self
+
+    @property
+    def offset(self) -> Estimate | None:
+        """Encoder offset: the slow rotation's, made fine by the speed run where there was one (rad)."""
+        if self.encoder is None:
+            return None
+        if self.flux is None:
+            return self.encoder.offset
+        fine = self.flux.frame_offset
+        return replace(fine, value=wrapped(self.encoder.offset.value + fine.value))
+
+    @property
+    def shown(self) -> ShownInstant | None:
+        """What the speed run shows of the instant at which currents are sampled."""
+        return None if self.flux is None else self.flux.shown
+
+    @property
+    def checks(self) -> list[CrossCheck]:
+        """What second methods say: psi_f by q currents, and L_q, apparent, beside the incremental one."""
+        found = []
+        if self.flux is not None and self.flux.driven is not None:
+            common = self.flux.voltage_scale_std
+            found.append(cross_check("psi_f_wb_driven", "psi_f_wb", self.flux.driven, self.flux.psi_f, common))
+        if self.flux is not None and self.inductance is not None:
+            found.append(cross_check("L_q_h_apparent", "L_q_h", self.flux.L_q_app, self.inductance.L_q))
+        return found
+
+    def estimates(self) -> dict[str, Estimate]:
+        """Return every estimate by its machine-file key."""
+        found: dict[str, Estimate] = {}
+        if self.resistance is not None:
+            found["R_s_ohm"] = self.resistance.R_s
+            found[R_MEASURED] = self.resistance.R_measured
+        if self.inductance is not None:
+            found["L_d_h"], found["L_q_h"] = self.inductance.L_d, self.inductance.L_q
+        if self.flux is not None:
+            found["psi_f_wb"] = self.map_estimates.get("psi_f_wb", self.flux.psi_f)
+        if self.encoder is not None:
+            found["pole_pairs"] = self.encoder.pole_pairs
+        if self.offset is not None:
+            found["offset_rad"] = self.offset
+        if self.mechanics is not None:
+            found |= {"J_kgm2": self.mechanics.J, "B_nms": self.mechanics.B, "tau_c_nm": self.mechanics.tau_c}
+        if self.frequency_response is not None:
+            found |= self.frequency_response.found
+            if self.mechanics is None and self.frequency_response.inertia is not None:
+                found["J_kgm2"] = self.frequency_response.inertia
+        found.update((name, estimate) for name, estimate in self.map_estimates.items() if name not in found)
+        return found
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle within (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)
+
+
+def tolerance_on(tolerance: SensorTolerance, U_dc_v: float) -> SensorTolerance:
+    """Return the tolerances with the DC link on which the thresholds of the bridge act (V)."""
+    without = U_dc_v < MOSFET_LINK_V and tolerance.bridge_difference_v is None
+    threshold_v = 0.0 if without else tolerance.bridge_threshold_v
+    return replace(tolerance, U_dc_v=U_dc_v, bridge_threshold_v=threshold_v)
+
+
+def evaluate(
+    traces: Mapping[str, Trace],
+    period_s: float,
+    *,
+    T_ref_c: float = 20.0,
+    copper: Copper | None = None,
+    alpha_psi_per_k: float = MAGNET_ALPHA_PER_K,
+    U_dc_v: float = math.inf,
+    tolerance: SensorTolerance | None = None,
+    ended: Mapping[str, IdentificationError] | None = None,
+) -> Evaluation:
+    """Estimate everything the traces allow; what is refused takes only what depends on it along.
+
+    Parameters
+    ----------
+    traces : mapping of str to Trace
+        As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
+        ``levels_half_frequency``, ``phase_pairs``, ``rotation_forward``, ``rotation_backward``,
+        ``square_d_<half period>``, ``square_q_<half period>``, ``speeds``, ``map_<k>``, ``speeds_after_map``,
+        ``inertia_<k>``, ``frf_<k>``.
+    period_s : float
+        Control period (s).
+    T_ref_c : float
+        Temperature the values are referred to (degC); that of ``copper`` where it is given.
+    copper : Copper, optional
+        What the machine file says of the winding.
+    alpha_psi_per_k : float
+        Temperature coefficient of the magnet flux (1/K).
+    U_dc_v : float
+        DC link of the nameplate (V); infinite: the thresholds of the bridge are not counted.
+    tolerance : SensorTolerance
+        Declared sensor tolerances.
+    ended : mapping of str to IdentificationError, optional
+        Experiments that were refused while they ran, by the keys of ``Evaluation.refused``: their traces are not whole.
+
+    Raises
+    ------
+    IdentificationError
+        Noise, phases, encoder counts or current sensors: then no value can be trusted.
+    ConfigError
+        There is no zero-current trace.
+    """
+    if "zero_current" not in traces:
+        raise ConfigError("the run has no zero-current trace", hint="run identify again")
+    tolerance = tolerance_on(tolerance or SensorTolerance(), U_dc_v)
+    copper = copper or Copper(T_ref_c)
+    traces = calibrated_traces(traces, tolerance)
+    noise = estimate_noise(traces["zero_current"])
+    mismatch = estimate_mismatch(traces["phase_pairs"], noise) if "phase_pairs" in traces else None
+    traces = with_equal_sensors(traces, mismatch)
+    result = Evaluation(noise, mismatch=mismatch)
+    if "phase_vectors" in traces:
+        result = replace(result, phases=check_phases(traces["phase_vectors"], result.noise))
+    if "first_turn" in traces:
+        check_encoder_counts(traces["first_turn"])
+    refused = dict(ended or {})
+
+    def attempt(quantity: str, estimate: Callable[[], _Found]) -> _Found | None:
+        if quantity in refused:
+            return None
+        try:
+            return estimate()
+        except IdentificationError as refusal:
+            refused[quantity] = refusal
+            return None
+
+    if "levels" in traces:
+        found = attempt("R", lambda: resistances_of(traces, result.noise, copper, tolerance))
+        if found is not None:
+            R = found[0]
+            R = replace(R, R_s=widened(R.R_s, mismatch), R_measured=widened(R.R_measured, mismatch))
+            result = replace(result, resistance=R, split=found[1])
+    if "phase_pairs" in traces and result.resistance is not None:
+        result = replace(result, pairs=check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve))
+    if "rotation_backward" in traces:
+        turns = traces["rotation_forward"], traces["rotation_backward"]
+        result = replace(result, encoder=attempt("encoder", lambda: estimate_encoder(*turns)))
+    resistance = result.resistance
+    # a wrong angle or number of pole pairs is in the speeds, too
+    if "speeds" in traces and resistance is not None and "encoder" not in refused:
+        flux = attempt("psi", lambda: flux_of(traces, resistance, period_s, alpha_psi_per_k, tolerance))
+        result = replace(result, flux=flux)
+    shots = all(any(name.startswith(f"square_{axis}") for name in traces) for axis in "dq")
+    if resistance is not None and result.encoder is not None and shots:
+        before = result
+        inductance = attempt("L", lambda: inductance_of(traces, before, tolerance, U_dc_v))
+        if inductance is not None:
+            L_d, L_q = widened(inductance.L_d, mismatch), widened(inductance.L_q, mismatch)
+            inductance = replace(inductance, L_d=L_d, L_q=L_q)
+            rough = replace(before, inductance=inductance)
+            result = attempt("psi", lambda: as_sampled(traces, rough, period_s, alpha_psi_per_k, tolerance)) or replace(
+                rough, flux=None
+            )
+    result = attempt("psi", lambda: magnet_checked(traces, result, alpha_psi_per_k)) or replace(result, flux=None)
+    flux_map = attempt("map", lambda: flux_map_of(traces, result, tolerance))
+    if flux_map is not None:
+        result = replace(result, flux_map=flux_map, map_estimates=map_estimates(result, flux_map, traces))
+    dead_time_s = 0.0
+    if result.resistance is not None and math.isfinite(U_dc_v):
+        dead_time_s = max(0.0, result.resistance.V_dead_v) * period_s / U_dc_v
+    shaft = result
+    mechanics = attempt("mechanics", lambda: mechanics_of(traces, shaft, tolerance, dead_time_s, period_s))
+    moving = replace(shaft, mechanics=mechanics)
+    response = attempt("frf", lambda: frequency_response.frequency_response_of(traces, moving, tolerance, dead_time_s))
+    return replace(moving, frequency_response=response, refused=refused)
+
+
+def with_equal_sensors(traces: Mapping[str, Trace], mismatch: SensorMismatch | None) -> Mapping[str, Trace]:
+    """Return the traces along fixed vectors as equal current sensors would have shown them.
+
+    In a frame that follows the rotor the mismatch is a second harmonic, which the means over whole turns do not see.
+    """
+    if mismatch is None or not mismatch.corrected:
+        return traces
+    fixed = {name: trace for name, trace in traces.items() if name.startswith(FIXED)}
+    return {
+        **traces,
+        **{n: without_mismatch(trace, mismatch, float(trace.meta["fixed_angle_rad"])) for n, trace in fixed.items()},
+    }
+
+
+def resistances_of(
+    traces: Mapping[str, Trace], noise: Noise, copper: Copper, tolerance: SensorTolerance
+) -> tuple[ResistanceResult, FrequencySplit | None]:
+    """Return the resistance by one control frequency, or by two where both were measured."""
+    resistance = resistance_of(traces["levels"], noise, copper, tolerance)
+    return resistance_at_two_frequencies(traces, noise, resistance, copper, tolerance)
+
+
+def resistance_of(
+    levels: Trace, noise: Noise, copper: Copper | None = None, tolerance: SensorTolerance | None = None
+) -> ResistanceResult:
+    """Return the resistance at a reference temperature; levels at which the shaft moved are left out, and counted."""
+    levels, left_out = settled_levels(levels, noise)
+    result = estimate_resistance(levels, noise, tolerance=tolerance, copper=copper)
+    if not left_out:
+        return result
+    note = f"{left_out} levels left out: shaft or voltage moved during them"
+    fallback = "; ".join(part for part in (result.R_s.fallback, note) if part)
+    return replace(result, R_s=replace(result.R_s, fallback=fallback))
+
+
+def as_sampled(
+    traces: Mapping[str, Trace], result: Evaluation, period_s: float, alpha_psi_per_k: float, tolerance: SensorTolerance
+) -> Evaluation:
+    """Return resistance and flux linkage for the mean current, once the inductances and the instant are known."""
+    resistance, flux, inductance = result.resistance, result.flux, result.inductance
+    assert resistance is not None and inductance is not None
+    if flux is None or flux.shown is None or inductance.sampling is None:
+        return result
+    L = (inductance.L_d.value, inductance.L_q.value)
+    modulation = modulation_of(traces["speeds"], resistance, L, period_s)
+    assert modulation is not None
+    copper = resistance.copper
+    resistance = resistance_as_sampled(resistance, inductance, flux.shown, modulation, copper, tolerance)
+    again = flux_of(
+        traces, resistance, period_s, alpha_psi_per_k, tolerance, L, inductance.sampling, inductance.apart_s
+    )
+    return replace(result, resistance=resistance, flux=replace(again, shown=flux.shown))
+
+
+def magnet_checked(traces: Mapping[str, Trace], result: Evaluation, alpha_psi_per_k: float) -> Evaluation:
+    """Return the result, unless the magnets give another flux after the pulses of a flux map."""
+    if result.flux is not None and "speeds_after_map" in traces:
+        check_magnet(traces["speeds"], traces["speeds_after_map"], result.flux, alpha_psi_per_k)
+    return result
+
+
+def modulation_of(
+    speeds: Trace, resistance: ResistanceResult, L_h: tuple[float, float], period_s: float
+) -> Modulation | None:
+    """Return what the ripple of the speed run depends on; None where DC link or inductances are not known."""
+    U_dc_v = float(speeds.meta.get("U_dc_v", math.inf))
+    if not all(L > 0.0 for L in L_h) or not math.isfinite(U_dc_v):
+        return None
+    return Modulation(U_dc_v, L_h, period_s, max(0.0, resistance.V_dead_v) * period_s / U_dc_v)
+
+
+def flux_of(
+    traces: Mapping[str, Trace],
+    resistance: ResistanceResult,
+    period_s: float,
+    alpha_psi_per_k: float,
+    tolerance: SensorTolerance | None,
+    L_h: tuple[float, float] | None = None,
+    sampling: Sampling | None = None,
+    apart_s: float = 0.0,
+) -> FluxResult:
+    """Return the flux linkage, with the resistance at the temperature of the speed run.
+
+    Before the inductances are known (H), rough ones from the ripple serve, and currents count as sampled in time.
+    """
+    speeds = traces["speeds"]
+    T = float(np.mean(speeds["T_winding_c"]))
+    return estimate_flux_linkage(
+        speeds,
+        resistance_warmed(resistance.R_measured, T, resistance.copper),
+        period_s=period_s,
+        inverter=resistance.curve,
+        modulation=modulation_of(
+            speeds, resistance, L_h or (_rough_inductance(traces, "d"), _rough_inductance(traces, "q")), period_s
+        ),
+        lag_s=float(speeds.meta.get("speed_lag_s", 0.0)),
+        sampling=sampling,
+        apart_s=apart_s,
+        tolerance=tolerance,
+        T_ref_c=resistance.copper.T_ref_c,
+        alpha_psi_per_k=alpha_psi_per_k,
+    )
+
+
+def _rough_inductance(traces: Mapping[str, Trace], axis: str) -> float:
+    """Inductance from the ripple of the first shot of an axis, without its delay and resistance; 0 without one (H)."""
+    shots = shots_of(traces, axis, 1)
+    try:
+        return initial_inductance(bare_shot(shots[0], axis)) if shots else 0.0
+    except IdentificationError:  # a bad shot refuses L, not what only corrects by it
+        return 0.0
+
+
+def inductance_of(
+    traces: Mapping[str, Trace], result: Evaluation, tolerance: SensorTolerance | None = None, U_dc_v: float = math.inf
+) -> InductanceResult:
+    """Return the incremental inductances, with the frame's angle from the encoder."""
+    assert result.resistance is not None and result.encoder is not None
+    pole_pairs = round(result.encoder.pole_pairs.value)
+    shots = {axis: shots_of(traces, axis, pole_pairs) for axis in "dq"}
+    offset = result.offset
+    frame = None
+    if offset is not None and result.flux is not None:
+        ahead = {axis: _frame_ahead(shots[axis], result.encoder, offset.value) for axis in "dq"}
+        frame = FrameAhead(ahead["d"], ahead["q"], max(offset.std, 1e-6))
+    return estimate_inductances(
+        shots["d"],
+        shots["q"],
+        result.noise,
+        result.resistance.R_measured.value,
+        frame=frame,
+        inverter=result.resistance.curve,
+        motion=None if result.flux is None else motion_of(traces, result.flux.psi_measured.value, shots["q"]),
+        instant=None if result.flux is None else result.flux.shown,
+        U_dc_v=U_dc_v,
+        tolerance=tolerance,
+    )
+
+
+def motion_of(traces: Mapping[str, Trace], psi_wb: float, q_shots: Sequence[Trace]) -> Motion | None:
+    """Return how the rotor answers an injection on q, from the pushes of the flux run; None without them.
+
+    A push at i_d = 0 shows the acceleration per ampere, 1.5 p^2 psi/J; reluctance takes some of the torque away.
+    """
+    pushes = [traces[name] for name in ("push_0", "push_1") if name in traces]
+    charges = [float(np.sum(push["i_q_a"][8:-8])) * push.period_s for push in pushes]
+    if not pushes or min(map(abs, charges)) == 0.0:
+        return None
+    changes = [float(np.mean(push["omega_e_rad_s"][-16:]) - np.mean(push["omega_e_rad_s"][:16])) for push in pushes]
+    rate = float(np.mean([abs(change / charge) for change, charge in zip(changes, charges, strict=True)]))
+    rough = [_rough_inductance(traces, axis) for axis in "dq"]
+    i_d = float(np.mean([np.mean(shot["i_d_a"]) for shot in q_shots]))
+    weakened = max(0.0, psi_wb + (rough[0] - rough[1]) * i_d)
+    free, per_f = rate * psi_wb, rate * weakened**2 / psi_wb
+    return Motion(per_f, MOTION_STD * per_f + RELUCTANCE_STD * abs(free - per_f))
+
+
+def shots_of(traces: Mapping[str, Trace], axis: str, pole_pairs: int) -> list[Trace]:
+    """Return the square-wave shots of one axis, the shorter half period first."""
+    names = sorted((name for name in traces if name.startswith(f"square_{axis}_")), key=lambda name: int(name[9:]))
+    return [
+        Trace(trace.t_s, trace.signals, trace.units, {**trace.meta, "pole_pairs": pole_pairs})
+        for trace in (traces[name] for name in names)
+    ]
+
+
+def _frame_ahead(shots: Sequence[Trace], encoder: EncoderResult, offset: float) -> float:
+    """Return the angle of the frozen frame ahead of the rotor's d axis, from where the rotor stood (rad)."""
+    pole_pairs = encoder.direction * round(encoder.pole_pairs.value)
+    angles = [
+        float(shot.meta["fixed_angle_rad"]) - (pole_pairs * float(np.mean(shot["theta_M_rad"])) - offset)
+        for shot in shots
+    ]
+    return math.atan2(sum(map(math.sin, angles)), sum(map(math.cos, angles)))

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: MIT
+"""The flux map of an identification, from the traces of its pulses, and its files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.flux.map_fit import MagnetFlux
+from pmsmtool.estimators.flux.map_result import FluxMapResult, estimate_flux_map
+from pmsmtool.estimators.flux.map_rows import Frame
+from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz
+from pmsmtool.machine.parameters import Estimate, MachineParameters
+from pmsmtool.measurement.flux_map import PLAN_LINE
+from pmsmtool.npz_file import npz_bytes
+from pmsmtool.run_directory import Acceptance, RunDirectory
+from pmsmtool.trace import Trace
+
+if TYPE_CHECKING:
+    from pmsmtool.identification.evaluate import Evaluation
+
+MAP_FILE = "flux_map.npz"
+MAP_CSV = "flux_map.csv"
+MAP_INTERVALS = "flux_map_intervals.npz"
+
+HELD_FALLBACK = "psi_f of the drive's parameter set: a held rotor shows increments of flux only"
+CORRECTION_STD = 0.2
+"""Standard deviation of what the map takes psi_f back to zero current by, of that correction: its curvature there."""
+DEVIATION_LIMIT = 0.005
+"""Largest rms deviation of the identified fluxes, of their range. Measured: 0.0006."""
+
+
+IF_SATURATED = f"where the machine saturates: {PLAN_LINE}"
+
+
+def flux_map_of(
+    traces: Mapping[str, Trace], result: Evaluation, tolerance: SensorTolerance | None
+) -> FluxMapResult | None:
+    """Return the flux map of the pulse trains; None without them, or where the rotor turned and no flux is known.
+
+    Raises
+    ------
+    IdentificationError
+        As the estimator refuses.
+    """
+    trains = [traces[f"map_{k}"] for k in range(sum(name.startswith("map_") for name in traces))]
+    if not trains or result.resistance is None:
+        return None
+    facts = trains[0].meta
+    held = bool(facts["held"])
+    drive_offset = float(facts["offset_rad"])
+    pole_pairs = int(facts["signed_pole_pairs"])
+    magnet = MagnetFlux(float(facts["psi_f_wb"]), 0.0)
+    to_reference = 0.0
+    offset = drive_offset
+    if result.flux is not None and result.offset is not None:
+        measured = result.flux.psi_measured
+        i_d = result.flux.low_i_d_a
+        magnet = MagnetFlux(result.flux.low_wb, result.flux.low_std_wb, (i_d, -i_d), (0.0, 0.0), (0.5, 0.5))
+        to_reference = result.flux.psi_f.value - measured.value
+        offset = result.offset.value
+    elif not held:
+        return None
+    return estimate_flux_map(
+        trains,
+        result.noise,
+        result.resistance,
+        Frame(pole_pairs, drive_offset, offset),
+        magnet,
+        to_reference_wb=to_reference,
+        align=held,
+        tolerance=tolerance,
+    )
+
+
+def map_estimates(result: Evaluation, flux_map: FluxMapResult, traces: Mapping[str, Trace]) -> dict[str, Estimate]:
+    """Return what the map says of the machine, by machine-file key.
+
+    Inductances at the largest torque of the rated current; and psi_f, which the run over speeds measures at d currents
+    and extrapolates, at none.
+    """
+    facts = traces["map_0"].meta
+    fallback = HELD_FALLBACK if facts["held"] else ""
+    found = flux_map.at_rated_current(abs(int(facts["signed_pole_pairs"])), float(facts["I_nom_a"]))
+    found = {name: replace(estimate, fallback=fallback) for name, estimate in found.items()}
+    if result.flux is not None:
+        psi_f = float(flux_map.flux_map.flux(0.0, 0.0)[0])
+        std = math.hypot(result.flux.psi_f.std, CORRECTION_STD * (psi_f - result.flux.psi_f.value))
+        method = f"{result.flux.psi_f.method}, at zero current by the flux map"
+        found["psi_f_wb"] = replace(result.flux.psi_f, value=psi_f, std=std, method=method)
+    return found
+
+
+def with_map(machine: MachineParameters, estimates: Mapping[str, Estimate]) -> MachineParameters:
+    """Return the machine with the name of its map and its apparent inductances."""
+    apparent = {name: estimates[name].value for name in ("L_d_app_h", "L_q_app_h") if name in estimates}
+    return replace(machine, flux_map=MAP_FILE, **apparent)  # type: ignore[arg-type]
+
+
+def save_map(run: RunDirectory, result: FluxMapResult | None) -> dict[str, str]:
+    """Write the map's files into the run; returns their names as a stage lists them."""
+    if result is None:
+        return {}
+    run.save(MAP_FILE, flux_map_npz(result.flux_map))
+    run.save(MAP_CSV, flux_map_csv(result.flux_map))
+    run.save(MAP_INTERVALS, npz_bytes(result.arrays()))
+    return {MAP_FILE: "", MAP_CSV: "", MAP_INTERVALS: ""}
+
+
+def map_acceptance(result: FluxMapResult | None) -> list[Acceptance]:
+    """Return the criterion of a map: how well its fluxes are known."""
+    if result is None:
+        return []
+    deviation = result.deviation
+    return [
+        Acceptance(
+            "flux map: standard deviation of the identified fluxes, of their range",
+            f"{100.0 * deviation:.2g} %",
+            f"{100.0 * DEVIATION_LIMIT:.2g} %",
+            deviation <= DEVIATION_LIMIT,
+        )
+    ]
+
+
+def map_summary(result: FluxMapResult | None) -> str:
+    """Return what a person reads of the map behind the other values."""
+    if result is None:
+        return ""
+    kind = "symmetric in i_q" if result.fit.symmetric else "not symmetric in i_q"
+    return (
+        f"; flux map to {result.radius_a:.3g} A, deviation {100 * result.deviation:.2g} % of the flux range, {kind} "
+        f"({100 * result.asymmetry:.2g} %), reciprocal to {100 * result.skew:.2g} %, misfit {100 * result.misfit:.2g} %"
+    )

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: MIT
+"""The frequency response of an identification, from the traces of its random torque, and its file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse, estimate_frequency_response
+from pmsmtool.identification.mechanics import in_frame, torque_doubt, torque_of
+from pmsmtool.npz_file import npz_bytes
+from pmsmtool.run_directory import RunDirectory
+from pmsmtool.trace import Trace
+
+if TYPE_CHECKING:
+    from pmsmtool.identification.evaluate import Evaluation
+
+TRACE = "frf_"
+"""Followed by the number of a record."""
+RESPONSE_FILE = "frequency_response.npz"
+NOISE_DOUBT = 0.3
+"""Relative standard deviation of the torque's scale, of the share of the noise in the power of the current: noise of
+the input makes a response too small."""
+SAMPLE_DOUBT = 0.5
+"""The same, of the displacement of the samples by a dead time, of the current's deviation. With both, errors of the
+inertia of seven random drives up to 1.2 % were up to 1.1 standard deviations; without them up to 3.2."""
+
+
+def frequency_response_of(
+    traces: Mapping[str, Trace],
+    result: Evaluation,
+    tolerance: SensorTolerance | None = None,
+    dead_time_s: float = 0.0,
+) -> FrequencyResponse | None:
+    """Return the response; None without the run, or without a flux linkage.
+
+    ``dead_time_s`` is that of a leg; it displaces the samples of the current.
+
+    Raises
+    ------
+    IdentificationError
+        As the estimator refuses.
+    """
+    parts = [traces[f"{TRACE}{k}"] for k in range(sum(name.startswith(TRACE) for name in traces))]
+    if not parts or result.flux is None or result.encoder is None or result.offset is None:
+        return None
+    behind = result.offset.value - float(parts[0].meta["offset_rad"])
+    return estimate_frequency_response(
+        [in_frame(part, behind) for part in parts],
+        torque_of(result, round(result.encoder.pole_pairs.value)),
+        direction=int(parts[0].meta["direction"]),
+        scale_std=_doubt(parts[0], result, dead_time_s),
+        tolerance=tolerance,
+    )
+
+
+def small_signal_doubt(sigma_a: float, displaced_a: float, deviation_a: float) -> float:
+    """Return what a small current's noise, and what a dead time displaces its samples by, may do to the torque's scale.
+
+    Parameters
+    ----------
+    sigma_a, displaced_a, deviation_a : float
+        Noise of a sample, displacement of the samples, and deviation of the current itself (A).
+    """
+    return math.hypot(NOISE_DOUBT * (sigma_a / deviation_a) ** 2, SAMPLE_DOUBT * displaced_a / deviation_a)
+
+
+def _doubt(record: Trace, result: Evaluation, dead_time_s: float) -> float:
+    """Relative standard deviation of the scale of the torque that shakes the shaft."""
+    assert result.flux is not None and result.encoder is not None
+    doubt = torque_doubt(result.flux, mapped=result.flux_map is not None)
+    deviation = float(np.std(record["i_q_a"]))
+    if result.inductance is None or deviation == 0.0:
+        return doubt
+    turned = float(np.ptp(record["theta_M_rad"])) / (float(record.t_s[-1]) - float(record.t_s[0]))
+    emf = round(result.encoder.pole_pairs.value) * turned * result.flux.psi_measured.value
+    displaced = 0.5 * dead_time_s * emf / result.inductance.L_q.value
+    return math.hypot(doubt, small_signal_doubt(result.noise.sigma_a, displaced, deviation))
+
+
+def save_response(run: RunDirectory, result: FrequencyResponse | None) -> dict[str, str]:
+    """Write the table of the response into the run; returns its name as a stage lists it."""
+    if result is None:
+        return {}
+    run.save(RESPONSE_FILE, npz_bytes(result.arrays()))
+    return {RESPONSE_FILE: ""}
+
+
+def response_summary(result: FrequencyResponse | None) -> str:
+    """Return what a person reads of the response behind the other values."""
+    return "" if result is None else f"; frequency response: {result.reason}"

@@ -1,0 +1,384 @@
+# SPDX-License-Identifier: MIT
+"""What the traces of a tier without injection tell: estimates, the machine file, and the judged stage.
+
+Everything follows from the stored traces, the request and :class:`TierFacts`, so that :func:`replay` gives the same
+bytes years later.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Literal
+
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
+from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
+from pmsmtool.estimators.estimate import SENSOR_GAIN_TOLERANCE, SensorTolerance, total_half_width
+from pmsmtool.estimators.flux.linkage import normalised as flux_at_reference
+from pmsmtool.estimators.flux.voltage_flux import flux_by_undriven_voltage, flux_by_voltage_limit
+from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
+from pmsmtool.estimators.resistance import R_MEASURED, Copper, copper_of
+from pmsmtool.estimators.resistance import normalised as resistance_at_reference
+from pmsmtool.estimators.rotation_offset import offset_by_turns
+from pmsmtool.estimators.shaft.inertia_ratio import estimate_ratios
+from pmsmtool.estimators.supply_power import resistance_by_supply
+from pmsmtool.files import read_text
+from pmsmtool.identification.calibration import calibrated_traces
+from pmsmtool.identification.evaluate import tolerance_on
+from pmsmtool.identification.push_limits import not_told, without
+from pmsmtool.identification.replay import MACHINE, NAMEPLATE, asked_again, place_of
+from pmsmtool.identification.replay import replay as replay_injection
+from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
+from pmsmtool.identification.tier_machine import tier_machine
+from pmsmtool.identification.tier_verdict import TOLD_BY, judged, stage_of
+from pmsmtool.identification.vendor_machine import ANSWERS
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.parameters import Estimate, InverterParameters
+from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K, magnet_tolerance_per_k
+from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.run_directory import RunDirectory, Stage
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import read_trace
+from pmsmtool.units import RPM_PER_RAD_S
+
+FACTS = "tier.json"
+"""What the estimates depend on besides traces, request and nameplate."""
+UTILISATION = 1.0 / math.sqrt(3.0)
+"""Largest phase voltage amplitude over the DC link where no machine file says it."""
+NO_RESISTANCE = "the inverter's error at running currents hides it on this drive; needs current set-points"
+NO_POWER = "needs a recorder of voltages, or a bench supply whose power a person reads (`identify R --supply`)"
+SUPPLY_LEVELS = "supply_levels"
+"""Name of the trace of a bench supply's readings."""
+NO_VOLTAGE = "needs injection, or a recorder of voltages at loop rate"
+NO_POLE_PAIRS = "needs the pole pairs: mode 11, an object in the drive's map, or a machine file"
+NO_LINK = "needs the DC link (0x6079) or the machine's voltage"
+UNDECIDED = "no source says whether this drive's amperes are peak or rms: the interval holds for both"
+Voltage = Literal["machine", "link", ""]
+
+
+@dataclass(frozen=True, slots=True)
+class TierResult:
+    """Estimates of a run without injection.
+
+    Attributes
+    ----------
+    estimates : mapping of str to Estimate
+        By the keys of a machine file.
+    missing : mapping of str to str
+        What was asked and cannot be told, with the reason.
+    traces : mapping of str to Trace
+        What was recorded.
+    """
+
+    estimates: Mapping[str, Estimate]
+    missing: Mapping[str, str]
+    traces: Mapping[str, Trace]
+
+
+@dataclass(frozen=True, slots=True)
+class TierFacts:
+    """What a run without injection was, besides its traces.
+
+    Attributes
+    ----------
+    kind : str
+        ``recorder``: recorded pushes; ``standard``: a turned vector, polled pushes.
+    period_s : float
+        Control period of a recorder (s).
+    pole_pairs : int
+        As given, or as the drive's set says; 0 where only the turned vector tells them.
+    T_winding_c, T_magnet_c : float or None
+        What the drive showed (degC).
+    pushed : bool
+        Whether the shaft was pushed by torque.
+    voltage : str
+        What ``psi_f`` is told by: the ``machine`` voltage, the DC ``link`` at the limit, or neither.
+    top_rpm, U_dc_v : float
+        Speed no run-up goes beyond, and the DC link as the drive shows it.
+    source : str
+        Where what completes the values comes from (``nameplate.toml``); empty: nothing does.
+    traces : tuple of str
+        Names of the traces in the order they were taken.
+    current_undecided : bool
+        Whether no source says if the drive's amperes are peak or rms; they were read as rms.
+    """
+
+    kind: Literal["recorder", "standard"]
+    period_s: float = 0.0
+    pole_pairs: int = 0
+    T_winding_c: float | None = None
+    T_magnet_c: float | None = None
+    pushed: bool = False
+    voltage: Voltage = ""
+    top_rpm: float = 0.0
+    U_dc_v: float = 0.0
+    source: str = ""
+    traces: tuple[str, ...] = ()
+    current_undecided: bool = False
+
+
+def tier_result(
+    traces: Mapping[str, Trace],
+    facts: TierFacts,
+    tolerance: SensorTolerance | None = None,
+    inverter: InverterParameters | None = None,
+    psi_f_wb: float = 0.0,
+    copper: Copper | None = None,
+    alpha_psi_per_k: float = MAGNET_ALPHA_PER_K,
+) -> TierResult:
+    """Estimate from traces.
+
+    Parameters
+    ----------
+    traces : mapping of str to Trace
+        In the order they were taken.
+    facts : TierFacts
+        Of the run.
+    tolerance : SensorTolerance, optional
+        Declared sensor tolerances.
+    inverter : InverterParameters, optional
+        Its voltage utilisation and dead time, where known.
+    psi_f_wb : float
+        Flux linkage as given (Wb); 0: none is. It tells how fast a run without voltage limit should have been.
+    copper : Copper, optional
+        Reference temperature, and what is known of the winding's temperature coefficient.
+    alpha_psi_per_k : float
+        Temperature coefficient of the flux linkage (1/K).
+
+    Raises
+    ------
+    IdentificationError
+        A trap is seen; a single quantity that cannot be told is in ``missing``.
+    """
+    tolerance = tolerance or SensorTolerance()
+    if tolerance.bridge_difference_v is not None:
+        tolerance = tolerance_on(tolerance, facts.U_dc_v or math.inf)
+    recorded, traces = traces, calibrated_traces(traces, tolerance)
+    if facts.kind == "recorder":
+        result = _by_recorder(traces, facts, tolerance, copper or Copper(), alpha_psi_per_k)
+        return replace(result, traces=recorded)
+    estimates: dict[str, Estimate] = {}
+    if SUPPLY_LEVELS in traces:
+        R = resistance_by_supply(traces[SUPPLY_LEVELS], tolerance=tolerance)
+        estimates["R_s_ohm"] = replace(resistance_at_reference(R, copper or Copper(), tolerance), dof=R.dof)
+        estimates[R_MEASURED] = R
+    if "rotation_backward" in traces:
+        found = estimate_encoder(traces["rotation_forward"], traces["rotation_backward"])
+        estimates |= encoder_estimates(found, traces)
+    missing: dict[str, str] = {}
+    if facts.pushed:
+        pole_pairs = round(estimates["pole_pairs"].value) if "pole_pairs" in estimates else facts.pole_pairs
+        pushed, missing = _by_torque(traces, replace(facts, pole_pairs=pole_pairs), tolerance, inverter, psi_f_wb)
+        estimates |= pushed
+        missing = {name: why for name, why in missing.items() if name not in estimates}
+    return TierResult(estimates, missing, recorded)
+
+
+def _by_recorder(
+    traces: Mapping[str, Trace], facts: TierFacts, tolerance: SensorTolerance, copper: Copper, alpha_psi_per_k: float
+) -> TierResult:
+    pushes = list(traces.values())
+    found = estimate_pushes(pushes, period_s=facts.period_s, pole_pairs=facts.pole_pairs, tolerance=tolerance)
+    T_winding_c, T_magnet_c = (math.nan if T is None else T for T in (facts.T_winding_c, facts.T_magnet_c))
+    estimates = push_estimates(found)
+    if "R_s_ohm" in estimates:
+        R = replace(estimates["R_s_ohm"], T_c=T_winding_c)
+        estimates["R_s_ohm"] = replace(resistance_at_reference(R, copper, tolerance), dof=R.dof)
+        estimates[R_MEASURED] = R
+    psi = replace(estimates["psi_f_wb"], T_c=T_magnet_c)
+    estimates["psi_f_wb"] = flux_at_reference(psi, copper.T_ref_c, alpha_psi_per_k, tolerance)
+    missing = {} if "R_s_ohm" in estimates else {"R_s_ohm": NO_RESISTANCE}
+    try:
+        estimates |= estimate_ratios(pushes, pole_pairs=facts.pole_pairs, tolerance=tolerance)
+    except IdentificationError as error:
+        missing["J_per_psi"] = error.what
+    reasons = not_told(estimates, pushes)
+    return TierResult(without(estimates, reasons), missing | reasons, traces)
+
+
+def _by_torque(
+    traces: Mapping[str, Trace],
+    facts: TierFacts,
+    tolerance: SensorTolerance,
+    inverter: InverterParameters | None,
+    psi_f_wb: float,
+) -> tuple[dict[str, Estimate], dict[str, str]]:
+    pushes = [trace for name, trace in traces.items() if name.startswith("torque_push")]
+    pole_pairs = facts.pole_pairs
+    estimates = estimate_ratios(pushes, pole_pairs=pole_pairs or 1, tolerance=tolerance)
+    if facts.current_undecided:
+        estimates = {name: either_reading(estimate) for name, estimate in estimates.items()}
+    missing = {"R_s_ohm": NO_POWER, "L_d_h, L_q_h": NO_VOLTAGE}
+    if not pole_pairs:
+        return over_torque_constant(estimates), {**missing, "psi_f_wb": NO_POLE_PAIRS}
+    utilisation = UTILISATION if inverter is None else inverter.voltage_utilisation
+    try:
+        if facts.voltage == "machine":
+            coasts = [trace for name, trace in traces.items() if name.startswith("coast")]
+            # another sensor than the DC link's: an instrument there says nothing of it
+            gain = tolerance.voltage_gain if tolerance.voltage_scale == 1.0 else SENSOR_GAIN_TOLERANCE
+            own = replace(tolerance, voltage_gain=gain)
+            estimates["psi_f_wb"] = flux_by_undriven_voltage(coasts, pole_pairs=pole_pairs, tolerance=own)
+        elif "voltage_limit" in traces:
+            share = None if inverter is None or not inverter.dead_time_s else inverter.dead_time_s / inverter.T_s
+            estimates["psi_f_wb"] = flux_by_voltage_limit(
+                traces["voltage_limit"], pole_pairs=pole_pairs, utilisation=utilisation, dead_time_share=share,
+                tolerance=tolerance,
+            )  # fmt: skip
+        else:
+            missing["psi_f_wb"] = below_voltage(facts, utilisation, psi_f_wb) if facts.voltage else NO_LINK
+    except IdentificationError as error:
+        missing["psi_f_wb"] = error.what
+    return estimates, missing
+
+
+def either_reading(ratio: Estimate) -> Estimate:
+    """Return a ratio to the current that holds whether the drive's amperes are rms, as they were read, or peak.
+
+    Read as peak they are sqrt 2 smaller, and so is the ratio: the middle, with half of what lies between. The truth
+    lies near an end, not somewhere between, so that its own interval stands beyond both (added, no root of squares).
+    """
+    middle, half = 0.5 * (1.0 + math.sqrt(0.5)), 0.5 * (1.0 - math.sqrt(0.5))
+    systematic = half * ratio.value + total_half_width(ratio)
+    return replace(
+        ratio, value=middle * ratio.value, std=middle * ratio.std, systematic=systematic, fallback=UNDECIDED
+    )  # fmt: skip
+
+
+def over_torque_constant(ratios: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Return the ratios to the flux linkage of one pole pair as ratios to the torque constant K_T (N m per A peak).
+
+    Without the pole pairs p, K_T = 1.5 p psi_f is what divides inertia and friction: 1.5 psi_f at one pole pair.
+    """
+    per_psi = torque_per_ampere(1.0, 1.0)
+    names = {"J_per_psi": ("J_per_kt", "kg m2 A/(N m)"), "tau_c_per_psi": ("tau_c_per_kt", "A")}
+    return {
+        names[key][0]: replace(
+            e, value=e.value / per_psi, std=e.std / per_psi, systematic=e.systematic / per_psi,
+            unit=names[key][1],
+        )
+        for key, e in ratios.items()
+    }  # fmt: skip
+
+
+def below_voltage(facts: TierFacts, utilisation: float, psi_f_wb: float) -> str:
+    """Return what the flux linkage needs of a run that did not reach the voltage limit."""
+    text = f"needs a speed at which the voltage ends, and up to {facts.top_rpm:.0f} rpm it did not"
+    if psi_f_wb > 0.0:
+        rpm = RPM_PER_RAD_S * utilisation * facts.U_dc_v / (psi_f_wb * facts.pole_pairs)
+        text += f" (by the given flux linkage it ends at about {rpm:.0f} rpm with {facts.U_dc_v:.4g} V)"
+    return f"{text}: allow a larger --speed-max, or lower the DC link"
+
+
+def encoder_estimates(found: EncoderResult, traces: Mapping[str, Trace]) -> dict[str, Estimate]:
+    """Return pole pairs, direction and offset by the keys of a machine file."""
+    direction = Estimate(float(found.direction), 0.0, 0.0, "1", n=found.offset.n, method=found.pole_pairs.method)
+    offset = offset_by_turns(found, traces["rotation_forward"], traces["rotation_backward"])
+    return {"pole_pairs": found.pole_pairs, "direction": direction, "offset_rad": offset}
+
+
+def push_estimates(found: PushResult) -> dict[str, Estimate]:
+    """Return what the pushes told by the keys of a machine file; R only where the inverter's error does not hide it."""
+    told = {"psi_f_wb": found.psi_f, "L_q_app_h": found.L_q, "frame_offset_rad": found.frame_offset}
+    return told if found.R is None else {"R_s_ohm": found.R, **told}
+
+
+# ---- the stage --------------------------------------------------------------------------------------
+
+
+def evaluated_stage(
+    run: RunDirectory, facts: TierFacts, request: IdentifyRequest, known: MachineFile | None = None
+) -> Stage:
+    """Estimate from the stored traces, write the machine file where it is whole, and judge every value.
+
+    Raises
+    ------
+    IdentificationError
+        A trap was seen; no machine file is written.
+    NotAvailable
+        Nothing of what was asked could be told.
+    """
+    traces = {name: read_trace(run.path / f"traces/{name}.npz") for name in facts.traces}
+    if known is None:
+        result = tier_result(traces, facts, request.tolerance)
+    else:
+        machine = known.machine
+        tolerance = replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(machine))
+        result = tier_result(
+            traces, facts, tolerance, known.inverter, machine.psi_f_wb, copper_of(machine),
+            machine.alpha_psi_per_k,
+        )  # fmt: skip
+    if {"psi", "mechanics"} & set(request.quantities) and facts.kind == "standard" and not facts.pushed:
+        result = replace(result, missing={**result.missing, "J_per_psi, psi_f_wb": NO_POLE_PAIRS})
+    if not any(set(TOLD_BY.get(name, ())) & set(result.estimates) for name in request.quantities):
+        reasons = [f"{name}: not available: {why}" for name, why in result.missing.items()]
+        raise NotAvailable("\n  - ".join(["nothing of what was asked could be told", *reasons]), where=str(run.path))
+    designed = tier_machine(known, result.estimates, facts.source).machine
+    judgement = judged(result.estimates, result.missing, request.quantities, designed)
+    made = tier_machine(known, judgement.kept(result.estimates), facts.source)
+    files = dict.fromkeys((*(f"traces/{name}.npz" for name in traces), REQUEST, FACTS), "")
+    if made.machine is not None and judgement.verdicts.accepted:
+        text = dump_machine_file(made.machine)
+        place, prefix = place_of(run, text)
+        place.save(MACHINE, text)
+        files[f"{prefix}{MACHINE}"] = ""
+    return replace(stage_of(result.estimates, result.missing, made, judgement, facts.source), files=files)
+
+
+def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibration: Sequence[str] = ()) -> Stage:
+    """Recompute every estimate of a run from its traces, whatever its tier; as ``identification.replay.replay``.
+
+    Raises
+    ------
+    ConfigError
+        The run has no traces, or a file that the estimates depend on is gone or damaged.
+    IdentificationError
+        A trap is seen in the traces.
+    """
+    if (run.path / ANSWERS).is_file():
+        raise ConfigError(
+            "the run holds what the drive identified by itself: nothing of that can be recomputed",
+            where=str(run.path),
+            hint="`pmsmtool identify --method vendor` has the drive measure again",
+        )
+    if not (run.path / FACTS).is_file():
+        return replay_injection(run, tolerance, calibration)
+    facts = parse_facts(read_text(run.path / FACTS), where=str(run.path / FACTS))
+    request = asked_again(run, (REQUEST, NAMEPLATE) if facts.source else (REQUEST,), tolerance, calibration)
+    known = load_machine_file(run.path / NAMEPLATE) if facts.source else None
+    recorded = run.read().stage("identify")
+    stage = evaluated_stage(run, facts, request, known)
+    beside = MACHINE not in stage.files and any(name.endswith(MACHINE) for name in stage.files)
+    if recorded is not None and not beside and json.dumps(list(recorded.values)) != json.dumps(list(stage.values)):
+        run.save(REQUEST, dump_request(request))
+        run.add(replace(stage, seconds=recorded.seconds))
+    return stage
+
+
+def dump_facts(facts: TierFacts) -> str:
+    """Return facts as JSON."""
+    return json.dumps(asdict(facts), indent=1) + "\n"
+
+
+def parse_facts(text: str, *, where: str) -> TierFacts:
+    """Return the facts of a run.
+
+    Raises
+    ------
+    ConfigError
+        It is not what :func:`dump_facts` writes.
+    """
+    try:
+        facts = json.loads(text)
+        found = TierFacts(**{**facts, "traces": tuple(facts["traces"])})
+        if found.kind not in ("recorder", "standard"):
+            raise ValueError(f"no kind {found.kind!r}")
+    except (ValueError, TypeError, KeyError) as error:
+        raise ConfigError(
+            f"the record of the tier is damaged: {error}",
+            where=where,
+            hint="identify again; or take the file from a copy of the run",
+        ) from error
+    return found

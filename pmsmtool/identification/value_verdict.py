@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: MIT
+"""What is recorded of an identification: values with their intervals, whether they are accepted, and what to know."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from pmsmtool.estimators.cross_check import CrossCheck
+from pmsmtool.estimators.estimate import Verdict, coverage_factor, statistical_half_width, total_half_width
+from pmsmtool.estimators.resistance import at_the_test
+from pmsmtool.identification import flux_map, frequency_response
+from pmsmtool.identification.evaluate import Evaluation
+from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
+from pmsmtool.identification.sampling import timing_warnings
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.run_directory import Acceptance
+from pmsmtool.units import format_estimate
+
+if TYPE_CHECKING:
+    from pmsmtool.identification.request import IdentifyRequest
+
+
+def acceptance_of(
+    evaluation: Evaluation, found: Mapping[str, Estimate], machine: MachineFile, asked: Collection[str]
+) -> dict[str, Acceptance]:
+    """Return what every value is judged by, by its key: what its interval leaves of the design's margins and limits."""
+    # the offset of the slow turn alone, which is for the pole pairs, is coarse, and nobody asked for it
+    coarse = {OFFSET} if evaluation.flux is None and "encoder" not in asked else set()
+    found = at_the_test(found)
+    if evaluation.flux is not None and "psi_f_wb" in found:  # loops see the magnets as they were, too
+        measured = evaluation.flux.psi_measured
+        share = measured.systematic / measured.value
+        found["psi_f_wb"] = replace(found["psi_f_wb"], systematic=share * found["psi_f_wb"].value)
+    judged = [name for name in JUDGED if name in found and name not in coarse]
+    criteria = judged_values({name: found[name] for name in judged}, machine)
+    mapped = flux_map.map_acceptance(evaluation.flux_map)
+    return criteria | dict(zip(("flux map",), mapped, strict=False))
+
+
+def had_of(evaluation: Evaluation) -> list[str]:
+    """Return the evaluations that gave a result, by the keys of ``Evaluation.refused``."""
+    results = {
+        "R": evaluation.resistance, "encoder": evaluation.encoder, "L": evaluation.inductance, "psi": evaluation.flux,
+        "map": evaluation.flux_map, "mechanics": evaluation.mechanics, "frf": evaluation.frequency_response,
+    }  # fmt: skip
+    return [name for name, result in results.items() if result is not None]
+
+
+ASSUMPTION_TOLD = 1.2
+"""Growth of the systematic interval of psi_f by the way to the reference temperature from which on a reader is told."""
+STANDS_FOR: Mapping[str, str] = {"L_q_app_h": "L_q_h", "J_per_psi": "J_kgm2"}
+"""Values of a drive without injection, and the machine key whose place they take: loops depend on the ratio J/psi."""
+
+
+def judged_values(found: Mapping[str, Estimate], machine: MachineFile | None) -> dict[str, Acceptance]:
+    """Return the criterion of every value by its key: what binds the design of the machine first over its interval.
+
+    Without a machine there is no design; then only an angle has a limit of its own.
+    """
+    halves = {name: total_half_width(estimate) for name, estimate in found.items()}
+    for name, key in STANDS_FOR.items():
+        if machine is not None and name in halves and found[name].value:
+            halves[key] = halves[name] / abs(found[name].value) * abs(getattr(machine.machine, key) or 0.0)
+    needs = interval_needs(machine, halves)
+    return {
+        name: _accepted(name, estimate, needs.get(STANDS_FOR.get(name, name), ())) for name, estimate in found.items()
+    }
+
+
+def summary_of(evaluation: Evaluation, found: Mapping[str, Estimate]) -> str:
+    """Return the one line of the stage."""
+    values = ", ".join(
+        f"{name} {format_estimate(found[name].value, total_half_width(found[name]), found[name].unit)}"
+        for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
+        if name in found
+    )
+    more = flux_map.map_summary(evaluation.flux_map) + frequency_response.response_summary(
+        evaluation.frequency_response
+    )
+    return values + more
+
+
+def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
+    """Return what a reader should know about a result that was accepted all the same."""
+    lines = []
+    if request.half_frequency and evaluation.split is None:
+        lines.append("R_s is from one control frequency: the drive does not take half of it")
+    if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
+        lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
+    if evaluation.mismatch is not None and evaluation.mismatch.corrected:
+        gains = ", ".join(f"{100.0 * gain:+.2g} %" for gain in evaluation.mismatch.gains)
+        lines.append(
+            f"the gains of the current sensors of a, b and c are {gains} off their mean: corrected in the values, not "
+            "in the drive, whose torque ripples twice per electrical turn"
+        )
+    if evaluation.encoder is not None:
+        lines += [
+            f"the encoder is off by {math.degrees(error):.2g} deg (mechanical) {often} per turn: mounted off centre? "
+            "J, B and tau_c suffer from it"
+            for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
+            if error > 0.0
+        ]
+    flux = evaluation.flux
+    if flux is not None and flux.psi_f.systematic > ASSUMPTION_TOLD * flux.psi_measured.systematic:
+        lines.append(
+            "psi_f at the reference temperature rests on an assumed temperature coefficient of the magnets: its range, "
+            "samarium-cobalt to ferrite, is in the interval; state alpha_psi_per_k and alpha_psi_tolerance_per_k"
+        )
+    if evaluation.mechanics is not None and evaluation.mechanics.note:
+        lines.append(evaluation.mechanics.note)
+    lines += timing_warnings(evaluation.shown)
+    lines += [f"{check.name} {check.verdict}" for check in evaluation.checks if not check.agrees]
+    if evaluation.pairs is not None and not evaluation.pairs.judged:
+        lines.append("the phases were not compared: the rotor did not come to rest on the three pairs")
+    inductance = evaluation.inductance
+    if inductance is not None and inductance.verdict is Verdict.WARN:
+        dependent = ", ".join(inductance.frequency_dependent)
+        lines.append(f"L: {'depends on frequency on ' + dependent if dependent else 'chi-square above its limit'}")
+    if evaluation.flux_map is not None:
+        lines += evaluation.flux_map.notes
+    return lines
+
+
+def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str, Any]:
+    """Return under what the machine was identified, as its file says it."""
+    conditions: dict[str, Any] = {
+        "shaft": request.shaft,
+        "current_gain_tolerance": request.tolerance.current_gain,
+        "voltage_gain_tolerance": request.tolerance.voltage_gain,
+        "current_scale": request.tolerance.current_scale,
+        "voltage_scale": request.tolerance.voltage_scale,
+        "noise_apk": evaluation.noise.sigma_a,
+    }
+    if request.tolerance.bridge_difference_v is not None:
+        conditions["bridge_difference_v"] = request.tolerance.bridge_difference_v
+    if evaluation.mismatch is not None and evaluation.mismatch.corrected:
+        pairs = zip("abc", evaluation.mismatch.gains, strict=True)
+        conditions |= {f"sensor_gain_{phase}_over_mean": 1.0 + gain for phase, gain in pairs}
+    if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
+        conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
+    return conditions
+
+
+def value_facts(name: str, estimate: Estimate) -> dict[str, Any]:
+    """Return an estimate as a stage records it; numbers that are not finite as None."""
+    facts = {key: getattr(estimate, key) for key in ("value", "std", "systematic", "unit", "n", "method", "source")}
+    for key in ("chi2", "T_c", "i_d_apk", "i_q_apk"):
+        number = getattr(estimate, key)
+        facts[key] = number if math.isfinite(number) else None
+    halves = {"statistical_95": statistical_half_width(estimate), "total_95": total_half_width(estimate)}
+    return {"name": name, **facts, "coverage_factor": coverage_factor(estimate.dof), **halves}
+
+
+def check_facts(check: CrossCheck) -> dict[str, Any]:
+    """Return a second method's estimate as a stage records it, with what it says about the first."""
+    facts = value_facts(check.name, check.estimate)
+    judged = {"of": check.of, "difference": check.difference, "interval_95": check.half_width, "agrees": check.agrees}
+    return {**facts, "method": f"check, {check.estimate.method}: {check.verdict}", "check": judged}
+
+
+def _accepted(name: str, estimate: Estimate, needs: Sequence[Need]) -> Acceptance:
+    half = total_half_width(estimate)
+    relative = half / abs(estimate.value) if estimate.value else math.inf
+    width = f"{math.degrees(half):.3g} deg" if name == OFFSET else f"{100.0 * relative:.2g} %"
+    what = f"{name}: total 95 % interval"
+    if not needs:  # no design, or nothing of it depends on the value
+        return Acceptance(what, width, "100 %, no design depends on it", relative < 1.0)
+    binding = min(needs, key=lambda need: need.reserve)
+    return Acceptance(
+        what,
+        f"{width}, over it {binding.what} {_number(binding.worst, binding.unit)}",
+        _number(binding.least, binding.unit),
+        all(need.ok for need in needs),
+    )
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value:.3g}" if unit == "1" else f"{value:.3g} {unit}"

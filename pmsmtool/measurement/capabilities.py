@@ -1,0 +1,496 @@
+# SPDX-License-Identifier: MIT
+"""What a drive can give: quantity x method x expected interval x what is missing, decided from map and drive.
+
+The map says what a family can do, the drive itself must confirm it: supported modes (0x6502) and objects that answer.
+Expected intervals are those measured on simulated nodes of the tier (:data:`EXPECTED`); where nothing was measured,
+nothing is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TypeVar
+
+from pmsmtool.cia402 import Mode
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.mapped_recorder_drive import records_pushes
+from pmsmtool.drive.motion_objects import (
+    NO_RATED,
+    limited_speed,
+    position_units,
+    rated_apk,
+    shown_current,
+    torque_target,
+    undecided,
+    watched_by_tool,
+)
+from pmsmtool.drive.objects import SUPPORTED_MODES
+from pmsmtool.drive.port import Identity
+from pmsmtool.drive.recorders.choice import described
+from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
+from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
+from pmsmtool.drive_maps.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
+from pmsmtool.errors import NotAvailable, SdoAbort
+
+T = TypeVar("T")
+
+
+class Tier(StrEnum):
+    """How much a drive gives, from most to least."""
+
+    FULL = "full"
+    INJECT = "inject"
+    RECORDER = "recorder"
+    STANDARD = "standard"
+    VENDOR = "vendor"
+    MANUAL = "manual"
+
+
+class Method(StrEnum):
+    """Ways to a quantity, as ``identify --method`` names them."""
+
+    INJECT = "inject"
+    RECORDER = "recorder"
+    STANDARD = "standard"
+    VENDOR = "vendor"
+    MANUAL = "manual"
+
+
+QUANTITIES = ("R", "L", "psi", "map", "inverter", "encoder", "poles", "mechanics", "frf")
+
+FEATURES: Mapping[str, str] = {
+    "heartbeat": "consumer heartbeat (0x1016)",
+    "abort option": "abort connection option (0x6007)",
+    "quick stop": "quick stop option (0x605A)",
+    "limits": "its own current and speed limit (0x6073, 0x6075, 0x6080)",
+    "supervision": "consumer heartbeat (0x1016), or node guarding (0x100C, 0x100D)",
+    "rated current": NO_RATED,
+    "set-points": "current set-points for d and q",
+    "excitation": "voltage or current injection",
+    "averages": "averages inside the drive",
+    "recorder": "a recorder of currents and voltages that this program reads",
+    "torque mode": "torque mode (0x6502 bit 3 or 9)",
+    "push": "torque mode (0x6502 bit 3 or 9), or a velocity mode whose unit a map says, with a current limit",
+    "position": "position in increments of a known number per turn (0x6064 with 0x608F, or in a map of its maker)",
+    "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
+    "vendor R": "the maker's identification of R, with its result, in a map that names this drive",
+    "vendor L": "the maker's identification of L, with its result, in a map that names this drive",
+    "vendor psi": "the maker's identification of psi, with its result, in a map that names this drive",
+    "vendor poles": "the maker's identification of the pole pairs, with its result, in a map that names this drive",
+    "line voltage": "the DC link (0x6079), or the machine's voltage in the drive map",
+    "current": "its current (0x6078) or torque (0x6077)",
+    "bench supply": "a bench supply whose power a person reads (`pmsmtool identify R --supply`)",
+}
+"""What methods need, as a person reads it."""
+
+_SAFE = ("heartbeat", "abort option", "quick stop", "limits")
+_INJECT = (*_SAFE, "set-points", "excitation", "recorder")
+_RECORD = (*_SAFE, "recorder", "torque mode")
+_BOUNDED = ("supervision", "rated current")
+"""What is safe where every command is a current that this program bounds: it replaces limits that the drive lacks."""
+_STANDARD = (*_BOUNDED, "position", "commutation angle")
+_PUSH = (*_BOUNDED, "push", "position", "current")
+_WATCHED = (*_SAFE, "position", "current")
+"""What the guard needs while the drive runs by itself."""
+
+NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
+    "R": {
+        Method.INJECT: _INJECT,
+        Method.RECORDER: _RECORD,
+        Method.STANDARD: (*_STANDARD, "bench supply"),
+        Method.VENDOR: (*_WATCHED, "vendor R"),
+        Method.MANUAL: (),
+    },
+    "L": {
+        Method.INJECT: _INJECT,
+        Method.RECORDER: _RECORD,
+        Method.VENDOR: (*_WATCHED, "vendor L"),
+        Method.MANUAL: (),
+    },
+    "psi": {
+        Method.INJECT: _INJECT,
+        Method.RECORDER: _RECORD,
+        Method.STANDARD: (*_PUSH, "line voltage"),
+        Method.VENDOR: (*_WATCHED, "vendor psi"),
+        Method.MANUAL: (),
+    },
+    "map": {Method.INJECT: _INJECT},
+    "inverter": {Method.INJECT: _INJECT},
+    "encoder": {Method.INJECT: _INJECT, Method.STANDARD: _STANDARD},
+    "poles": {
+        Method.INJECT: _INJECT,
+        Method.STANDARD: _STANDARD,
+        Method.VENDOR: (*_WATCHED, "vendor poles"),
+        Method.MANUAL: (),
+    },
+    "mechanics": {
+        Method.INJECT: _INJECT,
+        Method.RECORDER: (*_RECORD, "position"),
+        Method.STANDARD: _PUSH,
+        Method.MANUAL: (),
+    },
+    "frf": {Method.INJECT: _INJECT},
+}
+"""Methods of each quantity and what they need."""
+
+NOTES: Mapping[tuple[str, Method], str] = {
+    ("R", Method.RECORDER): "where the inverter's error does not hide it",
+    ("R", Method.STANDARD): "the loop, at the temperature of the run",
+    ("L", Method.RECORDER): "L_q at running currents only",
+    ("psi", Method.RECORDER): "the drive must commutate already",
+    ("psi", Method.STANDARD): "where the voltage limit is within the speed limit, or the drive shows its voltage",
+    ("mechanics", Method.RECORDER): "J/psi and tau_c/psi",
+    ("mechanics", Method.STANDARD): "J/psi and tau_c/psi; over the torque constant where the pole pairs are not known",
+    ("L", Method.VENDOR): "one inductance for both axes, unless the map has a result for each",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """An interval measured on simulated drives.
+
+    Attributes
+    ----------
+    name : str
+        Key of the estimate.
+    half_width, unit : float, str
+        90 % of the drives had a total 95 % half width up to this (% of the value, or deg).
+    drives : int
+        Accepted drives behind it.
+    program : str
+        Command that measured it.
+    given : str
+        What must be given for it besides the drive; empty: nothing.
+    """
+
+    name: str
+    half_width: float
+    unit: str
+    drives: int
+    program: str
+    given: str = ""
+
+    def __str__(self) -> str:
+        with_what = f" with {self.given}" if self.given else ""
+        return f"{self.name} +-{self.half_width:.2g} {self.unit}{with_what}"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One way to one quantity.
+
+    Attributes
+    ----------
+    quantity, method : str
+        What and how.
+    missing : tuple of str
+        What the drive lacks, in words; empty: available.
+    expected : tuple of Expected
+        What to expect; empty: not measured.
+    note : str
+        What limits it.
+    """
+
+    quantity: str
+    method: Method
+    missing: tuple[str, ...]
+    expected: tuple[Expected, ...] = ()
+    note: str = ""
+
+    @property
+    def available(self) -> bool:
+        """Whether the drive gives it."""
+        return not self.missing
+
+    @property
+    def waits_for_person(self) -> bool:
+        """Whether it lacks only what a person brings."""
+        return self.missing == (FEATURES["bench supply"],)
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What one drive gives.
+
+    Attributes
+    ----------
+    identity : Identity
+        Of the drive.
+    drive_map : DriveMap
+        The map used.
+    map_is_drives : bool
+        Whether that map names this identity; without, nothing is written through it.
+    features : frozenset of str
+        Keys of :data:`FEATURES` it has.
+    recorder : str
+        What a maker's recorder takes, or why it is not read; empty where the map names none.
+    replaced : tuple of str
+        Limits that the drive does not keep by itself, and what replaces them.
+    current_undecided : bool
+        Whether no source says if its amperes are peak or rms.
+    """
+
+    identity: Identity
+    drive_map: DriveMap
+    map_is_drives: bool
+    features: frozenset[str]
+    recorder: str = ""
+    replaced: tuple[str, ...] = ()
+    current_undecided: bool = False
+
+    @property
+    def tier(self) -> Tier:
+        """The highest tier whose needs are met."""
+        for tier, needs in _TIERS:
+            if self.features >= {*needs, *self._always}:
+                return tier
+        return Tier.VENDOR if any(self.row(name, Method.VENDOR).available for name in NEEDS) else Tier.MANUAL
+
+    @property
+    def unsafe(self) -> bool:
+        """Whether the full tier lacks only what makes motion safe: such a drive is refused, it is no lower tier."""
+        missing = set(dict(_TIERS)[Tier.FULL]) - self.features
+        return bool(missing) and missing <= set(_SAFE)
+
+    def rows(self) -> tuple[Row, ...]:
+        """Return every quantity by every method."""
+        return tuple(self.row(quantity, method) for quantity in QUANTITIES for method in NEEDS[quantity])
+
+    def row(self, quantity: str, method: Method) -> Row:
+        """Return one way to one quantity."""
+        if method not in NEEDS[quantity]:
+            return Row(quantity, method, (f"another method: {quantity} has no {method} method",))
+        needs = NEEDS[quantity][method]
+        needs = tuple(dict.fromkeys((*self._always, *needs))) if needs else needs
+        missing = tuple(FEATURES[need] for need in needs if need not in self.features)
+        expected, note = EXPECTED.get((quantity, method), ()), NOTES.get((quantity, method), "")
+        if method is Method.INJECT and "averages" not in self.features:
+            expected = FROM_RECORDS.get(quantity, ())  # the others come from drives that average by themselves
+            note = "; ".join(part for part in (note, "means are made from records") if part)
+        if self.current_undecided and (quantity, method) == ("mechanics", Method.STANDARD):
+            expected, note = (), f"{note}; {UNDECIDED}"
+        if method is Method.RECORDER and not self.drive_map.staging:
+            expected = ()  # those were measured with the reference drive's recorder
+        return Row(quantity, method, missing, expected, note)
+
+    def best(self, quantity: str) -> Row | None:
+        """Return the first measuring method of a quantity that is available."""
+        rows = (self.row(quantity, method) for method in NEEDS[quantity] if method in MEASURING)
+        return next((row for row in rows if row.available), None)
+
+    @property
+    def _always(self) -> tuple[str, ...]:
+        """What every motion needs: a reference drive without its own safety is not moved by a lower tier either."""
+        return _SAFE if self.drive_map.staging else ()
+
+    def require(self, quantities: Sequence[str], method: Method | None) -> Method:
+        """Return the method that gives all the quantities: the one asked for, else the first that does.
+
+        Raises
+        ------
+        NotAvailable
+            None does; for every quantity the message names what is missing.
+        """
+        for candidate in MEASURING if method is None else (method,):
+            if candidate in MEASURING and all(self.row(name, candidate).available for name in quantities):
+                return candidate
+        raise NotAvailable(
+            "\n  - ".join(["this drive cannot give what was asked", *self._reasons(quantities, method)]),
+            where=f"node {self.identity.node}",
+            hint="`pmsmtool caps` lists what it can; `pmsmtool machine new` takes numbers of a datasheet or a meter",
+        )
+
+    def _reasons(self, quantities: Sequence[str], method: Method | None) -> list[str]:
+        lines = []
+        for quantity in quantities:
+            rows = [self.row(quantity, m) for m in (NEEDS[quantity] if method is None else (method,))]
+            if any(row.available and row.method in MEASURING for row in rows):
+                lines.append(f"{quantity}: by itself yes ({self._how(quantity, method)}), together with the others no")
+                continue
+            for row in rows:
+                if row.method in MEASURING or method is not None:
+                    needs = f"not available: needs {', '.join(row.missing)}" if row.missing else "a number you bring"
+                    lines.append(f"{quantity} by {row.method}: {needs}")
+        return lines
+
+    def _how(self, quantity: str, method: Method | None) -> str:
+        best = self.best(quantity)
+        return str(method or (best.method if best else ""))
+
+
+UNDECIDED = "no source says whether its amperes are peak or rms: +-17 % more"
+MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD, Method.VENDOR)
+"""Methods that measure, the best first."""
+_TIERS = (
+    (Tier.FULL, (*_INJECT, "averages")),
+    (Tier.INJECT, _INJECT),
+    (Tier.RECORDER, _RECORD),
+    (Tier.STANDARD, (*_BOUNDED, "push")),
+)
+
+
+def with_supply(found: Capabilities) -> Capabilities:
+    """Return what a drive gives when a person reads its bench supply."""
+    return replace(found, features=found.features | {"bench supply"})
+
+
+def choose_map(identity: Identity, given: DriveMap | None) -> DriveMap:
+    """Return the map for a drive: the one given, the shipped one for its identity, else what CiA 402 says."""
+    return given or family_of(identity.vendor, identity.product) or load_family(GENERIC)
+
+
+def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
+    """Ask a drive what it has; only reads.
+
+    Parameters
+    ----------
+    node : DriveNode
+        The drive; its map is replaced by the chosen one.
+    given : DriveMap, optional
+        The map to use; default: by the drive's identity.
+    """
+    identity = node.identity()
+    drive_map = choose_map(identity, given)
+    node.map = drive_map
+    modes = _modes(node)
+    has = {
+        "heartbeat": node.has(0x1016, 1),
+        "abort option": node.has(0x6007, 0),
+        "quick stop": node.has(0x605A, 0),
+        "limits": all(node.has(index, 0) for index in (0x6073, 0x6075, 0x6080)),
+        "line voltage": node.has(0x6079, 0) or {"u_d_v", "u_q_v"} <= set(drive_map.signals),
+        "commutation angle": drive_map.capabilities.commutation_angle
+        and bool(modes & _bit(Mode.CYCLIC_TORQUE_ANGLE))
+        and node.has(0x60EA, 0),
+    }
+    rated = None if drive_map.staging else _told(lambda: rated_apk(node))
+    if not drive_map.staging:
+        has |= _motion(node, rated)
+        has["supervision"] = has["heartbeat"] or (node.has(0x100C, 0) and node.has(0x100D, 0))
+    else:  # only then these objects are what the reference drive has there
+        torque = bool(modes & (_bit(Mode.PROFILE_TORQUE) | _bit(Mode.CYCLIC_TORQUE))) and node.has(0x6071, 0)
+        has |= {
+            "position": node.has(0x6064, 0) and node.has(0x608F, 1),
+            "current": node.has(0x6078, 0),
+            "torque mode": torque,
+            "push": torque,
+            "supervision": has["heartbeat"],
+            "rated current": has["limits"],
+            "set-points": node.has(0x2052, 1),
+            "excitation": node.has(0x2050, 0x0E),
+            "averages": node.has(0x2063, 3),
+            "recorder": node.has(0x2060, 8),
+        }
+    named = identity.vendor != UNKNOWN_VENDOR and drive_map.is_for(identity.vendor, identity.product)
+    found = {name for name, there in has.items() if there}
+    if named:  # whatever starts a drive's own identification is not tried on another drive
+        found |= {f"vendor {name}" for name in _vendor_quantities(node, drive_map)}
+        found |= {"recorder"} if records_pushes(node) else set()
+    replaced = () if rated is None else tuple(watched_by_tool(node, rated))
+    shown = rated is not None and bool(_told(lambda: undecided(node, rated)))
+    return Capabilities(identity, drive_map, named, frozenset(found), described(node), replaced, shown)
+
+
+def _motion(node: DriveNode, rated: float | None) -> dict[str, bool]:
+    """Ask a drive of another maker for what motion needs: the standard's objects, else those its map names."""
+    base = rated or 1.0
+    torque = _told(lambda: torque_target(node, base)) is not None
+    return {
+        "rated current": rated is not None,
+        "position": node.has(0x6064, 0) and bool(_told(lambda: position_units(node))),
+        "current": _told(lambda: shown_current(node, base)) is not None,
+        "torque mode": torque,
+        "push": torque or _told(lambda: limited_speed(node)) is not None,
+    }
+
+
+def _told(ask: Callable[[], T]) -> T | None:
+    """Return what the drive tells, None where it does not."""
+    try:
+        return ask()
+    except (NotAvailable, SdoAbort):
+        return None
+
+
+def _vendor_quantities(node: DriveNode, drive_map: DriveMap) -> frozenset[str]:
+    """Return what the drive's own identification tells; an object that is not there tells nothing.
+
+    The answer of an OS command is not read here: reading it acknowledges it.
+    """
+    tuning = drive_map.vendor_tuning
+    if tuning is None:
+        return frozenset()
+    needed = [(OS_COMMAND, 2), (OS_COMMAND_MODE, 0)]
+    if tuning.kind == "mode":
+        needed = [(cell.index, cell.sub) for cell in tuning.results.values()]
+    return tuning.quantities if all(node.has(*address) for address in needed) else frozenset()
+
+
+def _bit(mode: Mode) -> int:
+    """Return the bit of a mode in object 0x6502."""
+    return 1 << (mode - 1)
+
+
+def _modes(node: DriveNode) -> int:
+    try:
+        return node.whole(SUPPORTED_MODES)
+    except SdoAbort:
+        return 0
+
+
+def reference_capabilities(identity: Identity) -> Capabilities:
+    """Return what the reference drive with everything gives, for tests and documentation."""
+    every = frozenset(_SAFE) | frozenset(_INJECT) | frozenset(_RECORD) | frozenset(_PUSH) | {"averages", "line voltage"}
+    return Capabilities(identity, reference_map(), True, every)
+
+
+_FULL = "benchmarks.identification_coverage --drives 400 --first 70000"
+_MECHANICS = "benchmarks.mechanics_accuracy --drives 240 --first 67000"
+_RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 200 --first 65302"
+_STANDARD_RUN = "benchmarks.tier_intervals standard --drives 200 --first 64200 --speed 1.35"
+
+_SUPPLY_RUN = "benchmarks.tier_intervals supply --drives 60 --first 65000"
+_DEAD_TIME = "a machine file that names the dead time"
+_BLIND_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --speed 1.35 --no-machine"
+
+
+def _expected(program: str, drives: int, *rows: tuple[str, float, str], given: str = "") -> tuple[Expected, ...]:
+    return tuple(Expected(name, half, unit, drives, program, given) for name, half, unit in rows)
+
+
+EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
+    ("R", Method.INJECT): _expected(_FULL, 400, ("R_s_ohm", 4.5, "%")),
+    ("L", Method.INJECT): _expected(_FULL, 400, ("L_d_h", 1.5, "%"), ("L_q_h", 1.5, "%")),
+    ("psi", Method.INJECT): _expected(_FULL, 400, ("psi_f_wb", 1.1, "%")),
+    ("encoder", Method.INJECT): _expected(_FULL, 400, ("offset_rad", 0.04, "deg")),
+    ("mechanics", Method.INJECT): _expected(_MECHANICS, 70, ("J_kgm2", 1.5, "%")),
+    ("R", Method.RECORDER): _expected(_RECORDER_RUN, 194, ("R_s_ohm", 7.4, "%")),
+    ("L", Method.RECORDER): _expected(_RECORDER_RUN, 195, ("L_q_app_h", 6.9, "%")),
+    ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 200, ("psi_f_wb", 1.2, "%")),
+    ("mechanics", Method.RECORDER): _expected(
+        _RECORDER_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")
+    ),
+    ("R", Method.STANDARD): _expected(_SUPPLY_RUN, 60, ("R_s_ohm", 3.0, "%")),
+    ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("offset_rad", 0.4, "deg")),
+    ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("pole_pairs", 0.1, "%")),
+    ("psi", Method.STANDARD): (
+        *_expected(_BLIND_RUN, 26, ("psi_f_wb", 6.4, "%")),
+        *_expected(_STANDARD_RUN, 194, ("psi_f_wb", 3.7, "%"), given=_DEAD_TIME),
+    ),
+    ("mechanics", Method.STANDARD): _expected(
+        _STANDARD_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")
+    ),
+}
+"""Total 95 % half widths that 90 % of random simulated drives of the tier kept to, with sensors of 1 %."""
+
+_INJECT_RUN = "benchmarks.tier_intervals inject --drives 200 --first 63000"
+FROM_RECORDS: Mapping[str, tuple[Expected, ...]] = {
+    "R": _expected(_INJECT_RUN, 200, ("R_s_ohm", 4.5, "%")),
+    "L": _expected(_INJECT_RUN, 200, ("L_d_h", 1.5, "%"), ("L_q_h", 1.5, "%")),
+    "psi": _expected(_INJECT_RUN, 200, ("psi_f_wb", 1.2, "%")),
+    "encoder": _expected(_INJECT_RUN, 200, ("offset_rad", 0.05, "deg")),
+    "mechanics": _expected(_INJECT_RUN, 200, ("J_kgm2", 1.5, "%")),
+}
+"""The same by injection on drives without averages, whose means are made from records."""

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: MIT
+"""Identify the machine on a drive: envelope and consent, then the experiments, whose traces go into a run.
+
+What the estimates are is decided from the stored traces alone (``replay``). Nothing is stored in the drive.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from pmsmtool.cia402 import HOMING_LOST
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.envelope import Envelope, largest_acceleration
+from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.port import Drive
+from pmsmtool.errors import ConfigError, DriveFault, IdentificationError, PmsmtoolError, SafetyRefusal
+from pmsmtool.experiments.rotation import dwell_within
+from pmsmtool.identification.flux_map import IF_SATURATED
+from pmsmtool.identification.predicted_file import PREDICTED, dump_predicted
+from pmsmtool.identification.refused_file import REFUSED, dump_refused
+from pmsmtool.identification.replay import NAMEPLATE, evaluated_stage
+from pmsmtool.identification.request import (
+    REQUEST,
+    IdentifyRequest,
+    dump_request,
+    steps_of,
+)
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, MachineLimits, MachineParameters
+from pmsmtool.measurement import flux_map, frequency_response, half_frequency, mechanics
+from pmsmtool.measurement.limits import HEADROOM, Limits, require_speed, unused_current
+from pmsmtool.measurement.measure import Measurement, starting_gains
+from pmsmtool.measurement.run_account import status_of, text_of
+from pmsmtool.run_directory import RunDirectory, Stage
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import trace_npz
+from pmsmtool.units import rad_s_from_rpm
+
+
+def nameplate_of(drive: Drive, name: str) -> MachineFile:
+    """Return the machine file of a drive before anything is identified: its ratings, and what its set says so far."""
+
+    def read(parameter: str) -> float:
+        return drive.read(parameter)
+
+    machine = MachineParameters(
+        pole_pairs=round(read("motor.pole_pairs")),
+        R_s_ohm=read("motor.R_s_ohm"),
+        L_d_h=read("motor.L_d_h"),
+        L_q_h=read("motor.L_q_h"),
+        psi_f_wb=read("motor.psi_f_wb"),
+        I_nom_apk=read("motor.I_nom_apk"),
+        I_max_apk=read("motor.I_max_apk"),
+        I_max_time_s=read("motor.I_max_time_s"),
+        n_max_rpm=read("motor.n_max_rpm"),
+        T_ref_c=read("motor.T_ref_c"),
+        alpha_R_per_k=read("motor.alpha_R_per_k"),
+        alpha_psi_per_k=read("motor.alpha_psi_per_k"),
+    )
+    inverter = InverterParameters(
+        U_dc_v=read("inverter.U_dc_nom_v"),
+        f_s_hz=1e9 / read("inverter.T_s_ns"),
+        dead_time_s=1e-9 * read("inverter.dead_time_ns"),
+        delay_periods=read("inverter.delay_periods"),
+        voltage_utilisation=read("inverter.voltage_utilisation"),
+    )
+    i_d_min = read("field_weakening.i_d_min_a")
+    limits = MachineLimits(
+        # what is no nearer than I_max is no demagnetisation limit: the design then assumes one
+        i_d_min_apk=i_d_min if i_d_min > -read("motor.I_max_apk") else None,
+        i_trip_apk=read("protection.i_trip_apk"),
+        I_cont_apk=read("protection.I_cont_apk"),
+        U_dc_min_v=read("protection.U_dc_min_v"),
+        U_dc_max_v=read("protection.U_dc_max_v"),
+        n_trip_rpm=read("protection.n_trip_rpm"),
+        T_winding_max_c=read("protection.T_winding_max_c"),
+    )
+    return MachineFile(
+        name,
+        machine,
+        inverter,
+        encoder=EncoderParameters(),
+        limits=limits,
+        provenance={"source": "parameter set and ratings of the drive; what was identified stands in [estimate]"},
+    )
+
+
+def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
+    """Return the motion envelope: what the request says, else the drive's ratings.
+
+    Raises
+    ------
+    ConfigError
+        The nameplate has no rated current or speed, and none was given.
+    """
+    machine = nameplate.machine
+    if machine.I_nom_apk is None or machine.n_max_rpm is None:
+        raise ConfigError("rated current and largest speed must be known", hint="give --i-max and --speed-max")
+    i_max = HEADROOM * machine.I_nom_apk if request.i_max_apk is None else request.i_max_apk
+    speed = rad_s_from_rpm(machine.n_max_rpm) if request.speed_max_rad_s is None else request.speed_max_rad_s
+    i_d_min = nameplate.limits.i_d_min_apk
+    return Envelope(
+        i_max_apk=i_max,
+        speed_max_rad_s=speed,
+        duration_s=300.0,
+        shaft=request.shaft,
+        load=request.load,
+        brake=request.brake,
+        acceleration_rad_s2=largest_acceleration(machine, i_max),
+        i_d_max_apk=machine.I_nom_apk if i_d_min is None else -i_d_min,
+    )
+
+
+def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineFile) -> list[str]:
+    """Return what a person reads before consenting: the envelope and what will happen inside it."""
+    steps = steps_of(request.quantities, request.shaft == "locked")
+    allowed = [*envelope.lines(), *unused_current(envelope.i_max_apk, nameplate, pulses="map" in steps)]
+    lines = [*allowed, f"the rotor aligns with current vectors: it may jump by half an electrical turn; {HOMING_LOST}"]
+    if request.half_frequency:
+        lines.append(half_frequency.PLAN_LINE)
+    if "rotation" in steps:
+        lines.append("the shaft turns slowly through one turn each way")
+    if "speeds" in steps:
+        lines.append("the shaft is pushed both ways and coasts with current from four speeds in each direction")
+    if "coasting" in steps:
+        lines.append(mechanics.PLAN_LINE)
+    if "response" in steps:
+        lines.append(frequency_response.PLAN_LINE)
+    if "map" in steps:
+        lines += flux_map.plan_lines(nameplate)
+    elif request.map_if_saturated and "speeds" in steps:
+        lines.append(IF_SATURATED)
+    lines.append("nothing is stored in the drive; every changed object is restored")
+    return lines
+
+
+def identify_stage(
+    run: RunDirectory,
+    drive: CanopenDrive,
+    nameplate: MachineFile,
+    request: IdentifyRequest,
+    allow_motion: Callable[[Sequence[str]], None],
+    say: Callable[[str], None],
+) -> Stage:
+    """Run the experiments and write ``machine.toml`` and the traces.
+
+    Raises
+    ------
+    Declined
+        The person did not consent; nothing was moved.
+    IdentificationError
+        A trap was seen; no number is given.
+    StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
+        As the guard ends the experiment.
+    """
+    request.check()
+    envelope = envelope_of(nameplate, request)
+    envelope.refuse_gravity()
+    steps = steps_of(request.quantities, request.shaft == "locked")
+    if "speeds" in steps:
+        require_speed(envelope.speed_max_rad_s, nameplate.machine.n_max_rpm or 0.0)
+    if "rotation" in steps:
+        dwell_within(0.0, envelope.speed_max_rad_s)
+    allow_motion(plan_lines(envelope, request, nameplate))
+    run.save(NAMEPLATE, dump_machine_file(nameplate))
+    run.save(REQUEST, dump_request(request))
+    limits = Limits(
+        I_nom_apk=nameplate.machine.I_nom_apk or envelope.i_max_apk,
+        i_max_apk=envelope.i_max_apk,
+        omega_max_rad_s=envelope.speed_max_rad_s,
+        V_max_v=nameplate.inverter.V_max_v,
+        i_d_max_apk=envelope.i_d_max_apk,
+    )
+
+    clock = drive.node.connection.clock
+    start = clock.now()
+    try:
+        _measure(run, drive, envelope, limits, request, say)
+    except (DriveFault, IdentificationError, SafetyRefusal) as error:
+        # what was measured before is not lost: it is evaluated and recorded, and the run ends as it did
+        with contextlib.suppress(PmsmtoolError):
+            kept = evaluated_stage(run, nameplate, request)
+            run.add(replace(kept, status=status_of(error), note=text_of(error), seconds=clock.now() - start))
+        raise
+    stage = evaluated_stage(run, nameplate, request)
+    return replace(stage, seconds=clock.now() - start)
+
+
+def _measure(
+    run: RunDirectory,
+    drive: CanopenDrive,
+    envelope: Envelope,
+    limits: Limits,
+    request: IdentifyRequest,
+    say: Callable[[str], None],
+) -> None:
+    """Run the experiments inside the guard; traces, predictions and refusals go into the run."""
+
+    def keep(name: str, trace: Trace) -> None:
+        run.save(f"traces/{name}.npz", trace_npz(trace))
+
+    with guarded(drive, envelope, first=starting_gains(limits), say=say) as guard:
+        locked = request.shaft == "locked"
+        measurement = Measurement(
+            guard,
+            limits,
+            keep,
+            say,
+            held=locked,
+            half_frequency=request.half_frequency,
+            map_if_saturated=request.map_if_saturated,
+        )
+        measurement.spent = lambda: (guard.energised_s, guard.energy_j)
+        predictions: list[dict[str, Any]] = []
+
+        def predicted(prediction: dict[str, Any]) -> None:
+            predictions.append(prediction)
+            run.save(PREDICTED, dump_predicted(predictions))
+
+        measurement.predicted = predicted
+        try:
+            measurement.run(request.quantities)
+        finally:
+            if measurement.refused:
+                run.save(REFUSED, dump_refused(measurement.refused))

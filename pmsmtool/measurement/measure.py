@@ -1,0 +1,381 @@
+# SPDX-License-Identifier: MIT
+"""The order of the experiments on one drive: each uses what the ones before it found, and leaves its traces.
+
+Noise and phases at five percent of the rated current come first, then resistance and inverter, pole pairs and offset,
+inductances at standstill, and last what turns the shaft. Between two experiments the drive is off while what was found
+goes into its parameters, so that its own control fits the machine; the guard puts everything back at the end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from pmsmtool.drive.port import Drive
+from pmsmtool.errors import IdentificationError, PmsmtoolError
+from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.noise import Noise, estimate_noise
+from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phases
+from pmsmtool.estimators.prediction import check_prediction, line_of, predict
+from pmsmtool.estimators.resistance import ResistanceResult
+from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
+from pmsmtool.experiments.frequency_response import FrequencyPlan
+from pmsmtool.experiments.mechanics_run import MechanicsPlan
+from pmsmtool.experiments.vector_turn import RAMP_S
+from pmsmtool.identification.evaluate import flux_of, resistance_of, tolerance_on
+from pmsmtool.identification.predicted_file import entry
+from pmsmtool.identification.request import steps_of
+from pmsmtool.measurement import flux_map, frequency_response, mechanics, shaft_forecast
+from pmsmtool.measurement.half_frequency import measure_at_half_frequency
+from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.shaft_forecast import ShaftForecast, forecast_of
+from pmsmtool.measurement.speeds import EMF_SHARE, SpeedStage
+from pmsmtool.measurement.square_waves import SquareStage
+from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.trace import Trace
+
+PHASE_CHECK_SHARE = 0.05
+LEVELS = 12
+LOWEST_LEVEL = 0.08
+"""Lowest DC level of the sweep, of the largest; the low ones serve the inverter curve."""
+CURVE_SHARES = (0.02, 0.04)
+"""Levels for the inverter curve alone: a speed run at small current lives there."""
+TURN_SHARES = (0.15, 0.35, 0.6)
+"""Currents that turn the rotor over, of the test current: the first that the encoder shows. A load whose friction takes
+15 % of the rated torque keeps the rotor from following the first."""
+ROTATIONS = (
+    (0.35, rotation.QUICK_STEP_RAD, rotation.QUICK_DWELL_S, RAMP_S),
+    (0.18, rotation.STEP_RAD, 0.03, 3.0 * RAMP_S),
+    (0.09, rotation.STEP_RAD, 0.03, 4.0 * RAMP_S),
+)
+"""Current, of the test current, largest step (rad), time per step and ramp (s) of every try. Above psi/(L_q - L_d) a d
+current is no stable position: a reluctance machine follows a smaller vector only, and swings longer on it. The next two
+have another speed and longer ramps, too, for a rotor that swings with the first."""
+SATURATED = 0.01
+"""Change of the flux linkage, mean of both signs of i_d over the one without, from which on a machine is mapped: -0.03
+of the saturated profile, below 0.0035 of linear drives, 0.007 to 0.02 beside 5 % of iron loss."""
+OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
+RIPPLE_SHARE = 0.25
+
+
+_Found = TypeVar("_Found")
+COMPENSATION = "inverter.deadtime_compensation"
+START_GAIN_SHARE = 1.0 / 15.0
+"""Proportional gain before anything is known, of V_max / I_nom: an eighth of the limit of stability (L times 1.05 per
+period, for a delay of 1.5) where the rated current drops a tenth of the voltage in L and 30 periods are a turn."""
+START_INTEGRAL_RATE_RAD_S = 100.0
+"""Integral gain over the proportional one."""
+
+
+def starting_gains(limits: Limits) -> dict[str, float]:
+    """Return gains from the ratings alone; a drive may hold those of another motor, far too weak or unstable here."""
+    K_p = START_GAIN_SHARE * limits.V_max_v / limits.I_nom_apk
+    gains = {"K_p_d_v_per_a": K_p, "K_p_q_v_per_a": K_p}
+    gains |= {f"K_i_{axis}_v_per_as": START_INTEGRAL_RATE_RAD_S * K_p for axis in "dq"}
+    wanted = {f"current.{name}": gain for name, gain in gains.items()}
+    # the loop that holds a bias takes its gain from the inductances
+    wanted |= {f"motor.L_{axis}_h": K_p / square_injection.BIAS_BANDWIDTH_RAD_S for axis in "dq"}
+    return {name: min(value, BY_NAME[name].maximum) for name, value in wanted.items()}
+
+
+@dataclass(slots=True)
+class Measurement:
+    """One run of the experiments.
+
+    Parameters
+    ----------
+    drive : Drive
+        Guarded, and off.
+    limits : Limits
+        What may be used.
+    keep : callable
+        Stores a trace under its name as soon as it is there.
+    say : callable
+        Told one line per experiment.
+    ripple_share : float
+        Ripple of the injection, peak to peak, of the rated current.
+    held : bool
+        Whether the shaft is locked.
+    half_frequency : bool
+        Whether R is measured at half the control frequency, too.
+    map_if_saturated : bool
+        Whether a machine that saturates is mapped without being asked for it.
+    spent : callable or None
+        Seconds energised and copper loss so far (s, J), told after every stage.
+    turn_share : float
+        Current that turns the rotor over, of the test current; more where it did not follow.
+    predicted : callable or None
+        Told every prediction (``identification/predicted_file``) before the machine moves for it.
+    """
+
+    drive: Drive
+    limits: Limits
+    keep: Callable[[str, Trace], None]
+    say: Callable[[str], None]
+    ripple_share: float = RIPPLE_SHARE
+    held: bool = False
+    half_frequency: bool = False
+    map_if_saturated: bool = False
+    spent: Callable[[], tuple[float, float]] | None = None
+    predicted: Callable[[dict[str, Any]], None] | None = None
+    turn_share: float = TURN_SHARES[0]
+    refused: dict[str, IdentificationError] = field(default_factory=dict)
+    _kept: dict[str, Trace] = field(default_factory=dict)
+
+    def run(self, quantities: tuple[str, ...]) -> None:
+        """Run what the quantities need; what is refused (:attr:`refused`) takes along only what depends on it.
+
+        Raises
+        ------
+        IdentificationError
+            Noise, phases, encoder counts or current sensors: nothing more is moved.
+        """
+        steps = steps_of(quantities, self.held)
+        if self.drive.read(COMPENSATION) != 0.0:
+            self.drive.write({COMPENSATION: 0.0})  # of an earlier commissioning: the inverter's own error is asked for
+        noise = self._zero_current()
+        phases = self._phase_check(noise)
+        self._predict(noise, phases, steps)
+        self._tell_spent()
+        start = standstill.PHASE_ANGLES_RAD[-1]
+        if "rotation" in steps:
+            self._encoder_counts(start, standstill.DC_ANGLE_RAD)
+            start = standstill.DC_ANGLE_RAD
+        resistance = self._attempt("R", lambda: self._levels(noise, start)) if "levels" in steps else None
+        if resistance is not None:
+            self._pairs(noise, resistance)
+        self._tell_spent()
+        last = standstill.DC_ANGLE_RAD + (standstill.PHASE_ANGLES_RAD[-1] if resistance is not None else 0.0)
+        encoder = self._attempt("encoder", lambda: self._rotation(last)) if "rotation" in steps else None
+        self._tell_spent()
+        turned = False
+        if resistance is not None and encoder is not None:
+            turned = self._driven(noise, resistance, encoder, steps)
+        mapped = "map" in steps or (turned and self.map_if_saturated and self._saturates(resistance))
+        if resistance is not None and mapped and (self.held or turned):
+            known = resistance
+            self._attempt(
+                "map",
+                lambda: flux_map.measure_map(self.drive, self.limits, noise, known, self.held, self.keep, self.say),
+            )
+            if turned and encoder is not None:
+                self.say("flux linkage after the pulses: two windows of the run over speeds once more")
+                rows = speed_run.repeat_fastest_pair(self.drive, self._kept["speeds"], round(encoder.pole_pairs.value))
+                self.keep("speeds_after_map", speed_run.speeds_trace(rows, {}))
+
+    def _driven(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> bool:
+        """Run what needs the rotor's angle; whether the machine runs under control by what was found."""
+        square = SquareStage(self.drive, self.limits, self._keep_for_later, self.say, self.ripple_share)
+        inductances = (
+            self._attempt("L", lambda: square.measure(noise, resistance, encoder)) if "square" in steps else None
+        )
+        self._tell_spent()
+        if inductances is None or "speeds" not in steps:
+            return False
+        speeds = SpeedStage(self.drive, self.limits, self._keep_for_later, self.say)
+
+        def coasted() -> bool:
+            speeds.measure(resistance, encoder, inductances)
+            return True
+
+        ran = self._attempt("psi", coasted)
+        self._tell_spent()
+        if ran and steps & set(shaft_forecast.LATER):
+            self._shaft(noise, resistance, encoder, steps)
+        return bool(ran)
+
+    def _saturates(self, resistance: ResistanceResult | None) -> bool:
+        """Whether the run over speeds shows a d axis that saturates so far that a flux map is due; said if so."""
+        if resistance is None:
+            return False
+        try:
+            rough = float(self.drive.read("motor.alpha_psi_per_k"))
+            flux = flux_of(self._kept, resistance, self.drive.period_s, rough, self._tolerance())
+        except IdentificationError:
+            return False  # the evaluation says so
+        if abs(flux.curvature) < SATURATED:
+            return False
+        self.say(
+            f"the machine saturates: d currents change the flux of their mean by {100.0 * flux.curvature:+.2g} %; "
+            "a flux map is measured"
+        )
+        return True
+
+    def _attempt(self, quantity: str, measure: Callable[[], _Found]) -> _Found | None:
+        """Measure; a refusal is kept and said, and the drive is off until the next experiment enables it."""
+        try:
+            return measure()
+        except IdentificationError as refusal:
+            self.refused[quantity] = refusal
+            self.say(f"  {quantity} refused: {refusal.what}")
+            self.drive.disable()
+            self.drive.enable()
+            return None
+        except PmsmtoolError as error:  # it ends the run; the traces of this experiment are not whole
+            self.refused[quantity] = IdentificationError(
+                "E_NOT_MEASURED", f"the run ended during it: {error.what}", hint="remove the cause, identify again"
+            )
+            raise
+
+    def _shaft(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> None:
+        """Run what measures the shaft, and say before each how well."""
+        forecast = self._forecast(noise, resistance, encoder)
+        if "coasting" in steps:
+
+            def pushes(plan: MechanicsPlan) -> None:
+                if forecast is not None:
+                    values = forecast.mechanics(plan)
+                    self.say(shaft_forecast.mechanics_line(values))
+                    self._tell(entry("mechanics", values, rough=forecast.rough))
+
+            self._attempt(
+                "mechanics",
+                lambda: mechanics.measure_mechanics(self.drive, self.limits, self.keep, self.say, pushes),
+            )
+            self._tell_spent()
+        if "response" in steps:
+
+            def sequence(plan: FrequencyPlan) -> None:
+                if forecast is not None:
+                    found = forecast.response(plan, self.drive.period_s)
+                    self.say(shaft_forecast.response_line(found))
+                    at = {f"response_{hz:g}_hz": found.at(hz) for hz in shaft_forecast.AT_HZ}
+                    values = {"J_kgm2": found.J, **at}
+                    self._tell(entry("frequency response", values, coherent_to_hz=found.highest_hz))
+
+            self._attempt(
+                "frf",
+                lambda: frequency_response.measure_frequency_response(
+                    self.drive, self.limits, self.keep, self.say, sequence
+                ),
+            )
+            self._tell_spent()
+
+    def _forecast(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult) -> ShaftForecast | None:
+        """Return what is known of the shaft so far; None, and said, where its traces are refused."""
+        try:
+            return forecast_of(self.drive, self._kept, noise, resistance, encoder, self._tolerance())
+        except IdentificationError as error:
+            self.say(shaft_forecast.not_predicted(error))
+            self._tell(entry("mechanics", {}, reason=str(error)))
+            return None
+
+    def _tolerance(self) -> SensorTolerance:
+        return tolerance_on(SensorTolerance(), math.sqrt(3.0) * self.limits.V_max_v)
+
+    def _tell(self, prediction: dict[str, Any]) -> None:
+        if self.predicted is not None:
+            self.predicted(prediction)
+
+    def _keep_for_later(self, name: str, trace: Trace) -> None:
+        self._kept[name] = trace
+        self.keep(name, trace)
+
+    def _zero_current(self) -> Noise:
+        self.say("noise: currents of the drive at rest")
+        trace = standstill.record_zero_current(self.drive)
+        self.keep("zero_current", trace)
+        return estimate_noise(trace)
+
+    def _tell_spent(self) -> None:
+        if self.spent is not None:
+            seconds, energy = self.spent()
+            self.say(f"  so far energised for {seconds:.1f} s, {energy:.3g} J in the winding")
+
+    def _predict(self, noise: Noise, phases: PhaseCheck, steps: set[str]) -> None:
+        """Say how good the numbers will be, and stop here where they cannot be good enough."""
+        limits = self.limits
+        if "levels" not in steps:
+            return
+        prediction = predict(
+            noise,
+            standstill.calm_sequence(self._magnitudes()),
+            standstill.LEVEL_WINDOW,
+            self.ripple_share * limits.I_test_apk,
+            2 * square_injection.SHOT_SAMPLES,
+            max(abs(z * i) for z, i in zip(phases.impedance_ohm, phases.currents_a, strict=True)),
+            EMF_SHARE * limits.V_max_v * speed_run.SHARES[1],
+            self._tolerance(),
+        )
+        values = prediction.values(steps)
+        self.say(line_of(values))
+        later = shaft_forecast.later_line(steps)
+        if later:
+            self.say(later)
+        self._tell(
+            entry("levels", values, later=[what for step, what in shaft_forecast.LATER.items() if step in steps])
+        )
+        check_prediction(values)
+
+    def _magnitudes(self) -> list[float]:
+        """DC levels that are held with both signs (A)."""
+        largest = self.limits.I_test_apk
+        ratio = (1.0 / LOWEST_LEVEL) ** (1.0 / (LEVELS - 1))
+        magnitudes = [largest * max(LOWEST_LEVEL, (k + 1) / LEVELS) for k in range(LEVELS)]
+        magnitudes[:2] = [largest * LOWEST_LEVEL, largest * LOWEST_LEVEL * ratio]
+        return sorted(set(magnitudes))
+
+    def _phase_check(self, noise: Noise) -> PhaseCheck:
+        i_a = PHASE_CHECK_SHARE * self.limits.I_test_apk
+        self.say(f"phases: three vectors of {i_a:.3g} A")
+        self.drive.enable()
+        trace = standstill.hold_phase_vectors(self.drive, i_a)
+        self.keep("phase_vectors", trace)
+        return check_phases(trace, noise)
+
+    def _encoder_counts(self, start_rad: float, end_rad: float) -> None:
+        for share in TURN_SHARES:
+            self.turn_share = share
+            trace = standstill.turn_and_look(self.drive, share * self.limits.I_test_apk, start_rad, end_rad)
+            try:
+                check_encoder_counts(trace)
+                break
+            except IdentificationError:
+                if share == TURN_SHARES[-1]:
+                    self.keep("first_turn", trace)
+                    raise
+        self.keep("first_turn", trace)
+
+    def _levels(self, noise: Noise, start_rad: float) -> ResistanceResult:
+        largest = self.limits.I_test_apk
+        low = [largest * share for share in CURVE_SHARES]
+        plan = standstill.LevelPlan(
+            standstill.calm_sequence(self._magnitudes(), low),
+            turn_a=self.turn_share * largest,
+            start_rad=start_rad,
+        )
+        self.say(f"R and inverter: {len(plan.levels_a)} levels up to {largest:.3g} A")
+        trace = standstill.hold_levels(self.drive, plan)
+        self.keep("levels", trace)
+        resistance = resistance_of(trace, noise)
+        measure_at_half_frequency(self.drive, plan, resistance, self.half_frequency, self.keep, self.say)
+        return resistance
+
+    def _pairs(self, noise: Noise, resistance: ResistanceResult) -> None:
+        """Compare the phases; current sensors that differ spoil every value, so that ends the run."""
+        largest = self.limits.I_test_apk
+        strongest = max(standstill.PAIR_SHARES) * largest
+        self.say(f"pairs of phases: two currents up to {strongest:.3g} A through each")
+        pairs = standstill.hold_pairs(self.drive, largest, self.turn_share * largest, standstill.DC_ANGLE_RAD)
+        self.keep("phase_pairs", pairs)
+        check_pairs(pairs, noise, resistance.curve)
+
+    def _rotation(self, start_rad: float) -> EncoderResult:
+        """Turn the vector from where it was last; with less current and slower again when the rotor was not on it."""
+        for share, step_rad, dwell_s, ramp_s in ROTATIONS:
+            step, dwell = rotation.step_within(step_rad, dwell_s, self.limits.omega_max_rad_s)
+            plan = rotation.RotationPlan(share * self.limits.I_test_apk, step, dwell, ramp_s=ramp_s)
+            self.say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
+            forward, backward = rotation.rotate_vector(self.drive, plan, start_rad=start_rad)
+            self.keep("rotation_forward", forward)
+            self.keep("rotation_backward", backward)
+            start_rad = 0.0  # where a turn ends
+            try:
+                return estimate_encoder(forward, backward)
+            except IdentificationError as error:
+                if error.reason not in OFF_THE_VECTOR or share == ROTATIONS[-1][0]:
+                    raise
+        raise AssertionError("the last try returns or raises")

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""The pushes for inertia and friction on the drive: sized, and recorded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
+from typing import TYPE_CHECKING
+
+from pmsmtool.drive.port import Drive
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.experiments import mechanics_run, speed_run
+from pmsmtool.experiments.mechanics_run import MechanicsPlan
+from pmsmtool.identification.mechanics import TRACE
+from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.trace import Trace
+from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
+
+if TYPE_CHECKING:
+    from pmsmtool.measurement.limits import Limits
+
+I_SHARE = 0.5
+"""Current of the pushes, of the test current."""
+SPEED_SHARE = 0.6
+"""Speed they aim at, of the largest that back-emf and envelope allow; the friction's share is not known before."""
+EMF_SHARE = 0.6
+ABORT_SHARE = 0.95
+REST_SHARE = 0.02
+"""Largest speed before the first push, of the speed that it is to reach."""
+PLAN_LINE = "pushes turn the shaft both ways, and it coasts with the voltage off"
+
+
+def numbered(drive: Drive, name: str, keep: Callable[[str, Trace], None]) -> Callable[[Trace], None]:
+    """Return what keeps trace after trace as ``name`` 0, 1, ... with offset and direction of the drive's encoder."""
+    frame = {
+        "offset_rad": drive.read("encoder.offset_rad"),
+        "direction": -1 if drive.read("encoder.reversed") else 1,
+    }
+    number = count()
+
+    def keep_part(trace: Trace) -> None:
+        keep(f"{name}{next(number)}", replace(trace, meta={**trace.meta, **frame}))
+
+    return keep_part
+
+
+def measure_mechanics(
+    drive: Drive,
+    limits: Limits,
+    keep: Callable[[str, Trace], None],
+    say: Callable[[str], None],
+    planned: Callable[[MechanicsPlan], None] | None = None,
+) -> None:
+    """Run the steps; the drive holds current gains, flux linkage and rough inertia of the runs before.
+
+    ``planned`` is told the plan before anything of it moves the shaft.
+    """
+    pole_pairs = drive.read("motor.pole_pairs")
+    psi, J, L_q = (drive.read(f"motor.{name}") for name in ("psi_f_wb", "J_kgm2", "L_q_h"))
+    current = I_SHARE * limits.I_test_apk
+    largest = min(limits.omega_max_rad_s, EMF_SHARE * limits.V_max_v / (pole_pairs * math.hypot(psi, L_q * current)))
+    plan = mechanics_run.plan_mechanics(current, SPEED_SHARE * largest, J, torque_per_ampere(pole_pairs, psi))
+    say(
+        f"J, B, tau_c: pushes of {plan.i_q_a:.3g} A up to about {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm and "
+        f"coasting with the voltage off, {plan.duration_s:.2g} s"
+    )
+    if planned is not None:
+        planned(plan)
+    _come_to_rest(drive, pole_pairs * plan.omega_rad_s)
+    keep_part = numbered(drive, TRACE, keep)
+    abort = ABORT_SHARE * pole_pairs * limits.omega_max_rad_s
+    mechanics_run.push_and_coast(drive, plan, abort, keep_part)
+    drive.enable()
+    _come_to_rest(drive, pole_pairs * plan.omega_rad_s)
+
+
+def _come_to_rest(drive: Drive, reached_rad_s: float) -> None:
+    """Stop the shaft by the speed controller; the speed is electrical."""
+    drive.command_speed(0.0)
+    band = REST_SHARE * reached_rad_s
+    rate = rad_s_from_rpm(drive.read("speed.acceleration_rpm_per_s")) * drive.read("motor.pole_pairs")
+    ramp_s = min(speed_run.RAMP_MOST_S, speed_run.RAMP_DOUBT * reached_rad_s / rate) if rate > 0.0 else 0.0
+    waited = speed_run.reach(drive, 0.0, limit_s=speed_run.REACH_LIMIT_S + ramp_s, band_rad_s=band)
+    if waited >= speed_run.REACH_LIMIT_S + ramp_s:
+        raise refuse(
+            "E_EXCITATION",
+            f"the shaft is not at rest {waited:.2g} s after it was asked to",
+            stage="mechanics",
+            likely="something drives the shaft, or it has much inertia for the current that is allowed",
+            hint="allow a higher --i-max, or a lower --speed-max",
+        )

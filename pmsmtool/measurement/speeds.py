@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: MIT
+"""The flux linkage's part of an identification: what turns the shaft, from the first push to coasting with current."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pmsmtool.design.loops.current_loop import imc
+from pmsmtool.drive.port import Drive
+from pmsmtool.estimators.encoder import EncoderResult
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.resistance import ResistanceResult
+from pmsmtool.experiments import speed_run
+from pmsmtool.experiments.shaft_answer import FIRST_S, FIRST_SHARE
+from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.measurement.limits import Limits
+from pmsmtool.trace import Trace
+from pmsmtool.units import rpm_from_rad_s
+
+EMF_SHARE = 0.8
+"""Largest speed of the flux run: back-emf of this share of the largest voltage."""
+RUN_BANDWIDTH_RAD_S = 2.0 * math.pi * 120.0
+"""Current bandwidth of the runs that turn the shaft, at most a fifteenth of the sampling rate; the flux run may have
+more."""
+PUSH_SHARE = 0.5
+PUSH_SPEED_SHARE = 0.12
+PUSH_SAMPLES = 1024
+PUSH_END_SHARE, SLOW_PUSH_SHARE = 0.9, 0.5
+"""Speed at which the drive ends a push by itself, of the speed limit; the speed of one that would get there."""
+PUSH_REACHED = 0.4
+"""Part of its speed that a push must get to: beside a dead time of 8 R I the current came in the last eighth of it, and
+a flux linkage of half its value, told at 1 % of the speed limit, led the run into the voltage limit."""
+PUSH_TRIES = 4
+"""Pushes in either direction, each of twice the time of the one before."""
+SPEED_LOOP_RAD_S = 25.0
+RUN_I_D_SHARE, RUN_I_D_MOST = 0.45, 0.8
+"""Largest d current of the flux run, of the test current: a third of it is still beyond the inverter's knee."""
+RUN_I_D_RIPPLES = 2.0
+"""The same in amplitudes of the ripple, whose part of the inverter's error falls with the d current: three drives whose
+ripple is 0.23 to 0.4 of the test current had psi_f -0.50, -0.40 and 0.52 % off with 0.45 of it."""
+SATURATED = 1.5
+"""Largest ratio of the chord of psi_d over the run's i_d to the rough L_d, which is that of a saturated bias."""
+RUN_I_Q_SPEED_SHARE = 0.15
+RUN_I_Q_LATE_S = 0.025
+"""A q current of the flux run may change the speed by this share of the largest until its window is over and the bus
+has answered, this late. Without the time in which currents settle, which a large dead time makes three times as long,
+one of 1005 drives was braked to a ninth of its speed, by half in one window (seed 70189)."""
+REACTANCE_SHARE = 0.25
+"""Voltage that the accelerating current may need at the largest speed, of the largest voltage."""
+REST_SHARE = 0.02
+"""Speed that counts as standstill, of the largest of the flux run."""
+
+
+def q_current_s(settle_s: float) -> float:
+    """Return how long a q current of the flux run accelerates the shaft (s)."""
+    return settle_s + speed_run.Q_WINDOW_S + RUN_I_Q_LATE_S
+
+
+def run_d_current(limits: Limits, L_h: tuple[float, float], period_s: float) -> float:
+    """Return the largest d current of the flux run (A), from rough inductances (H)."""
+    ripple_a = math.sqrt(3.0) * limits.V_max_v * period_s / (8.0 * max(L_h))
+    wanted = max(RUN_I_D_SHARE * limits.I_test_apk, RUN_I_D_RIPPLES * ripple_a)
+    return min(wanted, RUN_I_D_MOST * limits.I_test_apk)
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedStage:
+    """The pushes and the flux run on one drive; the fields are those of ``measure.Measurement``."""
+
+    drive: Drive
+    limits: Limits
+    keep: Callable[[str, Trace], None]
+    say: Callable[[str], None]
+
+    def measure(self, resistance: ResistanceResult, encoder: EncoderResult, L: tuple[float, float]) -> None:
+        """Push the shaft, then coast with current through the speeds, under control by what was found so far."""
+        pole_pairs = round(encoder.pole_pairs.value)
+        alpha = min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s))
+        d, q = (imc(resistance.R_measured.value, inductance, alpha) for inductance in L)
+        self.drive.disable()
+        self.drive.write(
+            {
+                "motor.L_d_h": L[0],
+                "motor.L_q_h": L[1],
+                "motor.L_d_app_h": L[0],
+                "motor.L_q_app_h": L[1],
+                "current.K_p_d_v_per_a": d.K_p,
+                "current.K_i_d_v_per_as": d.K_i,
+                "current.K_p_q_v_per_a": q.K_p,
+                "current.K_i_q_v_per_as": q.K_i,
+            }
+        )
+        self.drive.enable()
+        psi, J = self._pushes(resistance, pole_pairs)
+        self._speeds(psi, J, pole_pairs, L, resistance.V_dead_v)
+
+    def _pushes(self, resistance: ResistanceResult, pole_pairs: int) -> tuple[float, float]:
+        """Push the rotor there and back; return flux linkage (Wb) and inertia (kg m2), good for a speed controller."""
+        limits = self.limits
+        self.say("flux and inertia, roughly: short pushes both ways")
+        target = PUSH_SPEED_SHARE * limits.omega_max_rad_s
+        rate = self._acceleration_per_ampere(target, pole_pairs)
+        current = PUSH_SHARE * limits.I_test_apk
+        decimation = max(1, round(target / (rate * current) / (PUSH_SAMPLES * self.drive.period_s)))
+        reached = rate * current * PUSH_SAMPLES * decimation * self.drive.period_s
+        if reached > PUSH_END_SHARE * limits.omega_max_rad_s:  # within the shortest record
+            current *= SLOW_PUSH_SHARE * limits.omega_max_rad_s / reached
+            reached = SLOW_PUSH_SHARE * limits.omega_max_rad_s
+        tail = slice(-64, None)
+        for _ in range(PUSH_TRIES):
+            pushes = [self._push(sign * current, PUSH_SAMPLES, decimation, pole_pairs) for sign in (1.0, -1.0)]
+            fastest = max(pushes, key=lambda trace: float(abs(trace["omega_e_rad_s"][tail].mean())))
+            omega = float(fastest["omega_e_rad_s"][tail].mean())
+            if abs(omega) >= PUSH_REACHED * reached * pole_pairs:
+                break
+            decimation *= 2
+        for k, push in enumerate(pushes):
+            self.keep(f"push_{k}", push)
+        i_q = float(fastest["i_q_a"][tail].mean())
+        error = resistance.V_dead_v * (1.0 if i_q > 0.0 else -1.0) * 4.0 / math.pi
+        psi = (float(fastest["u_q_v"][tail].mean()) - resistance.R_measured.value * i_q - error) / omega
+        if not psi > 0.0:
+            raise refuse(
+                "E_EXCITATION",
+                f"the voltage at {omega:.3g} rad/s shows no flux linkage ({psi:.3g} Wb)",
+                stage="speed run",
+                likely="the pushes were too slow for this inverter's dead time",
+                hint="allow a higher --speed-max",
+            )
+        return psi, torque_per_ampere(pole_pairs, psi) / rate
+
+    def _acceleration_per_ampere(self, target: float, pole_pairs: int) -> float:
+        """Return the acceleration per ampere (rad/s2/A), from pushes that grow until the shaft answers."""
+        current, seconds = FIRST_SHARE * self.limits.I_test_apk, FIRST_S
+        for _ in range(9):
+            decimation = max(1, round(seconds / (256 * self.drive.period_s)))
+            push = self._push(current, 256, decimation, pole_pairs)
+            omega = push["omega_e_rad_s"] / pole_pairs
+            change = float(omega[-16:].mean() - omega[:16].mean())
+            self._push(-current, 256, decimation, pole_pairs)
+            if abs(change) > 0.15 * target:
+                # from the current that flowed: a slow loop, or a dead time, lets it rise late
+                return abs(change) / abs(float(np.sum(push["i_q_a"][8:-8])) * push.period_s)
+            if current < 0.4 * self.limits.I_test_apk:
+                current *= 2.0
+            else:
+                seconds *= min(4.0, 0.5 * target / max(abs(change), 1e-3 * target))
+        raise refuse(
+            "E_EXCITATION",
+            "the shaft does not answer a push",
+            stage="speed run",
+            likely="a locked shaft, a brake that is closed, or an encoder that does not count",
+        )
+
+    def _push(self, i_q_a: float, samples: int, decimation: int, pole_pairs: int) -> Trace:
+        omega_e = PUSH_END_SHARE * pole_pairs * self.limits.omega_max_rad_s
+        return speed_run.push_and_record(self.drive, i_q_a, samples, decimation, omega_e)
+
+    def _speeds(self, psi: float, J: float, pole_pairs: int, L: tuple[float, float], V_dead_v: float) -> None:
+        limits = self.limits
+        run_i_d = run_d_current(limits, L, self.drive.period_s)
+        flux = psi + SATURATED * L[0] * run_i_d
+        largest = min(limits.omega_max_rad_s / 1.1, EMF_SHARE * limits.V_max_v / (flux * pole_pairs))
+        # the accelerating current must leave voltage for itself: omega_e L_q i_q stands beside the back-emf
+        i_run = min(0.5 * limits.I_test_apk, REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L)))
+        per_ampere = torque_per_ampere(pole_pairs, psi) / J
+        # a current that is slow because the inverter's error is steep would not be steady in its window
+        loop = speed_run.steady_loop(
+            self.drive.read("motor.R_s_ohm"),
+            L,
+            V_dead_v,
+            min(map(min, speed_run.D_SHARES)) * run_i_d,
+            self.drive.period_s,
+            min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s)),
+        )
+        i_q = min(0.5 * i_run, RUN_I_Q_SPEED_SHARE * largest / (q_current_s(loop.settle_s) * per_ampere))
+        self._off_and_write(
+            {
+                "current.K_p_d_v_per_a": loop.K_p_v_per_a[0],
+                "current.K_p_q_v_per_a": loop.K_p_v_per_a[1],
+                "current.K_i_d_v_per_as": loop.K_i_v_per_as[0],
+                "current.K_i_q_v_per_as": loop.K_i_v_per_as[1],
+                "motor.psi_f_wb": psi,
+                "motor.J_kgm2": J,
+                "current.options": 7.0,
+                "speed.K_p_nms_per_rad": 2.0 * SPEED_LOOP_RAD_S * J,
+                "speed.K_i_nm_per_rad": SPEED_LOOP_RAD_S**2 * J,
+                "speed.tau_max_nm": 1.6 * J * per_ampere * i_run,
+                "speed.acceleration_rpm_per_s": rpm_from_rad_s(per_ampere * i_run),
+            }
+        )
+        self.drive.enable()
+        fastest_rpm = rpm_from_rad_s(largest)
+        self.say(f"psi_f and fine offset: coasting from up to {fastest_rpm:.0f} rpm, i_d up to {run_i_d:.3g} A")
+        plan = speed_run.SpeedPlan(
+            largest,
+            run_i_d,
+            i_q,
+            settle_s=loop.settle_s,
+            first_s=2.0 * loop.settle_s,
+            per_ampere_rad_s2=per_ampere,
+            acceleration_rad_s2=per_ampere * i_run,
+        )
+        rows = speed_run.coast_through(self.drive, plan, pole_pairs)
+        speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)
+        lag_s = 2.0 / self.drive.read("encoder.pll_bandwidth_rad_s")  # its poles are a double one
+        facts = {"pole_pairs": pole_pairs, "U_dc_v": math.sqrt(3.0) * limits.V_max_v, "speed_lag_s": lag_s}
+        facts["delay_periods"] = self.drive.read("inverter.delay_periods")
+        self.keep("speeds", speed_run.speeds_trace(rows, facts))
+
+    def _off_and_write(self, values: Mapping[str, float]) -> None:
+        self.drive.disable()
+        self.drive.write(values)

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: MIT
+"""The inductances' part of an identification: the bias that holds the rotor, and square waves of voltage on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from pmsmtool.drive.port import Drive
+from pmsmtool.estimators.encoder import EncoderResult
+from pmsmtool.estimators.noise import Noise
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.resistance import ResistanceResult
+from pmsmtool.experiments import square_injection
+from pmsmtool.measurement.limits import Limits
+from pmsmtool.trace import Trace
+
+BIAS_SHARE = 0.5
+BIAS_TRIES = 4
+BIAS_OFF_RAD = math.radians(6.0)
+"""Angle between rotor and bias vector that a load or friction may make (electrical)."""
+ALIGN_TRIES = 3
+"""Times the frame follows a rotor that was moved by the change of the frame itself."""
+NOISE_RIPPLE = 25.0
+"""Smallest ripple, peak to peak, in noise of one sample: an inverter's knee biases less than a ripple that drowns."""
+BIAS_ON_RAD = math.radians(2.0)
+"""The same, of a vector that was put on the rotor's axis: more is motion."""
+BIAS_MOST = 0.8
+"""Largest bias, of the test current: the ripple comes on top."""
+RIPPLE_LEAST = 0.2
+"""Smallest ripple, of the wanted one, that the inverter's knee may leave: below, noise decides."""
+CROSSING = 0.433
+"""A ripple on q reaches the phases at half the bias by sqrt(3)/4 of its peak-to-peak value
+(docs/identification.md, 3.2)."""
+U_SHARE = 0.5
+"""Largest injection amplitude, of the largest voltage."""
+
+
+def clear_ripple(wanted_a: float, bias_a: float, knee_a: float, angle_rad: float = 0.0) -> float:
+    """Return the ripple (A peak to peak) that keeps every phase current above the knee, or the least useful one.
+
+    The smallest phase current of a bias at a (small) stator angle is its share cos(60 deg + |angle|).
+    """
+    smallest = bias_a * math.cos(math.pi / 3.0 + abs(angle_rad))
+    return max(RIPPLE_LEAST * wanted_a, min(wanted_a, (smallest - knee_a) / CROSSING))
+
+
+def bias_and_ripple(I_test_apk: float, ripple_share: float, knee_a: float) -> tuple[float, float]:
+    """Return the d bias and the ripple, peak to peak (A), of the square wave.
+
+    No phase current may come into the inverter's knee: bias above 2 (0.433 ripple + knee) (docs/identification.md,
+    3.2). A steep inverter leaves half the test current; a soft one raises the bias, then lowers the ripple.
+
+    Parameters
+    ----------
+    I_test_apk : float
+        Largest steady current (A peak).
+    ripple_share : float
+        Wanted ripple, peak to peak, of that current.
+    knee_a : float
+        Phase current at which the measured error curve reaches its plateau (A).
+    """
+    wanted = ripple_share * I_test_apk
+    bias = min(BIAS_MOST * I_test_apk, max(BIAS_SHARE * I_test_apk, 2.0 * (CROSSING * wanted + knee_a)))
+    return bias, clear_ripple(wanted, bias, knee_a)
+
+
+@dataclass(frozen=True, slots=True)
+class SquareStage:
+    """The shots on one drive; the fields are those of ``measure.Measurement``."""
+
+    drive: Drive
+    limits: Limits
+    keep: Callable[[str, Trace], None]
+    say: Callable[[str], None]
+    ripple_share: float
+
+    def measure(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult) -> tuple[float, float]:
+        """Record the shots; return rough inductances (H) from ripple and voltage, enough for a current controller."""
+        limits = self.limits
+        self.drive.disable()
+        self.drive.write(
+            {
+                "motor.R_s_ohm": resistance.R_measured.value,
+                "motor.pole_pairs": encoder.pole_pairs.value,
+                "encoder.offset_rad": encoder.offset.value,
+                "encoder.reversed": float(encoder.direction < 0),
+            }
+        )
+        self.drive.enable()
+        knee = resistance.curve.knee_a(max(0.0, resistance.V_dead_v))
+        bias, ripple = bias_and_ripple(limits.I_test_apk, self.ripple_share, knee)
+        plan = square_injection.SquarePlan(bias_d_a=bias, ripple_a=ripple, u_max_v=U_SHARE * limits.V_max_v)
+        plan = self._hold_stable_bias(plan, encoder, knee, noise)
+        rough: list[float] = []
+        first_v = None
+        for axis in ("d", "q"):
+            amplitude = square_injection.find_amplitude(self.drive, plan, axis, first_v)
+            first_v = square_injection.NEXT_SHARE * amplitude
+            for half_period in plan.half_periods:
+                shot = square_injection.inject_square(self.drive, plan, axis, half_period, amplitude)
+                self.keep(f"square_{axis}_{half_period}", shot)
+            found = square_injection.ripple_of(shot, axis)
+            rough.append(amplitude * plan.half_periods[-1] * self.drive.period_s / found)
+        self.drive.command_current(0.0, 0.0, fixed_angle_rad=plan.angle_rad)
+        return rough[0], rough[1]
+
+    def _hold_stable_bias(
+        self, plan: square_injection.SquarePlan, encoder: EncoderResult, knee_a: float, noise: Noise
+    ) -> square_injection.SquarePlan:
+        """Hold the bias, or as much of it as leaves the rotor's d axis on the vector; returns the plan with it."""
+        wanted = plan.ripple_a
+        floor = NOISE_RIPPLE * noise.sigma_a
+        for _ in range(BIAS_TRIES):
+            self.say(f"L_d, L_q: square wave on {plan.bias_d_a:.3g} A, {plan.ripple_a:.3g} A peak to peak")
+            square_injection.hold_bias(self.drive, plan)
+            ahead = self._rotor_ahead(encoder, plan)
+            aligned = plan
+            for _ in range(ALIGN_TRIES):
+                if abs(ahead) > BIAS_OFF_RAD + abs(encoder.lag_rad):
+                    break
+                # the frame goes to the rotor: a d bias off its axis would pull, and mix the axes
+                angle = aligned.angle_rad + ahead
+                ripple = max(floor, clear_ripple(wanted, plan.bias_d_a, knee_a, angle))
+                aligned = replace(aligned, angle_rad=angle, ripple_a=ripple)
+                square_injection.hold_bias(self.drive, aligned)
+                ahead = self._rotor_ahead(encoder, aligned)
+                if abs(ahead) <= BIAS_ON_RAD:
+                    return aligned
+            wanted, bias = 0.5 * wanted, 0.5 * plan.bias_d_a
+            plan = replace(plan, bias_d_a=bias, ripple_a=max(floor, clear_ripple(wanted, bias, knee_a)))
+        raise refuse(
+            "E_ROTOR_MOVED",
+            f"the rotor stands {math.degrees(ahead):.3g} deg (electrical) off the bias vector",
+            stage="inductance",
+            likely="a load on the shaft, or a machine with much more reluctance than magnet torque",
+        )
+
+    def _rotor_ahead(self, encoder: EncoderResult, plan: square_injection.SquarePlan) -> float:
+        """Electrical angle of the rotor, with the coarse offset, ahead of the frozen frame (rad)."""
+        periods = max(1, round(0.02 / self.drive.period_s))
+        theta_M = self.drive.average(("theta_m_rad",), periods)["theta_m_rad"]
+        theta_e = encoder.direction * encoder.pole_pairs.value * theta_M - encoder.offset.value
+        return math.remainder(theta_e - plan.angle_rad, 2.0 * math.pi)

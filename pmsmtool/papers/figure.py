@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: MIT
+"""What a reproduced figure or table is: tables, checked numbers and panels, without a word about how they are shown.
+
+A figure is a function ``(seed: int, ...) -> Reproduction`` with its own keyword arguments for smaller sizes; a row of
+:mod:`pmsmtool.papers.registry` makes it a name of ``pmsmtool reproduce``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+Cell = str | int | float | None
+"""Entry of a table; None and NaN are shown as "-"."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Head of a column.
+
+    Attributes
+    ----------
+    name : str
+        Quantity.
+    unit : str
+        SI unit or ``%``, ``ms``, ``rpm``; empty for text and pure numbers.
+    digits : int
+        Significant digits shown.
+    """
+
+    name: str
+    unit: str = ""
+    digits: int = 4
+
+    @property
+    def head(self) -> str:
+        """Name with its unit."""
+        return f"{self.name} / {self.unit}" if self.unit else self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of numbers under named columns.
+
+    Attributes
+    ----------
+    title : str
+        What it shows, and under which conditions.
+    columns : tuple of Column
+        Heads.
+    rows : tuple of tuple
+        One cell per column.
+    """
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    def __post_init__(self) -> None:
+        wrong = [row for row in self.rows if len(row) != len(self.columns)]
+        if wrong:
+            raise ValueError(f"table {self.title!r}: {len(self.columns)} columns, but a row {wrong[0]!r}")
+
+    def shown(self) -> list[tuple[str, ...]]:
+        """Return the rows as text."""
+        return [
+            tuple(_text(cell, column.digits) for cell, column in zip(row, self.columns, strict=True))
+            for row in self.rows
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One number of a paper, or one that follows from it, beside ours.
+
+    Attributes
+    ----------
+    what : str
+        The number, with its conditions.
+    expected : float
+        The number in ``where``; NaN where only a bound is.
+    ours : float
+        As computed here, same unit.
+    unit : str
+        Unit of both.
+    low, high : float
+        Allowed range of ``ours``, ends included; infinite where one-sided.
+    where : str
+        Where the number comes from: what prints it, what curve it was read off, or what it was derived from.
+    printed : bool
+        Whether the paper prints this very number in ``where``; false for one read off a figure or derived.
+    """
+
+    what: str
+    expected: float
+    ours: float
+    unit: str
+    low: float
+    high: float
+    where: str = ""
+    printed: bool = False
+
+    def __post_init__(self) -> None:
+        if math.isfinite(self.expected) and not self.where:
+            raise ValueError(f"{self.what}: an expected number needs its source")
+
+    @property
+    def within(self) -> bool:
+        """Whether ours lies in the allowed range; a number that is not finite does not."""
+        return math.isfinite(self.ours) and self.low <= self.ours <= self.high
+
+    @property
+    def two_columns(self) -> tuple[float | None, float | None]:
+        """What the paper prints, and what is expected otherwise; None for the other one."""
+        number = self.expected if math.isfinite(self.expected) else None
+        return (number, None) if self.printed else (None, number)
+
+    @property
+    def allowed(self) -> str:
+        """The range as text."""
+        if math.isinf(self.low):
+            return f"<= {self.high:.6g}"
+        return f">= {self.low:.6g}" if math.isinf(self.high) else f"{self.low:.6g} .. {self.high:.6g}"
+
+
+def near(
+    what: str,
+    expected: float,
+    ours: float,
+    unit: str,
+    *,
+    absolute: float = 0.0,
+    relative: float = 0.0,
+    where: str = "",
+) -> Check:
+    """Return a check of a number against an expected one within an absolute plus a relative tolerance."""
+    room = absolute + relative * abs(expected)
+    return Check(what, expected, ours, unit, expected - room, expected + room, where)
+
+
+def as_printed(what: str, printed: float, ours: float, unit: str, *, where: str) -> Check:
+    """Return a check of a number against the one that the paper prints, to the digits a float holds."""
+    room = 1e-12 * abs(printed)
+    return Check(what, printed, ours, unit, printed - room, printed + room, where, printed=True)
+
+
+def at_most(what: str, ours: float, limit: float, unit: str, *, expected: float = math.nan, where: str = "") -> Check:
+    """Return a check of a number against an upper limit."""
+    return Check(what, expected, ours, unit, -math.inf, limit, where)
+
+
+def at_least(what: str, ours: float, limit: float, unit: str, *, expected: float = math.nan, where: str = "") -> Check:
+    """Return a check of a number against a lower limit."""
+    return Check(what, expected, ours, unit, limit, math.inf, where)
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One line or cloud of points of a panel.
+
+    Attributes
+    ----------
+    name : str
+        In the legend; empty: not in the legend.
+    x, y : ndarray, shape (n,)
+        In the units of the panel's axes.
+    style : str
+        matplotlib's short form: ``-`` response, ``--`` reference, ``:`` limit, ``.`` or ``o`` points.
+    colour : int or None
+        Number of the colour, to pair lines; None: the next one. Negative: grey.
+    """
+
+    name: str
+    x: Array
+    y: Array
+    style: str = "-"
+    colour: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One pair of axes.
+
+    Attributes
+    ----------
+    title : str
+        Above the axes.
+    x_label, y_label : str
+        Quantity and unit, ``i_q / A``.
+    series : tuple of Series
+        What is drawn.
+    equal : bool
+        Same scale on both axes (current plane).
+    x_log, y_log : bool
+        Logarithmic axes.
+    x_range, y_range : tuple of float, optional
+        Shown range; all where None.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    series: tuple[Series, ...]
+    equal: bool = False
+    x_log: bool = False
+    y_log: bool = False
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Reproduction:
+    """A figure or table of a paper, recomputed.
+
+    Attributes
+    ----------
+    name : str
+        As in the registry.
+    title : str
+        What it shows.
+    source : str
+        Paper and figure, DOI.
+    tables : tuple of Table
+        Numbers.
+    panels : tuple of Panel
+        Plot; empty for a table alone.
+    checks : tuple of Check
+        Printed and expected numbers beside ours.
+    notes : tuple of str
+        Conditions, assumptions, and what differs from the paper and why.
+    columns : int
+        Panels side by side.
+    """
+
+    name: str
+    title: str
+    source: str
+    tables: tuple[Table, ...] = ()
+    panels: tuple[Panel, ...] = ()
+    checks: tuple[Check, ...] = ()
+    notes: tuple[str, ...] = ()
+    columns: int = 1
+
+    @property
+    def good(self) -> bool:
+        """Whether every checked number is within its range."""
+        return all(check.within for check in self.checks)
+
+
+def check_table(checks: Sequence[Check]) -> Table:
+    """Return the checks as a table."""
+    heads = ("number", "printed", "expected", "ours", "unit", "allowed", "within", "source")
+    rows = tuple(
+        (c.what, *c.two_columns, c.ours, c.unit, c.allowed, "yes" if c.within else "NO", c.where) for c in checks
+    )
+    title = "checked numbers: printed in the paper, or expected from its source"
+    return Table(title, tuple(Column(head) for head in heads), rows)
+
+
+def _text(cell: Cell, digits: int) -> str:
+    if cell is None or (isinstance(cell, float) and math.isnan(cell)):
+        return "-"
+    return f"{cell:.{digits}g}" if isinstance(cell, float) else str(cell)

@@ -1,0 +1,387 @@
+# SPDX-License-Identifier: MIT
+"""``prove``: refuse a drive that holds another set, predict, commit, measure, compare; everything in a run directory.
+
+The prediction is written, synced to the disk and named by its hash before the first step. Traces and prediction stay
+in ``prove/<first digits of the hash>/`` of the run, so a proof that is repeated does not replace an earlier one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain, count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pmsmtool.design.design_file import Design
+from pmsmtool.design.prediction import Array, Prediction
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.envelope import Envelope, largest_acceleration
+from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.errors import (
+    ConfigError,
+    DriveFault,
+    LimitExceeded,
+    NotAvailable,
+    PmsmtoolError,
+    SdoAbort,
+    VerifyMismatch,
+)
+from pmsmtool.files import write_file
+from pmsmtool.flash.restore import plan_download
+from pmsmtool.machine.shaft import Brake, Load, Shaft
+from pmsmtool.npz_file import npz_bytes, read_npz
+from pmsmtool.proof.judgement import Judgement, judge
+from pmsmtool.proof.measured import SpeedNotReached, run_experiments
+from pmsmtool.proof.plan import RPM, Conditions, Experiment, ProofPlan, plan_proof
+from pmsmtool.proof.prediction_file import from_arrays, to_arrays
+from pmsmtool.proof.simulated import RUNS, averaged, predict_proof
+from pmsmtool.run_directory import Acceptance, RunDirectory, Stage
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import read_trace, trace_npz
+
+FOLDER = "prove"
+PREDICTION = "prediction.npz"
+GROSS = 3.0
+"""A response this far outside its band, in half widths, ends the proof: what is demanded next needs what has failed."""
+SPEED = "omega_e_rad_s"
+ENCODER_INCREMENTS = DriveObject(0x608F, 1, "I")
+_HASH_DIGITS = 12
+ROUNDING = 1e-6
+"""Relative: a rating that went through a drive's units and back is the same rating."""
+WIDEST_BAND = 2.0
+"""Largest half width of a predicted speed, of the speed: beyond, the design does not hold it on machines within its
+intervals (seen: 9 in the field weakening of a machine of 4e-6 kg m2; 1.3 of a healthy one of 1.2e-5 kg m2)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProofRequest:
+    """What is asked, and what the machine may do meanwhile; None leaves the choice to the design's ratings.
+
+    Attributes
+    ----------
+    i_max_apk, speed_max_rad_s : float or None
+        Envelope (A peak, rad/s mechanical).
+    shaft, load, brake : str
+        What hangs on the shaft; it must be what the design was made for.
+    runs, seed : int
+        Machines drawn for the prediction, and the seed of the draw.
+    experiments : tuple of str
+        Names of the experiments the drive can show; empty: all.
+    """
+
+    i_max_apk: float | None = None
+    speed_max_rad_s: float | None = None
+    shaft: Shaft = "free"
+    load: Load = "none"
+    brake: Brake = "none"
+    runs: int = RUNS
+    seed: int = 0
+    experiments: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class _Record:
+    """What has been measured so far, and whether it went on."""
+
+    prediction: Prediction
+    save: Callable[[str, bytes], None]
+    measured: dict[tuple[str, str], Array] = field(default_factory=dict)
+    done: list[str] = field(default_factory=list)
+
+    def keep(self, experiment: Experiment, trace: Trace) -> bool:
+        """Store a record and compare it; False when it is grossly outside."""
+        self.save(f"{experiment.name}.npz", trace_npz(trace))
+        self.done.append(experiment.name)
+        self.measured |= responses({experiment.name: trace}, self.prediction)
+        shares = [self.prediction.bands[key].largest(v)[0] for key, v in self.measured.items()
+                  if key[0] == experiment.name]  # fmt: skip
+        return max(shares) <= GROSS
+
+
+def envelope_of(design: Design, request: ProofRequest, plan: ProofPlan | None = None) -> Envelope:
+    """Return the motion envelope: what the request says, else the design's largest current and speed."""
+    T_s, slope = design.machine.inverter.T_s, design["speed.acceleration_rpm_per_s"] * RPM
+    i_max = design["motor.I_max_apk"] if request.i_max_apk is None else request.i_max_apk
+    return Envelope(
+        i_max_apk=i_max,
+        speed_max_rad_s=design["motor.n_max_rpm"] * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,
+        duration_s=60.0 if plan is None else 45.0 + 2.0 * plan.seconds(T_s, slope),
+        shaft=request.shaft,
+        load=request.load,
+        brake=request.brake,
+        acceleration_rad_s2=largest_acceleration(design.machine.machine, i_max),
+    )
+
+
+def prove_stage(
+    run: RunDirectory,
+    drive: CanopenDrive,
+    design: Design,
+    request: ProofRequest,
+    allow_motion: Callable[[Sequence[str]], None],
+    say: Callable[[str], None],
+) -> Stage:
+    """Prove a design on the machine; the stage says pass or fail, ``run`` holds prediction and traces.
+
+    Raises
+    ------
+    VerifyMismatch
+        The drive holds another set than the design's.
+    Declined
+        The person did not consent; nothing was moved.
+    StopNotConfirmed, Interrupted, BusError, SafetyRefusal
+        As the guard ends it.
+    """
+    refuse_other_set(drive.node, design)
+    envelope = envelope_of(design, request)
+    envelope.refuse_gravity()
+    conditions = conditions_of(drive, envelope)
+    plan = _shown(plan_proof(design, conditions), request.experiments)
+    envelope = envelope_of(design, request, plan)
+    allow_motion([*envelope.lines(), *(e.text for e in plan.experiments), "nothing is stored in the drive"])
+    say(f"predicting {len(plan.experiments)} responses on {request.runs} machines")
+    prediction = predict_proof(design, conditions, plan, runs=request.runs, seed=request.seed)
+    digest, folder = commit(run, prediction)
+    say(f"prediction committed: sha256:{digest}")
+    for line in band_lines(prediction):
+        say(line)
+
+    def save(name: str, data: bytes) -> None:
+        run.save(f"{folder}/{name}", data)
+
+    record = _Record(prediction, save)
+    drive.recorder.forget()  # a download before this may have reset the drive
+    event: PmsmtoolError | None = None
+    try:
+        with guarded(drive, envelope, say=say) as guard:
+            run_experiments(guard, plan, design, conditions, record.keep, say)
+    except (DriveFault, LimitExceeded, SpeedNotReached) as error:
+        if isinstance(error, SdoAbort):
+            raise
+        event = error  # the guard has stopped the machine and restored the drive
+    stage = _stage(plan, prediction, record, event, digest, folder)
+    return replace(stage, not_checked=_beyond(design, conditions))
+
+
+def _beyond(design: Design, conditions: Conditions) -> list[str]:
+    """Return what a proof within its envelope leaves open of the machine's ratings."""
+    machine = design.machine.machine
+    rated_rpm = machine.n_nom_rpm or design["motor.n_max_rpm"]
+    rows = (
+        ("current", conditions.i_max_apk, design["motor.I_nom_apk"], "A pk"),
+        ("speed", conditions.speed_max_rad_s / RPM, rated_rpm, "rpm"),
+    )
+    lines = [
+        f"{name} beyond {allowed:.4g} of rated {rated:.4g} {unit} (the envelope of the proof): NOT CHECKED"
+        for name, allowed, rated, unit in rows
+        if allowed < rated * (1.0 - ROUNDING)
+    ]
+    return [*lines, *(["turning shaft (locked): NOT CHECKED"] if conditions.shaft == "locked" else [])]
+
+
+def _shown(plan: ProofPlan, names: tuple[str, ...]) -> ProofPlan:
+    """Return the plan without the experiments that the drive cannot show.
+
+    Raises
+    ------
+    NotAvailable
+        Nothing is left.
+    """
+    if not names:
+        return plan
+    left = tuple(f"{e.text}: the drive has no excitation" for e in plan.experiments if e.name not in names)
+    kept = tuple(e for e in plan.experiments if e.name in names)
+    if not kept:
+        raise NotAvailable(f"needs one of {', '.join(names)}, and the design has none", hint="see `pmsmtool caps`")
+    return ProofPlan(kept, (*plan.left_out, *left))
+
+
+def refuse_other_set(node: DriveNode, design: Design) -> None:
+    """Refuse a drive that does not hold the design's bytes.
+
+    Raises
+    ------
+    VerifyMismatch
+        Every object that holds something else.
+    """
+    plan = plan_download(node, design.parameter_set())
+    if plan.changes:
+        raise VerifyMismatch(
+            f"the drive does not hold this design: {len(plan.changes)} of {len(plan.entries)} objects differ",
+            where=f"node {node.node}",
+            differences=plan.lines()[: len(plan.changes)],
+            likely="another design was flashed, or none",
+            hint="`pmsmtool flash-params DESIGN` first; nothing was moved",
+        )
+
+
+def conditions_of(drive: CanopenDrive, envelope: Envelope) -> Conditions:
+    """Read what the prediction depends on, with the drive off."""
+    counts = 0
+    with contextlib.suppress(SdoAbort):
+        counts = drive.node.whole(ENCODER_INCREMENTS)
+
+    def live(name: str) -> float:
+        try:
+            return drive.live(name)
+        except SdoAbort:
+            return math.nan
+
+    return Conditions(
+        drive.live("U_dc_v"), live("T_winding_c"), live("T_magnet_c"), counts,
+        envelope.i_max_apk, envelope.speed_max_rad_s, envelope.shaft,
+    )  # fmt: skip
+
+
+def commit(run: RunDirectory, prediction: Prediction) -> tuple[str, str]:
+    """Write a prediction, sync it to the disk, and return its SHA-256 (hex) and its folder in the run.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be written: then nothing may be moved.
+    """
+    data = npz_bytes(to_arrays(prediction))
+    digest = hashlib.sha256(data).hexdigest()
+    stem = f"{FOLDER}/{digest[:_HASH_DIGITS]}"
+    names = chain((stem,), (f"{stem}-{k}" for k in count(2)))
+    folder = next(name for name in names if not (run.path / name).exists())
+    path = run.path / folder / PREDICTION
+    try:
+        path.parent.mkdir(parents=True)
+    except OSError as error:
+        raise ConfigError(
+            f"the prediction cannot be committed: {error.strerror}",
+            where=str(path),
+            hint="check your rights there and the space on the disk",
+        ) from error
+    write_file(path, data, synced=True, hint="check your rights there and the space on the disk")
+    return digest, folder
+
+
+def band_lines(prediction: Prediction) -> list[str]:
+    """Return the predicted band as lines: final value and width of every signal, and every derived quantity."""
+    lines = []
+    for (experiment, signal), band in prediction.bands.items():
+        half = band.factor * band.std
+        lines.append(
+            f"predicted {experiment} {signal}: {float(band.mean.min()):.4g} to {float(band.mean.max()):.4g}, "
+            f"95 % within +-{float(np.median(half)):.2g} (median), +-{float(half.max()):.2g} (largest)"
+        )
+    lines += [f"predicted {name}: {q.low:.3g} to {q.high:.3g}" for name, q in prediction.quantities.items()]
+    return lines
+
+
+def responses(traces: Mapping[str, Trace], prediction: Prediction) -> dict[tuple[str, str], Array]:
+    """Return the judged responses of recorded experiments, repeated patterns averaged."""
+    found = {}
+    for (experiment, signal), band in prediction.bands.items():
+        if experiment in traces:
+            trace = traces[experiment]
+            repeats = int(trace.meta.get("repeats", 1))
+            values = trace[signal]
+            if len(values) != repeats * len(band.mean):
+                raise ConfigError(
+                    f"{experiment}: the record has {len(values)} rows of {repeats * len(band.mean)}",
+                    hint="prove the design again: the record is not of this prediction",
+                )
+            found[experiment, signal] = np.asarray(values.reshape(repeats, -1).mean(axis=0))
+    return found
+
+
+def read_proof(folder: Path) -> tuple[Prediction, dict[str, Trace]]:
+    """Read prediction and traces of a proof again.
+
+    Raises
+    ------
+    ConfigError
+        A file is missing or damaged.
+    """
+    prediction = from_arrays(read_npz(folder / PREDICTION), where=str(folder / PREDICTION))
+    names = [name for name in prediction.t_s if (folder / f"{name}.npz").is_file()]
+    return prediction, {name: read_trace(folder / f"{name}.npz") for name in names}
+
+
+def _stage(
+    plan: ProofPlan, prediction: Prediction, record: _Record, event: PmsmtoolError | None, digest: str, folder: str
+) -> Stage:
+    found = judge(prediction, record.measured)
+    missing = [e.name for e in plan.experiments if e.name not in record.done]
+    criteria = [Acceptance(line.what, f"{100.0 * line.share:.3g} % of the band: {line.where}", "<= 100 %", line.inside)
+                for line in found.seen]  # fmt: skip
+    happened = "" if event is None else _happened(event, missing)
+    if happened or missing:
+        what = happened or f"not run after a response far outside its band: {', '.join(missing)}"
+        criteria.append(Acceptance("all experiments are run to their end", what, "all", False))
+    slow = _too_slow(prediction, record.measured)
+    if slow:
+        criteria.append(Acceptance("the speed is reached", slow, "within the band", False))
+    good = bool(found.seen) and all(line.ok for line in criteria)
+    cause = found.cause or ("" if event is None else event.likely)
+    outside = [line.what for line in found.seen if not line.inside]
+    told = [happened, slow and f"the speed was not reached: {slow}",
+            outside and f"outside the predicted band: {', '.join(outside)}"]  # fmt: skip
+    note = "; ".join(str(text) for text in told if text) + (f"; likely {cause}" if cause else "; no known cause fits")
+    values: list[Mapping[str, Any]] = [
+        {"name": "prediction", "value": f"sha256:{digest}"},
+        {"name": "cause", "value": cause},
+        {"name": "event", "value": happened},
+        *({"name": line.what, "value": line.share, "where": line.where} for line in found.seen),
+    ]
+    files = [f"{folder}/{PREDICTION}", *(f"{folder}/{name}.npz" for name in record.done)]
+    return Stage(
+        "prove", "pass" if good else "fail", 0.0, values=values, acceptance=criteria,
+        files=dict.fromkeys(files, ""), fallbacks=plan.left_out, note="" if good else note,
+        summary=_summary(found, len(record.done)),
+    )  # fmt: skip
+
+
+def _happened(event: PmsmtoolError, missing: Sequence[str]) -> str:
+    """Return what ended the measurement, and where in the proof."""
+    if isinstance(event, SpeedNotReached):
+        return event.what
+    return f"{event.what}, {f'during {missing[0]}' if missing else 'after the last experiment'}"
+
+
+def _too_slow(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> str:
+    """Return which records end below the band of their speed, or have one that says nothing; empty when none does."""
+    lines = []
+    for (experiment, signal), values in measured.items():
+        if signal != SPEED:
+            continue
+        band = prediction.bands[experiment, signal]
+        low, high = float(band.low[-1]), float(band.high[-1])
+        if high - low > 2.0 * WIDEST_BAND * abs(band.mean[-1]):
+            ends = f"between {low:.4g} and {high:.4g} rad/s (electrical)"
+            lines.append(f"{experiment} is predicted to end {ends}, which tells no speed to prove")
+        elif abs(values[-1]) < max(low, -high):  # a band on both sides of standstill has no edge near it
+            lines.append(f"{experiment} ends at {values[-1]:.4g} instead of {band.mean[-1]:.4g} rad/s (electrical)")
+    return ", ".join(lines)
+
+
+def _summary(found: Judgement, experiments: int) -> str:
+    worst = max(found.seen, key=lambda line: line.share, default=None)
+    share = "" if worst is None else f"; nearest to its edge: {worst.what}, {100.0 * worst.share:.2g} %"
+    return f"{experiments} responses inside the predicted 95 % band{share}"
+
+
+def not_proven(stage: Stage, run: RunDirectory) -> PmsmtoolError:
+    """Return the error of a proof that failed: exit code 1, with the likely cause."""
+    from pmsmtool.errors import CheckFailed
+
+    cause = next((str(v["value"]) for v in stage.values if v["name"] == "cause"), "")
+    return CheckFailed(
+        f"the drive does not do what the design promises: {stage.note}",
+        where=str(run.path), likely=cause, hint=f"pmsmtool report {run.path}",
+    )  # fmt: skip
+
+
+__all__ = ["ProofRequest", "averaged", "envelope_of", "not_proven", "prove_stage", "read_proof", "responses"]

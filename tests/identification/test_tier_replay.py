@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: MIT
+"""``identify --replay`` on runs of the lower tiers: the same numbers from the stored traces, and others where asked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from pmsmtool.bus.connect import Connection
+from pmsmtool.cli.main import cli
+from pmsmtool.commissioning.commission import begin_run
+from pmsmtool.commissioning.tier_stages import open_tier_drive
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.errors import ConfigError, NotAvailable, Partial
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.identification.replay import MACHINE, NAMEPLATE, REPLAYED
+from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.tier_evaluate import FACTS, TierFacts, below_voltage, parse_facts, replay
+from pmsmtool.identification.vendor_machine import ANSWERS
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.measurement.capabilities import Capabilities, examine
+from pmsmtool.measurement.tier_identify import tier_stage
+from pmsmtool.resources import data_folder
+from pmsmtool.run_directory import RunDirectory, Stage
+from pmsmtool.sim.bus import PmsmSimBus
+
+pytestmark = pytest.mark.chain
+
+PROFILE = data_folder("profiles") / "interior-2k2.toml"
+ASKED = ("poles", "encoder", "psi", "mechanics")
+SHEET = "as given"
+
+
+@contextmanager
+def opened(options: str) -> Iterator[tuple[CanopenDrive, Capabilities]]:
+    with Connection(PmsmSimBus(f"interior-2k2?nv=:memory:{options}")) as connection:
+        node = DriveNode(connection, 1)
+        found = examine(node)
+        node.close()
+        drive = open_tier_drive(connection, 1, found)
+        yield drive, found
+        drive.close()
+
+
+def measured(
+    options: str, folder: Path, quantities: tuple[str, ...], known: MachineFile | None = None, **limits: float
+) -> tuple[RunDirectory, Stage]:
+    request = IdentifyRequest(quantities, **limits)  # type: ignore[arg-type]
+    with opened(options) as (drive, found):
+        run = begin_run(drive, folder, tier=found.tier)
+        if known is not None:
+            run.save(NAMEPLATE, dump_machine_file(known))
+        pair = None if known is None else (known, SHEET)
+        stage = tier_stage(run, drive, found, request, lambda lines: None, lambda text: None, known=pair)
+    run.add(stage)
+    return run, stage
+
+
+def told(stage: Stage) -> str:
+    return json.dumps([list(stage.values), stage.summary, stage.status, list(stage.fallbacks)])
+
+
+@pytest.mark.parametrize(("options", "quantities"), [("&tier=recorder", ("R", "psi", "L")), ("&drive=cia402", ASKED)])
+def test_a_run_with_a_machine_file_gives_the_same_bytes(
+    options: str, quantities: tuple[str, ...], tmp_path: Path
+) -> None:
+    run, stage = measured(options, tmp_path, quantities, load_machine_file(PROFILE))
+    before = {name: (run.path / name).read_bytes() for name in (MACHINE, "run.json", FACTS)}
+    again = replay(run)
+    assert told(again) == told(stage) and "psi_f_wb" in told(stage)
+    assert {name: (run.path / name).read_bytes() for name in before} == before
+
+    wider = replay(run, SensorTolerance(current_gain=0.03, voltage_gain=0.03))
+    psi, doubted = ({v["name"]: v for v in s.values}["psi_f_wb"] for s in (again, wider))
+    assert doubted["value"] == psi["value"] and doubted["systematic"] > 1.2 * psi["systematic"]
+    assert (run.path / MACHINE).read_bytes() != before[MACHINE]
+    assert told(run.read().stage("identify")) == told(wider)  # type: ignore[arg-type]
+
+    used = (run.path / MACHINE).read_bytes()
+    run.save("design.toml", "made from it")
+    narrow = replay(run, SensorTolerance(current_gain=0.001, voltage_gain=0.001))
+    assert (run.path / MACHINE).read_bytes() == used and f"{REPLAYED}/{MACHINE}" in narrow.files
+    assert told(run.read().stage("identify")) == told(wider)  # type: ignore[arg-type]
+
+
+def test_a_run_without_a_machine_file_is_replayed_from_the_command_line(tmp_path: Path) -> None:
+    """Slow on purpose: the voltage limit is not reached, and what it needs is said with numbers."""
+    run, stage = measured("&drive=cia402", tmp_path, ASKED, speed_max_rad_s=60.0)
+    assert not (run.path / MACHINE).exists()
+    needed = "up to 561 rpm it did not: allow a larger --speed-max"
+    assert any(needed in line for line in stage.fallbacks) and needed in stage.summary
+    outcome = CliRunner().invoke(cli, ["--json", "identify", "--replay", str(run.path)])
+    assert isinstance(outcome.exception, Partial) and "run.json" in outcome.exception.hint
+    assert stage.status == "partial" and list(stage.refused) == ["psi"] and needed in stage.refused["psi"]
+    assert json.loads(outcome.stdout)["values"] == json.loads(told(stage))[0]
+
+    facts = parse_facts((run.path / FACTS).read_text(encoding="utf-8"), where="")
+    assert facts.traces[:2] == ("rotation_forward", "rotation_backward") and facts.pushed and facts.voltage == "link"
+    run.save(FACTS, "{}")
+    with pytest.raises(ConfigError, match="the record of the tier is damaged"):
+        replay(run)
+    run.save(ANSWERS, "{}")
+    with pytest.raises(ConfigError, match="nothing of that can be recomputed"):
+        replay(run)
+
+
+def test_what_the_flux_linkage_needs_is_a_speed_in_numbers() -> None:
+    facts = TierFacts("standard", pole_pairs=3, pushed=True, voltage="link", top_rpm=1000.0, U_dc_v=540.0)
+    text = below_voltage(facts, 0.5, 0.5)
+    assert "up to 1000 rpm it did not" in text and "it ends at about 1719 rpm with 540 V" in text  # 540 / 2 / 0.5 / 3
+    assert "given flux linkage" not in below_voltage(facts, 0.5, 0.0)
+
+
+def test_an_instrument_scales_what_a_recorder_told(tmp_path: Path) -> None:
+    """Voltage and current as the instruments have them: psi goes with the voltage, R and L_q with their ratio."""
+    run, stage = measured("&tier=recorder", tmp_path, ("R", "psi", "L"), load_machine_file(PROFILE))
+    plain = {row["name"]: row for row in stage.values}
+    again = replay(run, None, ["V_dc=560V:554.4V:0.5V", "I=5Apk:5.05Apk:0.1%"])
+    scaled = {row["name"]: row for row in again.values}
+    assert scaled["psi_f_wb"]["value"] / plain["psi_f_wb"]["value"] == pytest.approx(0.99, rel=1e-3)
+    assert scaled["R_s_ohm"]["value"] / plain["R_s_ohm"]["value"] == pytest.approx(0.99 / 1.01, rel=1e-3)
+    assert scaled["psi_f_wb"]["systematic"] < 0.8 * plain["psi_f_wb"]["systematic"]
+    with pytest.raises(NotAvailable, match="does not know"):
+        replay(run, None, ["bridge=1V:1.2V:0.2V"])

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: MIT
+"""Without injection a value is judged by what its interval costs the design, and each quantity by itself."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from pmsmtool.identification.tier_machine import tier_machine
+from pmsmtool.identification.tier_verdict import Judgement, judged, stage_of
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.profile import machine_path
+
+ASKED = ("R", "L", "psi", "mechanics")
+SHEET = "as given"
+
+
+@pytest.fixture(scope="module")
+def known() -> MachineFile:
+    return load_machine_file(machine_path("interior-2k2"))
+
+
+def estimates(known: MachineFile, **shares: float) -> dict[str, Estimate]:
+    """Return values of the machine itself with relative total 95 % half widths."""
+    machine = known.machine
+    true = {
+        "R_s_ohm": machine.R_s_ohm, "L_q_app_h": machine.L_q_h, "psi_f_wb": machine.psi_f_wb,
+        "J_per_psi": (machine.J_kgm2 or 0.0) / machine.psi_f_wb, "tau_c_per_psi": 0.1,
+    }  # fmt: skip
+    return {
+        name: Estimate(value, 0.0, shares.get(name, 0.01) * value, "1", T_c=20.0, method="as it is")
+        for name, value in true.items()
+    }
+
+
+def judgement_of(found: dict[str, Estimate], known: MachineFile | None) -> Judgement:
+    machine = tier_machine(known, found, SHEET).machine
+    return judged(found, {}, ASKED, machine)
+
+
+def test_no_percentage_refuses_what_the_design_can_bear(known: MachineFile) -> None:
+    """R within 16 % and L_q within 18 % were refused by the fixed 15 %, J/psi within 8 % by 5 %."""
+    wide = estimates(known, R_s_ohm=0.16, L_q_app_h=0.18, J_per_psi=0.08)
+    judgement = judgement_of(wide, known)
+    assert judgement.verdicts.accepted == ASKED and judgement.verdicts.status == "pass"
+    margins = {name: line.measured for name, line in judgement.acceptance.items()}
+    assert "voltage headroom" in margins["L_q_app_h"] and "speed phase margin" in margins["J_per_psi"]
+
+
+def test_a_useless_value_is_refused_alone_and_the_others_are_kept(known: MachineFile) -> None:
+    found = estimates(known, L_q_app_h=0.7, J_per_psi=1.2)
+    found["L_q_app_h"] = Estimate(2.0 * found["L_q_app_h"].value, 0.0, 1.4 * found["L_q_app_h"].value, "H")
+    judgement = judgement_of(found, known)
+    assert judgement.verdicts.accepted == ("R", "psi") and set(judgement.verdicts.refused) == {"L", "mechanics"}
+    kept = judgement.kept(found)
+    assert set(kept) == {"R_s_ohm", "psi_f_wb"}, "the friction goes with its inertia"
+    made = tier_machine(known, kept, SHEET)
+    stage = stage_of(found, {}, made, judgement, SHEET)
+    assert stage.status == "partial" and all(line.ok for line in stage.acceptance)
+    assert {v["name"] for v in stage.values if v.get("accepted") is False} == {"L_q_app_h", "J_per_psi"}
+    assert "L refused" in stage.summary and "L_q_app_h" not in stage.summary
+    assert made.machine is not None and made.machine.machine.L_q_h == known.machine.L_q_h
+
+
+def test_what_is_missing_is_refused_by_its_reason_and_nothing_at_all_fails(known: MachineFile) -> None:
+    found = estimates(known)
+    del found["R_s_ohm"]
+    judgement = judged(found, {"R_s_ohm": "hidden by the inverter"}, ASKED, known)
+    assert judgement.verdicts.refused == {
+        "R": "E_NOT_MEASURED: hidden by the inverter (try: state it in MACHINE, or allow more current and speed)"
+    }
+    only = {"J_per_psi": estimates(known, J_per_psi=1.5)["J_per_psi"]}
+    assert judged(only, {}, ("mechanics",), known).verdicts.status == "fail"
+
+
+@pytest.mark.parametrize(("half_deg", "good"), [(2.6, True), (25.0, True), (26.5, False)])
+def test_an_angle_without_a_machine_is_judged_by_the_torque_it_takes(half_deg: float, good: bool) -> None:
+    """cos(25.8 deg) is 0.9; 2.6 deg was refused by the fixed 2.5 deg."""
+    angle = {"offset_rad": Estimate(0.3, 0.0, math.radians(half_deg), "rad")}
+    judgement = judged(angle, {}, ("encoder",), None)
+    assert (judgement.verdicts.accepted == ("encoder",)) is good

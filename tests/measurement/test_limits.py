@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""What the experiments may use must leave something."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from pmsmtool.errors import ConfigError, IdentificationError
+from pmsmtool.experiments.rotation import SLOWEST_STEP_S, STEP_RAD, dwell_within
+from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.parameters import MachineLimits
+from pmsmtool.measurement.identify import envelope_of, nameplate_of, plan_lines
+from pmsmtool.measurement.limits import LEAST_SPEED_SHARE, Limits, require_speed, unused_current
+from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.resources import data_folder
+
+GIVEN = {"I_nom_apk": 5.0, "i_max_apk": 6.0, "omega_max_rad_s": 300.0, "V_max_v": 28.0}
+
+
+@pytest.mark.parametrize("name", GIVEN)
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
+def test_a_limit_that_leaves_nothing_is_refused_before_anything_moves(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match="nothing can be measured"):
+        Limits(**{**GIVEN, name: value})
+
+
+def test_the_test_current_stays_within_the_envelope() -> None:
+    assert Limits(**GIVEN).I_test_apk == 5.0
+    assert Limits(**{**GIVEN, "i_max_apk": 4.4}).I_test_apk == pytest.approx(4.0)
+
+
+def test_a_speed_limit_that_no_push_stays_within_is_refused_with_the_least_one() -> None:
+    least_rad_s = LEAST_SPEED_SHARE * 3000.0 * math.pi / 30.0
+    require_speed(1.001 * least_rad_s, 3000.0)
+    with pytest.raises(IdentificationError, match="E_EXCITATION") as caught:
+        require_speed(0.999 * least_rad_s, 3000.0)
+    assert f"--speed-max {LEAST_SPEED_SHARE * 3000.0:.0f}rpm" in caught.value.hint
+
+
+def rated(i_nom_apk: float | None, i_trip_apk: float | None) -> MachineFile:
+    own = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
+    return replace(own, limits=MachineLimits(i_trip_apk=i_trip_apk), machine=replace(own.machine, I_nom_apk=i_nom_apk))
+
+
+def test_a_current_limit_above_the_machines_own_says_what_is_used() -> None:
+    """As `identify all --i-max 500Apk` uses it: levels up to 6.08 A, and pulses up to 13.2 A."""
+    own = rated(6.08, 15.5)
+    request = IdentifyRequest(i_max_apk=500.0)
+    above = [line for line in plan_lines(envelope_of(own, request), request, own) if "6.08 Apk" in line]
+    assert above == ["the current limit is above what is used: 6.08 Apk (4.299 Arms), the rated current"]
+    for given in (None, 7.0):
+        request = IdentifyRequest(i_max_apk=given)
+        assert not any("above" in line for line in plan_lines(envelope_of(own, request), request, own))
+    assert "up to 13.1" in unused_current(500.0, own, pulses=True)[1]
+    assert "up to 10 Apk" in unused_current(10.0, own, pulses=True)[1]
+    assert unused_current(500.0, rated(6.08, None), pulses=True)[1].endswith("overcurrent trip")
+    assert unused_current(500.0, rated(None, None), pulses=True) == []
+
+
+@pytest.mark.parametrize("rpm", [26.0, 60.0, 200.0, 3000.0])
+def test_the_slow_turn_keeps_to_the_speed_limit_even_with_one_pole_pair(rpm: float) -> None:
+    mean_rpm = STEP_RAD / dwell_within(0.015, rpm * math.pi / 30.0) * 30.0 / math.pi
+    assert mean_rpm <= 0.5 * rpm * (1.0 + 1e-12)
+    assert mean_rpm == pytest.approx(min(0.5 * rpm, STEP_RAD / 0.015 * 30.0 / math.pi))
+
+
+def test_a_speed_limit_too_low_for_the_slow_turn_is_refused_with_the_least_one() -> None:
+    with pytest.raises(IdentificationError, match="E_EXCITATION") as caught:
+        dwell_within(0.015, 1.0 * math.pi / 30.0)
+    least = float(caught.value.hint.split("--speed-max ")[1].removesuffix("rpm"))
+    assert dwell_within(0.015, least * math.pi / 30.0) <= SLOWEST_STEP_S
+
+
+class _Held:
+    """A drive that holds a set; the rest of it is not asked for."""
+
+    def __init__(self, **changed: float) -> None:
+        self._changed = {name.replace("__", "."): value for name, value in changed.items()}
+
+    def read(self, name: str) -> float:
+        return self._changed.get(name, BY_NAME[name].default)
+
+
+@pytest.mark.parametrize(("held", "known"), [(-12.0, None), (-15.0, None), (-10.0, -10.0)])
+def test_a_drive_whose_i_d_may_reach_the_largest_current_states_no_demagnetisation_limit(
+    held: float, known: float | None
+) -> None:
+    drive = _Held(motor__I_max_apk=12.0, motor__I_nom_apk=6.0, field_weakening__i_d_min_a=held)
+    assert nameplate_of(drive, "held").limits.i_d_min_apk == known  # type: ignore[arg-type]

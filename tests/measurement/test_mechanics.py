@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: MIT
+"""Inertia and friction of simulated drives over frames: one with much reluctance torque, and one that saturates."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pmsmtool.bus.connect import connect
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.guard import guarded
+from pmsmtool.estimators.estimate import statistical_half_width
+from pmsmtool.identification.evaluate import evaluate
+from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.measurement.identify import envelope_of, nameplate_of
+from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.measure import Measurement
+from pmsmtool.resources import data_folder
+from pmsmtool.sim.simulated_machine import settings_of, with_simulation
+from pmsmtool.trace import Trace
+
+pytestmark = pytest.mark.chain
+
+LIMIT = {"J_kgm2": 0.02, "tau_c_nm": 0.05, "B_nms": 0.08}
+"""Measured: 0.11, 0.4 and 0.5 % (fast-ipm), 0.77, 0.78 and 0.75 % (saturated-pmsyrm without its map, which would be
+needed for the torque of a q current; the interval says so)."""
+
+PREDICTED_FACTOR = 2.0
+"""Achieved deviation over the predicted one: 1.00 here; of random drives: ``benchmarks/mechanics_accuracy``."""
+
+
+@pytest.mark.parametrize(("name", "seed"), [("fast-ipm", 1), ("saturated-pmsyrm", 2)])
+def test_the_inertia_is_right_where_i_d_does_not_stay_zero(name: str, seed: int, tmp_path: Path) -> None:
+    """The slow current loop of the runs lets i_d rise in a push: on fast-ipm a fifth of the torque is reluctance."""
+    profiles = data_folder("profiles")
+    drive_file = with_simulation(load_machine_file(profiles / f"{name}.toml"), {"seed": seed})
+    path = tmp_path / "drive.toml"
+    path.write_text(dump_machine_file(drive_file))
+    shutil.copy(profiles / "saturated-pmsyrm.csv", tmp_path)
+    traces: dict[str, Trace] = {}
+    said: list[str] = []
+    predictions: list[dict[str, Any]] = []
+    with connect("pmsmsim", f"{path}?nv=:memory:") as connection:
+        drive = CanopenDrive(connection, 1)
+        nameplate = nameplate_of(drive, name)
+        envelope = envelope_of(nameplate, IdentifyRequest())
+        I_nom = nameplate.machine.I_nom_apk or envelope.i_max_apk
+        limits = Limits(I_nom, envelope.i_max_apk, envelope.speed_max_rad_s, nameplate.inverter.V_max_v)
+        with guarded(drive, envelope) as guard:
+            measurement = Measurement(guard, limits, traces.__setitem__, said.append)
+            measurement.predicted = predictions.append
+            measurement.run(IdentifyRequest().quantities)
+        drive.close()
+    inverter = nameplate.inverter
+    found = (
+        evaluate(traces, inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=inverter.U_dc_v).whole().estimates()
+    )
+    settings = settings_of(drive_file)
+    for key, limit in LIMIT.items():
+        error = abs(found[key].value - settings.number(key))
+        assert error < limit * settings.number(key), key
+        assert error < 2.0 * statistical_half_width(found[key]), key
+    pushes = said.index(next(line for line in said if line.startswith("J, B, tau_c: pushes")))
+    assert said[pushes + 1].startswith("predicted standard deviation: J ")
+    first, last = predictions
+    assert first["later"] == ["J, B, tau_c"] and last["before"] == "mechanics"
+    for key in LIMIT:
+        ratio = found[key].std / found[key].value / last["relative_std"][key]
+        assert 1.0 / PREDICTED_FACTOR < ratio < PREDICTED_FACTOR, key

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: MIT
+"""The pushes that tell flux and inertia roughly, on a drive whose current comes late: a large dead time holds it up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pmsmtool.drive.port import Excitation
+from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.speeds import PUSH_REACHED, PUSH_SPEED_SHARE, SpeedStage
+from pmsmtool.trace import Trace
+
+POLE_PAIRS, PSI, RATE, R, V_DEAD = 4, 0.05, 400.0, 0.2, 10.0
+"""The rate is in rad/s2 (mechanical) per ampere."""
+LIMITS = Limits(10.0, 12.0, 300.0, 150.0)
+
+
+class LateCurrent:
+    """``i_q`` is there ``late_s`` after its command; the voltage is off by ``off_v``: the dead time's rest."""
+
+    period_s = 5e-5
+
+    def __init__(self, late_s: float, off_v: float) -> None:
+        self.late_s, self.off_v, self.omega = late_s, off_v, 0.0
+
+    def command_current(self, i_d_a: float, i_q_a: float) -> None:
+        pass
+
+    def record(
+        self, names: Sequence[str], samples: int, *, decimation: int = 1, excitation: Excitation | None = None
+    ) -> Trace:
+        assert excitation is not None
+        t = np.arange(samples) * decimation * self.period_s
+        i_q = excitation.amplitude * (t >= self.late_s)
+        omega = self.omega + RATE * np.cumsum(i_q) * decimation * self.period_s
+        self.omega = float(omega[-1])
+        error = (4.0 / math.pi * V_DEAD - self.off_v) * np.sign(i_q)
+        signals: dict[str, Any] = {name: np.zeros(samples) for name in names}
+        signals |= {
+            "i_q_a": i_q,
+            "omega_e_rad_s": POLE_PAIRS * omega,
+            "u_q_v": PSI * POLE_PAIRS * omega + R * i_q + error,
+        }
+        return Trace(t, signals, dict.fromkeys(names, "1"), {"period_s": decimation * self.period_s})
+
+
+def pushed(late_s: float) -> tuple[dict[str, Trace], float, float]:
+    kept: dict[str, Trace] = {}
+    drive: Any = LateCurrent(late_s, off_v=0.5)
+    stage = SpeedStage(drive, LIMITS, kept.__setitem__, lambda text: None)
+    resistance: Any = SimpleNamespace(R_measured=SimpleNamespace(value=R), V_dead_v=V_DEAD)
+    psi, J = stage._pushes(resistance, POLE_PAIRS)
+    return kept, psi, J
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.03, 0.049])
+def test_a_push_goes_on_until_it_turns_the_shaft(late_s: float) -> None:
+    kept, psi, _ = pushed(late_s)
+    reached = max(abs(float(push["omega_e_rad_s"][-1])) for push in kept.values()) / POLE_PAIRS
+    assert reached >= 0.9 * PUSH_REACHED * PUSH_SPEED_SHARE * LIMITS.omega_max_rad_s
+    assert reached < LIMITS.omega_max_rad_s
+    assert psi == pytest.approx(PSI, rel=0.25)

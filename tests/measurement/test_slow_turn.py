@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: MIT
+"""The rotor on a slowly turning vector: what it swings by, on a mass that only friction damps, and on a whole drive."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+
+from pmsmtool.estimators.encoder import estimate_encoder
+from pmsmtool.experiments.rotation import QUICK_DWELL_S, QUICK_STEP_RAD, SWING, RotationPlan, rotate_vector, step_within
+from pmsmtool.experiments.vector_turn import LOOK_S, RAMP_S, REST_LIMIT_S, come_to_rest, rising, turn_vector
+from pmsmtool.measurement.measure import ROTATIONS
+from pmsmtool.trace import Trace
+
+POLE_PAIRS = 2
+FRICTION = 0.02
+"""Friction over the largest torque of the vector: the rotor comes to rest within this angle (rad electrical)."""
+FRAME_S = 0.002
+"""Time that a command or a question takes on the bus."""
+STEP_S = 1e-3
+SWING_LIMIT_RAD = math.radians(15.0)
+"""Half of what the estimator refuses. These turns swing by 10 deg at the most; on a vector that jumps to 75/6 rad/s
+98, 34, 21, 17 and 7 deg."""
+
+
+class SwingingRotor:
+    """A mass on the current vector, whose angle the dead time moves by ``ripple_rad`` six times a turn."""
+
+    period_s = 1e-4
+
+    def __init__(self, swing_rad_s: float, ripple_rad: float = 0.0, theta_rad: float = 0.0) -> None:
+        self.swing_rad_s, self.ripple_rad = swing_rad_s, ripple_rad
+        self.theta, self.omega, self.i_a, self.vector = theta_rad, 0.0, 0.0, 0.0
+        self.elapsed = 0.0
+        self.speeds: list[float] = []
+
+    def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
+        assert fixed_angle_rad is not None
+        self.i_a, self.vector = i_d_a, fixed_angle_rad
+        self.wait(FRAME_S)
+
+    def wait(self, seconds: float) -> None:
+        spring = self.swing_rad_s**2
+        for _ in range(round(seconds / STEP_S)):
+            pull = self.vector + self.ripple_rad * math.sin(6.0 * self.vector) - self.theta
+            push = spring * self.i_a * math.sin(pull)
+            held = spring * FRICTION
+            if abs(self.omega) <= STEP_S * held and abs(push) <= held:
+                self.omega = 0.0
+            else:
+                self.omega += STEP_S * (push - math.copysign(held, self.omega or push))
+            self.theta += STEP_S * self.omega
+            self.elapsed += STEP_S
+            self.speeds.append(self.omega)
+
+    def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
+        self.wait(FRAME_S + periods * self.period_s)
+        return {"theta_m_rad": self.theta / POLE_PAIRS}
+
+
+def swing_rad(run: Trace) -> float:
+    off = POLE_PAIRS * run["theta_M_rad"] - run["theta_imposed_rad"]
+    return float(np.max(np.abs(off - np.mean(off))))
+
+
+def first_plan(omega_max_rad_s: float = 300.0) -> RotationPlan:
+    _, step_rad, dwell_s, ramp_s = ROTATIONS[0]
+    return RotationPlan(1.0, *step_within(step_rad, dwell_s, omega_max_rad_s), ramp_s=ramp_s)
+
+
+@pytest.mark.parametrize(
+    ("swing_rad_s", "ripple_rad"), [(19.0, 0.0), (25.0, 0.03), (60.0, 0.03), (75.0, 0.03), (106.0, 0.0)]
+)
+def test_a_rotor_that_swings_stays_on_the_first_vector(swing_rad_s: float, ripple_rad: float) -> None:
+    drive = SwingingRotor(swing_rad_s, ripple_rad)
+    runs = rotate_vector(drive, first_plan())  # type: ignore[arg-type]
+    assert max(map(swing_rad, runs)) < SWING_LIMIT_RAD
+    found = estimate_encoder(*runs)
+    assert found.pole_pairs.value == POLE_PAIRS
+    assert abs(found.offset.value) < math.radians(1.0)
+
+
+def test_the_rotor_rests_on_a_whole_turn_afterwards() -> None:
+    drive = SwingingRotor(25.0, 0.02, theta_rad=math.radians(330.0))
+    rotate_vector(drive, first_plan(), start_rad=math.radians(330.0))  # type: ignore[arg-type]
+    assert drive.i_a == 0.0
+    assert math.remainder(drive.vector, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-9)
+    assert abs(math.remainder(drive.theta, 2.0 * math.pi)) < 2.0 * FRICTION
+    assert abs(drive.omega) < 0.1
+
+
+def test_a_rotor_far_off_the_first_vector_is_waited_for() -> None:
+    drive = SwingingRotor(40.0, theta_rad=math.radians(100.0))
+    assert max(map(swing_rad, rotate_vector(drive, first_plan()))) < SWING_LIMIT_RAD  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("swing_rad_s", [16.0, 30.0, 60.0])
+def test_half_an_electrical_turn_leaves_no_swing(swing_rad_s: float) -> None:
+    drive = SwingingRotor(swing_rad_s)
+    turn_vector(drive, 1.0, 0.0, math.pi)  # type: ignore[arg-type]
+    drive.speeds.clear()
+    drive.wait(0.5)
+    assert max(map(abs, drive.speeds)) < math.radians(10.0) * swing_rad_s
+
+
+def test_rest_is_not_taken_for_the_end_of_a_swing_and_not_waited_for_for_ever() -> None:
+    class Endless(SwingingRotor):
+        def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
+            self.elapsed += FRAME_S
+            return {"theta_m_rad": 0.1 * math.cos(7.0 * self.elapsed)}
+
+        def wait(self, seconds: float) -> None:
+            self.elapsed += seconds
+
+    assert come_to_rest(Endless(7.0)) == pytest.approx(REST_LIMIT_S, abs=LOOK_S)  # type: ignore[arg-type]
+    assert come_to_rest(SwingingRotor(7.0)) < 0.2  # type: ignore[arg-type]
+
+
+def test_a_ramp_rises_smoothly_and_never_beyond_the_speed() -> None:
+    ramp = rising(30)
+    assert list(ramp) == sorted(ramp)
+    assert 0.0 < ramp[0] < 0.01 and 0.99 < ramp[-1] < 1.0
+    assert sum(ramp) == pytest.approx(15.0)
+    assert len(RotationPlan(1.0, dwell_s=0.018, ramp_s=RAMP_S).ramp) == 25
+
+
+@pytest.mark.parametrize("rpm", [26.0, 60.0, 120.0, 249.0, 251.0, 400.0, 573.0, 3000.0])
+@pytest.mark.parametrize("plan", ROTATIONS)
+def test_every_try_keeps_to_the_speed_limit(rpm: float, plan: tuple[float, float, float, float]) -> None:
+    allowed = rpm * math.pi / 30.0
+    step_rad, dwell_s = step_within(plan[1], plan[2], allowed)
+    assert SWING * step_rad / (dwell_s + 0.002) <= allowed * (1.0 + 1e-12)
+    assert step_rad <= plan[1] and dwell_s >= plan[2]
+    if rpm == 3000.0:
+        assert (step_rad, dwell_s) == plan[1:3]
+
+
+def test_the_first_vector_is_above_the_swing_of_every_drive_it_was_made_for() -> None:
+    """The dead time pulls six times per turn; 105 rad/s is the fastest swing of 400 random drives."""
+    on_the_bus_s = QUICK_DWELL_S + 0.006
+    assert 6.0 * QUICK_STEP_RAD / on_the_bus_s > 1.3 * 105.0

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""The current loop of the flux run against an inverter whose error is large beside the winding's voltage."""
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.identification_coverage import drawn, evaluated, measured, truth_of
+from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.experiments.speed_run import SETTLE_MOST_S, SETTLE_S, SteadyLoop, steady_loop
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.speeds import run_d_current
+
+R, L, I_LEAST, PERIOD_S, LEAST_RAD_S = 0.4, (1e-3, 1.5e-3), 2.0, 5e-5, 754.0
+STEPS_PER_PERIOD = 4
+
+
+def off_after(loop: SteadyLoop, V_dead_v: float, axis_q_a: float) -> float:
+    """Largest distance from the wanted current, relative, once the loop's time is over after i_d changed its sign.
+
+    The error is 4/pi V_dead along the current, softened at a hundredth of the current; speed adds what is feed-forward.
+    """
+    error_v, soft = 4.0 / math.pi * V_dead_v, 0.01 * I_LEAST
+    i, wanted = [-I_LEAST, axis_q_a], (I_LEAST, 0.0)
+    x = [-I_LEAST * (R + error_v / I_LEAST), 0.0]
+    step = PERIOD_S / STEPS_PER_PERIOD
+    worst = 0.0
+    for k in range(round(1.5 * loop.settle_s / PERIOD_S)):
+        u = [loop.K_p_v_per_a[n] * (wanted[n] - i[n]) + x[n] for n in (0, 1)]
+        x = [x[n] + PERIOD_S * loop.K_i_v_per_as[n] * (wanted[n] - i[n]) for n in (0, 1)]
+        for _ in range(STEPS_PER_PERIOD):
+            along = error_v / math.hypot(*i, soft)
+            # implicit in the error's resistance: it is stiff near zero
+            i = [(i[n] + step / L[n] * u[n]) / (1.0 + step / L[n] * (R + along)) for n in (0, 1)]
+        if k * PERIOD_S >= loop.settle_s:
+            worst = max(worst, abs(i[0] - wanted[0]), abs(i[1]))
+    return worst / I_LEAST
+
+
+@pytest.mark.parametrize("V_dead_v", [0.0, 0.5, 5.0, 25.0])
+def test_currents_are_steady_when_the_window_begins(V_dead_v: float) -> None:
+    loop = steady_loop(R, L, V_dead_v, I_LEAST, PERIOD_S, LEAST_RAD_S)
+    assert SETTLE_S <= loop.settle_s < 2.0 * SETTLE_S
+    assert off_after(loop, V_dead_v, 0.1) < 0.03
+
+
+def test_the_least_bandwidth_would_leave_the_current_at_zero() -> None:
+    slow = steady_loop(R, L, 0.0, I_LEAST, PERIOD_S, LEAST_RAD_S)
+    assert slow.K_p_v_per_a == pytest.approx((LEAST_RAD_S * L[0], LEAST_RAD_S * L[1]))
+    assert off_after(slow, 25.0, 0.1) > 0.5
+
+
+def test_a_slow_drive_waits_longer_but_not_for_ever() -> None:
+    slow = steady_loop(R, L, 25.0, I_LEAST, 1.0 / 8000.0, 533.0)
+    assert slow.K_p_v_per_a[0] == pytest.approx(8000.0 / 6.0 * L[0])
+    assert SETTLE_S < slow.settle_s <= SETTLE_MOST_S
+
+
+PSI_LIMIT = 3e-3
+"""Largest error of psi_f that is asked for."""
+SLOW_AND_LIGHT = 70189
+"""325 V, 0.25 mH: in the 83 ms in which currents settle, 0.17 of the rated one braked it from 990 to 204 rad/s."""
+
+
+@pytest.mark.chain
+def test_a_q_current_that_settles_slowly_does_not_stop_the_shaft() -> None:
+    drive = drawn("", SLOW_AND_LIGHT, "ideal")
+    traces, nameplate, _ = measured(drive)
+    speeds = traces["speeds"]
+    driven = np.abs(speeds["i_q_a"]) > np.abs(speeds["i_d_a"])
+    w = np.abs(speeds["omega_e_rad_s"])
+    change = np.abs(speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / w
+    assert np.count_nonzero(driven) == 8
+    assert float(np.max(change)) < 0.2  # measured 0.102; 0.50 with a current that left settling out of account
+    assert float(np.min(w[driven])) > 0.3 * float(np.max(w))  # measured 0.32; 0.09
+    evaluation = evaluated(traces, nameplate)
+    truth = truth_of(drive, evaluation)
+    for name, found in evaluation.estimates().items():
+        if name in truth:
+            assert abs(found.value - truth[name]) <= total_half_width(found), name
+    # the ripple of 7.6 A beside a d current of 9.4 A, and psi_f is 0.52 % off, outside its statistical interval
+    psi = evaluation.estimates()["psi_f_wb"]
+    assert float(np.max(np.abs(speeds["i_d_a"]))) > 1.9 * ripple_of(drive)
+    assert abs(psi.value / truth["psi_f_wb"] - 1.0) < PSI_LIMIT
+
+
+def ripple_of(drive: MachineFile) -> float:
+    """Largest amplitude of the current's ripple (A)."""
+    machine = drive.machine
+    return drive.inverter.U_dc_v * drive.inverter.T_s / (8.0 * max(machine.L_d_h, machine.L_q_h))
+
+
+@pytest.mark.parametrize(("L_q_h", "share"), [(1.5e-3, 0.45), (0.4e-3, 0.65), (0.2e-3, 0.8)])
+def test_the_d_current_grows_with_the_ripple(L_q_h: float, share: float) -> None:
+    limits = Limits(20.0, 22.0, 100.0, 325.0 / math.sqrt(3.0))
+    found = run_d_current(limits, (0.5 * L_q_h, L_q_h), 6.4e-5)
+    assert found == pytest.approx(share * limits.I_test_apk, rel=1e-9)

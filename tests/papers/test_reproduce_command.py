@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: MIT
+"""``pmsmtool reproduce`` as a command."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.cli.main import run
+from pmsmtool.papers import registry
+from pmsmtool.papers.figure import Reproduction, at_most
+
+
+@dataclass(frozen=True)
+class Done:
+    exit_code: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def pmsmtool(capsys: pytest.CaptureFixture[str]) -> Callable[..., Done]:
+    def call(*arguments: str) -> Done:
+        capsys.readouterr()
+        code = run(["reproduce", *arguments])
+        said = capsys.readouterr()
+        return Done(code, said.out, said.err)
+
+    return call
+
+
+Command = Callable[..., Done]
+
+
+def test_list_names_every_figure(pmsmtool: Command) -> None:
+    listed = pmsmtool("--list")
+    assert listed.exit_code == 0
+    assert all(row.name in listed.stdout for row in registry.FIGURES)
+    data = json.loads(pmsmtool("--list", "--json").stdout)
+    assert data["schema"] == "pmsmtool.reproduce/1"
+    assert [one["name"] for one in data["figures"]] == [row.name for row in registry.FIGURES]
+
+
+@pytest.mark.chain
+def test_tables_go_to_stdout_and_files_hold_the_same_bytes_twice(pmsmtool: Command, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        done = pmsmtool("jercic-fig12", "-o", str(tmp_path / name))
+        assert done.exit_code == 0, done.stderr
+        assert "checked numbers: printed in the paper, or expected" in done.stdout
+        assert "predicted excess" in done.stdout
+        assert "wrote" in done.stderr
+        assert "wrote" not in done.stdout
+    files = sorted(path.name for path in (tmp_path / "one").iterdir())
+    assert files == [f"jercic-fig12.{suffix}" for suffix in ("csv", "json", "svg", "txt")]
+    assert all((tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in files)
+    stored = json.loads((tmp_path / "one" / "jercic-fig12.json").read_text(encoding="utf-8"))
+    assert stored["schema"] == "pmsmtool.reproduce/1"
+    assert stored["ok"] is True
+    assert len(stored["panels"][0]["series"][0]["x"]) == 19200
+
+
+@pytest.mark.chain
+def test_json_has_the_checks_and_one_file_can_be_asked_for(pmsmtool: Command, tmp_path: Path) -> None:
+    target = tmp_path / "t.csv"
+    done = pmsmtool("jercic-fig12", "--json", "-o", str(target), "--plot", str(tmp_path / "t.svg"))
+    data = json.loads(done.stdout)
+    assert data["name"] == "jercic-fig12"
+    assert all(check["within"] for check in data["checks"])
+    assert data["tables"][1]["units"] == ["rpm/s", "%", "%"]
+    assert target.read_text(encoding="utf-8").startswith("panel,series,x,y")
+    assert (tmp_path / "t.svg").read_text(encoding="utf-8").startswith("<?xml")
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def outside(seed: int) -> Reproduction:
+    return Reproduction("bad", "t", "s", checks=(at_most("the number", 2.0 + seed, 1.0, "A"),))
+
+
+def test_a_number_out_of_range_is_exit_code_1_after_the_table(
+    pmsmtool: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = registry.Row("bad", "none:none", "t", "s", 1.0)
+    monkeypatch.setattr(registry, "FIGURES", (row,))
+    monkeypatch.setattr(registry, "reproduce", lambda row, seed: outside(seed))
+    for name in ("bad", "all"):
+        done = pmsmtool(name, "--seed", "3")
+        assert done.exit_code == 1
+        assert "the number" in done.stdout
+        assert "5" in done.stdout
+        assert "NO" in done.stdout
+        assert "bad: the number" in done.stderr
+    assert json.loads(pmsmtool("all", "--json").stdout)["figures"][0]["ok"] is False
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ((), "missing argument FIGURE"),
+        (("jercic-fig1",), "did you mean"),
+        (("all", "--plot", "x.svg"), "folder"),
+        (("all", "-o", "x.json"), "folder"),
+        (("jercic-fig12", "-o", "x.xls"), "no format"),
+        (("jercic-fig12", "--plot", "x.gif"), "no figure format"),
+        (("jercic-fig12", "--seed", "-1"), "outside"),
+    ],
+)
+def test_wrong_use_is_refused_before_anything_runs(
+    pmsmtool: Command, arguments: tuple[str, ...], complaint: str
+) -> None:
+    done = pmsmtool(*arguments)
+    assert done.exit_code == 2
+    assert complaint in done.stderr
+
+
+def test_a_table_without_plot_says_so(pmsmtool: Command, tmp_path: Path) -> None:
+    done = pmsmtool("jercic-table2", "--plot", str(tmp_path / "t.svg"))
+    assert done.exit_code == 2
+    assert "nothing to plot" in done.stderr

@@ -1,0 +1,369 @@
+# SPDX-License-Identifier: MIT
+"""``prove`` on a simulated drive: healthy, spoiled, refused, declined, interrupted; also from the command line."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from benchmarks.prove_verdicts import KINDS, Shared, flash, spoiled
+from pmsmtool.bus.clock import VirtualClock
+from pmsmtool.bus.connect import connect
+from pmsmtool.cia402 import Mode
+from pmsmtool.cli.main import run as program
+from pmsmtool.commissioning.commission import begin_run
+from pmsmtool.commissioning.report_page import report_page
+from pmsmtool.design.design_file import Design, design_text
+from pmsmtool.design.prediction import Band, Prediction
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import is_safe
+from pmsmtool.errors import Declined, Interrupted, VerifyMismatch
+from pmsmtool.flash.restore import take_backup
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.proof import measured
+from pmsmtool.proof import stage as stages
+from pmsmtool.proof.judgement import judge
+from pmsmtool.proof.plan import Conditions
+from pmsmtool.proof.stage import ProofRequest, _too_slow, prove_stage, read_proof, responses
+from pmsmtool.resources import data_folder
+from pmsmtool.run_directory import RunDirectory, Stage
+from pmsmtool.sim.kernel import Params
+
+pytestmark = pytest.mark.chain
+
+FEW = ProofRequest(runs=32)
+"""A third of the machines the tool draws."""
+SHARED = Shared()
+"""The design and the conditions are the same in every test, and so is their prediction: it is made once."""
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(stages, "predict_proof", SHARED.predict)
+    monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
+    monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
+    return tmp_path
+
+
+def machine() -> MachineFile:
+    """The profile with the deviations that identification leaves instead of those of a data sheet."""
+    base = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
+    m = base.machine
+    std = {
+        "R_s_ohm": 0.01 * m.R_s_ohm,
+        "L_d_h": 0.007 * m.L_d_h,
+        "L_q_h": 0.007 * m.L_q_h,
+        "psi_f_wb": 0.006 * m.psi_f_wb,
+    }
+    inverter = replace(base.inverter, V_dead_v=13.76, i_knee_apk=0.15)
+    return replace(base, inverter=inverter, std={**std, "J_kgm2": 0.01 * (m.J_kgm2 or 1.0), "offset_rad": 2e-3})
+
+
+@pytest.fixture(scope="module")
+def design() -> Design:
+    return tune(machine(), TuneRequest(field_weakening="lookup"))
+
+
+@contextmanager
+def flashed(
+    design: Design, *, delay: float = 0.0, rotor: str = "free", truth: MachineFile | None = None
+) -> Iterator[CanopenDrive]:
+    """A simulated drive that holds the design."""
+    truth = truth or machine()
+    truth = replace(truth, inverter=replace(truth.inverter, delay_periods=1.5 + delay))
+    truth = replace(truth, simulation={**truth.simulation, "rotor": rotor})
+    Path("drive.toml").write_text(dump_machine_file(truth))
+    with connect("pmsmsim", "drive.toml?nv=drive.nv") as connection:
+        drive = CanopenDrive(connection, 1)
+        flash(drive, design, Path("journals"))
+        yield drive
+        drive.close()
+
+
+def prove(drive: CanopenDrive, design: Design, said: list[str] | None = None) -> tuple[RunDirectory, Stage]:
+    run = begin_run(drive, Path("runs"))
+    lines = said if said is not None else []
+    stage = prove_stage(run, drive, design, FEW, lambda shown: None, lines.append)
+    run.add(stage)
+    return run, stage
+
+
+def test_a_healthy_drive_passes_and_the_prediction_came_first(design: Design) -> None:
+    committed: list[tuple[str, str]] = []
+
+    class Said(list[str]):
+        def append(self, line: str) -> None:
+            super().append(line)
+            if line.startswith("dead-man proven"):  # the last line before anything is energised for long
+                (path,) = Path("runs").glob("*/prove/*/prediction.npz")
+                committed.append((hashlib.sha256(path.read_bytes()).hexdigest(), "\n".join(self)))
+
+    said = Said()
+    with flashed(design) as drive:
+        before = take_backup(drive.node, drive.identity).entries
+        run, stage = prove(drive, design, said)
+        assert is_safe(drive.node.state()) and take_backup(drive.node, drive.identity).entries == before
+    assert stage.status == "pass", stage.note
+    ((digest, until),) = committed
+    assert f"prediction committed: sha256:{digest}" in until and "predicted q_steps i_q_a" in until
+    assert {"name": "prediction", "value": f"sha256:{digest}"} in stage.values
+    (folder,) = (run.path / "prove").iterdir()
+    assert hashlib.sha256((folder / "prediction.npz").read_bytes()).hexdigest() == digest, "the file is as committed"
+    prediction, traces = read_proof(folder)
+    assert prediction.facts["design"] == design.content_hash()
+    assert list(traces) == ["speed_step", "q_steps", "d_steps", "unreachable", "weakening"]
+    again = judge(prediction, responses(traces, prediction))
+    assert [line.share for line in again.seen] == [v["value"] for v in stage.values if "where" in v]
+    page = report_page(run.path)
+    assert page.count("inside its band") == 5 and "Behaviour: the drive" not in page
+
+
+@pytest.mark.parametrize(
+    ("kind", "cause"),
+    [
+        ("gain_low", "gain of the current loops is lower"),
+        ("gain_high", "gain of the current loops is higher"),
+        ("delay", "one more control period of delay"),
+        ("decoupling", "decoupling has the wrong sign"),
+        ("pole_pairs_high", "wrong pole pairs"),
+        ("pole_pairs_low", "wrong pole pairs"),
+    ],
+)
+def test_a_spoiled_drive_is_caught_and_the_cause_named(kind: str, cause: str, design: Design) -> None:
+    with spoiled(kind), flashed(design, delay=1.0 if kind == "delay" else 0.0) as drive:
+        run, stage = prove(drive, design)
+        assert is_safe(drive.node.state())
+    assert stage.status == "fail"
+    assert cause in stage.note
+    if kind == "gain_low":
+        assert "OUTSIDE its band" in report_page(run.path)
+
+
+def test_a_healthy_drive_passes_within_a_small_current_limit(design: Design) -> None:
+    """At full torque 5 A of the design's 12 A would all go into i_d, and the base speed would not be reached."""
+    few = replace(FEW, i_max_apk=5.0)
+    with flashed(design) as drive:
+        run = begin_run(drive, Path("runs"))
+        stage = prove_stage(run, drive, design, few, lambda shown: None, lambda line: None)
+    assert stage.status == "pass", stage.note
+    (folder,) = (run.path / "prove").iterdir()
+    prediction, traces = read_proof(folder)
+    assert prediction.facts["conditions"]["i_max_apk"] == 5.0 and "unreachable" in traces
+
+
+def test_a_link_below_what_it_showed_at_rest_is_named(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    conditions_of = stages.conditions_of
+
+    def at_rest(*asked: Any) -> Conditions:
+        found = conditions_of(*asked)
+        return replace(found, U_dc_v=found.U_dc_v / 0.85)
+
+    monkeypatch.setattr(stages, "conditions_of", at_rest)
+    with flashed(design) as drive:
+        _, stage = prove(drive, design)
+    assert stage.status == "fail" and "likely the voltage is too low" in stage.note
+
+
+def test_a_shaft_that_is_held_is_named(design: Design) -> None:
+    with flashed(design, rotor="locked") as drive:
+        _, stage = prove(drive, design)
+        assert is_safe(drive.node.state())
+    assert stage.status == "fail" and "likely something holds the shaft" in stage.note
+    assert stage.note.startswith("the speed was not reached: speed_step ends at ")
+    assert [line.what for line in stage.acceptance if not line.ok][-1] == "the speed is reached"
+
+
+def test_a_fault_is_named_with_the_experiment(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    def touchy(params: Params) -> None:
+        params.protection_i_trip_apk = 4.0
+
+    monkeypatch.setitem(KINDS, "touchy", touchy)
+    with spoiled("touchy"), flashed(design) as drive:
+        _, stage = prove(drive, design)
+    assert stage.status == "fail" and "0x2310" in stage.note and "during speed_step" in stage.note
+
+
+def test_a_heavy_shaft_is_given_the_time_it_needs() -> None:
+    """It takes 9 s to the speed of the unreachable current; 7 s were all a proof waited for."""
+    base = machine()
+    heavy = replace(base, machine=replace(base.machine, J_kgm2=2.0), std={**base.std, "J_kgm2": 0.02})
+    made = tune(heavy, TuneRequest())
+    with flashed(made, truth=heavy) as drive:
+        stage = prove_stage(
+            begin_run(drive, Path("runs")), drive, made, replace(FEW, experiments=("unreachable",)),
+            lambda shown: None, lambda line: None,
+        )  # fmt: skip
+        assert is_safe(drive.node.state())
+    assert stage.status == "pass", stage.note
+
+
+def test_a_speed_that_is_not_reached_is_named(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody waits for it here, so it is on its way: named, with a reason, and the machine is stopped."""
+    monkeypatch.setattr(measured, "RISE_S", 0.0)
+    monkeypatch.setattr(measured, "REACH_S", 0.0)
+    monkeypatch.setattr(measured, "REACH_FACTOR", 0.0)
+    with flashed(design) as drive:
+        _, stage = prove(drive, design)
+        assert is_safe(drive.node.state())
+    assert stage.status == "fail"
+    assert "the speed was not reached: " in stage.note and "before q_steps" in stage.note
+    assert "rpm after 0 s, with i_d = " in stage.note and "; likely " in stage.note
+    assert [line.what for line in stage.acceptance if not line.ok] == ["all experiments are run to their end"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "limited", "reason"),
+    [
+        ({"i_d_a": -4.99, "i_q_a": 0.3}, True, "all current stays in i_d"),
+        ({"i_d_a": -1.0, "i_q_a": 4.9}, True, "torque at the current limit does not suffice"),
+        ({"u_q_lim_v": 311.0}, False, "the voltage is too low: none is left"),
+        ({"U_dc_v": 480.0}, True, "the DC link falls to 480 V, at rest it shows 540 V"),
+        ({}, False, "asks for no more current"),
+    ],
+)
+def test_what_the_drive_shows_tells_why_a_speed_is_not_reached(
+    changed: dict[str, float], limited: bool, reason: str, design: Design
+) -> None:
+    state = {"i_d_a": -0.5, "i_q_a": 1.0, "u_d_lim_v": -20.0, "u_q_lim_v": 100.0, "U_dc_v": 540.0, **changed}
+    at_rest = Conditions(540.0, 25.0, 25.0, 1 << 17, 5.0, 300.0)
+    assert reason in measured._why_not(state, limited, design, at_rest)
+
+
+@pytest.mark.parametrize("slow", [1, 99])
+def test_a_record_that_begins_at_another_speed_does_not_count(
+    slow: int, design: Design, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A slow host leaves the shaft coasting before the step: once is forgiven, always is named."""
+    set_mode, count = CanopenDrive._set_mode, 0
+    said: list[str] = []
+
+    def slowly(self: CanopenDrive, mode: Mode) -> None:
+        nonlocal count
+        set_mode(self, mode)
+        if mode is Mode.IDENTIFICATION and self.live("omega_e_rad_s") > 100.0:
+            count += 1
+            for _ in range(30 if count <= slow else 0):  # 1.5 s, in which the tool asks often enough to be alive
+                self.node.connection.clock.wait(0.05)
+                self.node.state()
+
+    monkeypatch.setattr(CanopenDrive, "_set_mode", slowly)
+    with flashed(design) as drive:
+        _, stage = prove(drive, design, said)
+    assert [line for line in said if "off its speed; again" in line]
+    assert stage.status == ("pass" if slow == 1 else "fail"), stage.note
+    assert slow == 1 or stage.note.startswith("the speed was not kept: 3 times q_steps began more than 5 % below")
+
+
+def test_a_gross_deviation_ends_the_proof_before_more_is_asked(design: Design) -> None:
+    with spoiled("pole_pairs_high"), flashed(design) as drive:
+        _, stage = prove(drive, design)
+    assert sorted(name.rsplit("/", 1)[1] for name in stage.files) == ["prediction.npz", "speed_step.npz"]
+    assert any("not run after a response far outside" in line.measured for line in stage.acceptance)
+
+
+def test_a_drive_that_holds_another_set_is_refused(design: Design) -> None:
+    with flashed(design) as drive:
+        drive.write({"current.K_p_d_v_per_a": 0.9 * design["current.K_p_d_v_per_a"]})
+        with pytest.raises(VerifyMismatch, match=r"1 of 89 objects differ") as caught:
+            prove(drive, design)
+        assert "flash-params" in str(caught.value) and "K_p_d" in str(caught.value)
+        assert not list(Path("runs").glob("*/prove"))
+
+
+def test_declined_moves_and_predicts_nothing(design: Design) -> None:
+    shown: list[str] = []
+
+    def decline(lines: Sequence[str]) -> None:
+        shown.extend(lines)
+        raise Declined("no")
+
+    with flashed(design) as drive:
+        run = begin_run(drive, Path("runs"))
+        with pytest.raises(Declined):
+            prove_stage(run, drive, design, FEW, decline, lambda line: None)
+        assert not drive.may_be_energised
+    assert any("field weakening" in line for line in shown) and any(line.startswith("current ") for line in shown)
+    assert not (run.path / "prove").exists()
+
+
+@pytest.mark.parametrize("wait", [40, 110])
+def test_ctrl_c_leaves_the_machine_off_and_the_drive_as_it_was(
+    wait: int, design: Design, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count, pass_time = 0, VirtualClock.wait
+
+    def interrupted(self: VirtualClock, seconds: float) -> None:
+        nonlocal count
+        count += 1
+        if count == wait:
+            signal.raise_signal(signal.SIGINT)
+        pass_time(self, seconds)
+
+    with flashed(design) as drive:
+        before = take_backup(drive.node, drive.identity).entries
+        with monkeypatch.context() as patch:
+            patch.setattr(VirtualClock, "wait", interrupted)
+            with pytest.raises(Interrupted):
+                prove(drive, design)
+        assert is_safe(drive.node.state())
+        assert take_backup(drive.node, drive.identity).entries == before
+
+
+# ---- the command line -----------------------------------------------------------------------------------------
+
+
+def test_from_the_command_line(design: Design, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("design.toml").write_text(design_text(design))
+    with flashed(design):
+        pass
+    bus = ("-i", "pmsmsim", "-c", "drive.toml?nv=drive.nv")
+    assert program(["prove", *bus, "design.toml"]) == 7, "nobody can be asked"
+    assert not list(Path("runs").glob("*"))
+    capsys.readouterr()
+    assert program(["prove", *bus, "design.toml", "--yes", "--machines", "32", "--json"]) == 0
+    printed = capsys.readouterr()
+    found = json.loads(printed.out)
+    assert found["schema"] == "pmsmtool.prove/1" and found["verdict"] == "PASS" and found["cause"] == ""
+    assert f"prediction committed: {found['prediction']}" in printed.err
+    assert len(found["seen"]) == 15 and all(line["inside"] for line in found["seen"])
+    run = RunDirectory(Path(found["run"]))
+    assert (run.path / "report.html").is_file() and run.read().passed("prove")
+    assert [given["subject"] for given in run.read().consents] == ["motion"]
+    with spoiled("gain_low"):
+        assert program(["prove", *bus, str(run.path), "--yes", "--machines", "32"]) == 1
+    printed = capsys.readouterr()
+    assert "OUTSIDE" in printed.out and "gain of the current loops is lower" in printed.err
+    assert [stage.status for stage in run.read().stages] == ["pass", "fail"]
+    first, second = sorted((run.path / "prove").iterdir())
+    assert second.name == f"{first.name}-2", "the same prediction, and no trace of the first proof replaced"
+    assert (first / "prediction.npz").read_bytes() == (second / "prediction.npz").read_bytes()
+
+
+def test_a_band_on_both_sides_of_standstill_tells_no_speed() -> None:
+    """Before: 1088 rad/s were "instead of 545.2" within -4329 to 5748, for the edges' magnitudes were compared."""
+    end = {("weakening", "omega_e_rad_s"): np.array([830.0, 1088.0])}
+
+    def said(mean: float, std: float) -> str:
+        band = Band(np.array([830.0, mean]), np.array([10.0, std]), 2.0)
+        return _too_slow(Prediction({}, {("weakening", "omega_e_rad_s"): band}), end)
+
+    assert "tells no speed to prove" in said(545.0, 1000.0) and "instead of" not in said(545.0, 1000.0)
+    assert said(545.0, 540.0) == ""  # -535 to 1625: 1088 lies inside
+    assert said(1500.0, 1350.0) == ""  # -1200 to 4200: before, slower than 1200
+    assert said(1100.0, 10.0) == "" and said(900.0, 10.0) == ""  # faster than both
+    assert "ends at 1088 instead of 1200 rad/s" in said(1200.0, 10.0)
+    assert "ends at 1088 instead of -1200 rad/s" in said(-1200.0, 10.0)
