@@ -11,7 +11,7 @@ import itertools
 import re
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,26 +33,37 @@ FLOORS: dict[str, int] = {
     "npz_file": 2,
     "toml_file": 2,
     "toml_text": 2,
+    "run_directory": 2,
     "machine": 3,
-    "params": 4,
     "trace": 3,
     "packaging": 3,
+    "params": 4,
     "estimators": 5,
     "design": 5,
     "firmware": 5,
-    "drive": 6,
-    "sim": 6,
-    "report": 6,
-    "experiments": 7,
-    "flash": 7,
-    "workflow": 8,
-    "cli": 9,
+    "drive_maps": 6,
+    "drive": 7,
+    "sim": 7,
+    "report": 7,
+    "experiments": 8,
+    "flash": 8,
+    "identification": 8,
+    "measurement": 9,
+    "proof": 10,
+    "commissioning": 11,
+    "papers": 12,
+    "cli": 13,
 }
 SAME_ROOM = {"trace_file": "trace", "__main__": "cli"}
-PURE = frozenset({"machine", "params", "estimators", "design", "firmware", "report", "trace", "units"})
-IMPURE_ROOMS = frozenset({"bus", "drive", "experiments", "flash", "sim", "workflow", "cli", "packaging"})
+PURE = frozenset(
+    {
+        *("machine", "params", "estimators", "design", "firmware", "drive_maps", "identification"),
+        *("report", "trace", "units"),
+    }
+)
+IMPURE_ROOMS = frozenset(FLOORS) - PURE - frozenset(room for room, floor in FLOORS.items() if floor <= 2) | {"bus"}
 IMPURE_LIBRARIES = frozenset({"click", "rich", "can", "canopen", "time", "random"})
-MAY_IMPORT_SIM = frozenset({"sim", "workflow", "cli"})
+MAY_IMPORT_SIM = frozenset({"sim", "proof", "papers", "cli"})
 TYPES_ONLY = "pmsmtool.drive.port"
 """Types alone; every room that stands as high as drive may name them."""
 
@@ -64,6 +75,9 @@ MAY_PRINT = frozenset({"cli", "packaging"})
 RANDOM_TYPES = frozenset({"Generator", "BitGenerator", "SeedSequence", "PCG64", "Philox", "default_rng"})
 EMPTY_WORDS = frozenset({"manager", "handler", "util", "utils", "helper", "helpers", "engine", "service"})
 LINES_MAX = 600
+ROOM_LINES_MAX = 9000
+OWN_COUNT = ("sim/node", "sim/foreign")
+"""Folders that count as rooms of their own."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +199,85 @@ def test_module_keeps_the_rules(path: Path) -> None:
     assert faults(module_name(path), path.read_text(encoding="utf-8")) == []
 
 
+def arrows() -> dict[str, set[str]]:
+    """Every module of the package and the modules it imports, also for type checkers and inside functions."""
+    known = {module_name(path) for path in MODULES}
+    found: dict[str, set[str]] = {}
+    for path in MODULES:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        named = {item.module for item in imports(tree)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                named |= {f"{node.module}.{alias.name}" for alias in node.names}
+        found[module_name(path)] = named & known - {"pmsmtool"}
+    return found
+
+
+ARROWS = arrows()
+
+
+def circle(graph: Mapping[str, Collection[str]]) -> list[str]:
+    """Return the names of one circle of a graph, in its order; empty where there is none."""
+    done: set[str] = set()
+
+    def walk(name: str, path: list[str]) -> list[str]:
+        if name in path:
+            return path[path.index(name) :]
+        if name in done:
+            return []
+        found = next((way for there in sorted(graph.get(name, ())) if (way := walk(there, [*path, name]))), [])
+        done.add(name)
+        return found
+
+    return next((way for name in sorted(graph) if (way := walk(name, []))), [])
+
+
+def rooms(modules: Mapping[str, Collection[str]]) -> dict[str, set[str]]:
+    """Return which room imports which."""
+    found: dict[str, set[str]] = {}
+    for module, imported in modules.items():
+        if room(module):
+            found.setdefault(room(module), set()).update({room(there) for there in imported} - {room(module), ""})
+    return found
+
+
+def reached(module: str, modules: Mapping[str, Collection[str]]) -> set[str]:
+    """Return all modules that importing one imports, over any number of others."""
+    found: set[str] = set()
+    left = [module]
+    while left:
+        new = set(modules.get(left.pop(), ())) - found
+        found |= new
+        left += new
+    return found
+
+
+def test_no_circle_between_rooms() -> None:
+    assert circle(rooms(ARROWS)) == []
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": ()}) == ["b", "c"]
+
+
+def test_identification_moves_nothing() -> None:
+    """From stored traces to values, whoever imports it, years later, without a bus."""
+    mine = [module for module in ARROWS if room(module) == "identification"]
+    assert mine
+    for module in mine:
+        assert {room(there) for there in reached(module, ARROWS)} & {"drive", "experiments", "bus", "sim"} == set(), (
+            module
+        )
+    assert reached("a", {"a": {"b"}, "b": {"c", "a"}}) == {"a", "b", "c"}
+
+
+def test_no_room_is_too_large() -> None:
+    lines: dict[str, int] = {}
+    for path in (path for suffix in ("py", "c", "h") for path in PACKAGE.rglob(f"*.{suffix}")):
+        inside = path.relative_to(PACKAGE).as_posix()
+        name = next((own for own in OWN_COUNT if inside.startswith(f"{own}/")), inside.split("/")[0])
+        lines[name] = lines.get(name, 0) + path.read_text(encoding="utf-8").count("\n")
+    assert {"sim", "design", "identification"} <= set(lines)
+    assert {name: count for name, count in lines.items() if count > ROOM_LINES_MAX} == {}
+
+
 @pytest.mark.parametrize("folder", ["pmsmtool", "tests", "benchmarks"])
 def test_no_file_is_too_long(folder: str) -> None:
     files = [path for suffix in ("py", "c", "h") for path in (ROOT / folder).rglob(f"*.{suffix}")]
@@ -207,13 +300,28 @@ def test_no_file_is_too_long(folder: str) -> None:
         ("pmsmtool.estimators.x", "from pmsmtool.drive.port import Drive", "pure room estimators imports drive"),
         ("pmsmtool.bus.x", "from pmsmtool.drive.port import Drive", "bus (floor 2) imports drive"),
         ("pmsmtool.flash.x", "from pmsmtool.sim.bus import PmsmSimBus", "flash imports sim"),
+        ("pmsmtool.measurement.x", "from pmsmtool.sim.bus import PmsmSimBus", "measurement imports sim"),
+        (
+            "pmsmtool.identification.x",
+            "from pmsmtool.drive.port import Drive",
+            "pure room identification imports drive",
+        ),
+        ("pmsmtool.identification.x", "from pmsmtool.experiments import signals", "imports experiments"),
+        ("pmsmtool.identification.x", "from pmsmtool.measurement import limits", "identification imports measurement"),
+        (
+            "pmsmtool.firmware.x",
+            "from pmsmtool.drive_maps.eds import parse_eds",
+            "firmware (floor 5) imports drive_maps",
+        ),
+        ("pmsmtool.measurement.x", "from pmsmtool.proof import plan", "measurement (floor 9) imports proof"),
+        ("pmsmtool.commissioning.x", "from pmsmtool.papers import figure", "commissioning (floor 11) imports papers"),
         ("pmsmtool.cli.x", "from pmsmtool.packaging import kernels", "build tools"),
         ("pmsmtool.cli.x", "from pmsmtool.attic import y", "no floor is known"),
         ("pmsmtool.design.x", "from scipy import linalg", "imports scipy at top level"),
         ("pmsmtool.design.x", "class A:\n    import matplotlib.figure", "imports matplotlib.figure at top level"),
         ("pmsmtool.cli.x", "import numpy as np", "imports numpy at top level"),
         ("pmsmtool.cli.x", "if True:\n    import can", "imports can at top level"),
-        ("pmsmtool.workflow.x", "print('x')", "print outside cli"),
+        ("pmsmtool.measurement.x", "print('x')", "print outside cli"),
         ("pmsmtool.sim.x", "np.random.normal(0, 1)", "global random state"),
         ("pmsmtool.sim.x", "rng = np.random.default_rng()", "without a seed"),
         ("pmsmtool.sim.x", "class BusManager: ...", "BusManager says nothing"),
@@ -230,7 +338,7 @@ def test_rules_refuse(module: str, source: str, complaint: str) -> None:
     ("module", "source"),
     [
         ("pmsmtool.sim.x", "from pmsmtool.drive.port import Excitation"),
-        ("pmsmtool.workflow.x", "from pmsmtool.sim.bus import PmsmSimBus"),
+        ("pmsmtool.proof.x", "from pmsmtool.sim.bus import PmsmSimBus"),
         ("pmsmtool.design.x", "import numpy as np\ndef f(rng: np.random.Generator):\n    from scipy import linalg"),
         ("pmsmtool.cli.x", "if TYPE_CHECKING:\n    import numpy\ndef f():\n    import can\n    print(1)"),
         ("pmsmtool.sim.x", "rng = np.random.default_rng(7)\nUTILISATION = 1\ndef utilisation(): ..."),

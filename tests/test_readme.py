@@ -122,14 +122,6 @@ def test_the_python_names_are_the_documented_ones() -> None:
         _ = pmsmtool.nonsense
 
 
-def test_the_floors_are_those_the_layer_test_enforces() -> None:
-    from tests.test_layers import FLOORS
-
-    table = {int(row[0]): set(re.findall(r"`(\w+)`", row[1])) for row in rows_of("How the code is laid out, and why")}
-    for room, floor in FLOORS.items():
-        assert room in table[floor], room
-
-
 # ---- the command reference ---------------------------------------------------------------------------------
 
 
