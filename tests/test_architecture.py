@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """``docs/architecture.md`` is true: every path and name on it exists, and its floors are those the tests enforce."""
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ PATTERNS = {
 }
 """Home of each formula, and what a copy of it looks like."""
 TYPE_NAMES = frozenset(DATA_TYPES) | frozenset(BY_SHORT)
-OTHER_NUMBERS = frozenset({"monitor_objects.py"})
+OTHER_NUMBERS = frozenset({"ingenia_objects.py"})
 """A maker's own numbers of the types, which are not those of CiA 301."""
 
 

@@ -38,9 +38,9 @@ def check_command(bus: BusOptions, motion: MotionOptions, out: Output, machine_f
     """
     from pmsmtool.cia402 import HOMING_LOST
     from pmsmtool.cli.consent import ask_motion
+    from pmsmtool.commissioning.first_check import check_wiring, envelope_of
     from pmsmtool.errors import CheckFailed, Partial
-    from pmsmtool.estimators.wiring import NOT_SEEN, WRONG
-    from pmsmtool.measurement.first_check import check_wiring, envelope_of
+    from pmsmtool.identification.wiring import NOT_SEEN, WRONG
 
     with open_drive(bus) as drive:
         stated = _stated(drive, machine_file)

@@ -14,7 +14,6 @@ from pmsmtool.estimators.flux.map_result import FluxMapResult, estimate_flux_map
 from pmsmtool.estimators.flux.map_rows import Frame
 from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz
 from pmsmtool.machine.parameters import Estimate, MachineParameters
-from pmsmtool.measurement.flux_map import PLAN_LINE
 from pmsmtool.npz_file import npz_bytes
 from pmsmtool.run_directory import Acceptance, RunDirectory
 from pmsmtool.trace import Trace
@@ -31,9 +30,6 @@ CORRECTION_STD = 0.2
 """Standard deviation of what the map takes psi_f back to zero current by, of that correction: its curvature there."""
 DEVIATION_LIMIT = 0.005
 """Largest rms deviation of the identified fluxes, of their range. Measured: 0.0006."""
-
-
-IF_SATURATED = f"where the machine saturates: {PLAN_LINE}"
 
 
 def flux_map_of(

@@ -13,6 +13,7 @@ from pmsmtool.estimators.resistance import copper_of
 from pmsmtool.files import read_text
 from pmsmtool.identification import flux_map, frequency_response, half_frequency, value_verdict
 from pmsmtool.identification.calibration import calibrated_tolerance
+from pmsmtool.identification.cogging_file import cogging_estimates, save_cogging
 from pmsmtool.identification.evaluate import evaluate
 from pmsmtool.identification.identified_machine import machine_of
 from pmsmtool.identification.predicted_file import PREDICTED
@@ -27,7 +28,6 @@ from pmsmtool.identification.sampling import timing_estimates, with_timing
 from pmsmtool.identification.verdicts import verdicts_of
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.temperature import magnet_tolerance_per_k
-from pmsmtool.measurement.cogging_file import cogging_estimates, save_cogging
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace

@@ -31,6 +31,7 @@ SPEED_SHARE = 0.9
 COEFFICIENTS = 360
 """Of the spline, for the deviation predicted before the pulses."""
 PLAN_LINE = "voltage pulses of both axes up to the largest current: a free shaft jerks, by a turn or so"
+IF_SATURATED = f"where the machine saturates: {PLAN_LINE}"
 
 
 def plan_lines(nameplate: MachineFile) -> list[str]:

@@ -18,7 +18,6 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import ConfigError, DriveFault, IdentificationError, PmsmtoolError, SafetyRefusal
 from pmsmtool.experiments.rotation import dwell_within
-from pmsmtool.identification.flux_map import IF_SATURATED
 from pmsmtool.identification.predicted_file import PREDICTED, dump_predicted
 from pmsmtool.identification.refused_file import REFUSED, dump_refused
 from pmsmtool.identification.replay import NAMEPLATE, evaluated_stage
@@ -132,7 +131,7 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
     if "map" in steps:
         lines += flux_map.plan_lines(nameplate)
     elif request.map_if_saturated and "speeds" in steps:
-        lines.append(IF_SATURATED)
+        lines.append(flux_map.IF_SATURATED)
     lines.append("nothing is stored in the drive; every changed object is restored")
     return lines
 

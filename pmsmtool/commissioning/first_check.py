@@ -15,9 +15,9 @@ from pmsmtool.drive.port import Drive
 from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded
 from pmsmtool.estimators.noise import estimate_noise
 from pmsmtool.estimators.phase_check import check_phases
-from pmsmtool.estimators.wiring import NOT_SEEN, OK, WRONG, Finding, judge_sensors, judge_supply, judge_turn
 from pmsmtool.experiments import standstill
 from pmsmtool.experiments.first_turn import lead_half_a_turn
+from pmsmtool.identification.wiring import NOT_SEEN, OK, WRONG, Finding, judge_sensors, judge_supply, judge_turn
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import COMPENSATION, starting_gains

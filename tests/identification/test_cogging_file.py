@@ -12,8 +12,8 @@ import pytest
 
 from pmsmtool.estimators.angle_harmonics import AngleHarmonics, Harmonic
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult
+from pmsmtool.identification.cogging_file import COGGING_CSV, ROWS, cogging_estimates, save_cogging
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.measurement.cogging_file import COGGING_CSV, ROWS, cogging_estimates, save_cogging
 from pmsmtool.run_directory import RunDirectory, new_record
 
 J = Estimate(0.015, 1e-5, 2e-4, "kg m2")

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pmsmtool.estimators.wiring import NOT_SEEN, OK, WRONG, judge_sensors, judge_supply, judge_turn
+from pmsmtool.identification.wiring import NOT_SEEN, OK, WRONG, judge_sensors, judge_supply, judge_turn
 from pmsmtool.trace import Trace
 
 
