@@ -70,7 +70,7 @@ def check_command(bus: BusOptions, motion: MotionOptions, out: Output, machine_f
         )
     unseen = [finding.looked_at for finding in found if finding.verdict == NOT_SEEN]
     if any(name in unseen for name in ("phases", "shaft", "pole pairs")):
-        raise Partial(f"not judged: {', '.join(unseen)}")
+        raise Partial(f"not judged: {', '.join(unseen)}", hint="correct what the table names, and check again")
 
 
 def _stated(drive: CanopenDrive, path: Path | None) -> MachineFile:

@@ -10,7 +10,7 @@ from pmsmtool.commissioning.compared_stage import held_values
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.objects import DIGITAL_INPUTS
+from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded
 from pmsmtool.estimators.noise import estimate_noise
@@ -44,6 +44,7 @@ ORDER = (
     "supply", "limit switches", "current sensors", "phases", "shaft", "encoder counts", "pole pairs", "encoder sign",
 )  # fmt: skip
 TURNED_BY = "a load that turns the shaft; wrong counts per turn or pole pairs"
+DIGITAL_INPUTS = DriveObject(0x60FD, 0, "I")
 INPUTS = {0: "negative limit switch", 1: "positive limit switch", 3: "interlock"}
 """Bits of 0x60FD (CiA 402-2, digital inputs)."""
 

@@ -74,7 +74,6 @@ CURRENT_PERMILLE = DriveObject(0x6078, 0, "h")
 MAX_SPEED_RPM = DriveObject(0x6080, 0, "I")
 PROFILE_DECELERATION = DriveObject(0x6084, 0, "I")
 QUICK_STOP_DECELERATION = DriveObject(0x6085, 0, "I")
-DIGITAL_INPUTS = DriveObject(0x60FD, 0, "I")
 TARGET_VELOCITY_MRPM = DriveObject(0x60FF, 0, "i")
 SUPPORTED_MODES = DriveObject(0x6502, 0, "I")
 

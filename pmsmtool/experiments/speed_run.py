@@ -37,7 +37,7 @@ RAMP_DOUBT = 1.5
 RAMP_MOST_S = 25.0
 COAST_LOSS = 0.15
 """Part of its speed that a shaft may lose in one window; one that would lose more keeps the q current that held its
-speed. Profiles and random drives lose 0.02 to 0.06."""
+speed. Ten profiles and random drives lose 0.004 to 0.1, jercic-2017 0.2."""
 HOLD_S = 0.05
 """Shortest window for that current: whole electrical turns."""
 SETTLE_S, SETTLE_MOST_S = 0.025, 0.1

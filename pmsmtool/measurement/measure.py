@@ -55,7 +55,7 @@ ROTATIONS = (
 current is no stable position: a reluctance machine follows a smaller vector only, and swings longer on it. The next two
 have another speed and longer ramps, too, for a rotor that swings with the first."""
 SATURATED = 0.01
-"""Change of the flux linkage, mean of both signs of i_d over the one without, from which on a machine is mapped: -0.03
+"""Change of the flux linkage, mean of both signs of i_d over the one without, from which on a machine is mapped: 0.03
 of the saturated profile, below 0.0035 of linear drives, 0.007 to 0.02 beside 5 % of iron loss."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 RIPPLE_SHARE = 0.25

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -54,7 +55,7 @@ def completed(*without: str, identity: str = IDENTITY) -> str:
         if name not in without
     )
     text = dump_drive_map(load_family("copley")).replace("[left_out]", rows + "[left_out]")
-    return text.replace("vendor = 0\nproduct = 0\n", identity)
+    return re.sub(r"^vendor = .*\nproduct = .*\n", identity, text, count=1, flags=re.MULTILINE)
 
 
 @contextmanager

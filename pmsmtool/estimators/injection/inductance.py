@@ -50,8 +50,8 @@ CHI2_HOPELESS = 300.0
 """Reduced chi-square above which no number is given. Between it and the usual limit the interval is widened (ripple of
 3 % of a DC link: 37, L_d 0.1 % off) ..."""
 IN_STEP = 0.2
-"""... where a smaller part of the residual than this repeats with the square wave (that ripple: 0.01; a current that is
-clipped: 1.0)."""
+"""... where a smaller part of the residual than this repeats with the square wave (that ripple: 0.0003; a current that
+is clipped: 0.91 to 0.98)."""
 EDGE_STD = 0.05
 """Standard deviation of the instant at which a leg's error depends on its current (T_s): a fifth of its distance."""
 MINIMUM_PERIODS = 20
