@@ -244,6 +244,7 @@ HAVE_A_STEP = {"NotAvailable", "Interrupted", "PmsmtoolError"}
 """`pmsmtool caps` is the step of the first; the second says that the machine was stopped; the last is a bug."""
 
 
+@pytest.mark.chain
 def test_every_other_error_names_a_next_step() -> None:
     bare = []
     for path in sorted((ROOT / "pmsmtool").rglob("*.py")):

@@ -98,6 +98,7 @@ def bomb(kind, count, *, said=None):
     return out.getvalue()
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("data", "said"),
     [

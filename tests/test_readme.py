@@ -72,6 +72,7 @@ def as_shown(line: str) -> tuple[str, list[float]]:
     return " ".join(NUMBER.sub("#", line).split()), [float(text) for text in NUMBER.findall(line)]
 
 
+@pytest.mark.chain
 def test_the_first_session_is_what_the_program_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,6 +18,7 @@ TABLES = st.recursive(
 )
 
 
+@pytest.mark.chain
 @given(TABLES)
 def test_reads_back(tables):
     assert tomllib.loads(toml_text(tables)) == tables

@@ -42,6 +42,7 @@ def test_round_trip(tmp_path, suffix, meta):
     assert [item.name for item in tmp_path.iterdir()] == [path.name]
 
 
+@pytest.mark.chain
 @settings(max_examples=50)
 @given(
     arrays(np.float64, st.integers(1, 30), elements=st.floats(allow_nan=True, allow_infinity=True)),

@@ -28,6 +28,7 @@ def checked(tool: Tool, extra: str) -> tuple[int, dict[str, tuple[str, str]], st
     return code, {row["looked_at"]: (row["verdict"], row["shown"]) for row in rows}, told
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("extra", "wrong"),
     [

@@ -111,6 +111,7 @@ def test_an_incomplete_set_is_written_directly_but_never_a_table() -> None:
         concise_dcf(ParameterSet({"lut.format": 0}))
 
 
+@pytest.mark.chain
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler on this machine")
 def test_exported_c_compiles_and_is_the_image(folder: Path, tmp_path: Path) -> None:
     export("c", folder, "--prefix", "left", "--fixed-point", "-o", tmp_path / "new" / "firmware")

@@ -130,6 +130,7 @@ def test_a_bad_machine_is_refused_by_name(case: str, tool: Tool) -> None:
     assert not list(Path("runs").glob("*/machine.toml"))
 
 
+@pytest.mark.chain
 def test_a_converter_that_is_too_small_for_the_levels_leaves_what_less_current_measured(tool: Tool) -> None:
     channel = profile("interior-2k2", adc_full_scale_apk=0.7 * I_NOM_APK)
     with PmsmSimBus(channel):
@@ -170,6 +171,7 @@ def test_what_cannot_be_done_moves_nothing(case: str, tool: Tool) -> None:
     assert not list(Path(".").glob("runs/*/traces/*"))
 
 
+@pytest.mark.chain
 def test_resistance_alone_is_possible_on_a_locked_shaft(tool: Tool) -> None:
     channel = profile("interior-2k2", rotor="locked")
     found = tool("identify", "-i", "pmsmsim", "-c", channel, "--yes", "--shaft", "locked", "R", "inverter", "--json")

@@ -34,6 +34,7 @@ def answer(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, flo
     return dict(value)
 
 
+@pytest.mark.chain
 def test_a_scale_is_taken_out_and_its_tolerance_takes_the_sensors_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -96,6 +97,7 @@ def test_a_calibration_carries_its_units() -> None:
         calibrated_tolerance(bare, ["I=5A:5A:0.1A"])
 
 
+@pytest.mark.chain
 def test_the_data_sheet_of_the_bridge_takes_its_threshold_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -22,6 +22,8 @@ from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
 from tests.simulated_bus import settle
 
+pytestmark = pytest.mark.chain
+
 SHIFT = 0.005
 """Change of a value without the correction that another one gave it (relative); measured 0.3 % (R by the instant)."""
 Signals = dict[str, NDArray[np.float64]]

@@ -106,6 +106,7 @@ def test_the_next_step_names_the_shipped_map(capsys: pytest.CaptureFixture[str])
     assert "try:    give --map epos4; nothing was moved or written" in err
 
 
+@pytest.mark.chain
 @pytest.mark.usefixtures("files")
 def test_what_cia402_alone_says_holds_on_every_drive(capsys: pytest.CaptureFixture[str]) -> None:
     """The map that is taken where none is known may be named, too."""

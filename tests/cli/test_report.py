@@ -44,6 +44,7 @@ def page_of(folder: Path) -> str:
     return (folder / "report.html").read_text()
 
 
+@pytest.mark.chain
 def test_the_page_needs_nothing_else_and_puts_the_verdict_first(made: Path) -> None:
     page = page_of(made)
     assert page.index("PARTIAL: 3 of 7 stages ran") < page.index("<h1")
@@ -56,18 +57,21 @@ def test_the_page_needs_nothing_else_and_puts_the_verdict_first(made: Path) -> N
         assert text in page
 
 
+@pytest.mark.chain
 def test_ids_are_unique_and_referenced(made: Path) -> None:
     ids = re.findall(r' id="([^"]+)"', page_of(made))
     used = set(re.findall(r'(?:url\(#|xlink:href="#)([^)"]+)', page_of(made)))
     assert set(ids) == used
 
 
+@pytest.mark.chain
 def test_same_run_same_bytes(made: Path, tmp_path: Path) -> None:
     for name in ("one.html", "two.html"):
         assert program(["report", str(made), "-o", str(tmp_path / name), "-q"]) == 0
     assert (tmp_path / "one.html").read_bytes() == (tmp_path / "two.html").read_bytes()
 
 
+@pytest.mark.chain
 def test_json_gives_the_verdict_on_stdout_alone(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert program(["report", str(made), "--json", "-o", str(tmp_path / "r.html")]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -95,6 +99,7 @@ def test_a_commissioning_of_one_stage_so_far_is_not_complete(tmp_path: Path) -> 
     assert report_page.verdict(run.path).word == "PARTIAL"
 
 
+@pytest.mark.chain
 def test_a_failed_stage_makes_the_verdict(made: Path, tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
     shutil.copytree(made, run.path)
@@ -116,6 +121,7 @@ def test_the_loops_drawn_are_those_of_the_design(made: Path) -> None:
         assert again.gain_margin == pytest.approx(stated.gain_margin, rel=1e-9), name
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -138,6 +144,7 @@ def test_a_damaged_run_is_named(
     assert not (folder / "report.html").exists()
 
 
+@pytest.mark.chain
 def test_a_page_that_cannot_be_written_leaves_the_run_alone(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path: path.read_bytes() for path in made.rglob("*") if path.is_file() and path.name != "report.html"}
     assert program(["report", str(made), "-o", str(made / "nowhere" / "r.html")]) == 2
@@ -145,6 +152,7 @@ def test_a_page_that_cannot_be_written_leaves_the_run_alone(made: Path, capsys: 
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.chain
 def test_values_with_a_deviation_become_the_table(made: Path, tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
     shutil.copytree(made, run.path)

@@ -149,6 +149,7 @@ def test_a_declined_run_leaves_nothing(tool: Tool) -> None:
     assert not list(Path("runs").iterdir())
 
 
+@pytest.mark.chain
 def test_a_run_that_came_to_its_end_says_nothing_of_it(tool: Tool) -> None:
     code, _, err = tool(*IDENTIFY)
     assert code == 0, err

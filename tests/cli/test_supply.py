@@ -25,6 +25,7 @@ def run(*arguments: str, channel: str = CHANNEL) -> Result:
     return CliRunner().invoke(cli, ["--sim", channel, "--yes", *arguments])
 
 
+@pytest.mark.chain
 def test_resistance_by_a_bench_supply(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     outcome = run("identify", "R", "--supply", "--json")

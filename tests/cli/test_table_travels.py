@@ -148,6 +148,7 @@ def domains(found: ParameterSet) -> dict[int, bytes]:
     return made
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_drive_takes_it_and_gives_it_back(kind: str, complete: Path, tmp_path: Path) -> None:
     path = table(tmp_path, kind)

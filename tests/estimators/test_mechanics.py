@@ -229,6 +229,7 @@ def with_drag(traces: list[Trace], drag: float) -> list[Trace]:
     return out
 
 
+@pytest.mark.chain
 def test_drag_over_the_square_of_the_speed_is_told_from_friction() -> None:
     traces = run_of(np.random.default_rng(5))
     fastest = max(float(np.max(np.abs(np.diff(t["theta_M_rad"])))) / t.period_s for t in traces)

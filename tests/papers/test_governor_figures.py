@@ -22,6 +22,8 @@ from pmsmtool.papers.random_steps import (
 from pmsmtool.papers.speed_rise import speed_ramp, speed_steps
 from pmsmtool.papers.weakening import figure_11, figure_12, table_2
 
+pytestmark = pytest.mark.chain
+
 CASES = 24
 """Random cases here; the command takes 300 to 1000."""
 
@@ -58,7 +60,6 @@ def cells(found: Reproduction, column: str, table: int = 0, **where: Any) -> lis
     return [row[heads.index(column)] for row in rows]
 
 
-@pytest.mark.chain
 @pytest.mark.parametrize("name", MADE)
 def test_every_checked_number_is_within(name: str) -> None:
     found = made(name)
@@ -159,7 +160,6 @@ def test_delay_without_predictor_overshoots() -> None:
     assert max(cells(found, "overshoot", plant="one-period", predictor="yes")) < 0.2
 
 
-@pytest.mark.chain
 def test_same_seed_same_numbers_and_another_seed_others() -> None:
     first, again = (random_steps(7, 12) for _ in range(2))
     assert [table.rows[:2] for table in first.tables] == [table.rows[:2] for table in again.tables]

@@ -149,6 +149,7 @@ def test_windows_of_a_slow_machine_keep_a_part_of_the_inverters_ripple() -> None
     assert not np.any(ripple_v(replace(observations, meta={"window_s": 0.02}), inputs(observations, machine_known)))
 
 
+@pytest.mark.chain
 def test_too_few_observations_are_refused(warming: dict[int, Trace]) -> None:
     whole = condense(warming[1], ROWS)
     few = Trace(whole.t_s[:10], {n: v[:10] for n, v in whole.signals.items()}, whole.units, whole.meta)
