@@ -60,6 +60,9 @@ KEPT_SHARE, KEPT_S = 0.1, 0.5
 """A commanded speed kept this closely for so long proves encoder sign and speed loop: a wrong sign runs away."""
 UNPROVEN_BY = ("motor.", "encoder.", "current.", "speed.", "inverter.")
 """Parameters after whose change a proven speed loop is proven no more."""
+OVER_SPEED_TRIP, TRIP_RATIO = "protection.n_trip_rpm", 1.5
+"""Speed at which a drive that has such a trip removes the voltage by itself, whatever commands it, over the envelope's:
+above what the tool's own look sees first, so that the limit is named."""
 _ROUNDING = 1e-9
 RATED_RATIO = 30.0
 """Largest current limit over the drive's rated current (0x6075): three times the rated current of a motor ten times as
@@ -165,6 +168,9 @@ class GuardedDrive:
                 hint="without them nothing is moved",
             )
         self._speed_overshoot = OVERSHOOT if speed else 1.0
+        trip = TRIP_RATIO * rpm_from_rad_s(envelope.speed_max_rad_s)
+        if trips_itself(drive) and drive.read(OVER_SPEED_TRIP) > trip:
+            self.write({OVER_SPEED_TRIP: trip})
 
     def _keep(self, limits: Iterator[Quantity], wanted: float) -> bool:
         """Lower the drive's own limit to what is wanted (A peak or rpm); False where it has none."""
@@ -475,6 +481,11 @@ class GuardedDrive:
                 likely=_TURNS if quantity == "travel" and self.envelope.shaft == "locked" else "",
                 hint=_NEXT_STEP.get(quantity, "ask for less"),
             )
+
+
+def trips_itself(drive: CanopenDrive) -> bool:
+    """Return whether the drive removes the voltage by itself at a speed that is set, in every mode."""
+    return OVER_SPEED_TRIP in drive.node.map.cells
 
 
 @contextmanager

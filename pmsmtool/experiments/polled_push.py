@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
+from pmsmtool.experiments.shaft_answer import OVER_FRICTION, ShaftAnswer, acceleration_per_ampere
 from pmsmtool.experiments.signals import readable
 from pmsmtool.trace import Trace
 
@@ -24,6 +24,8 @@ PATIENCE = 3.0
 """Longest run-up, over that at the current of the top."""
 STALLED_SHARE = 0.25
 """Acceleration, of the first one at the same current, at which the voltage is taken to be the limit."""
+LEAST_NET = 0.5
+"""Of a current, what is taken to accelerate at least: friction is known roughly."""
 RUN_SHARE = 0.5
 """Current of the run-up, of the test current."""
 HOLD_SHARE = 0.08
@@ -32,7 +34,7 @@ HOLD_S = 0.4
 COAST_S = 0.2
 COAST_SHARES = (1.0, -1.0, 0.4, -0.4)
 """Speeds a coast begins at, of the plan's: one speed does not tell the flux from a constant voltage."""
-STOP_SLICES = 160
+STOP_SHARE, STOP_SLICES = 0.3, 160
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,37 +51,48 @@ class PolledPushPlan:
         Speed no run-up goes beyond (rad/s).
     shares : tuple of float
         Torque currents of the pushes, of the largest.
+    omega_failure_rad_s : float
+        Speed that must not be reached although the tool fails during a push (rad/s); infinity: the drive sees to it.
+    off_s : float
+        Time until the voltage is off then (s).
     """
 
     i_test_a: float
     omega_m_rad_s: float
     omega_top_rad_s: float
     shares: tuple[float, ...] = (0.3, 0.5, 0.7)
+    omega_failure_rad_s: float = math.inf
+    off_s: float = 0.5
+
+    def most_a(self, answer: ShaftAnswer, speed_rad_s: float) -> float:
+        """Return the largest current (A peak) at a speed (rad/s) from which the tool may fail."""
+        return answer.most_a(max(0.0, self.omega_failure_rad_s - abs(speed_rad_s)), self.off_s)
 
 
-def push_both_ways(drive: Drive, plan: PolledPushPlan, keep: Callable[[str, Trace], None]) -> float:
-    """Swing the shaft and keep every push as ``torque_push_<k>``; returns the acceleration per ampere (rad/s2/A).
+def push_both_ways(drive: Drive, plan: PolledPushPlan, keep: Callable[[str, Trace], None]) -> ShaftAnswer:
+    """Swing the shaft and keep every push as ``torque_push_<k>``; returns how the shaft answers.
 
     Raises
     ------
     IdentificationError
         ``E_EXCITATION``: the shaft does not answer.
     """
-    rate = acceleration_per_ampere(drive, plan.i_test_a, lambda way, _: way > ANSWER_RAD)
+    answer = acceleration_per_ampere(drive, plan.i_test_a, lambda way, _: way > ANSWER_RAD)
     count = 0
     # the shortest ramp takes a light shaft to its speed with less than the test current
-    largest = min(plan.i_test_a, plan.omega_m_rad_s / (rate * LEAST_RAMP_S * max(plan.shares)))
+    most = min(plan.omega_m_rad_s / (answer.per_ampere * LEAST_RAMP_S), plan.most_a(answer, plan.omega_m_rad_s))
+    largest = min(plan.i_test_a, most / max(plan.shares))
     for share in plan.shares:
-        current = share * largest
-        ramp_s = max(LEAST_RAMP_S, plan.omega_m_rad_s / (rate * current))
+        current = max(share * largest, min(OVER_FRICTION * answer.friction_a, plan.i_test_a))
+        ramp_s = max(LEAST_RAMP_S, plan.omega_m_rad_s / (answer.per_ampere * current))
         for sign, ramps in ((1.0, 1.0), (-1.0, 2.0), (1.0, 2.0), (-1.0, 1.0)):
             keep(f"torque_push_{count}", _polled(drive, sign * current, ramps * ramp_s))
             count += 1
-    stop_shaft(drive, 0.3 * plan.i_test_a, rate)
-    return rate
+    _stop(drive, plan, answer)
+    return answer
 
 
-def run_to_voltage(drive: Drive, plan: PolledPushPlan, rate: float) -> Trace | None:
+def run_to_voltage(drive: Drive, plan: PolledPushPlan, answer: ShaftAnswer) -> Trace | None:
     """Run up until the voltage takes the current away and return a record of the speed there.
 
     Returns
@@ -87,12 +100,13 @@ def run_to_voltage(drive: Drive, plan: PolledPushPlan, rate: float) -> Trace | N
     Trace or None
         ``theta_M_rad``, ``i_q_a`` and ``U_dc_v``; None when the top speed came first. The shaft is nearly at rest.
     """
-    hold = HOLD_SHARE * plan.i_test_a
     top, found = plan.omega_top_rad_s, None
+    hold = min(HOLD_SHARE * plan.i_test_a, plan.most_a(answer, top))
     before, speed, spent = drive.live("theta_m_rad"), 0.0, 0.0
-    while spent < PATIENCE * top / (rate * hold):
+    while spent < PATIENCE * top / (answer.per_ampere * hold):
         # what is left to the top is approached by halves, so that a weak voltage is seen before it
-        current = min(RUN_SHARE * plan.i_test_a, max(hold, 0.5 * (top - speed) / (rate * CHECK_S)))
+        nearer = min(0.5 * (top - speed) / (answer.per_ampere * CHECK_S), plan.most_a(answer, speed))
+        current = min(RUN_SHARE * plan.i_test_a, max(hold, nearer))
         drive.command_current(0.0, current)
         drive.wait(CHECK_S)
         spent += CHECK_S
@@ -101,27 +115,32 @@ def run_to_voltage(drive: Drive, plan: PolledPushPlan, rate: float) -> Trace | N
         before, speed = angle, now
         if now > top:
             break
-        if last > RUNNING * top and now - last < STALLED_SHARE * rate * current * CHECK_S:
+        net = max(current - answer.friction_a, LEAST_NET * current)
+        if last > RUNNING * top and now - last < STALLED_SHARE * answer.per_ampere * net * CHECK_S:
             drive.command_current(0.0, hold)
             drive.wait(HOLD_S)
             found = _recorded_top(drive, hold)
             break
-    stop_shaft(drive, 0.3 * plan.i_test_a, rate)
+    _stop(drive, plan, answer)
     return found
 
 
 def coast_both_ways(
-    drive: Drive, plan: PolledPushPlan, rate: float, signals: tuple[str, ...], keep: Callable[[str, Trace], None]
+    drive: Drive,
+    plan: PolledPushPlan,
+    answer: ShaftAnswer,
+    signals: tuple[str, ...],
+    keep: Callable[[str, Trace], None],
 ) -> None:
     """Let the shaft coast without torque from two speeds, both ways, and keep each as ``coast_<k>``."""
-    current = RUN_SHARE * plan.i_test_a
+    current = min(RUN_SHARE * plan.i_test_a, plan.most_a(answer, plan.omega_m_rad_s))
     for number, share in enumerate(COAST_SHARES):
         drive.command_current(0.0, math.copysign(current, share))
-        drive.wait(abs(share) * plan.omega_m_rad_s / (rate * current))
+        drive.wait(abs(share) * plan.omega_m_rad_s / (answer.per_ampere * current))
         drive.command_current(0.0, 0.0)
         drive.wait(CHECK_S)
         keep(f"coast_{number}", readable(drive.record(signals, round(COAST_S / drive.period_s))))
-        stop_shaft(drive, 0.3 * plan.i_test_a, rate)
+        _stop(drive, plan, answer)
 
 
 def _recorded_top(drive: Drive, command_a: float) -> Trace:
@@ -134,8 +153,9 @@ def _polled(drive: Drive, i_q_a: float, seconds: float) -> Trace:
     return readable(drive.record(SIGNALS, max(2, round(seconds / drive.period_s))), i_command_a=i_q_a)
 
 
-def stop_shaft(drive: Drive, current: float, rate: float) -> None:
+def _stop(drive: Drive, plan: PolledPushPlan, answer: ShaftAnswer) -> None:
     """Bring the shaft to about rest against its own sense of turning."""
+    current = min(STOP_SHARE * plan.i_test_a, plan.most_a(answer, 0.0))
     step_s = CHECK_S / 5.0
     before = drive.live("theta_m_rad")
     drive.wait(step_s)
@@ -143,7 +163,7 @@ def stop_shaft(drive: Drive, current: float, rate: float) -> None:
         angle = drive.live("theta_m_rad")
         speed = (angle - before) / step_s
         before = angle
-        push = min(current, abs(speed) / (rate * step_s))
+        push = min(current, abs(speed) / (answer.per_ampere * step_s))
         if push < 0.1 * current:
             break
         drive.command_current(0.0, -math.copysign(push, speed))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
+from pmsmtool.experiments.shaft_answer import OVER_FRICTION, acceleration_per_ampere
 from pmsmtool.experiments.signals import readable
 from pmsmtool.trace import Trace
 
@@ -50,6 +50,10 @@ class PushPlan:
         Largest current vector that is allowed (A peak).
     samples : int
         Samples of one record.
+    omega_failure_rad_s : float
+        Speed that must not be reached although the tool fails during a push (rad/s); infinity: the drive sees to it.
+    off_s : float
+        Time until the voltage is off then (s).
     """
 
     i_test_a: float
@@ -58,6 +62,8 @@ class PushPlan:
     samples: int = 1024
     u_max_v: float = math.inf
     i_max_a: float = math.inf
+    omega_failure_rad_s: float = math.inf
+    off_s: float = 0.5
 
 
 def swing(drive: Drive, plan: PushPlan, keep: Callable[[str, Trace], None]) -> None:
@@ -70,14 +76,15 @@ def swing(drive: Drive, plan: PushPlan, keep: Callable[[str, Trace], None]) -> N
     IdentificationError
         ``E_EXCITATION``: the shaft does not answer.
     """
-    rate = acceleration_per_ampere(
+    answer = acceleration_per_ampere(
         drive, plan.i_test_a, lambda way, seconds: 2.0 * way / seconds > ANSWER_SHARE * plan.omega_m_rad_s
     )
     count, speed = 0, plan.omega_m_rad_s
+    largest = min(plan.i_test_a, answer.most_a(plan.omega_failure_rad_s - speed, plan.off_s))
     last: list[Trace] = []
     for share, larger in zip(plan.shares, (*plan.shares[1:], plan.shares[-1]), strict=True):
-        current = share * plan.i_test_a
-        ramp_s = max(LEAST_RAMP_S, speed / (rate * current))
+        current = max(share * largest, min(OVER_FRICTION * answer.friction_a, plan.i_test_a))
+        ramp_s = max(LEAST_RAMP_S, speed / (answer.per_ampere * current))
         drive.command_current(0.0, -current)
         drive.wait(ramp_s)
         drive.command_current(0.0, 0.0)
@@ -88,7 +95,7 @@ def swing(drive: Drive, plan: PushPlan, keep: Callable[[str, Trace], None]) -> N
             last.append(trace)
             count += 1
         _stop(drive, current, ramp_s)
-        larger_a = larger * plan.i_test_a
+        larger_a = larger * largest
         speed *= min(1.0, *(_slower(trace, larger / share, larger_a, plan) for trace in last[-4:]))
 
 
@@ -102,7 +109,8 @@ def _slower(trace: Trace, times: float, current_a: float, plan: PushPlan) -> flo
     kick_a = times * float(np.max(np.abs(trace["i_d_a"])))
     room_a = math.sqrt(max(0.0, plan.i_max_a**2 - current_a**2))
     by_current = room_a / kick_a if kick_a > 0.0 else math.inf
-    return min(VOLTAGE_SHARE * plan.u_max_v / voltage_v, by_current)
+    by_voltage = VOLTAGE_SHARE * plan.u_max_v / voltage_v if voltage_v > 0.0 else math.inf
+    return min(by_voltage, by_current)
 
 
 def _recorded(drive: Drive, plan: PushPlan, i_q_a: float, seconds: float) -> Trace:

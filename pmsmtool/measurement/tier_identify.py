@@ -17,8 +17,8 @@ from dataclasses import replace
 
 from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.envelope import Envelope, largest_acceleration
-from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration
+from pmsmtool.drive.guard import OVERSHOOT, guarded, trips_itself
 from pmsmtool.drive.motion_objects import allowed, current_limits, rated_apk, speed_limits
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
 from pmsmtool.drive.tier_drives import TorqueDrive, pushing_drive
@@ -150,20 +150,23 @@ def identify_by_torque(
 def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say = _quiet) -> TierFacts:
     """Run the experiments of :func:`identify_by_torque`; raises as it does."""
     largest = envelope.speed_max_rad_s
-    plan = PolledPushPlan(envelope.i_max_apk / HEADROOM, SWING_SHARE * largest, TOP_SHARE * largest)
+    plan = PolledPushPlan(
+        envelope.i_max_apk / HEADROOM, SWING_SHARE * largest, TOP_SHARE * largest,
+        omega_failure_rad_s=OVERSHOOT * largest, off_s=OFF_S,
+    )  # fmt: skip
     shows_voltage = all(name in drive.node.map.signals for name in ("u_d_v", "u_q_v"))
     U_dc = _link_v(drive)
     drive.top_rad_s = ASKED_SHARE * largest
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
         say(f"J/psi, tau_c/psi: torque pushes up to {max(plan.shares) * plan.i_test_a:.3g} A, polled")
-        rate = push_both_ways(guard, plan, keep)
+        answer = push_both_ways(guard, plan, keep)
         if shows_voltage:
             say("psi: the voltage of the coasting machine")
-            coast_both_ways(guard, plan, rate, ("theta_m_rad", "u_d_v", "u_q_v"), keep)
+            coast_both_ways(guard, plan, answer, ("theta_m_rad", "u_d_v", "u_q_v"), keep)
         elif U_dc > 0.0:
             say("psi: the speed at which the voltage ends")
-            top = run_to_voltage(guard, plan, rate)
+            top = run_to_voltage(guard, plan, answer)
             if top is not None:
                 keep("voltage_limit", top)
     voltage: Voltage = "machine" if shows_voltage else "link" if U_dc > 0.0 else ""
@@ -210,6 +213,8 @@ def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: 
         SWING_SHARE * envelope.speed_max_rad_s,
         u_max_v=U_dc / math.sqrt(3.0) if U_dc > 0.0 else math.inf,
         i_max_a=envelope.i_max_apk,
+        omega_failure_rad_s=math.inf if trips_itself(drive) else OVERSHOOT * envelope.speed_max_rad_s,
+        off_s=OFF_S,
     )
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()

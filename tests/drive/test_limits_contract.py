@@ -456,7 +456,8 @@ def test_the_first_torque_pulse_is_small_and_short() -> None:
             asked.append((current[0], seconds))
 
     acceleration_per_ampere(cast(Drive, Light()), 10.0, lambda way, seconds: True)
-    assert asked == [(0.5, 0.02), (-0.5, 0.02)]
+    assert asked[0][0] > 0.0
+    assert all(abs(current) <= 0.5 and (seconds <= 0.02 or not current) for current, seconds in asked)
 
 
 # ---- how it stops --------------------------------------------------------------------------------
