@@ -37,32 +37,32 @@ QUANTITIES = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2", "B_nms", "tau_c
 Changes = dict[str, Value]
 
 
-def _truth(drive: MachineFile, name: str) -> float:
+def truth_of(drive: MachineFile, name: str) -> float:
     return float(drive.simulation_settings()[name])  # type: ignore[arg-type]
 
 
 def _rated(drive: MachineFile) -> tuple[float, float]:
     """Rated torque (N m) and electrical speed (rad/s)."""
-    p = _truth(drive, "pole_pairs")
-    torque = 1.5 * p * _truth(drive, "psi_f_wb") * float(drive.machine.I_nom_apk or 1.0)
+    p = truth_of(drive, "pole_pairs")
+    torque = 1.5 * p * truth_of(drive, "psi_f_wb") * float(drive.machine.I_nom_apk or 1.0)
     return torque, p * float(drive.machine.n_nom_rpm or 1.0) * math.pi / 30.0
 
 
 def _cogging(drive: MachineFile, percent: float) -> Changes:
-    slots = 6 * (2 if _truth(drive, "pole_pairs") < 5 else 3)
-    periods = math.lcm(slots, 2 * round(_truth(drive, "pole_pairs")))
+    slots = 6 * (2 if truth_of(drive, "pole_pairs") < 5 else 3)
+    periods = math.lcm(slots, 2 * round(truth_of(drive, "pole_pairs")))
     return {"cogging_nm": 0.01 * percent * _rated(drive)[0], "cogging_periods": periods}
 
 
 def _emf(drive: MachineFile, percent: float) -> Changes:
     """5th of the back-emf, and 0.6 of it as the 7th."""
-    psi = _truth(drive, "psi_f_wb")
+    psi = truth_of(drive, "psi_f_wb")
     return {"psi_6_wb": 0.01 * percent * psi / 5.0, "psi_7_wb": 0.006 * percent * psi / 7.0}
 
 
 def _iron(drive: MachineFile, percent: float) -> Changes:
     """Share of the rated power at rated speed without current."""
-    emf = _rated(drive)[1] * _truth(drive, "psi_f_wb")
+    emf = _rated(drive)[1] * truth_of(drive, "psi_f_wb")
     return {"iron_loss_ohm": emf / (0.01 * percent * float(drive.machine.I_nom_apk or 1.0)) if percent else 0.0}
 
 
@@ -71,7 +71,7 @@ def _eddy(drive: MachineFile, percent: float) -> Changes:
 
 
 def _inertia(drive: MachineFile, factor: float) -> Changes:
-    return {"J_kgm2": factor * _truth(drive, "J_kgm2")}
+    return {"J_kgm2": factor * truth_of(drive, "J_kgm2")}
 
 
 def _ripple(drive: MachineFile, percent: float) -> Changes:
@@ -85,7 +85,7 @@ def _mismatch(drive: MachineFile, percent: float) -> Changes:
 
 def _elastic(drive: MachineFile, ratio: float) -> Changes:
     """As many times the rotor's inertia behind a shaft that resonates at 150 Hz, damped by 2 %."""
-    J, w = _truth(drive, "J_kgm2"), 2.0 * math.pi * 150.0
+    J, w = truth_of(drive, "J_kgm2"), 2.0 * math.pi * 150.0
     if not ratio:
         return {}
     common = J * ratio / (1.0 + ratio)
@@ -98,8 +98,8 @@ def _elastic(drive: MachineFile, ratio: float) -> Changes:
 
 def _drag(drive: MachineFile, share: float) -> Changes:
     """Drag of the air at rated speed, of the Coulomb torque."""
-    speed = _rated(drive)[1] / _truth(drive, "pole_pairs")
-    return {"drag_nms2": share * _truth(drive, "tau_c_nm") / speed**2}
+    speed = _rated(drive)[1] / truth_of(drive, "pole_pairs")
+    return {"drag_nms2": share * truth_of(drive, "tau_c_nm") / speed**2}
 
 
 def _magnet(drive: MachineFile, alpha_percent: float) -> Changes:
@@ -110,7 +110,7 @@ def _magnet(drive: MachineFile, alpha_percent: float) -> Changes:
 
 def _heating(drive: MachineFile, seconds: float) -> Changes:
     """A winding with so short a time constant that rated current makes 40 K warmer."""
-    loss = 1.5 * _truth(drive, "R_s_ohm") * float(drive.machine.I_nom_apk or 1.0) ** 2
+    loss = 1.5 * truth_of(drive, "R_s_ohm") * float(drive.machine.I_nom_apk or 1.0) ** 2
     if not seconds:
         return {}
     warm = {"thermal_resistance_k_per_w": 40.0 / loss, "thermal_capacity_j_per_k": seconds * loss / 40.0}
@@ -131,7 +131,7 @@ def _latency(drive: MachineFile, microseconds: float) -> Changes:
 
 def _load(drive: MachineFile, percent: float) -> Changes:
     """Coulomb friction of a load, of the rated torque."""
-    return {"tau_c_nm": _truth(drive, "tau_c_nm") + 0.01 * percent * _rated(drive)[0]}
+    return {"tau_c_nm": truth_of(drive, "tau_c_nm") + 0.01 * percent * _rated(drive)[0]}
 
 
 EFFECTS: Mapping[str, tuple[Callable[[MachineFile, float], Changes], tuple[float, ...]]] = {
@@ -169,9 +169,9 @@ def values_of(drive: MachineFile, folder: Path) -> dict[str, tuple[float, float]
     if not (folder / MACHINE).is_file():
         return {}
     found = load_machine_file(folder / MACHINE).estimates
-    truth = {name: _truth(drive, name) for name in QUANTITIES}
+    truth = {name: truth_of(drive, name) for name in QUANTITIES}
     if "J_load_kgm2" in drive.simulation:
-        truth["J_kgm2"] += _truth(drive, "J_load_kgm2")
+        truth["J_kgm2"] += truth_of(drive, "J_load_kgm2")
     return {
         name: (
             100.0 * (found[name].value / truth[name] - 1.0),

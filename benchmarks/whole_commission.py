@@ -2,6 +2,7 @@
 """Run the whole command `pmsmtool commission FILE --yes` on random drives and judge verdicts and values.
 
     python -m benchmarks.whole_commission --drives 200 --first 120000 --results results.jsonl
+    python -m benchmarks.whole_commission --real --drives 400 --first 160000 --results real.jsonl
 
 Drives follow from their seeds (``sim/random_drives.py``: switched inverter, half of the encoders reversed, half of
 the machines with two leads swapped, 5 to 90 degC, three kinds of sensors in turn). FILE is a data sheet within its
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.commissioning import QUANTITIES, commanded, errors_of, prepared
+from benchmarks.real_population import draw_real
 from pmsmtool.commissioning.report_page import verdict
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
@@ -53,9 +55,15 @@ def fill_memory(path: Path, drive: MachineFile, other: MachineFile) -> None:
         pass
 
 
-def commission_one(seed: int) -> dict[str, Any]:
+def commission_real(seed: int) -> dict[str, Any]:
+    """Commission one drive of the *real* population and return what is judged."""
+    drive, effects = draw_real(seed, BLOCKS[seed % len(BLOCKS)])
+    return commission_one(seed, drive) | {"effects": effects}
+
+
+def commission_one(seed: int, drive: MachineFile | None = None) -> dict[str, Any]:
     """Commission one drive and return what is judged."""
-    drive = draw_drive(seed, BLOCKS[seed % len(BLOCKS)])
+    drive = draw_drive(seed, BLOCKS[seed % len(BLOCKS)]) if drive is None else drive
     start = time.process_time()
     with prepared():
         Path("drive.toml").write_text(dump_machine_file(drive), encoding="utf-8")
@@ -68,6 +76,7 @@ def commission_one(seed: int) -> dict[str, Any]:
             failed = [s.name for s in stages if s.status not in ("pass", "not available")]
             result |= {"word": verdict(folder).word, "stage": failed[-1] if failed else ""}
             result["alarms"] = [r["name"] for s in stages for r in s.comparison if r["verdict"] == "contradicts"]
+            result["refused"] = {name: why for s in stages if s.name == "identify" for name, why in s.refused.items()}
             errors = errors_of(drive, folder)
             found = load_machine_file(folder / "machine.toml").estimates if errors else {}
             result["values"] = {
@@ -98,6 +107,7 @@ def summary(results: Sequence[dict[str, Any]]) -> list[str]:
     for result in sorted(results, key=lambda each: str(each["stage"])):
         if result["code"]:
             lines.append(f"{result['seed']} {ended(result)} exit {result['code']}, {result['stage'] or 'no stage'}:")
+            lines += [f"    {name} {level:.3g}" for name, level in result.get("effects", {}).items()]
             lines += [f"    {line}" for line in result["told"]]
     return lines
 
@@ -113,13 +123,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--drives", type=int, default=200)
     parser.add_argument("--first", type=int, default=120_000, help="first seed")
+    parser.add_argument("--real", action="store_true", help="with effects of real machines (real_population.py)")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--results", type=Path, default=Path("whole_commission.jsonl"))
     asked = parser.parse_args()
     done = {result["seed"] for result in read_results(asked.results)}
     seeds = [seed for seed in range(asked.first, asked.first + asked.drives) if seed not in done]
     with multiprocessing.Pool(asked.processes, maxtasksperchild=1) as pool, asked.results.open("a") as file:
-        for result in pool.imap_unordered(commission_one, seeds, chunksize=1):
+        for result in pool.imap_unordered(commission_real if asked.real else commission_one, seeds, chunksize=1):
             file.write(json.dumps(result) + "\n")
             file.flush()
             print(f"{result['seed']} {ended(result)} {result['stage']} {result['seconds']:.0f} s", flush=True)
