@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: MIT
+"""``pmsmtool diff`` and ``pmsmtool fleet``: two runs compared with their intervals, statistics over many."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pmsmtool.cli.options import examples, output_options
+from pmsmtool.cli.output import Output, table
+
+if TYPE_CHECKING:
+    from pmsmtool.machine.parameters import Estimate
+    from pmsmtool.run_directory import RunRecord
+
+MOST_RUNS = 10_000
+"""Folders that are looked at."""
+
+
+@click.command(
+    "diff",
+    epilog=examples(
+        "pmsmtool diff runs/20260101T120000Z-000055f1 runs/20260301T090000Z-000055f1",
+        "pmsmtool diff BEFORE AFTER --check && echo nothing changed",
+    ),
+)
+@click.argument("first", type=click.Path(path_type=Path))
+@click.argument("second", type=click.Path(path_type=Path))
+@click.option("--check", is_flag=True, help="Exit code 1 where a value differs beyond its interval, or one is missing.")
+@output_options
+def diff_command(first: Path, second: Path, check: bool, out: Output) -> None:
+    """Compare what two runs identified, with the 95 % interval of the difference.
+
+    Runs of one drive share its sensors, so only what scatters counts; of two drives the whole interval does. Resistance
+    and flux linkage are compared at their reference temperature.
+    """
+    from pmsmtool.errors import CheckFailed
+    from pmsmtool.identification.compared_runs import differences
+    from pmsmtool.units import format_quantity
+
+    (record, found), (other_record, other) = _read(first), _read(second)
+    same = bool(record.drive.get("serial")) and record.drive == other_record.drive
+    rows = differences(found, other, same_sensors=same)
+
+    def told(value: float | None, unit: str) -> str:
+        return "-" if value is None or value != value else format_quantity(value, unit)
+
+    cells = [
+        (
+            row.name, told(row.first, row.unit), told(row.second, row.unit), told(row.difference, row.unit),
+            "-" if row.interval != row.interval else f"+-{format_quantity(row.interval, row.unit, 2)}", row.verdict,
+        )
+        for row in rows
+    ]  # fmt: skip
+    changed = [row.name for row in rows if row.verdict != "agrees"]
+    last = f"{len(rows) - len(changed)} of {len(rows)} quantities agree"
+    last += " (one drive: without its sensors' part)" if same else " (two drives: with the sensors' part)"
+    data = [{**_facts(row), "verdict": row.verdict} for row in rows]
+    heads = ("quantity", "first", "second", "difference", "interval", "verdict")
+    out.result("diff", {"same_drive": same, "quantities": data}, [*table(heads, cells), last])
+    if check and changed:
+        raise CheckFailed(
+            f"{', '.join(changed)}: not the same in both runs", where=str(second),
+            likely="the machine, its temperature or its wiring changed between the runs",
+            hint="`pmsmtool report RUN` shows what each run saw",
+        )  # fmt: skip
+
+
+@click.command("fleet", epilog=examples("pmsmtool fleet runs", "pmsmtool fleet runs --json | jq '.quantities[].odd'"))
+@click.argument("folder", type=click.Path(path_type=Path))
+@output_options
+def fleet_command(folder: Path, out: Output) -> None:
+    """Show the statistics of all runs in a folder: medians, spread, and the runs that stand out."""
+    from pmsmtool.errors import ConfigError, PmsmtoolError
+    from pmsmtool.identification.compared_runs import series
+    from pmsmtool.units import format_quantity
+
+    paths = sorted(path.parent for path in folder.glob("*/run.json"))[:MOST_RUNS]
+    runs, unread = [], []
+    for path in paths:
+        try:
+            runs.append((path.name, _read(path)[1]))
+        except PmsmtoolError as error:
+            unread.append(f"{path.name}: {error.what}")
+    if not runs:
+        raise ConfigError(
+            "no run with identified values in here", where=str(folder),
+            hint="give the folder that holds the run directories, usually runs",
+        )  # fmt: skip
+    rows = series(runs)
+    cells = [
+        (
+            row.name, row.runs, format_quantity(row.median, row.unit),
+            "-" if row.spread != row.spread else format_quantity(row.spread, row.unit, 2),
+            f"+-{format_quantity(row.interval, row.unit, 2)}", ", ".join(row.odd) or "-",
+        )
+        for row in rows
+    ]  # fmt: skip
+    heads = ("quantity", "runs", "median", "spread", "interval of one", "stand out")
+    lines = [*table(heads, cells), f"{len(runs)} runs", *(f"left out: {text}" for text in unread)]
+    out.result("fleet", {"runs": len(runs), "left_out": unread, "quantities": [_facts(row) for row in rows]}, lines)
+
+
+def _facts(row: object) -> dict[str, object]:
+    from dataclasses import asdict
+
+    return asdict(row)  # type: ignore[call-overload,no-any-return]
+
+
+def _read(path: Path) -> tuple[RunRecord, dict[str, Estimate]]:
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.identification.replay import MACHINE
+    from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.run_directory import RunDirectory
+
+    record = RunDirectory(path).read()
+    if not (path / MACHINE).is_file():
+        raise ConfigError(
+            f"the run has no {MACHINE}: nothing was identified", where=str(path),
+            hint="`pmsmtool report RUN` says how it ended",
+        )  # fmt: skip
+    return record, dict(load_machine_file(path / MACHINE).estimates)

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: MIT
+"""Two runs side by side, and many: what differs beyond the intervals, what the values of a series look like."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from pmsmtool.estimators.estimate import statistical_half_width, total_half_width
+from pmsmtool.machine.parameters import Estimate
+
+LEAST_SERIES = 5
+"""Runs of a quantity from which a median and a spread say something, and an odd one can be named."""
+ODD = 3.5
+"""Distance from the median, in robust standard deviations, that makes a value odd (Iglewicz and Hoaglin 1993)."""
+ROBUST = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One quantity in two runs.
+
+    Attributes
+    ----------
+    name, unit : str
+        As in the machine file.
+    first, second : float or None
+        Values; None where the run did not accept one.
+    difference, interval : float
+        Second minus first, and its 95 % half width; NaN where one is missing.
+    """
+
+    name: str
+    unit: str
+    first: float | None
+    second: float | None
+    difference: float
+    interval: float
+
+    @property
+    def verdict(self) -> str:
+        """``agrees``, ``differs``, or which run lacks it."""
+        if self.first is None or self.second is None:
+            return f"only in the {'second' if self.first is None else 'first'}"
+        return "agrees" if abs(self.difference) <= self.interval else "differs"
+
+
+def differences(
+    first: Mapping[str, Estimate], second: Mapping[str, Estimate], *, same_sensors: bool
+) -> list[Difference]:
+    """Return every quantity of either run, in the order of the names.
+
+    Parameters
+    ----------
+    same_sensors : bool
+        Whether both were measured by one drive: what its sensors are off by is then in both alike and does not count.
+    """
+    half = statistical_half_width if same_sensors else total_half_width
+    rows = []
+    for name in sorted({*first, *second}):
+        a, b = first.get(name), second.get(name)
+        known = a or b
+        assert known is not None
+        if a is None or b is None:
+            values = None if a is None else a.value, None if b is None else b.value
+            rows.append(Difference(name, known.unit, *values, math.nan, math.nan))
+        else:
+            rows.append(Difference(name, a.unit, a.value, b.value, b.value - a.value, math.hypot(half(a), half(b))))
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One quantity over many runs.
+
+    Attributes
+    ----------
+    name, unit : str
+        As in the machine file.
+    runs : int
+        In how many it was accepted.
+    median, spread : float
+        Median, and robust standard deviation (NaN below ``LEAST_SERIES`` runs).
+    interval : float
+        Median total 95 % half width of one run.
+    odd : tuple of str
+        Runs whose value stands out of the others by more than the series' spread and its own interval.
+    """
+
+    name: str
+    unit: str
+    runs: int
+    median: float
+    spread: float
+    interval: float
+    odd: tuple[str, ...] = ()
+
+
+def series(runs: Iterable[tuple[str, Mapping[str, Estimate]]]) -> list[Series]:
+    """Return the statistics of every quantity over runs, each with its name."""
+    found: dict[str, list[tuple[str, Estimate]]] = {}
+    for run, estimates in runs:
+        for name, estimate in estimates.items():
+            found.setdefault(name, []).append((run, estimate))
+    return [_series(name, found[name]) for name in sorted(found)]
+
+
+def _series(name: str, found: Sequence[tuple[str, Estimate]]) -> Series:
+    values = [estimate.value for _, estimate in found]
+    interval = statistics.median(total_half_width(estimate) for _, estimate in found)
+    median = statistics.median(values)
+    spread, odd = math.nan, list[str]()
+    if len(values) >= LEAST_SERIES:
+        spread = ROBUST * statistics.median(abs(value - median) for value in values)
+        for run, estimate in found:
+            allowed = max(ODD * spread, math.hypot(total_half_width(estimate), interval))
+            if abs(estimate.value - median) > allowed:
+                odd.append(run)
+    return Series(name, found[0][1].unit, len(values), median, spread, interval, tuple(odd))
