@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from pmsmtool.estimators.estimate import (
     COVERAGE_FACTOR,
@@ -66,8 +67,14 @@ MEAN_NOISE_FACTOR = 1.05
 TEMPERATURE_PASSES = 3
 MOVED_SHARE = 0.25
 """Largest share of levels that may be left out; with more the estimator sees them, and refuses what has not settled."""
-DRIFT_LIMIT = 0.06
-"""Largest change of R over the sweep (relative), 15 K of copper; beyond it E_THERMAL_DRIFT."""
+WARMING_S, WARMING_TOLERANCE = (0.3, 120.0), 0.02
+"""Time constants of a winding that warms by its own losses (s), and how finely one is sought (of its logarithm)."""
+WARMING_GAIN = 10.0
+"""Fall of chi-square for which that counts instead of a line of time: one shape more, at three standard deviations."""
+LATE = 0.75
+"""Middle of a level's window, of the level: its first half settles."""
+DRIFT_LIMIT = 0.15
+"""Largest change of R over the sweep (relative), 40 K of copper; beyond it E_THERMAL_DRIFT."""
 DRIFT_SECOND_ORDER = 0.02
 """Part of a drift that the linear drift term may leave in R: 12 K in one sweep left 0.6 % of 4.7 % without any term."""
 SETTLE_SIGMA = 6.0
@@ -201,7 +208,9 @@ def estimate_resistance(
     peak = float(np.max(np.abs(i)))
     R_0 = _two_point_slope(i, v)
     _check_levels(levels, i, peak, R_0, noise)
-    sigma_v = _level_sigma(levels.t_s, i, v, peak, R_0, MEAN_NOISE_FACTOR * R_0 * noise.sigma_a / math.sqrt(samples))
+    noise_v = MEAN_NOISE_FACTOR * R_0 * noise.sigma_a / math.sqrt(samples)
+    warmth = _warmth(levels.t_s, i, v, peak, math.hypot(noise_v, MODEL_FLOOR * R_0 * peak))
+    sigma_v = _level_sigma(warmth, i, v, peak, R_0, noise_v)
 
     T = levels["T_winding_c"]
     known_T = bool(np.all(np.isfinite(T)))
@@ -214,7 +223,7 @@ def estimate_resistance(
         # R at T_w: what the copper part adds at each level's own temperature moves to the left side
         slope = _slope_per_k(R_w * share, T_w, copper)
         v_w = v - slope * (T - T_w) * i if known_T else v
-        fits = [_fit_tail(levels.t_s, i, v_w, peak, sigma_v, powers) for powers in tail_models()]
+        fits = [_fit_tail(warmth, i, v_w, peak, sigma_v, powers) for powers in tail_models()]
         weights = information_weights([_criterion(fit, len(i)) for fit in fits])
         R_w = float(sum(w * fit.x[0] for w, fit in zip(weights, fits, strict=True)))
     V_vector, v_0, drift = (float(sum(w * fit.x[k] for w, fit in zip(weights, fits, strict=True))) for k in (1, 2, 3))
@@ -255,6 +264,29 @@ def estimate_resistance(
         verdict=verdict,
         copper=copper,
     )
+
+
+def _warmth(t: Vector, i: Vector, v: Vector, peak: float, sigma_v: float) -> Vector:
+    """Return how the winding warms from level to level: with time, or where that does not fit, by its own losses."""
+
+    def misfit(warmth: Vector) -> float:
+        return min(_fit_tail(warmth, i, v, peak, sigma_v, powers).chi2 for powers in tail_models())
+
+    found = minimize_scalar(
+        lambda log_tau: misfit(_heated(t, i, peak, math.exp(log_tau))),
+        bounds=(math.log(WARMING_S[0]), math.log(WARMING_S[1])), method="bounded", options={"xatol": WARMING_TOLERANCE},
+    )  # fmt: skip
+    return _heated(t, i, peak, math.exp(found.x)) if found.fun < misfit(t) - WARMING_GAIN else t
+
+
+def _heated(t: Vector, i: Vector, peak: float, tau_s: float) -> Vector:
+    """Return the warmth of a winding of one time constant (1), cold before the first level: late in every level."""
+    out, warm, before = np.empty_like(i), 0.0, float(t[0] - np.median(np.diff(t)))
+    for k, (now, current) in enumerate(zip(t, i, strict=True)):
+        rest, late = (1.0 - math.exp(-part * (now - before) / tau_s) for part in (1.0, LATE))
+        out[k] = warm + late * ((current / peak) ** 2 - warm)
+        warm, before = warm + rest * ((current / peak) ** 2 - warm), now
+    return out
 
 
 def _level_sigma(t: Vector, i: Vector, v: Vector, peak: float, R_0: float, noise_v: float) -> float:

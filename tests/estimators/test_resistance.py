@@ -208,7 +208,7 @@ def _flat(t: Trace) -> dict[str, np.ndarray]:
         (
             lambda t: {
                 "u_d_v": t["u_d_v"]
-                + 0.1 * np.linspace(0, 1, len(t)) * 0.8 * np.max(t["u_d_v"] / t["i_d_a"].max()) * t["i_d_a"]
+                + 0.25 * np.linspace(0, 1, len(t)) * 0.8 * np.max(t["u_d_v"] / t["i_d_a"].max()) * t["i_d_a"]
             },
             "E_THERMAL_DRIFT",
         ),
@@ -228,6 +228,30 @@ def test_refusals(change: Change, reason: str) -> None:
     assert caught.value.reason == reason
     assert caught.value.exit_code == 6
     assert caught.value.hint
+
+
+@pytest.mark.parametrize("tau_s", [0.7, 2.0, 4.3, 10.0, 60.0])
+def test_a_winding_that_warms_by_its_own_losses(tau_s: float) -> None:
+    """Up to 25 K at the largest level, no sensor. R at a temperature between cold and hot; a line of time refused it.
+
+    Levels of 0.25 s, the warmth of each simulated in steps of 1 ms and averaged over its second half.
+    """
+    rng = np.random.default_rng(31)
+    d = replace_inverter(draw(1, rng))
+    trace = levels_of(d, 0, rng, sensor=False)
+    i, warm, hot = trace["i_d_a"], 0.0, []
+    for current in i:
+        steps = []
+        for _ in range(250):
+            warm += 1e-3 / tau_s * (0.1 * (current / d.I_r[0]) ** 2 - warm)
+            steps.append(warm)
+        hot.append(float(np.mean(steps[125:])))
+    v = trace["u_d_v"] + d.R[0] * np.array(hot) * i
+    signals = dict.fromkeys(("u_d_v", "u_d_first_v", "u_d_second_v"), v)
+    result = estimate_resistance(replace(trace, signals={**trace.signals, **signals}), noise_of(d, 0))
+    expected = d.R[0] * (1.0 + float(np.sum(hot * i**2) / np.sum(i**2)))
+    error, half = result.R_measured.value / expected - 1.0, COVERAGE_FACTOR * result.R_measured.std / expected
+    assert abs(error) < half < 0.02, (error, half)
 
 
 def test_a_hard_drive_is_refused_by_name_when_the_interval_is_too_wide() -> None:
