@@ -50,10 +50,12 @@ ROTATIONS = (
     (0.35, rotation.QUICK_STEP_RAD, rotation.QUICK_DWELL_S, RAMP_S),
     (0.18, rotation.STEP_RAD, 0.03, 3.0 * RAMP_S),
     (0.09, rotation.STEP_RAD, 0.03, 4.0 * RAMP_S),
+    (0.7, rotation.STEP_RAD, 0.06, 4.0 * RAMP_S),
 )
 """Current, of the test current, largest step (rad), time per step and ramp (s) of every try. Above psi/(L_q - L_d) a d
 current is no stable position: a reluctance machine follows a smaller vector only, and swings longer on it. The next two
-have another speed and longer ramps, too, for a rotor that swings with the first."""
+have another speed and longer ramps, too, for a rotor that swings with the first; the last is for friction and inertia
+that hold the rotor off a smaller vector."""
 SATURATED = 0.01
 """Change of the flux linkage, mean of both signs of i_d over the one without, from which on a machine is mapped: 0.03
 of the saturated profile, below 0.0035 of linear drives, 0.007 to 0.02 beside 5 % of iron loss."""
