@@ -85,7 +85,8 @@ def mechanics_of(
             fast = np.abs(_speed(part)) > FAST_SHARE * np.max(np.abs(_speed(part)))
             size = float(np.mean(np.abs(before)))
             displaced = max(displaced, abs(float(np.mean(after - before))) / size)
-            tilt = max(tilt, abs(float(np.mean((after - before)[fast]))) / size)
+            eddy = _eddy_share(part, pole_pairs, result)
+            tilt = max(tilt, math.hypot(doubt * float(np.mean((after - before)[fast])) / size, eddy))
     return estimate_mechanics(
         parts,
         torque,
@@ -94,7 +95,7 @@ def mechanics_of(
         torque_doubt(result.flux, doubt * displaced, mapped=result.flux_map is not None),
         direction=direction,
         tolerance=tolerance,
-        tilt_std=math.hypot(TILT_FLOOR, doubt * tilt),
+        tilt_std=math.hypot(TILT_FLOOR, tilt),
     )
 
 
@@ -135,6 +136,15 @@ def _between_samples(
     u_d, u_q = R * i_d - omega * L_q * i_q, R * i_q + omega * (psi + L_d * i_d)
     late = standstill_instant_s(sampling, Modulation(math.inf, L_h, period_s, dead_time_s))
     return replace(trace, signals={**trace.signals, "i_d_a": i_d + u_d * late / L_d, "i_q_a": i_q + u_q * late / L_q})
+
+
+def _eddy_share(trace: Trace, pole_pairs: int, result: Evaluation) -> float:
+    """Return what the eddy currents of the inductances' fit take of a push's current at its fastest speed."""
+    if result.inductance is None or result.flux is None:
+        return 0.0
+    axis = result.inductance.axes["q"]
+    emf = pole_pairs * float(np.max(np.abs(_speed(trace)))) * result.flux.psi_measured.value
+    return emf * axis.eddy_s / axis.L_h / float(np.mean(np.abs(trace["i_q_a"])))
 
 
 def _speed(trace: Trace) -> Array:

@@ -135,7 +135,7 @@ def test_what_is_not_a_free_shaft_is_refused_by_name() -> None:
     assert reason(held) == "E_EXCITATION"
     clipped = [changed(good[0], flagged=np.ones(ROWS)), *good[1:]]
     assert reason(clipped) == "E_CLIPPED"
-    assert reason([good[0], swinging(good[1], 0.2), *good[2:]]) == "E_MODEL_MISMATCH"
+    assert reason([good[0], swinging(good[1], 0.5), *good[2:]]) == "E_MODEL_MISMATCH"
 
 
 def swinging(trace: Trace, amplitude: float) -> Trace:

@@ -4,8 +4,9 @@
 Each shape has a size of mean 0 and a standard deviation of 1, so that what the traces do not show of it widens J, B and
 tau_c instead of moving them:
 
-- torque of the pushes in proportion to the speed. Samples are displaced from the currents' mean by the voltage, and an
-  angle that is old turns i_q into i_d. Without it a shaft whose friction leaves little coasting takes that for B;
+- torque of the pushes in proportion to the speed. The voltage displaces samples from the currents' mean, and iron loss
+  takes a current of its own; an angle that is old turns i_q into i_d. Without it a shaft whose friction leaves little
+  coasting takes that for B;
 - friction over the angle, once and twice per turn: it changes its sign with the speed;
 - torque over the angle, once and twice per turn: unbalance, tolerances of the stator;
 - the encoder's error, once and twice per turn.
@@ -51,7 +52,7 @@ NONE = Disturbances(np.zeros((0, 0)), np.zeros((0, 0)))
 class Extent:
     """Sizes of a run: fastest speed (rad/s), largest torque (N m) and the pushes' doubt in proportion to the speed.
 
-    ``tilt_std`` is the relative standard deviation of a push's torque at the fastest speed.
+    ``tilt_std`` is the standard deviation of a push's torque at the fastest speed, of the largest.
     """
 
     speed_rad_s: float
@@ -77,8 +78,9 @@ def disturbances(theta: Array, torque: Array, T: float, extent: Extent) -> Distu
     rows = (len(theta) - 1) // blocks
     way = np.diff(theta)
     middle = theta[:-1] + 0.5 * way
-    share = np.abs(theta[rows::rows] - theta[:-1:rows]) / (T * extent.speed_rad_s)
-    torques = [extent.tilt_std * share * torque]
+    # a voltage displaces the current, and takes of it, whichever way the torque is
+    share = (theta[rows::rows] - theta[:-1:rows]) / (T * extent.speed_rad_s)
+    torques = [extent.tilt_std * extent.torque_nm * share * (torque != 0.0)]
     positions = []
     for order in ENCODER_ORDERS:
         for wave in WAVES:

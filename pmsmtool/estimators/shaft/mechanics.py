@@ -50,12 +50,14 @@ REST_SHARE = 0.005
 """Way of the shaft, of a trace's whole, from which on it is fitted."""
 STEP_SHARE = 0.1
 """Part of a push within which its step may be limited."""
-COARSE_RIPPLES = (0.3, 0.03, 3e-3)
+COARSE_RIPPLES = (0.3, 0.03, 3e-3, 3e-4)
 """Least noise of the torque in the first fits, of the push's, one after the other: with an encoder's resolution alone
 the cost is a narrow, bent valley in which a fit from rough starting values, or straight from the first of these, does
 not arrive (1 of 160 realisations, and 1 of 33 random drives)."""
-FITS_MOST = 8
+FITS_MOST = 10
 """Fits after it; the second whitens with the inertia of the first, more only where the torque's noise grows."""
+PATIENT_FITS = 2
+"""Fits after which the noise grows before a minimum, too: a shaft that the model is far from has none."""
 TORQUE_FLOOR = 1e-3
 """Deviation of a block's torque beyond the noise of the currents, of the push's: ripple that samples do not show."""
 COASTING_FLOOR = 1e-4
@@ -300,12 +302,14 @@ def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, Sequence[Run]]:
     """Return the fit with drag, its reduced chi-square, and the runs with the torque's noise that it took."""
     largest = largest_torque(runs)
     scale = sizes_of(runs, drag=True)
-    bare = [replace(run, disturbances=NONE) for run in runs]
     x = np.insert(start, SHAFT, 0.0)
-    for share in COARSE_RIPPLES:
-        coarse = [replace(run, torque_std=max(run.torque_std, share * largest)) for run in bare]
-        x = _minimum(coarse, x, sizes_of(bare, drag=True)).x
-    x = np.insert(x, SHAFT + 1, np.zeros(len(scale) - len(x)))
+    for count, share in enumerate(COARSE_RIPPLES):
+        coarse = [replace(run, torque_std=max(run.torque_std, share * largest)) for run in runs]
+        if not count:  # a rough start knows nothing of the disturbances
+            bare = [replace(run, disturbances=NONE) for run in coarse]
+            x = _minimum(bare, x, sizes_of(bare, drag=True)).x
+            x = np.insert(x, SHAFT + 1, np.zeros(len(scale) - len(x)))
+        x = _minimum(coarse, x, scale).x
     for count in range(FITS_MOST):
         fit = _minimum(runs, x, scale)
         x = fit.x
@@ -322,10 +326,10 @@ def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, Sequence[Run]]:
                 likely=NOISY_TORQUE,
                 hint="`identify R L psi encoder poles inverter frf` finds the resonance of an elastic shaft, and J",
             )
-        if fit.converged:
-            if count and noisier is runs:
+        if fit.converged or count >= PATIENT_FITS:
+            if fit.converged and count and noisier is runs:
                 break
-            runs = noisier  # before a minimum the residual says nothing of the noise
+            runs = noisier  # before a minimum the residual says little of the noise
     if not fit.converged:
         raise refuse("E_NOT_CONVERGED", f"{fit.iterations} steps without a minimum", stage=STAGE)
     return fit, chi2, runs
