@@ -249,7 +249,8 @@ def evaluate(
     if result.resistance is not None and math.isfinite(U_dc_v):
         dead_time_s = max(0.0, result.resistance.V_dead_v) * period_s / U_dc_v
     shaft = result
-    mechanics = attempt("mechanics", lambda: mechanics_of(traces, shaft, tolerance, dead_time_s, period_s))
+    rough_L_h = _rough_inductance(traces, "d"), _rough_inductance(traces, "q")
+    mechanics = attempt("mechanics", lambda: mechanics_of(traces, shaft, tolerance, dead_time_s, period_s, rough_L_h))
     moving = replace(shaft, mechanics=mechanics)
     response = attempt("frf", lambda: frequency_response.frequency_response_of(traces, moving, tolerance, dead_time_s))
     return replace(moving, frequency_response=response, refused=refused)

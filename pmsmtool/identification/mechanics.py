@@ -15,6 +15,7 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_instant_s
 from pmsmtool.estimators.injection.switching_ripple import Modulation
+from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult, Torque, estimate_mechanics
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
 from pmsmtool.trace import Trace
@@ -29,6 +30,8 @@ TRACE = "inertia_"
 SATURATION_DOUBT = 0.25
 """Relative standard deviation of the torque without a flux map, of the curvature of psi_d over i_d: the flux that a q
 current takes from the d axis is not seen. The saturated profile has a curvature of 3 % and its J was 0.77 % off."""
+FAST_SHARE = 0.8
+"""Speed of a push, of its largest, from which on the displacement there is looked at."""
 SAMPLE_DOUBT = 0.2
 """Relative standard deviation of the displacement that a dead time gives the sample of a current; on nine random
 drives with a switched inverter 0.02 to 0.5 % of J went down to at most 0.03 % with it."""
@@ -40,6 +43,7 @@ def mechanics_of(
     tolerance: SensorTolerance | None,
     dead_time_s: float = 0.0,
     period_s: float = 0.0,
+    rough_L_h: tuple[float, float] = (0.0, 0.0),
 ) -> MechanicsResult | None:
     """Return inertia and friction; None without the run, or without a flux linkage.
 
@@ -53,6 +57,8 @@ def mechanics_of(
         Declared sensor tolerances.
     dead_time_s, period_s : float
         Of a leg, and of the control (s): they displace the samples of the current.
+    rough_L_h : (float, float)
+        Inductances (H) for that displacement where they are refused; 0: not known.
 
     Raises
     ------
@@ -66,21 +72,30 @@ def mechanics_of(
     behind = result.offset.value - float(parts[0].meta["offset_rad"])
     direction = int(parts[0].meta["direction"])
     psi = result.flux.psi_measured
-    displaced = 0.0
+    torque = torque_of(result, pole_pairs)
+    found = result.inductance
+    L_h = rough_L_h if found is None else (found.L_d.value, found.L_q.value)
+    doubt = SAMPLE_DOUBT if found is not None else 1.0
+    displaced, tilt = 0.0, 0.0
     for k, part in enumerate(parts):
         if not part.meta["coasting"]:
             sampled = in_frame(part, behind)
-            parts[k] = _between_samples(sampled, direction * pole_pairs, result, dead_time_s, period_s)
-            moved = float(np.mean(np.abs(parts[k]["i_q_a"] - sampled["i_q_a"])))
-            displaced = max(displaced, moved / float(np.mean(np.abs(sampled["i_q_a"]))))
+            parts[k] = _between_samples(sampled, direction * pole_pairs, result, L_h, dead_time_s, period_s)
+            before, after = (torque(run["i_d_a"], run["i_q_a"]) for run in (sampled, parts[k]))
+            fast = np.abs(_speed(part)) > FAST_SHARE * np.max(np.abs(_speed(part)))
+            size = float(np.mean(np.abs(before)))
+            displaced = max(displaced, abs(float(np.mean(after - before))) / size)
+            eddy = _eddy_share(part, pole_pairs, result)
+            tilt = max(tilt, math.hypot(doubt * float(np.mean((after - before)[fast])) / size, eddy))
     return estimate_mechanics(
         parts,
-        torque_of(result, pole_pairs),
+        torque,
         torque_per_ampere(pole_pairs, psi.value),
         result.noise.sigma_a,
-        torque_doubt(result.flux, displaced, mapped=result.flux_map is not None),
+        torque_doubt(result.flux, doubt * displaced, mapped=result.flux_map is not None),
         direction=direction,
         tolerance=tolerance,
+        tilt_std=math.hypot(TILT_FLOOR, tilt),
     )
 
 
@@ -92,15 +107,17 @@ def torque_doubt(flux: FluxResult, displaced: float = 0.0, *, mapped: bool = Fal
     flux : FluxResult
         Flux linkage, and how the d axis saturates.
     displaced : float
-        Displacement of the current's samples, of the current.
+        Doubt about the displacement of the current's samples, of the torque.
     mapped : bool
         Whether a flux map gives the torque.
     """
     unseen = 0.0 if mapped else SATURATION_DOUBT * flux.curvature
-    return math.hypot(flux.psi_measured.std / flux.psi_measured.value, SAMPLE_DOUBT * displaced, unseen)
+    return math.hypot(flux.psi_measured.std / flux.psi_measured.value, displaced, unseen)
 
 
-def _between_samples(trace: Trace, pole_pairs: int, result: Evaluation, dead_time_s: float, period_s: float) -> Trace:
+def _between_samples(
+    trace: Trace, pole_pairs: int, result: Evaluation, L_h: tuple[float, float], dead_time_s: float, period_s: float
+) -> Trace:
     """Return a push with the mean currents of the periods in place of the sampled ones.
 
     A dead time delays every pulse by half of it, so that the sample in the middle of the zero vector, where the current
@@ -109,16 +126,25 @@ def _between_samples(trace: Trace, pole_pairs: int, result: Evaluation, dead_tim
     them.
     """
     assert result.flux is not None and result.resistance is not None
-    if result.inductance is None:
+    L_d, L_q = L_h
+    if not (L_d > 0.0 and L_q > 0.0):
         return trace
-    sampling = result.inductance.sampling or Sampling()
+    sampling = (result.inductance and result.inductance.sampling) or Sampling()
     R, psi = result.resistance.R_measured.value, result.flux.psi_measured.value
-    L_d, L_q = result.inductance.L_d.value, result.inductance.L_q.value
     i_d, i_q = trace["i_d_a"], trace["i_q_a"]
     omega = pole_pairs * _speed(trace)
     u_d, u_q = R * i_d - omega * L_q * i_q, R * i_q + omega * (psi + L_d * i_d)
-    late = standstill_instant_s(sampling, Modulation(math.inf, (L_d, L_q), period_s, dead_time_s))
+    late = standstill_instant_s(sampling, Modulation(math.inf, L_h, period_s, dead_time_s))
     return replace(trace, signals={**trace.signals, "i_d_a": i_d + u_d * late / L_d, "i_q_a": i_q + u_q * late / L_q})
+
+
+def _eddy_share(trace: Trace, pole_pairs: int, result: Evaluation) -> float:
+    """Return what the eddy currents of the inductances' fit take of a push's current at its fastest speed."""
+    if result.inductance is None or result.flux is None:
+        return 0.0
+    axis = result.inductance.axes["q"]
+    emf = pole_pairs * float(np.max(np.abs(_speed(trace)))) * result.flux.psi_measured.value
+    return emf * axis.eddy_s / axis.L_h / float(np.mean(np.abs(trace["i_q_a"])))
 
 
 def _speed(trace: Trace) -> Array:

@@ -3,7 +3,7 @@
 
 Before the first push nothing is known of the shaft, so that nothing can be predicted of it. Afterwards the rough
 inertia, how the shaft slows down between the windows of the speed run, the flux linkage's own deviation and the plan
-tell (``estimators/shaft/shaft_prediction``).
+tell (``identification/shaft_prediction``).
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.prediction import line_of
 from pmsmtool.estimators.resistance import ResistanceResult
-from pmsmtool.estimators.shaft import shaft_prediction
 from pmsmtool.estimators.shaft.frequency_response import INERTIA_FLOOR
 from pmsmtool.estimators.shaft.position import encoder_step
-from pmsmtool.estimators.shaft.shaft_prediction import RoughShaft
 from pmsmtool.experiments import frequency_response, mechanics_run
+from pmsmtool.identification import shaft_prediction
 from pmsmtool.identification.evaluate import flux_of
 from pmsmtool.identification.frequency_response import small_signal_doubt
 from pmsmtool.identification.mechanics import SAMPLE_DOUBT, torque_doubt
+from pmsmtool.identification.shaft_prediction import RoughShaft
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace
 

@@ -135,7 +135,7 @@ def test_what_is_not_a_free_shaft_is_refused_by_name() -> None:
     assert reason(held) == "E_EXCITATION"
     clipped = [changed(good[0], flagged=np.ones(ROWS)), *good[1:]]
     assert reason(clipped) == "E_CLIPPED"
-    assert reason([good[0], swinging(good[1], 0.2), *good[2:]]) == "E_MODEL_MISMATCH"
+    assert reason([good[0], swinging(good[1], 0.5), *good[2:]]) == "E_MODEL_MISMATCH"
 
 
 def swinging(trace: Trace, amplitude: float) -> Trace:
@@ -239,3 +239,51 @@ def test_drag_over_the_square_of_the_speed_is_told_from_friction() -> None:
     for value, true in ((found.J, J), (found.B, B), (found.tau_c, TAU_C)):
         assert abs(value.value - true) < 3.0 * value.std + 1e-3 * true
     assert "square of the speed" in found.note and estimate(traces).drag is None
+
+
+def braked(rng: np.random.Generator, tilt: float = 0.0, friction: float = 0.0, encoder: float = 0.0) -> list[Trace]:
+    """A shaft that stops soon: coasting is recorded from a fifth of the speed on, as an upload of the push leaves it.
+
+    The measured torque is off by ``tilt`` at the fastest speed; Coulomb friction varies by the share ``friction`` and
+    the encoder's angle by ``encoder`` (rad), once per turn.
+    """
+    tau_c, step = 1.2, 2.0 * math.pi / 2**BITS
+    traces, omega = [], 0.0
+    for current, period, rows in ((4.0, 1e-4, 1600), (0.0, 5e-4, 800), (-4.0, 1e-4, 1600), (0.0, 5e-4, 800)):
+        if current == 0.0:
+            omega *= 0.2
+        elif abs(omega) < 0.5:
+            omega = 0.0
+        theta, shown, speeds, h = 0.7, [], [], period / 10
+        for _ in range(rows):
+            shown.append(theta)
+            speeds.append(omega)
+            for _ in range(10):
+                sign = math.copysign(1.0, omega if omega != 0.0 else current)
+                brake = tau_c * (1.0 + friction * math.cos(theta - 0.4)) * sign + B * omega
+                if omega == 0.0 and current == 0.0:
+                    break
+                after = omega + h * (PER_A * current - brake) / J
+                after = 0.0 if after * omega < 0.0 else after
+                theta, omega = theta + 0.5 * h * (omega + after), after
+        way = np.array(shown)
+        way = way + encoder * np.cos(way + 1.0)
+        i_q = current * (1.0 + tilt * np.abs(speeds) / 190.0) + SIGMA * rng.standard_normal(rows) * (current != 0.0)
+        signals = {
+            "i_d_a": np.zeros(rows),
+            "i_q_a": i_q,
+            "theta_M_rad": step * np.round(way / step),
+            "flagged": np.zeros(rows),
+        }
+        meta = {"coasting": current == 0.0}
+        traces.append(Trace(period * np.arange(rows, dtype=np.float64), signals, dict.fromkeys(signals, "1"), meta))
+    return traces
+
+
+@pytest.mark.parametrize("effect", [{"tilt": 3e-3}, {"friction": 0.15}, {"encoder": 6e-3}, {}])
+def test_what_repeats_with_the_angle_or_grows_with_the_speed_is_no_friction(effect: dict[str, float]) -> None:
+    """Before: tau_c 11 deviations (8 %) off with friction over the angle, B 25 (20 %) by the encoder, 3 by the tilt."""
+    found = estimate(braked(np.random.default_rng(12), **effect))
+    for value, true in ((found.J, J), (found.B, B), (found.tau_c, 1.2)):
+        assert abs(value.value - true) < 3.0 * value.std
+    assert found.J.std < 2e-3 * J and found.tau_c.std < 0.01 * 1.2

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import information_weights, scaled_covariance
+from pmsmtool.estimators.estimate import CHI2_WARN, information_weights, scaled_covariance
 from pmsmtool.estimators.injection.axis_layout import Effects, Layout, Motion, Timing
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, arx_guess, projected, simulate
 from pmsmtool.estimators.injection.output_error import respond
@@ -35,6 +35,8 @@ DISPERSION_SHARE = 0.5
 DELAY_STARTS = (0.05, 0.45, 0.95, 1.45, 1.95)
 LAG_STARTS = ((0.02, 0.1), (0.4, 0.8))
 """Delays and lags tried before the fit (T_s); one fit begins at the best of each group of lags."""
+EDDY_STARTS, TAU_STARTS = (0.05, 0.3, 1.2), (0.05, 1.0)
+"""Eddy currents (of T_s/L) from each of which a fit begins, and time constants (T_s) tried before it."""
 ITERATIONS = 30
 STEP_TOLERANCE = 1e-7
 """Relative size of the last step."""
@@ -87,6 +89,8 @@ class AxisFit:
         What the axis says about delay and lag, for the other one.
     places : tuple of (float, float, float)
         Information weight, delay (T_s) and lag (s) of every model that counts.
+    eddy_s : float
+        Eddy currents of the best model, per voltage and 1/L (s); 0 where it has none.
     """
 
     L_h: float
@@ -106,6 +110,7 @@ class AxisFit:
     condition: float
     timing: Timing
     places: tuple[tuple[float, float, float], ...] = ()
+    eddy_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,6 +255,18 @@ def fit_axis(
         if not set(best.names) > set(current.names):
             break
         current = best
+    fit = tried[current][0]
+    if current.dispersion or fit.cost > CHI2_WARN * fit.dof:
+        # what makes L fall with the frequency, or a residual in step with it
+        for bend in {current.bend, optional["bend"] and current.bend, not optional["bend"]}:
+            new_layout, start = base.changed(first.x, Effects(bend=bend, motion=current.motion, eddy=True))
+            branch = _Problem(shots, slow, sigma_a, new_layout)
+            fits = []
+            for eddy in EDDY_STARTS:
+                places = [new_layout.with_eddy(start, eddy, tau, delay) for tau in TAU_STARTS for delay in (None, 1.0)]
+                costs = [float(np.sum(branch(x) ** 2)) for x in places]
+                fits.append(branch.fit(places[costs.index(min(costs))]))
+            tried[new_layout.effects] = (min(fits, key=lambda found: found.cost), new_layout)
     criteria = {effects: _criterion(*found, timing) for effects, found in tried.items()}
     # each without its lag, not the best alone: with one choice made before it, the average over models was none
     for effects in [e for e, criterion in criteria.items() if criterion - min(criteria.values()) < DECIDED]:
@@ -353,4 +370,5 @@ def _average(
             if w > NEGLIGIBLE_WEIGHT
             for model in [layout.responses(fit.x)[0].model]
         ),
+        eddy_s=first.model.eddy_s,
     )

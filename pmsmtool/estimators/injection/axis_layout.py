@@ -28,6 +28,12 @@ MOTION_PRIOR_STD = 10.0
 """Prior of the motional term, in hundredths of L over the square of a half period."""
 RATIO_PRIOR_STD = 0.3
 """Prior of the relative difference of L and R between injection frequencies."""
+EDDY_PRIOR_STD = 1.0
+"""Prior of the eddy current per voltage, relative to T_s/L: 5 % of iron loss make 0.1 to 1.3, an eddy branch 0.1."""
+EDDY_TAU_CENTRE, EDDY_TAU_PRIOR_STD = 0.5, 1.5
+"""Centre (T_s) and standard deviation (of the logarithm) of the prior of its time constant."""
+EDDY_R_PRIOR_STD = 0.05
+"""Prior of the resistance beside it: what eddy currents add is then their own."""
 LARGEST_LOG_L, LARGEST_LOG_LAG = 3.0, 10.0
 SMALLEST_DECAY, LARGEST_DECAY = -0.3, 5.0
 """Region of the fit: L relative to its first guess, lag relative to T_s, and R T_s/L."""
@@ -95,11 +101,12 @@ class Effects:
     bend: bool = False
     motion: bool = False
     dispersion: bool = False
+    eddy: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the effects in use."""
-        return tuple(name for name in ("lag", "bend", "motion", "dispersion") if getattr(self, name))
+        return tuple(name for name in ("lag", "bend", "motion", "dispersion", "eddy") if getattr(self, name))
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +140,8 @@ class Layout:
             yield "motion", 1
         if self.effects.dispersion:
             yield "dispersion", 2 * (self.shots - 1)
+        if self.effects.eddy:
+            yield "eddy", 2
         yield "start", self.shots
 
     def split(self, x: Vector) -> dict[str, list[float]]:
@@ -150,6 +159,7 @@ class Layout:
         lag = math.exp(parts["lag"][0]) * self.period_s if self.effects.lag else 0.0
         b_2, b_3 = [0.0, 0.0, *parts.get("bend", [])][-2:]
         motion = parts.get("motion", [0.0])[0] * self.motion_scale
+        eddy, log_tau = parts.get("eddy", [0.0, 0.0])
         ratios = [0.0, 0.0, *parts.get("dispersion", [0.0] * (2 * (self.shots - 1)))]
         return [
             Response(
@@ -158,6 +168,8 @@ class Layout:
                     R * self.R_scale * (1.0 + ratios[2 * k + 1]),
                     delay,
                     lag,
+                    eddy * self.period_s,
+                    math.exp(log_tau) * self.period_s,
                 ),
                 start_a=parts["start"][k] * self.ripple_a,
                 c_2=0.1 * b_2 / self.ripple_a,
@@ -170,7 +182,7 @@ class Layout:
     def prior(self, x: Vector) -> Vector:
         """Residuals of the weak priors that keep an undetermined effect from running away."""
         parts = self.split(x)
-        rows = [(parts["main"][1] - 1.0) / R_PRIOR_STD]
+        rows = [(parts["main"][1] - 1.0) / (EDDY_R_PRIOR_STD if self.effects.eddy else R_PRIOR_STD)]
         if self.timing is not None:
             rows += self.timing.prior(parts["main"][2], parts["lag"][0] if self.effects.lag else None)
         elif self.effects.lag:
@@ -185,6 +197,9 @@ class Layout:
             else:
                 rows.append((value * self.motion_scale - self.motion.per_f) / self.motion.std_per_f)
         rows += [value / RATIO_PRIOR_STD for value in parts.get("dispersion", [])]
+        if self.effects.eddy:
+            eddy, log_tau = parts["eddy"]
+            rows += [eddy / EDDY_PRIOR_STD, (log_tau - math.log(EDDY_TAU_CENTRE)) / EDDY_TAU_PRIOR_STD]
         return np.array(rows)
 
     def changed(self, x: Vector, effects: Effects) -> tuple[Layout, Vector]:
@@ -198,9 +213,19 @@ class Layout:
             "bend": [0.0] * (1 if self.symmetric else 2),
             "motion": [0.0],
             "dispersion": [0.0] * (2 * (self.shots - 1)),
+            "eddy": [0.0, math.log(EDDY_TAU_CENTRE)],
         }
         values = [value for name, _ in richer.blocks() for value in parts.get(name, start.get(name, []))]
         return richer, np.array(values)
+
+    def with_eddy(self, x: Vector, eddy: float, tau: float, delay: float | None) -> Vector:
+        """Return the vector with an eddy branch (T_s/L, T_s), a delay (T_s; None: its own), and no loss beside it."""
+        parts = self.split(x)
+        parts["main"][1] = 1.0
+        parts["eddy"] = [eddy, math.log(tau)]
+        if delay is not None:
+            parts["main"][2] = delay
+        return np.array([value for name, _ in self.blocks() for value in parts[name]])
 
     def defined(self, x: Vector) -> bool:
         """Whether the model can be evaluated at x."""
@@ -208,7 +233,8 @@ class Layout:
         (log_L, _, delay), log_lag = parts["main"], parts.get("lag", [0.0])[0]
         sizes = [log_L, *(log_L + ratio for ratio in parts.get("dispersion", [0.0])[::2])]
         bent = max(abs(value) for value in parts.get("bend", [0.0]))
-        if max(map(abs, sizes)) > LARGEST_LOG_L or abs(log_lag) > LARGEST_LOG_LAG or bent > BEND_LIMIT:
+        slow = max(map(abs, (log_lag, parts.get("eddy", [0.0, 0.0])[1])))
+        if max(map(abs, sizes)) > LARGEST_LOG_L or slow > LARGEST_LOG_LAG or bent > BEND_LIMIT:
             return False
         decays = [r.model.R_ohm * self.period_s / r.model.L_h for r in self.responses(x)]
         return 0.0 <= delay <= SKIP_SAMPLES - 3 and min(decays) > SMALLEST_DECAY and max(decays) < LARGEST_DECAY

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.injection.output_error import AxisModel, Pulses, bend, recursion, respond
+from pmsmtool.estimators.injection.output_error import AxisModel, Pulses, bend, eddy_current, recursion, respond
 from pmsmtool.estimators.refusals import refuse
 
 Vector = NDArray[np.float64]
@@ -122,6 +122,8 @@ def simulate(responses: Sequence[Response], shot: Shot, slow: NDArray[np.float64
     count = len(shot.i_a) - SKIP_SAMPLES
     command, pulses = shot.u_v - np.mean(shot.u_v), shot.pulses
     linear = np.stack([respond(response.model, command, T_s, response.start_a, pulses) for response in responses])
+    if any(response.model.eddy_s for response in responses):
+        linear = linear + np.stack([eddy_current(response.model, command, T_s) for response in responses])
     centre_a = float(np.mean(shot.i_a))
     c_2, c_3, motion, R = (
         np.array(values)[:, None]

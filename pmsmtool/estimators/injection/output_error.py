@@ -54,12 +54,17 @@ class AxisModel:
         Delay D from sample to acting voltage (T_s), 0 <= D.
     lag_s : float
         Time constant of the current sensor (s), 0 for none.
+    eddy_s, eddy_tau_s : float
+        Eddy currents add ``eddy_s``/(L tau) of the flux that a first order of time constant tau lags behind; iron loss
+        is a tau far below the period (s).
     """
 
     L_h: float
     R_ohm: float
     delay: float
     lag_s: float
+    eddy_s: float = 0.0
+    eddy_tau_s: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,6 +193,19 @@ def respond(model: AxisModel, command: Vector, period_s: float, start_a: float, 
     inside = a_1 * current[:-1] + b_1 * early
     forced = e_2 * (c_1 * current[:-1] + d_1 * early) + c_2 * inside + d_2 * late
     return recursion(e_1 * e_2, forced, start_a)
+
+
+def eddy_current(model: AxisModel, command: Vector, period_s: float) -> Vector:
+    """Current of the eddy branch (A) at the samples of :func:`respond`: flux, less what has got through, over L.
+
+    The voltage counts as constant over each command's period, and its resistive part as none of it.
+    """
+    early, late, fraction = acting_voltages(command, model.delay)
+    tau = model.eddy_tau_s
+    decay_1, decay_2 = (math.exp(-h * period_s / tau) for h in (fraction, 1.0 - fraction))
+    # the slope's mean over tau, with a weight of 1 for a voltage that stands
+    slope = recursion(decay_1 * decay_2, decay_2 * (1.0 - decay_1) * early + (1.0 - decay_2) * late, 0.0)
+    return np.asarray(slope * (model.eddy_s / model.L_h))
 
 
 def _respond_to_pulses(model: AxisModel, pulses: Pulses, period_s: float, start_a: float) -> Vector:

@@ -31,7 +31,8 @@ from pmsmtool.estimators.estimate import (
 )
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt, linear_solve
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.estimators.shaft.model import SHAFT, Problem, Run, whitener
+from pmsmtool.estimators.shaft.disturbances import NONE, TILT_FLOOR, Extent, disturbances
+from pmsmtool.estimators.shaft.model import SHAFT, Problem, Run, fastest, largest_torque, sizes_of, whitener
 from pmsmtool.estimators.shaft.position import encoder_step, position_std
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
@@ -49,12 +50,14 @@ REST_SHARE = 0.005
 """Way of the shaft, of a trace's whole, from which on it is fitted."""
 STEP_SHARE = 0.1
 """Part of a push within which its step may be limited."""
-COARSE_RIPPLES = (0.3, 0.03, 3e-3)
+COARSE_RIPPLES = (0.3, 0.03, 3e-3, 3e-4)
 """Least noise of the torque in the first fits, of the push's, one after the other: with an encoder's resolution alone
 the cost is a narrow, bent valley in which a fit from rough starting values, or straight from the first of these, does
 not arrive (1 of 160 realisations, and 1 of 33 random drives)."""
-FITS_MOST = 8
+FITS_MOST = 10
 """Fits after it; the second whitens with the inertia of the first, more only where the torque's noise grows."""
+PATIENT_FITS = 2
+"""Fits after which the noise grows before a minimum, too: a shaft that the model is far from has none."""
 TORQUE_FLOOR = 1e-3
 """Deviation of a block's torque beyond the noise of the currents, of the push's: ripple that samples do not show."""
 COASTING_FLOOR = 1e-4
@@ -142,6 +145,7 @@ def estimate_mechanics(
     *,
     direction: int = 1,
     tolerance: SensorTolerance | None = None,
+    tilt_std: float = TILT_FLOOR,
 ) -> MechanicsResult:
     """Estimate inertia and friction.
 
@@ -162,6 +166,8 @@ def estimate_mechanics(
         Sign of the encoder's count along the phase order.
     tolerance : SensorTolerance
         Declared sensor tolerances.
+    tilt_std : float
+        Relative standard deviation of the pushes' torque at their fastest speed, less at others.
 
     Raises
     ------
@@ -179,18 +185,21 @@ def estimate_mechanics(
     harmonics = angle_harmonics([(run.t_s, direction * run["theta_M_rad"]) for run in runs if run.meta["coasting"]])
 
     def blocks_of(J_kgm2: float) -> list[Run]:
-        return [_blocks(run, torque, torque_per_a, sigma_a, direction, step, harmonics, J_kgm2) for run in runs]
+        found = [_blocks(run, torque, torque_per_a, sigma_a, direction, step, harmonics, J_kgm2) for run in runs]
+        extent = Extent(fastest([run for _, run in found]), largest_torque([run for _, run in found]), tilt_std)
+        return [replace(run, disturbances=disturbances(theta, run.torque, run.T, extent)) for theta, run in found]
 
     blocks = blocks_of(0.0)
     start = _start(blocks)
     if harmonics.acceleration_rad_s2:
         for _ in range(COGGING_FITS - 1):  # the torque over the angle is known as an acceleration
-            start = np.delete(_fit(blocks_of(math.exp(start[0])), start)[0].x, SHAFT)
+            found = _fit(blocks_of(math.exp(start[0])), start)[0].x
+            start = np.delete(found, range(SHAFT, len(found) - 2 * len(runs)))
         blocks = blocks_of(math.exp(start[0]))
     with_drag, chi2, noisy = _fit(blocks, start)
     before, noise = _noise(blocks), _noise(noisy)
     unexplained = any(noise[kind] > UNEXPLAINED * max(before[kind], COASTING_FLOOR) for kind in noise)
-    without = _minimum(noisy, np.delete(with_drag.x, SHAFT), _scale(blocks, SHAFT))
+    without = _minimum(noisy, np.delete(with_drag.x, SHAFT), sizes_of(blocks))
     bound, condition = information_bound(without.jacobian)
     condition_gate(condition, "B and tau_c", STAGE)
     _, widen = chi2_gate(chi2, STAGE)
@@ -250,23 +259,24 @@ def _blocks(
     step: float,
     harmonics: AngleHarmonics,
     J_kgm2: float,
-) -> Run:
-    """Return a trace in blocks without the encoder's error; cogging as a torque of pushes, out of a coasting's way.
+) -> tuple[Array, Run]:
+    """Return a trace's positions, and it in blocks, without the encoder's error.
 
-    Cogging goes through periods within a block of a coasting, where only the position shows it.
+    Cogging is a torque of the pushes, and out of the way of a coasting: it goes through periods within a block of a
+    coasting, where only the position shows it.
     """
     rows = max(1, (len(run) - 1) // BLOCKS)
     count = (len(run) - 1) // rows
     shown = direction * run["theta_M_rad"]
     theta_std = position_std(shown[: count * rows + 1 : rows], step)
     if run.meta["coasting"]:
-        way = harmonics.shaft(harmonics.without_ripple(run.t_s, shown))
-        return Run(way[: count * rows + 1 : rows], np.zeros(count), rows * run.period_s, theta_std, 0.0, True)
-    theta = harmonics.shaft(shown)[: count * rows + 1 : rows]
+        theta = harmonics.shaft(harmonics.without_ripple(run.t_s, shown))[: count * rows + 1]
+        return theta, Run(theta[::rows], np.zeros(count), rows * run.period_s, theta_std, 0.0, True)
+    theta = harmonics.shaft(shown)[: count * rows + 1]
     tau = torque(run["i_d_a"], run["i_q_a"]) + harmonics.torque_nm(shown, J_kgm2)
     mean = (0.5 * (tau[:-1] + tau[1:]))[: count * rows].reshape(count, rows).mean(axis=1)
     noise = math.hypot(abs(torque_per_a) * sigma_a / math.sqrt(rows), TORQUE_FLOOR * float(np.max(np.abs(mean))))
-    return Run(theta, mean, rows * run.period_s, theta_std, noise, False)
+    return theta, Run(theta[::rows], mean, rows * run.period_s, theta_std, noise, False)
 
 
 def _start(runs: Sequence[Run]) -> Array:
@@ -288,21 +298,18 @@ def _start(runs: Sequence[Run]) -> Array:
     return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
 
 
-def _scale(runs: Sequence[Run], shared: int) -> Array:
-    """Sizes of the parameters."""
-    speed = max(float(np.max(np.abs(np.diff(run.theta)))) / run.T for run in runs)
-    largest = max(float(np.max(np.abs(run.torque))) for run in runs)
-    common = (1.0, largest / speed, largest, largest / speed**2)[:shared]
-    return np.array([*common, *(value for run in runs for value in (1.0, speed))])
-
-
 def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, Sequence[Run]]:
     """Return the fit with drag, its reduced chi-square, and the runs with the torque's noise that it took."""
-    largest = max(float(np.max(np.abs(run.torque))) for run in runs)
-    scale = _scale(runs, SHAFT + 1)
+    largest = largest_torque(runs)
+    scale = sizes_of(runs, drag=True)
     x = np.insert(start, SHAFT, 0.0)
-    for share in COARSE_RIPPLES:
-        x = _minimum([replace(run, torque_std=max(run.torque_std, share * largest)) for run in runs], x, scale).x
+    for count, share in enumerate(COARSE_RIPPLES):
+        coarse = [replace(run, torque_std=max(run.torque_std, share * largest)) for run in runs]
+        if not count:  # a rough start knows nothing of the disturbances
+            bare = [replace(run, disturbances=NONE) for run in coarse]
+            x = _minimum(bare, x, sizes_of(bare, drag=True)).x
+            x = np.insert(x, SHAFT + 1, np.zeros(len(scale) - len(x)))
+        x = _minimum(coarse, x, scale).x
     for count in range(FITS_MOST):
         fit = _minimum(runs, x, scale)
         x = fit.x
@@ -319,10 +326,10 @@ def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, Sequence[Run]]:
                 likely=NOISY_TORQUE,
                 hint="`identify R L psi encoder poles inverter frf` finds the resonance of an elastic shaft, and J",
             )
-        if fit.converged:
-            if count and noisier is runs:
+        if fit.converged or count >= PATIENT_FITS:
+            if fit.converged and count and noisier is runs:
                 break
-            runs = noisier  # before a minimum the residual says nothing of the noise
+            runs = noisier  # before a minimum the residual says little of the noise
     if not fit.converged:
         raise refuse("E_NOT_CONVERGED", f"{fit.iterations} steps without a minimum", stage=STAGE)
     return fit, chi2, runs
@@ -330,7 +337,7 @@ def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, Sequence[Run]]:
 
 def _noise(runs: Sequence[Run]) -> dict[bool, float]:
     """Deviation of a block's torque in pushes (False) and coasting (True), of the push's torque."""
-    largest = max(float(np.max(np.abs(run.torque))) for run in runs)
+    largest = largest_torque(runs)
     return {
         kind: max((run.torque_std for run in runs if run.coasting is kind), default=0.0) / largest
         for kind in (False, True)
@@ -339,7 +346,8 @@ def _noise(runs: Sequence[Run]) -> dict[bool, float]:
 
 def _minimum(runs: Sequence[Run], x: Array, scale: Array) -> Fit:
     factors = [whitener(run, math.exp(float(x[0]))) for run in runs]
-    problem = Problem(runs, factors, RELATIVE_STEP * scale, len(x) - 2 * len(runs))
+    sizes = runs[0].disturbances.torque.shape[1]
+    problem = Problem(runs, factors, RELATIVE_STEP * scale, drag=len(x) == SHAFT + 1 + sizes + 2 * len(runs))
     return levenberg_marquardt(problem.residual, x, scale, cost_tolerance=1e-4, derivative=problem.jacobian)
 
 
@@ -349,7 +357,7 @@ def _noisier(runs: Sequence[Run], residual: Array, largest: float) -> Sequence[R
     Every push by itself, one through standstill asks for more than one from rest; coasting together.
     """
     ends = np.cumsum([len(run.theta) for run in runs])
-    parts = np.split(residual, ends[:-1])
+    parts = np.split(residual[: ends[-1]], ends[:-1])
     coasting = np.concatenate([part for part, run in zip(parts, runs, strict=True) if run.coasting])
     own = [coasting if run.coasting else part for part, run in zip(parts, runs, strict=True)]
     more = [

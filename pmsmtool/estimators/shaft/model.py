@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.estimators.shaft.disturbances import NONE, Disturbances
 from pmsmtool.estimators.shaft.motion import positions
 
 Array = NDArray[np.float64]
@@ -30,6 +31,7 @@ class Run:
     theta_std: Array
     torque_std: float
     coasting: bool
+    disturbances: Disturbances = NONE
 
     @property
     def square(self) -> Array:
@@ -38,43 +40,83 @@ class Run:
         return np.asarray(speed * np.abs(speed))
 
 
+def fastest(runs: Sequence[Run]) -> float:
+    """Largest speed of the traces (rad/s)."""
+    return max(float(np.max(np.abs(np.diff(run.theta)))) / run.T for run in runs)
+
+
+def largest_torque(runs: Sequence[Run]) -> float:
+    """Largest torque of a block (N m)."""
+    return max(float(np.max(np.abs(run.torque))) for run in runs)
+
+
+def sizes_of(runs: Sequence[Run], *, drag: bool = False) -> Array:
+    """Typical sizes of the parameters of :class:`Problem`, shape (k,)."""
+    speed, largest = fastest(runs), largest_torque(runs)
+    common = (1.0, largest / speed, largest, largest / speed**2)[: SHAFT + drag]
+    disturbed = (1.0,) * runs[0].disturbances.torque.shape[1]
+    return np.array([*common, *disturbed, *(value for _ in runs for value in (1.0, speed))])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
     """Whitened residual of all traces; a trace knows the common parameters and its own two.
 
-    Common are ln J, B and tau_c, and with ``shared`` 4 the drag: a torque against the square of the speed, which the
-    positions show well enough.
+    Common are ln J, B and tau_c, with ``drag`` a torque against the square of the speed, which the positions show well
+    enough, and the sizes of the disturbances, each with a row of its own: its size is 0 with a deviation of 1.
     """
 
     runs: Sequence[Run]
     factors: Sequence[Array]
     step: Array
-    shared: int = SHAFT
+    drag: bool = False
+
+    @property
+    def sizes(self) -> slice:
+        """Where the sizes of the disturbances are among the parameters."""
+        return slice(SHAFT + self.drag, self.shared)
+
+    @property
+    def shared(self) -> int:
+        """Parameters before the traces' own."""
+        return SHAFT + int(self.drag) + int(self.runs[0].disturbances.torque.shape[1])
 
     def of_run(self, k: int, x: Array) -> Array:
         """Whitened residual of one trace."""
         run, first = self.runs[k], self.shared + 2 * k
         own = np.append(x[:SHAFT], x[first : first + 2])
-        torque = run.torque if self.shared == SHAFT else run.torque - x[SHAFT] * run.square
-        return np.asarray(self.factors[k] @ (positions(torque, run.T, own) - run.theta))
+        torque = run.torque - x[SHAFT] * run.square if self.drag else run.torque
+        shown = run.theta
+        if self.shared > self.sizes.start:
+            torque = torque + run.disturbances.torque @ x[self.sizes]
+            shown = shown - run.disturbances.position @ x[self.sizes]
+        return np.asarray(self.factors[k] @ (positions(torque, run.T, own) - shown))
 
     def residual(self, x: Array) -> Array:
-        """Whitened residual, shape (n,)."""
-        return np.concatenate([self.of_run(k, x) for k in range(len(self.runs))])
+        """Whitened residual of the traces, one after the other, and of the disturbances, shape (n,)."""
+        return np.concatenate([*(self.of_run(k, x) for k in range(len(self.runs))), x[self.sizes]])
 
     def jacobian(self, x: Array) -> Array:
-        """Its derivative by central differences, shape (n, k)."""
+        """Its derivative, shape (n, k); one-sided for the disturbances, which hardly bend it."""
         blocks = []
         for k, run in enumerate(self.runs):
             block = np.zeros((len(run.theta), len(x)))
-            for column in (*range(self.shared), self.shared + 2 * k, self.shared + 2 * k + 1):
+            here, first = self.of_run(k, x), self.sizes.start
+            if self.shared > first:
+                block[:, self.sizes] = self.factors[k] @ run.disturbances.position
+            turning = [first + int(column) for column in np.nonzero(np.any(run.disturbances.torque, axis=0))[0]]
+            for column in turning:
+                plus = x.copy()
+                plus[column] += self.step[column]
+                block[:, column] = (self.of_run(k, plus) - here) / (plus[column] - x[column])
+            for column in (*range(first), self.shared + 2 * k, self.shared + 2 * k + 1):
                 plus, minus = x.copy(), x.copy()
                 plus[column] += self.step[column]
                 minus[column] -= self.step[column]
                 change = self.of_run(k, plus) - self.of_run(k, minus)
                 block[:, column] = change / (plus[column] - minus[column])
             blocks.append(block)
-        return np.concatenate(blocks)
+        return np.concatenate([*blocks, np.eye(len(x))[self.sizes]])
 
 
 def whitener(run: Run, J: float) -> Array:

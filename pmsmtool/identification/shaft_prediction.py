@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.estimators.estimate import CONDITION_LIMIT, information_bound
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, linear_solve
+from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR, Extent, disturbances
 from pmsmtool.estimators.shaft.frequency_response import COHERENT
 from pmsmtool.estimators.shaft.mechanics import BLOCKS, SCALE_FLOOR
-from pmsmtool.estimators.shaft.model import Problem, Run, whitener
+from pmsmtool.estimators.shaft.model import SHAFT, Problem, Run, fastest, sizes_of, whitener
 from pmsmtool.estimators.shaft.motion import positions
 from pmsmtool.estimators.shaft.position import position_std
 from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, HIGHEST_SHARE, LOWEST_HZ, ORDER
@@ -108,12 +109,14 @@ def predict_mechanics(shaft: RoughShaft, plan: PushPlan, sigma_a: float, scale_s
         Relative standard deviation of the torque's scale.
     """
     runs = _planned(shaft, plan, sigma_a)
-    speed = max(float(np.max(np.abs(np.diff(run.theta)))) / run.T for run in runs)
+    speed = fastest(runs)
     if speed == 0.0:
         return {}
-    largest = shaft.torque_per_a * plan.i_q_a
-    scale = np.array([1.0, largest / speed, largest, *(value for _ in runs for value in (1.0, speed))])
-    x = np.array([math.log(shaft.J), shaft.B, shaft.tau_c, *(v for run in runs for v in _state(run))])
+    extent = Extent(speed, shaft.torque_per_a * plan.i_q_a, TILT_FLOOR)
+    runs = [replace(run, disturbances=disturbances(run.theta, run.torque, run.T, extent)) for run in runs]
+    scale = sizes_of(runs)
+    states = [v for run in runs for v in _state(run)]
+    x = np.array([math.log(shaft.J), shaft.B, shaft.tau_c, *np.zeros(len(scale) - SHAFT - len(states)), *states])
     problem = Problem(runs, [whitener(run, shaft.J) for run in runs], RELATIVE_STEP * scale)
     bound, condition = information_bound(problem.jacobian(x))
     if not condition < CONDITION_LIMIT:
