@@ -13,8 +13,10 @@ from pmsmtool.trace import Trace
 
 ANSWER_RAD = 0.02
 """Angle that counts as an answer: an encoder of 1024 increments has three of them."""
-WAY_RAD = 0.1
-"""Way of a push until it is braked; the shortest push ends at 10 rad/s."""
+WAY_RAD = 0.3
+"""Way of a push until it is braked: some electrical angles, of which an open phase has weak ones."""
+FASTEST_RAD_S = 10.0
+"""A light shaft is pushed by less, to this speed: a third of the speed limit."""
 SHORTEST_S, LONGEST_S = 0.02, 0.5
 HELD_S = 0.1
 """Slow current loops have settled by then."""
@@ -52,11 +54,11 @@ def push_forth_and_back(drive: Drive, i_a: float, speed_rad_s: float) -> Trace:
         if error.reason != "E_EXCITATION":
             raise
         return _held(drive, i_a, error)
-    # a light shaft is pushed by less: the shortest push takes it along the same way
-    most = answer.friction_a + 2.0 * WAY_RAD / (SHORTEST_S * SHORTEST_S * answer.per_ampere)
+    fastest = min(FASTEST_RAD_S, speed_rad_s)
+    most = answer.friction_a + fastest / (SHORTEST_S * answer.per_ampere)
     i_a = min(i_a, most)
     net = answer.per_ampere * max(i_a - answer.friction_a, LEAST_NET * i_a)
-    seconds = min(math.sqrt(2.0 * WAY_RAD / net), speed_rad_s / net, LONGEST_S)
+    seconds = min(math.sqrt(2.0 * WAY_RAD / net), fastest / net, LONGEST_S)
     rows = []
     for current in (i_a, -i_a):
         before = drive.live("theta_m_rad")
