@@ -53,8 +53,13 @@ from tests.firmware.test_projection import (
 )
 
 DELAYED = {"inverter__delay_periods": 1.5}
-PLANTS = {"0.7 L": (1, 0.7, 1), "1.43 L": (1, 1.43, 1), "0.7 psi, 1.5 R": (1.5, 1, 0.7), "1.1 psi": (1, 1, 1.1),
-          "1.5 R": (1.5, 1, 1)}
+PLANTS = {
+    "0.7 L": (1, 0.7, 1),
+    "1.43 L": (1, 1.43, 1),
+    "0.7 psi, 1.5 R": (1.5, 1, 0.7),
+    "1.1 psi": (1, 1, 1.1),
+    "1.5 R": (1.5, 1, 1),
+}
 BACK_CALCULATION_DELAYED = {"inverter__delay_periods": 1.5, "current__options": 23}
 
 Verdict = tuple[str, float, float]
@@ -80,13 +85,17 @@ def projection(count: int) -> list[Verdict]:
         if general is not None:
             compared += 1
             far = max(far, float(np.linalg.norm(general - v)))
-    print(f"  {count} instances: {statuses[0]} pass, {statuses[1]} on one row, {statuses[2]} on two, "
-          f"{statuses[EMPTY]} empty; {compared} compared")
-    return [("projection, double build against SLSQP (A)", far, 1e-5),
-            ("projection, float32 against double (A)", far_float, 2e-3),
-            ("projection, Newton steps of one call", steps_most, 30),
-            ("projection, instances not compared", count - statuses[EMPTY] - compared, 0),
-            ("projection, wrong verdict about an empty set", wrong, 0)]
+    print(
+        f"  {count} instances: {statuses[0]} pass, {statuses[1]} on one row, {statuses[2]} on two, "
+        f"{statuses[EMPTY]} empty; {compared} compared"
+    )
+    return [
+        ("projection, double build against SLSQP (A)", far, 1e-5),
+        ("projection, float32 against double (A)", far_float, 2e-3),
+        ("projection, Newton steps of one call", steps_most, 30),
+        ("projection, instances not compared", count - statuses[EMPTY] - compared, 0),
+        ("projection, wrong verdict about an empty set", wrong, 0),
+    ]
 
 
 def demand(count: int) -> list[Verdict]:
@@ -158,11 +167,15 @@ def unreachable(count: int) -> list[Verdict]:
             if len(times) == count:
                 break
         p95 = float(np.percentile(times, 95))
-        print(f"  {name}: {unsettled} of {len(times)} not settled after {len(seen['i']) * T_S * 1e3:.0f} ms, "
-              f"p95 {p95:.2f} ms")
+        print(
+            f"  {name}: {unsettled} of {len(times)} not settled after {len(seen['i']) * T_S * 1e3:.0f} ms, "
+            f"p95 {p95:.2f} ms"
+        )
         if name == "best":
-            out += [("unreachable, best mode, not settled", unsettled, 0),
-                    ("unreachable, best mode, p95 (ms)", p95, 6.0)]
+            out += [
+                ("unreachable, best mode, not settled", unsettled, 0),
+                ("unreachable, best mode, p95 (ms)", p95, 6.0),
+            ]
     return out
 
 
@@ -173,9 +186,13 @@ def mismatch(count: int) -> list[Verdict]:
     for name, plant in PLANTS.items():
         missed = done = 0
         for rpm, start, target in random_cases(100 * count, 4):
-            held = [math.hypot(plant[0] * m.R * i[0] - rpm * RPM * plant[1] * m.L_q * i[1],
-                               plant[0] * m.R * i[1] + rpm * RPM * (plant[1] * m.L_d * i[0] + plant[2] * m.psi))
-                    for i in (start, target)]
+            held = [
+                math.hypot(
+                    plant[0] * m.R * i[0] - rpm * RPM * plant[1] * m.L_q * i[1],
+                    plant[0] * m.R * i[1] + rpm * RPM * (plant[1] * m.L_d * i[0] + plant[2] * m.psi),
+                )
+                for i in (start, target)
+            ]
             if max(held) > 0.92 * V_MAX:
                 continue
             seen = run(best(governor__observer_gain=0.1), rpm, start, target, 500, plant=plant)

@@ -73,6 +73,7 @@ def tail(seeds: int, cases: int, large: int) -> list[str]:
     """Table of the 95th percentiles, law by law."""
     draws = {f"seed {seed}": slow_ratios(cases, seed) for seed in range(1, seeds + 1)}
     big = slow_ratios(large, LARGE_SEED)
+
     def row(name: str, ratios: np.ndarray) -> str:
         return f"  {name:10} {len(ratios):5} steps  " + "{:.3f} ({:.3f} .. {:.3f})".format(*p95(ratios))
 

@@ -41,8 +41,11 @@ def rows(seed: int, only: list[str]) -> tuple[list[str], int]:
         lines += ["", f"{figure.name}: {figure.title}", *(line(check) for check in checks)]
         count += len(checks)
         missed += sum(not check.within for check in checks)
-    return [f"{count} rows, {missed} do not hold. Columns: holds | number | printed in the paper | expected | target | "
-             "measured | source.", *lines], missed
+    return [
+        f"{count} rows, {missed} do not hold. Columns: holds | number | printed in the paper | expected | target | "
+        "measured | source.",
+        *lines,
+    ], missed
 
 
 def main() -> int:

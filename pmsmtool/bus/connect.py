@@ -7,14 +7,15 @@ import contextlib
 import errno
 import logging
 import socket
-import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import can
 
+from pmsmtool.bus.adapter_setup import how_to_set_up, meant_interface
 from pmsmtool.bus.connection import TRACE_HINT, Connection
+from pmsmtool.bus.in_time import in_time
 from pmsmtool.errors import BusError, ConfigError, PmsmtoolError
 from pmsmtool.plain_text import reason
 
@@ -77,33 +78,13 @@ def _open_in_time(arguments: dict[str, Any], interface: str | None) -> can.BusAB
     """
     if interface == "pmsmsim":
         return can.Bus(**arguments)  # in this process; its clock belongs to this thread
-    opened: list[can.BusABC] = []
-    failed: list[BaseException] = []
-    given_up = threading.Event()
-
-    def work() -> None:
-        try:
-            opened.append(can.Bus(**arguments))
-            if given_up.is_set():
-                opened[0].shutdown()
-        except BaseException as error:
-            failed.append(error)
-
-    worker = threading.Thread(target=work, name="pmsmtool bus opener", daemon=True)
     before = socket.getdefaulttimeout()
     # Also of the sockets made now, for good: a server that stops reading must not keep a sender waiting.
     socket.setdefaulttimeout(_SERVER_TIMEOUT_S)
     try:
-        worker.start()
-        worker.join(OPEN_LIMIT_S)
+        return in_time(lambda: can.Bus(**arguments), OPEN_LIMIT_S, too_late=lambda bus: bus.shutdown())
     finally:
-        given_up.set()
         socket.setdefaulttimeout(before)
-    if failed:
-        raise failed[0]
-    if not opened:
-        raise TimeoutError(f"no answer within {OPEN_LIMIT_S:g} s")
-    return opened[0]
 
 
 def _configured(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -138,12 +119,20 @@ def _open_failure(arguments: Mapping[str, Any], error: Exception) -> PmsmtoolErr
             likely="neither -i/-c nor python-can's own configuration (~/.canrc, can.ini, CAN_INTERFACE) names one",
             hint="-i pmsmsim for the simulated drive, or -i and -c of your adapter; `pmsmtool doctor` lists adapters",
         )
+    known = can.VALID_INTERFACES
+    if name is not None and name not in known:
+        near = meant_interface(name, known)
+        return BusError(
+            f"there is no CAN interface {name!r}" + (f", did you mean {near}?" if near else ""),
+            where=f"-i {name}",
+            hint=how_to_set_up(near) or "`pmsmtool doctor` lists what there is",
+        )
     where = " ".join(str(arguments[k]) for k in ("interface", "channel") if arguments.get(k) is not None)
     return BusError(
         f"the bus does not open: {reason(error)}",
         where=where,
         likely=_why_closed(name, error),
-        hint="`pmsmtool doctor`",
+        hint=how_to_set_up(name or "") or "`pmsmtool doctor`",
     )
 
 

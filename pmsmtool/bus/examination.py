@@ -23,6 +23,10 @@ from pmsmtool.errors import BusError, PmsmtoolError, SdoAbort
 
 BITRATES = (1_000_000, 800_000, 500_000, 250_000, 125_000, 100_000, 50_000, 20_000, 10_000)
 """Rates of CiA 301, section 5.3, and 100 kbit/s."""
+TERMINATION = (
+    "termination: without power CAN_H to CAN_L measures 60 ohm; 120 ohm is one missing resistor, 40 ohm one too many"
+)
+"""ISO 11898-2: 120 ohm at each end of the line."""
 LISTEN_S = 1.0
 ROUND_TRIPS = 50
 NODES_TIMED = 3
@@ -81,15 +85,17 @@ def adapters() -> list[Adapter]:
 
 def _load(name: str, module: str, class_name: str) -> Adapter:
     complaints = _Complaints()
-    log = logging.getLogger("can")
+    log, top = logging.getLogger("can"), logging.getLogger()  # some modules complain under names of their own
     propagate, log.propagate = log.propagate, False
     log.addHandler(complaints)
+    top.addHandler(complaints)
     try:
         getattr(importlib.import_module(module), class_name)
     except Exception as error:  # a vendor's module may fail in any way while it loads its driver
         return Adapter(name, False, str(error).splitlines()[0] if str(error) else type(error).__name__)
     finally:
         log.removeHandler(complaints)
+        top.removeHandler(complaints)
         log.propagate = propagate
     # Most modules without their driver do load, and only complain.
     return Adapter(name, not complaints.texts, complaints.texts[0] if complaints.texts else "")
@@ -131,7 +137,7 @@ def examine(connection: Connection, bitrate: int | None, *, listen_s: float = LI
         findings.append(("FAIL", f"{error.what}; likely: {error.likely}"))
     state = _state(connection.bus)
     if state == "ERROR":
-        findings.append(("FAIL", "the controller is bus-off: wrong bit rate, a short circuit, or no termination"))
+        findings.append(("FAIL", f"the controller is bus-off: wrong bit rate, a short circuit, or {TERMINATION}"))
     return Examination(frames, error_frames, listen_s, load, state, nodes, times, tuple(findings))
 
 
@@ -173,9 +179,9 @@ class _Bits:
 
 def _heard(frames: int, error_frames: int, load: float | None) -> tuple[str, str]:
     if error_frames and not frames:
-        return "FAIL", f"only error frames ({error_frames}): wrong bit rate, or a bus without termination"
+        return "FAIL", f"only error frames ({error_frames}): wrong bit rate, or {TERMINATION}"
     if error_frames:
-        return "WARN", f"{error_frames} error frames among {frames} frames: termination, stub lengths, or a loose plug"
+        return "WARN", f"{error_frames} error frames among {frames} frames: {TERMINATION}; long stubs; a loose plug"
     if not frames:
         return "WARN", "nothing was heard: no node sends by itself (heartbeat off), no power, or another channel"
     used = "" if load is None else f", bus load {100.0 * load:.1f} %"

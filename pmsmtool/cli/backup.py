@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,27 +12,74 @@ from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_m
 from pmsmtool.cli.options import FILE, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
+if TYPE_CHECKING:
+    from pmsmtool.flash.whole_drive import Listed
+
 
 @click.command(
-    "backup", epilog=examples("pmsmtool -i pmsmsim backup -o drive.json", "pmsmtool -n 5 backup -o drive.json")
+    "backup",
+    epilog=examples(
+        "pmsmtool -i pmsmsim backup -o drive.json",
+        "pmsmtool -n 5 backup -o drive.json",
+        "pmsmtool -n 5 backup --eds maker.eds -o drive.json      # another maker's drive: all of it",
+    ),
 )
 @click.option("-o", "--output", "path", type=FILE, required=True, help="File to write (.json).")
 @click.option("--force", is_flag=True, help="Replace the file.")
+@click.option("--eds", metavar="FILE", help="Save every setting that this EDS or DCF lists, byte for byte; no map.")
 @map_option
 @bus_options
 @output_options
-def backup_command(bus: BusOptions, out: Output, path: Path, force: bool, map_file: Path | None) -> None:
-    """Save every parameter and table of a drive; `pmsmtool restore` brings them back, byte for byte."""
+def backup_command(
+    bus: BusOptions, out: Output, path: Path, force: bool, map_file: Path | None, eds: str | None
+) -> None:
+    """Save every parameter and table of a drive; `pmsmtool restore` brings them back, byte for byte.
+
+    With --eds every object of the maker's file that can be written is saved in the order of writing, but commands, set
+    points, outputs, node id and serial number. `pmsmtool restore FILE --other-drive` brings it to a spare part.
+    """
     from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.journal import write_snapshot
     from pmsmtool.flash.restore import take_backup
+    from pmsmtool.flash.whole_drive import take_whole_backup
 
     if path.exists() and not force:
         raise ConfigError("the file exists", where=str(path), hint="choose another name, or --force")
-    with open_node(bus, read_map(map_file), within_s=WHOLE_SET_S) as node:
-        identity = checked_identity(node)
-        snapshot = take_backup(node, identity, progress=lambda done, total: out.status(f"{done}/{total}"))
+    if eds is not None and map_file is not None:
+        raise ConfigError("--eds saves bytes, --map values", hint="give one of them")
+    listed = None if eds is None else _listed(eds)
+    left_out: dict[str, str] = {}
+    with open_node(bus, read_map(map_file) if listed is None else None, within_s=WHOLE_SET_S) as node:
+
+        def progress(done: int, total: int) -> None:
+            out.status(f"{done}/{total}")
+
+        if listed is None:
+            identity = checked_identity(node)
+            snapshot = take_backup(node, identity, progress=progress)
+        else:
+            identity = node.identity()
+            snapshot, left_out = take_whole_backup(node, identity, listed, progress=progress)
+            if not snapshot.entries:
+                raise ConfigError("the drive has none of the file's objects", where=str(eds), hint="give its own file")
     write_snapshot(path, snapshot)
-    data = {"identity": identity, "file": path, "content": snapshot.content, "objects": len(snapshot.entries)}
+    for label, reason in left_out.items():
+        out.note(f"not saved: {label}: {reason}")
+    data = {
+        "identity": identity,
+        "file": path,
+        "content": snapshot.content,
+        "objects": len(snapshot.entries),
+        "left_out": left_out,
+    }
     out.result("backup", data, [f"{len(snapshot.entries)} objects of serial {identity.serial} in {path}"])
+
+
+def _listed(eds: str) -> list[Listed]:
+    """Return the objects of an EDS, a DCF or ``TABLE.csv#FAMILY`` that can be read and written."""
+    from pmsmtool.flash.whole_drive import Listed
+    from pmsmtool.sim.foreign.file_rows import read_makers_objects
+
+    rows = read_makers_objects(eds).rows.values()
+    return [Listed(row.index, row.sub, row.name) for row in rows if row.access == "rw"]

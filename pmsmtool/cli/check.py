@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import open_drive
+from pmsmtool.cli.drive_access import LOOKING_S, claimed_node, map_option, open_drive, open_node, read_map
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
     from pmsmtool.drive.canopen_drive import CanopenDrive
+    from pmsmtool.identification.wiring import Finding
     from pmsmtool.machine.machine_file import MachineFile
+    from pmsmtool.measurement.capabilities import Capabilities
 
 
 @click.command(
@@ -26,22 +28,29 @@ if TYPE_CHECKING:
     ),
 )
 @click.argument("machine_file", metavar="[MACHINE]", type=FILE, required=False)
+@map_option
 @bus_options
 @motion_options
 @output_options
-def check_command(bus: BusOptions, motion: MotionOptions, out: Output, machine_file: Path | None) -> None:
+def check_command(
+    bus: BusOptions, motion: MotionOptions, out: Output, machine_file: Path | None, map_file: Path | None
+) -> None:
     """Look for wrong wiring at a first power-on: a tenth of the rated current, half a turn, 15 s at most.
 
     One table names what is wrong with supply, phases, current sensors, shaft or brake, pole pairs, counts per turn and
     encoder sign, the most likely cause first. MACHINE says what is connected; without it the drive's own set does.
-    Nothing is stored in the drive. Exit code 1 when something is wrong, 10 when the shaft could not be judged.
+    Nothing is stored in the drive. Exit code 1 when something is wrong, 10 when phases, shaft or pole pairs could not
+    be judged: so at the levels recorder and standard, where it is listed what the drive cannot show.
     """
     from pmsmtool.cia402 import HOMING_LOST
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.commissioning.first_check import check_wiring, envelope_of
-    from pmsmtool.errors import CheckFailed, Partial
-    from pmsmtool.identification.wiring import NOT_SEEN, WRONG
 
+    below = _below_full(bus, map_file)
+    if below is not None:
+        found = _check_below_full(bus, motion, out, below, machine_file)
+        _conclude(out, found)
+        return
     with open_drive(bus) as drive:
         stated = _stated(drive, machine_file)
         envelope = replace(
@@ -57,6 +66,14 @@ def check_command(bus: BusOptions, motion: MotionOptions, out: Output, machine_f
         ]
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
         found = check_wiring(drive, stated, envelope, out.note)
+    _conclude(out, found)
+
+
+def _conclude(out: Output, found: list[Finding]) -> None:
+    """Print the table; raises where something is wrong, or what matters was not seen."""
+    from pmsmtool.errors import CheckFailed, Partial
+    from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG
+
     out.result(
         "check",
         {"findings": [asdict(finding) for finding in found]},
@@ -68,9 +85,62 @@ def check_command(bus: BusOptions, motion: MotionOptions, out: Output, machine_f
         raise CheckFailed(
             f"{first.looked_at}: {first.shown}", likely=first.likely, hint="switch off, correct it, and check again"
         )
-    unseen = [finding.looked_at for finding in found if finding.verdict == NOT_SEEN]
+    unseen = [finding.looked_at for finding in found if finding.verdict in (NOT_SEEN, NOT_CHECKED)]
     if any(name in unseen for name in ("phases", "shaft", "pole pairs")):
         raise Partial(f"not judged: {', '.join(unseen)}", hint="correct what the table names, and check again")
+
+
+def _below_full(bus: BusOptions, map_file: Path | None) -> Capabilities | None:
+    """Return what the drive has where that is less than the full level, None where all is there."""
+    from pmsmtool.measurement.capabilities import Tier, examine
+
+    with open_node(bus, within_s=LOOKING_S) as node:
+        found = examine(node, None if map_file is None else read_map(map_file))
+    return None if found.tier in (Tier.FULL, Tier.INJECT) else found
+
+
+def _check_below_full(
+    bus: BusOptions, motion: MotionOptions, out: Output, found: Capabilities, path: Path | None
+) -> list[Finding]:
+    """Ask, and check what the drive's level lets be seen."""
+    from pmsmtool.cia402 import HOMING_LOST
+    from pmsmtool.cli.consent import ask_motion
+    from pmsmtool.commissioning.first_check_tiers import check_below_full, envelope_below_full
+    from pmsmtool.commissioning.tier_stages import open_tier_drive
+    from pmsmtool.errors import ConfigError, NotAvailable
+    from pmsmtool.identification.request import IdentifyRequest
+    from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.measurement.capabilities import Method, Tier
+
+    if found.tier not in (Tier.STANDARD, Tier.RECORDER):
+        missing = found.row("mechanics", Method.STANDARD).missing
+        raise NotAvailable(
+            f"nothing can be moved on this drive: it needs {', '.join(missing) or 'objects of CiA 402'}",
+            where=f"node {found.identity.node}", hint="`pmsmtool caps` lists what it can give",
+        )  # fmt: skip
+    if path is None:
+        raise ConfigError(
+            "MACHINE is missing: this drive does not hold what is connected", hint="`pmsmtool machine new` writes one"
+        )
+    stated = load_machine_file(path)
+    request = IdentifyRequest(
+        i_max_apk=motion.i_max_apk, speed_max_rad_s=motion.speed_max_rad_s, shaft=motion.shaft or "free",
+        load=motion.load, brake=motion.brake,
+    )  # fmt: skip
+    with bus.connect() as connection:
+        drive = open_tier_drive(connection, claimed_node(connection, bus.node), found)
+        envelope = envelope_below_full(drive, found, request, stated)
+        envelope.refuse_gravity()
+        lines = [
+            *envelope.lines(),
+            f"the shaft is turned or pushed by at most half a turn; {HOMING_LOST}",
+            f"this drive is of the {found.tier} level: what it cannot show is listed as NOT CHECKED",
+            "nothing is stored in the drive; every changed object is restored",
+        ]
+        ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
+        rows = check_below_full(drive, found, stated, envelope, out.note)
+        drive.close()
+    return rows
 
 
 def _stated(drive: CanopenDrive, path: Path | None) -> MachineFile:

@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from pmsmtool.bus.examination import Adapter, Examination
 
 
+WITHIN_S = 60.0
+"""Loading all interfaces takes 1 s, opening at most 10 s a bus, asking every node and timing three 20 s."""
+
+
 @click.command(
     "doctor",
     epilog=examples(
@@ -29,10 +33,37 @@ if TYPE_CHECKING:
 def doctor_command(bus: BusOptions, out: Output, find_bitrate: bool, listen_s: float) -> None:
     """Examine adapters, then the bus: listen first, ask then; nothing is written to any node.
 
-    Exit code 3 when a bus is configured and no node answers on it.
+    Says what each usual adapter needs on this system and what to type then. Exit code 3 when a bus is configured and no
+    node answers on it. Ends within 60 s and the time of listening, whatever a driver does.
     """
-    from pmsmtool.bus import examination
+    from pmsmtool.bus.in_time import in_time
     from pmsmtool.errors import BusError
+
+    rounds = 9.0 if find_bitrate else 1.0
+    limit_s = WITHIN_S + rounds * listen_s
+    if bus.simulated():
+        result = _examined(bus, find_bitrate, listen_s)  # its clock belongs to this thread
+    else:
+        try:
+            result = in_time(lambda: _examined(bus, find_bitrate, listen_s), limit_s)
+        except TimeoutError as error:
+            raise BusError(
+                f"the examination does not end within {limit_s:g} s",
+                where=" ".join(str(v) for v in (bus.interface, bus.channel) if v),
+                likely="the adapter's driver hangs",
+                hint="unplug the adapter, plug it in again, and try again",
+            ) from error
+    data, lines, failed = result
+    out.result("doctor", data, lines)
+    if failed:
+        raise BusError(
+            failed, where=" ".join(str(v) for v in (bus.interface, bus.channel) if v), hint="see the lines above"
+        )
+
+
+def _examined(bus: BusOptions, find_bitrate: bool, listen_s: float) -> tuple[dict[str, Any], list[str], str]:
+    """Return the facts, the lines, and what failed."""
+    from pmsmtool.bus import examination
 
     found = examination.adapters()
     configured = _configuration(bus)
@@ -52,11 +83,7 @@ def doctor_command(bus: BusOptions, out: Output, find_bitrate: bool, listen_s: f
         failed = "; ".join(text for verdict, text in result.findings if verdict == "FAIL")
     else:
         lines.append("no bus is configured: give -i and -c, or configure python-can (~/.canrc, CAN_INTERFACE)")
-    out.result("doctor", data, lines)
-    if failed:
-        raise BusError(
-            failed, where=" ".join(str(v) for v in (bus.interface, bus.channel) if v), hint="see the lines above"
-        )
+    return data, lines, failed
 
 
 def _configuration(bus: BusOptions) -> dict[str, Any]:
@@ -78,8 +105,18 @@ def _adapter_lines(found: list[Adapter], configured: dict[str, Any]) -> list[str
     chosen = next((a for a in found if a.name == configured.get("interface")), None)
     if chosen is not None and not chosen.ready:
         lines.append(f"FAIL  {chosen.name}: {chosen.reason}")
+    if chosen is None or not chosen.ready:
+        lines += _set_up_lines(configured.get("interface"))
     used = "  ".join(f"{key} {value}" for key, value in configured.items())
     return [*lines, f"configured: {used or 'nothing'}"]
+
+
+def _set_up_lines(interface: str | None) -> list[str]:
+    """Return what the adapter of an interface needs on this system; of all usual ones where none is named."""
+    from pmsmtool.bus.adapter_setup import ADAPTERS, how_to_set_up
+
+    named = [interface] if interface in ADAPTERS else list(ADAPTERS)
+    return ["to set up an adapter on this system:", *(f"  {how_to_set_up(str(each))}" for each in named)]
 
 
 def _finding_lines(result: Examination) -> list[str]:

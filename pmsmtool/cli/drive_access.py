@@ -108,13 +108,13 @@ def open_node(
         if within_s is not None:
             node.sdo.finish_within(within_s - (connection.clock.now() - began_s))
         if drive_map is not None and drive_map.name == OWN_FAMILY:
-            _refuse_another_family(node)
+            refuse_another_family(node)
         yield node
         node.close()
 
 
-def _refuse_another_family(node: DriveNode) -> None:
-    """Say which map a known drive needs, instead of failing at its first object."""
+def refuse_another_family(node: DriveNode) -> None:
+    """Say which map a known drive needs, instead of failing at its first object; raises ``ConfigError``."""
     from pmsmtool.drive_maps.shipped_maps import family_of
 
     shown = _vendor_product(node)

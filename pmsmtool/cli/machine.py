@@ -42,7 +42,7 @@ def machine_command() -> None:
 @click.option("--l-between", "L_between", type=_BETWEEN, default="line-line", help="Where they are measured.")
 @click.option("--ke", help="Back-EMF constant: 58Vrms/krpm, 0.39Vpks/rad, 190rpm/Vpk, or a flux 0.41Wb.")
 @click.option("--ke-between", type=_BETWEEN, help="Where the back-EMF is measured.")
-@click.option("--kt", help="Torque constant: 1.74Nm/Arms, 85mNm/Apk, 12oz-in/Arms.")
+@click.option("--kt", help="Torque constant: 1.74Nm/Arms, 85mNm/Apk, '38mNm/A block'.")
 @click.option("--i-nom", "I_nom_apk", type=CURRENT, help="Rated line current, e.g. 19.8Arms.")
 @click.option("--i-peak", "I_max_apk", type=CURRENT, help="Short-time line current, e.g. 40Arms.")
 @click.option("--n-nom", "n_nom_rpm", type=Quantity("rpm"), help="Rated speed, e.g. 3000rpm.")
@@ -51,6 +51,7 @@ def machine_command() -> None:
 @click.option("--u-dc", "U_dc_v", required=True, type=Quantity("voltage"), help="DC-link voltage, e.g. 540V.")
 @click.option("--pwm", "f_s_hz", required=True, type=FREQUENCY, help="Control frequency, e.g. 12kHz.")
 @click.option("--dead-time", "dead_time_s", type=TIME, default="0s", help="Dead time, e.g. 2us.")
+@click.option("--encoder-bits", type=click.IntRange(8, 32), help="Encoder per turn, for a rehearsal, e.g. 12.")
 @click.option("--source", type=_SOURCE, default="datasheet", help="Where the numbers come from; sets the deviations.")
 @click.option("--r-source", type=_SOURCE, help="As --source, for the resistance.", show_default=False)
 @click.option("--l-source", type=_SOURCE, help="As --source, for the inductances.", show_default=False)
@@ -62,7 +63,8 @@ def new_command(path: Path, force: bool, out: Output, **given: Any) -> None:
     """Write a machine file from a datasheet or meter readings.
 
     Line-line or phase, star or delta, rms or peak: every conversion is printed. A torque constant that contradicts the
-    back-EMF constant is flagged (exit code 0; the file says which one was used).
+    back-EMF constant is flagged (exit code 0; the file says which one was used). The table [simulation] is what
+    `commission FILE --rehearse FAMILY` and `--eds` need; what is assumed for it is printed.
     """
     from pmsmtool.errors import ConfigError
     from pmsmtool.machine.datasheet import machine_from_datasheet
@@ -70,7 +72,8 @@ def new_command(path: Path, force: bool, out: Output, **given: Any) -> None:
 
     if path.exists() and not force:
         raise ConfigError("the file exists", where=str(path), hint="choose another name, or --force")
-    result = machine_from_datasheet(_sheet(given))
+    sheet, recognised = _sheet(given)
+    result = machine_from_datasheet(sheet)
     text = dump_machine_file(result.machine_file)
     parse_machine(text, where=str(path))  # what the reader would refuse is not written
     write_file(path, text)
@@ -83,15 +86,17 @@ def new_command(path: Path, force: bool, out: Output, **given: Any) -> None:
         "warnings": result.warnings,
     }
     out.result("machine-new", data, table(("key", "given", "rule", "result"), rows))
+    if recognised:
+        out.note(recognised)
     for warning in result.warnings:
         out.warn(warning)
     out.note(f"wrote {path}")
 
 
-def _sheet(given: dict[str, Any]) -> Any:
-    """The datasheet of the command's options."""
+def _sheet(given: dict[str, Any]) -> tuple[Any, str]:
+    """The datasheet of the command's options, and which ampere was recognised."""
     from pmsmtool.errors import ConfigError
-    from pmsmtool.machine.datasheet import Datasheet, parse_emf_constant, parse_torque_constant
+    from pmsmtool.machine.datasheet import Datasheet, parse_emf_constant, parse_torque_constant, torque_constant_by_emf
 
     both = given.pop("L_h")
     for name in ("L_d_h", "L_q_h"):
@@ -104,8 +109,12 @@ def _sheet(given: dict[str, Any]) -> Any:
     }
     ke, between, kt = given.pop("ke"), given.pop("ke_between"), given.pop("kt")
     given["K_e"] = None if ke is None else parse_emf_constant(ke, between)
-    given["K_t"] = None if kt is None else parse_torque_constant(kt)
-    return Datasheet(**given)
+    recognised = ""
+    if kt is not None and given["K_e"] is not None:
+        given["K_t"], recognised = torque_constant_by_emf(kt, given["K_e"], given["pole_pairs"], given["connection"])
+    else:
+        given["K_t"] = None if kt is None else parse_torque_constant(kt)
+    return Datasheet(**given), recognised
 
 
 @machine_command.command(

@@ -147,10 +147,13 @@ class Output:
 
 
 def set_up_logging(verbosity: int) -> None:
-    """Send the logs of python-can and canopen to stderr: warnings, from ``-v`` on more, with ``-q`` errors only."""
-    if verbosity == 0:
-        return  # Python's own default: warnings to stderr
+    """Send the logs of python-can and canopen to stderr from ``-v`` on, with ``-q`` errors; else none."""
     import logging
+
+    if verbosity == 0:  # modules without their driver complain while they are looked at, whoever's adapter is meant
+        if not logging.getLogger().handlers:
+            logging.getLogger().addHandler(logging.NullHandler())
+        return
 
     class Plain(logging.Formatter):
         def format(self, record: logging.LogRecord) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map
+from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map, refuse_another_family
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output
 
@@ -40,17 +40,26 @@ def restore_command(
 
     The journal is found by the drive's vendor, product and serial number. An interrupted download ends here too. Where
     the drive holds it all already, nothing is written, stored or reset: a second restore changes nothing.
+
+    A backup by --eds needs no map. Objects that the drive refuses are named, and the exit code is 10; all others are
+    brought back. Identifiers that follow the node id are those of this drive.
     """
     from pmsmtool.cli.flash_session import checked_identity, plan_facts, told, write_plan
-    from pmsmtool.errors import ConfigError
+    from pmsmtool.drive.objects import STORE_ALL
+    from pmsmtool.errors import ConfigError, Partial
     from pmsmtool.flash.download import describe, set_named
     from pmsmtool.flash.journal import JournalFolder, read_snapshot
     from pmsmtool.flash.restore import check_snapshot, due_of_journal, nothing_written, old_marks, plan_restore
+    from pmsmtool.flash.whole_drive import is_whole, readdressed, whole_map
 
-    with set_named() as jobs, open_node(bus, read_map(map_file), within_s=WHOLE_SET_S) as node:
-        identity = checked_identity(node)
+    drive_map = read_map(map_file)
+    given = None if snapshot_file is None else read_snapshot(snapshot_file)
+    if given is not None and is_whole(given) and map_file is not None:
+        raise ConfigError("the backup holds bytes by address, --map scales values", hint="leave out --map")
+    with set_named() as jobs, open_node(bus, within_s=WHOLE_SET_S) as node:
+        identity = node.identity()
         folder = JournalFolder(identity)
-        snapshot = folder.last() if snapshot_file is None else read_snapshot(snapshot_file)
+        snapshot = given or folder.last()
         if snapshot is None:
             raise ConfigError(
                 f"there is no journal of {describe(identity)}",
@@ -58,6 +67,14 @@ def restore_command(
                 likely="nothing was ever written to this drive from this account",
                 hint="give the file of a backup",
             )
+        if is_whole(snapshot):
+            node.map = whole_map(identity)
+            snapshot = readdressed(snapshot, node.node) if given is not None else snapshot
+        else:
+            node.map = drive_map
+            if map_file is None:
+                refuse_another_family(node)
+            checked_identity(node)
         check_snapshot(node.map, snapshot, identity, other_drive=other_drive)
         out.note(f"{snapshot.kind} of serial {snapshot.identity.serial}, state {snapshot.state}")
         plan = plan_restore(node, snapshot)
@@ -76,7 +93,19 @@ def restore_command(
             if not outcome.stored:
                 out.warn("whether the drive keeps these values over a reset is not known; flash-params stores a set")
             return
+        keeps = not is_whole(snapshot) or node.has(*STORE_ALL)
         outcome = write_plan(
-            node, jobs, identity, plan, old_marks(snapshot), bus, motion, out, restoring=snapshot_file is None
-        )
+            node, jobs, identity, plan, old_marks(snapshot), bus, motion, out,
+            restoring=snapshot_file is None, store=keeps,
+        )  # fmt: skip
         out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])
+        missed = [f"not restored: {name}: {reason}" for name, reason in outcome.refused.items()]
+        if not keeps:
+            missed.append("not stored: the drive has no 0x1010; it holds the values until its next reset")
+        if missed:
+            raise Partial(
+                f"{len(outcome.refused)} of {len(plan.entries)} objects were not taken, all others are as saved",
+                where=f"node {node.node}",
+                missing=missed,
+                hint="compare firmware and product of both drives; set what is named by the maker's own tool",
+            )

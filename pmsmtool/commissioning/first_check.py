@@ -80,7 +80,7 @@ def check_wiring(
     say : callable
         Told one line per step.
     """
-    found = [_counts(drive, stated), _inputs(drive)]
+    found = [_counts(drive, stated), look_at_inputs(drive)]
     against = drive.read("encoder.reversed") > 0.5
     limits = Limits(
         envelope.i_max_apk / (HEADROOM * CURRENT_SHARE), envelope.i_max_apk, envelope.speed_max_rad_s,
@@ -147,7 +147,7 @@ def _counts(drive: CanopenDrive, stated: MachineFile) -> Finding:
     )  # fmt: skip
 
 
-def _inputs(drive: CanopenDrive) -> Finding:
+def look_at_inputs(drive: CanopenDrive) -> Finding:
     """Look at limit switches and interlock, where the drive shows its inputs."""
     if not drive.node.has(DIGITAL_INPUTS.index, DIGITAL_INPUTS.sub):
         return Finding("limit switches", NOT_SEEN, "the drive does not show its inputs (0x60FD)")

@@ -9,6 +9,7 @@ drive will really hold is :meth:`DriveMap.quantised`; it is shown before anythin
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 
+_ADDRESS = re.compile(r"0x([0-9A-F]{4}):([0-9A-F]{2})(?: |\Z)")
 Rounding = Literal["nearest", "down", "up"]
 Form = Literal["value", "time", "rate", "relative", "torque constant"]
 Injecting = Literal["none", "current", "voltage"]
@@ -330,8 +332,24 @@ class DriveMap:
         """Return index and sub-index of an entry."""
         if name in self.tables:
             return self.tables[name]
-        cell = self.cells[name]
-        return cell.index, cell.sub
+        cell = self.cells.get(name)
+        if cell is not None:
+            return cell.index, cell.sub
+        address = address_in(name)
+        if address is None:
+            raise KeyError(name)
+        return address
+
+    @property
+    def scales(self) -> bool:
+        """Whether any value goes through the map; otherwise objects go by their addresses, byte for byte."""
+        return bool(self.cells or self.tables)
+
+
+def address_in(name: str) -> tuple[int, int] | None:
+    """Return index and sub-index with which a name begins (``0x3001:02 Output current limit``), None without."""
+    found = _ADDRESS.match(name)
+    return None if found is None else (int(found[1], 16), int(found[2], 16))
 
 
 SIGNALS: dict[str, str] = {

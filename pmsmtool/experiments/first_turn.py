@@ -22,8 +22,12 @@ HALF_TURN_RAD = math.pi
 MARGIN = 0.9
 """Of half a turn, for the swing at its end."""
 
+SIGNALS = ("theta_m_rad", "U_dc_v")
 
-def lead_half_a_turn(drive: Drive, i_a: float, pole_pairs: int, start_rad: float) -> Trace:
+
+def lead_half_a_turn(
+    drive: Drive, i_a: float, pole_pairs: int, start_rad: float, *, signals: tuple[str, ...] = SIGNALS
+) -> Trace:
     """Lead the rotor forward and back and return both ways, one row per step.
 
     The way ends at half a turn by the pole pairs that are stated, or by the encoder, whichever comes first: one of them
@@ -39,29 +43,31 @@ def lead_half_a_turn(drive: Drive, i_a: float, pole_pairs: int, start_rad: float
         As stated.
     start_rad : float
         Electrical angle of the vector that was held last.
+    signals : tuple of str
+        What the drive shows of :data:`SIGNALS`, and of ``i_q_a``.
 
     Returns
     -------
     Trace
-        ``theta_imposed_rad`` (electrical, unwrapped), ``theta_M_rad`` (mechanical), ``U_dc_v``; ``at_rest`` 1 in the
-        three rows before, between and after the two ways.
+        ``theta_imposed_rad`` (electrical, unwrapped), ``theta_M_rad`` (mechanical), ``U_dc_v`` where it is shown;
+        ``at_rest`` 1 in the three rows before, between and after the two ways.
     """
     turn_vector(drive, i_a, start_rad, 0.0)
     come_to_rest(drive)
-    rows = [_row(drive, 0.0, at_rest=True)]
+    rows = [_row(drive, 0.0, signals, at_rest=True)]
     way_rad = pole_pairs * MARGIN * HALF_TURN_RAD
     steps = max(STEPS, math.ceil(2.0 * way_rad / STEP_RAD))
     dwell_s = max(LEAST_DWELL_S, WAY_S / steps - ROW_S)
     for angle in _smooth(way_rad, steps):
-        rows.append(_led(drive, i_a, angle, dwell_s))
+        rows.append(_led(drive, i_a, angle, dwell_s, signals))
         if abs(rows[-1]["theta_M_rad"] - rows[0]["theta_M_rad"]) >= MARGIN * HALF_TURN_RAD:
             break
     end = rows[-1]["theta_imposed_rad"]
     come_to_rest(drive)
-    rows.append(_row(drive, end, at_rest=True))
-    rows += [_led(drive, i_a, end - angle, dwell_s) for angle in _smooth(end, steps)]
+    rows.append(_row(drive, end, signals, at_rest=True))
+    rows += [_led(drive, i_a, end - angle, dwell_s, signals) for angle in _smooth(end, steps)]
     come_to_rest(drive)
-    rows.append(_row(drive, 0.0, at_rest=True))
+    rows.append(_row(drive, 0.0, signals, at_rest=True))
     drive.command_current(0.0, 0.0, fixed_angle_rad=0.0)
     return table(rows, [k * (dwell_s + ROW_S) for k in range(len(rows))], i_command_a=i_a)
 
@@ -72,17 +78,13 @@ def _smooth(way_rad: float, steps: int) -> list[float]:
     return [way_rad * (share - math.sin(2.0 * math.pi * share) / (2.0 * math.pi)) for share in shares]
 
 
-def _led(drive: Drive, i_a: float, angle_rad: float, dwell_s: float) -> dict[str, float]:
+def _led(drive: Drive, i_a: float, angle_rad: float, dwell_s: float, signals: tuple[str, ...]) -> dict[str, float]:
     drive.command_current(i_a, 0.0, fixed_angle_rad=angle_rad)
     drive.wait(dwell_s)
-    return _row(drive, angle_rad, at_rest=False)
+    return _row(drive, angle_rad, signals, at_rest=False)
 
 
-def _row(drive: Drive, angle_rad: float, *, at_rest: bool) -> dict[str, float]:
-    means = drive.average(("theta_m_rad", "U_dc_v"), max(1, round(ROW_S / drive.period_s)))
-    return {
-        "theta_imposed_rad": angle_rad,
-        "theta_M_rad": means["theta_m_rad"],
-        "U_dc_v": means["U_dc_v"],
-        "at_rest": float(at_rest),
-    }
+def _row(drive: Drive, angle_rad: float, signals: tuple[str, ...], *, at_rest: bool) -> dict[str, float]:
+    means = drive.average(signals, max(1, round(ROW_S / drive.period_s)))
+    row = {"theta_imposed_rad": angle_rad, "theta_M_rad": means["theta_m_rad"], "at_rest": float(at_rest)}
+    return row | {name: means[name] for name in signals if name != "theta_m_rad"}

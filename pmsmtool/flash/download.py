@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 from pmsmtool.bus.nmt import TOOL_NODE
@@ -20,7 +20,7 @@ from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.interruption import interrupts_deferred
-from pmsmtool.drive.parameters import DriveParameters, Progress
+from pmsmtool.drive.parameters import Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import (
     DriveTimeout,
@@ -33,6 +33,7 @@ from pmsmtool.errors import (
 from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot, State
 from pmsmtool.flash.map_gate import check_map, remember_map
 from pmsmtool.flash.plan import Change, Plan, differences
+from pmsmtool.flash.whole_drive import WholeDrive, parameters_of
 from pmsmtool.params.catalogue import layout_signature
 
 CONSUMERS_MAX = 8
@@ -68,6 +69,8 @@ class Outcome:
         Transfers repeated, frames thrown away.
     starts : int
         2 when the node was reset in between and everything started over.
+    refused : mapping of str to str
+        Objects the drive did not take or keep, and why; only where objects go by their addresses.
     """
 
     written: int
@@ -77,6 +80,7 @@ class Outcome:
     retries: int
     discarded: int
     starts: int
+    refused: Mapping[str, str] = field(default_factory=dict)
 
 
 class Download:
@@ -114,7 +118,7 @@ class Download:
         self.plan = plan
         self.folder = folder
         self.phase = Phase.BEFORE
-        self._parameters = DriveParameters(node)
+        self._parameters = parameters_of(node)
         self._say = say
         self._progress = progress
         self._wanted_marks = dict(marks)
@@ -322,7 +326,7 @@ class Download:
     ) -> None:
         """Compare everything, also what was not written: the drive was reset in between."""
         found = self._parameters.read([entry.name for entry in entries], progress=self._progress)
-        wrong = differences(entries, found)
+        wrong = self._not_excused(entries, found)
         held = self._read_marks()
         wrong += [
             f"{name}: wrote {marks[name].hex(' ')}, reads {held[name].hex(' ')}"
@@ -342,6 +346,18 @@ class Download:
                 differences=wrong,
                 hint="`pmsmtool verify` shows what it holds, `pmsmtool restore` brings back what it held before",
             )
+
+    def _not_excused(self, entries: tuple[Change, ...], found: Mapping[str, bytes]) -> list[str]:
+        """Return the differences that end the download; where objects go by their addresses only a loss of all."""
+        whole = self._parameters
+        if not isinstance(whole, WholeDrive):
+            return differences(entries, found)
+        due = [entry for entry in entries if entry.changes and entry.name not in whole.refused]
+        lost = [entry for entry in entries if entry.name not in whole.refused and found.get(entry.name) != entry.new]
+        if due and len(lost) >= len(due):
+            return differences(tuple(lost), found)
+        whole.refused.update((entry.name, "the drive does not keep it over a reset") for entry in lost)
+        return []
 
     def _start_over(self) -> None:
         with self.node.supervision.expected_reset():
@@ -379,7 +395,9 @@ class Download:
         if self.phase is Phase.ACTIVE and self._was_stored:
             self.node.reset()
         else:
-            self._parameters.replace({change.name: change.old for change in self.plan.changes})
+            whole = isinstance(self._parameters, WholeDrive)  # compares first: a PDO half written shows
+            due = self.plan.entries if whole else self.plan.changes
+            self._parameters.replace({change.name: change.old for change in due})
             self._write_marks(self._old_marks)
             if self.phase is Phase.STORING:
                 # The memory may hold the new set already; the set that acted before is stored over it.
@@ -402,7 +420,11 @@ class Download:
     def _outcome(self, written: int, *, starts: int, stored: bool) -> Outcome:
         crc = self._parameters.crc_active if self.node.map.staging else None
         sdo = self.node.sdo
-        return Outcome(written, len(self.plan.entries) - written, stored, crc, sdo.retries, sdo.discarded, starts)
+        whole = self._parameters
+        refused = dict(whole.refused) if isinstance(whole, WholeDrive) else {}
+        equal = len(self.plan.entries) - written
+        written -= len(refused)
+        return Outcome(written, equal, stored, crc, sdo.retries, sdo.discarded, starts, refused)
 
 
 @contextlib.contextmanager

@@ -40,11 +40,11 @@ def check_map(drive_map: DriveMap, identity: Identity, folder: JournalFolder) ->
     SafetyRefusal
         The drive was last written through another map.
     """
-    if drive_map.vendor == UNKNOWN_VENDOR:
+    if drive_map.vendor == UNKNOWN_VENDOR and drive_map.scales:
         raise _other_drive(drive_map, identity)
     check_family(drive_map, identity)
-    if drive_map.staging:
-        return  # the drive itself shows the layout of its set
+    if drive_map.staging or not drive_map.scales:
+        return  # the drive itself shows the layout of its set, or nothing is scaled
     kept, now = _kept(folder), map_hash(drive_map)
     if kept not in ("", now):
         raise SafetyRefusal(
@@ -112,7 +112,7 @@ def _where(identity: Identity) -> str:
 
 def remember_map(drive_map: DriveMap, folder: JournalFolder) -> None:
     """Note the map a drive is written through."""
-    if drive_map.staging:
+    if drive_map.staging or not drive_map.scales:
         return
     path = memory_of(folder)
     try:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from pmsmtool.cia402 import HOMING_LOST
-from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.drive_map import DriveMap, address_in
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.diff import table_unit
@@ -187,12 +187,21 @@ def _hex(data: bytes) -> str:
 
 
 def _row(change: Change, mark: str = "") -> tuple[str, str, str, str, str]:
+    if math.isnan(change.wanted) and address_in(change.name) is not None:
+        return change.name, _number(change.old), _number(change.new), "", mark
     if math.isnan(change.wanted):
         return change.name, f"{len(change.old)} B", f"{len(change.new)} B", "", f"{_cells(change)}  {mark}".strip()
     relative = "" if math.isnan(change.relative) else f"{100.0 * change.relative:+.3g} %"
     held = f"(asked for {change.wanted:.9g})" if change.quantised else ""
     unit = "" if change.unit == "1" else change.unit
     return change.name, f"{change.old_value:.7g}", f"{change.held:.7g}", unit, f"{relative}  {held}  {mark}".strip()
+
+
+def _number(data: bytes) -> str:
+    """Return an object's bytes as the number they are on the wire; whether it has a sign the bytes do not say."""
+    if not data:
+        return "none"
+    return f"0x{data[::-1].hex().upper()}" if len(data) <= 8 else f"{len(data)} B"
 
 
 def _cells(change: Change) -> str:

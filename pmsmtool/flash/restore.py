@@ -12,11 +12,12 @@ from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
-from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.drive_map import DriveMap, address_in
 from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
 from pmsmtool.flash.download import Outcome
 from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
 from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
+from pmsmtool.flash.whole_drive import parameters_of
 from pmsmtool.params.catalogue import BY_NAME, layout_signature
 from pmsmtool.params.diff import table_unit
 from pmsmtool.params.parameter_set import ParameterSet
@@ -66,7 +67,7 @@ def plan_restore(node: DriveNode, snapshot: Snapshot) -> Plan:
 
 
 def _settled(node: DriveNode) -> DriveParameters:
-    parameters = DriveParameters(node)
+    parameters = parameters_of(node)
     parameters.check_layout()
     parameters.settle()
     return parameters
@@ -121,6 +122,12 @@ def check_snapshot(drive_map: DriveMap, snapshot: Snapshot, identity: Identity, 
             f"the drive is vendor {identity.vendor:#010x} product {identity.product:#010x}",
             hint="give a snapshot of this kind of drive",
         )
+    if identity.vendor == 0 and theirs.name != identity.name:
+        raise ConfigError(
+            f"drive and snapshot name no vendor, and the drive calls itself {identity.name!r}, not {theirs.name!r}",
+            where=f"node {identity.node}, 0x1008",
+            hint="give a snapshot of this kind of drive",
+        )
     if theirs.serial != identity.serial and not other_drive:
         raise ConfigError(
             f"the snapshot is of the drive with serial number {theirs.serial}, this one is {identity.serial}",
@@ -148,6 +155,8 @@ def _strange(drive_map: DriveMap, entry: Entry) -> str:
         expected = next((index, sub) for name, index, sub in MARKS if name == entry.name)
     elif entry.name in drive_map.cells or entry.name in drive_map.tables:
         expected = drive_map.address(entry.name)
+    elif not drive_map.scales and (address := address_in(entry.name)) is not None:
+        expected = address
     else:
         return f"{entry.name}: is not in the map"
     if (entry.index, entry.sub) != expected:
@@ -169,7 +178,8 @@ def restore_plan(drive_map: DriveMap, snapshot: Snapshot, found: Mapping[str, by
         scalar = entry.name in drive_map.cells
         value = wanted[entry.name] if scalar else math.nan
         old_value = before.get(entry.name, math.nan) if scalar else math.nan
-        unit = BY_NAME[entry.name].unit if scalar else table_unit(entry.name)
+        by_address = address_in(entry.name) is not None
+        unit = BY_NAME[entry.name].unit if scalar else "" if by_address else table_unit(entry.name)
         change = Change(entry.name, entry.index, entry.sub, found[entry.name], entry.old, old_value, value, value, unit)
         entries.append(change)
     return Plan(tuple(entries), (), snapshot.content)

@@ -97,16 +97,12 @@ class IdentifyRequest:
             )
 
 
-
-
 def dump_request(request: IdentifyRequest) -> str:
     """Return a request as JSON: what an estimate depends on besides traces and nameplate."""
     facts = asdict(request)
     if math.isinf(request.tolerance.U_dc_v):
         del facts["tolerance"]["U_dc_v"]  # comes from the nameplate, and JSON has no infinity
     return json.dumps(facts, indent=1) + "\n"
-
-
 
 
 def parse_request(text: str, *, where: str) -> IdentifyRequest:

@@ -15,7 +15,7 @@ import numpy as np
 
 from pmsmtool.trace import Trace
 
-OK, WRONG, NOT_SEEN = "ok", "WRONG", "not seen"
+OK, WRONG, NOT_SEEN, NOT_CHECKED = "ok", "WRONG", "not seen", "NOT CHECKED"
 HELD_SHARE = 0.1
 """Way of the encoder, of the vector's over the largest pole pairs that count (64), below which the shaft was held."""
 MOST_POLE_PAIRS = 64
@@ -31,6 +31,9 @@ SAGS = 0.1
 U_DC_RANGE = (0.7, 1.4)
 """DC link over the stated one beyond which it is not the supply that was stated."""
 
+LEAST_CURRENT = 0.3
+"""Current that is shown at the end of a push, of the one asked for: less is not given. (A reading as peak of what is
+rms makes 0.71, and a slow current loop is not at its end.)"""
 NOT_LED = "the vector does not lead the rotor"
 HELD_BY = "brake shut, or the shaft is held; an encoder that does not count; friction above this torque"
 SLIPS_BY = "friction, cogging or a load beyond this torque; a brake that is half open"
@@ -46,7 +49,7 @@ class Finding:
     looked_at : str
         What was looked at.
     verdict : str
-        ``ok``, ``WRONG``, or ``not seen``: nothing is said of it.
+        ``ok``, ``WRONG``, ``not seen``: nothing is said of it, or ``NOT CHECKED``: this drive cannot show it.
     shown : str
         What was seen.
     likely : str
@@ -117,6 +120,56 @@ def _pole_pairs(ratio: float, stated: int, same: float) -> Finding:
     if any(abs(factor / usual - 1.0) <= same for usual in COUNT_FACTORS):
         return Finding("encoder counts", WRONG, seen, f"{counts}; or {pairs}")
     return Finding("pole pairs", WRONG, seen, f"{pairs}; or {counts}")
+
+
+def judge_current(turn: Trace, i_a: float) -> list[Finding]:
+    """Judge the torque current that is shown while a vector turns: with an open phase it breaks in at some angles.
+
+    Parameters
+    ----------
+    turn : Trace
+        ``i_q_a``, ``at_rest``.
+    i_a : float
+        Length of the vector (A peak).
+    """
+    led = turn["at_rest"] < 0.5
+    share = float(np.percentile(np.abs(turn["i_q_a"][led]) / i_a, 10.0))
+    if share >= LEAST_CURRENT:
+        return []
+    seen = f"at a tenth of the angles {100.0 * share:.2g} % of the current asked for is shown, or less"
+    return [Finding("phases", WRONG, seen, "an open phase, or the supply in current limit")]
+
+
+def judge_push(pushes: Trace) -> list[Finding]:
+    """Judge two torque pushes, forth and back, of a drive that commutates by itself.
+
+    Parameters
+    ----------
+    pushes : Trace
+        ``i_command_a``, ``i_q_a``, ``way_rad``, one row per push.
+
+    Returns
+    -------
+    list of Finding
+        Shaft, sign, and the phases where no current flows.
+    """
+    command, way = pushes["i_command_a"], pushes["way_rad"]
+    share = float(np.mean(pushes["i_q_a"] / command))
+    ways = " and ".join(f"{math.degrees(each):+.2g} deg" for each in way)
+    found = []
+    if share < LEAST_CURRENT:
+        seen = f"the drive shows {100.0 * share:.2g} % of the current asked for"
+        found.append(Finding("phases", WRONG, seen, "an open phase, or the supply in current limit"))
+    if not np.any(way):
+        return [*found, Finding("shaft", NOT_SEEN, "what is wrong comes first")]
+    if way[0] * way[1] >= 0.0:
+        seen = f"torque forth and back moves the shaft by {ways}, both the same way"
+        return [*found, Finding("shaft", WRONG, seen, "a load that turns the shaft; the encoder's sign or offset")]
+    found.append(Finding("shaft", OK, f"torque forth and back moves it by {ways}"))
+    if way[0] * command[0] < 0.0:
+        seen = "the position falls under positive torque"
+        return [*found, Finding("encoder sign", WRONG, seen, "the polarity of the position (0x607E), or " + SIGN_BY)]
+    return [*found, Finding("encoder sign", OK, "the position grows under positive torque")]
 
 
 def judge_sensors(vectors: Trace) -> Finding:

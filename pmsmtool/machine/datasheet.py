@@ -15,6 +15,7 @@ from decimal import Decimal
 from typing import Literal
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.machine.datasheet_simulation import simulation_of
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K
@@ -24,6 +25,7 @@ from pmsmtool.units import RAD_S_PER_RPM, RPM_PER_RAD_S, format_quantity
 Between = Literal["line-line", "phase"]
 Connection = Literal["star", "delta"]
 Kind = Literal["rms", "peak"]
+CurrentKind = Literal["rms", "peak", "block"]
 Source = Literal["datasheet", "meter", "guess"]
 
 
@@ -41,8 +43,23 @@ back-EMF on an oscilloscope."""
 DISAGREEMENT_LIMIT = 0.05
 """Relative difference of the flux from K_e and the flux from K_t that is flagged."""
 
+PEAK_PER_AMPERE: Mapping[CurrentKind, float] = {
+    "peak": 1.0,
+    "rms": math.sqrt(2.0),
+    "block": 2.0 * math.sqrt(3.0) / math.pi,
+}
+"""Torque per ampere of a kind over torque per ampere peak, 1.5 p psi: rms 2.121 p psi; block commutation 3 sqrt3 / pi
+p psi = 1.654 p psi, the mean over 60 degrees between two terminals."""
+_SAME_KIND = 0.02
+"""K_t and K_e of one datasheet agree to their digits; two kinds are 10 % apart at the least."""
+
 _CONFUSIONS: tuple[tuple[float, str], ...] = (
     (math.sqrt(2.0), "one of the two is rms where peak was said, or the reverse"),
+    (PEAK_PER_AMPERE["block"], "the A of K_t is that of block commutation where peak was said, or the reverse"),
+    (
+        PEAK_PER_AMPERE["rms"] / PEAK_PER_AMPERE["block"],
+        "the A of K_t is that of block commutation where rms was said, or the reverse",
+    ),
     (math.sqrt(3.0), "one of the two is line-line where phase was said, or the reverse"),
     (math.sqrt(1.5), "line-line rms and phase peak are mixed"),
     (math.sqrt(6.0), "line-line peak and phase rms are mixed"),
@@ -84,7 +101,7 @@ class TorqueConstant:
     """Torque constant: N m per ampere of line current, ``kind`` of that ampere, as printed."""
 
     value: float
-    kind: Kind
+    kind: CurrentKind
     text: str
 
 
@@ -115,6 +132,7 @@ class Datasheet:
     n_nom_rpm: float | None = None
     n_max_rpm: float | None = None
     J_kgm2: float | None = None
+    encoder_bits: int | None = None
     sources: Mapping[str, Source] = field(default_factory=dict)
 
     def source(self, quantity: str) -> Source:
@@ -155,7 +173,7 @@ _EMF = re.compile(_NUMBER + r"(m?)V(rms|eff|pk|peak)?/(.+)")
 _EMF_SECONDS = re.compile(_NUMBER + r"(m?)V(rms|eff|pk|peak)?s/rad")
 _FLUX = re.compile(_NUMBER + r"(m?)(Wb|Vs)")
 _SPEED_CONSTANT = re.compile(_NUMBER + r"rpm/V(rms|eff|pk|peak)?")
-_TORQUE = re.compile(_NUMBER + r"(m?Nm|oz-?in|lb-?in)/A(rms|eff|pk|peak)?")
+_TORQUE = re.compile(_NUMBER + r"(m?Nm|oz-?in|lb-?in)/A(?:\(?(rms|eff|pk|peak|block|dc)\)?)?")
 _TORQUE_UNIT = {"Nm": 1.0, "mNm": 1e-3, "ozin": 0.0070615518, "lbin": 0.1129848290}
 """N m; ounce- and pound-force inch by 0.45359237 kg * 9.80665 m/s2 * 0.0254 m (exact definitions)."""
 
@@ -211,13 +229,73 @@ def parse_emf_constant(text: str, between: Between | None, kind: Kind | None = N
     return EmfConstant(value, _kind(written, kind, text), between, False, text)
 
 
-def parse_torque_constant(text: str, kind: Kind | None = None) -> TorqueConstant:
-    """Read a torque constant: ``1.74Nm/Arms``, ``85mNm/Apk``, ``12 oz-in/Arms``."""
+def parse_torque_constant(text: str, kind: CurrentKind | None = None) -> TorqueConstant:
+    """Read a torque constant: ``1.74Nm/Arms``, ``85mNm/Apk``, ``12 oz-in/Arms``, ``38.5mNm/A block``.
+
+    Raises
+    ------
+    ConfigError
+        Not readable, or neither the unit nor ``kind`` says what the ampere is.
+    """
+    value, written = _torque_number(text)
+    if written in ("block", "dc"):
+        if kind not in (None, "block"):
+            raise ConfigError(f"{text!r} says block, but {kind} was given beside it", hint="leave one of the two out")
+        return TorqueConstant(value, "block", text)
+    if written is None and kind == "block":
+        return TorqueConstant(value, "block", text)
+    if written is None and kind is None:
+        raise ConfigError(
+            f"{text!r} does not say whether the ampere is peak, rms or of block commutation",
+            likely="1 Apk makes 1.5 p psi, 1 A block 1.654 p psi, 1 Arms 2.121 p psi",
+            hint="write Apk, Arms or 'A block'; with --ke beside it the kind is recognised where the two fit",
+        )
+    return TorqueConstant(value, _kind(written, None if kind == "block" else kind, text), text)
+
+
+def torque_constant_by_emf(
+    text: str, K_e: EmfConstant, pole_pairs: int, connection: Connection
+) -> tuple[TorqueConstant, str]:
+    """Read a torque constant whose ampere is not said, as the kind that the back-EMF constant makes it.
+
+    Returns
+    -------
+    TorqueConstant
+    str
+        What was recognised; empty where the text itself says the kind.
+
+    Raises
+    ------
+    ConfigError
+        No kind fits.
+    """
+    value, written = _torque_number(text)
+    if written is not None:
+        return parse_torque_constant(text), ""
+    psi, _ = flux_from_emf(K_e, pole_pairs, connection)
+    ratio = value / torque_per_ampere(pole_pairs, psi)
+    for kind, factor in PEAK_PER_AMPERE.items():
+        if abs(ratio / factor - 1.0) <= _SAME_KIND:
+            off = 100.0 * (ratio / factor - 1.0)
+            return TorqueConstant(value, kind, text), (
+                f"the A of {text} is {kind}: K_t = {1.5 * factor:.4g} p psi fits K_e to {off:+.2g} %"
+            )
+    raise ConfigError(
+        f"{text!r} does not say what its ampere is, and K_t = {1.5 * ratio:.4g} p psi by K_e is none of "
+        "1.5 (peak), 1.654 (block), 2.121 (rms)",
+        likely="K_e is stated otherwise than given (line-line or phase, rms or peak)",
+        hint="write Apk, Arms or 'A block', and compare --ke with the datasheet",
+    )
+
+
+def _torque_number(text: str) -> tuple[float, str | None]:
+    """Return the value (N m/A) and what is written behind the A."""
     match = _TORQUE.fullmatch(text.replace(" ", "").replace("N*m", "Nm"))
     if match is None or not float(match[1]) > 0.0:
-        raise ConfigError(f"{text!r} is no torque constant", hint="write it like 1.74Nm/Arms or 85mNm/Apk")
-    value = float(match[1]) * _TORQUE_UNIT[match[2].replace("-", "")]
-    return TorqueConstant(value, _kind(match[3], kind, text), text)
+        raise ConfigError(
+            f"{text!r} is no torque constant", hint="write it like 1.74Nm/Arms, 85mNm/Apk or 85mNm/A block"
+        )
+    return float(match[1]) * _TORQUE_UNIT[match[2].replace("-", "")], match[3]
 
 
 def _scaled(number: str, milli: str) -> float:
@@ -252,11 +330,10 @@ def flux_from_emf(K_e: EmfConstant, pole_pairs: int, connection: Connection) -> 
 
 def flux_from_torque(K_t: TorqueConstant, pole_pairs: int) -> tuple[float, str]:
     """Return the flux linkage (Wb peak) and the rule: T = 1.5 p psi I_peak, I of the line."""
-    value = K_t.value / math.sqrt(2.0) if K_t.kind == "rms" else K_t.value
-    step = " / sqrt 2" if K_t.kind == "rms" else ""
-    return value / torque_per_ampere(
-        pole_pairs, 1.0
-    ), f"{K_t.value:.6g} N m/A {K_t.kind}{step} / (1.5 * {pole_pairs} pole pairs)"
+    factor = PEAK_PER_AMPERE[K_t.kind]
+    step = {"peak": "", "rms": " / sqrt 2", "block": f" / {factor:.5g}"}[K_t.kind]
+    psi = K_t.value / factor / torque_per_ampere(pole_pairs, 1.0)
+    return psi, f"{K_t.value:.6g} N m/A {K_t.kind}{step} / (1.5 * {pole_pairs} pole pairs)"
 
 
 def disagreement(psi_e: float, psi_t: float, pole_pairs: int) -> str:
@@ -312,7 +389,11 @@ def machine_from_datasheet(sheet: Datasheet) -> DatasheetResult:
     inverter = InverterParameters(U_dc_v=sheet.U_dc_v, f_s_hz=sheet.f_s_hz, dead_time_s=sheet.dead_time_s)
     warnings.extend(_plausibility(machine, inverter))
     std = {key: estimate.std for key, estimate in estimates.items()}
-    machine_file = MachineFile(sheet.name, machine, inverter, std=std, estimates=estimates)
+    simulation, assumed = simulation_of(machine, sheet.encoder_bits)
+    steps += [Conversion("[simulation]", "assumed", line, "for a rehearsal alone") for line in assumed]
+    machine_file = MachineFile(
+        sheet.name, machine, inverter, std=std, estimates=estimates, simulation=simulation
+    )  # fmt: skip
     return DatasheetResult(machine_file, tuple(steps), tuple(warnings))
 
 

@@ -122,7 +122,14 @@ def test_what_cia402_alone_says_holds_on_every_drive(capsys: pytest.CaptureFixtu
     ("channel", "map_file", "command"),
     [
         (EPOS4, "epos.toml", ("param", "get", "current.*")),
-        (EPOS4, "epos.toml", ("param", "dump",)),
+        (
+            EPOS4,
+            "epos.toml",
+            (
+                "param",
+                "dump",
+            ),
+        ),
         (EPOS4, "epos.toml", ("param", "diff", "device", "default")),
         (EPOS4, "epos.toml", ("caps",)),
         (EPOS4, "epos2", ("caps",)),

@@ -65,8 +65,9 @@ def test_gain_schedule_has_the_reference_values_and_leaves_out_what_is_not_reach
     assert at_800.direct_phase * POWER_TO_PEAK == pytest.approx(0.070, rel=0.02)
     assert slow.direct_phase > 15 * at_800.direct_phase  # below |p| = 600 the kick of the PID grows
     design = polar.design_at(SET_A, W_800, SET_A.current_a(1.0), V_MAX)
-    assert at_800.amplitude == pytest.approx((design.amplitude.K_p, design.amplitude.K_i, design.amplitude.K_d,
-                                              design.amplitude.a), rel=1e-6)
+    assert at_800.amplitude == pytest.approx(
+        (design.amplitude.K_p, design.amplitude.K_i, design.amplitude.K_d, design.amplitude.a), rel=1e-6
+    )
 
 
 def test_relative_gain_says_which_input_belongs_to_which_current() -> None:

@@ -34,12 +34,8 @@ def run(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return |demand| and |i - reference|, from the steady state of the first sample; plain equations, step by step."""
     resistance, inductance_d, inductance_q, psi = machine
-    sampled = sampled_machine(
-        np.array(resistance), np.array(inductance_d), np.array(inductance_q), omega, loops.T_s
-    )
-    first = sampled_machine(
-        np.array(resistance), np.array(inductance_d), np.array(inductance_q), omega[0], loops.T_s
-    )
+    sampled = sampled_machine(np.array(resistance), np.array(inductance_d), np.array(inductance_q), omega, loops.T_s)
+    first = sampled_machine(np.array(resistance), np.array(inductance_d), np.array(inductance_q), omega[0], loops.T_s)
 
     def feed_forward(w: float, i: np.ndarray) -> np.ndarray:
         own_psi = 0.5 * sum(BOX.psi)

@@ -173,9 +173,7 @@ def test_live_values_in_the_familys_counts() -> None:
 
 @pytest.mark.chain
 @settings(max_examples=300, deadline=None)
-@given(
-    K_p=st.floats(1e-6, 4000.0), T_n=st.floats(1e-6, 0.06), step=st.sampled_from(["V/A", "mV/A", "0.1 V/A"])
-)
+@given(K_p=st.floats(1e-6, 4000.0), T_n=st.floats(1e-6, 0.06), step=st.sampled_from(["V/A", "mV/A", "0.1 V/A"]))
 def test_an_integral_time_is_read_back_as_shown(K_p: float, T_n: float, step: str) -> None:
     text = f"""
 schema = "pmsmtool.drive-map/1"

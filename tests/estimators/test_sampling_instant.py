@@ -159,9 +159,7 @@ def test_shown_is_what_was_put_in(instant: float, lag: float) -> None:
     shown = shown_instant(_run(instant, lag), 0.4, 0.1, MODULATION, 1.0)
     assert shown is not None
     delay = 1.0 - instant + 0.5 * MODULATION.dead_time_s / T_S
-    assert (
-        abs(shown.distance(delay, lag * T_S)) * shown.std_s < 6e-4 * T_S
-    )  # the grid: measured 3.5e-4
+    assert abs(shown.distance(delay, lag * T_S)) * shown.std_s < 6e-4 * T_S  # the grid: measured 3.5e-4
     assert abs(shown.distance(delay - 0.05, lag * T_S)) > 4.0  # a slow sensor hides most of it: 5.1
     assert shown.sampling(delay, lag * T_S).instant_s == pytest.approx(instant * T_S)
 

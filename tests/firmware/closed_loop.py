@@ -45,8 +45,9 @@ def reference_case(alpha: float, **changes: float) -> dict[str, float]:
 class Loop:
     """The core and a plant; one call of step() is one period."""
 
-    def __init__(self, binding: CoreBinding, values: dict[str, float], *, omega: float, U_dc: float = 540.0,
-                 lut: bytes = b"") -> None:
+    def __init__(
+        self, binding: CoreBinding, values: dict[str, float], *, omega: float, U_dc: float = 540.0, lut: bytes = b""
+    ) -> None:
         self.binding, self.values, self.U_dc = binding, values, U_dc
         self.params = binding.params(values, lut)
         self.lut = (ctypes.c_uint32 * (len(lut) // 4)).from_buffer_copy(lut) if lut else None
@@ -55,8 +56,12 @@ class Loop:
         self.measurement = binding.make("pmsm_measurement", T_winding=values["motor.T_ref_c"], U_dc=U_dc)
         self.reference = binding.make("pmsm_reference")
         self.plant = LinearPlant(
-            R=values["motor.R_s_ohm"], L_d=values["motor.L_d_h"], L_q=values["motor.L_q_h"],
-            psi=values["motor.psi_f_wb"], T_s=1e-9 * values["inverter.T_s_ns"], omega=omega,
+            R=values["motor.R_s_ohm"],
+            L_d=values["motor.L_d_h"],
+            L_q=values["motor.L_q_h"],
+            psi=values["motor.psi_f_wb"],
+            T_s=1e-9 * values["inverter.T_s_ns"],
+            omega=omega,
             delayed=values["inverter.delay_periods"] >= 1,
         )
 
@@ -69,8 +74,9 @@ class Loop:
         state.integrator.q = plant.R * i_q + plant.omega * (lost_d * i_d + plant.psi - v["motor.psi_f_wb"])
         state.disturbance.d = state.integrator.d - v["motor.R_s_ohm"] * i_d
         state.disturbance.q = state.integrator.q - v["motor.R_s_ohm"] * i_q
-        u = complex(plant.R * i_d - plant.omega * plant.L_q * i_q,
-                    plant.R * i_q + plant.omega * (plant.L_d * i_d + plant.psi))
+        u = complex(
+            plant.R * i_d - plant.omega * plant.L_q * i_q, plant.R * i_q + plant.omega * (plant.L_d * i_d + plant.psi)
+        )
         turn = plant.omega * plant.T_s
         after, before = (u * cmath.exp(1j * (plant.theta + share * turn)) for share in (0.5, -0.5))
         last = after if plant.delayed else before

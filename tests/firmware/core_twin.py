@@ -208,8 +208,13 @@ class Twin:
             self.x[k] = self.x[k] + T_s * K_i * (target - i[k])
 
     def step(
-        self, phases: Vector | tuple, theta: np.float32, omega: np.float32, U_dc: np.float32,
-        reference: Vector | None = None, tau: np.float32 | None = None,
+        self,
+        phases: Vector | tuple,
+        theta: np.float32,
+        omega: np.float32,
+        U_dc: np.float32,
+        reference: Vector | None = None,
+        tau: np.float32 | None = None,
     ) -> tuple[list[np.float32], Vector, Vector]:
         """Return duties, demanded and realised dq voltage of one period."""
         self.flags = 0

@@ -32,12 +32,21 @@ class FixedPointSignals:
         """Set the last governed reference (A)."""
         self.state.held.d, self.state.held.q = (self.format.quantise(x, self.format.I_base) for x in v)
 
-    def give(self, request: tuple[float, float], i: tuple[float, float], integrator: tuple[float, float],
-             omega_e: float, V_max: float) -> None:
+    def give(
+        self,
+        request: tuple[float, float],
+        i: tuple[float, float],
+        integrator: tuple[float, float],
+        omega_e: float,
+        V_max: float,
+    ) -> None:
         """Set the input of a period."""
         q, given = self.format, self.input
-        for part, pair, base in (("request", request, q.I_base), ("i", i, q.I_base),
-                                 ("integrator", integrator, q.U_base)):
+        for part, pair, base in (
+            ("request", request, q.I_base),
+            ("i", i, q.I_base),
+            ("integrator", integrator, q.U_base),
+        ):
             member = getattr(given, part)
             member.d, member.q = (q.quantise(x, base) for x in pair)
         given.omega_e, given.V_max = q.quantise(omega_e, q.omega_base), q.quantise(V_max, q.U_base)
@@ -51,15 +60,33 @@ class FixedPointGovernor(FixedPointSignals):
         files = q_files(values, prefix="motor")
         for name, text in files.items():
             (folder / name).write_text(text)
-        subprocess.run([compiler, *FLAGS.split(), "-O2", "-fPIC", "-shared", "-o", "governor_q.so",
-                        *(name for name in files if name.endswith(".c"))], cwd=folder, check=True)
+        subprocess.run(
+            [
+                compiler,
+                *FLAGS.split(),
+                "-O2",
+                "-fPIC",
+                "-shared",
+                "-o",
+                "governor_q.so",
+                *(name for name in files if name.endswith(".c")),
+            ],
+            cwd=folder,
+            check=True,
+        )
         library = ctypes.CDLL(str(folder / "governor_q.so"))
         self.constants = self.types["pmsm_governor_q_constants"].in_dll(library, "motor_cfg_q")
         self.function = library.pmsm_governor_q
         self.function.restype = self.types["pmsm_q27_dq"]
 
-    def govern(self, request: tuple[float, float], i: tuple[float, float], integrator: tuple[float, float],
-               omega_e: float, V_max: float) -> tuple[float, float]:
+    def govern(
+        self,
+        request: tuple[float, float],
+        i: tuple[float, float],
+        integrator: tuple[float, float],
+        omega_e: float,
+        V_max: float,
+    ) -> tuple[float, float]:
         """Return the governed reference (A)."""
         self.give(request, i, integrator, omega_e, V_max)
         v = self.function(ctypes.byref(self.constants), ctypes.byref(self.state), ctypes.byref(self.input))

@@ -59,8 +59,10 @@ class GovernedTwin(Twin):
         return int(self.values["governor.mode"]) == BEST and self.values["governor.observer_gain"] > 0
 
     def model_voltage(self, i: Vector) -> Vector:
-        return (self["motor.R_s_ohm"] * i[0] - self.omega * self["motor.L_q_app_h"] * i[1],
-                self["motor.R_s_ohm"] * i[1] + self.omega * (self["motor.L_d_app_h"] * i[0] + self["motor.psi_f_wb"]))
+        return (
+            self["motor.R_s_ohm"] * i[0] - self.omega * self["motor.L_q_app_h"] * i[1],
+            self["motor.R_s_ohm"] * i[1] + self.omega * (self["motor.L_d_app_h"] * i[0] + self["motor.psi_f_wb"]),
+        )
 
     def observe(self, s: np.float32, c: np.float32) -> None:
         sine, cosine = sincos(f(-0.5) * self.T_s * self.omega)
@@ -89,8 +91,16 @@ class GovernedTwin(Twin):
             hold, model = rows[0].voltage(self.i), self.model_voltage(self.i)
             offset = hold[0] - model[0], hold[1] - model[1]
         R, w = self["motor.R_s_ohm"], self.omega
-        rows.append(Row(R, -w * self["motor.L_q_app_h"], w * self["motor.L_d_app_h"], R,
-                        (offset[0], offset[1] + w * self["motor.psi_f_wb"]), (ONE - self["governor.eps"]) * self.V_max))
+        rows.append(
+            Row(
+                R,
+                -w * self["motor.L_q_app_h"],
+                w * self["motor.L_d_app_h"],
+                R,
+                (offset[0], offset[1] + w * self["motor.psi_f_wb"]),
+                (ONE - self["governor.eps"]) * self.V_max,
+            )
+        )
         steady = len(rows) - 1
         if int(self.values["governor.options"]) & CURRENT_ROW:
             rows.append(Row(ONE, ZERO, ZERO, ONE, (ZERO, ZERO), self["governor.I_transient_apk"]))
@@ -111,10 +121,16 @@ class GovernedTwin(Twin):
                 i[k] = i[k] + T_L[k] * (u - R * i[k])
                 x1[k] = x1[k] + K_iT[k] * (ONE - i1[k])
                 i1[k] = i1[k] + T_L[k] * (u1 - R * i1[k])
-            rows.append(Row(
-                K[0] * (ONE - i1[0]) + x1[0], -X[1] * i1[1], X[0] * i1[0], K[1] * (ONE - i1[1]) + x1[1],
-                ((x[0] - K[0] * i[0]) - X[1] * i[1], (x[1] - K[1] * i[1]) + X[0] * i[0] + emf), self.V_max,
-            ))
+            rows.append(
+                Row(
+                    K[0] * (ONE - i1[0]) + x1[0],
+                    -X[1] * i1[1],
+                    X[0] * i1[0],
+                    K[1] * (ONE - i1[1]) + x1[1],
+                    ((x[0] - K[0] * i[0]) - X[1] * i[1], (x[1] - K[1] * i[1]) + X[0] * i[0] + emf),
+                    self.V_max,
+                )
+            )
         return rows
 
     def admits(self, rows: list[Row], steady: int, r: Vector) -> bool:
@@ -269,8 +285,10 @@ class GovernedTwin(Twin):
     def minimum_time(self, now: Row, offset: Vector, target: Vector, may_start: bool) -> tuple[Vector | None, bool]:
         """The steering reference, and whether a transfer was found that the transient current limit bars."""
         R, least = self["motor.R_s_ohm"], f(3) * self.T_s
-        a, b = ((self["motor.psi_f_wb"] + self["motor.L_d_app_h"] * x[0], self["motor.L_q_app_h"] * x[1])
-                for x in (self.i, target))
+        a, b = (
+            (self["motor.psi_f_wb"] + self["motor.L_d_app_h"] * x[0], self["motor.L_q_app_h"] * x[1])
+            for x in (self.i, target)
+        )
         drops = tuple((HALF * (R * x[0] + offset[0]), HALF * (R * x[1] + offset[1])) for x in (self.i, target))
         T, m = self.time_to_go - self.T_s, None
         if T > 0:
@@ -293,8 +311,11 @@ class GovernedTwin(Twin):
         return ((kept[0] - now.c[0]) / now.dd, (kept[1] - now.c[1]) / now.qq), False
 
     def is_cornered(self, offset: Vector) -> bool:
-        model, limit, power = (self.model_voltage(self.i), CLOSE_SHARE * self["governor.I_transient_apk"],
-                               self.V_max * self.V_max)
+        model, limit, power = (
+            self.model_voltage(self.i),
+            CLOSE_SHARE * self["governor.I_transient_apk"],
+            self.V_max * self.V_max,
+        )
         hold = square((model[0] + offset[0], model[1] + offset[1]))
         return bool(square(self.i) > limit * limit and HOLD_SHARE * HOLD_SHARE * power < hold <= power)
 
@@ -346,4 +367,3 @@ class GovernedTwin(Twin):
         self.integrate(v, i, u, realised)
         self.held, self.before, self.committed = v, i, stator
         return v, duties, realised
-

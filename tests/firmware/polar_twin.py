@@ -17,8 +17,20 @@ from tests.firmware.core_twin import PI, Twin, Vector, clamp, clarke, f, park, p
 CONVENTIONAL, PROPOSED, LINEAR, PRINTED, REGULARISED, UNIFIED = range(1, 7)
 ON_MEASUREMENT, NO_ANTI_WINDUP, PREDICT, SWITCH = 1, 2, 4, 8
 ZERO, HALF, ONE, TWO = f(0), f(0.5), f(1), f(2)
-ARCTAN = [f(x) for x in (0.99999989, -0.33332597, 0.19985907, -0.14161229, 0.10498946, -0.07234858, 0.03978123,
-                         -0.01440136, 0.00245673)]
+ARCTAN = [
+    f(x)
+    for x in (
+        0.99999989,
+        -0.33332597,
+        0.19985907,
+        -0.14161229,
+        0.10498946,
+        -0.07234858,
+        0.03978123,
+        -0.01440136,
+        0.00245673,
+    )
+]
 FOLD, QUARTER = HALF * PI + f(0.2), HALF * PI
 REACH = f(0.97)
 
@@ -84,8 +96,10 @@ class PolarTwin(Twin):
 
     def model_voltage(self, i: Vector) -> Vector:
         w = self.omega
-        return (self.R * i[0] - w * self["motor.L_q_app_h"] * i[1],
-                self.R * i[1] + w * (self["motor.L_d_app_h"] * i[0] + self.psi))
+        return (
+            self.R * i[0] - w * self["motor.L_q_app_h"] * i[1],
+            self.R * i[1] + w * (self["motor.L_d_app_h"] * i[0] + self.psi),
+        )
 
     def observe(self, s: np.float32, c: np.float32, gain: np.float32) -> None:
         held = self.before_voltage if self["inverter.delay_periods"] >= 1 else self.committed
@@ -93,8 +107,10 @@ class PolarTwin(Twin):
         u = park(held, s * cosine + c * sine, c * cosine - s * sine)
         mean = HALF * (self.i[0] + self.before[0]), HALF * (self.i[1] + self.before[1])
         model, rate = self.model_voltage(mean), ONE / self.T_s
-        z = [u[k] - model[k] - self[f"motor.L_{axis}_h"] * ((self.i[k] - self.before[k]) * rate)
-             for k, axis in enumerate("dq")]
+        z = [
+            u[k] - model[k] - self[f"motor.L_{axis}_h"] * ((self.i[k] - self.before[k]) * rate)
+            for k, axis in enumerate("dq")
+        ]
         d = self.disturbance
         self.disturbance = d[0] + gain * (z[0] - d[0]), d[1] + gain * (z[1] - d[1])
 
@@ -107,8 +123,10 @@ class PolarTwin(Twin):
         fixed = (psi[0] + self.T_s * (u[0] - lost[0]) - drop * i[0], psi[1] + self.T_s * (u[1] - lost[1]) - drop * i[1])
         turned = park(fixed, sine, cosine)
         L = self["motor.L_d_h"], self["motor.L_q_h"]
-        return ((L[0] * i[0] + (turned[0] - psi[0])) / (L[0] + drop),
-                (L[1] * i[1] + (turned[1] - psi[1])) / (L[1] + drop))
+        return (
+            (L[0] * i[0] + (turned[0] - psi[0])) / (L[0] + drop),
+            (L[1] * i[1] + (turned[1] - psi[1])) / (L[1] + drop),
+        )
 
     # -- laws 1 and 2 ----------------------------------------------------------------------------------------
 
@@ -238,8 +256,10 @@ class PolarTwin(Twin):
         b, i, r, model = self["polar.b"], self.i_model, self.reference, self.model_voltage(self.i_model)
         tau = self["polar.tau_s"]
         K = self.cdm(tau, self["motor.L_d_h"])[0], self.cdm(tau, self["motor.L_q_h"])[0]
-        return (K[0] * (b * r[0] - i[0]) + (model[0] - self.R * i[0]),
-                K[1] * (b * r[1] - i[1]) + (model[1] - self.R * i[1]))
+        return (
+            K[0] * (b * r[0] - i[0]) + (model[0] - self.R * i[0]),
+            K[1] * (b * r[1] - i[1]) + (model[1] - self.R * i[1]),
+        )
 
     def regularised(self) -> None:
         base = self.regularised_base()
@@ -351,8 +371,10 @@ class PolarTwin(Twin):
         i_o, v_o, weakened = self.find_point(min(self["polar.V_ref_ratio"] * self.V_max, self.V))
         L, w, w_c = (self["motor.L_d_h"], self["motor.L_q_h"]), self.omega, self["polar.omega_c_rad_s"]
         e = i_o[0] - self.i_model[0], i_o[1] - self.i_model[1]
-        v = (v_o[0] + L[0] * w_c * e[0] + w * self["motor.L_q_app_h"] * e[1],
-             v_o[1] + L[1] * w_c * e[1] - w * self["motor.L_d_app_h"] * e[0])
+        v = (
+            v_o[0] + L[0] * w_c * e[0] + w * self["motor.L_q_app_h"] * e[1],
+            v_o[1] + L[1] * w_c * e[1] - w * self["motor.L_d_app_h"] * e[0],
+        )
         if weakened and square(v) > self.V * self.V:
             w_f = TWO * abs(w)
             v = v_o[0] + L[0] * w_f * e[0], v_o[1] + L[1] * w_f * e[1]
@@ -405,8 +427,13 @@ class PolarTwin(Twin):
         return i_d, tau / (f(1.5) * f(self.values["motor.pole_pairs"]) * (self.psi + saliency * i_d))
 
     def period(
-        self, phases: tuple, theta: np.float32, omega: np.float32, U_dc: np.float32,
-        request: Vector | None = None, tau: np.float32 | None = None,
+        self,
+        phases: tuple,
+        theta: np.float32,
+        omega: np.float32,
+        U_dc: np.float32,
+        request: Vector | None = None,
+        tau: np.float32 | None = None,
     ) -> tuple:
         """One period: duties, demanded and realised voltage."""
         self.torque_mode = tau is not None

@@ -42,8 +42,11 @@ class Row:
 
     def gram(self) -> Symmetric:
         """M M^T."""
-        return (self.dd * self.dd + self.dq * self.dq, self.dd * self.qd + self.dq * self.qq,
-                self.qd * self.qd + self.qq * self.qq)
+        return (
+            self.dd * self.dd + self.dq * self.dq,
+            self.dd * self.qd + self.dq * self.qq,
+            self.qd * self.qd + self.qq * self.qq,
+        )
 
     def reference_of(self, w: Vector) -> Vector:
         inverse = ONE / (self.dd * self.qq - self.dq * self.qd)
@@ -95,8 +98,14 @@ def smallest_voltage(goal: Row, limit: Row) -> Vector:
     inverse = ONE / (limit.dd * limit.qq - limit.dq * limit.qd)
     back = Row(limit.qq * inverse, -limit.dq * inverse, -limit.qd * inverse, limit.dd * inverse, (ZERO, ZERO), ONE)
     rest = goal.voltage(back.voltage((-limit.c[0], -limit.c[1])))
-    B = Row(goal.dd * back.dd + goal.dq * back.qd, goal.dd * back.dq + goal.dq * back.qq,
-            goal.qd * back.dd + goal.qq * back.qd, goal.qd * back.dq + goal.qq * back.qq, (ZERO, ZERO), ONE)
+    B = Row(
+        goal.dd * back.dd + goal.dq * back.qd,
+        goal.dd * back.dq + goal.dq * back.qq,
+        goal.qd * back.dd + goal.qq * back.qd,
+        goal.qd * back.dq + goal.qq * back.qq,
+        (ZERO, ZERO),
+        ONE,
+    )
     G = (B.dd * B.dd + B.qd * B.qd, B.dd * B.dq + B.qd * B.qq, B.dq * B.dq + B.qq * B.qq)
     right, enough = B.transposed(rest), limit.V * (ONE + ROW_TOLERANCE)
     mu, y, size = SINGULAR * (G[0] + G[2]), (ZERO, ZERO), ZERO
@@ -125,8 +134,10 @@ def find_corner(first: Row, second: Row, r: Vector, v: Vector) -> tuple[Vector, 
         inverse = ONE / det
         step = (f1 * n2[1] - f2 * n1[1]) * inverse, (f2 * n1[0] - f1 * n2[0]) * inverse
         v = v[0] - step[0], v[1] - step[1]
-        if all(square(row.change(step)) <= PAIR_TOLERANCE * limit
-               for row, limit in zip((first, second), limits, strict=True)):
+        if all(
+            square(row.change(step)) <= PAIR_TOLERANCE * limit
+            for row, limit in zip((first, second), limits, strict=True)
+        ):
             pull = r[0] - v[0], r[1] - v[1]
             l1 = (pull[0] * n2[1] - pull[1] * n2[0]) * inverse
             l2 = (pull[1] * n1[0] - pull[0] * n1[1]) * inverse

@@ -320,9 +320,15 @@ def test_overload_budget_is_used_up_in_its_time_and_recovers() -> None:
 @pytest.mark.chain
 def test_speed_control_runs_up_and_holds() -> None:
     J = 0.01
-    values = tuned(speed__K_p_nms_per_rad=J * 60, speed__K_i_nm_per_rad=J * 60 * 15, speed__filter_hz=500.0,
-                   speed__acceleration_rpm_per_s=3000.0, speed__decimation=4, speed__notch_hz=150.0,
-                   speed__tau_max_nm=40.0)
+    values = tuned(
+        speed__K_p_nms_per_rad=J * 60,
+        speed__K_i_nm_per_rad=J * 60 * 15,
+        speed__filter_hz=500.0,
+        speed__acceleration_rpm_per_s=3000.0,
+        speed__decimation=4,
+        speed__notch_hz=150.0,
+        speed__tau_max_nm=40.0,
+    )
     loop = Loop(core(), values, omega=0.0)
     omega_M, peak, history = 0.0, 0.0, []
     for k in range(9500):
@@ -341,8 +347,14 @@ def test_speed_control_runs_up_and_holds() -> None:
 
 
 def test_notch_removes_its_frequency_and_keeps_the_rest() -> None:
-    values = tuned(speed__K_p_nms_per_rad=1.0, speed__notch_hz=200.0, speed__decimation=1, speed__filter_hz=1e5,
-                   speed__notch_zeta_num=0.0, motor__J_kgm2=0.0)
+    values = tuned(
+        speed__K_p_nms_per_rad=1.0,
+        speed__notch_hz=200.0,
+        speed__decimation=1,
+        speed__filter_hz=1e5,
+        speed__notch_zeta_num=0.0,
+        motor__J_kgm2=0.0,
+    )
     gains = []
     for hz in (20.0, 200.0):
         loop = Loop(core(), values, omega=0.0)

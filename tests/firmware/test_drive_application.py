@@ -25,9 +25,31 @@ IDLE, ARMED, RUNNING, DONE, ABORTED = range(5)
 U_D, U_Q, I_D, I_Q, SPEED = range(5)
 MODE_OFF, MODE_VOLTAGE, MODE_CURRENT, MODE_TORQUE, MODE_SPEED = range(5)
 SIGNALS = (
-    "NONE", "I_D", "I_Q", "I_D_REQ", "I_Q_REQ", "I_D_REF", "I_Q_REF", "U_D", "U_Q", "U_D_LIM", "U_Q_LIM",
-    "THETA_E", "OMEGA_E", "TAU", "KAPPA", "BINDING", "ITERATIONS", "FLAGS", "I_A", "I_B", "I_C", "U_DC",
-    "T_WINDING", "T_MAGNET", "THETA_M",
+    "NONE",
+    "I_D",
+    "I_Q",
+    "I_D_REQ",
+    "I_Q_REQ",
+    "I_D_REF",
+    "I_Q_REF",
+    "U_D",
+    "U_Q",
+    "U_D_LIM",
+    "U_Q_LIM",
+    "THETA_E",
+    "OMEGA_E",
+    "TAU",
+    "KAPPA",
+    "BINDING",
+    "ITERATIONS",
+    "FLAGS",
+    "I_A",
+    "I_B",
+    "I_C",
+    "U_DC",
+    "T_WINDING",
+    "T_MAGNET",
+    "THETA_M",
 )
 S = {name: k for k, name in enumerate(SIGNALS)}
 
@@ -47,8 +69,12 @@ class Bench:
         v = self.values
         self.p = int(v["motor.pole_pairs"])
         self.plant = LinearPlant(
-            R=v["motor.R_s_ohm"], L_d=v["motor.L_d_h"], L_q=v["motor.L_q_h"], psi=v["motor.psi_f_wb"],
-            T_s=1e-9 * v["inverter.T_s_ns"], omega=self.p * omega_M,
+            R=v["motor.R_s_ohm"],
+            L_d=v["motor.L_d_h"],
+            L_q=v["motor.L_q_h"],
+            psi=v["motor.psi_f_wb"],
+            T_s=1e-9 * v["inverter.T_s_ns"],
+            omega=self.p * omega_M,
         )
         self.inertia, self.omega_M, self.theta_M, self.U_dc = inertia, omega_M, 0.0, 210.0
         self.drive.pll_omega = omega_M
@@ -198,8 +224,9 @@ def test_window_average_and_its_spread() -> None:
 def test_shapes(shape: int, expected: Any) -> None:
     bench = Bench()
     bench.drive.buffer[0], bench.drive.buffer[1], bench.drive.buffer[2] = 1.0, -2.0, 0.5
-    bench.excite(shape=shape, point=U_Q, amplitude=3.0, f0=250.0, f1=900.0, duration=0.02, hold_periods=6,
-                 buffer_samples=3)
+    bench.excite(
+        shape=shape, point=U_Q, amplitude=3.0, f0=250.0, f1=900.0, duration=0.02, hold_periods=6, buffer_samples=3
+    )
     bench.record("U_Q", "FLAGS", depth=300, trigger=4)
     bench.run(300)
     u, flags = bench.recording().T
@@ -235,8 +262,18 @@ def test_prbs_is_maximal_and_balanced() -> None:
 def test_square_wave_on_a_bias_in_a_frozen_frame() -> None:
     bench = Bench(motor__L_d_h=0.0023)
     bias = 14.0
-    bench.excite(ARM, shape=SQUARE, point=U_Q, amplitude=30.0, hold_periods=6, bias_d=bias,
-                 bias_bandwidth=2 * math.pi * 60, fixed_angle=0.4, duration=0.02, abort_current=40.0)
+    bench.excite(
+        ARM,
+        shape=SQUARE,
+        point=U_Q,
+        amplitude=30.0,
+        hold_periods=6,
+        bias_d=bias,
+        bias_bandwidth=2 * math.pi * 60,
+        fixed_angle=0.4,
+        duration=0.02,
+        abort_current=40.0,
+    )
     bench.run(1500)
     assert bench.drive.excitation.state == ARMED
     assert bench.plant.phases()[0] == pytest.approx(bias * math.cos(0.4), abs=0.02)
@@ -270,8 +307,16 @@ def test_current_injection_and_speed_injection_add_to_their_references() -> None
 
 def test_hysteresis_pulses_turn_at_their_current_limits() -> None:
     bench = Bench(protection__i_trip_apk=200.0)
-    bench.excite(shape=HYSTERESIS, amplitude=60.0, amplitude_q=45.0, i_limit_d=6.0, i_limit_q=8.0, i_centre_d=-4.0,
-                 fixed_angle=0.0, duration=0.1)
+    bench.excite(
+        shape=HYSTERESIS,
+        amplitude=60.0,
+        amplitude_q=45.0,
+        i_limit_d=6.0,
+        i_limit_q=8.0,
+        i_centre_d=-4.0,
+        fixed_angle=0.0,
+        duration=0.1,
+    )
     bench.record("I_D", "I_Q", "U_D_LIM", "U_Q_LIM", depth=1200, trigger=4)
     bench.run(1200)
     i_d, i_q, u_d, u_q = bench.recording().T
@@ -314,8 +359,9 @@ def test_recorder_triggers_and_keeps_the_oldest_row_first() -> None:
     for trigger, level, source in ((1, 2.0, "I_Q"), (3, 2.0, "I_Q"), (2, -2.0, "I_Q")):
         bench.drive.reference.i_q_ref = 0.0
         bench.run(400)
-        bench.record("I_Q", "I_Q_REF", depth=50, pretrigger=20, trigger=trigger, trigger_level=level,
-                     trigger_signal=S[source])
+        bench.record(
+            "I_Q", "I_Q_REF", depth=50, pretrigger=20, trigger=trigger, trigger_level=level, trigger_signal=S[source]
+        )
         bench.run(37)
         assert bench.drive.recorder.state == ARMED
         bench.drive.reference.i_q_ref = -4.0 if trigger == 2 else 4.0
@@ -360,8 +406,14 @@ def test_fault_trigger_records_the_trip() -> None:
 
 @pytest.mark.parametrize(
     ("code", "member", "value"),
-    [(0x2310, "i_b", -90.0), (0x3210, "U_dc", 801.0), (0x3220, "U_dc", 19.0), (0x4310, "T_winding", 156.0),
-     (0x5530, "i_a", math.nan), (0x5530, "theta_M", math.inf)],
+    [
+        (0x2310, "i_b", -90.0),
+        (0x3210, "U_dc", 801.0),
+        (0x3220, "U_dc", 19.0),
+        (0x4310, "T_winding", 156.0),
+        (0x5530, "i_a", math.nan),
+        (0x5530, "theta_M", math.inf),
+    ],
 )
 def test_trips_latch_and_remove_the_gates(code: int, member: str, value: float) -> None:
     bench = Bench()
@@ -370,8 +422,10 @@ def test_trips_latch_and_remove_the_gates(code: int, member: str, value: float) 
     assert bench.output.gates == 1
     sensors = bench.types["pmsm_sensors"](T_winding=20.0, U_dc=210.0)
     setattr(sensors, member, value)
+
     def call(s: Any) -> None:
         bench.library.pmsm_drive_period(ctypes.byref(bench.drive), ctypes.byref(s), ctypes.byref(bench.output))
+
     call(sensors)
     assert (bench.drive.trip, bench.output.gates) == (code, 0)
     bench.library.pmsm_drive_reset_fault(ctypes.byref(bench.drive))
@@ -419,8 +473,13 @@ def test_quick_stop_ramps_the_current_and_then_takes_the_gates() -> None:
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.parametrize("known_inertia", [0.0, 0.01])
 def test_quick_stop_brakes_a_turning_machine(direction: float, known_inertia: float) -> None:
-    bench = Bench(40.0 * direction, inertia=0.01, motor__J_kgm2=known_inertia, speed__K_p_nms_per_rad=0.5,
-                  speed__K_i_nm_per_rad=5.0)
+    bench = Bench(
+        40.0 * direction,
+        inertia=0.01,
+        motor__J_kgm2=known_inertia,
+        speed__K_p_nms_per_rad=0.5,
+        speed__K_i_nm_per_rad=5.0,
+    )
     bench.drive.reference.mode = MODE_SPEED
     bench.drive.reference.omega_M_ref = 40.0 * direction
     bench.run(50)

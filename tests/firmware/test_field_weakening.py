@@ -43,8 +43,14 @@ def governed(mode: int, **changes: float) -> dict[str, float]:
     return weakening(mode, governor__mode=BEST, governor__options=options, **changes)
 
 
-def ramp(values: dict[str, float], torque: float, rpm: tuple[float, float], *, periods: int = 9000,
-         plant: tuple[float, float, float] = (1, 1, 1)) -> dict[str, np.ndarray]:
+def ramp(
+    values: dict[str, float],
+    torque: float,
+    rpm: tuple[float, float],
+    *,
+    periods: int = 9000,
+    plant: tuple[float, float, float] = (1, 1, 1),
+) -> dict[str, np.ndarray]:
     """Hold a torque over a speed ramp of 0.55 s and what follows; ``plant`` scales R, L, psi against the controller."""
     loop = Loop(core(), values, omega=rpm[0] * RPM, U_dc=V_DC)
     m = loop.plant
@@ -122,22 +128,37 @@ def optimum(values: dict[str, float], omega: float, torque: float, V_m: float, I
     def voltage(i: np.ndarray) -> float:
         return float(1 - ((R * i[0] - omega * L_q * i[1]) ** 2 + (R * i[1] + omega * (L_d * i[0] + psi)) ** 2) / V_m**2)
 
-    limits: list[dict[str, Any]] = [{"type": "ineq", "fun": voltage},
-              {"type": "ineq", "fun": lambda i: 1 - (i[0] ** 2 + i[1] ** 2) / I_m**2},
-              {"type": "ineq", "fun": lambda i: -i[0] / I_m}]
+    limits: list[dict[str, Any]] = [
+        {"type": "ineq", "fun": voltage},
+        {"type": "ineq", "fun": lambda i: 1 - (i[0] ** 2 + i[1] ** 2) / I_m**2},
+        {"type": "ineq", "fun": lambda i: -i[0] / I_m},
+    ]
     best: tuple[float, float, np.ndarray] | None = None
     for start in np.random.default_rng(2).uniform([-I_m, -I_m], [0, I_m], (30, 2)):
-        found = minimize(lambda i: error(i) ** 2 + 1e-3 * i[0] ** 2, start, constraints=limits, method="SLSQP",
-                         options={"ftol": 1e-13, "maxiter": 400})
+        found = minimize(
+            lambda i: error(i) ** 2 + 1e-3 * i[0] ** 2,
+            start,
+            constraints=limits,
+            method="SLSQP",
+            options={"ftol": 1e-13, "maxiter": 400},
+        )
         if min(limit["fun"](found.x) for limit in limits) > -1e-7 and (best is None or found.fun < best[0]):
             best = (found.fun, abs(error(found.x)), found.x)
     assert best is not None
     return best[2]
 
 
-SALIENT = {"motor.R_s_ohm": 0.05, "motor.L_d_h": 0.001, "motor.L_q_h": 0.0025, "motor.psi_f_wb": 0.1,
-           "motor.L_d_app_h": 0.001, "motor.L_q_app_h": 0.0025, "motor.I_max_apk": 150.0, "motor.I_nom_apk": 100.0,
-           "protection.I_cont_apk": 150.0}
+SALIENT = {
+    "motor.R_s_ohm": 0.05,
+    "motor.L_d_h": 0.001,
+    "motor.L_q_h": 0.0025,
+    "motor.psi_f_wb": 0.1,
+    "motor.L_d_app_h": 0.001,
+    "motor.L_q_app_h": 0.0025,
+    "motor.I_max_apk": 150.0,
+    "motor.I_nom_apk": 100.0,
+    "protection.I_cont_apk": 150.0,
+}
 
 
 @pytest.mark.parametrize("mode", [GRADIENT, ACCELERATED])

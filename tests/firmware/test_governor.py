@@ -46,13 +46,24 @@ def paper(**changes: float) -> dict[str, float]:
 
 
 def best(alpha: float = 7540.0, options: int = ALL_OPTIONS, **changes: float) -> dict[str, float]:
-    return reference_case(alpha, **{"governor__mode": BEST, "governor__options": options, "governor__eps": 0.001,
-                                    **changes})
+    return reference_case(
+        alpha, **{"governor__mode": BEST, "governor__options": options, "governor__eps": 0.001, **changes}
+    )
 
 
-def run(values: dict[str, float], rpm: float, start: tuple[float, float], target: tuple[float, float], periods: int,
-        *, double: bool = False, plant: tuple[float, float, float] = (1, 1, 1), end_rpm: float | None = None,
-        ramp_periods: int = 1, noise: float = 0.0) -> dict[str, np.ndarray]:
+def run(
+    values: dict[str, float],
+    rpm: float,
+    start: tuple[float, float],
+    target: tuple[float, float],
+    periods: int,
+    *,
+    double: bool = False,
+    plant: tuple[float, float, float] = (1, 1, 1),
+    end_rpm: float | None = None,
+    ramp_periods: int = 1,
+    noise: float = 0.0,
+) -> dict[str, np.ndarray]:
     """Step from a steady state; ``plant`` scales R, L, psi of the machine against the controller's."""
     loop = Loop(core(double=double), values, omega=rpm * RPM, U_dc=V_DC)
     machine = loop.plant
@@ -84,8 +95,7 @@ def settling_ms(i: np.ndarray, target: tuple[float, float], band: float) -> floa
 
 def steady_voltage(i: np.ndarray, omega: np.ndarray | float) -> np.ndarray:
     m = Table1()
-    return np.hypot(m.R * i[..., 0] - omega * m.L_q * i[..., 1],
-                    m.R * i[..., 1] + omega * (m.L_d * i[..., 0] + m.psi))
+    return np.hypot(m.R * i[..., 0] - omega * m.L_q * i[..., 1], m.R * i[..., 1] + omega * (m.L_d * i[..., 0] + m.psi))
 
 
 @pytest.mark.chain
@@ -119,8 +129,12 @@ def test_paper_mode_is_the_projection_on_the_papers_rows(double: bool, distance:
 
 
 # rpm, start, target -> settling (ms) of the reference's table 5.3 (a); one T_s of slack as the step may fall anywhere
-STEPS = [(0, (0.0, 0.0), (0.0, 28.0)), (310, (0.0, 0.0), (0.0, 28.0)), (620, (0.0, 0.0), (0.0, 28.0)),
-         (800, (-40.0, 0.0), (-40.0, 28.0))]
+STEPS = [
+    (0, (0.0, 0.0), (0.0, 28.0)),
+    (310, (0.0, 0.0), (0.0, 28.0)),
+    (620, (0.0, 0.0), (0.0, 28.0)),
+    (800, (-40.0, 0.0), (-40.0, 28.0)),
+]
 LAWS: dict[str, tuple[dict[str, float], list[float], float]] = {
     "paper": (paper(), [0.92, 1.25, 4.92, 5.67], 1e-5),
     "line search": (reference_case(4000.0, governor__mode=LINE, governor__eps=0.0), [0.92, 1.25, 4.75, 5.17], 1e-5),
@@ -261,8 +275,9 @@ def test_speed_ramp_and_speed_steps_without_field_weakening() -> None:
 
 
 def test_line_search_says_when_a_row_is_given_up() -> None:
-    values = reference_case(4000.0, governor__mode=LINE, governor__eps=0.001, governor__I_transient_apk=20.0,
-                            governor__options=CURRENT_ROW)
+    values = reference_case(
+        4000.0, governor__mode=LINE, governor__eps=0.001, governor__I_transient_apk=20.0, governor__options=CURRENT_ROW
+    )
     loop = Loop(core(), values, omega=300 * RPM, U_dc=V_DC)
     loop.settle_at(0.0, 30.0)  # the held reference is beyond the row
     first = loop.step(mode=MODE_CURRENT, i_q_ref=10.0)
@@ -323,9 +338,13 @@ def test_offset_free_rows_reach_the_reference_under_mismatch(plant: tuple[float,
     m = Table1()
     done = 0
     for rpm, start, target in random_cases(60, 4):
-        loops = [math.hypot(plant[0] * m.R * i[0] - rpm * RPM * plant[1] * m.L_q * i[1],
-                            plant[0] * m.R * i[1] + rpm * RPM * (plant[1] * m.L_d * i[0] + plant[2] * m.psi))
-                 for i in (start, target)]
+        loops = [
+            math.hypot(
+                plant[0] * m.R * i[0] - rpm * RPM * plant[1] * m.L_q * i[1],
+                plant[0] * m.R * i[1] + rpm * RPM * (plant[1] * m.L_d * i[0] + plant[2] * m.psi),
+            )
+            for i in (start, target)
+        ]
         if max(loops) > 0.92 * V_MAX:
             continue
         seen = run(best(governor__observer_gain=gain), rpm, start, target, 500, plant=plant)
@@ -340,8 +359,12 @@ def test_paper_rows_veto_feasible_currents_under_table_2b() -> None:
     stuck = tried = 0
     m = Table1()
     for rpm, start, target in random_cases(80, 4):
-        feasible = [math.hypot(1.5 * m.R * i[0] - rpm * RPM * m.L_q * i[1],
-                               1.5 * m.R * i[1] + rpm * RPM * (m.L_d * i[0] + 0.7 * m.psi)) for i in (start, target)]
+        feasible = [
+            math.hypot(
+                1.5 * m.R * i[0] - rpm * RPM * m.L_q * i[1], 1.5 * m.R * i[1] + rpm * RPM * (m.L_d * i[0] + 0.7 * m.psi)
+            )
+            for i in (start, target)
+        ]
         if max(feasible) <= 0.92 * V_MAX:
             tried += 1
             seen = run(paper(governor__eps=1e-3, governor__k_max=12), rpm, start, target, 500, plant=(1.5, 1, 0.7))
@@ -350,8 +373,9 @@ def test_paper_rows_veto_feasible_currents_under_table_2b() -> None:
 
 
 @pytest.mark.parametrize("rpm", [0, 310, 600])
-@pytest.mark.parametrize(("plant", "overshoot"), [((1, 1, 1), 0.005), ((1, 0.7, 1), 0.065), ((1.5, 1, 0.7), 0.065),
-                                                  ((1, 1.43, 1), 0.065)])
+@pytest.mark.parametrize(
+    ("plant", "overshoot"), [((1, 1, 1), 0.005), ((1, 0.7, 1), 0.065), ((1.5, 1, 0.7), 0.065), ((1, 1.43, 1), 0.065)]
+)
 def test_delay_and_predictor(rpm: float, plant: tuple[float, float, float], overshoot: float) -> None:
     values = best(options=ALL_OPTIONS | PREDICTOR, inverter__delay_periods=1.5)
     seen = run(values, rpm, (0, 0), (0, 28), 1500, plant=plant)

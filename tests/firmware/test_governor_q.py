@@ -71,8 +71,7 @@ def row_0(loop: Loop, v: tuple[float, float], state: tuple[float, ...]) -> float
     i_d, i_q, x_d, x_q, omega = state
     p = loop.values
     u_d = p["current.K_p_d_v_per_a"] * (v[0] - i_d) + x_d - omega * p["motor.L_q_app_h"] * i_q
-    u_q = (p["current.K_p_q_v_per_a"] * (v[1] - i_q) + x_q
-           + omega * (p["motor.L_d_app_h"] * i_d + p["motor.psi_f_wb"]))
+    u_q = p["current.K_p_q_v_per_a"] * (v[1] - i_q) + x_q + omega * (p["motor.L_d_app_h"] * i_d + p["motor.psi_f_wb"])
     return math.hypot(u_d, u_q)
 
 
@@ -132,9 +131,23 @@ def test_nothing_is_undefined_for_any_input(arguments: list[str], tmp_path: Path
         (tmp_path / name).write_text(text)
     (tmp_path / "main.c").write_text(EXTREMES)
     assert COMPILER is not None
-    built = subprocess.run([COMPILER, "-std=c99", "-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all", "-o",
-                            "extremes", "main.c", "motor_cfg_q.c", "pmsm_governor_q.c"], cwd=tmp_path,
-                           capture_output=True, text=True)
+    built = subprocess.run(
+        [
+            COMPILER,
+            "-std=c99",
+            "-O1",
+            "-fsanitize=undefined",
+            "-fno-sanitize-recover=all",
+            "-o",
+            "extremes",
+            "main.c",
+            "motor_cfg_q.c",
+            "pmsm_governor_q.c",
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
     if built.returncode and "ubsan" in built.stderr:
         pytest.skip("the compiler has no library for -fsanitize=undefined")
     assert built.returncode == 0, built.stderr
@@ -164,9 +177,13 @@ def test_bases_leave_room_and_errors_are_those_of_rounding() -> None:
 
 @pytest.mark.parametrize(
     ("change", "match"),
-    [({"current.options": 4}, "decoupling"), ({"current.K_p_d_v_per_a": 1e4}, "more than Q4.27"),
-     ({"current.K_p_q_v_per_a": 1e-3}, "inverse_K_p_q"), ({"current.K_p_d_v_per_a": 0.0}, "proportional"),
-     ({"motor.R_s_ohm": 1e-9}, "vanishes")],
+    [
+        ({"current.options": 4}, "decoupling"),
+        ({"current.K_p_d_v_per_a": 1e4}, "more than Q4.27"),
+        ({"current.K_p_q_v_per_a": 1e-3}, "inverse_K_p_q"),
+        ({"current.K_p_d_v_per_a": 0.0}, "proportional"),
+        ({"motor.R_s_ohm": 1e-9}, "vanishes"),
+    ],
 )
 def test_what_does_not_fit_is_refused(change: dict[str, float], match: str) -> None:
     with pytest.raises(ConfigError, match=match):

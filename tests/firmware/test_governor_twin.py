@@ -29,16 +29,45 @@ from tests.firmware.governor_twin import GovernedTwin
 V_DC = 210.0
 CASES = {
     "paper": (reference_case(4000.0, governor__mode=PAPER, governor__k_max=6, governor__eps=0.01), 620.0),
-    "line search": (reference_case(4000.0, governor__mode=LINE, governor__eps=0.01,
-                                   governor__options=PRE_PROJECTION), -700.0),
-    "best, rows only": (reference_case(4000.0, governor__mode=BEST, governor__eps=0.01, governor__observer_gain=0.0,
-                                       governor__options=CURRENT_ROW | PRE_PROJECTION), 800.0),
-    "best": (reference_case(7540.0, governor__mode=BEST, governor__eps=0.001,
-                            governor__options=CURRENT_ROW | PRE_PROJECTION | MINIMUM_TIME), 850.0),
-    "line search, current row": (reference_case(7540.0, governor__mode=LINE, governor__eps=0.001,
-                                                governor__options=CURRENT_ROW | PRE_PROJECTION), 900.0),
-    "best, corner": (reference_case(7540.0, governor__mode=BEST, governor__eps=0.001, governor__I_transient_apk=50.0,
-                                    governor__options=CURRENT_ROW | PRE_PROJECTION | MINIMUM_TIME), -800.0),
+    "line search": (
+        reference_case(4000.0, governor__mode=LINE, governor__eps=0.01, governor__options=PRE_PROJECTION),
+        -700.0,
+    ),
+    "best, rows only": (
+        reference_case(
+            4000.0,
+            governor__mode=BEST,
+            governor__eps=0.01,
+            governor__observer_gain=0.0,
+            governor__options=CURRENT_ROW | PRE_PROJECTION,
+        ),
+        800.0,
+    ),
+    "best": (
+        reference_case(
+            7540.0,
+            governor__mode=BEST,
+            governor__eps=0.001,
+            governor__options=CURRENT_ROW | PRE_PROJECTION | MINIMUM_TIME,
+        ),
+        850.0,
+    ),
+    "line search, current row": (
+        reference_case(
+            7540.0, governor__mode=LINE, governor__eps=0.001, governor__options=CURRENT_ROW | PRE_PROJECTION
+        ),
+        900.0,
+    ),
+    "best, corner": (
+        reference_case(
+            7540.0,
+            governor__mode=BEST,
+            governor__eps=0.001,
+            governor__I_transient_apk=50.0,
+            governor__options=CURRENT_ROW | PRE_PROJECTION | MINIMUM_TIME,
+        ),
+        -800.0,
+    ),
 }
 
 

@@ -51,8 +51,12 @@ def random_value(row: Parameter, choice: int, share: float) -> float:
 def random_values(rng: np.random.Generator) -> dict[str, float]:
     choices, shares = rng.integers(8, size=len(CATALOGUE)).tolist(), rng.random(len(CATALOGUE)).tolist()
     values = {row.name: random_value(row, *drawn) for row, *drawn in zip(CATALOGUE, choices, shares, strict=True)}
-    values |= {"lut.format": int(rng.integers(3)), "lut.n_x": int(rng.integers(2, 6)),
-               "lut.n_y": int(rng.integers(2, 6)), "lut.n_z": int(rng.integers(1, 4))}
+    values |= {
+        "lut.format": int(rng.integers(3)),
+        "lut.n_x": int(rng.integers(2, 6)),
+        "lut.n_y": int(rng.integers(2, 6)),
+        "lut.n_z": int(rng.integers(1, 4)),
+    }
     return values
 
 

@@ -31,10 +31,19 @@ RPM = POLE_PAIRS * math.pi / 30
 
 def values(mode: int, options: int = 0, **changes: float) -> dict[str, float]:
     """Peak quantities of the assumed machine of the paper."""
-    machine = {"motor.pole_pairs": POLE_PAIRS, "motor.R_s_ohm": 0.157, "motor.psi_f_wb": 0.026944,
-               "motor.I_max_apk": 40.0, "protection.I_cont_apk": 40.0, "field_weakening.i_d_min_a": -30.0,
-               "inverter.T_s_ns": 100_000, "inverter.delay_periods": 0.5, "polar.mode": mode, "polar.options": options,
-               "inverter.voltage_utilisation": 1 / math.sqrt(3)}
+    machine = {
+        "motor.pole_pairs": POLE_PAIRS,
+        "motor.R_s_ohm": 0.157,
+        "motor.psi_f_wb": 0.026944,
+        "motor.I_max_apk": 40.0,
+        "protection.I_cont_apk": 40.0,
+        "field_weakening.i_d_min_a": -30.0,
+        "inverter.T_s_ns": 100_000,
+        "inverter.delay_periods": 0.5,
+        "polar.mode": mode,
+        "polar.options": options,
+        "inverter.voltage_utilisation": 1 / math.sqrt(3),
+    }
     machine |= {f"motor.L_{axis}_h": 0.0009 for axis in ("d", "q", "d_app", "q_app")}
     return DEFAULTS | machine | {name.replace("__", "."): value for name, value in changes.items()}
 
@@ -48,7 +57,10 @@ CASES = {
     "proposed, torque out of reach": (values(PROPOSED, ON_MEASUREMENT), 1000.0, 39.0),
     "proposed, switched": (values(PROPOSED, SWITCH), 800.0, 14.0),
     "conventional, switched, delay": (
-        values(CONVENTIONAL, SWITCH | PREDICT | ON_MEASUREMENT, inverter__delay_periods=1.5), -880.0, 20.0),
+        values(CONVENTIONAL, SWITCH | PREDICT | ON_MEASUREMENT, inverter__delay_periods=1.5),
+        -880.0,
+        20.0,
+    ),
     "proposed near standstill": (values(PROPOSED, ON_MEASUREMENT), 60.0, 3.0),
     "linear": (values(LINEAR), 300.0, 6.0),
     "linear at standstill": (values(LINEAR), 0.0, 6.0),
@@ -58,8 +70,11 @@ CASES = {
     "unified": (values(UNIFIED, polar__V_ref_ratio=0.97), 900.0, 14.0),
     "unified, delay": (values(UNIFIED, PREDICT, inverter__delay_periods=1.5), -1000.0, 12.0),
     "unified, interior, limits": (values(UNIFIED, polar__V_ref_ratio=0.97, **SALIENT), 1300.0, 38.0),
-    "unified, interior, torque": (values(UNIFIED, polar__V_ref_ratio=0.97, field_weakening__i_d_lm_a=-2.0, **SALIENT),
-                                  1000.0, 7.0),
+    "unified, interior, torque": (
+        values(UNIFIED, polar__V_ref_ratio=0.97, field_weakening__i_d_lm_a=-2.0, **SALIENT),
+        1000.0,
+        7.0,
+    ),
     "unified in overmodulation": (values(UNIFIED, polar__V_a_max_ratio=1.1, polar__V_ref_ratio=1.05), 900.0, 18.0),
     "unified at standstill": (values(UNIFIED), 0.0, 10.0),
 }
@@ -84,7 +99,10 @@ def test_polar_law_equals_the_twin_bit_for_bit(case: str) -> None:
         live = loop.step(**asked)
         m, out = loop.measurement, loop.output
         duties, u, realised = twin.period(
-            (f(m.i_a), f(m.i_b), f(m.i_c)), f(m.theta_e), f(m.omega_e), f(m.U_dc),
+            (f(m.i_a), f(m.i_b), f(m.i_c)),
+            f(m.theta_e),
+            f(m.omega_e),
+            f(m.U_dc),
             **({"tau": f(target)} if in_torque else {"request": (f(0), f(target))}),
         )
         mine = np.array([live.u_d, live.u_q, live.u_d_lim, live.u_q_lim, out.duty_a, out.duty_b, out.duty_c], dtype=f)

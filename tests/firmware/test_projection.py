@@ -58,14 +58,23 @@ def general_solution(rows: list[Row], r: np.ndarray, near: np.ndarray, rng: np.r
     SLSQP alone leaves up to 1e-5 A along nearly parallel rows; its multipliers, which say what is active, are safe.
     """
     constraints = [
-        {"type": "ineq", "fun": lambda v, M=M, c=c, V=V: 1 - np.sum((M @ v + c) ** 2) / V**2,
-         "jac": lambda v, M=M, c=c, V=V: -2 * (M.T @ (M @ v + c)) / V**2}
+        {
+            "type": "ineq",
+            "fun": lambda v, M=M, c=c, V=V: 1 - np.sum((M @ v + c) ** 2) / V**2,
+            "jac": lambda v, M=M, c=c, V=V: -2 * (M.T @ (M @ v + c)) / V**2,
+        }
         for M, c, V in rows
     ]
     for precision, scatter in ((1e-14, 0.5), (1e-12, 0.1), (1e-15, 1.0), (1e-10, 2.0)):
         start = near + rng.normal(0, scatter, 2)
-        found = minimize(lambda v: np.sum((v - r) ** 2), start, jac=lambda v: 2 * (v - r), constraints=constraints,
-                         method="SLSQP", options={"ftol": precision, "maxiter": 300})
+        found = minimize(
+            lambda v: np.sum((v - r) ** 2),
+            start,
+            jac=lambda v: 2 * (v - r),
+            constraints=constraints,
+            method="SLSQP",
+            options={"ftol": precision, "maxiter": 300},
+        )
         if excess(rows, found.x) <= 1e-6:
             point = optimal_point([row for row in rows if excess([row], found.x) > -1e-6], r, found.x)
             if point is not None and excess(rows, point) <= 1e-12:
@@ -94,13 +103,22 @@ def optimal_point(active: list[Row], r: np.ndarray, near: np.ndarray) -> np.ndar
 def smallest_excess(rows: list[Row]) -> float:
     """min over v of the largest |w|^2/V^2 - 1: positive means the rows have no common point."""
     constraints = [
-        {"type": "ineq", "fun": lambda v, M=M, c=c, V=V: v[2] - np.sum((M @ v[:2] + c) ** 2) / V**2,
-         "jac": lambda v, M=M, c=c, V=V: np.append(-2 * (M.T @ (M @ v[:2] + c)) / V**2, 1.0)}
+        {
+            "type": "ineq",
+            "fun": lambda v, M=M, c=c, V=V: v[2] - np.sum((M @ v[:2] + c) ** 2) / V**2,
+            "jac": lambda v, M=M, c=c, V=V: np.append(-2 * (M.T @ (M @ v[:2] + c)) / V**2, 1.0),
+        }
         for M, c, V in rows
     ]
     start = [0.0, 0.0, excess(rows, np.zeros(2)) + 1]
-    found = minimize(lambda v: v[2], start, jac=lambda v: np.array([0.0, 0.0, 1.0]), constraints=constraints,
-                     method="SLSQP", options={"ftol": 1e-14, "maxiter": 500})
+    found = minimize(
+        lambda v: v[2],
+        start,
+        jac=lambda v: np.array([0.0, 0.0, 1.0]),
+        constraints=constraints,
+        method="SLSQP",
+        options={"ftol": 1e-14, "maxiter": 500},
+    )
     return float(found.x[2]) - 1
 
 
@@ -183,13 +201,23 @@ def test_half_planes_against_slsqp() -> None:
             r = rng.normal(scale=3, size=2)
             v, active, steps = dq(), ctypes.c_uint32(), ctypes.c_uint32()
             status = binding.library.pmsm_project_half_planes(
-                (dq * count)(*(dq(*a) for a in normals)), (real * count)(*bounds), count, dq(*r), ctypes.byref(v),
-                ctypes.byref(active), ctypes.byref(steps),
+                (dq * count)(*(dq(*a) for a in normals)),
+                (real * count)(*bounds),
+                count,
+                dq(*r),
+                ctypes.byref(v),
+                ctypes.byref(active),
+                ctypes.byref(steps),
             )
             statuses.add(status)
             constraint = {"type": "ineq", "fun": lambda x, a=normals, b=bounds: b - a @ x}
-            found = minimize(lambda x, r=r: np.sum((x - r) ** 2), np.zeros(2), constraints=[constraint], method="SLSQP",
-                             options={"ftol": 1e-15, "maxiter": 300})
+            found = minimize(
+                lambda x, r=r: np.sum((x - r) ** 2),
+                np.zeros(2),
+                constraints=[constraint],
+                method="SLSQP",
+                options={"ftol": 1e-15, "maxiter": 300},
+            )
             if status == EMPTY:
                 assert (bounds - normals @ found.x).min() < 0
             else:

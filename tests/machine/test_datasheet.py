@@ -19,9 +19,11 @@ from pmsmtool.machine.datasheet import (
     parse_emf_constant,
     parse_torque_constant,
     star_phase,
+    torque_constant_by_emf,
 )
 from pmsmtool.machine.flux_map_import import flux_map_csv, load_flux_map
 from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.sim.simulated_machine import settings_of
 
 P, R, L, PSI = 4, 0.137, 2.2e-3, 0.41
 """Star phase of the machine behind all sheets: ohm at 20 degC, H, Wb peak."""
@@ -77,6 +79,7 @@ def test_every_way_to_print_the_back_emf(text, between, connection):
         f"{1.5 * P * PSI * 1e3!r}mNm/Apk",
         f"{1.5 * P * PSI / 0.0070615518!r}oz-in/Apk",
         f"{1.5 * P * PSI / 0.1129848290!r}lb-in/Apk",
+        f"{3e3 * math.sqrt(3) / math.pi * P * PSI!r} mNm/A block",
     ],
 )
 def test_every_way_to_print_the_torque_constant(text):
@@ -110,6 +113,8 @@ def test_resistance_is_brought_to_20_degrees():
         (4.0, "pole pairs"),
         (9.5493, "rpm and rad/s"),
         (1.12, "differ by +12.0 %"),
+        (2 * math.sqrt(3) / math.pi, "block commutation where peak was said"),
+        (math.pi / math.sqrt(6), "block commutation where rms was said"),
     ],
 )
 def test_a_torque_constant_that_contradicts_is_named(factor, says):
@@ -117,6 +122,30 @@ def test_a_torque_constant_that_contradicts_is_named(factor, says):
     result = machine_from_datasheet(sheet(K_t=K_t))
     assert says in result.warnings[0]
     assert result.machine_file.machine.psi_f_wb == pytest.approx(PSI)  # K_e decides
+
+
+@pytest.mark.parametrize(("factor", "kind"), [(1.5, "peak"), (2.1213, "rms"), (1.654, "block")])
+def test_an_ampere_that_is_not_said_is_recognised_by_the_back_emf(factor, kind):
+    text = f"{factor * P * PSI * 1.006!r}Nm/A"
+    found, said = torque_constant_by_emf(text, parse_emf_constant(f"{PSI!r}Wb", None), P, "star")
+    assert found.kind == kind and kind in said and "+0.6" in said
+    assert torque_constant_by_emf("1Nm/Arms", parse_emf_constant(f"{PSI!r}Wb", None), P, "star") == (
+        parse_torque_constant("1Nm/Arms"),
+        "",
+    )
+    with pytest.raises(ConfigError, match="none of"):
+        torque_constant_by_emf(f"{1.9 * P * PSI!r}Nm/A", parse_emf_constant(f"{PSI!r}Wb", None), P, "star")
+
+
+@pytest.mark.parametrize(("rated", "assumed"), [(20.0, 3), (None, 1)])
+def test_what_a_rehearsal_needs_is_written_and_named(rated, assumed):
+    """Without it: `adc_bits needs adc_full_scale_apk`."""
+    result = machine_from_datasheet(sheet(I_nom_apk=rated, encoder_bits=12))
+    settings = settings_of(result.machine_file)
+    assert settings.whole("encoder_bits") == 12
+    assert [step.given for step in result.conversions if step.key == "[simulation]"] == ["assumed"] * assumed
+    if rated is not None:
+        assert settings.number("J_kgm2") > 0.0 and settings.number("adc_full_scale_apk") == 1.5 * 2.0 * rated
 
 
 def test_small_disagreement_is_production_spread():

@@ -72,9 +72,7 @@ def test_an_unconfigured_drive_is_silent_until_it_gets_an_id(make_bench: BenchMa
 )
 def test_identify_remote_slave_by_ranges(bench: Bench, low: int, high: int, found: bool) -> None:
     answers = []
-    for command, number in zip(
-        range(0x46, 0x4C), (VENDOR, PRODUCT, 0, 0xFFFFFFFF, low, high), strict=True
-    ):
+    for command, number in zip(range(0x46, 0x4C), (VENDOR, PRODUCT, 0, 0xFFFFFFFF, low, high), strict=True):
         answers += lss(bench, command, number=number)
     assert bool(answers) is found
 

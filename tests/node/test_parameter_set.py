@@ -264,8 +264,11 @@ _VALUES = st.fixed_dictionaries(
     {
         row.name: st.integers(int(row.minimum), int(row.maximum))
         if row.is_integer
-        else st.floats(struct.unpack("<f", struct.pack("<f", row.minimum))[0],
-                       struct.unpack("<f", struct.pack("<f", row.maximum))[0], width=32)
+        else st.floats(
+            struct.unpack("<f", struct.pack("<f", row.minimum))[0],
+            struct.unpack("<f", struct.pack("<f", row.maximum))[0],
+            width=32,
+        )
         for row in CATALOGUE
         if not row.name.startswith("lut.")
     }

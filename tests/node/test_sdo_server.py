@@ -362,8 +362,11 @@ def test_an_abandoned_transfer_times_out_on_the_node_clock(bench: Bench, opening
 
 @pytest.mark.parametrize(
     "opening",
-    [HEAD.pack(0x40, 0x1008, 0) + bytes(4), struct.pack("<BHBI", 0x21, 0x2051, 0, 100),
-     HEAD.pack(0xA4, 0x2001, 0) + bytes((127, 0, 0, 0))],
+    [
+        HEAD.pack(0x40, 0x1008, 0) + bytes(4),
+        struct.pack("<BHBI", 0x21, 0x2051, 0, 100),
+        HEAD.pack(0xA4, 0x2001, 0) + bytes((127, 0, 0, 0)),
+    ],
 )
 def test_a_new_request_replaces_an_abandoned_one(bench: Bench, opening: bytes) -> None:
     bench.client.send(opening)

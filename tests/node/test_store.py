@@ -61,9 +61,7 @@ def test_unsaved_values_are_lost_with_a_reset_and_saved_ones_stay(bench: Bench) 
     assert bench.client.number(0x2000, 4) == bench.client.number(0x2000, 3) != 0
 
 
-@pytest.mark.parametrize(
-    ("sub", "kept"), [(2, (0.137, 250, 3)), (3, (0.137, 200, 1)), (4, (0.25, 200, 3))]
-)
+@pytest.mark.parametrize(("sub", "kept"), [(2, (0.137, 250, 3)), (3, (0.137, 200, 1)), (4, (0.25, 200, 3))])
 def test_groups_are_stored_apart(bench: Bench, sub: int, kept: tuple[float, float, float]) -> None:
     change(bench)
     save(bench, sub)

@@ -226,6 +226,7 @@ def test_another_thread_can_become_the_one_that_drives_time(bench: Bench) -> Non
 
 def test_threads_may_send_at_any_time(bench: Bench) -> None:
     """Four threads send while the main thread receives: every request is answered once."""
+
     def ask() -> None:
         for _ in range(50):
             bench.bus.send(message(0x601, READ_SERIAL))

@@ -156,7 +156,7 @@ def test_a_slow_store(make_bench: BenchMaker) -> None:
 
 def test_absent_objects(make_bench: BenchMaker) -> None:
     names = ("0x1016", "0x6007:00", "0x1018:04")
-    bench = make_bench(faults="".join(f"[[absent]]\nobject=\"{name}\"\n" for name in names))
+    bench = make_bench(faults="".join(f'[[absent]]\nobject="{name}"\n' for name in names))
     for _ in range(2):
         for index, sub, code in ((0x1016, 0, 0x06020000), (0x1016, 1, 0x06020000), (0x6007, 0, 0x06020000),
                                  (0x1018, 4, 0x06090011)):  # fmt: skip

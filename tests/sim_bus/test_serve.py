@@ -202,9 +202,10 @@ def test_a_bit_rate_paces_the_served_bus() -> None:
 def test_a_pulled_adapter_ends_the_connection(tmp_path: Path) -> None:
     faults = tmp_path / "faults.toml"
     faults.write_text("[[adapter]]\nat_s = 0.3\n", encoding="utf-8")
-    with served(f"interior-2k2?nv=:memory:&faults={faults}") as port, socket.create_connection(
-        ("127.0.0.1", port)
-    ) as raw:
+    with (
+        served(f"interior-2k2?nv=:memory:&faults={faults}") as port,
+        socket.create_connection(("127.0.0.1", port)) as raw,
+    ):
         for command in (b"< open can0 >", b"< rawmode >"):
             raw.recv(256)
             raw.sendall(command)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
@@ -88,6 +89,7 @@ class ForeignDrive:
             if index < LAST_COMMUNICATION and kept is not None and kept.row.type == row.type:
                 if index in COMMUNICATION and index != 0x1018 and row.default:
                     kept.value = row.default_bytes(0)
+                kept.row = replace(kept.row, stored=row.stored)
                 kept.readable, kept.writable = row.access != "wo", row.access in ("rw", "wo")
                 dictionary.show(kept)
                 continue

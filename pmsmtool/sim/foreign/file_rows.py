@@ -52,6 +52,8 @@ BY_MODE: Mapping[int, tuple[tuple[int, int, str, str, str], ...]] = {
     10: ((0x6071, 0, "I16", "rw", "0"),),
 }
 """Mandatory in a mode of operation (CiA 402-2, its table of objects per mode)."""
+NOT_KEPT = frozenset({0x1003, 0x1010, 0x1011, 0x1013, 0x1020, 0x6040, 0x6071, 0x607A, 0x60FF, 0x60FE})
+"""Commands and set points; every other object that can be written outlives a reset once it is stored (assumed)."""
 DRIVE_PROFILE = 402
 
 
@@ -172,7 +174,7 @@ def _row(
     access = _ACCESS.get(access, "ro")
     if low is not None and high is not None and not low < high and access == "rw":
         low = high = None if low == high == 0 else low  # both 0: the file's way to say nothing
-    kept = access == "rw" and index >= 0x2000
+    kept = access == "rw" and index not in NOT_KEPT
     return ObjectRow(index, sub, "", name, kind, access, "T", "", _value(value, kind), low, high, kept)
 
 

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: MIT
+"""The first check of drives below the full level: what their objects let be seen, and by name what they do not.
+
+A drive that takes the master's commutation angle is led by a turned vector, as at the full level. A drive that
+commutates by itself is pushed by torque. Currents of single phases, and so the current sensors, are seen by neither.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+from pmsmtool.commissioning.first_check import (
+    CURRENT_SHARE,
+    DURATION_S,
+    HEADROOM,
+    ORDER,
+    SPEED_RAD_S,
+    SPEED_SHARE,
+    TRAVEL_RAD,
+    TURNED_BY,
+    look_at_inputs,
+)
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.standard_drive import StandardDrive
+from pmsmtool.drive.tier_drives import TorqueDrive, pushing_drive
+from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, NotAvailable
+from pmsmtool.experiments.first_push import push_forth_and_back
+from pmsmtool.experiments.first_turn import lead_half_a_turn
+from pmsmtool.experiments.vector_lead import lead_onto_vector
+from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.wiring import (
+    COUNT_FACTORS,
+    NOT_CHECKED,
+    OK,
+    WRONG,
+    Finding,
+    judge_current,
+    judge_push,
+    judge_supply,
+    judge_turn,
+)
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.measurement.capabilities import Capabilities, Method
+from pmsmtool.measurement.tier_identify import HEADROOM as TIER_HEADROOM
+from pmsmtool.measurement.tier_identify import tier_envelope
+
+UNSEEN = {
+    "supply": "the drive does not show its DC link (0x6079)",
+    "phases": "the drive shows no current of a single phase",
+    "current sensors": "the drive shows no current of a single phase",
+    "shaft": "what is wrong comes first",
+    "pole pairs": "the drive turns no vector: it takes no commutation angle (0x60EA)",
+    "encoder sign": "what is wrong comes first",
+}
+FAULT_BY = "safe torque off or the enable input open, no DC link; a limit switch; then " + TURNED_BY
+VOLTAGE_FAULT = re.compile(r"fault 0x3[0-9a-fA-F]{3}\b")
+"""Error codes of the class voltage (CiA 301, 7.2.8)."""
+RUNS_OFF_BY = "an open or shorted phase, or gains of the current loop that do not fit the motor"
+POLE_PAIRS = "motor.pole_pairs"
+
+
+def turns_a_vector(found: Capabilities) -> bool:
+    """Whether the drive takes the master's commutation angle."""
+    return found.row("poles", Method.STANDARD).available
+
+
+def envelope_below_full(
+    drive: CanopenDrive, found: Capabilities, request: IdentifyRequest, stated: MachineFile
+) -> Envelope:
+    """Return what the check may do: a tenth of the rated current, half a turn, 15 s; raises as ``tier_envelope``."""
+    allowed = tier_envelope(drive, replace(request, i_max_apk=None), stated)
+    largest = HEADROOM * CURRENT_SHARE * allowed.i_max_apk / TIER_HEADROOM
+    return replace(
+        allowed,
+        i_max_apk=largest if request.i_max_apk is None else min(request.i_max_apk, largest),
+        speed_max_rad_s=min(allowed.speed_max_rad_s, max(SPEED_RAD_S, SPEED_SHARE * allowed.speed_max_rad_s)),
+        duration_s=DURATION_S,
+        travel_rad=TRAVEL_RAD if turns_a_vector(found) else math.pi,
+    )
+
+
+def check_below_full(
+    drive: CanopenDrive, found: Capabilities, stated: MachineFile, envelope: Envelope, say: Callable[[str], None]
+) -> list[Finding]:
+    """Look at a drive that nobody has seen move, and return one row per thing, those it cannot show included.
+
+    Parameters
+    ----------
+    drive : CanopenDrive
+        As ``open_tier_drive`` gives it.
+    found : Capabilities
+        What it has.
+    stated : MachineFile
+        What is connected.
+    envelope : Envelope
+        As :func:`envelope_below_full`.
+    """
+    connection, node = drive.node.connection, drive.node.node
+    rows = [look_at_inputs(drive)]
+    turns = turns_a_vector(found)
+    moving: StandardDrive | TorqueDrive
+    if turns:
+        moving = StandardDrive(connection, node, drive_map=found.drive_map)
+    else:
+        moving = pushing_drive(connection, node, found.drive_map)
+    try:
+        rows += [_counts(moving, stated), *_held_pole_pairs(drive, stated)]
+        rest_v = _link_v(moving)
+        if rest_v is not None:
+            rows.append(judge_supply(rest_v, None, stated.inverter.U_dc_v))
+        if any(row.verdict == WRONG for row in rows):
+            return _whole(rows)  # nothing is energised against what is known to be wrong
+        i_a = envelope.i_max_apk / HEADROOM
+        if isinstance(moving, TorqueDrive):
+            moving.top_rad_s = envelope.speed_max_rad_s
+        try:
+            with guarded(moving, envelope, say=say) as guard:
+                guard.enable()
+                if turns:
+                    say("shaft: half a turn forward and back by a turned vector")
+                    pole_pairs = round(stated.machine.pole_pairs)
+                    lead_onto_vector(guard, i_a, 0.0)
+                    link = () if rest_v is None else ("U_dc_v",)
+                    turn = lead_half_a_turn(guard, i_a, pole_pairs, 0.0, signals=("theta_m_rad", "i_q_a", *link))
+                    judged = [*judge_current(turn, i_a), *judge_turn(turn, pole_pairs, counts_against=False)]
+                else:
+                    say(f"shaft: torque pushes up to {i_a:.3g} A, forth and back")
+                    judged = judge_push(push_forth_and_back(guard, i_a, 0.5 * envelope.speed_max_rad_s))
+            rows = [row for row in rows if row.looked_at not in {each.looked_at for each in judged}] + judged
+        except IdentificationError as error:
+            rows.append(Finding("shaft", WRONG, error.what, error.likely + "; an open phase; the encoder's sign"))
+        except DriveFault as error:  # the guard has stopped the machine
+            about = "supply" if VOLTAGE_FAULT.search(error.what) else "shaft"
+            rows = [row for row in rows if row.looked_at != about]
+            rows.append(Finding(about, WRONG, error.what, error.likely or FAULT_BY))
+        except LimitExceeded as error:
+            about, likely = ("phases", RUNS_OFF_BY) if error.what.startswith("current ") else ("shaft", TURNED_BY)
+            rows.append(Finding(about, WRONG, error.what, likely))
+    finally:
+        drive.may_be_energised = drive.may_be_energised or moving.may_be_energised
+        moving.close()
+    return _whole(rows)
+
+
+def _whole(rows: list[Finding]) -> list[Finding]:
+    """Return the rows in their order, with one for each thing that this level does not see."""
+    seen = {row.looked_at for row in rows}
+    rows = [*rows, *(Finding(name, NOT_CHECKED, why) for name, why in UNSEEN.items() if name not in seen)]
+    return sorted(rows, key=lambda row: ORDER.index(row.looked_at))
+
+
+def _link_v(drive: StandardDrive) -> float | None:
+    try:
+        return drive.live("U_dc_v")
+    except NotAvailable:
+        return None
+
+
+def _counts(drive: StandardDrive, stated: MachineFile) -> Finding:
+    held, bits = abs(drive.counts_per_turn), stated.encoder.bits
+    factor = held / (1 << bits) if bits else math.nan
+    if not bits:
+        return Finding("encoder counts", NOT_CHECKED, "no file states them")
+    if any(math.isclose(factor, usual, rel_tol=1e-9) for usual in COUNT_FACTORS):
+        shown = f"the drive is set for {held:.6g} per turn, {1 << bits} are stated"
+        return Finding("encoder counts", WRONG, shown, "lines given for counts, or the reverse")
+    if math.isclose(factor, 1.0, rel_tol=1e-9):
+        return Finding("encoder counts", OK, f"{held:.6g} units of position per turn, as stated")
+    return Finding(
+        "encoder counts", NOT_CHECKED,
+        f"the drive counts {held:.6g} units of position per turn, {1 << bits} counts are stated: units may be scaled",
+    )  # fmt: skip
+
+
+def _held_pole_pairs(drive: CanopenDrive, stated: MachineFile) -> list[Finding]:
+    """Compare the pole pairs that the drive is set for, where its map knows them; that is no measurement."""
+    if POLE_PAIRS not in drive.node.map.cells:
+        return []
+    held, said = round(drive.parameters.read_value(POLE_PAIRS)), round(stated.machine.pole_pairs)
+    if held == said:
+        return [Finding("pole pairs", NOT_CHECKED, f"the drive is set for the stated {said}; not measured")]
+    shown = f"the drive is set for {held}, {said} are stated"
+    return [Finding("pole pairs", WRONG, shown, "poles given for pole pairs, or another motor's set-up")]

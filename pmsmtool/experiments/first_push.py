@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: MIT
+"""The first push of a shaft whose drive commutates by itself: forth and back by a small torque, with its sign."""
+
+from __future__ import annotations
+
+import math
+
+from pmsmtool.drive.port import Drive
+from pmsmtool.errors import IdentificationError
+from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
+from pmsmtool.experiments.signals import table
+from pmsmtool.trace import Trace
+
+ANSWER_RAD = 0.02
+"""Angle that counts as an answer: an encoder of 1024 increments has three of them."""
+WAY_RAD = 0.3
+"""Way of a push until it is braked: some electrical angles, of which an open phase has weak ones."""
+FASTEST_RAD_S = 10.0
+"""A light shaft is pushed by less, to this speed: a third of the speed limit."""
+SHORTEST_S, LONGEST_S = 0.02, 0.5
+HELD_S = 0.1
+"""Slow current loops have settled by then."""
+CURRENT_FLOWS = 0.3
+"""Current shown, of the one asked for, from which it is the shaft that does not move."""
+LEAST_NET = 0.3
+"""Of the current, what accelerates at least: friction is known roughly."""
+
+
+def push_forth_and_back(drive: Drive, i_a: float, speed_rad_s: float) -> Trace:
+    """Push with a torque current one way, brake it, and the other way; one row per push.
+
+    Parameters
+    ----------
+    drive : Drive
+        Enabled, at rest, in torque mode; it holds zero current on return.
+    i_a : float
+        Current (A peak).
+    speed_rad_s : float
+        Mechanical speed that a push is to stay below.
+
+    Returns
+    -------
+    Trace
+        ``i_command_a``, ``i_q_a`` at the end of the push (A peak), ``way_rad`` until then.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``: the shaft does not answer, and the current flows.
+    """
+    try:
+        answer = acceleration_per_ampere(drive, i_a, _answered)
+    except IdentificationError as error:
+        if error.reason != "E_EXCITATION":
+            raise
+        return _held(drive, i_a, error)
+    fastest = min(FASTEST_RAD_S, speed_rad_s)
+    most = answer.friction_a + fastest / (SHORTEST_S * answer.per_ampere)
+    i_a = min(i_a, most)
+    net = answer.per_ampere * max(i_a - answer.friction_a, LEAST_NET * i_a)
+    seconds = min(math.sqrt(2.0 * WAY_RAD / net), fastest / net, LONGEST_S)
+    rows = []
+    for current in (i_a, -i_a):
+        before = drive.live("theta_m_rad")
+        drive.command_current(0.0, current)
+        drive.wait(seconds)
+        shown, way = drive.live("i_q_a"), drive.live("theta_m_rad") - before
+        drive.command_current(0.0, -current)
+        drive.wait(seconds)
+        drive.command_current(0.0, 0.0)
+        drive.wait(2.0 * seconds)
+        rows.append({"i_command_a": current, "i_q_a": shown, "way_rad": way})
+    return table(rows, [4.0 * seconds * k for k in range(len(rows))])
+
+
+def _answered(way_rad: float, seconds: float) -> bool:
+    if way_rad <= ANSWER_RAD and seconds > LONGEST_S:
+        raise IdentificationError(
+            "E_EXCITATION", "the shaft does not answer a tenth of the rated current", where="torque push",
+            likely="brake shut, or the shaft is held; a commutation that is not set up",
+            hint="free the shaft; run the maker's own set-up first",
+        )  # fmt: skip
+    return way_rad > ANSWER_RAD
+
+
+def _held(drive: Drive, i_a: float, error: IdentificationError) -> Trace:
+    """Return what is shown of the current where the shaft stands still, or raise: it flows, so the shaft is held."""
+    rows = []
+    for current in (i_a, -i_a):
+        drive.command_current(0.0, current)
+        drive.wait(HELD_S)
+        rows.append({"i_command_a": current, "i_q_a": drive.live("i_q_a"), "way_rad": 0.0})
+    drive.command_current(0.0, 0.0)
+    if all(row["i_q_a"] / row["i_command_a"] > CURRENT_FLOWS for row in rows):
+        raise error
+    return table(rows, [HELD_S * k for k in range(len(rows))])

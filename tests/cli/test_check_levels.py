@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: MIT
+"""The first check of drives that show less: what is wrong is named where it shows, the rest is listed, none passes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pmsmtool.identification.wiring import NOT_CHECKED, WRONG, judge_current, judge_push
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.machine.profile import machine_path
+from pmsmtool.trace import Trace
+from tests.cli.conftest import Tool
+from tests.foreign.data_sheets import epos4, write_eds
+
+
+def checked(tool: Tool, level: str, extra: str = "encoder_bits = 17") -> tuple[int, dict[str, str]]:
+    text = dump_machine_file(load_machine_file(machine_path("interior-2k2")))
+    Path("sheet.toml").write_text(text, encoding="utf-8")
+    lines = text.splitlines()
+    at = lines.index("[simulation]") + 1
+    rest = [line for line in lines[at:] if line.partition(" ")[0] != extra.partition(" ")[0]]
+    Path("drive.toml").write_text("\n".join([*lines[:at], extra, *rest]), encoding="utf-8")
+    channel = f"drive.toml?nv=:memory:&{level}"
+    code, out, told = tool("-i", "pmsmsim", "-c", channel, "check", "sheet.toml", "--yes", "--json")
+    assert "at most 15 s" in told and "NOT CHECKED" in told
+    return code, {row["looked_at"]: row["verdict"] for row in json.loads(out)["findings"]}
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize(
+    ("extra", "wrong"),
+    [
+        ("encoder_bits = 17", ""), ("leads_swapped = true", "encoder sign"), ("U_dc_v = 300.0", "supply"),
+        ('rotor = "locked"', "shaft"), ('phase_open = "b"', "phases"), ("encoder_bits = 15", "encoder counts"),
+    ],
+)  # fmt: skip
+def test_a_drive_with_a_recorder(extra: str, wrong: str, tool: Tool) -> None:
+    code, rows = checked(tool, "tier=recorder", extra)
+    assert [name for name, verdict in rows.items() if verdict == WRONG] == ([wrong] if wrong else []), rows
+    assert code == (1 if wrong else 10)
+    assert rows["current sensors"] == NOT_CHECKED
+
+
+@pytest.mark.chain
+def test_a_makers_drive_lists_what_it_cannot_show(tool: Tool, tmp_path: Path) -> None:
+    code, rows = checked(tool, f"eds={write_eds(tmp_path / 'x.eds', epos4())}")
+    assert code == 10 and rows["shaft"] == rows["encoder sign"] == "ok"
+    assert {name for name, verdict in rows.items() if verdict == NOT_CHECKED} == {
+        "supply", "phases", "current sensors", "pole pairs",
+    }  # fmt: skip
+
+
+def test_without_a_machine_file_nothing_moves(tool: Tool) -> None:
+    code, _, told = tool("-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&tier=recorder", "check", "--yes")
+    assert code == 2 and "MACHINE is missing" in told
+
+
+def pushed(i_q_a: tuple[float, float], way_rad: tuple[float, float]) -> dict[str, str]:
+    signals = {"i_command_a": np.array([1.0, -1.0]), "i_q_a": np.array(i_q_a), "way_rad": np.array(way_rad)}
+    return {
+        row.looked_at: row.verdict
+        for row in judge_push(Trace(np.array([0.0, 1.0]), signals, dict.fromkeys(signals, ""), {}))
+    }
+
+
+def test_pushes_are_judged_by_current_way_and_sign() -> None:
+    assert pushed((0.9, -0.9), (0.3, -0.2)) == {"shaft": "ok", "encoder sign": "ok"}
+    assert pushed((0.9, -0.9), (-0.3, 0.2)) == {"shaft": "ok", "encoder sign": WRONG}
+    assert pushed((0.9, -0.9), (0.3, 0.2)) == {"shaft": WRONG}
+    assert pushed((0.1, -0.1), (0.0, 0.0)) == {"phases": WRONG, "shaft": "not seen"}
+    assert pushed((0.71, -0.71), (0.3, -0.2))["shaft"] == "ok", "a reading as peak of what is rms"
+
+
+def test_a_current_that_breaks_in_at_some_angles_is_an_open_phase() -> None:
+    angle = np.linspace(0.0, 6.0, 61)
+    whole = {"i_q_a": np.full(61, 0.9), "at_rest": np.zeros(61)}
+    assert not judge_current(Trace(angle, whole, dict.fromkeys(whole, ""), {}), 1.0)
+    (found,) = judge_current(Trace(angle, {**whole, "i_q_a": np.sin(angle)}, dict.fromkeys(whole, ""), {}), 1.0)
+    assert found.looked_at == "phases" and found.verdict == WRONG

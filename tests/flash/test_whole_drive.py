@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+"""A foreign drive saved by its data sheet and brought to a spare part: all equal, what is refused is named."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import pytest
+from click.testing import CliRunner, Result
+
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.connect import connect
+from pmsmtool.cli.main import cli
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.errors import ConfigError, Interrupted, Partial
+from pmsmtool.flash.download import Download
+from pmsmtool.flash.journal import JournalFolder, read_snapshot
+from pmsmtool.flash.restore import check_snapshot, old_marks, plan_restore
+from pmsmtool.flash.whole_drive import Listed, kept_objects, readdressed, take_whole_backup, whole_map
+from pmsmtool.sim.node.node import Node
+from tests.foreign.data_sheets import Row, epos4, write_eds
+from tests.simulated_bus import settle
+
+STORE: tuple[Row, ...] = ((0x1010, 0, "U8", "ro", "1"), (0x1010, 1, "U32", "rw", "1"))
+PDO: tuple[Row, ...] = (
+    (0x1800, 0, "U8", "ro", "2"), (0x1800, 1, "U32", "rw", "$NODEID+0x180"), (0x1800, 2, "U8", "rw", "255"),
+    (0x1A00, 0, "U8", "rw", "1"), (0x1A00, 1, "U32", "rw", "0x60410010"), (0x1A00, 2, "U32", "rw", "0"),
+)  # fmt: skip
+ROWS = (*epos4(), *STORE, *PDO, (0x2000, 0, "U8", "rw", "1"), (0x31E4, 1, "U16", "rw", "0"))
+CHANGED = {(0x30A0, 1): 777_000, (0x30A0, 2): 888_000, (0x3001, 2): 9000, (0x6080, 0): 2900, (0x1017, 0): 250}
+
+
+@contextmanager
+def opened(path: Path, machine: str = "interior-2k2") -> Iterator[DriveNode]:
+    with connect("pmsmsim", f"{machine}?nv=:memory:&eds={path}") as connection:
+        node = DriveNode(connection, 1)
+        yield node
+        node.close()
+
+
+def listed() -> list[Listed]:
+    names = {0x2000: "Node ID", 0x31E4: "Internal data recorder controlword"}
+    return [Listed(i, s, names.get(i, "object")) for i, s, _, access, _ in ROWS if access == "rw"]
+
+
+def write(node: DriveNode, values: dict[tuple[int, int], int]) -> None:
+    for (index, sub), value in values.items():
+        node.sdo.download(index, sub, value.to_bytes(len(node.sdo.read(index, sub)), "little"))
+
+
+def map_pdo(node: DriveNode) -> None:
+    write(node, {(0x1800, 1): 0x80000181, (0x1A00, 0): 0, (0x1A00, 1): 0x60640020, (0x1A00, 2): 0x60410010})
+    write(node, {(0x1A00, 0): 2, (0x1800, 2): 1, (0x1800, 1): 0x181})
+
+
+def refuse(node: DriveNode, *places: tuple[int, int]) -> None:
+    simulated = cast(Node, node.connection.bus.line.nodes[0])  # type: ignore[attr-defined]
+    simulated.set_faults(
+        refuse=lambda index, sub: AbortCode.VALUE if (index, sub) in places else None, distort=None, store_scale=1.0
+    )
+
+
+def job(node: DriveNode, snapshot, folder: Path) -> Download:  # type: ignore[no-untyped-def]
+    identity = node.identity()
+    node.map = whole_map(identity)
+    plan = plan_restore(node, snapshot)
+    return Download(node, identity, plan, old_marks(snapshot), JournalFolder(identity, folder))
+
+
+def test_commands_set_points_and_what_is_of_one_device_are_left_out() -> None:
+    kept, left_out = kept_objects(listed())
+    order = [(item.index, item.sub) for item in kept]
+    assert order.index((0x6080, 0)) < order.index((0x1017, 0)), "communication last"
+    reasons = {label[:9]: why for label, why in left_out.items()}
+    for place in ("0x2000:00", "0x31E4:01", "0x1010:01", "0x6040:00", "0x6071:00", "0x60FF:00"):
+        assert place in reasons
+    names = ("Internal LR Identification Control", "Current Mode Setting Value", "Serial number", "Controller gain")
+    kept, left_out = kept_objects(Listed(0x2400, sub, name) for sub, name in enumerate(names))
+    assert [item.name for item in kept] == ["Controller gain"] and len(left_out) == 3
+
+
+def test_a_spare_part_holds_all_of_it(tmp_path: Path) -> None:
+    path = write_eds(tmp_path / "x.eds", ROWS)
+    with opened(path) as node:
+        write(node, CHANGED)
+        map_pdo(node)
+        saved, _ = take_whole_backup(node, node.identity(), listed())
+    with opened(path, "mtpv-test") as node:
+        with pytest.raises(ConfigError, match="--other-drive|serial"):
+            check_snapshot(whole_map(node.identity()), saved, node.identity())
+        check_snapshot(whole_map(node.identity()), saved, node.identity(), other_drive=True)
+        outcome = job(node, saved, tmp_path).run()
+        assert not outcome.refused and outcome.stored and outcome.written >= len(CHANGED) + 3
+        for entry in saved.entries:
+            assert node.sdo.read(entry.index, entry.sub) == entry.old, entry.name
+
+
+def test_a_refused_object_is_named_and_takes_nothing_along(tmp_path: Path) -> None:
+    path = write_eds(tmp_path / "x.eds", ROWS)
+    with opened(path) as node:
+        write(node, CHANGED)
+        saved, _ = take_whole_backup(node, node.identity(), listed())
+    with opened(path, "mtpv-test") as node:
+        refuse(node, (0x30A0, 1), (0x6080, 0))
+        outcome = job(node, saved, tmp_path).run()
+        assert {name[:9] for name in outcome.refused} == {"0x30A0:01", "0x6080:00"}
+        for entry in saved.entries:
+            equal = node.sdo.read(entry.index, entry.sub) == entry.old
+            assert equal == (entry.name not in outcome.refused), entry.name
+        journal = JournalFolder(node.identity(), tmp_path).last()
+        assert journal is not None and journal.state == "done"
+
+
+@pytest.mark.parametrize("at", [3, 8, 12])
+def test_an_interrupt_brings_the_old_objects_back(tmp_path: Path, at: int) -> None:
+    """Also in the middle of a PDO, which is off then."""
+    path = write_eds(tmp_path / "x.eds", ROWS)
+    with opened(path) as node:
+        write(node, CHANGED)
+        map_pdo(node)
+        saved, _ = take_whole_backup(node, node.identity(), listed())
+    with opened(path, "mtpv-test") as node:
+        before, _ = take_whole_backup(node, node.identity(), listed())
+        download, original, count = job(node, saved, tmp_path), node.sdo.download, 0
+
+        def interrupted(*arguments: object, **options: object) -> object:
+            nonlocal count
+            count += 1
+            if count == at:
+                raise KeyboardInterrupt
+            return original(*arguments, **options)  # type: ignore[arg-type]
+
+        node.sdo.download = interrupted  # type: ignore[method-assign, assignment]
+        with pytest.raises(Interrupted, match="exactly the old set"):
+            download.run()
+        assert count > at
+        for entry in before.entries:
+            if entry.name.startswith("0x"):
+                assert node.sdo.read(entry.index, entry.sub) == entry.old, entry.name
+
+
+def test_identifiers_follow_the_node_id(tmp_path: Path) -> None:
+    with opened(write_eds(tmp_path / "x.eds", ROWS)) as node:
+        saved, _ = take_whole_backup(node, node.identity(), listed())
+    words = {(e.index, e.sub): int.from_bytes(e.old, "little") for e in readdressed(saved, 7).entries}
+    assert words[0x1800, 1] & 0x7FF == 0x187 and readdressed(saved, 1) == saved
+    other = replace(saved, identity=replace(saved.identity, node=9))
+    assert readdressed(other, 7) == other, "an identifier that somebody chose stays"
+
+
+def tool(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, [*arguments])
+
+
+def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settle(tmp_path, monkeypatch)
+    path = write_eds(tmp_path / "x.eds", ROWS)
+    first, spare = f"interior-2k2?nv=a.nv&eds={path}", f"mtpv-test?nv=b.nv&eds={path}"
+    with connect("pmsmsim", first) as connection:
+        node = DriveNode(connection, 1)
+        write(node, CHANGED)
+        node.store()
+    outcome = tool("--sim", first, "backup", "--eds", str(path), "-o", "drive.json", "--json")
+    assert outcome.exit_code == 0 and "0x6040:00" in str(json.loads(outcome.stdout)["left_out"])
+    assert "serial" in str(tool("--sim", spare, "--yes", "restore", "drive.json").exception)
+    assert tool("--sim", spare, "--yes", "restore", "drive.json", "--other-drive").exit_code == 0
+    with connect("pmsmsim", spare) as connection:
+        node = DriveNode(connection, 1)
+        for entry in read_snapshot(tmp_path / "drive.json").entries:
+            assert node.sdo.read(entry.index, entry.sub) == entry.old
+    again = tool("--sim", spare, "--yes", "restore", "drive.json", "--other-drive")
+    assert again.exit_code == 0 and "nothing was done" in again.stdout
+    undone = tool("--sim", spare, "--yes", "restore")
+    assert undone.exit_code == 0, undone.exception
+    with connect("pmsmsim", spare) as connection:
+        assert int.from_bytes(DriveNode(connection, 1).sdo.read(0x30A0, 1), "little") != CHANGED[0x30A0, 1]
+
+
+def test_a_drive_that_cannot_store_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settle(tmp_path, monkeypatch)
+    path = write_eds(tmp_path / "x.eds", tuple(row for row in ROWS if row not in STORE))
+    with opened(path) as node:
+        write(node, CHANGED)
+        saved, _ = take_whole_backup(node, node.identity(), listed())
+    (tmp_path / "drive.json").write_text(saved.dumps())
+    error = tool("--sim", f"mtpv-test?nv=:memory:&eds={path}", "--yes", "restore", "drive.json", "--other-drive")
+    assert isinstance(error.exception, Partial) and "no 0x1010" in str(error.exception)
