@@ -258,7 +258,7 @@ def main() -> int:
     print(f"{len(results)} drives of {len(FAMILIES)} families")
     for key in ("K_p", "K_i", "current"):
         right, bad = counted[key, "right"], counted[key, "wrong"]
-        known = len(results) - counted[key, "published"]
+        known = max(1, len(results) - counted[key, "published"])
         sizes = sorted(100 * abs(r.errors[key]) for r in results if key in r.errors)
         spread = f"; error median {sizes[len(sizes) // 2]:.1f} %, largest {sizes[-1]:.1f} %" if sizes else ""
         print(f"{key}: decided {right + bad} of {known} ({100 * (right + bad) / known:.0f} %), wrong {bad}{spread}")

@@ -21,8 +21,12 @@ MODEL_DOUBT = (0.03, 0.05)
 Measured error of 40 random drives (``benchmarks/learned_gains.py``): see docs/learned-gains.md."""
 CURRENT_BANDWIDTH_RAD_S, BANDWIDTH_DOUBT = 2000.0, 0.6
 """What a maker's current loop has, about; the standard deviation of what follows from it (relative): 600 to 6000."""
-CHANGE_DOUBT = (0.02, 0.03)
-"""What it leaves of a ratio of two gains of one drive (standard deviation, relative): most of it cancels."""
+CHANGE_DOUBT = (0.04, 0.07, 0.07)
+"""What it leaves of a ratio of two K_p, K_i or K_i / K_p of one drive (standard deviation, relative)."""
+SPREAD_DOUBT = 0.5
+"""Of what a scale differs between the drive's own and changed gains (standard deviation, relative)."""
+LEFT_DOUBT = 0.5
+"""Of what steps of two sizes say about steps without end (standard deviation, relative)."""
 FITS = 14.2
 """Largest chi-square of a hypothesis that explains three ratios (3 degrees of freedom, 3 sigma)."""
 APART = 16.0
@@ -44,7 +48,9 @@ EXPONENTS = {
     "no effect": (0.0, 0.0),
     "no effect but the gain's": (1.0, 0.0),
 }
-"""How K_i follows the counts of the gain and of the integral part: parallel, and three series forms."""
+"""How K_i follows the counts of the gain and of the integral part: parallel, and three series forms.
+
+The integral part leaves K_p alone, so that its effect is seen in K_i / K_p, which a fit knows better than K_i."""
 UNITS = {"gain": "N m s/rad", "value": "N m/rad", "rate": "1/s", "time": "s"}
 
 
@@ -131,18 +137,28 @@ class Convention:
     why: str = ""
 
 
+K_P, K_I, RATE = 0, 1, 2
+
+
 def _log(observation: Observation, which: int) -> float:
     loop = observation.loop
-    return math.log((loop.K_p_per_J, loop.K_i_per_J)[which])
+    return math.log((loop.K_p_per_J, loop.K_i_per_J, loop.K_i_per_J / loop.K_p_per_J)[which])
 
 
 def _change(after: Observation, base: Sequence[Observation], which: int) -> tuple[float, float]:
-    """Return the change of a gain's logarithm, and its standard deviation: from what repeats, and what may not cancel.
+    """Return the change of a gain's logarithm, and its standard deviation."""
+    return _log(after, which) - _log(base[0], which), CHANGE_DOUBT[which]
 
-    The residual of a record is mostly what the model lacks, and the same in every record of a drive.
+
+def _at_large_steps(logs: Sequence[float], half_size: float) -> tuple[float, float]:
+    """Return the first logarithm as steps without end would give it, and its standard deviation.
+
+    Friction and the inverter's dead time are a share of a step that is twice as large at half its size: what the first
+    of the logarithms differs from the one at half the size is left of it, and half of that is doubted.
     """
-    before, scatter = _mean([_log(o, which) for o in base])
-    return _log(after, which) - before, math.hypot(scatter, CHANGE_DOUBT[which])
+    _, spread = _mean(logs)
+    left = logs[0] - half_size
+    return logs[0] + left, math.hypot(SPREAD_DOUBT * spread, LEFT_DOUBT * left)
 
 
 def _mean(logs: Sequence[float]) -> tuple[float, float]:
@@ -157,7 +173,7 @@ def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, ro
     Parameters
     ----------
     base : sequence of Observation
-        With the drive's own gains, at different sizes of the steps.
+        With the drive's own gains: with steps of full size, and of half of it.
     gain_changed : Observation or None
         With other counts of the gain alone; None: it could not be changed.
     rotor : Rotor
@@ -165,16 +181,16 @@ def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, ro
     """
     if gain_changed is None:
         return Learned(name, None, math.inf, None, "", "the gain was not changed")
-    change, std = _change(gain_changed, base, 0)
+    change, std = _change(gain_changed, base, K_P)
     asked = math.log(gain_changed.gain / base[0].gain)
     if abs(asked) < EXCLUDED * std:
         return Learned(name, None, math.inf, None, "", f"a change by {100 * std:.0f} % would not be seen")
     if abs(change - asked) > NOT_SAME * std:
         why = f"the response follows the counts with the exponent {change / asked:.2f}, not 1"
         return Learned(name, None, math.inf, None, "", why)
-    logs = [_log(o, 0) - math.log(o.gain) for o in (*base, gain_changed)]
-    mean, spread = _mean(logs)
-    std = math.hypot(spread, MODEL_DOUBT[0], rotor.std)
+    logs = [_log(o, K_P) - math.log(o.gain) for o in (base[0], gain_changed, base[1])]
+    mean, std = _at_large_steps(logs[:-1], logs[-1])
+    std = math.hypot(std, MODEL_DOUBT[0], rotor.std)
     scale, half = rotor.gain_per_rad_s(math.exp(mean)), NORMAL_95 * std
     if half > WIDEST:
         return Learned(name, None, half, "value", UNITS["gain"], f"its interval of {100 * half:.0f} % is too wide")
@@ -191,10 +207,10 @@ def integral_scale(
     """Return form and scale of the integral part; parameters as of :func:`gain_scale`."""
     if gain_changed is None or not integral_changed:
         return Learned(name, None, math.inf, None, "", "it was not changed")
-    by_gain, std_gain = _change(gain_changed, base, 1)
+    by_gain, std_gain = _change(gain_changed, base, K_I)
     ratio_gain = math.log(gain_changed.gain / base[0].gain)
     by_integral = [
-        (*_change(after, base, 1), math.log(after.integral / base[0].integral)) for after in integral_changed
+        (*_change(after, base, RATE), math.log(after.integral / base[0].integral)) for after in integral_changed
     ]
     chi_squares = {
         form: ((by_gain - of_gain * ratio_gain) / std_gain) ** 2
@@ -207,7 +223,7 @@ def integral_scale(
         return Learned(name, None, half, form, UNITS.get(form or "", ""), why, chi_squares)
 
     for after in integral_changed:
-        moved, std = _change(after, base, 0)
+        moved, std = _change(after, base, K_P)
         if abs(moved) > max(NOT_SAME * std, UNMOVED * abs(math.log(after.integral / base[0].integral))):
             return unknown(f"its change moved K_p by {100 * moved:.0f} %")
     if chi_squares[best] > FITS:
@@ -217,13 +233,13 @@ def integral_scale(
     if best not in UNITS:
         return unknown(f"its form is {best!r}, which a drive map cannot say")
     relative = best != "value"
-    observed = (*base, gain_changed, *integral_changed)
+    observed = (base[0], gain_changed, integral_changed[0], base[1])  # the smallest K_i is known least
     logs = []
     for o in observed:
-        kept = _log(o, 1) - (_log(o, 0) if relative else 0.0)
+        kept = _log(o, RATE if relative else K_I)
         logs.append((-kept if best == "time" else kept) - math.log(o.integral))
-    mean, spread = _mean(logs)
-    half = NORMAL_95 * math.hypot(spread, MODEL_DOUBT[1], 0.0 if relative else rotor.std)
+    mean, std = _at_large_steps(logs[:-1], logs[-1])
+    half = NORMAL_95 * math.hypot(std, MODEL_DOUBT[1], 0.0 if relative else rotor.std)
     if half > WIDEST:
         return unknown(f"its interval of {100 * half:.0f} % is too wide", best, half)
     scale = math.exp(mean) if relative else rotor.gain_per_rad_s(math.exp(mean))

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration
-from pmsmtool.drive.guard import GuardedDrive, guarded
+from pmsmtool.drive.envelope import Envelope, largest_acceleration
+from pmsmtool.drive.guard import WATCH_S, GuardedDrive, guarded
 from pmsmtool.drive.motion_objects import allowed, held, speed_limits
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Shape
@@ -35,9 +35,11 @@ INTEGRAL_DOWN = 0.8
 """First change of an integral part: where it is a time, its gain rises by 1.25."""
 FURTHER_DOWN = 0.5
 """Second change of an integral part, towards the smaller gain."""
+SURE = 0.4
+"""Share of the first change that must be seen before the second: noise and friction leave a fifth."""
 MOST_UP = 1.25
-LEAST_MARGIN_RAD = math.radians(40.0)
-"""Predicted phase margin below which nothing is changed."""
+LEAST_MARGIN_RAD, LEAST_MARGIN_DOWN_RAD = math.radians(40.0), math.radians(30.0)
+"""Predicted phase margin below which nothing is changed: where a gain may rise, and where it can only fall."""
 TRIP = 3.0
 """Oscillation over the one with the drive's own gains, at which the voltage is removed."""
 AIM_SHARE = 0.5
@@ -54,6 +56,8 @@ INTEGRAL_S, LONGEST = 0.1, 2.5
 SETTLE_S = 0.8
 PATTERN = (*(0,) * 8, *(1,) * 8, *(0,) * 6, *(1,) * 4, *(0,) * 8, *(1,) * 6, *(0,) * 6)
 """Two levels of speed, held for 0.2 to 0.4 s: a loop of 25 to 200 rad/s and an integral of 2 to 40 rad/s."""
+SEEN_S = 2.0 * WATCH_S
+"""A speed beyond its limit is seen and the voltage off within this time."""
 REST_S, REST_RAD = 0.3, 2e-3
 COARSEST = 0.12
 """Largest deviation of a ratio in whole counts from the one wanted."""
@@ -149,15 +153,16 @@ def refuse_unsafe(node: DriveNode, envelope: Envelope) -> None:
 
 
 def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: float, speed_max_rad_s: float) -> float:
-    """Return the largest current that cannot bring the shaft beyond the speed limit before a dead tool is noticed.
+    """Return the largest current that cannot bring the shaft beyond the speed limit before this program sees it.
 
-    A drive with a speed limit of its own keeps it; of any other the current is cut.
+    The drive's speed loop keeps the speed, also when the tool is dead; this is for a loop that runs away. A drive with
+    a speed limit of its own keeps it; of any other the current is cut.
     """
     acceleration = largest_acceleration(machine, i_max_apk)
     if allowed(drive.node, speed_limits(drive.node)) is not None or acceleration is None:
         return i_max_apk
     room = (1.0 - AIM_SHARE * (1.0 + MOST_STEP)) * speed_max_rad_s
-    return i_max_apk * min(1.0, room / (acceleration * OFF_S))
+    return i_max_apk * min(1.0, room / (acceleration * SEEN_S))
 
 
 def _refuse_turning(drive: SpeedLoopDrive) -> None:
@@ -203,6 +208,19 @@ def learn_speed_loop(
     return found
 
 
+def _smaller(own: SpeedLoop, changed: SpeedLoop) -> float | None:
+    """Return in which ratio counts must change to make K_i smaller; None where that is not sure.
+
+    K_i / K_p must show it, for the fit tells K_i and K_p apart least; K_i must not show the contrary.
+    """
+    sure = SURE * abs(math.log(INTEGRAL_DOWN))
+    K_i = math.log(changed.K_i_per_J / own.K_i_per_J)
+    relative = K_i - math.log(changed.K_p_per_J / own.K_p_per_J)
+    if relative < -sure and K_i < 0.5 * sure:
+        return FURTHER_DOWN
+    return 1.0 / FURTHER_DOWN if relative > sure and K_i > -0.5 * sure else None
+
+
 class _Learner:
     """One run; the guard has the drive."""
 
@@ -235,9 +253,8 @@ class _Learner:
         half = self._observe("with steps of half the size", 0.5 * step, counts, own.loop)
         gain_changed = self._changed(gain, DOWN, own.loop, (DOWN, DOWN), step, counts)
         integral_changed = [self._changed(integral, INTEGRAL_DOWN, own.loop, (1.0, MOST_UP), step, counts)]
-        if integral_changed[0] is not None:  # which way it acts is known now: further down, and safely so
-            risen = integral_changed[0].loop.K_i_per_J > own.loop.K_i_per_J
-            further = 1.0 / FURTHER_DOWN if risen else FURTHER_DOWN
+        further = None if integral_changed[0] is None else _smaller(own.loop, integral_changed[0].loop)
+        if further is not None:
             integral_changed.append(self._changed(integral, further, own.loop, (1.0, FURTHER_DOWN), step, counts))
         found = [observation for observation in integral_changed if observation is not None]
         return LearnedLoop((own, half), gain_changed, found, unit, self.notes)
@@ -311,10 +328,11 @@ class _Learner:
             return None
         a, b, lag_s = own.K_p_per_J, own.K_i_per_J, own.lag_s
         margin = min(phase_margin_rad(a * p, b * i, lag_s) for p in (1.0, worst[0]) for i in (1.0, worst[0], worst[1]))
-        if margin < LEAST_MARGIN_RAD:
+        least = LEAST_MARGIN_RAD if max(worst) > 1.0 else LEAST_MARGIN_DOWN_RAD
+        if margin < least:
             self.notes.append(
                 f"{gain.name}: not changed, for the predicted phase margin is {math.degrees(margin):.0f} deg, below "
-                f"{math.degrees(LEAST_MARGIN_RAD):.0f}"
+                f"{math.degrees(least):.0f}"
             )
             return None
         try:

@@ -28,16 +28,12 @@ def b_of(form: str, gain: int, integral: int) -> float:
     return {"value": A0 * RATE * ratio, "rate": a * RATE * ratio, "time": a * RATE / ratio, "none": A0 * RATE}[form]
 
 
-def observed(form: str, noise: float = 0.01) -> tuple[list[Observation], Observation, list[Observation]]:
-    def one(gain: int, integral: int, sign: int = 0) -> Observation:
-        b = b_of(form, gain, integral) * math.exp(sign * noise)
-        return Observation(gain, integral, loop(A0 * gain / COUNTS, b))
+def observed(form: str, half_size: float = 0.0) -> tuple[list[Observation], Observation, list[Observation]]:
+    def one(gain: int, integral: int, off: float = 0.0) -> Observation:
+        return Observation(gain, integral, loop(A0 * gain / COUNTS, b_of(form, gain, integral) * math.exp(off)))
 
-    return (
-        [one(COUNTS, INTEGRALS, 1), one(COUNTS, INTEGRALS, -1)],
-        one(1400, INTEGRALS),
-        [one(COUNTS, 400), one(COUNTS, 250)],
-    )
+    base = [one(COUNTS, INTEGRALS), one(COUNTS, INTEGRALS, half_size)]
+    return base, one(1400, INTEGRALS), [one(COUNTS, 400), one(COUNTS, 250)]
 
 
 @pytest.mark.parametrize(
@@ -55,9 +51,19 @@ def test_each_form_is_told_apart(form: str, unit: str, scale: float) -> None:
 
 
 def test_what_is_not_told_apart_stays_unknown() -> None:
-    base, gain_changed, integral_changed = observed("rate", noise=0.15)
-    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    base, _, integral_changed = observed("value")
+    between = Observation(1400, INTEGRALS, loop(0.7 * A0, math.sqrt(0.7) * A0 * RATE))
+    found = integral_scale(base, between, integral_changed, ROTOR, I)
     assert found.scale is None and "not told apart" in found.why
+
+
+def test_steps_of_two_sizes_say_what_friction_leaves() -> None:
+    base, gain_changed, integral_changed = observed("rate", half_size=-0.04)
+    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    assert found.scale == pytest.approx(math.exp(0.04) * RATE / INTEGRALS)
+    base, gain_changed, integral_changed = observed("rate", half_size=-0.15)
+    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    assert found.scale is None and "too wide" in found.why
 
 
 def test_an_object_without_effect_is_named() -> None:
