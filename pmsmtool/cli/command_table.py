@@ -56,6 +56,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("identify", "pmsmtool.cli.identify:identify_command", Section.MOVE, "Measure the machine on its drive."),
     Row("track", "pmsmtool.cli.track:track_command", Section.LOOK, "Follow R and psi while the machine runs."),
     Row("check", "pmsmtool.cli.check:check_command", Section.MOVE, "Look for wrong wiring at a first power-on."),
+    Row("map", "pmsmtool.cli.map:map_group", Section.MOVE, "Find out what a drive's gains count."),
     Row("jog", "pmsmtool.cli.jog:jog_command", Section.MOVE, "Move shortly, within limits."),
     Row("prove", "pmsmtool.cli.prove:prove_command", Section.MOVE, "Show that the machine does what was designed."),
     Row("param", "pmsmtool.cli.param:param_command", Section.WRITE, "Read, write, compare parameters."),

@@ -193,12 +193,32 @@ def claimed_node(connection: Connection, node: int | None) -> int:
     ------
     SecondMaster
         Another program works with the drive.
+    SafetyRefusal
+        Gains that an interrupted `map learn` left changed cannot be restored.
     """
     from pmsmtool.drive.drive_lock import claim
 
     chosen = choose_node(connection, node)
     claim(connection, chosen)
+    _restore_gains(connection, chosen)
     return chosen
+
+
+def _restore_gains(connection: Connection, node_id: int) -> None:
+    """Bring back what a killed `map learn` left changed, before anything else is done with the drive."""
+    from pmsmtool.flash.gain_journal import any_left, restore_left
+
+    if not any_left():
+        return
+    from pmsmtool.drive.drive_node import DriveNode
+
+    node = DriveNode(connection, node_id)
+    try:
+        count = restore_left(node, node.identity())
+    finally:
+        node.close()
+    if count:
+        click.echo(f"node {node_id}: {count} gain(s) restored that an interrupted `map learn` left changed", err=True)
 
 
 def choose_node(connection: Connection, node: int | None) -> int:

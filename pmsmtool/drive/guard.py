@@ -47,6 +47,7 @@ So a main thread that hangs lets the drive stop after at most this time, one hea
 declared time, together 0.5 s."""
 LOCKED_TRAVEL_RAD = math.radians(20.0)
 """A clamp and its coupling give by a few degrees; a shaft that goes further is not locked."""
+_BUG = "this is a bug worth reporting"
 _TURNS = "the shaft turns, though it is said to be locked"
 _NEXT_STEP = {
     "current": "raise the limit knowingly (--i-max), or ask for less",
@@ -263,6 +264,29 @@ class GuardedDrive:
         self._pole_pairs = values.get("motor.pole_pairs", self._pole_pairs)
         self._R_s_ohm = values.get("motor.R_s_ohm", self._R_s_ohm)
 
+    def change(self, item: objects.DriveObject, data: bytes) -> None:
+        """Write a gain that no map knows, while the voltage is off, and read it back; restored when the guard ends.
+
+        From then on a stop removes the voltage: the speed loop is proven no more.
+
+        Raises
+        ------
+        SafetyRefusal
+            The drive is not off, or does not hold what was written.
+        """
+        where = f"node {self._node.node}, 0x{item.index:04X}:{item.sub:02X}"
+        if self._drive.may_be_energised or not is_safe(self._node.state()):
+            raise SafetyRefusal("gains are changed only while the voltage is off", where=where, hint=_BUG)
+        self._stop_without_ramp()
+        self._node.write_bytes(item.index, item.sub, data)
+        held = self._node.sdo.read(item.index, item.sub)
+        if held != data:
+            raise SafetyRefusal(
+                f"the drive holds {held.hex(' ')}, not the {data.hex(' ')} that was written", where=where,
+                likely="the drive limits the gain, or takes it at another occasion",
+                hint="nothing is learned from this gain; it was restored",
+            )  # fmt: skip
+
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero reference, supervised by the tool's heartbeat.
 
@@ -277,12 +301,12 @@ class GuardedDrive:
             raise SafetyRefusal(
                 "the guard has ended and the drive is restored, so nothing is enabled",
                 where=f"node {self._node.node}",
-                hint="this is a bug worth reporting",
+                hint=_BUG,
             )
         if self.proof is None:
             raise SafetyRefusal(
                 "the dead-man was not proven, so nothing is enabled", where=f"node {self._node.node}",
-                hint="this is a bug worth reporting",
+                hint=_BUG,
             )  # fmt: skip
         self._heartbeat.resume()  # after the dead-man ended operation nobody else would watch
         self._drive.enable()

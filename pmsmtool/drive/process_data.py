@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from pmsmtool.bus.nmt import NmtCommand, NmtState, send_nmt
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.interruption import interrupts_deferred
-from pmsmtool.drive.objects import LIVE
+from pmsmtool.drive.objects import LIVE, DriveObject
 from pmsmtool.errors import NotAvailable, SdoAbort
 
 BORROWED = (2, 3, 4)
@@ -40,7 +40,8 @@ class LiveValues:
         Called with the bus's time stamp when every PDO has come once more; may only take notes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, objects: Mapping[str, DriveObject] = LIVE) -> None:
+        self._objects = objects
         self.values: dict[str, float] = {}
         self.received = 0
         self.on_set: Callable[[float], None] = lambda stamp_s: None
@@ -49,7 +50,7 @@ class LiveValues:
 
     def expect(self, cob_id: int, names: Sequence[str]) -> None:
         """Say what a COB-ID carries."""
-        self._layout[cob_id] = [(name, struct.Struct("<" + LIVE[name].letter)) for name in names]
+        self._layout[cob_id] = [(name, struct.Struct("<" + self._objects[name].letter)) for name in names]
 
     def take(self, cob_id: int, data: bytes, timestamp: float) -> None:
         """Take the values of one PDO; a short one is left out."""
@@ -68,16 +69,23 @@ class LiveValues:
 
 
 @contextmanager
-def live_values(node: DriveNode, names: Sequence[str], period_s: float) -> Iterator[LiveValues]:
+def live_values(
+    node: DriveNode, names: Sequence[str], period_s: float, objects: Mapping[str, DriveObject] = LIVE
+) -> Iterator[LiveValues]:
     """Have the drive send live quantities every ``period_s``, as long as the context lasts.
+
+    Parameters
+    ----------
+    objects : mapping of str to DriveObject
+        Where a drive shows what the names mean; default: the reference drive's.
 
     Raises
     ------
     NotAvailable
         More quantities than the borrowed PDOs hold, or a drive without them.
     """
-    groups = _groups(names)
-    live = LiveValues()
+    groups = _groups(names, objects)
+    live = LiveValues(objects)
     before: list[tuple[int, int, bytes]] = []
     cob_ids = [0x80 + 0x100 * number + node.node for number in BORROWED[: len(groups)]]
     state = node.supervision.nmt_state
@@ -98,7 +106,7 @@ def live_values(node: DriveNode, names: Sequence[str], period_s: float) -> Itera
     try:
         for number, cob_id, group in zip(BORROWED, cob_ids, groups, strict=False):
             before += _contents(node, number)
-            _map(node, number, cob_id, group, period_s)
+            _map(node, number, cob_id, [objects[name] for name in group], period_s)
             live.expect(cob_id, group)
             node.connection.subscribe(cob_id, live.take)
         send_nmt(node.connection, NmtCommand.START, node.node)
@@ -120,11 +128,11 @@ def sent_every_s(period_s: float) -> float:
     return 1e-3 * min(max(1, round(1000.0 * period_s)), 0xFFFF)
 
 
-def _groups(names: Sequence[str]) -> list[list[str]]:
+def _groups(names: Sequence[str], objects: Mapping[str, DriveObject]) -> list[list[str]]:
     """Fill the PDOs in order."""
     groups: list[list[str]] = [[]]
     for name in names:
-        if sum(LIVE[other].size for other in [*groups[-1], name]) > PDO_BYTES:
+        if sum(objects[other].size for other in [*groups[-1], name]) > PDO_BYTES:
             groups.append([])
         groups[-1].append(name)
     if len(groups) > len(BORROWED):
@@ -154,19 +162,25 @@ def _with_off(cob_id: bytes) -> bytes:
     return (int.from_bytes(cob_id, "little") | _OFF).to_bytes(4, "little")
 
 
-def _map(node: DriveNode, number: int, cob_id: int, names: Sequence[str], period_s: float) -> None:
+def _map(node: DriveNode, number: int, cob_id: int, items: Sequence[DriveObject], period_s: float) -> None:
     communication, mapping = 0x1800 + number - 1, 0x1A00 + number - 1
     write = node.sdo.download
     write(communication, 1, (cob_id | _OFF | _NO_RTR).to_bytes(4, "little"))
     write(mapping, 0, b"\0")
-    for sub, name in enumerate(names, 1):
-        write(mapping, sub, LIVE[name].mapping_word.to_bytes(4, "little"))
-    write(mapping, 0, bytes((len(names),)))
+    for sub, item in enumerate(items, 1):
+        write(mapping, sub, item.mapping_word.to_bytes(4, "little"))
+    write(mapping, 0, bytes((len(items),)))
     write(communication, 2, bytes((EVENT_DRIVEN,)))
     write(communication, 5, round(1000.0 * sent_every_s(period_s)).to_bytes(2, "little"))
     write(communication, 1, (cob_id | _NO_RTR).to_bytes(4, "little"))
 
 
 def _bring_back(node: DriveNode, before: list[tuple[int, int, bytes]]) -> None:
+    refused: SdoAbort | None = None
     for index, sub, data in before:
-        node.sdo.download(index, sub, data)
+        try:
+            node.sdo.download(index, sub, data)
+        except SdoAbort as abort:  # a drive that refuses one must get the others
+            refused = refused or abort
+    if refused is not None:
+        raise refused

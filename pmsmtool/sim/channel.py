@@ -13,6 +13,7 @@ NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
 ``drive``  family whose object dictionary the drive shows (``firmware-params``), or the path of a map file; default:
            the reference drive's own
 ``eds``    EDS or DCF of a maker's drive, or ``TABLE.csv#FAMILY``: the drive has those objects and no others
+``gains``  seed that draws what the gains of a drive made by ``eds`` mean; default: they mean nothing
 ``tier``   ``inject`` or ``recorder``: the reference drive without its averages, without its excitation too
 ``filter`` time constant (s) of a set-point filter behind the torque slope; default: none
 ``jitter`` how late (s) a process data object is sent at most; default: not late
@@ -75,6 +76,7 @@ class Channel:
     speed: float | None = None
     drive: str | None = None
     eds: str | None = None
+    gains: int | None = None
     tier: str | None = None
     filter: float = 0.0
     jitter: float = 0.0
@@ -120,6 +122,7 @@ _KEYS: dict[str, Callable[[str], Any]] = {
     "speed": _positive,
     "drive": str,
     "eds": str,
+    "gains": _whole(0, 2**63 - 1),
     "tier": _tier,
     "filter": _short_time,
     "jitter": _short_time,
@@ -183,12 +186,14 @@ def _face(channel: Channel, machine_file: MachineFile) -> DriveFace | None:
 
 def _makers_drive(channel: Channel, machine_file: MachineFile) -> DriveFace:
     from pmsmtool.sim.foreign.behind import set_up_of
+    from pmsmtool.sim.foreign.drawn_gains import draw_gains
     from pmsmtool.sim.foreign.drive import ForeignDrive
     from pmsmtool.sim.foreign.file_rows import read_makers_objects
 
     if channel.drive is not None or channel.tier is not None:
         raise ConfigError("eds says what the drive has; drive and tier do, too", where=f"channel {channel.name}")
-    return ForeignDrive(read_makers_objects(str(channel.eds)), set_up_of(machine_file))
+    objects, motor = read_makers_objects(str(channel.eds)), set_up_of(machine_file)
+    return ForeignDrive(objects, motor, None if channel.gains is None else draw_gains(channel.gains, objects, motor))
 
 
 def _map(drive: str) -> DriveMap:

@@ -176,8 +176,23 @@ class Behind:
     def tune_speed_loop(self) -> None:
         """Leave the gains of the speed loop that its maker's tool would have found."""
         K_p = SPEED_RAD_S * self.set_up.J_kgm2
-        self._write("speed.K_p_nms_per_rad", K_p)
-        self._write("speed.K_i_nm_per_rad", SPEED_INTEGRAL * SPEED_RAD_S * K_p)
+        self.set_speed_gains(K_p, SPEED_INTEGRAL * SPEED_RAD_S * K_p)
+
+    def set_speed_gains(self, K_p_nms_per_rad: float, K_i_nm_per_rad: float) -> None:
+        """Change the gains of the speed loop."""
+        self._write("speed.K_p_nms_per_rad", K_p_nms_per_rad)
+        self._write("speed.K_i_nm_per_rad", K_i_nm_per_rad)
+
+    def speed_current_loops(self, factor: float) -> None:
+        """Make both current loops faster than the maker's tool left them."""
+        for axis in "dq":
+            for name in (f"current.K_p_{axis}_v_per_a", f"current.K_i_{axis}_v_per_as"):
+                self._write(name, factor * self.dictionary[name].number())
+
+    def sample_speed(self, filter_hz: float, decimation: int) -> None:
+        """Change the filter of the speed loop's feedback, and how many control periods lie between its samples."""
+        self._write("speed.filter_hz", filter_hz)
+        self._write("speed.decimation", decimation)
 
     def torque_slope(self, permille_per_s: float) -> None:
         """Move a profile torque no faster (0: at once)."""

@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.sim.foreign.behind import Behind, SetUp
+from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.families import family_of, laws_of, modes_of
 from pmsmtool.sim.foreign.file_rows import MakersObjects
 from pmsmtool.sim.foreign.guarding import NodeGuarding
 from pmsmtool.sim.foreign.laws import Law
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.node.objects import ObjectRow
 
 if TYPE_CHECKING:
@@ -48,6 +50,8 @@ class ForeignDrive:
         Of the file.
     set_up : SetUp
         The motor.
+    gains : DrawnGains, optional
+        What the objects of the gains mean; without it they mean nothing, and the loops are tuned by their maker.
 
     Attributes
     ----------
@@ -59,9 +63,12 @@ class ForeignDrive:
         The machine behind, while the drive runs; for tests.
     """
 
-    def __init__(self, objects: MakersObjects, set_up: SetUp) -> None:
+    def __init__(self, objects: MakersObjects, set_up: SetUp, gains: DrawnGains | None = None) -> None:
         self.objects = objects
+        self.gains = gains
         self.laws = laws_of(objects, set_up)
+        if gains is not None:
+            self.laws |= {(law.index, law.sub): law for law in gains.laws(self.laws)}
         self._set_up = set_up
         family = family_of(objects)
         stated = objects.stored(0x1018, 1), objects.stored(0x1018, 2)
@@ -116,9 +123,12 @@ class ForeignDrive:
         for (index, sub), entry in inner.items():
             if self.objects.has((index, sub)):
                 _pass_on(dictionary, dictionary.find(index, sub), entry)
+        behind.tune_speed_loop()
         for law in self.laws.values():
             _obey(law, dictionary.find(law.index, law.sub), behind)
-        behind.tune_speed_loop()
+        if self.gains is not None:
+            behind.sample_speed(self.gains.filter_hz, self.gains.decimation)
+            behind.speed_current_loops(self.gains.current_bandwidth / SET_UP_BANDWIDTH)
         self._hook_modes(dictionary, behind)
 
     def _hook_modes(self, dictionary: Dictionary, behind: Behind) -> None:

@@ -29,6 +29,8 @@ _LONG = {kind.name: _KEPT_AS.get(short, short) for short, kind in BY_SHORT.items
 _CODES = {kind.code: _KEPT_AS.get(short, short) for short, kind in BY_SHORT.items()}
 """CiA 301 data types by number and by name; one of 64 bits with a sign is kept as its bytes."""
 _ACCESS = {"ro": "ro", "const": "const", "wo": "wo", "rw": "rw", "rwr": "rw", "rww": "rw"}
+MAPPINGS = frozenset((*range(0x1600, 0x1800), *range(0x1A00, 0x1C00)))
+"""Mapping of the PDOs: its number of entries is written when it changes (CiA 301, 7.5.2.36 and 7.5.2.38)."""
 CONSUMER_LIMIT = 0x7FFFFF
 """Largest entry of 0x1016: a node id above 16 bits of time (CiA 301); files with 65535 leave no room for the node."""
 
@@ -217,7 +219,8 @@ def _completed(
             add(items, f"mandatory in mode {mode}")
     for index in sorted({index for index, sub in found if sub}):
         highest = max(sub for at, sub in found if at == index)
-        add([(index, 0, "U8", "const", str(highest))], "number of entries")
+        access = "rw" if index in MAPPINGS else "const"
+        add([(index, 0, "U8", access, str(highest))], "number of entries")
     for (index, sub), row in found.items():
         if index == 0x1016 and sub and row.high is not None and row.high < CONSUMER_LIMIT:
             found[index, sub] = replace(row, high=None)

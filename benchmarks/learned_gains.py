@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: MIT
+"""`map learn` on drives whose gains, forms and conventions a seed drew: what is decided, what is wrong, what is left.
+
+    python -m benchmarks.learned_gains TABLE.csv [--drives 100] [--first 0] [--kills 40] [--processes 2]
+
+A table has the columns of ``sim/foreign/file_rows.py``; the nodes are its families that have a velocity mode and gains
+of a speed loop (``sim/foreign/drawn_gains.py``), and one that keeps to CiA 402. Machines are random
+(``sim/random_drives.py``); the learner gets the inertia with an error drawn from the standard deviation it is told.
+
+A scale is right within 12 %; the truth is what one count does on this machine (its magnets are not at 20 degC, so the
+drive's own newton metre is not one). *Wrong* is a decided scale, form or convention that is not the truth. After every
+run the gains are compared, and the largest speed of the shaft with the limit. With ``--kills`` the bus is cut at a
+drawn change of a gain, the tool's process counts as dead, and another command follows: the gains must be back.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pmsmtool.bus.connect import connect
+from pmsmtool.bus.connection import Connection
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.guard import GuardedDrive
+from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
+from pmsmtool.drive_maps.shipped_maps import family_of, load_family
+from pmsmtool.errors import PmsmtoolError
+from pmsmtool.flash.gain_journal import any_left, restore_left
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.machine.temperature import magnet_flux_at
+from pmsmtool.measurement.learn_gains import GAIN, INTEGRAL, gain_object, learn_speed_loop, within_budget
+from pmsmtool.measurement.learned_rows import learned_gains, shown_currents
+from pmsmtool.sim.foreign.drawn_gains import DrawnGains
+from pmsmtool.sim.random_drives import draw_drive
+from pmsmtool.sim.simulated_machine import settings_of
+from pmsmtool.units import rad_s_from_rpm
+
+FAMILIES = (
+    "epos4-c505-eds", "epos4-50/8-eds", "epos2", "copley", "nanotec-c5-e", "nanotec-pd4-c", "faulhaber", "cia402",
+)  # fmt: skip
+RIGHT = 0.12
+J_STD = 0.03
+SPEED_SHARE = 0.4
+FORMS = {"parallel": "value", "rate": "rate", "time": "time"}
+OVER = 1.25
+"""Speed over the limit that counts as an over-speed: what the guard itself allows for overshoot."""
+CIA402 = (
+    "0x1000,0,UNSIGNED32,ro,0x00020192", "0x1016,1,UNSIGNED32,rw,0", "0x1017,0,UNSIGNED16,rw,0",
+    "0x1018,1,UNSIGNED32,ro,0x999", "0x1018,2,UNSIGNED32,ro,1", "0x1018,4,UNSIGNED32,ro,0",
+    "0x6007,0,INTEGER16,rw,2", "0x6072,0,UNSIGNED16,rw,0", "0x6073,0,UNSIGNED16,rw,0", "0x6075,0,UNSIGNED32,rw,0",
+    "0x6076,0,UNSIGNED32,rw,0", "0x6077,0,INTEGER16,ro,0", "0x6078,0,INTEGER16,ro,0", "0x6064,0,INTEGER32,ro,0",
+    "0x606C,0,INTEGER32,ro,0", "0x6080,0,UNSIGNED32,rw,0", "0x608F,1,UNSIGNED32,ro,1", "0x608F,2,UNSIGNED32,ro,1",
+    "0x60FF,0,INTEGER32,rw,0", "0x60F9,1,UNSIGNED16,rw,0", "0x60F9,2,UNSIGNED16,rw,0", "0x6502,0,UNSIGNED32,ro,0x104",
+)  # fmt: skip
+"""A drive of the standard alone: torque is not offered, the cyclic velocity mode is."""
+
+
+class Killed(BaseException):
+    """The tool's process is dead."""
+
+
+@dataclass(slots=True)
+class Result:
+    """What one run gave."""
+
+    seed: int
+    family: str
+    verdicts: dict[str, str] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
+    why: dict[str, str] = field(default_factory=dict)
+    left_changed: bool = False
+    over_speed: bool = False
+    fault: str = ""
+
+
+def stated(machine: MachineFile, seed: int) -> MachineFile:
+    """Return the machine as a person knows it: an inertia with an error, and how well it is known."""
+    J = settings_of(machine).number("J_kgm2")
+    told = J * (1.0 + J_STD * random.Random(f"inertia {seed}").gauss(0.0, 1.0))
+    std = {**machine.std, "J_kgm2": J_STD * told}
+    return replace(machine, machine=replace(machine.machine, J_kgm2=told), std=std)
+
+
+def strength(machine: MachineFile) -> float:
+    """Return torque per ampere of the simulated machine over the one that its drive was told."""
+    number = settings_of(machine).number
+    cold = replace(machine.machine, psi_f_wb=number("psi_f_wb"))
+    return float(magnet_flux_at(cold, number("T_magnet_c"))) / number("psi_f_wb")
+
+
+@contextmanager
+def machine_at(seed: int, table: str, family: str) -> Iterator[str]:
+    """Yield the channel of a seed's drive, in a folder of its own."""
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        os.environ["PMSMTOOL_HOME"] = folder
+        try:
+            Path("drive.toml").write_text(dump_machine_file(draw_drive(3000 + seed)), encoding="utf-8")
+            source = table
+            if family == "cia402":
+                head = "family,source,index,sub,name,type,access,default_or_stored,low,high\n"
+                rows = ("cia402,CiA 402,{},{},x,{},{},{},,\n".format(*row.split(",")) for row in CIA402)
+                Path("cia402.csv").write_text(head + "".join(rows), encoding="ascii")
+                source = "cia402.csv"
+            yield f"drive.toml?nv=:memory:&eds={source}#{family}&gains={seed}"
+        finally:
+            os.chdir(before)
+
+
+def _gains(connection: Connection) -> DrawnGains:
+    return connection.bus.line.nodes[0].face.gains  # type: ignore[attr-defined,no-any-return]
+
+
+def _held(connection: Connection, gains: DrawnGains) -> tuple[bytes, bytes]:
+    dictionary = connection.bus.line.nodes[0].face.behind.dictionary  # type: ignore[attr-defined]
+    return dictionary.find(*gains.gain).value, dictionary.find(*gains.integral).value
+
+
+def run(seed: int, table: str, *, kill: bool = False) -> Result:
+    """Learn one drive's gains; with ``kill`` the bus is cut at a drawn change of a gain."""
+    family = FAMILIES[seed % len(FAMILIES)]
+    result = Result(seed, family)
+    with machine_at(seed, table, family) as channel, connect("pmsmsim", channel) as watching:
+        machine = draw_drive(3000 + seed)
+        gains = _gains(watching)
+        before = _held(watching, gains)
+        told = stated(machine, seed)
+        try:
+            with connect("pmsmsim", channel) as connection:
+                _learn(connection, told, machine, gains, result, random.Random(seed).randint(1, 4) if kill else 0)
+        except Killed:
+            watching.wait(1.0)
+        except PmsmtoolError as error:
+            result.fault = f"{type(error).__name__}: {error.what}"
+            if kill:
+                watching.wait(1.0)
+        if any_left():
+            node = DriveNode(watching, 1)
+            try:
+                restore_left(node, node.identity())
+            except PmsmtoolError as error:
+                result.fault = f"restore: {error.what}"
+            node.close()
+        result.left_changed = _held(watching, gains) != before
+    return result
+
+
+def _learn(
+    connection: Connection, told: MachineFile, machine: MachineFile, gains: DrawnGains, result: Result, kill_at: int
+) -> None:
+    node = DriveNode(connection, 1)
+    identity = node.identity()
+    node.close()
+    drive_map = family_of(identity.vendor, identity.product) or load_family("cia402")
+    drive = SpeedLoopDrive(connection, 1, drive_map=drive_map)
+    gain, integral = gain_object(drive.node, GAIN, *gains.gain), gain_object(drive.node, INTEGRAL, *gains.integral)
+    speed_max = SPEED_SHARE * rad_s_from_rpm(told.machine.n_max_rpm or 1000.0)
+    i_max = within_budget(drive, told.machine, drive.rated_apk, speed_max)
+    envelope = Envelope(i_max, speed_max, duration_s=120.0)
+    drive_live = drive.live
+    largest = 0.0
+
+    def live(name: str) -> float:
+        nonlocal largest
+        value = drive_live(name)
+        if name == "omega_e_rad_s":
+            largest = max(largest, abs(value))
+        return value
+
+    drive.live = live  # type: ignore[method-assign]
+    change, changes = GuardedDrive.change, 0
+
+    def cut(self: GuardedDrive, item: Any, data: bytes) -> None:
+        nonlocal changes
+        change(self, item, data)
+        changes += 1
+        if changes == kill_at:
+            connection.bus._pulled = True  # type: ignore[attr-defined]
+            raise Killed
+
+    if kill_at:
+        GuardedDrive.change = cut  # type: ignore[method-assign]
+    try:
+        measured = learn_speed_loop(drive, gain, integral, envelope, lambda text: None)
+    finally:
+        GuardedDrive.change = change  # type: ignore[method-assign]
+        result.over_speed = largest > OVER * speed_max
+    for note in measured.notes:
+        result.why["note"] = note
+    _judge(result, told, machine, gains, measured, drive)
+
+
+def _judge(
+    result: Result, told: MachineFile, machine: MachineFile, gains: DrawnGains, measured: Any, drive: SpeedLoopDrive
+) -> None:
+    found = learned_gains(told, measured)
+    stronger = strength(machine)
+    relative = gains.form != "parallel"
+    truth = {
+        GAIN: ("value", gains.K_p_nms_per_rad * stronger),
+        INTEGRAL: (FORMS[gains.form], gains.integral_scale * (1.0 if relative else stronger)),
+    }
+    for name, (form, scale) in truth.items():
+        one = found[name]
+        key = name.split(".")[1][:3]
+        result.why[key] = one.why
+        if one.scale is None:
+            result.verdicts[key] = "unknown"
+            continue
+        result.errors[key] = one.scale / scale - 1.0
+        result.verdicts[key] = "right" if one.form == form and abs(result.errors[key]) <= RIGHT else "wrong"
+    kind = shown_currents(told, measured, drive).kind
+    rms = gains.rms if drive.current_undecided or result.family == "cia402" else None
+    if kind is None or rms is None:
+        result.verdicts["current"] = "unknown" if rms is not None else "published"
+    else:
+        result.verdicts["current"] = "right" if kind == ("rms" if rms else "peak") else "wrong"
+
+
+def main() -> int:
+    """Print a line per drive and the summary; exit code 1 where something is wrong, left or too fast."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", type=lambda text: str(Path(text).resolve()))
+    parser.add_argument("--drives", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--kills", type=int, default=0)
+    parser.add_argument("--processes", type=int, default=2)
+    options = parser.parse_args()
+    seeds = range(options.first, options.first + options.drives)
+    with ProcessPoolExecutor(options.processes) as pool:
+        results = []
+        for r in pool.map(partial(run, table=options.table), seeds):
+            results.append(r)
+            errors = " ".join(f"{k} {100 * e:+.1f}%" for k, e in r.errors.items())
+            said = " ".join(f"{k}:{v}" for k, v in r.verdicts.items())
+            print(
+                f"{r.seed} {r.family}: {said} {errors} {r.fault} {'; '.join(w for w in r.why.values() if w)}",
+                flush=True,
+            )
+        kills = list(
+            pool.map(partial(run, table=options.table, kill=True), range(options.first, options.first + options.kills))
+        )
+    counted = Counter((key, verdict) for r in results for key, verdict in r.verdicts.items())
+    wrong = sum(n for (_, verdict), n in counted.items() if verdict == "wrong")
+    print(f"{len(results)} drives of {len(FAMILIES)} families")
+    for key in ("K_p", "K_i", "current"):
+        right, bad = counted[key, "right"], counted[key, "wrong"]
+        known = max(1, len(results) - counted[key, "published"])
+        sizes = sorted(100 * abs(r.errors[key]) for r in results if key in r.errors)
+        spread = f"; error median {sizes[len(sizes) // 2]:.1f} %, largest {sizes[-1]:.1f} %" if sizes else ""
+        print(f"{key}: decided {right + bad} of {known} ({100 * (right + bad) / known:.0f} %), wrong {bad}{spread}")
+    left = sum(r.left_changed for r in (*results, *kills))
+    fast = sum(r.over_speed for r in (*results, *kills))
+    print(f"gains left changed {left} of {len(results) + len(kills)} ({len(kills)} killed), over-speeds {fast}")
+    for r in kills:
+        if r.left_changed or r.fault.startswith("restore"):
+            print(f"killed {r.seed} {r.family}: {r.fault}")
+    return 1 if wrong or left or fast else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

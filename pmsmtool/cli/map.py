@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: MIT
+"""``pmsmtool map``: what the objects of a drive count."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pmsmtool.cli.drive_access import claimed_node, map_option, read_map
+from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
+from pmsmtool.cli.output import Output, table
+
+if TYPE_CHECKING:
+    from pmsmtool.bus.connection import Connection
+    from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
+    from pmsmtool.drive_maps.drive_map import DriveMap
+    from pmsmtool.machine.machine_file import MachineFile
+    from pmsmtool.measurement.learn_gains import GainObject, LearnedLoop
+
+OBJECT = re.compile(r"0x([0-9A-Fa-f]{4})(?::0?x?([0-9A-Fa-f]{1,2}))?")
+STANDARD = {"speed.K_p_nms_per_rad": (0x60F9, 1), "speed.K_i_nm_per_rad": (0x60F9, 2)}
+"""Where CiA 402 puts the gains of the speed loop; what one count is worth it leaves to the maker."""
+SPEED_SHARE = 0.4
+"""Speed limit without --speed-max, of the largest speed of the machine: no field weakening."""
+DURATION_S = 120.0
+NORMAL = 1.96
+
+
+@click.group("map")
+def map_group() -> None:
+    """Find out what the objects of a drive count."""
+
+
+@map_group.command(
+    "learn",
+    epilog=examples(
+        "pmsmtool -n 5 map learn --machine motor.toml -o my-drive.toml --shaft free",
+        "pmsmtool -n 5 map learn speed.K_p_nms_per_rad=0x30A2:01 speed.K_i_nm_per_rad=0x30A2:02 --map epos4 "
+        "--machine motor.toml -o my-drive.toml",
+    ),
+)
+@click.argument("names", metavar="[NAME[=0xINDEX:SUB]]...", nargs=-1)
+@click.option("--machine", "machine_path", type=FILE, required=True, metavar="FILE", help="The machine: its inertia.")
+@click.option("-o", "--output", type=FILE, metavar="FILE", help="Map file to write; none is written without it.")
+@map_option
+@bus_options
+@motion_options
+@output_options
+def learn_command(
+    bus: BusOptions,
+    motion: MotionOptions,
+    out: Output,
+    names: tuple[str, ...],
+    machine_path: Path,
+    output: Path | None,
+    map_file: Path | None,
+) -> None:
+    """Find out what one count of a gain of the speed loop is worth on this drive, by its response.
+
+    The gains are changed by known ratios while the voltage is off, the speed is stepped, and the answers say scale and
+    form of both gains, and whether shown currents are peak or rms. What the data do not decide stays unknown. The drive
+    keeps its own gains: they are restored when the command ends, and if it is killed, by the next connection.
+
+    The shaft must be free and without load. Scales rest on the inertia in the machine file and on its standard
+    deviation in [std]; without one nothing that rests on the inertia is decided. Published scales of the map are
+    checked. Exit code 0: everything decided; 1: a published scale is contradicted; 6: nothing decided; 10: some.
+    """
+    from pmsmtool.cli.consent import ask_motion
+    from pmsmtool.drive.envelope import Envelope, largest_acceleration
+    from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.flash.map_gate import check_motion
+    from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.measurement.learn_gains import (
+        GAIN,
+        INTEGRAL,
+        gain_object,
+        learn_speed_loop,
+        refuse_unsafe,
+        within_budget,
+    )
+    from pmsmtool.units import rad_s_from_rpm
+
+    asked = _addresses(names)
+    file = load_machine_file(machine_path)
+    machine = file.machine
+    if not machine.J_kgm2 or not machine.n_max_rpm:
+        raise ConfigError(
+            "the scale of a gain rests on the inertia, and the speed limit on the largest speed",
+            where=f"{machine_path}: [machine]", hint="add J_kgm2 and n_max_rpm",
+        )  # fmt: skip
+    with bus.connect() as connection:
+        node_id = claimed_node(connection, bus.node)
+        drive = SpeedLoopDrive(connection, node_id, drive_map=_map_of(connection, node_id, map_file))
+        node = drive.node
+        check_motion(node.map, drive.identity)
+        found = {}
+        for name in (GAIN, INTEGRAL):
+            address = asked.get(name) or (node.map.address(name) if name in node.map.cells else STANDARD[name])
+            found[name] = gain_object(node, name, *address)
+        speed_max = motion.speed_max_rad_s or SPEED_SHARE * rad_s_from_rpm(machine.n_max_rpm)
+        i_max = within_budget(drive, machine, motion.i_max_apk or drive.rated_apk, speed_max)
+        envelope = Envelope(
+            i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S, shaft=motion.shaft or "free",
+            load=motion.load, brake=motion.brake, acceleration_rad_s2=largest_acceleration(machine, i_max),
+        )  # fmt: skip
+        refuse_unsafe(node, envelope)
+        lines = [
+            *envelope.lines(),
+            "the shaft turns at half of the speed limit and takes steps, with the drive's own speed loop",
+            *(f"{gain.name} in {gain.address} holds {gain.counts}: it is changed while the voltage is off, and restored"
+              for gain in found.values()),
+            "nothing is stored in the drive; every changed object is restored",
+        ]  # fmt: skip
+        ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
+        measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, out.note)
+        drive.close()
+    for note in measured.notes:
+        out.warn(note)
+    _tell(file, drive, measured, found, asked, output, out)
+
+
+def _addresses(names: tuple[str, ...]) -> dict[str, tuple[int, int] | None]:
+    """Return the wanted names with their objects, None where none is given."""
+    from pmsmtool.errors import ConfigError
+
+    asked: dict[str, tuple[int, int] | None] = {}
+    for text in names:
+        name, mark, where = text.partition("=")
+        match = OBJECT.fullmatch(where)
+        if name not in STANDARD or (mark and match is None):
+            raise ConfigError(
+                f"{text!r} is no gain that can be learned",
+                hint=f"NAME or NAME=0xINDEX:SUB, with {' or '.join(STANDARD)}",
+            )
+        asked[name] = (int(match[1], 16), int(match[2] or "0", 16)) if match else None
+    return asked or dict.fromkeys(STANDARD)
+
+
+def _map_of(connection: Connection, node_id: int, map_file: Path | None) -> DriveMap:
+    """Return the map that is given, else the shipped one that names the drive, else the standard's."""
+    from pmsmtool.drive.drive_node import DriveNode
+    from pmsmtool.drive_maps.shipped_maps import family_of, load_family
+
+    if map_file is not None:
+        return read_map(map_file)
+    node = DriveNode(connection, node_id)
+    try:
+        identity = node.identity()
+    finally:
+        node.close()
+    return family_of(identity.vendor, identity.product) or load_family("cia402")
+
+
+def _tell(
+    file: MachineFile,
+    drive: SpeedLoopDrive,
+    measured: LearnedLoop,
+    found: Mapping[str, GainObject],
+    asked: Iterable[str],
+    output: Path | None,
+    out: Output,
+) -> None:
+    """Print what was learned, write the map, and end with the exit code it deserves."""
+    from pmsmtool.drive_maps.drive_map_file import dump_drive_map
+    from pmsmtool.drive_maps.measured_rows import with_measured
+    from pmsmtool.errors import CheckFailed, IdentificationError, Partial
+    from pmsmtool.files import write_file
+    from pmsmtool.measurement.learned_rows import learned_gains, measured_row, shown_currents
+
+    results = {name: result for name, result in learned_gains(file, measured).items() if name in asked}
+    currents = shown_currents(file, measured, drive)
+    rows = [measured_row(found[name], result) for name, result in results.items() if result.scale is not None]
+    cells = drive.node.map.cells
+    against = [text for row in rows if row.name in cells and (text := row.against(cells[row.name]))]
+    facts = {
+        "gains": [{"object": found[name].address, "counts": found[name].counts, **asdict(result)}
+                  for name, result in results.items()],
+        "currents": asdict(currents), "speed_unit_rad_s": measured.speed_unit_rad_s, "contradicts": against,
+    }  # fmt: skip
+    heads = ("gain", "object", "one count", "+- 95 %", "form", "why not")
+    lines = [
+        (name, found[name].address, "unknown" if r.scale is None else f"{r.scale:.4g} {r.unit}",
+         f"{100 * r.half_width:.0f} %" if math.isfinite(r.half_width) else "-", r.form or "unknown", r.why or "-")
+        for name, r in results.items()
+    ]  # fmt: skip
+    lines.append(
+        ("shown current", "-", "-", f"{100 * NORMAL * currents.std_log:.0f} %", currents.kind or "unknown",
+         currents.why or "-")
+    )  # fmt: skip
+    out.result("map.learn", facts, lambda: table(heads, lines))
+    if output is not None and rows and not against:
+        identity = drive.identity
+        widths = ", ".join(f"{row.name} +-{100 * row.half_width:.0f} %" for row in rows)
+        said = f"pmsmtool map learn on the drive with serial number {identity.serial}: {widths}"
+        made = with_measured(drive.node.map, identity.vendor, identity.product, rows, said, currents.kind)
+        write_file(output, dump_drive_map(made))
+        out.note(f"wrote {output}")
+    if against:
+        raise CheckFailed(
+            "; ".join(against), likely="the map is of another firmware, or of other settings of the drive",
+            hint="nothing was written; compare the map with the drive's manual",
+        )  # fmt: skip
+    unknown = [name for name, result in results.items() if result.scale is None]
+    if len(unknown) == len(results):
+        raise IdentificationError("E_EXCITATION", "no gain was decided", hint="the table says why of each")
+    if unknown:
+        raise Partial(f"not decided: {', '.join(unknown)}", hint="the table says why")

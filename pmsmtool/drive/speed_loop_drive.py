@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: MIT
+"""A drive of another maker in its own velocity mode: steps of its speed reference, position and current as answers.
+
+What one count of its speed is worth is nobody's word: :attr:`SpeedLoopDrive.rad_s_per_count` is measured by who uses it
+(``measurement/speed_unit.py``). The speed loop is the drive's own, so that every stop removes the voltage.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import NamedTuple
+
+import numpy as np
+
+from pmsmtool.bus.connection import Connection
+from pmsmtool.cia402 import Mode
+from pmsmtool.drive import objects
+from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits, held
+from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
+from pmsmtool.drive.process_data import LiveValues, live_values
+from pmsmtool.drive.standard_drive import POLL_PERIOD_S
+from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.errors import LimitExceeded, NotAvailable, SdoAbort
+from pmsmtool.trace import Trace
+
+SHOWN = ("position", "current")
+OSCILLATION_SAMPLES = 20
+"""Periods of sampling over which an oscillation is judged."""
+LARGEST_COUNT = 2.0 * math.pi
+"""Largest speed that one count of any drive's velocity is worth (rad/s): a turn per second."""
+
+
+class Row(NamedTuple):
+    """One sample: when it was sent (s), position (rad) and current (A)."""
+
+    t_s: float
+    position_rad: float
+    current_a: float
+
+
+class Oscillation:
+    """Root mean square of the current's last samples about their mean: grows when a loop begins to oscillate.
+
+    Attributes
+    ----------
+    largest_a : float
+        Largest one since :meth:`begin`.
+    limit_a : float
+        Trip level; infinity: only watched.
+    """
+
+    def __init__(self) -> None:
+        self.limit_a = math.inf
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the samples."""
+        self._last: deque[float] = deque(maxlen=OSCILLATION_SAMPLES)
+        self.largest_a = 0.0
+
+    def take(self, current_a: float) -> None:
+        """Take a sample."""
+        self._last.append(current_a)
+        if len(self._last) == OSCILLATION_SAMPLES:
+            mean = math.fsum(self._last) / OSCILLATION_SAMPLES
+            square = math.fsum((value - mean) ** 2 for value in self._last) / OSCILLATION_SAMPLES
+            self.largest_a = max(self.largest_a, math.sqrt(square))
+
+    def check(self, where: str) -> None:
+        """Raise ``LimitExceeded`` where the trip level was reached; the guard then removes the voltage."""
+        if self.largest_a > self.limit_a:
+            raise LimitExceeded(
+                "oscillation of the current", self.largest_a, self.limit_a, "A rms", where=where,
+                likely="the changed gain makes the loop oscillate", hint="the gains are restored; nothing was learned",
+            )  # fmt: skip
+
+
+class SpeedLoopDrive(TorqueDrive):
+    """A drive that follows a speed by its own loop; a record holds position and current at up to 1 kHz.
+
+    Attributes
+    ----------
+    mode : int
+        Velocity mode: cyclic (9) where it has one, for it knows no ramp, else 3.
+    rad_s_per_count : float
+        One count of 0x60FF; until it is measured the largest that occurs.
+    sends : bool
+        Whether the drive sends its samples by itself (process data); else they are asked for one by one.
+
+    Raises
+    ------
+    NotAvailable
+        The drive has no velocity mode.
+    """
+
+    def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
+        super().__init__(connection, node_id, drive_map=drive_map)
+        modes = int(held(self.node, objects.SUPPORTED_MODES) or 0)
+        offered = [mode for mode in (Mode.CYCLIC_VELOCITY, Mode.PROFILE_VELOCITY) if modes >> mode - 1 & 1]
+        if not offered or held(self.node, objects.TARGET_VELOCITY_MRPM) is None:
+            raise NotAvailable(
+                f"the drive has no velocity mode (0x6502 = {modes:#x}, 0x60FF)", where=f"node {node_id}",
+                hint="`pmsmtool caps` lists what this drive can give",
+            )  # fmt: skip
+        self.mode = offered[0]
+        self.rad_s_per_count = LARGEST_COUNT
+        limits = list(current_limits(self.node, self._rated_apk))
+        # the drive's own limit bounds whatever its loop asks for
+        self.commands_bounded_current = allowed(self.node, iter(limits)) is not None
+        allows = [limit.per_count * value for limit in limits if (value := held(self.node, limit.item)) is not None]
+        self.current_limit_apk = min(allows, default=math.inf)
+        self.oscillation = Oscillation()
+        self.sends = True
+        self._sending: AbstractContextManager[LiveValues] | None = None
+        self._samples: list[Row] = []
+        self._due: list[tuple[float, float]] = []
+        self._written: list[tuple[float, float]] = []
+        self._recording = False
+        self._unwrapped: float | None = None
+        self._behind_s = math.inf
+
+    @property
+    def current_count_a(self) -> float:
+        """One count of the current that is shown (A, as rms where nobody says)."""
+        return self._current.per_count
+
+    # ---- motion ---------------------------------------------------------------------------------
+
+    def enable(self) -> None:
+        """Bring the drive to operation enabled at no speed, in its velocity mode."""
+        self.node.put(objects.TARGET_VELOCITY_MRPM, 0)
+        self._set_mode(self.mode)
+        self.may_be_energised = True
+        self.node.enable()
+
+    def command_speed(self, omega_m_rad_s: float) -> None:
+        """Ask for the nearest speed that whole counts give."""
+        self.node.put(objects.TARGET_VELOCITY_MRPM, self._counts(omega_m_rad_s))
+
+    def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
+        """Refuse: the drive is in its velocity mode."""
+        raise NotAvailable("the drive follows a speed here, no current", where=f"node {self.node.node}")
+
+    def _counts(self, omega_m_rad_s: float) -> int:
+        return round(omega_m_rad_s / self.rad_s_per_count)
+
+    # ---- records --------------------------------------------------------------------------------
+
+    def send_samples(self) -> None:
+        """Have the drive send position and current every millisecond, where it can; else they will be asked for."""
+        items = {"position": POSITION, "current": self._current.item}
+        sending = live_values(self.node, SHOWN, POLL_PERIOD_S, items)
+        try:
+            live = sending.__enter__()
+        except (NotAvailable, SdoAbort):  # fixed process data
+            self.sends = False
+            return
+        self._sending = sending
+
+        def note(stamp_s: float) -> None:
+            if self._recording:
+                # an adapter's time stamps begin where they like; the shortest way here ties them to the clock
+                self._behind_s = min(self._behind_s, self.node.connection.clock.now() - stamp_s)
+                self._take(stamp_s, live.values["position"], live.values["current"])
+
+        live.on_set = note
+
+    def end_samples(self) -> None:
+        """Bring the drive's process data back."""
+        sending, self._sending = self._sending, None
+        if sending is not None:
+            sending.__exit__(None, None, None)
+
+    def prepare(self, excitation: Excitation) -> None:
+        """Check that it is a staircase of speeds: the drive has no other excitation."""
+        if excitation.point is not Injection.SPEED or excitation.shape is not Shape.BUFFER:
+            raise NotAvailable("the drive has no excitation, only references", where=f"node {self.node.node}")
+
+    def begin_record(self, recording: Recording, wait: Callable[[float], None]) -> None:
+        """Note every sample from now on; a staircase is written step by step meanwhile."""
+        began = self.node.connection.clock.now()
+        self._samples, self._written, self._due = [], [], []
+        self._unwrapped, self._behind_s = None, math.inf
+        self.oscillation.begin()
+        step = recording.excitation
+        if step is not None:
+            last = math.nan
+            for k, speed in enumerate(step.buffer):
+                if speed != last:
+                    self._due.append((began + k * step.hold_periods * self.period_s, speed))
+                last = speed
+        self._recording = True
+
+    def finish_record(self, recording: Recording) -> Trace:
+        """Return the samples, with the references written and their times in ``meta`` (rad/s, s)."""
+        self._recording = False
+        self.check_operating()
+        table = np.array(self._samples, dtype=np.float64).reshape(len(self._samples), 3)
+        if self.sends and len(table):
+            table[:, 0] += self._behind_s
+        first = table[0, 0] if len(table) else 0.0
+        steps = [[t - first, speed] for t, speed in self._written]
+        return Trace(
+            table[:, 0] - first, {"theta_m_rad": table[:, 1], "i_q_a": table[:, 2]},
+            {"theta_m_rad": "rad", "i_q_a": "A"}, {"polled": not self.sends, "steps": steps},
+        )  # fmt: skip
+
+    def end_excitation(self) -> None:
+        """Leave the speed where it is: the next command takes it back."""
+        self._recording, self._due = False, []
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass; writes the steps that are due, and asks for samples where the drive does not send them."""
+        clock = self.node.connection.clock
+        end = clock.now() + seconds
+        while self._recording:
+            self.oscillation.check(f"node {self.node.node}")
+            while self._due and self._due[0][0] <= clock.now():
+                speed = self._due.pop(0)[1]
+                before = clock.now()
+                self.command_speed(speed)
+                self._written.append((0.5 * (before + clock.now()), self._counts(speed) * self.rad_s_per_count))
+            if not self.sends:
+                self._ask()
+            until = min([end, *(at for at, _ in self._due[:1])])
+            left = (min(until, clock.now() + POLL_PERIOD_S) if not self.sends else until) - clock.now()
+            if left > 0.0:
+                self.node.connection.wait(left)
+            if clock.now() >= end:
+                break
+        super().wait(max(0.0, end - clock.now()))
+
+    def _ask(self) -> None:
+        before = self.node.connection.clock.now()
+        position = self.node.get(POSITION)
+        between = self.node.connection.clock.now()
+        current = self.node.get(self._current.item)
+        self._take(0.5 * (before + between), position, current)
+
+    def _take(self, t_s: float, counts: float, current: float) -> None:
+        if self._unwrapped is not None:
+            step = counts - self._unwrapped
+            counts = self._unwrapped + step - round(step / 2.0**32) * 2.0**32
+        self._unwrapped = counts
+        position = 2.0 * math.pi * counts / self.counts_per_turn
+        self._samples.append(Row(t_s, position, current * self._current.per_count))
+        self.oscillation.take(self._samples[-1].current_a)

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: MIT
+"""The journal of gains that are changed on a live drive for a measurement: beside the drive's other journals.
+
+It is on disk before the first change, and before every further one. What ends a measurement without its end (a killed
+program, a dead battery) leaves it there; the next connection to the drive restores before it does anything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pmsmtool.drive.drive_node import DriveNode, is_safe
+from pmsmtool.drive.port import Identity
+from pmsmtool.drive.stop import state_text
+from pmsmtool.errors import SafetyRefusal, VerifyMismatch
+from pmsmtool.flash.journal import Entry, JournalFolder, Snapshot, read_snapshot, write_snapshot
+from pmsmtool.resources import user_folder
+
+FILE = "gains.json"
+CONTENT = "gains changed for a measurement"
+
+
+class GainJournal:
+    """Gains of one drive while they are changed.
+
+    Parameters
+    ----------
+    identity : Identity
+        Of the drive.
+    entries : sequence of Entry
+        What every object holds now; their ``new`` is None.
+    root : Path, optional
+        Instead of the user's data folder.
+    """
+
+    def __init__(self, identity: Identity, entries: Sequence[Entry], root: Path | None = None) -> None:
+        self.path = path_of(identity, root)
+        self._snapshot = Snapshot("journal", "open", identity, 0, CONTENT, tuple(entries))
+
+    def begin(self) -> None:
+        """Put the journal on disk.
+
+        Raises
+        ------
+        ConfigError
+            The folder cannot be written: nothing may be changed then.
+        """
+        write_snapshot(self.path, self._snapshot)
+
+    def note(self, index: int, sub: int, data: bytes) -> None:
+        """Put on disk what is about to be written."""
+        entries = tuple(
+            replace(entry, new=data) if (entry.index, entry.sub) == (index, sub) else entry
+            for entry in self._snapshot.entries
+        )
+        self._snapshot = replace(self._snapshot, entries=entries)
+        self.begin()
+
+    def end(self, node: DriveNode) -> None:
+        """Read every object, and remove the journal when all hold again what they held.
+
+        Raises
+        ------
+        VerifyMismatch
+            An object does not; the journal stays.
+        """
+        _confirm(node, self._snapshot)
+        self.path.unlink(missing_ok=True)
+
+
+def path_of(identity: Identity, root: Path | None = None) -> Path:
+    """Return where a drive's journal of changed gains stands."""
+    return JournalFolder(identity, root).path.with_name(FILE)
+
+
+def any_left(root: Path | None = None) -> bool:
+    """Whether a measurement of any drive ended without its end; looks at the disk alone."""
+    folder = root or user_folder() / "journals"
+    return any(folder.glob(f"*/{FILE}"))
+
+
+def restore_left(node: DriveNode, identity: Identity, root: Path | None = None) -> int:
+    """Bring back the gains that an ended measurement left changed; return how many objects were written.
+
+    Raises
+    ------
+    SafetyRefusal
+        The drive is energised, or an object holds neither the old value nor the one that was written.
+    VerifyMismatch
+        An object does not hold its old value again.
+    """
+    path = path_of(identity, root)
+    if not path.exists():
+        return 0
+    snapshot = read_snapshot(path)
+    state = node.state()
+    if not is_safe(state):
+        raise SafetyRefusal(
+            f"an interrupted `map learn` left gains of this drive changed, and it is in {state_text(state)}",
+            where=f"node {node.node}, {path}",
+            hint=f"`pmsmtool stop -n {node.node}`, then run the command again: it restores them first",
+        )
+    held = {entry: node.sdo.read(entry.index, entry.sub) for entry in snapshot.entries}
+    strange = [e for e, data in held.items() if data not in (e.old, e.new)]
+    if strange:
+        names = ", ".join(f"0x{e.index:04X}:{e.sub:02X}" for e in strange)
+        raise SafetyRefusal(
+            f"{names} hold neither what they held before `map learn` nor what it wrote",
+            where=f"node {node.node}, {path}",
+            likely="another program wrote them since, or another drive without a serial number answers",
+            hint="compare them with the file; when they are right, delete it",
+        )
+    changed = [entry for entry, data in held.items() if data != entry.old]
+    for entry in changed:
+        node.sdo.download(entry.index, entry.sub, entry.old)
+    _confirm(node, snapshot)
+    path.unlink(missing_ok=True)
+    return len(changed)
+
+
+def _confirm(node: DriveNode, snapshot: Snapshot) -> None:
+    wrong = [
+        f"0x{e.index:04X}:{e.sub:02X} holds {held.hex(' ')}, before {e.old.hex(' ')}"
+        for e in snapshot.entries
+        if (held := node.sdo.read(e.index, e.sub)) != e.old
+    ]
+    if wrong:
+        raise VerifyMismatch(
+            "gains of the drive are not what they were before the measurement", where=f"node {node.node}",
+            differences=wrong, hint="connect again: the journal brings them back; or reset the drive",
+        )  # fmt: skip

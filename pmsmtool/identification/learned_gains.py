@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: MIT
+"""What one count of a gain is worth, from loops measured with the gains as they are and with each changed.
+
+The form of the integral part is the one under which the changes of counts explain the changes of K_i: hypotheses are
+compared by their likelihood. A form, a scale or a convention that the data do not decide stays unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from pmsmtool.identification.speed_loop_response import SpeedLoop
+
+NORMAL_95 = 1.96
+WIDEST = 0.15
+"""Half width (95 %, relative) of a scale beyond which it stays unknown: 12 % of a gain is 1 dB."""
+MODEL_DOUBT = (0.03, 0.05)
+"""What the loop's model leaves of K_p and of K_i (standard deviation, relative): unknown filters, dead time, friction.
+Measured error of 40 random drives (``benchmarks/learned_gains.py``): see docs/learned-gains.md."""
+CURRENT_BANDWIDTH_RAD_S, BANDWIDTH_DOUBT = 2000.0, 0.6
+"""What a maker's current loop has, about; the standard deviation of what follows from it (relative): 600 to 6000."""
+CHANGE_DOUBT = (0.04, 0.07, 0.07)
+"""What it leaves of a ratio of two K_p, K_i or K_i / K_p of one drive (standard deviation, relative)."""
+SPREAD_DOUBT = 0.5
+"""Of what a scale differs between the drive's own and changed gains (standard deviation, relative)."""
+LEFT_DOUBT = 0.5
+"""Of what steps of two sizes say about steps without end (standard deviation, relative)."""
+FITS = 14.2
+"""Largest chi-square of a hypothesis that explains three ratios (3 degrees of freedom, 3 sigma)."""
+APART = 16.0
+"""Smallest chi-square by which the second-best hypothesis must be worse: 1 in 3000."""
+EXCLUDED = 3.5
+"""Standard deviations from which a convention is excluded: 1 in 2000."""
+UNMOVED = 0.2
+"""Share of a change of the integral's counts that K_p may seem to follow: friction and dead time let it seem so."""
+NOT_SAME = 3.0
+"""Standard deviations by which a ratio may miss what it should be."""
+BLOCK = 3.0 * math.sqrt(3.0) / math.pi / 1.5
+CONVENTIONS = {"peak": 1.0, "block": BLOCK, "rms": math.sqrt(2.0)}
+"""Torque per ampere of block commutation and of a sine's rms value, over that of its peak value."""
+EXPONENTS = {
+    "value": (0.0, 1.0),
+    "rate": (1.0, 1.0),
+    "time": (1.0, -1.0),
+    "time of its own": (0.0, -1.0),
+    "no effect": (0.0, 0.0),
+    "no effect but the gain's": (1.0, 0.0),
+}
+"""How K_i follows the counts of the gain and of the integral part: parallel, and three series forms.
+
+The integral part leaves K_p alone, so that its effect is seen in K_i / K_p, which a fit knows better than K_i."""
+UNITS = {"gain": "N m s/rad", "value": "N m/rad", "rate": "1/s", "time": "s"}
+
+
+@dataclass(frozen=True, slots=True)
+class Rotor:
+    """What the scales of gains rest on.
+
+    Attributes
+    ----------
+    J_kgm2, J_std : float
+        Inertia of all that turns, and its standard deviation (relative).
+    time_constant_s : float
+        J R / (K_T K_E): without feed-forward of the EMF a current loop of bandwidth w lags an acceleration as if the
+        inertia were larger by 1 / (w tau).
+    """
+
+    J_kgm2: float
+    J_std: float
+    time_constant_s: float
+
+    @property
+    def lagging(self) -> float:
+        """By how much a gain seems smaller, for its current lags the EMF (relative)."""
+        return 1.0 / (CURRENT_BANDWIDTH_RAD_S * self.time_constant_s)
+
+    def gain_per_rad_s(self, K_per_J: float) -> float:
+        """Return a gain from its share of the inertia."""
+        return self.J_kgm2 * K_per_J * (1.0 + self.lagging)
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of that (relative)."""
+        return math.hypot(self.J_std, BANDWIDTH_DOUBT * self.lagging)
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One measured loop, and the counts that both gains held meanwhile."""
+
+    gain: int
+    integral: int
+    loop: SpeedLoop
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """What was found of one gain.
+
+    Attributes
+    ----------
+    name : str
+        Catalogue name.
+    scale : float or None
+        SI value of one count in the unit of the form; None: unknown.
+    half_width : float
+        Of the scale, relative, 95 %; also where it stays unknown.
+    form : str or None
+        ``value``, ``rate`` or ``time``, as a drive map names it; None: unknown.
+    unit : str
+        Of one count; empty where the form is unknown.
+    why : str
+        Why it stays unknown; empty where it does not.
+    chi_squares : dict of str to float
+        Of every hypothesis about the form.
+    """
+
+    name: str
+    scale: float | None
+    half_width: float
+    form: str | None
+    unit: str
+    why: str = ""
+    chi_squares: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Convention:
+    """What an ampere that the drive shows is: ``peak``, ``rms`` or ``block``; None: unknown."""
+
+    kind: str | None
+    torque_per_ampere: float
+    expected_peak: float
+    std_log: float
+    why: str = ""
+
+
+K_P, K_I, RATE = 0, 1, 2
+
+
+def _log(observation: Observation, which: int) -> float:
+    loop = observation.loop
+    return math.log((loop.K_p_per_J, loop.K_i_per_J, loop.K_i_per_J / loop.K_p_per_J)[which])
+
+
+def _change(after: Observation, base: Sequence[Observation], which: int) -> tuple[float, float]:
+    """Return the change of a gain's logarithm, and its standard deviation."""
+    return _log(after, which) - _log(base[0], which), CHANGE_DOUBT[which]
+
+
+def _at_large_steps(logs: Sequence[float], half_size: float) -> tuple[float, float]:
+    """Return the first logarithm as steps without end would give it, and its standard deviation.
+
+    Friction and the inverter's dead time are a share of a step that is twice as large at half its size: what the first
+    of the logarithms differs from the one at half the size is left of it, and half of that is doubted.
+    """
+    _, spread = _mean(logs)
+    left = logs[0] - half_size
+    return logs[0] + left, math.hypot(SPREAD_DOUBT * spread, LEFT_DOUBT * left)
+
+
+def _mean(logs: Sequence[float]) -> tuple[float, float]:
+    """Return mean and standard deviation of single values."""
+    mean = sum(logs) / len(logs)
+    return mean, math.sqrt(sum((x - mean) ** 2 for x in logs) / max(1, len(logs) - 1))
+
+
+def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, rotor: Rotor, name: str) -> Learned:
+    """Return what one count of the proportional gain is worth.
+
+    Parameters
+    ----------
+    base : sequence of Observation
+        With the drive's own gains: with steps of full size, and of half of it.
+    gain_changed : Observation or None
+        With other counts of the gain alone; None: it could not be changed.
+    rotor : Rotor
+        Its inertia.
+    """
+    if gain_changed is None:
+        return Learned(name, None, math.inf, None, "", "the gain was not changed")
+    change, std = _change(gain_changed, base, K_P)
+    asked = math.log(gain_changed.gain / base[0].gain)
+    if abs(asked) < EXCLUDED * std:
+        return Learned(name, None, math.inf, None, "", f"a change by {100 * std:.0f} % would not be seen")
+    if abs(change - asked) > NOT_SAME * std:
+        why = f"the response follows the counts with the exponent {change / asked:.2f}, not 1"
+        return Learned(name, None, math.inf, None, "", why)
+    logs = [_log(o, K_P) - math.log(o.gain) for o in (base[0], gain_changed, base[1])]
+    mean, std = _at_large_steps(logs[:-1], logs[-1])
+    std = math.hypot(std, MODEL_DOUBT[0], rotor.std)
+    scale, half = rotor.gain_per_rad_s(math.exp(mean)), NORMAL_95 * std
+    if half > WIDEST:
+        return Learned(name, None, half, "value", UNITS["gain"], f"its interval of {100 * half:.0f} % is too wide")
+    return Learned(name, scale, half, "value", UNITS["gain"])
+
+
+def integral_scale(
+    base: Sequence[Observation],
+    gain_changed: Observation | None,
+    integral_changed: Sequence[Observation],
+    rotor: Rotor,
+    name: str,
+) -> Learned:
+    """Return form and scale of the integral part; parameters as of :func:`gain_scale`."""
+    if gain_changed is None or not integral_changed:
+        return Learned(name, None, math.inf, None, "", "it was not changed")
+    by_gain, std_gain = _change(gain_changed, base, K_I)
+    ratio_gain = math.log(gain_changed.gain / base[0].gain)
+    by_integral = [
+        (*_change(after, base, RATE), math.log(after.integral / base[0].integral)) for after in integral_changed
+    ]
+    chi_squares = {
+        form: ((by_gain - of_gain * ratio_gain) / std_gain) ** 2
+        + sum(((change - of_integral * ratio) / std) ** 2 for change, std, ratio in by_integral)
+        for form, (of_gain, of_integral) in EXPONENTS.items()
+    }
+    best, second = sorted(chi_squares, key=lambda form: chi_squares[form])[:2]
+
+    def unknown(why: str, form: str | None = None, half: float = math.inf) -> Learned:
+        return Learned(name, None, half, form, UNITS.get(form or "", ""), why, chi_squares)
+
+    for after in integral_changed:
+        moved, std = _change(after, base, K_P)
+        if abs(moved) > max(NOT_SAME * std, UNMOVED * abs(math.log(after.integral / base[0].integral))):
+            return unknown(f"its change moved K_p by {100 * moved:.0f} %")
+    if chi_squares[best] > FITS:
+        return unknown("no form explains how the response follows both gains")
+    if chi_squares[second] - chi_squares[best] < APART:
+        return unknown(f"the forms {best!r} and {second!r} are not told apart")
+    if best not in UNITS:
+        return unknown(f"its form is {best!r}, which a drive map cannot say")
+    relative = best != "value"
+    observed = (base[0], gain_changed, integral_changed[0], base[1])  # the smallest K_i is known least
+    logs = []
+    for o in observed:
+        kept = _log(o, RATE if relative else K_I)
+        logs.append((-kept if best == "time" else kept) - math.log(o.integral))
+    mean, std = _at_large_steps(logs[:-1], logs[-1])
+    half = NORMAL_95 * math.hypot(std, MODEL_DOUBT[1], 0.0 if relative else rotor.std)
+    if half > WIDEST:
+        return unknown(f"its interval of {100 * half:.0f} % is too wide", best, half)
+    scale = math.exp(mean) if relative else rotor.gain_per_rad_s(math.exp(mean))
+    return Learned(name, scale, half, best, UNITS[best], "", chi_squares)
+
+
+def convention(
+    observed: Sequence[Observation], rotor: Rotor, torque_per_apk: float, psi_std: float, shown_per_ampere: float
+) -> Convention:
+    """Return whether the drive's amperes are peak, rms or block, from the acceleration that one of them gives.
+
+    Parameters
+    ----------
+    torque_per_apk, psi_std : float
+        Torque per ampere peak (N m/A), and the standard deviation of the flux linkage (relative).
+    shown_per_ampere : float
+        By what the shown current was multiplied already (sqrt 2 where it was read as rms).
+    """
+    logs = [math.log(rotor.J_kgm2 / abs(o.loop.amps_per_rad_s2) * shown_per_ampere) for o in observed]
+    mean, spread = _mean(logs)
+    std = math.hypot(rotor.J_std, psi_std, spread, MODEL_DOUBT[0])
+    found = mean - math.log(torque_per_apk)
+    misses = {kind: abs(found - math.log(ratio)) / std for kind, ratio in CONVENTIONS.items()}
+    best, second = sorted(misses, key=lambda kind: misses[kind])[:2]
+    facts = math.exp(mean), torque_per_apk, std
+    if misses[best] > NOT_SAME:
+        return Convention(None, *facts, f"torque per shown ampere is {math.exp(found):.2f} of the peak one")
+    if misses[second] < EXCLUDED:
+        return Convention(None, *facts, f"{best} and {second} are not told apart")
+    return Convention(best, *facts)

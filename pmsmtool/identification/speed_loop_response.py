@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: MIT
+"""A drive's speed loop from steps of its reference: K_p and K_i over the inertia, and the current per acceleration.
+
+The loop is J d(omega)/dt = K_p e + K_i int e dt, with e = omega_ref - omega_f and a lag of everything that the loop
+waits for (filter, sampling, current loop). Position and current are compared with the loop's answer to the very
+references that were written (output error), so that the loop's own noise feedback does not bias the gains. The time
+from a write to its effect, the age of the current against the position, and the state at the beginning are estimated
+with the gains. A current loop without feed-forward of the EMF adds ``emf`` of the inertia below its integral's corner.
+
+Source: L. Ljung, System Identification, 2nd ed., 1999, section 13.4 (direct closed-loop identification).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.errors import IdentificationError
+
+Array = NDArray[np.float64]
+
+GRID_S = 0.5e-3
+"""Step of the model (s): half of the fastest sampling."""
+ENOUGH_SAMPLES = 2000
+"""Of a longer record every second, third ... sample counts: what is looked for is far slower."""
+FIRST_LAG_S, LEAST_LAG_S, MOST_LAG_S = 2e-3, 2e-5, 2e-2
+EARLY_S, LATE_S, AGE_S = 2e-3, 1e-2, 5e-3
+"""Bounds of the loop's lag, of the time from the write of a reference to its effect, and of the current's age (s)."""
+FIRST_BANDWIDTHS = (25.0, 90.0)
+FIRST_SHARE = 0.2
+"""First values of K_p / J (1/s), and of K_i / K_p as a share of it: from each the fit is begun."""
+LEAST_SAMPLES = 200
+BOUNDS = {
+    "K_p": (0.5, 5e3),
+    "K_i": (0.05, 5e6),
+    "lag": (LEAST_LAG_S, MOST_LAG_S),
+    "late": (-EARLY_S, LATE_S),
+    "age": (-AGE_S, AGE_S),
+}
+_LOGARITHMIC = ("K_p", "K_i", "lag")
+_STEPS = np.array([0.1, 0.1, 0.5, 1e-3, 1e-3])
+
+
+@dataclass(frozen=True, slots=True)
+class StepRecord:
+    """Answers to steps of a speed reference.
+
+    Attributes
+    ----------
+    t_s, position_rad, current_a : ndarray, shape (n,)
+        Samples; the current as the drive shows it.
+    references : sequence of (s, rad/s)
+        When a reference was written, and which.
+    segments : sequence of (s, s)
+        Where the samples count: the current keeps its sign there.
+    noise_rad, noise_a : float
+        Standard deviation of position and current at a held speed.
+    """
+
+    t_s: Array
+    position_rad: Array
+    current_a: Array
+    references: Sequence[tuple[float, float]]
+    segments: Sequence[tuple[float, float]]
+    noise_rad: float
+    noise_a: float
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedLoop:
+    """What one record says of a speed loop.
+
+    Attributes
+    ----------
+    K_p_per_J, K_i_per_J : float
+        Gains over the inertia (1/s and 1/s2).
+    lag_s, late_s : float
+        Of the loop; from the write of a reference to its effect.
+    amps_per_rad_s2 : float
+        Shown current per acceleration: J over the torque per shown ampere.
+    reference_scale : float
+        Speed that came, over the one that was asked for.
+    misfit : float
+        Residual over the noise at a held speed, root mean square of position's and current's.
+    """
+
+    K_p_per_J: float
+    K_i_per_J: float
+    lag_s: float
+    late_s: float
+    amps_per_rad_s2: float
+    reference_scale: float
+    misfit: float
+
+
+def phase_margin_rad(K_p_per_J: float, K_i_per_J: float, lag_s: float) -> float:
+    """Return the phase margin of the loop (a s + b) / (s^2 (1 + T s)) (rad), at its gain crossover."""
+
+    def gain(omega: float) -> float:
+        return math.hypot(K_p_per_J * omega, K_i_per_J) / (omega * omega * math.hypot(1.0, lag_s * omega))
+
+    low, high = 1e-3, 1e6
+    for _ in range(80):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if gain(middle) > 1.0 else (low, middle)
+    return math.atan2(K_p_per_J * low, K_i_per_J) - math.atan(lag_s * low)
+
+
+class _Model:
+    """Answer of the loop to a record's references, for trial parameters."""
+
+    def __init__(self, record: StepRecord) -> None:
+        thin = max(1, len(record.t_s) // ENOUGH_SAMPLES)
+        if thin > 1:
+            t, position, current = record.t_s[::thin], record.position_rad[::thin], record.current_a[::thin]
+            record = replace(record, t_s=t, position_rad=position, current_a=current)
+        self.record = record
+        t, references = record.t_s, record.references
+        self.grid = np.arange(t[0], t[-1] + GRID_S, GRID_S)
+        self.times = np.array([at for at, _ in references])
+        self.values = np.array([value for _, value in references]) - references[0][1]
+        inside = [(t >= begin) & (t < end) for begin, end in record.segments]
+        self.parts = [np.flatnonzero(part) for part in inside if np.count_nonzero(part) >= LEAST_SAMPLES]
+        if not self.parts:
+            raise IdentificationError(
+                "E_EXCITATION", "too few samples of the steps", hint="the bus is busy, or the adapter slow"
+            )
+
+    def reference(self, late_s: float) -> Array:
+        """Mean of the reference over each step of the grid, against the first one (rad/s)."""
+        edges = np.append(self.grid, self.grid[-1] + GRID_S) - late_s
+        passed = np.concatenate(([0.0], np.cumsum(np.diff(self.times) * self.values[:-1])))
+        at = np.clip(np.searchsorted(self.times, edges, side="right") - 1, 0, None)
+        area = passed[at] + np.clip(edges - self.times[at], 0.0, None) * self.values[at]
+        mean: Array = np.diff(area) / GRID_S
+        return mean
+
+    def modes(self, p: Array) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """Return poles and residues of speed over reference."""
+        a, b, lag_s = np.exp(p[:3])
+        numerator, open_loop = np.array([a, b]), np.array([1.0, 0.0, 0.0])
+        loop = np.polyadd(np.polymul(open_loop, [lag_s, 1.0]), numerator)
+        numerator = np.polymul(numerator, [lag_s, 1.0])
+        poles = np.roots(loop).astype(np.complex128)
+        poles *= 1.0 + 1e-7 * np.arange(len(poles))  # no two the same
+        residues: NDArray[np.complex128] = np.polyval(numerator, poles) / np.polyval(np.polyder(loop), poles)
+        return poles, residues
+
+    def answer(self, p: Array) -> tuple[Array, Array, Array, NDArray[np.complex128]]:
+        """Return angle, speed and acceleration on the grid, and the poles."""
+        from scipy.signal import lfilter
+
+        poles, residues = self.modes(p)
+        reference = self.reference(p[3])
+        grown = np.exp(poles * GRID_S)
+        states = [
+            lfilter([0.0, (g - 1.0) / pole], [1.0, -g], reference.astype(np.complex128))
+            for g, pole in zip(grown, poles, strict=True)
+        ]
+        speed = sum(r * x for r, x in zip(residues, states, strict=True)).real
+        acceleration = sum(r * pole * x for r, pole, x in zip(residues, poles, states, strict=True)).real
+        acceleration = acceleration + residues.sum().real * reference
+        angle = GRID_S * (np.cumsum(speed) - 0.5 * speed)
+        return angle, speed, acceleration, poles
+
+    def fitted(self, p: Array) -> tuple[Array, Array, float, float]:
+        """Return the weighted residuals of position and of current, current per acceleration, and the speed's scale."""
+        record, t = self.record, self.record.t_s
+        angle, speed, acceleration, poles = self.answer(p)
+        slow = poles[np.argsort(np.abs(poles))][:2]
+        position, current = [], []
+        for part in self.parts:
+            x = t[part] - t[part[0]]
+            decay = np.exp(np.outer(x, slow))
+            free = np.column_stack((np.ones_like(x), x, decay.real, decay.imag))
+            position.append((free, np.interp(t[part], self.grid, angle), record.position_rad[part]))
+            then = t[part] - p[4]
+            free = np.column_stack((np.ones_like(x), np.interp(then, self.grid, speed), decay.real, decay.imag))
+            current.append((free, np.interp(then, self.grid, acceleration), record.current_a[part]))
+        rest_position, scale = _projected(position)
+        rest_current, amps = _projected(current)
+        return rest_position / record.noise_rad, rest_current / record.noise_a, amps / scale, scale
+
+    def start(self, a: float) -> Array:
+        """Return first parameters at a bandwidth."""
+        return np.array([math.log(a), math.log(FIRST_SHARE * a * a), math.log(FIRST_LAG_S), 1e-3, 0.0])
+
+
+def _projected(parts: list[tuple[Array, Array, Array]]) -> tuple[Array, float]:
+    """Fit one coefficient in common beside each part's free columns; return residuals and the coefficient."""
+    model, seen = [], []
+    for free, answer, values in parts:
+        basis = np.linalg.qr(free)[0]
+        model.append(answer - basis @ (basis.T @ answer))
+        seen.append(values - basis @ (basis.T @ values))
+    x, y = np.concatenate(model), np.concatenate(seen)
+    power = float(x @ x)
+    share = float(x @ y) / power if power > 0.0 else 0.0
+    return y - share * x, share
+
+
+def fit_speed_loop(record: StepRecord, first: SpeedLoop | None = None) -> SpeedLoop:
+    """Return the speed loop that answers as the record does.
+
+    Parameters
+    ----------
+    first : SpeedLoop, optional
+        Of a similar record, to begin with.
+
+    Raises
+    ------
+    IdentificationError
+        Too few samples, or no loop of this kind answers so.
+    """
+    model = _Model(record)
+    firsts = [model.start(a) for a in FIRST_BANDWIDTHS]
+    if first is not None:
+        firsts = [
+            np.array([math.log(first.K_p_per_J), math.log(first.K_i_per_J), math.log(first.lag_s), first.late_s, 0.0])
+        ]
+    tried = [_solve(model, start, (1.0, 1.0)) for start in firsts]
+    plain = min(tried, key=lambda found: float(np.sum(np.square(_weighted(model, found, (1.0, 1.0))))))
+    parts = model.fitted(plain)[:2]
+    weights = tuple(max(1.0, float(np.sqrt(np.mean(part**2)))) for part in parts)
+    plain = _solve(model, plain, weights)
+    rest_position, rest_current, amps, scale = model.fitted(plain)
+    if not scale > 0.0 or amps == 0.0:
+        raise IdentificationError("E_EXCITATION", "the shaft does not answer the steps of the speed reference")
+    misfit = math.hypot(*(float(np.sqrt(np.mean(part**2))) for part in (rest_position, rest_current))) / math.sqrt(2.0)
+    return SpeedLoop(
+        math.exp(plain[0]), math.exp(plain[1]), math.exp(plain[2]), float(plain[3]), amps, scale, misfit
+    )  # fmt: skip
+
+
+def _weighted(model: _Model, p: Array, weights: Sequence[float]) -> Array:
+    position, current, _, _ = model.fitted(p)
+    found = [position / weights[0], current / weights[1]]
+    return np.concatenate(found)
+
+
+def _solve(model: _Model, first: Array, weights: Sequence[float]) -> Array:
+    """Return the parameters of least squares."""
+    from scipy.optimize import least_squares
+
+    names = list(BOUNDS)[: len(first)]
+    low, high = (
+        np.array([math.log(BOUNDS[name][k]) if name in _LOGARITHMIC else BOUNDS[name][k] for name in names])
+        for k in (0, 1)
+    )
+    start = np.clip(first, low + 1e-9, high - 1e-9)
+    found = least_squares(
+        lambda p: _weighted(model, p, weights), start, bounds=(low, high), x_scale=_STEPS[: len(first)],
+        diff_step=1e-4, max_nfev=30,
+    )  # fmt: skip
+    return np.asarray(found.x, dtype=np.float64)

@@ -1,0 +1,358 @@
+# SPDX-License-Identifier: MIT
+"""``map learn``: change a gain of the connected drive by a known ratio, and see how its speed loop answers.
+
+The journal is on disk before the first change; every change happens with the voltage off; the first one is a step
+down. The drive holds its own gains again when this ends, and the next connection sees to it where this cannot.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.envelope import Envelope, largest_acceleration
+from pmsmtool.drive.guard import WATCH_S, GuardedDrive, guarded
+from pmsmtool.drive.motion_objects import allowed, held, speed_limits
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
+from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
+from pmsmtool.flash.gain_journal import GainJournal
+from pmsmtool.flash.journal import Entry
+from pmsmtool.identification.learned_gains import Observation
+from pmsmtool.identification.speed_loop_response import SpeedLoop, StepRecord, fit_speed_loop, phase_margin_rad
+from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.measurement.speed_unit import find_speed_unit
+
+GAIN, INTEGRAL = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"
+DOWN = 0.7
+"""First change of a gain."""
+INTEGRAL_DOWN = 0.8
+"""First change of an integral part: where it is a time, its gain rises by 1.25."""
+FURTHER_DOWN = 0.5
+"""Second change of an integral part, towards the smaller gain."""
+SURE = 0.4
+"""Share of the first change that must be seen before the second: noise and friction leave a fifth."""
+MOST_UP = 1.25
+LEAST_MARGIN_RAD, LEAST_MARGIN_DOWN_RAD = math.radians(40.0), math.radians(30.0)
+"""Predicted phase margin below which nothing is changed: where a gain may rise, and where it can only fall."""
+TRIP = 3.0
+"""Oscillation over the one with the drive's own gains, at which the voltage is removed."""
+AIM_SHARE = 0.5
+"""Speed about which the steps are taken, of the speed limit."""
+STEP_CURRENT = 0.5
+"""Current of a step, of what drive and envelope allow: large against friction and the inverter's dead time."""
+FIRST_STEP, MOST_STEP = 0.03, 0.35
+"""Steps of speed, of the speed about which they are taken."""
+GROWN, ENOUGH, TRIES = 4.0, 0.75, 6
+HOLD_S = 0.05
+"""Steps are held for multiples of this time."""
+INTEGRAL_S, LONGEST = 0.1, 2.5
+"""Time of the integral (K_p / K_i) for which these holds are long enough; by how much they grow with it at most."""
+SETTLE_S = 0.8
+PATTERN = (*(0,) * 8, *(1,) * 8, *(0,) * 6, *(1,) * 4, *(0,) * 8, *(1,) * 6, *(0,) * 6)
+"""Two levels of speed, held for 0.2 to 0.4 s: a loop of 25 to 200 rad/s and an integral of 2 to 40 rad/s."""
+SEEN_S = 2.0 * WATCH_S
+"""A speed beyond its limit is seen and the voltage off within this time."""
+REST_S, REST_RAD = 0.3, 2e-3
+COARSEST = 0.12
+"""Largest deviation of a ratio in whole counts from the one wanted."""
+ROUNDING = 1.0 / math.sqrt(12.0)
+
+
+@dataclass(frozen=True, slots=True)
+class GainObject:
+    """Where the drive keeps a gain, and what it held before."""
+
+    name: str
+    item: DriveObject
+    counts: int
+
+    @property
+    def address(self) -> str:
+        """Index and sub-index."""
+        return f"0x{self.item.index:04X}:{self.item.sub:02X}"
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedLoop:
+    """Everything that was measured: loops with the drive's own gains, and with each changed (None: not changed)."""
+
+    base: Sequence[Observation]
+    gain_changed: Observation | None
+    integral_changed: Sequence[Observation]
+    speed_unit_rad_s: float
+    notes: Sequence[str]
+
+
+def gain_object(node: DriveNode, name: str, index: int, sub: int, wire: str | None = None) -> GainObject:
+    """Return the object of a gain, its type by its size where no map says it.
+
+    Raises
+    ------
+    NotAvailable
+        It is no whole number of up to 32 bits, or too small to be changed by a known ratio.
+    SdoAbort
+        The drive has no such object.
+    """
+    data = node.sdo.read(index, sub)
+    letter = wire or {1: "B", 2: "H", 4: "I"}.get(len(data), "")
+    where = f"node {node.node}, 0x{index:04X}:{sub:02X}"
+    if not letter or letter == "f" or DriveObject(index, sub, letter).size != len(data):
+        raise NotAvailable(f"{name}: {len(data)} bytes are no whole number that this program changes", where=where)
+    item = DriveObject(index, sub, letter)
+    found = GainObject(name, item, int(item.decode(data)))
+    changed_counts(found, DOWN)
+    return found
+
+
+def changed_counts(gain: GainObject, ratio: float) -> int:
+    """Return counts in about a ratio to those held.
+
+    Raises
+    ------
+    NotAvailable
+        Whole counts are too coarse for it.
+    """
+    counts = round(gain.counts * ratio)
+    signed = (1 << 8 * gain.item.size - 1) - 1
+    if gain.counts <= signed:  # nothing says whether the object has a sign
+        counts = min(counts, signed)
+    if gain.counts <= 0 or not 1.0 - COARSEST < counts / (gain.counts * ratio) < 1.0 + COARSEST:
+        raise NotAvailable(
+            f"{gain.name} holds {gain.counts}: too few counts to change it by {ratio:g}", where=gain.address
+        )
+    return counts
+
+
+def refuse_unsafe(node: DriveNode, envelope: Envelope) -> None:
+    """Refuse what rules out a change of gains: a drive that saves by itself, a coupled shaft, gravity, a turning shaft.
+
+    Raises
+    ------
+    SafetyRefusal
+        With what it is.
+    """
+    if envelope.shaft != "free" or envelope.load != "none":
+        raise SafetyRefusal(
+            f"gains are changed only with a free shaft and no load; said are shaft {envelope.shaft}, load "
+            f"{envelope.load}",
+            where=f"node {node.node}", hint="uncouple the machine, then say --shaft free",
+        )  # fmt: skip
+    for sub in (1, 2, 3):
+        word = held(node, DriveObject(0x1010, sub, "I"))
+        if word is not None and int(word) & 2:
+            raise SafetyRefusal(
+                "the drive stores parameters by itself: a changed gain would survive", hint="learn it on another drive",
+                where=f"node {node.node}, 0x1010:{sub:02X} = {int(word):#x}",
+            )  # fmt: skip
+
+
+def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: float, speed_max_rad_s: float) -> float:
+    """Return the largest current that cannot bring the shaft beyond the speed limit before this program sees it.
+
+    The drive's speed loop keeps the speed, also when the tool is dead; this is for a loop that runs away. A drive with
+    a speed limit of its own keeps it; of any other the current is cut.
+    """
+    acceleration = largest_acceleration(machine, i_max_apk)
+    if allowed(drive.node, speed_limits(drive.node)) is not None or acceleration is None:
+        return i_max_apk
+    room = (1.0 - AIM_SHARE * (1.0 + MOST_STEP)) * speed_max_rad_s
+    return i_max_apk * min(1.0, room / (acceleration * SEEN_S))
+
+
+def _refuse_turning(drive: SpeedLoopDrive) -> None:
+    first = drive.live("theta_m_rad")
+    drive.node.connection.wait(REST_S)
+    if abs(drive.live("theta_m_rad") - first) > REST_RAD:
+        raise SafetyRefusal(
+            "the shaft turns although the drive is off", where=f"node {drive.node.node}",
+            likely="somebody or something moves it", hint="bring it to rest",
+        )  # fmt: skip
+
+
+def learn_speed_loop(
+    drive: SpeedLoopDrive,
+    gain: GainObject,
+    integral: GainObject,
+    envelope: Envelope,
+    say: Callable[[str], None],
+) -> LearnedLoop:
+    """Measure the speed loop with the drive's own gains and with each changed; the drive is as before on return.
+
+    Raises
+    ------
+    SafetyRefusal, LimitExceeded
+        Refused, or the loop began to oscillate: the voltage is off and the gains are back.
+    NotAvailable
+        The drive does not follow its velocity mode, or a gain cannot be changed.
+    """
+    node = drive.node
+    refuse_unsafe(node, envelope)
+    _refuse_turning(drive)
+    entries = [Entry(g.name, g.item.index, g.item.sub, g.item.encode(g.counts)) for g in (gain, integral)]
+    journal = GainJournal(drive.identity, entries)
+    journal.begin()
+    with guarded(drive, envelope, say=say) as guard:
+        drive.send_samples()
+        try:
+            found = _Learner(guard, drive, journal, say).run(gain, integral)
+        finally:
+            guard.stop()
+            drive.end_samples()
+    journal.end(node)
+    return found
+
+
+def _smaller(own: SpeedLoop, changed: SpeedLoop) -> float | None:
+    """Return in which ratio counts must change to make K_i smaller; None where that is not sure.
+
+    K_i / K_p must show it, for the fit tells K_i and K_p apart least; K_i must not show the contrary.
+    """
+    sure = SURE * abs(math.log(INTEGRAL_DOWN))
+    K_i = math.log(changed.K_i_per_J / own.K_i_per_J)
+    relative = K_i - math.log(changed.K_p_per_J / own.K_p_per_J)
+    if relative < -sure and K_i < 0.5 * sure:
+        return FURTHER_DOWN
+    return 1.0 / FURTHER_DOWN if relative > sure and K_i > -0.5 * sure else None
+
+
+class _Learner:
+    """One run; the guard has the drive."""
+
+    def __init__(
+        self,
+        guard: GuardedDrive,
+        drive: SpeedLoopDrive,
+        journal: GainJournal,
+        say: Callable[[str], None],
+    ) -> None:
+        self.guard, self.drive, self.journal, self.say = guard, drive, journal, say
+        self.aim = AIM_SHARE * guard.envelope.speed_max_rad_s
+        self.hold_s = HOLD_S
+        self.notes: list[str] = []
+
+    def run(self, gain: GainObject, integral: GainObject) -> LearnedLoop:
+        """Measure everything."""
+        guard, drive = self.guard, self.drive
+        guard.enable()
+        unit = find_speed_unit(guard, drive, self.aim)
+        self.say(f"one count of 0x60FF is {unit:.5g} rad/s; the steps are taken about {self.aim:.4g} rad/s")
+        step = self._size()
+        counts = {GAIN: gain.counts, INTEGRAL: integral.counts}
+        own = self._observe("with the drive's own gains", step, counts)
+        slow = own.loop.K_p_per_J / own.loop.K_i_per_J / INTEGRAL_S
+        if slow > 1.0:  # a slow integral needs longer steps
+            self.hold_s = HOLD_S * min(slow, LONGEST)
+            own = self._observe(f"with steps {min(slow, LONGEST):.2g} times as long", step, counts, own.loop)
+        drive.oscillation.limit_a = TRIP * max(drive.oscillation.largest_a, drive.current_count_a)
+        half = self._observe("with steps of half the size", 0.5 * step, counts, own.loop)
+        gain_changed = self._changed(gain, DOWN, own.loop, (DOWN, DOWN), step, counts)
+        integral_changed = [self._changed(integral, INTEGRAL_DOWN, own.loop, (1.0, MOST_UP), step, counts)]
+        further = None if integral_changed[0] is None else _smaller(own.loop, integral_changed[0].loop)
+        if further is not None:
+            integral_changed.append(self._changed(integral, further, own.loop, (1.0, FURTHER_DOWN), step, counts))
+        found = [observation for observation in integral_changed if observation is not None]
+        return LearnedLoop((own, half), gain_changed, found, unit, self.notes)
+
+    def _size(self) -> float:
+        """Return the step of speed whose current is large against friction and small against every limit."""
+        drive, guard = self.drive, self.guard
+        wanted = STEP_CURRENT * min(guard.envelope.i_max_apk, drive.current_limit_apk, drive.rated_apk)
+        step = FIRST_STEP * self.aim
+        for _ in range(TRIES):
+            record = self._record(step, PATTERN[:14])
+            shown = np.abs(record.current_a - np.median(record.current_a[record.t_s < record.references[1][0]]))
+            ratio = wanted / max(float(shown.max()), drive.current_count_a)
+            if ENOUGH < ratio < 1.0 / ENOUGH:
+                break
+            grown = min(step * min(ratio, GROWN), MOST_STEP * self.aim)
+            if grown == step:
+                break
+            step = grown
+        return step
+
+    def _record(self, step: float, pattern: Sequence[int]) -> StepRecord:
+        guard, drive = self.guard, self.drive
+        guard.command_speed(self.aim)
+        guard.wait(SETTLE_S)
+        hold = round(self.hold_s / drive.period_s)
+        excitation = Excitation(
+            Shape.BUFFER, Injection.SPEED, 0.0, hold_periods=hold, buffer=[self.aim + step * level for level in pattern]
+        )
+        trace = guard.record(("theta_m_rad", "i_q_a"), hold * len(pattern), excitation=excitation)
+        t, position, current = trace.t_s, trace["theta_m_rad"], trace["i_q_a"]
+        references = [(float(at), float(value)) for at, value in trace.meta["steps"]]
+        still = t < references[1][0]
+        if np.count_nonzero(still) < len(pattern):
+            raise IdentificationError("E_EXCITATION", "too few samples of the steps", likely="the bus is busy")
+        line = np.polyval(np.polyfit(t[still], position[still], 1), t[still])
+        count = 2.0 * math.pi / abs(drive.counts_per_turn)
+        noise_rad = math.hypot(float(np.std(position[still] - line)), ROUNDING * count)
+        noise_a = math.hypot(float(np.std(current[still])), ROUNDING * drive.current_count_a)
+        return StepRecord(t, position, current, references, [(HOLD_S, float(t[-1]))], noise_rad, noise_a)
+
+    def _observe(
+        self, what: str, step: float, counts: Mapping[str, int], first: SpeedLoop | None = None
+    ) -> Observation:
+        record = self._record(step, PATTERN)
+        loop = fit_speed_loop(record, first)
+        margin = math.degrees(phase_margin_rad(loop.K_p_per_J, loop.K_i_per_J, loop.lag_s))
+        self.say(
+            f"{what}: K_p/J {loop.K_p_per_J:.4g} 1/s, K_i/K_p {loop.K_i_per_J / loop.K_p_per_J:.3g} 1/s, "
+            f"phase margin about {margin:.0f} deg"
+        )
+        return Observation(counts[GAIN], counts[INTEGRAL], loop)
+
+    def _changed(
+        self,
+        gain: GainObject,
+        ratio: float,
+        own: SpeedLoop,
+        worst: tuple[float, float],
+        step: float,
+        counts: Mapping[str, int],
+    ) -> Observation | None:
+        """Change one gain while the voltage is off, measure, and bring it back; None where it must not be changed.
+
+        ``worst`` is by what K_p and K_i may have changed whatever the form: the margin is predicted for each.
+        """
+        try:
+            new = changed_counts(gain, ratio)
+        except NotAvailable as error:
+            self.notes.append(f"{gain.name}: {error.what}")
+            return None
+        a, b, lag_s = own.K_p_per_J, own.K_i_per_J, own.lag_s
+        margin = min(phase_margin_rad(a * p, b * i, lag_s) for p in (1.0, worst[0]) for i in (1.0, worst[0], worst[1]))
+        least = LEAST_MARGIN_RAD if max(worst) > 1.0 else LEAST_MARGIN_DOWN_RAD
+        if margin < least:
+            self.notes.append(
+                f"{gain.name}: not changed, for the predicted phase margin is {math.degrees(margin):.0f} deg, below "
+                f"{math.degrees(least):.0f}"
+            )
+            return None
+        try:
+            self._put(gain, new)
+        except SdoAbort as abort:
+            self.notes.append(f"{gain.name}: the drive does not take {new}: {abort.what}")
+            self.guard.enable()
+            return None
+        self.guard.enable()
+        found = None
+        try:
+            found = self._observe(f"{gain.address} {gain.counts} -> {new}", step, {**counts, gain.name: new}, own)
+        except IdentificationError as error:
+            self.notes.append(f"{gain.name}: {error.what}")
+        self._put(gain, gain.counts)  # after anything else the guard does it, and nothing is enabled again
+        self.guard.enable()
+        return found
+
+    def _put(self, gain: GainObject, counts: int) -> None:
+        data = gain.item.encode(counts)
+        self.guard.stop()
+        self.journal.note(gain.item.index, gain.item.sub, data)
+        self.guard.change(gain.item, data)

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""Gains of a maker's drive as a seed draws them: what one count is worth, the form of the integral part, peak or rms.
+
+The objects are the family's own and keep whole counts within the file's limits; what they mean is drawn, and nothing
+that measures may import it. The speed filter and the sampling of the speed loop are drawn with them.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from pmsmtool.sim.foreign.behind import Behind, SetUp
+from pmsmtool.sim.foreign.file_rows import MakersObjects
+from pmsmtool.sim.foreign.laws import Law
+
+Form = Literal["parallel", "rate", "time"]
+Address = tuple[int, int]
+SPEED_OBJECTS: tuple[tuple[Address, Address], ...] = (
+    ((0x30A2, 1), (0x30A2, 2)),
+    ((0x3210, 3), (0x3210, 4)),
+    ((0x2331, 1), (0x2331, 2)),
+    ((0x2381, 1), (0x2381, 2)),
+    ((0x60F9, 1), (0x60F9, 2)),
+)
+"""Proportional and integral part of the speed loop: EPOS4, Nanotec, Faulhaber, ZeroErr; EPOS2, Copley and CiA 402."""
+SOURCE = "drawn by a seed"
+BANDWIDTH_RAD_S = (25.0, 140.0)
+INTEGRAL_RATE = (0.08, 0.35)
+"""K_p / J, and K_i / K_p as a share of it: from a calm loop to a brisk one with 60 degrees of margin."""
+FILTER_HZ = (120.0, 1000.0)
+DECIMATION = (4, 20)
+CURRENT_BANDWIDTH = (0.08, 0.3)
+"""Bandwidth of the current loop (rad/s) times control period: a maker's tool leaves a tenth to a third."""
+RMS = math.sqrt(0.5)
+CURRENTS: Mapping[Address, float] = {
+    (0x6075, 0): RMS, (0x2031, 0): RMS, (0x203B, 1): RMS, (0x2039, 1): RMS, (0x2039, 2): RMS,
+    (0x3001, 1): 1.0, (0x3001, 2): 1.0, (0x30D1, 1): 1.0, (0x30D1, 2): 1.0, (0x30D0, 0): 1.0,
+    (0x2333, 1): 1.0, (0x2333, 2): 1.0,
+}  # fmt: skip
+"""Currents that families keep by an assumed convention: what one ampere peak counts there."""
+EPOS2_CURRENTS: tuple[Address, ...] = ((0x6410, 1), (0x6410, 2), (0x6078, 0), (0x2027, 0), (0x2030, 0))
+FAULHABER_CURRENT = (0x6078, 0)
+COUNTS = (250, 20_000)
+SMALL_COUNTS = (30, 200)
+"""Counts a gain holds at first; where the file allows no more than a byte."""
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnGains:
+    """What a seed drew; the truth of a benchmark.
+
+    Attributes
+    ----------
+    gain, integral : (index, sub)
+        Objects of the speed loop.
+    counts : tuple of int
+        What both hold at first.
+    K_p_nms_per_rad : float
+        One count of the gain (N m s/rad).
+    integral_scale : float
+        One count of the integral part: N m/rad (parallel), 1/s (rate) or s (time).
+    form : str
+        Of the integral part.
+    rms : bool
+        Whether the drive's currents are rms where no source says so.
+    filter_hz, decimation : float, int
+        Of the speed loop.
+    current_bandwidth : float
+        Of the current loop, times the control period.
+    """
+
+    gain: Address
+    integral: Address
+    counts: tuple[int, int]
+    K_p_nms_per_rad: float
+    integral_scale: float
+    form: Form
+    rms: bool
+    filter_hz: float
+    decimation: int
+    current_bandwidth: float
+
+    def K_i_nm_per_rad(self, gain: float, integral: float) -> float:
+        """Return the integral gain that counts of both objects mean."""
+        if self.form == "parallel":
+            return self.integral_scale * integral
+        K_p = self.K_p_nms_per_rad * gain
+        rate = self.integral_scale * integral
+        if self.form == "time":
+            rate = 1.0 / rate if rate else 0.0
+        return K_p * rate
+
+    def laws(self, laws: Mapping[Address, Law]) -> Iterator[Law]:
+        """Yield the laws of both gains, and those of the currents as drawn."""
+        held = list(map(float, self.counts))
+
+        def taking(position: int) -> Callable[[Behind, float], None]:
+            def act(behind: Behind, counts: float) -> None:
+                held[position] = counts
+                behind.set_speed_gains(self.K_p_nms_per_rad * held[0], self.K_i_nm_per_rad(*held))
+
+            return act
+
+        for position, address in enumerate((self.gain, self.integral)):
+            yield Law(*address, SOURCE, set_up=self.counts[position], act=taking(position))
+        kind = RMS if self.rms else 1.0
+        own = dict.fromkeys(EPOS2_CURRENTS, 1.0) if (0x2027, 0) in laws else {}
+        if (0x2333, 1) in laws:
+            own[FAULHABER_CURRENT] = 1.0
+        for address, stated in {**CURRENTS, **own}.items():
+            if address in laws:
+                yield _scaled(laws[address], kind / stated)
+
+
+def _scaled(law: Law, factor: float) -> Law:
+    """Return a law whose counts are larger by a factor."""
+    show, act = law.show, law.act
+    return replace(
+        law,
+        source=SOURCE,
+        set_up=None if law.set_up is None else law.set_up * factor,
+        show=None if show is None else lambda behind: factor * show(behind),
+        act=None if act is None else lambda behind, counts: act(behind, counts / factor),
+    )
+
+
+def draw_gains(seed: int, objects: MakersObjects, motor: SetUp) -> DrawnGains | None:
+    """Return the gains of a seed; None where the file has no gains of a speed loop that this program knows."""
+    found = next((pair for pair in SPEED_OBJECTS if objects.has(*pair)), None)
+    if found is None:
+        return None
+    chance = random.Random(f"gains {seed} {objects.name}")
+    bandwidth = _between(chance, *BANDWIDTH_RAD_S)
+    share = _between(chance, *INTEGRAL_RATE)
+    K_p = bandwidth * motor.J_kgm2
+    form: Form = chance.choice(("parallel", "rate", "time"))
+    counts = tuple(round(_between(chance, *_room(objects, address))) for address in found)
+    rate = share * bandwidth
+    kept = {"parallel": K_p * rate, "rate": rate, "time": 1.0 / rate}[form]
+    return DrawnGains(
+        *found, (counts[0], counts[1]), K_p / counts[0], kept / counts[1], form, chance.random() < 0.5,
+        _between(chance, *FILTER_HZ), chance.randint(*DECIMATION), _between(chance, *CURRENT_BANDWIDTH),
+    )  # fmt: skip
+
+
+def _room(objects: MakersObjects, address: Address) -> tuple[int, int]:
+    row = objects.rows[address]
+    return SMALL_COUNTS if row.high is not None and row.high < COUNTS[1] else COUNTS
+
+
+def _between(chance: random.Random, low: float, high: float) -> float:
+    return math.exp(chance.uniform(math.log(low), math.log(high)))

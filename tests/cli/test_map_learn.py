@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: MIT
+"""`map learn` on a simulated drive whose gains a seed drew: what it finds, what it refuses, what it leaves."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from pmsmtool.bus.connect import connect
+from pmsmtool.bus.connection import Connection
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.guard import GuardedDrive, guarded
+from pmsmtool.drive.speed_loop_drive import Oscillation, SpeedLoopDrive
+from pmsmtool.drive_maps.drive_map_file import parse_drive_map
+from pmsmtool.drive_maps.measured_rows import MeasuredRow
+from pmsmtool.drive_maps.shipped_maps import load_family
+from pmsmtool.errors import LimitExceeded, SafetyRefusal
+from pmsmtool.flash.gain_journal import any_left
+from pmsmtool.identification.speed_loop_response import SpeedLoop
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.machine.profile import machine_path
+from pmsmtool.measurement import learn_gains
+from pmsmtool.sim.foreign.drawn_gains import DrawnGains
+from pmsmtool.sim.foreign.drive import ForeignDrive
+from pmsmtool.sim.node.node import Node
+from tests.cli.conftest import Tool
+from tests.foreign.data_sheets import COMMON, HEARTBEAT, Row, identity, write_eds
+
+SEED = 4
+GAIN, INTEGRAL = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"
+PDO: tuple[Row, ...] = tuple(
+    (base + number, sub, kind, "rw", value)
+    for number in (1, 2, 3)
+    for base, rows in (
+        (0x1800, ((1, "U32", f"{0x80000180 + 0x100 * number:#x}"), (2, "U8", "255"), (5, "U16", "0"))),
+        (0x1A00, ((0, "U8", "0"), (1, "U32", "0"), (2, "U32", "0"))),
+    )
+    for sub, kind, value in rows
+)
+
+
+def drive_rows(*more: Row) -> tuple[Row, ...]:
+    """A drive of CiA 402 with a cyclic velocity mode, limits, process data, and gains in 0x60F9."""
+    return (
+        *COMMON, *HEARTBEAT, *PDO, *identity(0x999, 1), (0x6007, 0, "I16", "rw", "2"),
+        (0x6073, 0, "U16", "rw", ""), (0x6075, 0, "U32", "rw", ""), (0x6078, 0, "I16", "ro", ""),
+        (0x606C, 0, "I32", "ro", ""), (0x6080, 0, "U32", "rw", ""), (0x608F, 1, "U32", "ro", "8192"),
+        (0x608F, 2, "U32", "ro", "1"), (0x60FF, 0, "I32", "rw", "0"), (0x60F9, 1, "U16", "rw", "0"),
+        (0x60F9, 2, "U16", "rw", "0"), (0x6502, 0, "U32", "ro", "0x100"), *more,
+    )  # fmt: skip
+
+
+class Bench:
+    """A drawn drive that stays powered while commands come and go, and a machine file for it."""
+
+    def __init__(self, folder: Path, *more: Row) -> None:
+        eds = write_eds(folder / "drive.eds", drive_rows(*more))
+        machine = load_machine_file(machine_path("interior-2k2"))
+        machine.std["J_kgm2"] = 0.02 * machine.machine.J_kgm2  # type: ignore[index, operator]
+        self.machine = folder / "machine.toml"
+        self.machine.write_text(dump_machine_file(machine), encoding="utf-8")
+        self.channel = f"interior-2k2?nv=:memory:&eds={eds}&gains={SEED}"
+        self.holder = connect("pmsmsim", self.channel)
+
+    @property
+    def node(self) -> Node:
+        return cast(Node, self.holder.bus.line.nodes[0])  # type: ignore[attr-defined]
+
+    @property
+    def drawn(self) -> DrawnGains:
+        gains = cast(ForeignDrive, self.node.face).gains
+        assert gains is not None
+        return gains
+
+    def counts(self) -> tuple[int, int]:
+        assert self.node.session is not None
+        find = self.node.session.dictionary.find
+        return find(*self.drawn.gain).integer(), find(*self.drawn.integral).integer()
+
+    def learn(self, tool: Tool, *arguments: str, yes: bool = True) -> Any:
+        consent = ("--yes",) if yes else ()
+        return tool("--sim", self.channel, *consent, "map", "learn", "--machine", str(self.machine), *arguments)
+
+
+@pytest.fixture
+def bench(tool: Tool, tmp_path: Path) -> Any:
+    made = Bench(tmp_path)
+    yield made
+    made.holder.close()
+
+
+def test_learned_gains_are_the_drawn_ones_and_go_into_a_map(bench: Bench, tool: Tool, tmp_path: Path) -> None:
+    before = bench.counts()
+    code, printed, said = bench.learn(tool, "-o", "mine.toml", "--json")
+    assert code == 0, said
+    assert bench.counts() == before and not any_left()
+    facts = json.loads(printed)
+    drawn, found = bench.drawn, {row["name"]: row for row in facts["gains"]}
+    assert found[GAIN]["scale"] == pytest.approx(drawn.K_p_nms_per_rad, rel=0.12)
+    form = {"parallel": "value"}.get(drawn.form, drawn.form)
+    assert found[INTEGRAL]["form"] == form
+    assert found[INTEGRAL]["scale"] == pytest.approx(drawn.integral_scale, rel=0.12)
+    cells = parse_drive_map((tmp_path / "mine.toml").read_text(encoding="utf-8")).cells
+    assert cells[GAIN].source == "measured" and (cells[GAIN].index, cells[GAIN].sub) == drawn.gain
+    K_p = cells[GAIN].decode(before[0].to_bytes(2, "little"), {})
+    K_i = cells[INTEGRAL].decode(before[1].to_bytes(2, "little"), {GAIN: K_p})
+    assert K_i == pytest.approx(drawn.K_i_nm_per_rad(*before), rel=0.2)
+    published = cells[GAIN]
+    row = MeasuredRow(GAIN, *drawn.gain, "UNSIGNED16", "value", "", 2.0 * published.factor, "N m s/rad", 0.1)
+    assert "in the map, measured is" in row.against(published)
+    assert replace(row, scale=1.05 * published.factor).against(published) == ""
+
+
+def test_refused_before_anything_is_written(tool: Tool, tmp_path: Path) -> None:
+    bench = Bench(tmp_path, (0x1010, 1, "U32", "rw", "2"))
+    with bench.holder:
+        code, _, said = bench.learn(tool)
+        assert code == 5 and "stores parameters by itself" in said
+    (tmp_path / "other").mkdir()
+    bench = Bench(tmp_path / "other")
+    with bench.holder:
+        for arguments, why in ((("--shaft", "coupled"), "free shaft"), (("--load", "gravity"), "falls")):
+            code, _, said = bench.learn(tool, *arguments)
+            assert code == 5 and (why in said or "free shaft" in said)
+        code, _, said = bench.learn(tool, yes=False)
+        assert code == 7 and "is changed while the voltage is off" in said
+        assert not any_left()
+
+
+def test_killed_with_a_changed_gain_the_next_connection_restores(
+    bench: Bench, tool: Tool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = bench.counts()
+    change = GuardedDrive.change
+
+    def cut(self: GuardedDrive, item: Any, data: bytes) -> None:
+        change(self, item, data)
+        connection: Connection = self._node.connection
+        monkeypatch.setattr(connection.bus, "_pulled", True)
+        raise KeyboardInterrupt
+
+    loop = SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02, 1.0, 1.0)
+    monkeypatch.setattr(learn_gains, "fit_speed_loop", lambda *arguments: loop)
+    monkeypatch.setattr(learn_gains, "PATTERN", learn_gains.PATTERN[:18])
+    monkeypatch.setattr(GuardedDrive, "change", cut)
+    code, _, _ = bench.learn(tool)
+    assert code != 0 and bench.counts() != before and any_left()
+    bench.holder.wait(1.0)
+    code, _, said = tool("--sim", bench.channel, "info")
+    assert "restored" in said and bench.counts() == before and not any_left()
+
+
+def test_an_oscillation_trips() -> None:
+    watched = Oscillation()
+    for k in range(40):
+        watched.take(0.1 * (-1) ** k)
+    watched.limit_a = 3.0 * watched.largest_a
+    watched.begin()
+    for k in range(20):
+        watched.take(0.29 * (-1) ** k)
+    watched.check("node 1")
+    for k in range(20):
+        watched.take(0.4 * (-1) ** k)
+    with pytest.raises(LimitExceeded, match="oscillation"):
+        watched.check("node 1")
+
+
+def test_a_gain_is_changed_only_while_the_voltage_is_off(bench: Bench) -> None:
+    before = bench.counts()
+    with connect("pmsmsim", bench.channel) as connection:
+        drive = SpeedLoopDrive(connection, 1, drive_map=load_family("cia402"))
+        gain = learn_gains.gain_object(drive.node, GAIN, *bench.drawn.gain)
+        data = gain.item.encode(gain.counts - 100)
+        with guarded(drive, Envelope(6.0, 50.0)) as guard:
+            guard.enable()
+            with pytest.raises(SafetyRefusal, match="only while the voltage is off"):
+                guard.change(gain.item, data)
+            assert bench.counts() == before
+            guard.stop()
+            guard.change(gain.item, data)
+            assert bench.counts() == (before[0] - 100, before[1])
+        assert bench.counts() == before
+        drive.close()

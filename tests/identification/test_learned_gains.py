@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: MIT
+"""Form, scale and convention out of measured loops: what is decided is right, and what is not stays unknown."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from pmsmtool.identification.learned_gains import Observation, Rotor, convention, gain_scale, integral_scale
+from pmsmtool.identification.speed_loop_response import SpeedLoop
+
+J = 2e-3
+COUNT, COUNTS, INTEGRALS = 4e-5, 2000, 500
+A0 = COUNT * COUNTS / J
+RATE = 8.0
+ROTOR = Rotor(J, 0.02, 1.0)
+P, I = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"  # noqa: E741
+
+
+def loop(a: float, b: float, amps: float = 0.02) -> SpeedLoop:
+    return SpeedLoop(a, b, 2e-3, 1e-3, amps, 1.0, 1.2)
+
+
+def b_of(form: str, gain: int, integral: int) -> float:
+    a = A0 * gain / COUNTS
+    ratio = integral / INTEGRALS
+    return {"value": A0 * RATE * ratio, "rate": a * RATE * ratio, "time": a * RATE / ratio, "none": A0 * RATE}[form]
+
+
+def observed(form: str, half_size: float = 0.0) -> tuple[list[Observation], Observation, list[Observation]]:
+    def one(gain: int, integral: int, off: float = 0.0) -> Observation:
+        return Observation(gain, integral, loop(A0 * gain / COUNTS, b_of(form, gain, integral) * math.exp(off)))
+
+    base = [one(COUNTS, INTEGRALS), one(COUNTS, INTEGRALS, half_size)]
+    return base, one(1400, INTEGRALS), [one(COUNTS, 400), one(COUNTS, 250)]
+
+
+@pytest.mark.parametrize(
+    ("form", "unit", "scale"),
+    [("value", "N m/rad", J * A0 * RATE / INTEGRALS), ("rate", "1/s", RATE / INTEGRALS),
+     ("time", "s", 1.0 / RATE / INTEGRALS)],
+)  # fmt: skip
+def test_each_form_is_told_apart(form: str, unit: str, scale: float) -> None:
+    base, gain_changed, integral_changed = observed(form)
+    gain = gain_scale(base, gain_changed, ROTOR, P)
+    assert gain.scale == pytest.approx(COUNT, rel=1e-3) and gain.half_width < 0.12
+    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    assert (found.form, found.unit) == (form, unit) and found.scale == pytest.approx(scale, rel=3e-3)
+    assert min(found.chi_squares, key=lambda name: found.chi_squares[name]) == form
+
+
+def test_what_is_not_told_apart_stays_unknown() -> None:
+    base, _, integral_changed = observed("value")
+    between = Observation(1400, INTEGRALS, loop(0.7 * A0, math.sqrt(0.7) * A0 * RATE))
+    found = integral_scale(base, between, integral_changed, ROTOR, I)
+    assert found.scale is None and "not told apart" in found.why
+
+
+def test_steps_of_two_sizes_say_what_friction_leaves() -> None:
+    base, gain_changed, integral_changed = observed("rate", half_size=-0.04)
+    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    assert found.scale == pytest.approx(math.exp(0.04) * RATE / INTEGRALS)
+    base, gain_changed, integral_changed = observed("rate", half_size=-0.15)
+    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    assert found.scale is None and "too wide" in found.why
+
+
+def test_an_object_without_effect_is_named() -> None:
+    base, gain_changed, integral_changed = observed("none")
+    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    assert found.scale is None and found.form is None and "no effect" in found.why
+
+
+def test_a_response_that_does_not_follow_the_counts_decides_nothing() -> None:
+    base, gain_changed, _ = observed("value")
+    half = Observation(1400, INTEGRALS, loop(A0 * math.sqrt(0.7), A0 * RATE))
+    assert "exponent 0.50" in gain_scale(base, half, ROTOR, P).why
+    assert gain_scale(base, None, ROTOR, P).scale is None
+    wide = gain_scale(base, gain_changed, Rotor(J, 0.1, 1.0), P)
+    assert wide.scale is None and "too wide" in wide.why
+
+
+def test_an_integral_that_moves_the_gain_too_is_not_one() -> None:
+    base, gain_changed, _ = observed("value")
+    both = Observation(COUNTS, 400, loop(0.8 * A0, 0.8 * A0 * RATE))
+    assert "moved K_p" in integral_scale(base, gain_changed, [both], ROTOR, I).why
+
+
+@pytest.mark.parametrize(("kind", "ratio"), [("peak", 1.0), ("rms", math.sqrt(2.0)), ("block", 1.1027)])
+def test_convention_from_the_acceleration_of_an_ampere(kind: str, ratio: float) -> None:
+    torque_per_apk = 0.3
+    shown = [Observation(1, 1, loop(A0, A0 * RATE, amps=J / (torque_per_apk * ratio)))] * 2
+    assert convention(shown, Rotor(J, 0.005, 1.0), torque_per_apk, 0.005, 1.0).kind in (None, kind)
+    wide = convention(shown, Rotor(J, 0.04, 1.0), torque_per_apk, 0.03, 1.0)
+    assert wide.kind == ("rms" if kind == "rms" else None)
+    read_as_rms = [Observation(1, 1, loop(A0, A0 * RATE, amps=math.sqrt(2.0) * J / (torque_per_apk * ratio)))]
+    assert convention(read_as_rms, Rotor(J, 0.04, 1.0), torque_per_apk, 0.03, math.sqrt(2.0)).kind == wide.kind
+
+
+def test_a_light_rotor_leaves_a_gain_unknown_but_not_a_time() -> None:
+    base, gain_changed, integral_changed = observed("time")
+    light = Rotor(J, 0.02, 3e-3)  # its EMF may hold back a sixth of the torque, more or less
+    assert gain_scale(base, gain_changed, light, P).scale is None
+    assert integral_scale(base, gain_changed, integral_changed, light, I).scale == pytest.approx(
+        1.0 / RATE / INTEGRALS, rel=3e-3
+    )
+    middle = gain_scale(base, gain_changed, Rotor(J, 0.02, 1e-2), P)
+    assert middle.scale == pytest.approx(1.05 * COUNT) and middle.half_width > 0.08

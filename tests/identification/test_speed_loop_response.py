@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: MIT
+"""A speed loop out of its step responses, against a loop that is simulated sample by sample."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from pmsmtool.errors import IdentificationError
+from pmsmtool.identification.speed_loop_response import StepRecord, fit_speed_loop, phase_margin_rad
+from pmsmtool.measurement.learn_gains import PATTERN
+
+PLANT_S = 1e-4
+AMPS_PER_RAD_S2 = 0.011
+
+
+def simulated(
+    a: float, b: float, filter_s: float, every: int, latency_s: float, steps: Sequence[tuple[float, float]], seed: int
+) -> StepRecord:
+    """Run the loop in periods of 100 us, its controller every few of them, and sample it every millisecond."""
+    rng = np.random.default_rng(seed)
+    end = steps[-1][0] + 0.4
+    omega = filtered = steps[0][1]
+    angle = integral = torque = 0.0
+    rows = []
+    times, values = [at for at, _ in steps], [value for _, value in steps]
+    for k in range(int(end / PLANT_S)):
+        t = k * PLANT_S
+        reference = values[max(0, int(np.searchsorted(times, t - latency_s, side="right")) - 1)]
+        filtered += PLANT_S / filter_s * (omega - filtered)
+        if k % every == 0:
+            integral += b * (reference - filtered) * every * PLANT_S
+            torque = a * (reference - filtered) + integral
+        omega += torque * PLANT_S
+        angle += omega * PLANT_S
+        if k % 10 == 0:
+            rows.append((t, angle, AMPS_PER_RAD_S2 * torque))
+    table = np.array(rows)
+    count = 2.0 * math.pi / 16384
+    position = np.round(table[:, 1] / count) * count
+    current = table[:, 2] + rng.normal(0.0, 0.01, len(table))
+    return StepRecord(table[:, 0], position, current, steps, [(0.05, end)], count / 3.5, 0.01)
+
+
+def staircase(bias: float, step: float) -> list[tuple[float, float]]:
+    steps, before = [], -1
+    for k, level in enumerate(PATTERN):
+        if level != before:
+            steps.append((0.05 * k, bias + step * level))
+        before = level
+    return steps
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "filter_s", "every", "latency_s"),
+    [(40.0, 320.0, 8e-4, 5, 5e-4), (110.0, 2400.0, 3e-4, 2, 1.7e-3)],
+)
+def test_gains_over_inertia(a: float, b: float, filter_s: float, every: int, latency_s: float) -> None:
+    found = fit_speed_loop(simulated(a, b, filter_s, every, latency_s, staircase(60.0, 8.0), 1))
+    assert found.K_p_per_J == pytest.approx(a, rel=0.02)
+    assert found.K_i_per_J == pytest.approx(b, rel=0.03)
+    assert found.amps_per_rad_s2 == pytest.approx(AMPS_PER_RAD_S2, rel=0.03)
+    assert found.reference_scale == pytest.approx(1.0, abs=2e-3)
+
+
+def test_a_shaft_that_does_not_answer_gives_nothing() -> None:
+    good = simulated(40.0, 320.0, 8e-4, 5, 5e-4, staircase(60.0, 8.0), 1)
+    turning = StepRecord(good.t_s, 60.0 * good.t_s, np.zeros_like(good.t_s), good.references, good.segments, 1e-3, 0.01)
+    with pytest.raises(IdentificationError, match="E_EXCITATION"):
+        fit_speed_loop(turning)
+    short = StepRecord(
+        *(x[:150] for x in (good.t_s, good.position_rad, good.current_a)), good.references, [(0, 1)], 1, 1
+    )
+    with pytest.raises(IdentificationError, match="too few samples"):
+        fit_speed_loop(short)
+
+
+def test_phase_margin_is_that_of_the_open_loop() -> None:
+    a, b, lag = 100.0, 1500.0, 3e-3
+    omega = np.geomspace(1.0, 1e4, 200_001)
+    s = 1j * omega
+    loop = (a * s + b) / (s * s * (1.0 + lag * s))
+    at = int(np.argmin(np.abs(np.abs(loop) - 1.0)))
+    assert phase_margin_rad(a, b, lag) == pytest.approx(math.pi + np.angle(loop[at]), abs=1e-3)
