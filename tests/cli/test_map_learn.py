@@ -16,7 +16,7 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import GuardedDrive, guarded
 from pmsmtool.drive.speed_loop_drive import Oscillation, SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
-from pmsmtool.drive_maps.measured_rows import MeasuredRow
+from pmsmtool.drive_maps.measured_rows import MeasuredRow, with_measured
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import LimitExceeded, SafetyRefusal
 from pmsmtool.flash.gain_journal import any_left
@@ -96,23 +96,33 @@ def bench(tool: Tool, tmp_path: Path) -> Any:
 def test_learned_gains_are_the_drawn_ones_and_go_into_a_map(bench: Bench, tool: Tool, tmp_path: Path) -> None:
     before = bench.counts()
     code, printed, said = bench.learn(tool, "-o", "mine.toml", "--json")
-    assert code == 0, said
+    assert code in (0, 10), said  # the interval of a slow integral may be wider than is decided
     assert bench.counts() == before and not any_left()
     facts = json.loads(printed)
     drawn, found = bench.drawn, {row["name"]: row for row in facts["gains"]}
     assert found[GAIN]["scale"] == pytest.approx(drawn.K_p_nms_per_rad, rel=0.12)
-    form = {"parallel": "value"}.get(drawn.form, drawn.form)
-    assert found[INTEGRAL]["form"] == form
-    assert found[INTEGRAL]["scale"] == pytest.approx(drawn.integral_scale, rel=0.12)
+    assert found[INTEGRAL]["form"] == drawn.form == "time"
+    assert found[INTEGRAL]["scale"] in (None, pytest.approx(drawn.integral_scale, rel=0.12))
     cells = parse_drive_map((tmp_path / "mine.toml").read_text(encoding="utf-8")).cells
     assert cells[GAIN].source == "measured" and (cells[GAIN].index, cells[GAIN].sub) == drawn.gain
-    K_p = cells[GAIN].decode(before[0].to_bytes(2, "little"), {})
-    K_i = cells[INTEGRAL].decode(before[1].to_bytes(2, "little"), {GAIN: K_p})
-    assert K_i == pytest.approx(drawn.K_i_nm_per_rad(*before), rel=0.2)
-    published = cells[GAIN]
-    row = MeasuredRow(GAIN, *drawn.gain, "UNSIGNED16", "value", "", 2.0 * published.factor, "N m s/rad", 0.1)
-    assert "in the map, measured is" in row.against(published)
-    assert replace(row, scale=1.05 * published.factor).against(published) == ""
+    assert (INTEGRAL in cells) == (found[INTEGRAL]["scale"] is not None) == (code == 0)
+
+
+def test_measured_rows_make_a_map_and_check_a_published_one() -> None:
+    rows = [
+        MeasuredRow(GAIN, 0x60F9, 1, "UNSIGNED16", "value", "", 2e-4, "N m s/rad", 0.1),
+        MeasuredRow(INTEGRAL, 0x60F9, 2, "UNSIGNED16", "time", GAIN, 5e-5, "s", 0.1),
+    ]
+    made = with_measured(load_family("cia402"), 0x999, 1, rows, "on a bench", None)
+    assert made.is_for(0x999, 1) and made.cells[INTEGRAL].source == "measured"
+    K_p = made.cells[GAIN].decode((500).to_bytes(2, "little"), {})
+    assert K_p == pytest.approx(0.1)
+    assert made.cells[INTEGRAL].decode((2000).to_bytes(2, "little"), {GAIN: K_p}) == pytest.approx(K_p / 0.1)
+    alone = with_measured(load_family("cia402"), 0x999, 1, rows[1:], "on a bench", None)
+    assert INTEGRAL not in alone.cells and f"needs {GAIN}" in alone.sources["measured"]
+    assert "in the map, measured is" in replace(rows[0], scale=4e-4).against(made.cells[GAIN])
+    assert replace(rows[0], scale=2.1e-4).against(made.cells[GAIN]) == ""
+    assert "form" in replace(rows[1], form="rate").against(made.cells[INTEGRAL])
 
 
 def test_refused_before_anything_is_written(tool: Tool, tmp_path: Path) -> None:
