@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from pmsmtool.estimators.estimate import (
     COVERAGE_FACTOR,
@@ -268,6 +267,7 @@ def estimate_resistance(
 
 def _warmth(t: Vector, i: Vector, v: Vector, peak: float, sigma_v: float) -> Vector:
     """Return how the winding warms from level to level: with time, or where that does not fit, by its own losses."""
+    from scipy.optimize import minimize_scalar
 
     def misfit(warmth: Vector) -> float:
         return min(_fit_tail(warmth, i, v, peak, sigma_v, powers).chi2 for powers in tail_models())

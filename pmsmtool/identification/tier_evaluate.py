@@ -23,7 +23,6 @@ from pmsmtool.estimators.resistance import R_MEASURED, Copper, copper_of
 from pmsmtool.estimators.resistance import normalised as resistance_at_reference
 from pmsmtool.estimators.rotation_offset import offset_by_turns
 from pmsmtool.estimators.shaft.inertia_ratio import estimate_ratios
-from pmsmtool.estimators.supply_power import resistance_by_supply
 from pmsmtool.files import read_text
 from pmsmtool.identification.calibration import calibrated_traces
 from pmsmtool.identification.evaluate import tolerance_on
@@ -31,6 +30,7 @@ from pmsmtool.identification.push_limits import not_told, without
 from pmsmtool.identification.replay import MACHINE, NAMEPLATE, asked_again, place_of
 from pmsmtool.identification.replay import replay as replay_injection
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
+from pmsmtool.identification.supply_power import resistance_by_supply
 from pmsmtool.identification.tier_machine import tier_machine
 from pmsmtool.identification.tier_verdict import TOLD_BY, judged, stage_of
 from pmsmtool.identification.vendor_machine import ANSWERS
