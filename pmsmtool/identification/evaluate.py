@@ -107,7 +107,10 @@ class Evaluation:
         found = []
         if self.flux is not None and self.flux.driven is not None:
             common = self.flux.voltage_scale_std
-            found.append(cross_check("psi_f_wb_driven", "psi_f_wb", self.flux.driven, self.flux.psi_f, common))
+            first = self.flux.psi_f
+            apart = self.flux.apart_wb * first.value / self.flux.psi_measured.value
+            alone = replace(first, std=math.sqrt(max(0.0, first.std**2 - apart**2)))
+            found.append(cross_check("psi_f_wb_driven", "psi_f_wb", self.flux.driven, alone, common))
         if self.flux is not None and self.inductance is not None:
             found.append(cross_check("L_q_h_apparent", "L_q_h", self.flux.L_q_app, self.inductance.L_q))
         return found

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.estimators.cross_check import driven_flux_linkage
-from pmsmtool.estimators.estimate import SensorTolerance, condition_gate, information_weights
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, condition_gate, information_weights
 from pmsmtool.estimators.flux.linkage_rows import STAGE, Corrected, check_speeds, corrected, fastest_pair, pairs_of
 from pmsmtool.estimators.injection.sampling_instant import CoastingPairs, Sampling, ShownInstant, shown_instant
 from pmsmtool.estimators.injection.switching_ripple import Modulation
@@ -82,6 +82,9 @@ class FluxResult:
         The same at the temperature of the run (Wb).
     frame_offset : Estimate
         Angle of the frame ahead of the d axis (rad electrical): add it to the stored encoder offset.
+    apart_wb : float
+        How far the flux linkage by driving currents lies from this one, where beyond what both say of themselves: then
+        an effect that neither knows, iron loss above all, is in them, and it is a standard deviation here. Else 0 (Wb).
     driven : Estimate or None
         PM flux linkage at the reference temperature by the run's q currents, a check only (Wb); None without them.
     voltage_scale_std : float
@@ -116,6 +119,7 @@ class FluxResult:
     omega_rad_s: Vector
     residual_wb: Vector
     shown: ShownInstant | None = None
+    apart_wb: float = 0.0
 
 
 def estimate_flux_linkage(
@@ -202,6 +206,14 @@ def estimate_flux_linkage(
     fitted = math.hypot(math.cos(eps) * even.std_wb, math.sin(eps) * d_std[1])
     std = math.hypot(fitted, model_std)
     T = float(np.mean(speeds["T_magnet_c"]))
+    L_d = _rough_L_d(rows, np.nonzero(rows.is_d)[0])
+    driven = driven_flux_linkage(rows, L_d, x2, even.curvature, lag_s, tolerance, T)
+    apart = 0.0
+    if driven is not None:
+        common = tolerance.voltage_scale_std * psi
+        own = math.sqrt(max(0.0, driven.std**2 - common**2 + std**2 - common**2))
+        apart = abs(driven.value - psi) if abs(driven.value - psi) > COVERAGE_FACTOR * own else 0.0
+    std = math.hypot(std, apart)
     measured = Estimate(
         value=psi,
         std=std,
@@ -225,8 +237,6 @@ def estimate_flux_linkage(
         method="direction of the no-load voltage over speeds in both directions",
         dof=d_dof,
     )
-    L_d = _rough_L_d(rows, np.nonzero(rows.is_d)[0])
-    driven = driven_flux_linkage(rows, L_d, x2, even.curvature, lag_s, tolerance, T)
     return FluxResult(
         psi_f=normalised(measured, T_ref_c, alpha_psi_per_k, tolerance),
         psi_measured=measured,
@@ -252,6 +262,7 @@ def estimate_flux_linkage(
         omega_rad_s=even.w,
         residual_wb=even.residual_wb,
         shown=shown,
+        apart_wb=apart,
     )
 
 
