@@ -13,7 +13,6 @@ from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import square_injection
-from pmsmtool.experiments.vector_turn import come_to_rest
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.trace import Trace
 
@@ -117,9 +116,6 @@ class SquareStage:
             self.say(f"L_d, L_q: square wave on {plan.bias_d_a:.3g} A, {plan.ripple_a:.3g} A peak to peak")
             square_injection.hold_bias(self.drive, plan)
             ahead = self._rotor_ahead(encoder, plan)
-            if abs(ahead) > BIAS_OFF_RAD + abs(encoder.lag_rad):
-                come_to_rest(self.drive)  # much inertia swings on the vector for seconds
-                ahead = self._rotor_ahead(encoder, plan)
             aligned = plan
             for _ in range(ALIGN_TRIES):
                 if abs(ahead) > BIAS_OFF_RAD + abs(encoder.lag_rad):
