@@ -58,6 +58,9 @@ def restore_command(
         raise ConfigError("the backup holds bytes by address, --map scales values", hint="leave out --map")
     with set_named() as jobs, open_node(bus, within_s=WHOLE_SET_S) as node:
         identity = node.identity()
+        if map_file is not None:
+            node.map = drive_map
+            checked_identity(node)
         folder = JournalFolder(identity)
         snapshot = given or folder.last()
         if snapshot is None:

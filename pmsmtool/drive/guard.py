@@ -22,7 +22,16 @@ from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
-from pmsmtool.drive.motion_objects import Quantity, allowed, current_limits, rated_apk, speed_limits
+from pmsmtool.drive.motion_objects import (
+    OVER_SPEED_TRIP,
+    Quantity,
+    allowed,
+    current_limits,
+    lowered_trip,
+    rated_apk,
+    speed_limits,
+    trips_itself,
+)
 from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, Recording, Shape
 from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import (
@@ -61,9 +70,6 @@ KEPT_SHARE, KEPT_S = 0.1, 0.5
 """A commanded speed kept this closely for so long proves encoder sign and speed loop: a wrong sign runs away."""
 UNPROVEN_BY = ("motor.", "encoder.", "current.", "speed.", "inverter.")
 """Parameters after whose change a proven speed loop is proven no more."""
-OVER_SPEED_TRIP, TRIP_RATIO = "protection.n_trip_rpm", 1.5
-"""Speed at which a drive that has such a trip removes the voltage by itself, whatever commands it, over the envelope's:
-above what the tool's own look sees first, so that the limit is named."""
 _ROUNDING = 1e-9
 RATED_RATIO = 30.0
 """Largest current limit over the drive's rated current (0x6075): three times the rated current of a motor ten times as
@@ -169,9 +175,9 @@ class GuardedDrive:
                 hint="without them nothing is moved",
             )
         self._speed_overshoot = OVERSHOOT if speed else 1.0
-        trip = TRIP_RATIO * rpm_from_rad_s(envelope.speed_max_rad_s)
-        if trips_itself(drive) and drive.read(OVER_SPEED_TRIP) > trip:
-            self.write({OVER_SPEED_TRIP: trip})
+        if trips_itself(self._node):
+            held = drive.read(OVER_SPEED_TRIP)
+            self.write({OVER_SPEED_TRIP: lowered_trip(held, rpm_from_rad_s(envelope.speed_max_rad_s))})
 
     def _keep(self, limits: Iterator[Quantity], wanted: float) -> bool:
         """Lower the drive's own limit to what is wanted (A peak or rpm); False where it has none."""
@@ -505,11 +511,6 @@ class GuardedDrive:
                 likely=_TURNS if quantity == "travel" and self.envelope.shaft == "locked" else "",
                 hint=_NEXT_STEP.get(quantity, "ask for less"),
             )
-
-
-def trips_itself(drive: CanopenDrive) -> bool:
-    """Return whether the drive removes the voltage by itself at a speed that is set, in every mode."""
-    return OVER_SPEED_TRIP in drive.node.map.cells
 
 
 @contextmanager

@@ -40,6 +40,11 @@ RATED_RMS = 1e-3 * math.sqrt(2.0)
 """A peak per count of 0x6075, taken as mA rms: the larger of the two readings."""
 NO_RATED = "its rated current (0x6075, or the maker's own object in a map that names this drive)"
 NO_COUNTS = "how many increments its encoder has per turn (0x608F, or the maker's own object in a map)"
+OVER_SPEED_TRIP, TRIP_RATIO = "protection.n_trip_rpm", 1.5
+"""Speed at which a drive that has such a trip removes the voltage by itself, whatever commands it, over the envelope's:
+above what the tool's own look sees first, so that the limit is named."""
+TRIP_LEAST = 0.25
+"""Smallest speed for it, of the trip that the drive holds: a rotor that aligns with a vector is fast for a moment."""
 _ABSENT = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX)
 
 
@@ -254,6 +259,16 @@ def speed_limits(node: DriveNode) -> Iterator[Quantity]:
     own = _own(node, "speed_limit")
     if own is not None:
         yield Quantity(own.item, own.per_count * RPM_PER_RAD_S)
+
+
+def trips_itself(node: DriveNode) -> bool:
+    """Return whether the drive removes the voltage by itself at a speed that is set, in every mode."""
+    return OVER_SPEED_TRIP in node.map.cells
+
+
+def lowered_trip(held_rpm: float, speed_max_rpm: float) -> float:
+    """Return that speed (rpm) for a drive that is lent: never above what it holds."""
+    return min(held_rpm, TRIP_RATIO * max(speed_max_rpm, TRIP_LEAST * held_rpm))
 
 
 def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, float] | None:

@@ -16,7 +16,7 @@ GROWTH, LONGER = 1.25, 1.6
 the next one brings to little, whatever friction took."""
 BELOW = 9
 """Growths below the largest first push at which the first one begins: 0.7 % of the test current."""
-MOST_TRIES = 40
+MOST_TRIES = 29
 SURELY, LESS = 0.25, 0.8
 """Of a way, what answers surely: the second push is then this share of the first, else it is larger."""
 OVER_FRICTION = 1.3

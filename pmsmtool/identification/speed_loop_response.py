@@ -229,7 +229,12 @@ def fit_speed_loop(record: StepRecord, first: SpeedLoop | None = None) -> SpeedL
     plain = _solve(model, plain, weights)
     rest_position, rest_current, amps, scale = model.fitted(plain)
     if not scale > 0.0 or amps == 0.0:
-        raise IdentificationError("E_EXCITATION", "the shaft does not answer the steps of the speed reference")
+        raise IdentificationError(
+            "E_EXCITATION",
+            "the shaft does not answer the steps of the speed reference",
+            likely="a locked shaft or a closed brake, or a speed loop that is not set up",
+            hint="free the shaft; run the maker's own set-up first",
+        )
     misfit = math.hypot(*(float(np.sqrt(np.mean(part**2))) for part in (rest_position, rest_current))) / math.sqrt(2.0)
     return SpeedLoop(
         math.exp(plain[0]), math.exp(plain[1]), math.exp(plain[2]), float(plain[3]), amps, scale, misfit

@@ -289,7 +289,10 @@ class _Learner:
         references = [(float(at), float(value)) for at, value in trace.meta["steps"]]
         still = t < references[1][0]
         if np.count_nonzero(still) < len(pattern):
-            raise IdentificationError("E_EXCITATION", "too few samples of the steps", likely="the bus is busy")
+            raise IdentificationError(
+                "E_EXCITATION", "too few samples of the steps",
+                likely="the bus is busy", hint="leave the bus to this program, then run the command again",
+            )  # fmt: skip
         line = np.polyval(np.polyfit(t[still], position[still], 1), t[still])
         count = 2.0 * math.pi / abs(drive.counts_per_turn)
         noise_rad = math.hypot(float(np.std(position[still] - line)), ROUNDING * count)

@@ -18,8 +18,8 @@ from dataclasses import replace
 from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration
-from pmsmtool.drive.guard import OVERSHOOT, guarded, trips_itself
-from pmsmtool.drive.motion_objects import allowed, current_limits, rated_apk, speed_limits
+from pmsmtool.drive.guard import OVERSHOOT, guarded
+from pmsmtool.drive.motion_objects import allowed, current_limits, rated_apk, speed_limits, trips_itself
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
 from pmsmtool.drive.tier_drives import TorqueDrive, pushing_drive
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
@@ -213,7 +213,7 @@ def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: 
         SWING_SHARE * envelope.speed_max_rad_s,
         u_max_v=U_dc / math.sqrt(3.0) if U_dc > 0.0 else math.inf,
         i_max_a=envelope.i_max_apk,
-        omega_failure_rad_s=math.inf if trips_itself(drive) else OVERSHOOT * envelope.speed_max_rad_s,
+        omega_failure_rad_s=math.inf if trips_itself(drive.node) else OVERSHOOT * envelope.speed_max_rad_s,
         off_s=OFF_S,
     )
     with guarded(drive, envelope, say=say) as guard:

@@ -105,7 +105,7 @@ def test_a_tool_that_dies_at_any_moment_leaves_a_shaft_within_the_speed(rate: fl
     coast_both_ways(cast(Drive, shaft), plan, answer, ("theta_m_rad",), lambda name, trace: None)
     run_to_voltage(cast(Drive, shaft), plan, answer)
     assert shaft.at_failure <= NEAR * MOST
-    assert shaft.fastest > 30.0, "it is pushed all the same"
+    assert shaft.fastest > 10.0, "it is pushed all the same"
 
 
 @pytest.mark.parametrize(("rate", "friction"), LIGHT_TO_HEAVY)
@@ -114,4 +114,4 @@ def test_recorded_pushes_keep_it_too(rate: float, friction: float) -> None:
     plan = recorded_push.PushPlan(10.0, 40.0, samples=64, omega_failure_rad_s=MOST, off_s=0.5)
     recorded_push.swing(cast(Drive, shaft), plan, lambda name, trace: None)
     assert shaft.at_failure <= NEAR * MOST
-    assert shaft.fastest > 30.0
+    assert shaft.fastest > 10.0, "with friction of a tenth, 15 to 30 of the 40 that are aimed at"
