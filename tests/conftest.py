@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -22,6 +24,19 @@ from tests import wall_clock
 # would wait for ever. A handler of ours is back to the default in children.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Before 3.11.8 two threads must not parse at once (python/cpython#106905: SystemError "AST constructor recursion depth
+# mismatch"): pytest does for the source of a failure, and `traceback` for what a server's thread logs meanwhile. The
+# whole worker died of it.
+_parse, _one_parser = ast.parse, threading.RLock()
+
+
+def _parse_alone(*args: Any, **kwargs: Any) -> Any:
+    with _one_parser:
+        return _parse(*args, **kwargs)
+
+
+ast.parse = _parse_alone
 
 
 @pytest.fixture(scope="session", autouse=True)
