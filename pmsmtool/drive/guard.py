@@ -22,16 +22,8 @@ from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
-from pmsmtool.drive.motion_objects import (
-    OVER_SPEED_TRIP,
-    Quantity,
-    allowed,
-    current_limits,
-    lowered_trip,
-    rated_apk,
-    speed_limits,
-    trips_itself,
-)
+from pmsmtool.drive.motion_objects import OVER_SPEED_TRIP, lowered_trip, trips_itself
+from pmsmtool.drive.own_limits import NO_LIMITS, lower_limits, put_current_limit
 from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, Recording, Shape
 from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import (
@@ -39,7 +31,6 @@ from pmsmtool.errors import (
     DriveFault,
     Interrupted,
     LimitExceeded,
-    NotAvailable,
     PmsmtoolError,
     SafetyRefusal,
     StopNotConfirmed,
@@ -71,9 +62,6 @@ KEPT_SHARE, KEPT_S = 0.1, 0.5
 UNPROVEN_BY = ("motor.", "encoder.", "current.", "speed.", "inverter.")
 """Parameters after whose change a proven speed loop is proven no more."""
 _ROUNDING = 1e-9
-RATED_RATIO = 30.0
-"""Largest current limit over the drive's rated current (0x6075): three times the rated current of a motor ten times as
-large as the one that the drive still holds."""
 RESTORED = "voltage off, drive restored"
 """What is said when a drive that was lent is off and holds again what it held before."""
 
@@ -112,6 +100,7 @@ class GuardedDrive:
         self._kept_since_s: float | None = None
         self._pole_pairs = 1.0
         self._R_s_ohm = 0.0
+        self._limits = NO_LIMITS
 
     # ---- beginning and end ----------------------------------------------------------------------
 
@@ -145,62 +134,13 @@ class GuardedDrive:
                 hint="limit the current and the duration instead",
             )
 
-    def _refuse_no_limit(self, rated: float) -> None:
-        """Refuse a current limit so far above the drive's rated current that it limits nothing."""
-        i_max, largest = self.envelope.i_max_apk, RATED_RATIO * rated
-        if not i_max <= largest:  # what is no number is no limit either
-            raise SafetyRefusal(
-                f"the current limit of {i_max:.4g} A (peak) is none: the drive is rated {rated:.4g} A (peak), and "
-                f"at most {RATED_RATIO:g} times that, {largest:.4g} A, counts as a limit; nothing was energised",
-                where=f"node {self._node.node}, 0x6075:00",
-                likely="a wrong digit or unit in --i-max, or the drive holds the rated current of a much smaller motor",
-                hint="give --i-max what the motor stands, or write the motor's rated current to 0x6075 first",
-            )
-
     def _limit_in_drive(self) -> None:
-        """Make the drive itself keep current and speed, by the first object it has for each (0x6073, 0x6080).
-
-        Where it has none, a drive whose every command is a bounded current goes on: its current is commanded and looked
-        at here, and its speed may not even overshoot.
-        """
-        drive, envelope = self._drive, self.envelope
-        rated = rated_apk(self._node)
-        self._refuse_no_limit(rated)
-        current = self._keep(current_limits(self._node, rated), envelope.i_max_apk)
-        speed = self._keep(speed_limits(self._node), rpm_from_rad_s(envelope.speed_max_rad_s))
-        if not (current and speed) and not drive.commands_bounded_current:
-            raise NotAvailable(
-                "the drive has no current and speed limit of its own (0x6073, 0x6075, 0x6080)",
-                where=f"node {self._node.node}",
-                hint="without them nothing is moved",
-            )
-        self._speed_overshoot = OVERSHOOT if speed else 1.0
+        """Make the drive itself keep current and speed where it can."""
+        self._limits = lower_limits(self._drive, self.envelope)
+        self._speed_overshoot = OVERSHOOT if self._limits.speed else 1.0
         if trips_itself(self._node):
-            held = drive.read(OVER_SPEED_TRIP)
-            self.write({OVER_SPEED_TRIP: lowered_trip(held, rpm_from_rad_s(envelope.speed_max_rad_s))})
-
-    def _keep(self, limits: Iterator[Quantity], wanted: float) -> bool:
-        """Lower the drive's own limit to what is wanted (A peak or rpm); False where it has none."""
-        found = allowed(self._node, limits)
-        if found is None:
-            return False
-        limit, now = found
-        # Rounded up: a permille of the rated current must not cut what the envelope allows.
-        counts = math.ceil(wanted / limit.per_count)
-        if counts * limit.per_count < now:
-            self._put_limit(limit.item, counts)
-        return True
-
-    def _put_limit(self, item: objects.DriveObject, value: float) -> None:
-        self._node.put(item, value)
-        held = self._node.get(item)
-        if held > value:
-            raise SafetyRefusal(
-                f"the drive holds the limit {held:.0f}, not the {value:.0f} that was written",
-                where=f"node {self._node.node}, 0x{item.index:04X}:{item.sub:02X}",
-                likely="the object is locked, or follows another one of the maker's",
-                hint="set it with the maker's software; nothing is moved without limits in the drive",
-            )
+            held = self._drive.read(OVER_SPEED_TRIP)
+            self.write({OVER_SPEED_TRIP: lowered_trip(held, rpm_from_rad_s(self.envelope.speed_max_rad_s))})
 
     def stop(self) -> bool:
         """Stop and confirm it; a Ctrl-C meanwhile removes the voltage at once.
@@ -269,6 +209,13 @@ class GuardedDrive:
         # speed and loss are judged with what the drive now takes for its motor
         self._pole_pairs = values.get("motor.pole_pairs", self._pole_pairs)
         self._R_s_ohm = values.get("motor.R_s_ohm", self._R_s_ohm)
+
+    def limit_current(self, apk: float) -> float | None:
+        """Lower the drive's own current limit (A peak), at most to the envelope's; return what it keeps.
+
+        None where the drive has no limit that this could lower.
+        """
+        return put_current_limit(self._node, self._limits, apk)
 
     def change(self, item: objects.DriveObject, data: bytes) -> None:
         """Write a gain that no map knows, while the voltage is off, and read it back; restored when the guard ends.

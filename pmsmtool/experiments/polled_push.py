@@ -69,8 +69,15 @@ class PolledPushPlan:
         return answer.most_a(max(0.0, self.omega_failure_rad_s - abs(speed_rad_s)), self.off_s)
 
 
-def push_both_ways(drive: Drive, plan: PolledPushPlan, keep: Callable[[str, Trace], None]) -> ShaftAnswer:
+def push_both_ways(
+    drive: Drive,
+    plan: PolledPushPlan,
+    keep: Callable[[str, Trace], None],
+    answered: Callable[[ShaftAnswer], None] = lambda answer: None,
+) -> ShaftAnswer:
     """Swing the shaft and keep every push as ``torque_push_<k>``; returns how the shaft answers.
+
+    ``answered`` is called as soon as that is known.
 
     Raises
     ------
@@ -78,6 +85,7 @@ def push_both_ways(drive: Drive, plan: PolledPushPlan, keep: Callable[[str, Trac
         ``E_EXCITATION``: the shaft does not answer.
     """
     answer = acceleration_per_ampere(drive, plan.i_test_a, lambda way, _: way > ANSWER_RAD)
+    answered(answer)
     count = 0
     # the shortest ramp takes a light shaft to its speed with less than the test current
     most = min(plan.omega_m_rad_s / (answer.per_ampere * LEAST_RAMP_S), plan.most_a(answer, plan.omega_m_rad_s))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.experiments.shaft_answer import OVER_FRICTION, acceleration_per_ampere
+from pmsmtool.experiments.shaft_answer import OVER_FRICTION, ShaftAnswer, acceleration_per_ampere
 from pmsmtool.experiments.signals import readable
 from pmsmtool.trace import Trace
 
@@ -66,9 +66,15 @@ class PushPlan:
     off_s: float = 0.5
 
 
-def swing(drive: Drive, plan: PushPlan, keep: Callable[[str, Trace], None]) -> None:
+def swing(
+    drive: Drive,
+    plan: PushPlan,
+    keep: Callable[[str, Trace], None],
+    answered: Callable[[ShaftAnswer], None] = lambda answer: None,
+) -> None:
     """Swing the shaft and keep a record of every push as ``push_<k>``; the shaft is nearly at rest on return.
 
+    ``answered`` is called as soon as it is known how the shaft answers.
     Larger currents go to a smaller speed where the pushes before say that voltage or current would leave their limits.
 
     Raises
@@ -79,6 +85,7 @@ def swing(drive: Drive, plan: PushPlan, keep: Callable[[str, Trace], None]) -> N
     answer = acceleration_per_ampere(
         drive, plan.i_test_a, lambda way, seconds: 2.0 * way / seconds > ANSWER_SHARE * plan.omega_m_rad_s
     )
+    answered(answer)
     count, speed = 0, plan.omega_m_rad_s
     largest = min(plan.i_test_a, answer.most_a(plan.omega_failure_rad_s - speed, plan.off_s))
     last: list[Trace] = []

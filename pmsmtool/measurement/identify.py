@@ -213,6 +213,7 @@ def _measure(
             map_if_saturated=request.map_if_saturated,
         )
         measurement.spent = lambda: (guard.energised_s, guard.energy_j)
+        measurement.limit_current = guard.limit_current
         predictions: list[dict[str, Any]] = []
 
         def predicted(prediction: dict[str, Any]) -> None:

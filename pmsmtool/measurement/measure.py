@@ -22,6 +22,7 @@ from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phase
 from pmsmtool.estimators.prediction import check_prediction, line_of, predict
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
+from pmsmtool.experiments.current_limit import NOT_SHOWN, LimitCurrent, require_limit, show_current_limit
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.experiments.vector_turn import RAMP_S
@@ -109,6 +110,8 @@ class Measurement:
         Seconds energised and copper loss so far (s, J), told after every stage.
     turn_share : float
         Current that turns the rotor over, of the test current; more where it did not follow.
+    limit_current : callable or None
+        Sets the drive's own current limit (A peak) and returns what it keeps; with it the limit is shown to act.
     predicted : callable or None
         Told every prediction (``identification/predicted_file``) before the machine moves for it.
     """
@@ -122,6 +125,7 @@ class Measurement:
     half_frequency: bool = False
     map_if_saturated: bool = False
     spent: Callable[[], tuple[float, float]] | None = None
+    limit_current: LimitCurrent | None = None
     predicted: Callable[[dict[str, Any]], None] | None = None
     turn_share: float = TURN_SHARES[0]
     refused: dict[str, IdentificationError] = field(default_factory=dict)
@@ -326,7 +330,13 @@ class Measurement:
         self.drive.enable()
         trace = standstill.hold_phase_vectors(self.drive, i_a)
         self.keep("phase_vectors", trace)
-        return check_phases(trace, noise)
+        found = check_phases(trace, noise)
+        if self.limit_current is not None:
+            limits, angle = self.limits, standstill.PHASE_ANGLES_RAD[-1]
+            shown = show_current_limit(self.drive, self.limit_current, limits.I_nom_apk, limits.i_max_apk, angle)
+            self.say(f"  {shown or NOT_SHOWN}")
+            require_limit(shown)
+        return found
 
     def _encoder_counts(self, start_rad: float, end_rad: float) -> None:
         for share in TURN_SHARES:

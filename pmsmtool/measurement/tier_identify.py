@@ -18,16 +18,18 @@ from dataclasses import replace
 from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration
-from pmsmtool.drive.guard import OVERSHOOT, guarded
+from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive, guarded
 from pmsmtool.drive.motion_objects import allowed, current_limits, rated_apk, speed_limits, trips_itself
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
-from pmsmtool.drive.tier_drives import TorqueDrive, pushing_drive
+from pmsmtool.drive.tier_drives import SpeedPushDrive, TorqueDrive, pushing_drive
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.experiments.current_limit import NOT_SHOWN, LimitShown, require_limit, show_torque_limit
 from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, push_both_ways, run_to_voltage
 from pmsmtool.experiments.recorded_push import PushPlan, swing
 from pmsmtool.experiments.rotation import STEP_RAD, RotationPlan, dwell_within, rotate_vector
+from pmsmtool.experiments.shaft_answer import ShaftAnswer
 from pmsmtool.experiments.supply_levels import LEVELS, ReadSupply
 from pmsmtool.experiments.vector_lead import lead_onto_vector
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
@@ -160,7 +162,12 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say 
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
         say(f"J/psi, tau_c/psi: torque pushes up to {max(plan.shares) * plan.i_test_a:.3g} A, polled")
-        answer = push_both_ways(guard, plan, keep)
+
+        def answered(answer: ShaftAnswer) -> None:
+            if not isinstance(drive, SpeedPushDrive):  # its limit is the push
+                show_limit(guard, answer, min(plan.i_test_a, plan.most_a(answer, 0.0)), say)
+
+        answer = push_both_ways(guard, plan, keep, answered)
         if shows_voltage:
             say("psi: the voltage of the coasting machine")
             coast_both_ways(guard, plan, answer, ("theta_m_rad", "u_d_v", "u_q_v"), keep)
@@ -174,6 +181,16 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say 
         "standard", pushed=True, voltage=voltage, top_rpm=plan.omega_top_rad_s / RPM, U_dc_v=max(0.0, U_dc),
         current_undecided=drive.current_undecided,
     )  # fmt: skip
+
+
+def show_limit(guard: GuardedDrive, answer: ShaftAnswer, most_a: float, say: Say) -> LimitShown | None:
+    """Say whether the drive keeps its own current limit, asked for at most a torque current (A peak)."""
+    shown = show_torque_limit(guard, guard.limit_current, answer, most_a)
+    if shown is None:
+        say(NOT_SHOWN)
+    else:
+        say(str(shown) if shown.acts else f"{shown}; every command is bounded here, and this program looks")
+    return shown
 
 
 def _link_v(drive: TorqueCurrent) -> float:
@@ -219,7 +236,12 @@ def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: 
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
         say(f"R, psi, L_q, J: {4 * len(plan.shares)} recorded torque pushes up to {plan.i_test_a:.3g} A")
-        swing(guard, plan, keep)
+
+        def answered(answer: ShaftAnswer) -> None:
+            most = min(plan.i_test_a, answer.most_a(plan.omega_failure_rad_s, plan.off_s))
+            require_limit(show_limit(guard, answer, most, say))
+
+        swing(guard, plan, keep, answered)
     T_winding_c, T_magnet_c = (_temperature(drive, name) for name in ("T_winding_c", "T_magnet_c"))
     return TierFacts("recorder", drive.period_s, pole_pairs, T_winding_c, T_magnet_c)
 

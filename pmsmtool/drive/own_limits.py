@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: MIT
+"""Limits that a drive keeps by itself: lowered to the envelope while it is lent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.motion_objects import Quantity, allowed, current_limits, rated_apk, speed_limits
+from pmsmtool.errors import NotAvailable, SafetyRefusal, SdoAbort
+from pmsmtool.units import rpm_from_rad_s
+
+RATED_RATIO = 30.0
+"""Largest current limit over the drive's rated current (0x6075): three times the rated current of a motor ten times as
+large as the one that the drive still holds."""
+LEAST_COUNTS = 4
+"""Steps of its limit below which a drive is not asked to keep a current: they are too coarse."""
+_ROUNDING = 1e-6
+
+
+class OwnLimits(NamedTuple):
+    """The drive's own limits.
+
+    Attributes
+    ----------
+    current, speed : Quantity or None
+        The objects in use, None where the drive has none.
+    most_apk : float
+        What the current's allows after it was lowered to the envelope (A peak).
+    """
+
+    current: Quantity | None
+    speed: Quantity | None
+    most_apk: float
+
+
+NO_LIMITS = OwnLimits(None, None, math.inf)
+
+
+def lower_limits(drive: CanopenDrive, envelope: Envelope) -> OwnLimits:
+    """Make the drive itself keep current and speed, by the first object it has for each (0x6073, 0x6080).
+
+    Where it has none, a drive whose every command is a bounded current goes on: its current is commanded and looked
+    at by the guard, and its speed may not even overshoot.
+
+    Raises
+    ------
+    SafetyRefusal
+        The current limit is none beside the rated current, or the drive does not hold what was written.
+    NotAvailable
+        The drive lacks a limit that nothing replaces.
+    """
+    node = drive.node
+    rated = rated_apk(node)
+    _refuse_no_limit(node, rated, envelope.i_max_apk)
+    current = _lowered(node, current_limits(node, rated), envelope.i_max_apk)
+    speed = _lowered(node, speed_limits(node), rpm_from_rad_s(envelope.speed_max_rad_s))
+    if not (current and speed) and not drive.commands_bounded_current:
+        raise NotAvailable(
+            "the drive has no current and speed limit of its own (0x6073, 0x6075, 0x6080)",
+            where=f"node {node.node}",
+            hint="without them nothing is moved",
+        )
+    return OwnLimits(
+        None if current is None else current[0],
+        None if speed is None else speed[0],
+        math.inf if current is None else current[1],
+    )
+
+
+def put_current_limit(node: DriveNode, limits: OwnLimits, wanted_apk: float) -> float | None:
+    """Let the drive keep a current (A peak), at most what it allows while it is lent; return what it keeps.
+
+    None where it has no such limit, or steps too coarse for it.
+    """
+    limit = limits.current
+    if limit is None:
+        return None
+    counts = math.floor(min(wanted_apk, limits.most_apk) / limit.per_count + _ROUNDING)
+    if counts < LEAST_COUNTS:
+        return None
+    try:
+        _put(node, limit, counts)
+    except (SafetyRefusal, SdoAbort):
+        return None
+    return counts * limit.per_count
+
+
+def _refuse_no_limit(node: DriveNode, rated: float, i_max: float) -> None:
+    """Refuse a current limit so far above the drive's rated current that it limits nothing."""
+    largest = RATED_RATIO * rated
+    if not i_max <= largest:  # what is no number is no limit either
+        raise SafetyRefusal(
+            f"the current limit of {i_max:.4g} A (peak) is none: the drive is rated {rated:.4g} A (peak), and "
+            f"at most {RATED_RATIO:g} times that, {largest:.4g} A, counts as a limit; nothing was energised",
+            where=f"node {node.node}, 0x6075:00",
+            likely="a wrong digit or unit in --i-max, or the drive holds the rated current of a much smaller motor",
+            hint="give --i-max what the motor stands, or write the motor's rated current to 0x6075 first",
+        )
+
+
+def _lowered(node: DriveNode, limits: Iterator[Quantity], wanted: float) -> tuple[Quantity, float] | None:
+    """Lower the drive's own limit to what is wanted and return it with what it allows (A peak or rpm)."""
+    found = allowed(node, limits)
+    if found is None:
+        return None
+    limit, now = found
+    # Rounded up: a permille of the rated current must not cut what the envelope allows.
+    counts = math.ceil(wanted / limit.per_count)
+    if counts * limit.per_count >= now:
+        return found
+    _put(node, limit, counts)
+    return limit, counts * limit.per_count
+
+
+def _put(node: DriveNode, limit: Quantity, counts: int) -> None:
+    item = limit.item
+    node.put(item, counts)
+    held = node.get(item)
+    if held > counts:
+        raise SafetyRefusal(
+            f"the drive holds the limit {held:.0f}, not the {counts:.0f} that was written",
+            where=f"node {node.node}, 0x{item.index:04X}:{item.sub:02X}",
+            likely="the object is locked, or follows another one of the maker's",
+            hint="set it with the maker's software; nothing is moved without limits in the drive",
+        )

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: MIT
+"""More current is asked for than the drive's own limit allows: a limit that does not act is none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from pmsmtool.drive.port import Drive
+from pmsmtool.errors import SafetyRefusal
+from pmsmtool.experiments.shaft_answer import FIRST_S, ShaftAnswer
+from pmsmtool.experiments.standstill import ARRIVAL_LIMIT_S
+
+LimitCurrent = Callable[[float], float | None]
+"""Sets the drive's own limit (A peak), at most to the envelope's, and returns what it keeps; None where it takes none.
+"""
+ASKED, OVER = 0.15, 1.5
+"""Current that is asked for, of the rated one, and how many times the limit it is."""
+MOST = 1.1
+"""Current over the limit up to which the limit acts; measured 0.99 to 1.00 on the simulated drives."""
+LEAST = 0.5
+"""Current, of the limit, below which it was not reached and nothing was shown."""
+WINDOW_S = 0.03
+NEAR, STEADY = 0.9, 0.02
+"""Current, of the limit, and its change from window to window, at which it stands; the gains are slow ones as yet."""
+WAY_RAD = 0.06
+"""Angle of a push that shows a limit: ten increments of an encoder with 1024."""
+TORQUE_OVER = 2.0
+"""As ``OVER``, where the current is told from the way of the shaft."""
+LEAST_NET = 0.3
+"""Of a current, what is taken to accelerate at least: friction is known roughly."""
+
+
+@dataclass(frozen=True, slots=True)
+class LimitShown:
+    """Currents (A peak) of one trial: asked for, kept by the limit, seen, and the most with which the limit acts."""
+
+    asked_a: float
+    kept_a: float
+    seen_a: float
+    most_a: float
+
+    @property
+    def acts(self) -> bool:
+        """Whether no more was seen than the limit allows."""
+        return self.seen_a <= self.most_a
+
+    def __str__(self) -> str:
+        shown = f"asked for {self.asked_a:.3g} A, limit {self.kept_a:.3g} A, the drive gave at most {self.seen_a:.3g} A"
+        if not self.acts:
+            return f"the drive does not keep its own current limit: {shown}"
+        if self.seen_a < LEAST * self.kept_a:
+            return f"current limit not proven: {shown}"
+        return f"current limit proven: {shown}"
+
+
+NOT_SHOWN = "current limit not proven: the drive has none that can be lowered; every command is bounded here"
+
+
+def show_current_limit(
+    drive: Drive, limit_current: LimitCurrent, I_nom_apk: float, i_max_apk: float, angle_rad: float
+) -> LimitShown | None:
+    """Ask for more than the limit, along a vector that the rotor lies on already; None where there is no limit.
+
+    Parameters
+    ----------
+    drive : Drive
+        Enabled; enabled at zero current on return.
+    I_nom_apk, i_max_apk : float
+        Rated current, and what may be asked for (A peak).
+    angle_rad : float
+        Electrical angle of the vector in the stator frame.
+    """
+    with _limited(drive, limit_current, min(ASKED * I_nom_apk, i_max_apk) / OVER) as kept:
+        if kept is None:
+            return None
+        drive.command_current(OVER * kept, 0.0, fixed_angle_rad=angle_rad)
+        return LimitShown(OVER * kept, kept, _settled(drive, kept), MOST * kept)
+
+
+def show_torque_limit(
+    drive: Drive, limit_current: LimitCurrent, answer: ShaftAnswer, most_a: float
+) -> LimitShown | None:
+    """Push with more torque current than the limit, and tell from the shaft what flowed; None as above.
+
+    The same push without the limit is what it is compared with.
+
+    Parameters
+    ----------
+    drive : Drive
+        Enabled, at rest, in torque mode; so on return.
+    most_a : float
+        Largest torque current that may be asked for (A peak).
+    """
+    asked = min(most_a, max(ASKED * most_a, 2.0 * TORQUE_OVER * answer.friction_a))
+    net = max(asked - answer.friction_a, LEAST_NET * asked)
+    seconds = max(FIRST_S, math.sqrt(2.0 * WAY_RAD / (answer.per_ampere * net)))
+    free = _way_of_push(drive, asked, seconds)
+    with _limited(drive, limit_current, asked / TORQUE_OVER) as kept:
+        if kept is None or not free:
+            return None
+        limited = _way_of_push(drive, asked, seconds)
+    idle = asked - net  # what friction takes, with and without the limit
+    return LimitShown(asked, kept, idle + net * limited / free, 0.5 * (asked + max(kept, idle)))
+
+
+def require_limit(shown: LimitShown | None) -> None:
+    """Refuse a drive whose commands are not all bounded here and that does not keep its limit.
+
+    Raises
+    ------
+    SafetyRefusal
+        The limit does not act.
+    """
+    if shown is not None and not shown.acts:
+        raise SafetyRefusal(
+            str(shown),
+            likely="the limit acts in other modes only, or another object than 0x6073 limits the current",
+            hint="ask the maker which object limits the current; nothing more is moved without it",
+        )
+
+
+@contextmanager
+def _limited(drive: Drive, limit_current: LimitCurrent, wanted_a: float) -> Iterator[float | None]:
+    """Lower the limit while the drive is off and enable it; afterwards the envelope's limit holds again."""
+    drive.disable()
+    try:
+        kept = limit_current(wanted_a)
+        drive.enable()
+        yield kept
+        drive.disable()
+    finally:
+        limit_current(math.inf)
+    drive.enable()
+
+
+def _way_of_push(drive: Drive, current_a: float, seconds: float) -> float:
+    """Push forth and back and return the angle (rad) that the way forth adds to how the shaft moved before."""
+    angles = []
+    for current in (0.0, current_a, -current_a):
+        angles.append(drive.live("theta_m_rad"))
+        drive.command_current(0.0, current)
+        drive.wait(seconds)
+    drive.command_current(0.0, 0.0)
+    drive.wait(2.0 * seconds)
+    before, start, end = angles
+    return (end - start) - (start - before)
+
+
+def _settled(drive: Drive, kept_a: float) -> float:
+    """Return the current (A peak) once it stands, or after a limit."""
+    periods = max(1, round(WINDOW_S / drive.period_s))
+    seen = 0.0
+    for _ in range(round(ARRIVAL_LIMIT_S / WINDOW_S)):
+        means = drive.average(("i_d_a", "i_q_a"), periods)
+        before, seen = seen, math.hypot(means["i_d_a"], means["i_q_a"])
+        if seen >= NEAR * kept_a and abs(seen - before) <= STEADY * kept_a:
+            break
+    return seen
