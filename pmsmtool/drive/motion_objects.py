@@ -8,6 +8,7 @@ the larger one for what is watched.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ POLARITY = DriveObject(0x607E, 0, "B")
 GEAR_MOTOR, GEAR_SHAFT = DriveObject(0x6091, 1, "I"), DriveObject(0x6091, 2, "I")
 FEED, FEED_TURNS = DriveObject(0x6092, 1, "I"), DriveObject(0x6092, 2, "I")
 POSITION_UNIT = DriveObject(0x60A8, 0, "I")
+PERIOD_VALUE, PERIOD_EXPONENT = DriveObject(0x60C2, 1, "B"), DriveObject(0x60C2, 2, "b")
+"""Time between two targets of a cyclic mode, value times 10^exponent s (CiA 402-2, interpolation time period)."""
 POSITION_TURNED = 0x80
 """Bit of the polarity that turns position against torque (CiA 402-2, 0x607E)."""
 DEGREE = 0x41
@@ -187,6 +190,21 @@ def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
     raise NotAvailable(
         f"the drive has no torque mode that this program knows (0x6502 = {modes:#x})", where=f"node {node.node}"
     )
+
+
+def cyclic_period_s(node: DriveNode, wanted_s: float) -> float:
+    """Ask for a time between two targets of a cyclic mode (s, whole milliseconds); return what the drive holds.
+
+    A drive fills a longer time than the targets really take by going from one to the next: it would follow late.
+    """
+    if held(node, PERIOD_VALUE) is None:
+        return wanted_s
+    for item, number in ((PERIOD_EXPONENT, -3), (PERIOD_VALUE, round(1e3 * wanted_s))):
+        with contextlib.suppress(SdoAbort):
+            if node.get(item) != number:
+                node.put(item, number)
+    exponent = held(node, PERIOD_EXPONENT)
+    return node.get(PERIOD_VALUE) * 10.0 ** (-3 if exponent is None else exponent)
 
 
 def limited_speed(node: DriveNode) -> LimitedSpeed:

@@ -22,6 +22,7 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.motion_objects import (
     POSITION,
     TorqueTarget,
+    cyclic_period_s,
     position_units,
     rated_apk,
     shown_current,
@@ -182,6 +183,7 @@ class TorqueCurrent(CanopenDrive):
     """A drive that takes a q current as torque, in permille of rated: both are taken as proportional."""
 
     _rated_apk: float
+    _step_s = STEP_S
 
     @cached_property
     def target(self) -> TorqueTarget:
@@ -192,6 +194,8 @@ class TorqueCurrent(CanopenDrive):
         """Bring the drive to operation enabled at zero torque."""
         self.node.put(self.target.quantity.item, 0)
         self._asked_a = 0.0
+        if self.target.cyclic:
+            self._step_s = max(STEP_S, cyclic_period_s(self.node, STEP_S))
         self._set_mode(self.target.mode)
         self.may_be_energised = True
         self.node.enable()
@@ -209,7 +213,7 @@ class TorqueCurrent(CanopenDrive):
             self.node.put(self.target.quantity.item, round(asked / self.target.quantity.per_count))
             self._asked_a = asked
             if step < steps:
-                self.node.connection.wait(STEP_S)
+                self.node.connection.wait(self._step_s)
 
 
 class RecorderDrive(TorqueCurrent):

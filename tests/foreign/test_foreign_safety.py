@@ -131,6 +131,22 @@ def test_an_adapter_without_remote_frames_is_named(tmp_path: Path, monkeypatch: 
         assert "adapter sends no remote frames" in caught.value.likely and not rig.was_on
 
 
+@pytest.mark.parametrize(("access", "step_s"), [("rw", 1e-3), ("ro", 1e-2)])
+def test_a_cyclic_torque_is_asked_for_at_the_drives_period(tmp_path: Path, access: str, step_s: float) -> None:
+    """Stored 10 ms: set to the 1 ms of the tool's ramp where the drive takes it, else the ramp takes 10 ms a step."""
+    period: tuple[Row, ...] = ((0x60C2, 1, "U8", access, "10"), (0x60C2, 2, "I8", "ro", "-3"))
+    with opened(tmp_path, (*epos4(), *period)) as rig:
+        before = rig.memory()
+        with guarded(rig.drive, ENVELOPE) as guard:
+            guard.enable()
+            assert rig.number(0x60C2, 1) == round(1e3 * step_s)
+            began = rig.drive.node.connection.clock.now()
+            guard.command_current(0.0, 2.9)
+            steps = math.ceil(2.9 / (0.1 * rig.drive.rated_apk)) - 1
+            assert steps >= 2 and rig.drive.node.connection.clock.now() - began >= steps * step_s
+        assert [key for key, data in rig.memory().items() if data != before[key]] == []
+
+
 def test_its_own_limit_gets_the_reading_with_the_smaller_current(tmp_path: Path) -> None:
     """mA, peak or rms unknown: 3 A peak is 2121 mA if rms, and 2.12 A peak if the drive means peak."""
     with opened(tmp_path, epos4()) as rig:
