@@ -19,8 +19,11 @@ import numpy as np
 from pmsmtool.design.design_file import load_design
 from pmsmtool.design.loops.open_loops import open_loops
 from pmsmtool.errors import IdentificationError
+from pmsmtool.files import read_text
 from pmsmtool.identification.evaluate import Evaluation, evaluate, shots_of
-from pmsmtool.identification.replay import stored_traces
+from pmsmtool.identification.replay import NAMEPLATE, evaluation_of, stored_traces
+from pmsmtool.identification.request import REQUEST, parse_request
+from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.run_account import account_lines
 from pmsmtool.npz_file import read_npz
 from pmsmtool.proof.judgement import judge
@@ -104,7 +107,9 @@ def _identification_figures(run: RunDirectory, record: RunRecord) -> Iterator[Fi
     period_s = traces["zero_current"].period_s
     identified = record.stage("identify")
     complete = identified is not None and identified.status in ("pass", "partial")
-    found = _evaluated(traces, period_s, complete=complete)
+    found = _as_judged(run) if complete else None
+    if found is None:
+        found = _evaluated(traces, period_s, complete=complete)
     if found is None:
         return
     resistance, inductance, flux = found.resistance, found.inductance, found.flux
@@ -115,6 +120,16 @@ def _identification_figures(run: RunDirectory, record: RunRecord) -> Iterator[Fi
         yield figures.inductance_figure(shots, inductance.axes, found.noise.sigma_a)
     if flux is not None:
         yield figures.flux_figure(flux)
+
+
+def _as_judged(run: RunDirectory) -> Evaluation | None:
+    """Return the evaluation that the run's values come from; None where it has none."""
+    if not all((run.path / name).is_file() for name in (NAMEPLATE, REQUEST)):
+        return None
+    request = parse_request(read_text(run.path / REQUEST), where=str(run.path / REQUEST))
+    with contextlib.suppress(IdentificationError):
+        return evaluation_of(run, load_machine_file(run.path / NAMEPLATE), request)
+    return None
 
 
 _EXPERIMENTS = (("phase_vectors",), ("levels",), ("rotation",), ("square",), ("push",), ("speeds",))

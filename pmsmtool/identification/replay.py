@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.estimate import SensorTolerance
@@ -14,7 +16,7 @@ from pmsmtool.files import read_text
 from pmsmtool.identification import flux_map, frequency_response, half_frequency, value_verdict
 from pmsmtool.identification.calibration import calibrated_tolerance
 from pmsmtool.identification.cogging_file import cogging_estimates, save_cogging
-from pmsmtool.identification.evaluate import evaluate
+from pmsmtool.identification.evaluate import Evaluation, evaluate
 from pmsmtool.identification.identified_machine import machine_of
 from pmsmtool.identification.predicted_file import PREDICTED
 from pmsmtool.identification.refused_file import REFUSED, refused_in
@@ -50,16 +52,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     IdentificationError
         A trap was seen; no machine file is written.
     """
-    traces = stored_traces(run)
-    evaluation = evaluate(
-        traces,
-        nameplate.inverter.T_s,
-        copper=copper_of(nameplate.machine),
-        alpha_psi_per_k=nameplate.machine.alpha_psi_per_k,
-        U_dc_v=nameplate.inverter.U_dc_v,
-        tolerance=replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(nameplate.machine)),
-        ended=refused_in(run),
-    )
+    evaluation = evaluation_of(run, nameplate, request)
     parts = half_frequency.split_estimates(evaluation.split, nameplate.inverter.U_dc_v, request.tolerance)
     timing = timing_estimates(evaluation.inductance, evaluation.shown, request.tolerance)
     conditions = value_verdict.conditions_of(evaluation, request) | half_frequency.split_conditions(
@@ -101,10 +94,49 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         # what is refused is no criterion of the values that go on
         acceptance=[line for line in acceptance.values() if line.ok or verdicts.status == "fail"],
         fallbacks=[*verdicts.lines(), *fallen],
-        files={**files, NAMEPLATE: "", REQUEST: "", **{f"traces/{name}.npz": "" for name in traces}},
+        files={**files, NAMEPLATE: "", REQUEST: "", **{f"traces/{path.name}": "" for path in _trace_files(run)}},
         note="; ".join(value_verdict.warnings_of(evaluation, request)),
         summary="; ".join(filter(None, (summary, *(f"{name} refused" for name in verdicts.refused)))),
         refused=dict(verdicts.refused),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Question:
+    """What is evaluated; equal where the files and what was asked are."""
+
+    run: RunDirectory = field(compare=False)
+    nameplate: MachineFile = field(compare=False)
+    request: IdentifyRequest = field(compare=False)
+    asked: tuple[str, ...]
+    files: tuple[tuple[str, int, int], ...]
+
+
+def evaluation_of(run: RunDirectory, nameplate: MachineFile, request: IdentifyRequest) -> Evaluation:
+    """Return what the stored traces say; the last one is kept, as a report is drawn from it right after.
+
+    Raises
+    ------
+    IdentificationError
+        No value can be trusted.
+    """
+    files = [*_trace_files(run), *(path for path in [run.path / REFUSED] if path.is_file())]
+    states = tuple((str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in files)
+    asked = dump_machine_file(nameplate), dump_request(request)
+    return _evaluation(_Question(run, nameplate, request, asked, states))
+
+
+@lru_cache(maxsize=1)
+def _evaluation(question: _Question) -> Evaluation:
+    run, nameplate, request = question.run, question.nameplate, question.request
+    return evaluate(
+        stored_traces(run),
+        nameplate.inverter.T_s,
+        copper=copper_of(nameplate.machine),
+        alpha_psi_per_k=nameplate.machine.alpha_psi_per_k,
+        U_dc_v=nameplate.inverter.U_dc_v,
+        tolerance=replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(nameplate.machine)),
+        ended=refused_in(run),
     )
 
 
@@ -179,4 +211,8 @@ def asked_again(
 
 def stored_traces(run: RunDirectory) -> dict[str, Trace]:
     """Return the traces of a run by name."""
-    return {path.stem: read_trace(path) for path in sorted((run.path / "traces").glob("*.npz"))}
+    return {path.stem: read_trace(path) for path in _trace_files(run)}
+
+
+def _trace_files(run: RunDirectory) -> list[Path]:
+    return sorted((run.path / "traces").glob("*.npz"))

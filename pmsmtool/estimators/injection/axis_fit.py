@@ -37,7 +37,8 @@ LAG_STARTS = ((0.02, 0.1), (0.4, 0.8))
 """Delays and lags tried before the fit (T_s); one fit begins at the best of each group of lags."""
 EDDY_STARTS, TAU_STARTS = (0.05, 0.3, 1.2), (0.05, 1.0)
 """Eddy currents (of T_s/L) from each of which a fit begins, and time constants (T_s) tried before it."""
-ITERATIONS = 30
+ITERATIONS, FIRST_ITERATIONS = 30, 8
+"""Steps of a fit, and of those beside which only the best is carried on."""
 STEP_TOLERANCE = 1e-7
 """Relative size of the last step."""
 COST_TOLERANCE = 1e-4
@@ -169,13 +170,13 @@ class _Problem:
             first += len(slow)
         return out
 
-    def fit(self, x: Vector) -> Fit:
+    def fit(self, x: Vector, iterations: int = ITERATIONS) -> Fit:
         with np.errstate(over="ignore", invalid="ignore"):  # a step that runs away has no finite cost and is refused
             return levenberg_marquardt(
                 self,
                 x,
                 np.ones(len(x)),
-                iterations=ITERATIONS,
+                iterations=iterations,
                 tolerance=STEP_TOLERANCE,
                 cost_tolerance=COST_TOLERANCE,
                 derivative=self.derivative,
@@ -265,8 +266,9 @@ def fit_axis(
             for eddy in EDDY_STARTS:
                 places = [new_layout.with_eddy(start, eddy, tau, delay) for tau in TAU_STARTS for delay in (None, 1.0)]
                 costs = [float(np.sum(branch(x) ** 2)) for x in places]
-                fits.append(branch.fit(places[costs.index(min(costs))]))
-            tried[new_layout.effects] = (min(fits, key=lambda found: found.cost), new_layout)
+                fits.append(branch.fit(places[costs.index(min(costs))], FIRST_ITERATIONS))
+            nearest = min(fits, key=lambda found: found.cost)
+            tried[new_layout.effects] = (nearest if nearest.converged else branch.fit(nearest.x), new_layout)
     criteria = {effects: _criterion(*found, timing) for effects, found in tried.items()}
     # each without its lag, not the best alone: with one choice made before it, the average over models was none
     for effects in [e for e, criterion in criteria.items() if criterion - min(criteria.values()) < DECIDED]:
