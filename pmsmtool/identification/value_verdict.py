@@ -140,6 +140,9 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     if evaluation.mismatch is not None and evaluation.mismatch.corrected:
         pairs = zip("abc", evaluation.mismatch.gains, strict=True)
         conditions |= {f"sensor_gain_{phase}_over_mean": 1.0 + gain for phase, gain in pairs}
+    for axis, fit in () if evaluation.inductance is None else evaluation.inductance.axes.items():
+        if "eddy" in fit.effects:
+            conditions |= {f"eddy_{axis}_s": fit.eddy_s, f"eddy_{axis}_time_s": fit.eddy_tau_s}
     if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
         conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
     return conditions

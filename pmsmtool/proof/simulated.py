@@ -63,6 +63,8 @@ TIMING_COVERAGE = 2.0
 OFFSET_SHARE = 0.001
 MISMATCH = 0.002
 """Standard deviations of sensor offsets (of I_max) and of the phases' gains against each other."""
+EDDY_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
+"""Range of identified eddy currents, and factor either way of their time constant: one branch stands for many."""
 BASE_SPEED = (-0.03, 0.01)
 """Relative range of the speed that is held before current steps: what coasting lets it lose, too."""
 COAST_PERIODS = 64
@@ -343,12 +345,31 @@ def _draw(
     setup.T_winding, setup.T_magnet, setup.U_dc = (varied[n] for n in ("T_winding_c", "T_magnet_c", "U_dc_v"))
     setup.sensors.encoder_offset_e += varied["encoder_rad"]
     setup.sensors.offset[:] = list(rng.normal(0.0, OFFSET_SHARE * I_max, 3))
-    setup.sensors.gain[:] = list(rng.normal(1.0, MISMATCH, 3))
+    known = [machine.conditions.get(f"sensor_gain_{phase}_over_mean", 1.0) for phase in "abc"]
+    setup.sensors.gain[:] = list(rng.normal(1.0, MISMATCH, 3) * np.array(known))
+    _draw_eddy_currents(setup, machine, rng)
     _draw_inverter(setup, machine, rng)
     setup.sensor_lag, setup.sampling_shift = _timing(machine, rng, late=setup.delay > 0)
     setup.theta_M = float(rng.uniform(-math.pi, math.pi))
     setup.seed = int(rng.integers(2**62))
     return setup
+
+
+def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
+    """Draw eddy currents about those that the inductances were identified with; none where there were none.
+
+    The branch of an axis without them stays; the plant has one time constant for both.
+    """
+    found = {axis: (machine.conditions.get(f"eddy_{axis}_s"), machine.conditions.get(f"eddy_{axis}_time_s"))
+             for axis in "dq"}  # fmt: skip
+    rates = [1.0 / tau for _, tau in found.values() if isinstance(tau, float)]
+    if not rates:
+        return
+    out = setup.machine
+    out.eddy_rate = float(np.mean(rates)) * math.exp(rng.uniform(-1.0, 1.0) * math.log(EDDY_FACTOR))
+    for axis, (size_s, _) in found.items():
+        share = float(rng.uniform(*EDDY_SHARES)) * (size_s if isinstance(size_s, float) else 0.0)
+        setattr(out, f"eddy_{axis}", share * out.eddy_rate / getattr(out, f"L_{axis}"))
 
 
 def _timing(machine: MachineFile, rng: np.random.Generator, *, late: bool) -> tuple[float, float]:

@@ -153,6 +153,22 @@ def test_a_spoiled_drive_is_caught_and_the_cause_named(kind: str, cause: str, de
         assert "OUTSIDE its band" in report_page(run.path)
 
 
+@pytest.mark.chain
+def test_what_identification_saw_of_iron_and_sensors_is_in_the_band() -> None:
+    """Eddy currents in 15 % of the inductances and sensors 2 % apart, as the machine file's conditions say them."""
+    share, tau_s = 0.15, 1e-4
+    known = {
+        **{f"eddy_{axis}_s": tau_s * share / (1.0 - share) for axis in "dq"},
+        **{f"eddy_{axis}_time_s": tau_s for axis in "dq"},
+        "sensor_gain_a_over_mean": 1.02,
+    }
+    design = tune(replace(machine(), conditions=known), TuneRequest(field_weakening="lookup"))
+    settings = {"eddy_share": share, "eddy_time_s": tau_s, "sensor_gain_a": 1.02}
+    with flashed(design, truth=replace(machine(), simulation={**machine().simulation, **settings})) as drive:
+        _, stage = prove(drive, design)
+    assert stage.status == "pass", stage.note
+
+
 def test_a_healthy_drive_passes_within_a_small_current_limit(design: Design) -> None:
     """At full torque 5 A of the design's 12 A would all go into i_d, and the base speed would not be reached."""
     few = replace(FEW, i_max_apk=5.0)

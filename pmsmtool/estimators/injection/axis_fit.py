@@ -90,8 +90,8 @@ class AxisFit:
         What the axis says about delay and lag, for the other one.
     places : tuple of (float, float, float)
         Information weight, delay (T_s) and lag (s) of every model that counts.
-    eddy_s : float
-        Eddy currents of the best model, per voltage and 1/L (s); 0 where it has none.
+    eddy_s, eddy_tau_s : float
+        Eddy currents of the best model, per voltage and 1/L (s), and their time constant; 0 where it has none.
     """
 
     L_h: float
@@ -112,6 +112,7 @@ class AxisFit:
     timing: Timing
     places: tuple[tuple[float, float, float], ...] = ()
     eddy_s: float = 0.0
+    eddy_tau_s: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -373,4 +374,5 @@ def _average(
             for model in [layout.responses(fit.x)[0].model]
         ),
         eddy_s=first.model.eddy_s,
+        eddy_tau_s=first.model.eddy_tau_s,
     )
