@@ -12,7 +12,7 @@ import numpy as np
 
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.estimators.cross_check import CrossCheck, cross_check
-from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.linkage import FluxResult, check_magnet, estimate_flux_linkage
 from pmsmtool.estimators.flux.map_result import FluxMapResult
@@ -227,7 +227,7 @@ def evaluate(
         result = replace(result, pairs=check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve))
     if "rotation_backward" in traces:
         turns = traces["rotation_forward"], traces["rotation_backward"]
-        result = replace(result, encoder=attempt("encoder", lambda: estimate_encoder(*turns)))
+        result = replace(result, encoder=attempt("encoder", lambda: estimate_encoder(*turns, JUMP_LIMIT_RAD)))
     resistance = result.resistance
     # a wrong angle or number of pole pairs is in the speeds, too
     if "speeds" in traces and resistance is not None and "encoder" not in refused:
