@@ -187,15 +187,14 @@ class Measurement:
             return False
         speeds = SpeedStage(self.drive, self.limits, self._keep_for_later, self.say)
 
-        def coasted() -> bool:
-            speeds.measure(resistance, encoder, inductances)
-            return True
-
-        ran = self._attempt("psi", coasted)
+        plan = self._attempt("psi", lambda: speeds.measure(resistance, encoder, inductances))
+        ran = plan is not None
+        if plan is not None and "turns" in steps:
+            self._attempt("harmonics", lambda: speeds.record_harmonics(plan))
         self._tell_spent()
         if ran and steps & set(shaft_forecast.LATER):
             self._shaft(noise, resistance, encoder, steps)
-        return bool(ran)
+        return ran
 
     def _saturates(self, resistance: ResistanceResult | None) -> bool:
         """Whether the run over speeds shows a d axis that saturates so far that a flux map is due; said if so."""
@@ -245,6 +244,10 @@ class Measurement:
                 "mechanics",
                 lambda: mechanics.measure_mechanics(self.drive, self.limits, self.keep, self.say, pushes),
             )
+            self._tell_spent()
+        if "slow" in steps:
+            slow = (self.drive, self.limits, self.keep, self.say)
+            self._attempt("cogging", lambda: mechanics.measure_cogging(*slow))
             self._tell_spent()
         if "response" in steps:
 
@@ -392,8 +395,8 @@ class Measurement:
             self.say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
             turns = rotation.rotate_vector(self.drive, plan, start_rad=start_rad)
             self._keep_turns(turns)
-            last = share == ROTATIONS[-1][0]
             start_rad = 0.0  # where a turn ends
+            last = share == ROTATIONS[-1][0]
             try:
                 found = estimate_encoder(*turns)
             except IdentificationError as error:
