@@ -49,6 +49,8 @@ DEGREE = 3
 """Of the polynomial of time beside them: the shaft coasts."""
 TURNS_LEAST = 2.5
 """Electrical turns of a record from which on its harmonics are told from one another."""
+RECORDS_LEAST = 8
+"""Records without limited samples: as many as are fitted to the six columns, and two."""
 FOUND = 4.0
 """Amplitude, in standard deviations, from which on a harmonic is there."""
 ALWAYS = (5, 7)
@@ -153,10 +155,14 @@ def harmonics_of(
     if not records or None in (resistance, found, flux, result.encoder, result.offset):
         return None
     assert resistance and found and flux and result.encoder and result.offset
+    limited = sum(bool(np.any(record["flagged"] > 0.0)) for record in records)
+    records = [record for record in records if not np.any(record["flagged"] > 0.0)]
+    if len(records) < RECORDS_LEAST:
+        raise refuse("E_CLIPPED", f"voltage or current limited in {limited} records, {len(records)} left", stage=STAGE)
     behind = result.offset.value - float(records[0].meta["offset_rad"])
     counts = result.encoder.direction * round(result.encoder.pole_pairs.value)
     theta = [counts * record["theta_M_rad"] - result.offset.value for record in records]
-    _check(records, theta)
+    _check(theta)
     rows = [
         _Row(in_frame(record, behind), angle, abs(counts), resistance.curve, modulation)
         for record, angle in zip(records, theta, strict=True)
@@ -187,10 +193,7 @@ def _corners(L_d: Estimate, L_q: Estimate) -> tuple[tuple[float, float], tuple[f
     return (L_d.value + L_d.std, L_q.value), (L_d.value, L_q.value + L_q.std)
 
 
-def _check(records: Sequence[Trace], theta: Sequence[Array]) -> None:
-    flagged = sum(int(np.sum(record["flagged"] > 0.0)) for record in records)
-    if flagged:
-        raise refuse("E_CLIPPED", f"{flagged} samples of the records are limited or clipped", stage=STAGE)
+def _check(theta: Sequence[Array]) -> None:
     turns = min(float(abs(angle[-1] - angle[0])) for angle in theta) / (2.0 * math.pi)
     ways = [float(angle[-1] - angle[0]) for angle in theta]
     if turns < TURNS_LEAST or max(ways) < 0.0 or min(ways) > 0.0:

@@ -126,9 +126,16 @@ def test_a_dead_time_alone_is_no_harmonic_of_the_back_emf() -> None:
         assert values[f"psi_{order}_wb"].value < total_half_width(values[f"psi_{order}_wb"]) < 0.001 * PSI / order
 
 
-def test_one_speed_does_not_tell_the_dead_time_and_one_direction_is_refused() -> None:
-    one = run({}, V_DEAD, (400.0,))
-    with pytest.raises(IdentificationError, match="4 records do not tell the dead time"):
-        identified(one, V_DEAD)
-    with pytest.raises(IdentificationError, match="in both directions are needed"):
-        identified(one[:2], V_DEAD)
+def test_limited_records_are_left_out_and_too_few_refused() -> None:
+    """One speed alone does not tell the dead time from the back-EMF."""
+    true = {5: complex(0.02 * PSI / 5.0)}
+    runs = run(true, 0.0)
+    for k in (0, 5):
+        runs[k].signals["flagged"][3] = 1.0  # type: ignore[index]
+        runs[k].signals["u_q_v"][3:] += 5.0  # type: ignore[index]
+    fifth = identified(runs, 0.0).estimates()["psi_5_wb"]
+    assert fifth.value == pytest.approx(0.004 * PSI, rel=0.05)
+    with pytest.raises(IdentificationError, match="E_CLIPPED.*7 left"):
+        identified([*runs[:6], *runs[9:]], 0.0)
+    with pytest.raises(IdentificationError, match="8 records do not tell the dead time"):
+        identified([*runs[10:], *runs[10:], *runs[4:5], *runs[4:5], *runs[10:]], 0.0)
