@@ -34,7 +34,9 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
         "pmsmtool identify --replay runs/20260101T120000Z-000055f1",
     ),
 )
-@click.argument("quantities", nargs=-1, metavar="[R|L|psi|encoder|poles|inverter|mechanics|map|frf|all]...")
+@click.argument(
+    "quantities", nargs=-1, metavar="[R|L|psi|encoder|poles|inverter|mechanics|map|frf|cogging|harmonics|all]..."
+)
 @click.option(
     "--method",
     type=click.Choice(["auto", "inject", "recorder", "standard", "vendor", "manual"]),
@@ -89,8 +91,10 @@ def identify_command(
 
     "map" measures the flux linkages over the plane of currents with saturation and cross-saturation; a held rotor
     (--shaft locked) allows R, inverter and map. "mechanics" fits inertia, viscous and Coulomb friction to pushes and
-    coasting; "frf" measures the mechanical frequency response, and a resonance where the data support one. Without a
-    quantity all but map and frf are measured; with "all", all.
+    coasting; "cogging" finds the torque over the angle in slow turns, or the least that would have been found;
+    "harmonics" records voltages and currents over turns for the 5th, 7th, 11th and 13th of the back-EMF; "frf" measures
+    the mechanical frequency response, and a resonance where the data support one. Without a quantity all but map, frf,
+    cogging and harmonics are measured; with "all", all.
 
     With --method vendor the drive measures by itself, as its map says (`pmsmtool caps`); such values have no interval.
 

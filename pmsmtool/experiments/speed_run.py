@@ -172,11 +172,7 @@ def coast_through(drive: Drive, plan: SpeedPlan, pole_pairs: int) -> Rows:
         controlled, held = False, 0.0
         for i_d, i_q in vectors:
             if not controlled or abs(rows[-1]["omega_second_rad_s"]) < SLOWEST * abs(omega_e):
-                drive.command_speed(speed)
-                change = abs(speed - before)
-                ramp_s = min(RAMP_MOST_S, RAMP_DOUBT * change / plan.acceleration_rad_s2)
-                reach(drive, omega_e, limit_s=COAST_LIMIT_S + ramp_s, band_rad_s=COAST_BAND * abs(omega_e))
-                held = _holding(drive, plan, speed, pole_pairs)
+                held = reach_and_hold(drive, plan, speed, before, pole_pairs)
                 controlled, settle_s, before = True, plan.first_s, speed
             drive.command_current(i_d, i_q + held)
             drive.wait(settle_s)
@@ -184,6 +180,18 @@ def coast_through(drive: Drive, plan: SpeedPlan, pole_pairs: int) -> Rows:
             rows.append(_window(drive, _half_window(drive, plan, speed, pole_pairs, i_q != 0.0)))
     drive.command_speed(0.0)
     return rows
+
+
+def reach_and_hold(drive: Drive, plan: SpeedPlan, speed: float, before: float, pole_pairs: int) -> float:
+    """Bring the shaft to a mechanical speed (rad/s) from the one ``before``; return the q current that keeps it (A).
+
+    0 where the shaft coasts through a window well enough without.
+    """
+    drive.command_speed(speed)
+    omega_e = speed * pole_pairs
+    ramp_s = min(RAMP_MOST_S, RAMP_DOUBT * abs(speed - before) / plan.acceleration_rad_s2)
+    reach(drive, omega_e, limit_s=COAST_LIMIT_S + ramp_s, band_rad_s=COAST_BAND * abs(omega_e))
+    return _holding(drive, plan, speed, pole_pairs)
 
 
 def _holding(drive: Drive, plan: SpeedPlan, speed: float, pole_pairs: int) -> float:

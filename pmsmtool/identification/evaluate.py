@@ -12,7 +12,7 @@ import numpy as np
 
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.estimators.cross_check import CrossCheck, cross_check
-from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.linkage import FluxResult, check_magnet, estimate_flux_linkage
 from pmsmtool.estimators.flux.map_result import FluxMapResult
@@ -37,6 +37,8 @@ from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.identification import frequency_response
 from pmsmtool.identification.calibration import calibrated_traces
+from pmsmtool.identification.cogging import Cogging, cogging_of
+from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
 from pmsmtool.identification.half_frequency import resistance_at_two_frequencies
 from pmsmtool.identification.mechanics import mechanics_of
@@ -62,7 +64,8 @@ _Found = TypeVar("_Found")
 class Evaluation:
     """What the traces of a run say; None where an experiment was not run, or is in ``refused`` with its reason.
 
-    ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics`` and ``frf``.
+    ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics``, ``frf``,
+    ``cogging`` and ``harmonics``.
     """
 
     noise: Noise
@@ -77,6 +80,8 @@ class Evaluation:
     mechanics: MechanicsResult | None = None
     flux_map: FluxMapResult | None = None
     frequency_response: FrequencyResponse | None = None
+    cogging: Cogging | None = None
+    harmonics: EmfHarmonics | None = None
     map_estimates: Mapping[str, Estimate] = field(default_factory=dict)
     refused: Mapping[str, IdentificationError] = field(default_factory=dict)
 
@@ -114,6 +119,11 @@ class Evaluation:
         if self.flux is not None and self.inductance is not None:
             found.append(cross_check("L_q_h_apparent", "L_q_h", self.flux.L_q_app, self.inductance.L_q))
         return found
+
+    def ripples(self) -> dict[str, Estimate]:
+        """Return what repeats with the angle of the shaft, by its key: no design depends on it."""
+        found = [part.estimates() for part in (self.harmonics, self.cogging) if part is not None]
+        return {name: estimate for part in found for name, estimate in part.items()}
 
     def estimates(self) -> dict[str, Estimate]:
         """Return every estimate by its machine-file key."""
@@ -170,7 +180,7 @@ def evaluate(
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
         ``levels_half_frequency``, ``phase_pairs``, ``rotation_forward``, ``rotation_backward``,
         ``square_d_<half period>``, ``square_q_<half period>``, ``speeds``, ``map_<k>``, ``speeds_after_map``,
-        ``inertia_<k>``, ``frf_<k>``.
+        ``inertia_<k>``, ``frf_<k>``, ``turns_<k>``, ``slow_<k>``.
     period_s : float
         Control period (s).
     T_ref_c : float
@@ -227,7 +237,7 @@ def evaluate(
         result = replace(result, pairs=check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve))
     if "rotation_backward" in traces:
         turns = traces["rotation_forward"], traces["rotation_backward"]
-        result = replace(result, encoder=attempt("encoder", lambda: estimate_encoder(*turns)))
+        result = replace(result, encoder=attempt("encoder", lambda: estimate_encoder(*turns, JUMP_LIMIT_RAD)))
     resistance = result.resistance
     # a wrong angle or number of pole pairs is in the speeds, too
     if "speeds" in traces and resistance is not None and "encoder" not in refused:
@@ -256,7 +266,13 @@ def evaluate(
     mechanics = attempt("mechanics", lambda: mechanics_of(traces, shaft, tolerance, dead_time_s, period_s, rough_L_h))
     moving = replace(shaft, mechanics=mechanics)
     response = attempt("frf", lambda: frequency_response.frequency_response_of(traces, moving, tolerance, dead_time_s))
-    return replace(moving, frequency_response=response, refused=refused)
+    modulation = None
+    if shaft.resistance is not None and shaft.inductance is not None and "speeds" in traces:
+        L_h = shaft.inductance.L_d.value, shaft.inductance.L_q.value
+        modulation = modulation_of(traces["speeds"], shaft.resistance, L_h, period_s)
+    harmonics = attempt("harmonics", lambda: harmonics_of(traces, shaft, tolerance, period_s, modulation))
+    turned = replace(moving, frequency_response=response, harmonics=harmonics)
+    return replace(turned, cogging=attempt("cogging", lambda: cogging_of(traces, turned)), refused=refused)
 
 
 def with_equal_sensors(traces: Mapping[str, Trace], mismatch: SensorMismatch | None) -> Mapping[str, Trace]:

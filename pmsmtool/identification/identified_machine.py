@@ -63,7 +63,12 @@ def machine_of(
         encoder=encoder,
         std={**nameplate.std, **{name: e.std for name, e in measurable.items()}},
         systematic={**nameplate.systematic, **{name: e.systematic for name, e in measurable.items()}},
-        estimates={**nameplate.estimates, **found, **{check.name: check.estimate for check in evaluation.checks}},
+        estimates={
+            **nameplate.estimates,
+            **found,
+            **evaluation.ripples(),
+            **{check.name: check.estimate for check in evaluation.checks},
+        },
         conditions=dict(conditions),
         simulation={},
         flux_map=flux_map,

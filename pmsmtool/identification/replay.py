@@ -15,7 +15,7 @@ from pmsmtool.estimators.resistance import copper_of
 from pmsmtool.files import read_text
 from pmsmtool.identification import flux_map, frequency_response, half_frequency, value_verdict
 from pmsmtool.identification.calibration import calibrated_tolerance
-from pmsmtool.identification.cogging_file import cogging_estimates, save_cogging
+from pmsmtool.identification.cogging import save_cogging
 from pmsmtool.identification.evaluate import Evaluation, evaluate
 from pmsmtool.identification.identified_machine import machine_of
 from pmsmtool.identification.predicted_file import PREDICTED
@@ -76,14 +76,14 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         made = flux_map.save_map(target, kept.flux_map)
         made |= frequency_response.save_response(target, kept.frequency_response)
         if kept.encoder is not None:
-            made |= save_cogging(target, kept.mechanics, kept.encoder.direction)
+            made |= save_cogging(target, kept.cogging, kept.encoder.direction)
         target.save(MACHINE, text)
         files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
     files |= {name: "" for name in (PREDICTED, REFUSED) if (run.path / name).is_file()}
     fallen = [f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback]
     facts = [
         {**value_verdict.value_facts(name, estimate), "accepted": name not in rejected}
-        for name, estimate in (found | parts | timing | cogging_estimates(kept.mechanics)).items()
+        for name, estimate in (found | parts | timing | kept.ripples()).items()
     ]
     summary = value_verdict.summary_of(kept, {name: e for name, e in found.items() if name not in rejected})
     return Stage(

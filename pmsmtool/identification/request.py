@@ -24,6 +24,8 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "mechanics": ("levels", "rotation", "square", "speeds", "coasting"),
     "map": ("levels", "rotation", "square", "speeds", "map"),
     "frf": ("levels", "rotation", "square", "speeds", "response"),
+    "cogging": ("levels", "rotation", "square", "speeds", "coasting", "slow"),
+    "harmonics": ("levels", "rotation", "square", "speeds", "turns"),
 }
 """Experiments behind each quantity."""
 HELD = ("levels", "map")
@@ -47,7 +49,7 @@ class IdentifyRequest:
     Attributes
     ----------
     quantities : tuple of str
-        Out of ``R L psi encoder poles inverter mechanics map frf``.
+        Out of ``R L psi encoder poles inverter mechanics map frf cogging harmonics``.
     i_max_apk, speed_max_rad_s : float or None
         Envelope (A peak, rad/s mechanical).
     shaft, load, brake : str

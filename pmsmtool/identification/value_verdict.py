@@ -46,6 +46,7 @@ def had_of(evaluation: Evaluation) -> list[str]:
     results = {
         "R": evaluation.resistance, "encoder": evaluation.encoder, "L": evaluation.inductance, "psi": evaluation.flux,
         "map": evaluation.flux_map, "mechanics": evaluation.mechanics, "frf": evaluation.frequency_response,
+        "cogging": evaluation.cogging, "harmonics": evaluation.harmonics,
     }  # fmt: skip
     return [name for name, result in results.items() if result is not None]
 

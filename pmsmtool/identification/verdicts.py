@@ -15,11 +15,12 @@ from pmsmtool.run_directory import Acceptance, Status
 
 STEP: Mapping[str, str] = {
     "R": "R", "inverter": "R", "poles": "encoder", "encoder": "encoder", "L": "L", "psi": "psi",
-    "mechanics": "mechanics", "map": "map", "frf": "frf",
+    "mechanics": "mechanics", "map": "map", "frf": "frf", "cogging": "cogging", "harmonics": "harmonics",
 }  # fmt: skip
 """Evaluation that answers for a quantity (``evaluate.Evaluation.refused``)."""
 NEEDED: Mapping[str, tuple[str, ...]] = {
     "L": ("R", "encoder"), "psi": ("R", "encoder", "L"), "mechanics": ("psi",), "frf": ("psi",), "map": ("R", "psi"),
+    "cogging": ("mechanics",), "harmonics": ("L", "psi"),
 }  # fmt: skip
 """Evaluations that another one takes values from."""
 KEYS: Mapping[str, tuple[str, ...]] = {
@@ -37,6 +38,8 @@ FOLLOWS: Mapping[str, str] = {
     "mechanics": "speed control needs J: without one in the machine file it is not designed",
     "map": "the design is made with constant inductances",
     "frf": "no resonance is known, and no notch is set",
+    "cogging": "there is no table of its torque",
+    "harmonics": "the torque's ripple by the back-EMF is not known",
 }
 """What follows from a refused quantity."""
 ESSENTIAL = ("poles", "encoder")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 from pmsmtool.machine.key import Key, KeyKind, Value
@@ -115,6 +116,20 @@ MEASURABLE: dict[str, Key] = {
     key.name: key for key in (*MACHINE_KEYS, *INVERTER_KEYS, *ENCODER_KEYS) if key.kind in ("float", "int")
 }
 """Keys that ``[std]``, ``[systematic]`` and ``[estimate.<key>]`` may speak of."""
+
+_RIPPLES = {
+    r"psi_\d+_wb": _key("estimate", "psi_5_wb", "Wb", 0, 100, None, "harmonic of a phase's flux linkage (peak)"),
+    r"psi_\d+_rad": _key("estimate", "psi_5_rad", "rad", -_PI2, _PI2, None, "its phase"),
+    r"cogging(_\d+)?_nm": _key("estimate", "cogging_nm", "N m", 0, 1e4, None, "cogging torque, largest or of an order"),
+    r"cogging_\d+_rad": _key("estimate", "cogging_12_rad", "rad", -_PI2, _PI2, None, "its phase"),
+}
+"""What repeats with the angle, by order: keys of ``[estimate.<key>]`` alone."""
+
+
+def estimated_key(name: str) -> Key | None:
+    """Return the key that ``[estimate.<name>]`` speaks of, a label behind it left out; None: there is none."""
+    ripple = next((key for pattern, key in _RIPPLES.items() if re.fullmatch(pattern, name)), None)
+    return ripple or next((key for k, key in MEASURABLE.items() if name == k or name.startswith(f"{k}_")), None)
 
 
 def deviation_keys(table: str) -> tuple[Key, ...]:

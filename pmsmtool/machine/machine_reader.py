@@ -22,6 +22,7 @@ from pmsmtool.machine.machine_keys import (
     MEASURABLE,
     deviation_keys,
     estimate_keys,
+    estimated_key,
 )
 from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
@@ -118,7 +119,7 @@ class MachineReader:
             self.violations.append(f"{self.place('estimate')} is not a table")
             return found
         for name, table in raw.items():
-            key = next((MEASURABLE[k] for k in MEASURABLE if name == k or name.startswith(f"{k}_")), None)
+            key = estimated_key(name)
             if key is None or not isinstance(table, Mapping):
                 advice = did_you_mean(name, list(MEASURABLE)) if key is None else ", or not a table"
                 self.violations.append(f"{self.place('estimate', name)}: no key of the machine{advice}")

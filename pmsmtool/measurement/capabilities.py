@@ -58,7 +58,7 @@ class Method(StrEnum):
     MANUAL = "manual"
 
 
-QUANTITIES = ("R", "L", "psi", "map", "inverter", "encoder", "poles", "mechanics", "frf")
+QUANTITIES = ("R", "L", "psi", "map", "inverter", "encoder", "poles", "mechanics", "frf", "cogging", "harmonics")
 
 FEATURES: Mapping[str, str] = {
     "heartbeat": "consumer heartbeat (0x1016)",
@@ -132,6 +132,8 @@ NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
         Method.MANUAL: (),
     },
     "frf": {Method.INJECT: _INJECT},
+    "cogging": {Method.INJECT: _INJECT},
+    "harmonics": {Method.INJECT: _INJECT},
 }
 """Methods of each quantity and what they need."""
 

@@ -124,8 +124,12 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
         lines.append("the shaft turns slowly through one turn each way")
     if "speeds" in steps:
         lines.append("the shaft is pushed both ways and coasts with current from four speeds in each direction")
+    if "turns" in steps:
+        lines.append("it coasts with current from three speeds in each direction once more, for harmonics")
     if "coasting" in steps:
         lines.append(mechanics.PLAN_LINE)
+    if "slow" in steps:
+        lines.append("it turns twice each way at 30 rpm at the most")
     if "response" in steps:
         lines.append(frequency_response.PLAN_LINE)
     if "map" in steps:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.experiments import mechanics_run, speed_run
+from pmsmtool.experiments import mechanics_run, slow_turns, speed_run
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
+from pmsmtool.identification.cogging import SLOW_TRACE
 from pmsmtool.identification.mechanics import TRACE
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace
@@ -27,6 +28,8 @@ SPEED_SHARE = 0.6
 """Speed they aim at, of the largest that back-emf and envelope allow; the friction's share is not known before."""
 EMF_SHARE = 0.6
 ABORT_SHARE = 0.95
+SLOW_SHARE = 0.2
+"""Largest speed of the slow turns, of the speed limit."""
 REST_SHARE = 0.02
 """Largest speed before the first push, of the speed that it is to reach."""
 PLAN_LINE = "pushes turn the shaft both ways, and it coasts with the voltage off"
@@ -74,6 +77,17 @@ def measure_mechanics(
     mechanics_run.push_and_coast(drive, plan, abort, keep_part)
     drive.enable()
     _come_to_rest(drive, pole_pairs * plan.omega_rad_s)
+
+
+def measure_cogging(
+    drive: Drive, limits: Limits, keep: Callable[[str, Trace], None], say: Callable[[str], None]
+) -> None:
+    """Record slow turns; the drive holds the speed controller of the runs before."""
+    speed = min(slow_turns.SPEED_RAD_S, SLOW_SHARE * limits.omega_max_rad_s)
+    say(f"cogging: {slow_turns.TURNS:g} turns each way at {rpm_from_rad_s(speed):.0f} rpm")
+    pole_pairs = round(drive.read("motor.pole_pairs"))
+    slow_turns.record_slow_turns(drive, pole_pairs, speed, numbered(drive, SLOW_TRACE, keep))
+    _come_to_rest(drive, pole_pairs * speed)
 
 
 def _come_to_rest(drive: Drive, reached_rad_s: float) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,10 +14,13 @@ from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
-from pmsmtool.experiments import speed_run
+from pmsmtool.experiments import emf_run, speed_run
 from pmsmtool.experiments.shaft_answer import FIRST_S, FIRST_SHARE
+from pmsmtool.experiments.speed_run import SpeedPlan
+from pmsmtool.identification.emf_harmonics import TRACE as EMF_TRACE
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.mechanics import numbered
 from pmsmtool.trace import Trace
 from pmsmtool.units import rpm_from_rad_s
 
@@ -76,8 +79,11 @@ class SpeedStage:
     keep: Callable[[str, Trace], None]
     say: Callable[[str], None]
 
-    def measure(self, resistance: ResistanceResult, encoder: EncoderResult, L: tuple[float, float]) -> None:
-        """Push the shaft, then coast with current through the speeds, under control by what was found so far."""
+    def measure(self, resistance: ResistanceResult, encoder: EncoderResult, L: tuple[float, float]) -> SpeedPlan:
+        """Push the shaft, then coast with current through the speeds, under control by what was found so far.
+
+        Returns what was held at which speeds.
+        """
         pole_pairs = round(encoder.pole_pairs.value)
         alpha = min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s))
         d, q = (imc(resistance.R_measured.value, inductance, alpha) for inductance in L)
@@ -96,7 +102,21 @@ class SpeedStage:
         )
         self.drive.enable()
         psi, J = self._pushes(resistance, pole_pairs)
-        self._speeds(psi, J, pole_pairs, L, resistance.V_dead_v)
+        return self._speeds(psi, J, pole_pairs, L, resistance.V_dead_v)
+
+    def record_harmonics(self, plan: SpeedPlan) -> None:
+        """Record voltages and currents over turns at the speeds of the flux run, whose gains the drive holds."""
+        self.say(
+            f"harmonics of the back-EMF: records at {len(emf_run.SHARES)} speeds up to "
+            f"{rpm_from_rad_s(plan.omega_max_rad_s):.0f} rpm, both directions, i_d of +-{plan.i_d_a:.3g} A"
+        )
+        delay = {"delay_periods": self.drive.read("inverter.delay_periods")}
+        keep_part = numbered(self.drive, EMF_TRACE, self.keep)
+        pole_pairs = round(self.drive.read("motor.pole_pairs"))
+        emf_run.record_turns(
+            self.drive, plan, pole_pairs, lambda trace: keep_part(replace(trace, meta={**trace.meta, **delay}))
+        )
+        speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * plan.omega_max_rad_s * pole_pairs)
 
     def _pushes(self, resistance: ResistanceResult, pole_pairs: int) -> tuple[float, float]:
         """Push the rotor there and back; return flux linkage (Wb) and inertia (kg m2), good for a speed controller."""
@@ -160,7 +180,7 @@ class SpeedStage:
         omega_e = PUSH_END_SHARE * pole_pairs * self.limits.omega_max_rad_s
         return speed_run.push_and_record(self.drive, i_q_a, samples, decimation, omega_e)
 
-    def _speeds(self, psi: float, J: float, pole_pairs: int, L: tuple[float, float], V_dead_v: float) -> None:
+    def _speeds(self, psi: float, J: float, pole_pairs: int, L: tuple[float, float], V_dead_v: float) -> SpeedPlan:
         limits = self.limits
         run_i_d = run_d_current(limits, L, self.drive.period_s)
         flux = psi + SATURATED * L[0] * run_i_d
@@ -196,7 +216,7 @@ class SpeedStage:
         self.drive.enable()
         fastest_rpm = rpm_from_rad_s(largest)
         self.say(f"psi_f and fine offset: coasting from up to {fastest_rpm:.0f} rpm, i_d up to {run_i_d:.3g} A")
-        plan = speed_run.SpeedPlan(
+        plan = SpeedPlan(
             largest,
             run_i_d,
             i_q,
@@ -211,6 +231,7 @@ class SpeedStage:
         facts = {"pole_pairs": pole_pairs, "U_dc_v": math.sqrt(3.0) * limits.V_max_v, "speed_lag_s": lag_s}
         facts["delay_periods"] = self.drive.read("inverter.delay_periods")
         self.keep("speeds", speed_run.speeds_trace(rows, facts))
+        return plan
 
     def _off_and_write(self, values: Mapping[str, float]) -> None:
         self.drive.disable()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import ExitCode, IdentificationError
-from pmsmtool.estimators.encoder import EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import check_pairs, check_phases
@@ -92,6 +92,14 @@ def test_half_a_turn_is_not_enough() -> None:
 def test_a_cogging_rotor_that_leaves_the_vector_is_refused() -> None:
     with pytest.raises(IdentificationError, match="E_ROTOR_MOVED"):
         estimate_encoder(*rotation(4, 1, 0.0, ripple=math.radians(40.0)))
+
+
+def test_a_rotor_that_jumps_is_taken_where_nothing_better_is_had() -> None:
+    """Between positions a sixth of a turn apart: the mean of both directions is right, and its deviation large."""
+    found = estimate_encoder(*rotation(4, 1, 0.3, lag=0.3, ripple=math.radians(60.0)), JUMP_LIMIT_RAD)
+    assert found.offset.value == pytest.approx(0.3, abs=0.05) and found.offset.std > math.radians(20.0)
+    with pytest.raises(IdentificationError, match="E_ROTOR_MOVED"):
+        estimate_encoder(*rotation(4, 1, 0.0, ripple=math.radians(100.0)), JUMP_LIMIT_RAD)
 
 
 def vectors(i: float = 0.5, R: float = 1.0, phases: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Trace:

@@ -12,7 +12,8 @@ import pytest
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.experiments.rotation import QUICK_DWELL_S, QUICK_STEP_RAD, SWING, RotationPlan, rotate_vector, step_within
 from pmsmtool.experiments.vector_turn import LOOK_S, RAMP_S, REST_LIMIT_S, come_to_rest, rising, turn_vector
-from pmsmtool.measurement.measure import ROTATIONS
+from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.measure import ROTATIONS, Measurement
 from pmsmtool.trace import Trace
 
 POLE_PAIRS = 2
@@ -142,3 +143,30 @@ def test_the_first_vector_is_above_the_swing_of_every_drive_it_was_made_for() ->
     """The dead time pulls six times per turn; 105 rad/s is the fastest swing of 400 random drives."""
     on_the_bus_s = QUICK_DWELL_S + 0.006
     assert 6.0 * QUICK_STEP_RAD / on_the_bus_s > 1.3 * 105.0
+
+
+def turned(offset_rad: float, jumps_rad: float) -> tuple[Trace, Trace]:
+    """Both runs of a rotor that jumps beside its vector by up to an angle, eight times a turn of the shaft."""
+    angle = np.linspace(0.0, 2.05 * math.pi * POLE_PAIRS, 300)
+    runs = []
+    for imposed in (angle, angle[::-1]):
+        theta_e = imposed + offset_rad + jumps_rad * np.sin(8.0 * imposed / POLE_PAIRS)
+        signals = {"theta_imposed_rad": imposed, "theta_M_rad": theta_e / POLE_PAIRS}
+        runs.append(Trace(np.arange(300.0), signals, dict.fromkeys(signals, "rad"), {}))
+    return runs[0], runs[1]
+
+
+@pytest.mark.parametrize(("of_the_largest", "used"), [(0.75, 1), (0.02, 3)])
+def test_the_largest_current_is_not_trusted_where_it_puts_a_jumping_rotor_beside_its_vector(
+    of_the_largest: float, used: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cogging of 5 % on fast-ipm: above psi/(L_q - L_d) the rotor rested 43 deg off, and was taken for aligned."""
+    tries = [turned(0.0, 1.1), turned(0.03, 0.7), turned(0.1, 1.0), turned(of_the_largest, 0.1)]
+    left = iter(tries)
+    monkeypatch.setattr("pmsmtool.experiments.rotation.rotate_vector", lambda *_, **__: next(left))
+    kept: dict[str, Trace] = {}
+    limits = Limits(1.0, 1.2, 300.0, 100.0)
+    measurement = Measurement(SwingingRotor(20.0), limits, kept.__setitem__, lambda text: None)  # type: ignore[arg-type]
+    found = measurement._rotation(0.0)
+    assert found.offset.value == pytest.approx([0.0, 0.03, 0.1, of_the_largest][used], abs=0.03)
+    assert (kept["rotation_forward"], kept["rotation_backward"]) == tries[used]

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: MIT
+"""Cogging torque of an identification: one value per order, and a table over the encoder's angle for firmware.
+
+Slow turns under speed control show it by what they balance it with: with E = J omega^2/2 over the angle
+
+    T_cogging(theta) = dE/dtheta - T_current(theta) + friction,
+
+order by order over whole turns, the mean of both directions. What they differ by is the noise. Without slow turns the
+orders are those of the coasting traces (``estimators/angle_harmonics``), which show strong ones of low order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.estimators.angle_harmonics import (
+    ENCODER_ORDERS,
+    HIGHEST_ORDER,
+    ORDERS_MOST,
+    SURE,
+    AngleHarmonics,
+    Harmonic,
+)
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.identification.mechanics import in_frame, torque_of
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.run_directory import RunDirectory
+from pmsmtool.trace import Trace
+
+if TYPE_CHECKING:
+    from pmsmtool.identification.evaluate import Evaluation
+
+Array = NDArray[np.float64]
+Phasors = NDArray[np.complex128]
+
+COGGING_CSV = "cogging.csv"
+ROWS = 1024
+"""Rows of the table over one turn."""
+ORDERS_PER_POLE_PAIR = 18
+"""Highest order that none being found is stated for: the least common multiple of slots and poles is 6 to 18 times the
+pole pairs of usual windings (9 slots on 8 poles: 72)."""
+
+
+SLOW_TRACE = "slow_"
+"""Followed by a number: one direction, the other."""
+GRID = 4096
+"""Angles of a turn at which energy and torque are interpolated."""
+NEIGHBOURS = 12
+"""Orders to either side whose differences between the directions say the noise of an order."""
+MISMATCH = 0.03
+"""Torque of order 2 p that unequal gains of the current sensors hide, of the current's (one standard deviation). Their
+offsets hide one of order p, which is not told from cogging, and with the dead time as much of order 3 p (0.12 % of
+rated torque beside 0.09 %, seen once)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cogging:
+    """Accelerations over the angle, the inertia (kg m2), and what is said where there are none.
+
+    ``floor_nm`` is the amplitude from which on every order up to ``highest_order`` is found.
+    """
+
+    harmonics: AngleHarmonics
+    J: Estimate
+    highest_order: int
+    floor_nm: float
+    how: str
+
+    def estimates(self) -> dict[str, Estimate]:
+        """Return the largest torque, and amplitude (N m) and phase (rad) of every order per turn, by their names.
+
+        The torque along the phase order is amplitude cos(order theta - phase), theta the encoder's angle along it.
+        Where none was found the largest torque is 0, with the floor as its 95 % interval.
+        """
+        J, harmonics = self.J, self.harmonics
+        if not harmonics.acceleration_rad_s2:
+            method = f"none found up to order {self.highest_order} per turn, {self.how}; the interval is what would be"
+            return {"cogging_nm": Estimate(0.0, self.floor_nm / COVERAGE_FACTOR, 0.0, "N m", method=method)}
+        found: dict[str, Estimate] = {}
+        largest = float(np.max(np.abs(harmonics.torque_nm(turn(), J.value))))
+        std = math.hypot(self.table_std_nm, J.std / J.value * largest)
+        scale = J.systematic / J.value
+        found["cogging_nm"] = Estimate(largest, std, scale * largest, "N m", method=f"largest over a turn, {self.how}")
+        for h in harmonics.acceleration_rad_s2:
+            method = f"order {h.order} per turn, {self.how}"
+            amplitude, std = J.value * h.amplitude, math.hypot(J.value * h.std, J.std * h.amplitude)
+            found[f"cogging_{h.order}_nm"] = Estimate(amplitude, std, scale * amplitude, "N m", method=method)
+            found[f"cogging_{h.order}_rad"] = Estimate(h.phase_rad, h.std / h.amplitude, 0.0, "rad", method=method)
+        return found
+
+    @property
+    def table_std_nm(self) -> float:
+        """Standard deviation of the torque at an angle, beside that of the inertia (N m)."""
+        return self.J.value * math.sqrt(sum(h.std**2 for h in self.harmonics.acceleration_rad_s2))
+
+
+def turn() -> Array:
+    """Return the angles of the table (rad), shape (ROWS,)."""
+    return np.linspace(0.0, 2.0 * math.pi, ROWS, endpoint=False)
+
+
+def cogging_of(traces: Mapping[str, Trace], result: Evaluation) -> Cogging | None:
+    """Return the cogging torque; None where nothing says the inertia, and where coasting alone shows none.
+
+    Parameters
+    ----------
+    traces : mapping of str to Trace
+        ``slow_<k>`` of the run: ``i_d_a i_q_a theta_M_rad``.
+    result : Evaluation
+        With what mechanics, or the frequency response, says of the inertia.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``: the shaft did not turn once, in both directions.
+    """
+    slow = [trace for name, trace in sorted(traces.items()) if name.startswith(SLOW_TRACE)]
+    J = result.estimates().get("J_kgm2")
+    if J is None or result.encoder is None or result.offset is None:
+        return None
+    pole_pairs = round(result.encoder.pole_pairs.value)
+    highest = min(HIGHEST_ORDER, ORDERS_PER_POLE_PAIR * pole_pairs)
+    if slow:
+        torque = torque_of(result, pole_pairs)
+        behind = result.offset.value - float(slow[0].meta["offset_rad"])
+        both, friction = [], 0.0
+        for trace in slow:
+            seen = in_frame(trace, behind)
+            theta = int(trace.meta["direction"]) * trace["theta_M_rad"]
+            of_current = torque(seen["i_d_a"], seen["i_q_a"])
+            both.append(torque_orders(seen.t_s, theta, of_current, J.value, highest))
+            friction = max(friction, abs(float(np.mean(of_current))))
+        return _of_slow_turns(both, J, pole_pairs, highest, MISMATCH * friction)
+    if result.mechanics is None or not result.mechanics.harmonics.acceleration_rad_s2:
+        return None
+    harmonics = result.mechanics.harmonics
+    how = f"coasting through {harmonics.turns:.3g} turns and more each way"
+    return Cogging(harmonics, J, highest, math.inf, how)
+
+
+def torque_orders(t_s: Array, theta: Array, torque_nm: Array, J_kgm2: float, highest: int) -> Phasors:
+    """Return the torque over the angle by order, as phasors of exp(j order theta), shape (highest + 1,).
+
+    Parameters
+    ----------
+    t_s, theta, torque_nm : ndarray, shape (n,)
+        Times (s), positions along the phase order (rad, unwrapped) and torque of the currents (N m) of a slow turn.
+    J_kgm2 : float
+        Inertia.
+    highest : int
+        Highest order.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_EXCITATION``.
+    """
+    sense = 1.0 if theta[-1] > theta[0] else -1.0
+    way = np.maximum.accumulate(sense * (theta - theta[0]))
+    turns = int(way[-1] / (2.0 * math.pi))
+    if turns < 1:
+        raise refuse(
+            "E_EXCITATION",
+            f"the shaft turned {way[-1] / (2.0 * math.pi):.2g} times at low speed, one whole turn is needed",
+            stage="cogging",
+            likely="cogging or friction that the speed controller does not overcome at 30 rpm, or a limited travel",
+        )
+    angle = np.arange(turns * GRID) * (2.0 * math.pi / GRID)
+    step = np.diff(way)
+    middle = way[:-1] + 0.5 * step
+    energy = 0.5 * J_kgm2 * (step / np.diff(t_s)) ** 2
+    energy = energy - np.polyval(np.polyfit(middle, energy, 1), middle)
+    order = np.arange(highest + 1)
+    found = []
+    for values, at in ((energy, middle), (torque_nm, way)):
+        folded = np.interp(angle, at, values).reshape(turns, GRID).mean(axis=0)
+        phasors = 2.0 / GRID * np.fft.rfft(folded)[: highest + 1]
+        # a turn backward runs through the angles the other way round
+        found.append((phasors if sense > 0.0 else phasors.conj()) * np.exp(-1j * order * theta[0]))
+    # what straight lines between the rows leave of an order; speeds are means between two rows besides
+    row = 2.0 * math.pi * turns / np.count_nonzero(middle < 2.0 * math.pi * turns)
+    mean = np.sinc(0.5 * order * row / math.pi)
+    return np.asarray((1j * order * found[0] / mean - found[1]) / mean**2)
+
+
+def _of_slow_turns(both: Sequence[Phasors], J: Estimate, pole_pairs: int, highest: int, mismatch_nm: float) -> Cogging:
+    """Return the orders that stand out of what the directions differ by, and of what sensors hide."""
+    if len(both) != 2:
+        raise refuse("E_EXCITATION", "slow turns in one direction only", stage="cogging")
+    mean, apart = 0.5 * (both[0] + both[1]), 0.5 * np.abs(both[0] - both[1])
+    # the median of a squared amplitude is 2 ln 2 of the variance of its parts
+    std = np.array(
+        [
+            math.sqrt(np.median(apart[max(1, n - NEIGHBOURS) : n + NEIGHBOURS + 1] ** 2) / (2.0 * math.log(2.0)))
+            for n in range(highest + 1)
+        ]
+    )
+    hidden = {2 * pole_pairs: mismatch_nm, 3 * pole_pairs: abs(mean[pole_pairs])}
+    for n, torque_nm in hidden.items():
+        std[n] = max(std[n], torque_nm)
+    besides = {0, *ENCODER_ORDERS, pole_pairs}
+    orders = [n for n in range(highest + 1) if n not in besides]
+    clear = sorted((n for n in orders if abs(mean[n]) > SURE * std[n]), key=lambda n: -abs(mean[n]))[:ORDERS_MOST]
+    harmonics = []
+    for n in sorted(clear):
+        torque, deviation = complex(mean[n]), max(float(std[n]), float(apart[n]) / math.sqrt(2.0))
+        harmonics.append(Harmonic(n, torque.real / J.value, -torque.imag / J.value, deviation / J.value))
+    floor = SURE * float(np.max(std[[n for n in orders if n not in hidden]]))
+    return Cogging(AngleHarmonics((), tuple(harmonics)), J, highest, floor, "slow turns in both directions")
+
+
+def save_cogging(run: RunDirectory, cogging: Cogging | None, direction: int) -> dict[str, str]:
+    """Write the table into the run; returns its name as a stage lists it, nothing where no cogging was found.
+
+    ``theta_m_rad`` is what the drive's encoder shows, ``direction`` its sign along the phase order.
+    """
+    if cogging is None or not cogging.harmonics.acceleration_rad_s2:
+        return {}
+    theta = turn()
+    torque = cogging.harmonics.torque_nm(direction * theta, cogging.J.value)
+    half = COVERAGE_FACTOR * cogging.table_std_nm
+    rows = [f"{angle:.9g},{value:.6g},{half:.3g}" for angle, value in zip(theta, torque, strict=True)]
+    run.save(COGGING_CSV, "\n".join(["theta_m_rad,torque_nm,half_width_95_nm", *rows]) + "\n")
+    return {COGGING_CSV: ""}
