@@ -38,7 +38,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
     With --eds no bus is needed: a simulated drive with exactly the file's objects is asked, a motor set up in it.
     """
     from pmsmtool.drive_maps.shipped_maps import GENERIC
-    from pmsmtool.flash.map_gate import other_drive
+    from pmsmtool.flash.map_gate import other_drive, unknown_firmware
     from pmsmtool.measurement.capabilities import examine
 
     given = None if map_file is None else read_map(map_file)
@@ -50,10 +50,13 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
     if eds is not None:
         out.note(f"no drive was asked: this is what the objects of {eds} allow once a motor is set up")
     if given is not None and given.name != GENERIC and not found.map_is_drives:
-        differ = other_drive(given, found.identity.vendor, found.identity.product)
+        differ = other_drive(given, found.identity.vendor, found.identity.product, found.identity.doubt)
         out.warn(f"{differ}: what is listed is that map's, and nothing is written or moved through it")
     elif not found.map_is_drives:
-        out.warn(f"no map names this drive: {found.drive_map.name} was used, and nothing is written through it")
+        doubt = found.identity.doubt or "no map names this drive"
+        out.warn(f"{doubt}: {found.drive_map.name} was used, and nothing is written through it")
+    elif firmware := unknown_firmware(found.drive_map, found.identity):
+        out.warn(firmware)
 
 
 def _facts(found: Capabilities) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from pathlib import Path
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.bus.supervision import SecondMaster
-from pmsmtool.drive import objects
+from pmsmtool.drive.drive_node import vendor_product_serial
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.errors import ConfigError, SdoAbort
 from pmsmtool.plain_text import one_line
@@ -77,15 +77,11 @@ def _key(connection: Connection, node_id: int) -> str:
     sdo = SdoChannel(connection, node_id)
     sdo.finish_within(IDENTITY_S)
     try:
-        numbers = []
-        for sub in (1, 2, 4):
-            try:
-                numbers.append(int.from_bytes(sdo.read(objects.IDENTITY, sub, size=4), "little"))
-            except SdoAbort:
-                numbers.append(0)
+        vendor, product, serial = vendor_product_serial(sdo)
+    except SdoAbort:
+        vendor = product = serial = 0
     finally:
         sdo.close()
-    vendor, product, serial = numbers
     name = f"{vendor:08x}-{product:08x}-{serial}"
     if serial and vendor != reference_map().vendor:
         return name

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters, Progress
@@ -56,9 +57,33 @@ def plan_download(node: DriveNode, wanted: ParameterSet) -> Plan:
     NotAvailable
         The drive's parameter set has another layout than this program's.
     ConfigError
-        Values out of bounds, or that do not fit the drive's types.
+        Values out of bounds, or that do not fit the drive's types; rows of the map that the drive contradicts.
     """
-    return make_plan(node.map, wanted, _settled(node).read(names_to_read(node.map, wanted)))
+    parameters, names = _settled(node), names_to_read(node.map, wanted)
+    if not node.map.staging:  # the reference drive shows the layout of its set
+        _refuse_contradictions(node, names)
+    return make_plan(node.map, wanted, parameters.read(names))
+
+
+def _refuse_contradictions(node: DriveNode, names: Sequence[str]) -> None:
+    """Refuse rows of a map whose objects the drive does not have, or has in another size; all of them."""
+    wrong = []
+    for cell in (node.map.cells[name] for name in names):
+        try:
+            size = len(node.sdo.upload(cell.index, cell.sub).data)
+        except SdoAbort as abort:
+            if abort.code not in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX):
+                raise
+            wrong.append(f"{node.map.row_text(cell.name)}: the drive has no such object")
+            continue
+        if size != cell.size:
+            wrong.append(f"{node.map.row_text(cell.name)}: the drive holds {size} bytes there")
+    if wrong:
+        raise ConfigError(
+            f"the drive contradicts {len(wrong)} row(s) of the map {node.map.name!r}",
+            where=f"node {node.node}", violations=wrong, likely="another firmware than the map's sources describe",
+            hint="correct the rows in a copy of the map, and give it with --map; nothing was written",
+        )  # fmt: skip
 
 
 def plan_restore(node: DriveNode, snapshot: Snapshot) -> Plan:
