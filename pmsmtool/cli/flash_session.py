@@ -119,6 +119,7 @@ def plan_facts(plan: Plan) -> dict[str, Any]:
         "changes": [_change_facts(change) for change in plan.changes],
         "equal": len(plan.entries) - len(plan.changes),
         "missing": plan.missing,
+        "not_written": plan.not_written,
     }
 
 

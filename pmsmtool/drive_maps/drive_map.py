@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -326,7 +326,7 @@ class DriveMap:
 
     def missing(self, wanted: ParameterSet) -> tuple[str, ...]:
         """Return the entries of a set that this drive has no object for."""
-        return tuple(n for n in [*wanted.values, *wanted.tables] if n not in self.cells and n not in self.tables)
+        return tuple(self.not_written([*wanted.values, *wanted.tables]))
 
     def quantised(self, wanted: ParameterSet) -> ParameterSet:
         """Return what the drive will really hold of a set."""
@@ -350,9 +350,10 @@ class DriveMap:
         source = f"{row.source}: {self.sources[row.source]}" if row.source in self.sources else "no source stated"
         return f"{self.name} {name} 0x{row.index:04X}:{row.sub:02X} {row.wire} ({source})"
 
-    def why_not(self, name: str) -> str:
-        """Return why the map has no object for an entry of a set."""
-        return self.left_out.get(name, f"the map {self.name!r} has no row for it")
+    def not_written(self, names: Iterable[str]) -> dict[str, str]:
+        """Return the entries of a set that the map has no object for, and why."""
+        lacking = (name for name in names if name not in self.cells and name not in self.tables)
+        return {name: self.left_out.get(name, f"the map {self.name!r} has no row for it") for name in lacking}
 
     @property
     def scales(self) -> bool:

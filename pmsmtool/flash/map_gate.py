@@ -10,13 +10,16 @@ decision, not an accident.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.drive_map_file import map_hash
 from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
-from pmsmtool.errors import ConfigError, SafetyRefusal
+from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
 from pmsmtool.files import read_text, write_file
 from pmsmtool.flash.journal import JournalFolder
 
@@ -99,6 +102,22 @@ def unknown_firmware(drive_map: DriveMap, identity: Identity) -> str:
         f"firmware {identity.revision:#010x} (0x1018:03) of family {drive_map.name}: the map's sources {says}; "
         "compare types and units with your manual"
     )
+
+
+def contradictions(node: DriveNode, names: Iterable[str]) -> dict[str, str]:
+    """Return the parameters whose object the drive does not have, or has in another size than its map, and which."""
+    wrong = {}
+    for cell in (node.map.cells[name] for name in names):
+        try:
+            size = len(node.sdo.upload(cell.index, cell.sub).data)
+        except SdoAbort as abort:
+            if abort.code not in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX):
+                raise
+            wrong[cell.name] = "the drive has no such object"
+            continue
+        if size != cell.size:
+            wrong[cell.name] = f"the drive holds {size} bytes there"
+    return wrong
 
 
 def _other_drive(drive_map: DriveMap, identity: Identity) -> ConfigError:

@@ -8,7 +8,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters, Progress
@@ -17,6 +16,7 @@ from pmsmtool.drive_maps.drive_map import DriveMap, address_in
 from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
 from pmsmtool.flash.download import Outcome
 from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
+from pmsmtool.flash.map_gate import contradictions
 from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
 from pmsmtool.flash.whole_drive import parameters_of
 from pmsmtool.params.catalogue import BY_NAME, layout_signature
@@ -66,22 +66,12 @@ def plan_download(node: DriveNode, wanted: ParameterSet) -> Plan:
 
 
 def _refuse_contradictions(node: DriveNode, names: Sequence[str]) -> None:
-    """Refuse rows of a map whose objects the drive does not have, or has in another size; all of them."""
-    wrong = []
-    for cell in (node.map.cells[name] for name in names):
-        try:
-            size = len(node.sdo.upload(cell.index, cell.sub).data)
-        except SdoAbort as abort:
-            if abort.code not in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX):
-                raise
-            wrong.append(f"{node.map.row_text(cell.name)}: the drive has no such object")
-            continue
-        if size != cell.size:
-            wrong.append(f"{node.map.row_text(cell.name)}: the drive holds {size} bytes there")
+    wrong = contradictions(node, names)
     if wrong:
         raise ConfigError(
             f"the drive contradicts {len(wrong)} row(s) of the map {node.map.name!r}",
-            where=f"node {node.node}", violations=wrong, likely="another firmware than the map's sources describe",
+            where=f"node {node.node}", violations=[f"{node.map.row_text(name)}: {why}" for name, why in wrong.items()],
+            likely="another firmware than the map's sources describe",
             hint="correct the rows in a copy of the map, and give it with --map; nothing was written",
         )  # fmt: skip
 
@@ -207,7 +197,7 @@ def restore_plan(drive_map: DriveMap, snapshot: Snapshot, found: Mapping[str, by
         unit = BY_NAME[entry.name].unit if scalar else "" if by_address else table_unit(entry.name)
         change = Change(entry.name, entry.index, entry.sub, found[entry.name], entry.old, old_value, value, value, unit)
         entries.append(change)
-    return Plan(tuple(entries), (), snapshot.content)
+    return Plan(tuple(entries), {}, snapshot.content)
 
 
 def due_of_journal(snapshot: Snapshot, plan: Plan, folder: JournalFolder) -> Plan:
