@@ -141,6 +141,9 @@ def identified(channel: str, machine: MachineFile) -> tuple[str, list[str], bool
     """Return what `identify` told, by which keys, whether every truth lay within, and why it told no more."""
     code, facts, reason = asked("--sim", channel, "--yes", "identify", "--json")
     values = {value["name"]: value for value in facts.get("values", ()) if "total_95" in value}
+    if code in (0, 10):
+        lacking = "psi_f_wb" if "J_per_psi" not in values else "J_per_psi"  # the pole pairs, or peak or rms
+        reason = next((line for line in facts.get("warnings", ()) if line.startswith(lacking)), "")
     told, good = [], True
     for key, true in truth_of(machine).items():
         if key in values:

@@ -98,8 +98,13 @@ def test_guarding_that_ends_takes_the_voltage_away(tmp_path: Path) -> None:
         assert rig.off_since is not None and 0.0 < rig.off_since - began <= DECLARED_S
 
 
-def test_a_drive_without_any_supervision_is_refused(tmp_path: Path) -> None:
-    rows = tuple(row for row in copley() if row not in GUARDING)
+PDO_TIME_OUT: tuple[Row, ...] = ((0x1400, 2, "U8", "rw", "255"), (0x1400, 5, "U16", "rw", "100"))
+"""A receive PDO that is missed after 100 ms: CiA 301 lets that be a message, and nothing else."""
+
+
+@pytest.mark.parametrize("more", [(), PDO_TIME_OUT])
+def test_a_drive_without_any_supervision_is_refused(tmp_path: Path, more: tuple[Row, ...]) -> None:
+    rows = (*(row for row in copley() if row not in GUARDING), *more)
     with opened(tmp_path, rows) as rig:
         with pytest.raises(SafetyRefusal, match="neither a consumer heartbeat"), guarded(rig.drive, ENVELOPE):
             pass

@@ -113,6 +113,8 @@ class ForeignDrive:
         dictionary.find(0x6502, 0).value = self._modes_word(dictionary)
         if not self.objects.has((0x6007, 0)):
             dictionary["cia402.abort_connection"].put(1)
+            if not self.objects.has((0x605E, 0)):
+                dictionary["cia402.fault_reaction"].put(0)
 
     def _modes_word(self, dictionary: Dictionary) -> bytes:
         modes = sum(1 << mode - 1 for mode in modes_of(self.objects) if mode > 0)
