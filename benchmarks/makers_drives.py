@@ -20,6 +20,7 @@ import csv
 import itertools
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -52,7 +53,9 @@ SAME = (("copley", "dchcan"), ("elmo-gold-a", "elmo-gold-b", "elmo-gold-c"))
 """Files of one drive: they count once."""
 COUNTS = 1.0
 """A row of a map agrees with the node's own unit within so many counts: both round."""
-LONGEST_REASON = 160
+LONGEST_REASON = 300
+LEAST_COUNTS = 64
+"""Increments per turn from which the number of a file is an encoder's; one holds 1."""
 MOST_MACHINES = 3
 """Random machines that are tried on a drive that cannot commutate the one asked for."""
 
@@ -112,17 +115,26 @@ def machines_for(objects: MakersObjects, name: str, first: int) -> Iterator[tupl
     """Yield the machine named if the drive can commutate it, else random ones that it can, with its file's encoder."""
     machine = load_machine_file(machine_path(name)) if not Path(name).is_file() else load_machine_file(Path(name))
     if not too_much_for(objects, machine):
-        yield name, machine
+        yield with_encoder(objects, name, machine)
         return
     for seed in itertools.count(first):
-        machine, name = draw_drive(seed), f"drive-{seed}.toml"
-        if too_much_for(objects, machine):
-            continue
-        counts = objects.rows.get((0x608F, 1))
-        if counts is not None and counts.access == "ro" and counts.default:
-            machine = replace(machine, encoder=replace(machine.encoder, bits=int(counts.default, 0).bit_length() - 1))
-        Path(name).write_text(dump_machine_file(machine), encoding="utf-8")
-        yield name, machine
+        machine = draw_drive(seed)
+        if not too_much_for(objects, machine):
+            Path(f"drive-{seed}.toml").write_text(dump_machine_file(machine), encoding="utf-8")
+            yield with_encoder(objects, f"drive-{seed}.toml", machine)
+
+
+def with_encoder(objects: MakersObjects, name: str, machine: MachineFile) -> tuple[str, MachineFile]:
+    """Return the machine with the encoder that the file states (0x608F), where it states another one."""
+    row = objects.rows.get((0x608F, 1))
+    counts = int(row.default, 0) if row is not None and row.default else 0
+    if counts < LEAST_COUNTS or machine.encoder.bits is None or counts == 1 << machine.encoder.bits:
+        return name, machine
+    bits = counts.bit_length() - 1 if counts & counts - 1 == 0 else None  # a machine file knows powers of two
+    machine = replace(machine, encoder=replace(machine.encoder, bits=bits))
+    own = f"{name.removesuffix('.toml')}-encoder.toml"
+    Path(own).write_text(dump_machine_file(machine), encoding="utf-8")
+    return own, machine
 
 
 def asked(*words: str) -> tuple[int, dict[str, Any], str]:
@@ -142,8 +154,9 @@ def identified(channel: str, machine: MachineFile) -> tuple[str, list[str], bool
     code, facts, reason = asked("--sim", channel, "--yes", "identify", "--json")
     values = {value["name"]: value for value in facts.get("values", ()) if "total_95" in value}
     if code in (0, 10):
-        lacking = "psi_f_wb" if "J_per_psi" not in values else "J_per_psi"  # the pole pairs, or peak or rms
-        reason = next((line for line in facts.get("warnings", ()) if line.startswith(lacking)), "")
+        lacking = ("psi",) if "J_per_psi" not in values else ("J_per_psi",)  # the pole pairs, or peak or rms
+        told_why = [*facts.get("warnings", ()), *(f"{key}: {why}" for key, why in facts.get("refused", {}).items())]
+        reason = next((line for line in told_why if line.startswith(lacking)), "")
     told, good = [], True
     for key, true in truth_of(machine).items():
         if key in values:
@@ -155,9 +168,9 @@ def identified(channel: str, machine: MachineFile) -> tuple[str, list[str], bool
 
 def commissioned(file: str, machine: str) -> tuple[str, str]:
     """Return the stages that `commission` passed, and the first reason of one that it did not."""
+    shutil.rmtree("chain", ignore_errors=True)
     code, _, reason = asked("--yes", "commission", machine, "--eds", file, "--runs", "chain", "--json")
-    runs = sorted(Path("chain").glob("*"), key=lambda path: path.stat().st_mtime)
-    stages = RunDirectory(runs[-1]).read().stages if runs else ()
+    stages = next((RunDirectory(path).read().stages for path in Path("chain").glob("*")), ())
     passed = [stage.name for stage in stages if stage.status in ("pass", "partial")]
     failed = next((f"{stage.name}: {stage.note}" for stage in stages if stage.name not in passed), reason)
     return f"{', '.join(passed) or 'no stage'} (exit {code})", failed if code else ""
@@ -171,7 +184,7 @@ def flashed(channel: str, family: str) -> tuple[str, str]:
     outcome, names = facts["outcome"], [change["name"] for change in facts["changes"]]
     held = outcome["written"] + outcome["equal"]
     lacks = "" if held else f"flash-params: the map {family!r} has no row for a parameter"
-    return f"{held} held, {len(names)} of them changed" if held else "nothing", lacks
+    return f"{held} values held, {len(names)} changed" if held else "nothing", lacks
 
 
 def wrong_units(objects: MakersObjects, machine: MachineFile, family: str) -> tuple[int, list[str]]:
@@ -212,15 +225,19 @@ def row_of(file: str, name: str, first: int) -> tuple[Row, int]:
         channel = f"{own}?nv=:memory:&eds={file}"
         told, keys, within, why = identified(channel, machine)
         good = good and within
-        reasons.append(why if own == name or not why else f"{own}: {why}")
-        if own != name:
-            told += f" on {own}, as it cannot commutate {name}"
+        drawn = own.startswith("drive-") and not name.startswith("drive-")
+        motor = f"random motor of {machine.machine.pole_pairs} pole pairs, seed {own.split('-')[1].split('.')[0]}"
+        reasons.append(f"{motor}: {why}" if drawn and why else why)
+        if drawn:
+            told += f" ({motor}: it cannot commutate {name})"
         if keys:
             break
     chain, missing = commissioned(file, own if Path(own).is_file() else str(machine_path(own)))
     asked("tune", own, "-o", "design.toml")
     written, unwritten = flashed(channel, facts["map"])
     judged, wrong = wrong_units(objects, machine, facts["map"])
+    if not keys and missing.startswith("identify:"):
+        missing = ""  # the same reason once more
     shown = tuple(short(line) for line in (*reasons, missing, unwritten, *wrong) if line)
     seconds = time.perf_counter() - began
     row = Row(
@@ -231,7 +248,7 @@ def row_of(file: str, name: str, first: int) -> tuple[Row, int]:
 
 def short(text: str) -> str:
     """Return a reason as a cell of a table takes it."""
-    line = " ".join(text.replace("|", "/").split())
+    line = " ".join(text.partition(" (try:")[0].replace("|", "/").split())
     return line if len(line) <= LONGEST_REASON else f"{line[: LONGEST_REASON - 3]}..."
 
 
