@@ -24,7 +24,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -157,23 +157,31 @@ def identified(channel: str, machine: MachineFile) -> tuple[str, list[str], bool
         lacking = ("psi",) if "J_per_psi" not in values else ("J_per_psi",)  # the pole pairs, or peak or rms
         told_why = [*facts.get("warnings", ()), *(f"{key}: {why}" for key, why in facts.get("refused", {}).items())]
         reason = next((line for line in told_why if line.startswith(lacking)), "")
+    told, good = against_truth(values, machine)
+    return "; ".join(told) or f"nothing (exit {code})", [key for key in TOLD if key in values], good, reason
+
+
+def against_truth(values: Mapping[str, Mapping[str, Any]], machine: MachineFile) -> tuple[list[str], bool]:
+    """Return what was told with its error and half width, and whether every truth lay within."""
     told, good = [], True
     for key, true in truth_of(machine).items():
         if key in values:
             value, half = values[key]["value"], values[key]["total_95"]
             good = good and abs(value - true) <= half
             told.append(f"{key} {100.0 * (value / true - 1.0):+.1f} % +-{100.0 * half / true:.1f} %")
-    return "; ".join(told) or f"nothing (exit {code})", [key for key in TOLD if key in values], good, reason
+    return told, good
 
 
-def commissioned(file: str, machine: str) -> tuple[str, str]:
-    """Return the stages that `commission` passed, and the first reason of one that it did not."""
+def commissioned(file: str, machine: str) -> tuple[str, str, dict[str, Mapping[str, Any]]]:
+    """Return the stages that `commission` passed, the first reason of one that it did not, and what it identified."""
     shutil.rmtree("chain", ignore_errors=True)
     code, _, reason = asked("--yes", "commission", machine, "--eds", file, "--runs", "chain", "--json")
     stages = next((RunDirectory(path).read().stages for path in Path("chain").glob("*")), ())
     passed = [stage.name for stage in stages if stage.status in ("pass", "partial")]
     failed = next((f"{stage.name}: {stage.note}" for stage in stages if stage.name not in passed), reason)
-    return f"{', '.join(passed) or 'no stage'} (exit {code})", failed if code else ""
+    rows = [row for stage in stages if stage.name == "identify" for row in stage.values if "total_95" in row]
+    text = f"{', '.join(passed) or 'no stage'} (exit {code})"
+    return text, failed if code else "", {str(row["name"]): row for row in rows}
 
 
 def flashed(channel: str, family: str) -> tuple[str, str]:
@@ -232,7 +240,11 @@ def row_of(file: str, name: str, first: int) -> tuple[Row, int]:
             told += f" ({motor}: it cannot commutate {name})"
         if keys:
             break
-    chain, missing = commissioned(file, own if Path(own).is_file() else str(machine_path(own)))
+    chain, missing, values = commissioned(file, own if Path(own).is_file() else str(machine_path(own)))
+    more, within = against_truth(values, machine)
+    if "J_per_psi" in values and "J_per_psi" not in keys:  # the machine file tells the pole pairs
+        chain, keys = f"{'; '.join(more)}; {chain}", [*keys, "J_per_psi"]
+        good = good and within
     asked("tune", own, "-o", "design.toml")
     written, unwritten = flashed(channel, facts["map"])
     judged, wrong = wrong_units(objects, machine, facts["map"])
@@ -296,7 +308,8 @@ def main() -> int:
     good = all(row.good for row in rows)
     nodes, moved, told = counted(rows)
     sums = [
-        f"{moved} of {nodes} drives moved and told J over psi or K_T, {told} of them J/psi; "
+        f"{moved} of {nodes} drives moved; {told} told J/psi, by `identify` alone or with the pole pairs of the "
+        "machine file in `commission`; "
         f"{'every' if good else 'NOT every'} truth within its interval; {judged} rows of maps counted in the node's "
         f"own units, {'none' if good else 'SOME'} wrong."
     ]
