@@ -56,7 +56,7 @@ def backup_command(
             out.status(f"{done}/{total}")
 
         if listed is None:
-            identity = checked_identity(node)
+            identity = checked_identity(node, out)
             snapshot = take_backup(node, identity, progress=progress)
         else:
             identity = node.identity()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,26 +39,36 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
     With --eds no bus is needed: a simulated drive with exactly the file's objects is asked, a motor set up in it.
     """
     from pmsmtool.drive_maps.shipped_maps import GENERIC
-    from pmsmtool.flash.map_gate import other_drive
+    from pmsmtool.flash.map_gate import contradictions, other_drive, unknown_firmware
     from pmsmtool.measurement.capabilities import examine
+    from pmsmtool.params.catalogue import BY_NAME
 
     given = None if map_file is None else read_map(map_file)
     if eds is not None:
         bus = rehearsal_bus(bus, eds=eds)
     with open_node(bus, within_s=LOOKING_S) as node:
         found = examine(node, given)
-    out.result("caps", _facts(found), lambda: _lines(found))
+        own = not found.drive_map.staging  # the reference drive shows the layout of its set
+        denied = contradictions(node, found.drive_map.cells) if own else {}
+    out.result("caps", _facts(found, denied), lambda: _lines(found, denied))
+    for name, why in found.drive_map.not_written(BY_NAME).items():
+        if name not in found.drive_map.left_out:
+            out.detail(f"not written: {name}: {why}")
     if eds is not None:
         out.note(f"no drive was asked: this is what the objects of {eds} allow once a motor is set up")
     if given is not None and given.name != GENERIC and not found.map_is_drives:
-        differ = other_drive(given, found.identity.vendor, found.identity.product)
+        differ = other_drive(given, found.identity.vendor, found.identity.product, found.identity.doubt)
         out.warn(f"{differ}: what is listed is that map's, and nothing is written or moved through it")
     elif not found.map_is_drives:
-        out.warn(f"no map names this drive: {found.drive_map.name} was used, and nothing is written through it")
+        doubt = found.identity.doubt or "no map names this drive"
+        out.warn(f"{doubt}: {found.drive_map.name} was used, and nothing is written through it")
+    elif firmware := unknown_firmware(found.drive_map, found.identity):
+        out.warn(firmware)
 
 
-def _facts(found: Capabilities) -> dict[str, Any]:
+def _facts(found: Capabilities, denied: Mapping[str, str]) -> dict[str, Any]:
     from pmsmtool.drive_maps.drive_map_file import map_hash
+    from pmsmtool.params.catalogue import BY_NAME
 
     return {
         "identity": found.identity,
@@ -71,6 +82,8 @@ def _facts(found: Capabilities) -> dict[str, Any]:
         "quantities": [_row_facts(row) for row in found.rows()],
         "parameters": sorted(found.drive_map.cells),
         "left_out": dict(found.drive_map.left_out),
+        "written": {name: found.drive_map.row_text(name) for name in _written(found, denied)},
+        "not_written": {**found.drive_map.not_written(BY_NAME), **_unwritten(found, denied)},
     }
 
 
@@ -95,7 +108,34 @@ def _row_facts(row: Row) -> dict[str, Any]:
     }
 
 
-def _lines(found: Capabilities) -> list[str]:
+def _written(found: Capabilities, denied: Mapping[str, str]) -> list[str]:
+    return [name for name in found.drive_map.cells if name not in _unwritten(found, denied)]
+
+
+def _unwritten(found: Capabilities, denied: Mapping[str, str]) -> dict[str, str]:
+    """Return the mapped parameters that are not written all the same, and why."""
+    if found.map_is_drives:
+        return dict(denied)
+    return dict.fromkeys(found.drive_map.cells, "no map names this drive")
+
+
+def _parameter_lines(found: Capabilities, denied: Mapping[str, str]) -> list[str]:
+    """Say value by value what `flash-params` writes; what the map does not even name is a number (-v: by name)."""
+    from pmsmtool.params.catalogue import BY_NAME
+
+    drive_map = found.drive_map
+    others = len(drive_map.not_written(BY_NAME).keys() - drive_map.left_out.keys())
+    unwritten = _unwritten(found, denied)
+    return [
+        "",
+        *(f"written: {drive_map.row_text(name)}" for name in _written(found, denied)),
+        *(f"not written: {drive_map.row_text(name)}: {why}" for name, why in unwritten.items()),
+        *(f"not written: {name}: {why}" for name, why in drive_map.left_out.items() if name in BY_NAME),
+        *([f"not written: {others} other parameters, which the map has no row for"] if others else []),
+    ]
+
+
+def _lines(found: Capabilities, denied: Mapping[str, str]) -> list[str]:
     from pmsmtool.cli.output import table
 
     identity = found.identity
@@ -109,7 +149,7 @@ def _lines(found: Capabilities) -> list[str]:
     ]
     rows = [(row.quantity, row.method.value, *_said(row)) for row in found.rows()]
     lines += table(("quantity", "method", "expected total 95 %", ""), rows)
-    return lines
+    return lines if found.drive_map.staging else [*lines, *_parameter_lines(found, denied)]
 
 
 def _said(row: Row) -> tuple[str, str]:

@@ -41,7 +41,7 @@ def diff_command(first: Path, second: Path, check: bool, out: Output) -> None:
     from pmsmtool.units import format_quantity
 
     (record, found), (other_record, other) = _read(first), _read(second)
-    same = bool(record.drive.get("serial")) and record.drive == other_record.drive
+    same = bool(record.drive.get("serial")) and _who(record) == _who(other_record)
     rows = differences(found, other, same_sensors=same)
 
     def told(value: float | None, unit: str) -> str:
@@ -101,6 +101,10 @@ def fleet_command(folder: Path, out: Output) -> None:
     heads = ("quantity", "runs", "median", "spread", "interval of one", "stand out")
     lines = [*table(heads, cells), f"{len(runs)} runs", *(f"left out: {text}" for text in unread)]
     out.result("fleet", {"runs": len(runs), "left_out": unread, "quantities": [_facts(row) for row in rows]}, lines)
+
+
+def _who(record: RunRecord) -> dict[str, object]:
+    return {key: value for key, value in record.drive.items() if key != "doubt"}  # older records do not have it
 
 
 def _facts(row: object) -> dict[str, object]:

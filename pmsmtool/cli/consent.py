@@ -3,7 +3,8 @@
 
 Each is asked on its own. ``--yes`` answers them on a simulated bus; on a real one only together with ``--i-max``,
 ``--speed-max``, ``--shaft`` and the serial number of the very drive that answered, so that a line from a script's
-history cannot move another machine. Where nobody can be asked, nothing is done (exit code 7).
+history cannot move another machine; a drive that tells none is not moved or written by it at all. Where nobody can be
+asked, nothing is done (exit code 7).
 """
 
 from __future__ import annotations
@@ -124,6 +125,8 @@ def _ask(
             hint="check channel and node; `pmsmtool info` shows the drive",
         )
     missing = missing_for_yes(options)
+    if not serial:
+        missing.append("a drive that tells its serial number")
     if options.yes and (simulated or not missing):
         return Consent(subject, "--yes", text)
     if options.yes:
@@ -132,7 +135,7 @@ def _ask(
         raise Declined(
             f"no terminal to ask for consent to {_NAMES[subject]}: nothing was done",
             likely="standard input or standard error is not a terminal: give --yes with limits, or run interactively",
-            hint="--yes" if simulated or not missing else f"--yes {' '.join(f'{name} ...' for name in missing)}",
+            hint="--yes" if simulated or not missing else _lacking(missing, serial),
         )
     try:
         agreed = click.confirm(question, default=False, err=True)
@@ -144,6 +147,12 @@ def _ask(
             hint="run the command again and answer y, when all that is shown above is right",
         )
     return Consent(subject, "prompt", text)
+
+
+def _lacking(missing: list[str], serial: int) -> str:
+    if not serial:
+        return "run it in a terminal: this drive tells no serial number, and without one only a person may consent"
+    return f"--yes {' '.join(f'{name} ...' for name in missing)}"
 
 
 _NAMES: dict[Subject, str] = {"motion": "move the machine", "writing": "write to the drive"}

@@ -146,7 +146,9 @@ def difference_of_drive(node: DriveNode) -> str:
     """Say in which way the drive is not the one of its map; empty when it is."""
     from pmsmtool.flash.map_gate import other_drive
 
-    return other_drive(node.map, *(_vendor_product(node) or (0, 0)))
+    shown = _vendor_product(node) or (0, 0)
+    shared = node.map.identity.shared and node.map.is_for(*shown)
+    return other_drive(node.map, *shown, node.identity().doubt if shared else "")
 
 
 def warn_of_other_drive(node: DriveNode, out: Output) -> None:

@@ -65,6 +65,11 @@ def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
         out.warn(f"drive family {drive_map.name} has no object for {count}: {few}")
         if len(missing) > SHOWN:
             out.detail(f"no object for {', '.join(missing)}")
+    for name, why in drive_map.not_written(missing).items():
+        (out.note if name in drive_map.left_out else out.detail)(f"not written: {name}: {why}")
+    for name in wanted.values:
+        if name in drive_map.cells:
+            out.detail(f"written: {drive_map.row_text(name)}")
     return wanted
 
 
@@ -85,11 +90,17 @@ def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
 def dcf_command(design: Path, into: Path | None, node_id: int, map_file: Path | None, out: Output) -> bytes:
     """Write a device configuration file (CiA 306)."""
     from pmsmtool.commissioning.export import dcf_file
+    from pmsmtool.drive_maps.eds import parse_eds
+    from pmsmtool.drive_maps.sheet_check import other_identity
 
     drive_map = read_map(map_file)
     if into is None and map_file is not None:
         raise click.UsageError("--map needs --into: the data sheet of that drive")
     base = None if into is None else read_bytes(into, hint="give with --into an EDS or DCF that you may read")
+    if base is not None:
+        differs = other_identity(parse_eds(base, str(into)), drive_map)
+        if differs:
+            out.warn(f"{into}: {differs}")
     wanted = _parameters(design, drive_map, out)
     return dcf_file(wanted, drive_map=drive_map, base=base, node_id=node_id, where=str(into or "EDS"))
 

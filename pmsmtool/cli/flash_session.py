@@ -37,7 +37,7 @@ def carry_out(
     from pmsmtool.flash.journal import JournalFolder
     from pmsmtool.flash.restore import marks_of, plan_download
 
-    identity = checked_identity(node)
+    identity = checked_identity(node, out)
     looking = dry_run or check
     with contextlib.nullcontext() if looking else JournalFolder(identity).preparing():
         plan = plan_download(node, wanted)
@@ -86,18 +86,21 @@ def write_plan(
     return job.run(store=store, restoring=restoring)
 
 
-def checked_identity(node: DriveNode) -> Identity:
-    """Read the identity and refuse a drive the map is not for.
+def checked_identity(node: DriveNode, out: Output) -> Identity:
+    """Read the identity, refuse a drive the map is not for, and say where no source of the map knows its firmware.
 
     Raises
     ------
     ConfigError
         Vendor or product are not the map's.
     """
-    from pmsmtool.flash.map_gate import check_family
+    from pmsmtool.flash.map_gate import check_family, unknown_firmware
 
     identity = node.identity()
     check_family(node.map, identity)
+    firmware = unknown_firmware(node.map, identity)
+    if firmware:
+        out.warn(f"node {node.node}: {firmware}")
     return identity
 
 
@@ -116,6 +119,7 @@ def plan_facts(plan: Plan) -> dict[str, Any]:
         "changes": [_change_facts(change) for change in plan.changes],
         "equal": len(plan.entries) - len(plan.changes),
         "missing": plan.missing,
+        "not_written": plan.not_written,
     }
 
 

@@ -64,7 +64,7 @@ def flash_fleet(
         for node_id in nodes:
             claim(connection, node_id)
             node = DriveNode(connection, node_id, drive_map=drive_map)
-            identity = checked_identity(node)
+            identity = checked_identity(node, out)
             folder = JournalFolder(identity)
             if not (dry_run or check):
                 notes.enter_context(folder.preparing())
@@ -105,7 +105,8 @@ def _ask(
     from pmsmtool.cli.consent import ask_writing
 
     after = [f"node {job.node.node}: {line}" for job in due for line in job.plan.after_lines(store=store)]
-    ask_writing([*lines, *after], motion, simulated=bus.simulated(), serial=due[0].identity.serial, out=out)
+    serial = min(job.identity.serial for job in due)  # 0 where one of them tells none
+    ask_writing([*lines, *after], motion, simulated=bus.simulated(), serial=serial, out=out)
 
 
 def _refuse_serial(motion: MotionOptions) -> None:

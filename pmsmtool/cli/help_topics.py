@@ -39,8 +39,9 @@ Nothing moves and nothing is written without a consent, and there are two of the
            what the shaft may do (--shaft, --load, --brake).
   writing  before the first write the list of differences is printed: name, old, new, unit.
 --yes answers them on a simulated drive. On a real bus it needs --i-max, --speed-max, --shaft and --serial as well, and
-the serial number must be that of the drive that answers. It cannot be set by an environment variable. Where nobody can
-be asked (no terminal) and --yes does not hold, nothing is done: exit 7.
+the serial number must be that of the drive that answers: one that tells none is moved and written by a person at a
+terminal only. --yes cannot be set by an environment variable. Where nobody can be asked (no terminal) and --yes does
+not hold, nothing is done: exit 7.
 
 Every way out of a command that moved the machine is the same: voltage off, zero current, parameters restored, and the
 stop confirmed from the statusword. If the drive does not confirm it, the exit code is 8 whatever else went wrong: use

@@ -33,8 +33,10 @@ def lss_command() -> None:
 def scan_command(bus: BusOptions, out: Output) -> None:
     """Show the identity of one unconfigured node; nothing is changed."""
     from pmsmtool.bus.lss import LssMaster
+    from pmsmtool.drive.drive_lock import claim_layer_setting
 
     with bus.connect() as connection:
+        claim_layer_setting(connection)
         master = LssMaster(connection)
         found = master.fast_scan()
         master.close()
@@ -52,15 +54,18 @@ def set_command(bus: BusOptions, motion: MotionOptions, out: Output, new_id: int
     from pmsmtool.bus.lss import LssMaster
     from pmsmtool.bus.scan import find_nodes
     from pmsmtool.cli.consent import ask_writing
+    from pmsmtool.drive.drive_lock import claim_identity, claim_layer_setting
     from pmsmtool.errors import BusError, ConfigError
 
     with bus.connect() as connection:
+        claim_layer_setting(connection)
         if new_id in [entry.node for entry in find_nodes(connection)]:
             raise ConfigError(f"node id {new_id} is taken", hint="`pmsmtool scan` lists the ids in use")
         master = LssMaster(connection)
         found = master.fast_scan()
         if found is None:
             raise BusError("no unconfigured node answers", hint="a node that has an id is not found by the fast scan")
+        claim_identity(connection, found.vendor, found.product, found.serial)
         lines = [*_lines(found), f"gets node id {new_id}{', stored' if store else ''}"]
         ask_writing(lines, motion, simulated=bus.simulated(), serial=found.serial, out=out)
         with master.configuration(found):

@@ -155,7 +155,7 @@ def _map_of(connection: Connection, node_id: int, map_file: Path | None) -> Driv
         identity = node.identity()
     finally:
         node.close()
-    return family_of(identity.vendor, identity.product) or load_family("cia402")
+    return family_of(*identity.vendor_product) or load_family("cia402")
 
 
 def _tell(

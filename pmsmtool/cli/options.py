@@ -98,7 +98,7 @@ class FilePath(click.Path):
 NODE = WholeNumber("node", 1, 127)
 BITRATE = WholeNumber("bit rate", 1, 10**7)
 FILE = FilePath(dir_okay=False)
-SERIAL = WholeNumber("serial", 0, 0xFFFFFFFF)
+SERIAL = WholeNumber("serial", 0, 0xFFFFFFFF_FFFFFFFF)
 CURRENT = Quantity("current")
 SPEED = Quantity("angular speed")
 FREQUENCY = Quantity("frequency")

@@ -176,8 +176,16 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
     differences = compare(first, second, common_only=True)
     rows = [_difference_cells(d) for d in differences]
     heads = ("name", old, new, "unit", "change")
-    out.result("param-diff", {"old": old, "new": new, "differences": differences}, lambda: table(heads, rows))
+    lacking = drive_map.not_written(dict.fromkeys(name for side in sets for name in (*side.values, *side.tables)))
+    equal = [name for name in first.values if name in second.values and first.values[name] == second.values[name]]
+    facts = {"old": old, "new": new, "differences": differences, "equal": equal, "not_written": lacking}
+    out.result("param-diff", facts, lambda: table(heads, rows))
     out.note(f"{len(differences)} difference(s) among what both hold")
+    for name, why in lacking.items():
+        (out.note if name in drive_map.left_out else out.detail)(f"not compared, not written: {name}: {why}")
+    unnamed = len(lacking.keys() - drive_map.left_out.keys())
+    if unnamed:
+        out.note(f"not compared, not written: {unnamed} entries that the map has no row for (-v names them)")
     if check and differences:
         raise CheckFailed(
             f"{len(differences)} parameter(s) differ",

@@ -18,17 +18,26 @@ from pmsmtool.files import write_file
         "pmsmtool report runs/20260101T120000Z-000055f1",
         "pmsmtool report runs/20260101T120000Z-000055f1 -o commissioning.html",
         "pmsmtool report runs/20260101T120000Z-000055f1 --json | jq .verdict",
+        "pmsmtool report --anonymous runs/20260101T120000Z-000055f1 -o to-send.json",
     ),
 )
 @click.argument("run", type=click.Path(path_type=Path))
 @click.option("-o", "--output", "path", type=FILE, help="Page to write.  [default: report.html in the run directory]")
+@click.option("--anonymous", is_flag=True, help="Instead of the page one JSON file to send: traces, objects, verdicts, "
+              "no names.  [default: anonymous.json in the run directory]")  # fmt: skip
 @output_options
-def report_command(run: Path, path: Path | None, out: Output) -> None:
+def report_command(run: Path, path: Path | None, anonymous: bool, out: Output) -> None:
     """Write the report of a RUN directory: one self-contained HTML page, verdict first.
 
     Every figure is drawn again from the files of the run. The exit code says whether the page was written, not whether
     the run was good.
+
+    --anonymous is for owners of real drives who let others learn from theirs: no serial number, no name of a person,
+    drive, machine, computer or file, no date, no text of the run at all. Read it before you send it: it is plain text.
     """
+    if anonymous:
+        _write_anonymous(run, run / "anonymous.json" if path is None else path, out)
+        return
     from pmsmtool.commissioning.report_page import how_it_ended, report_page, verdict
 
     path = run / "report.html" if path is None else path
@@ -36,4 +45,21 @@ def report_command(run: Path, path: Path | None, out: Output) -> None:
     found, ended = verdict(run), how_it_ended(run)
     data = {"file": path, "verdict": found.word, "simulated": found.simulated, "reasons": found.lines, "ended": ended}
     out.result("report", data, [found.headline, *found.details, *ended])
+    out.note(f"wrote {path}")
+
+
+def _write_anonymous(run: Path, path: Path, out: Output) -> None:
+    import json
+
+    from pmsmtool.commissioning.anonymous import anonymous_text
+
+    text = anonymous_text(run)
+    write_file(path, text)
+    found = json.loads(text)
+    stages = ", ".join(f"{stage['stage']} {stage['status']}" for stage in found["stages"]) or "no stage"
+    counts = {name: len(found[name]) for name in ("traces", "stages", "parameters")}
+    out.result("report-anonymous", {"file": path, "verdict": found["verdict"], **counts}, [
+        f"{counts['traces']} traces, {counts['parameters']} parameters, {found['verdict']}: {stages}",
+        "no names, no serial number, no dates, no texts of the run: look at it before you send it",
+    ])  # fmt: skip
     out.note(f"wrote {path}")

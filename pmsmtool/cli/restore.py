@@ -60,7 +60,7 @@ def restore_command(
         identity = node.identity()
         if map_file is not None:
             node.map = drive_map
-            checked_identity(node)
+            checked_identity(node, out)
         folder = JournalFolder(identity)
         snapshot = given or folder.last()
         if snapshot is None:
@@ -77,7 +77,7 @@ def restore_command(
             node.map = drive_map
             if map_file is None:
                 refuse_another_family(node)
-            checked_identity(node)
+            checked_identity(node, out)
         check_snapshot(node.map, snapshot, identity, other_drive=other_drive)
         out.note(f"{snapshot.kind} of serial {snapshot.identity.serial}, state {snapshot.state}")
         plan = plan_restore(node, snapshot)

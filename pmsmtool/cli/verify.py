@@ -39,7 +39,7 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
     drive_map = read_map(map_file)
     backup = source.suffix == ".json"
     with open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
-        identity = checked_identity(node)
+        identity = checked_identity(node, out)
         if backup:
             snapshot = read_snapshot(source)
             check_snapshot(node.map, snapshot, identity, other_drive=other_drive)

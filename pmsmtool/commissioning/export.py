@@ -16,7 +16,9 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.parameters import SetCommand
 from pmsmtool.drive_maps.dcf import Entry, new_dcf, write_concise
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
+from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.drive_maps.map_tables import encode_table, look_up_words
+from pmsmtool.drive_maps.sheet_check import contradictions, types_of
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.image import crc32, pack_image
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
@@ -24,7 +26,7 @@ from pmsmtool.params.diff import table_unit
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.resources import data_folder
 
-CSV_HEAD = ("name", "value", "unit", "held", "object", "type", "bytes", "meaning")
+CSV_HEAD = ("name", "value", "unit", "held", "object", "type", "bytes", "meaning", "not written because")
 
 
 def checked(wanted: ParameterSet) -> ParameterSet:
@@ -84,7 +86,16 @@ def dcf_file(
     drive_map = drive_map or reference_map()
     if base is None:
         base = (data_folder("firmware-params") / drive_map.name / f"{drive_map.name}.eds").read_bytes()
-    values = {drive_map.address(name): data for name, data in drive_map.encode(checked(wanted)).items()}
+    encoded = drive_map.encode(checked(wanted))
+    rows = [name for name in encoded if name in drive_map.cells]
+    wrong = contradictions(drive_map, types_of(parse_eds(base, where)), rows)
+    if wrong:
+        raise ConfigError(
+            f"the file contradicts {len(wrong)} row(s) of the map {drive_map.name!r}",
+            where=where, violations=wrong, likely="the file belongs to another drive or firmware",
+            hint="give the EDS of the drive that the map is for, or its map with --map; nothing was written",
+        )  # fmt: skip
+    values = {drive_map.address(name): data for name, data in encoded.items()}
     return new_dcf(base, values, node_id=node_id, node_name=wanted.name, where=where)
 
 
@@ -143,21 +154,21 @@ def csv_text(wanted: ParameterSet, *, drive_map: DriveMap | None = None) -> str:
     return out.getvalue()
 
 
-Row = tuple[str, str, str, str, str, str, str, str]
+Row = tuple[str, str, str, str, str, str, str, str, str]
 
 
 def _scalar_rows(
     wanted: ParameterSet, drive_map: DriveMap, encoded: Mapping[str, bytes], held: Mapping[str, float]
 ) -> Iterator[Row]:
+    lacking = drive_map.not_written(wanted.values)
     for name, value in wanted.values.items():
         row, cell = BY_NAME[name], drive_map.cells.get(name)
         if cell is None:
-            yield name, _number(value), row.unit, "", "", "", "", row.meaning
+            yield name, _number(value), row.unit, "", "", "", "", row.meaning, lacking[name]
         else:
             where = f"0x{cell.index:04X}:{cell.sub:02X}"
-            yield (
-                name, _number(value), row.unit, _number(held[name]), where, cell.wire, encoded[name].hex(), row.meaning,
-            )  # fmt: skip
+            data = encoded[name].hex()
+            yield name, _number(value), row.unit, _number(held[name]), where, cell.wire, data, row.meaning, ""
 
 
 def _table_rows(
@@ -168,10 +179,11 @@ def _table_rows(
         known = name in drive_map.tables
         where = "0x{:04X}:{:02X}".format(*drive_map.tables[name]) if known else ""
         size = f"{len(encoded[name])} bytes" if known else ""
-        yield name, f"{len(table)} numbers", unit, "", where, "DOMAIN" if known else "", size, "look-up table"
+        lacking = "; ".join(drive_map.not_written([name]).values())
+        yield name, f"{len(table)} numbers", unit, "", where, "DOMAIN" if known else "", size, "look-up table", lacking
         for k, value in enumerate(table):
             kept = _number(held.tables[name][k]) if known else ""
-            yield f"{name}[{k}]", _number(value), unit, kept, "", "", "", ""
+            yield f"{name}[{k}]", _number(value), unit, kept, "", "", "", "", lacking
 
 
 def _number(value: float) -> str:

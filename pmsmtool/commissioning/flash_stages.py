@@ -14,6 +14,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.firmware.image import crc32
 from pmsmtool.flash.download import Download, set_named
 from pmsmtool.flash.journal import JournalFolder
+from pmsmtool.flash.map_gate import unknown_firmware
 from pmsmtool.flash.plan import Change
 from pmsmtool.flash.restore import marks_of, plan_download
 from pmsmtool.params.parameter_set import read_parameter_set
@@ -42,9 +43,11 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
         marks = marks_of(wanted.content_hash(), datetime.datetime.now())
         download = Download(drive.node, drive.identity, plan, marks, folder, say=say)
         jobs.append(download)
+        firmware = [line for line in (unknown_firmware(drive.node.map, drive.identity),) if line]
         if download.has_work(store=True):
             consent(
                 [
+                    *firmware,
                     *plan.lines(_unchecked_marks(run, [change.name for change in plan.changes])),
                     *plan.after_lines(store=True),
                 ]
@@ -59,7 +62,7 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
     good = all(line.ok for line in criteria)
     return Stage(
         "flash", "pass" if good else "fail", 0.0, values=values, acceptance=criteria,
-        note="" if good else "the drive does not keep the set", fallbacks=tuple(plan.left_out()),
+        note="" if good else "the drive does not keep the set", fallbacks=(*plan.left_out(), *firmware),
         summary=f"{outcome.written} of {total} objects written, stored, read back after a reset",
     )  # fmt: skip
 

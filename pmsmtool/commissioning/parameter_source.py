@@ -12,6 +12,7 @@ from pmsmtool.design.loops.open_loops import SMALLER, smaller_gains
 from pmsmtool.drive_maps.dcf import values_of
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.eds import parse_eds
+from pmsmtool.drive_maps.sheet_check import other_identity
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_bytes, read_text
 from pmsmtool.params import parameter_set
@@ -82,6 +83,12 @@ def _file(path: Path) -> Path:
 
 def _from_dcf(path: Path, drive_map: DriveMap) -> ParameterSet:
     sheet = parse_eds(read_bytes(path), str(path))
+    differs = other_identity(sheet, drive_map)
+    if differs:
+        raise ConfigError(
+            differs, where=str(path), likely="the file of another drive, whose objects mean something else",
+            hint="give the map that this file is for with --map, or the file of the map's drive",
+        )  # fmt: skip
     values = values_of(sheet)
     names = (*drive_map.cells, *drive_map.tables)
     found = {name: values[drive_map.address(name)] for name in names if drive_map.address(name) in values}

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE, NmtCommand, NmtState, send_nmt
-from pmsmtool.cia402 import AbortConnection, QuickStop, State
+from pmsmtool.cia402 import AbortConnection, FaultReaction, QuickStop, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
@@ -97,6 +97,8 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
         _set_guarding(drive, heartbeat)
     abort_option = _abort_option(drive)
     quick_stop = set_quick_stop(node, QuickStop.DISABLE)
+    if abort_option in (None, AbortConnection.FAULT):
+        _fault_without_ramp(node)
     with node.emergencies_tolerated():
         for _ in range(TRIES):
             proof = _try(drive, heartbeat, abort_option, quick_stop)
@@ -236,6 +238,13 @@ def set_quick_stop(node: DriveNode, option: int) -> int | None:
     with contextlib.suppress(SdoAbort):
         return node.whole(objects.QUICK_STOP_OPTION)
     return None
+
+
+def _fault_without_ramp(node: DriveNode) -> None:
+    """Make a fault remove the voltage (0x605E) where a lost connection is one: at rest a ramp would not be seen."""
+    with contextlib.suppress(SdoAbort):
+        if node.whole(objects.FAULT_REACTION) != FaultReaction.DISABLE:
+            node.put(objects.FAULT_REACTION, FaultReaction.DISABLE)
 
 
 def _abort_option(drive: CanopenDrive) -> AbortConnection | None:

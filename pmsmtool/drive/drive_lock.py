@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """One program per drive: a lock file per serial number, which the system frees when its owner ends or dies.
 
+Layer setting services have none to speak of: their answers carry no node id, so one program per bus uses them.
+
 Two programs on one SDO channel corrupt each other's transfers, and both roll back. The lock lets the first one win and
 names it to the second. ``stop`` never asks for it; a drive simulated in this process cannot be shared and has none.
 """
@@ -13,12 +15,13 @@ import getpass
 import hashlib
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.bus.supervision import SecondMaster
-from pmsmtool.drive import objects
+from pmsmtool.drive.drive_node import vendor_product_serial
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.errors import ConfigError, SdoAbort
 from pmsmtool.plain_text import one_line
@@ -46,22 +49,52 @@ def claim(connection: Connection, node_id: int) -> None:
     SecondMaster
         Another program of this account works with the drive; it is named.
     """
+    _hold(
+        connection, lambda: _key(connection, node_id), "this drive", f"node {node_id}",
+        f"; `pmsmtool stop -n {node_id}` works all the same",
+    )  # fmt: skip
+
+
+def claim_layer_setting(connection: Connection) -> None:
+    """Lock the layer setting services of a bus until the connection is closed.
+
+    Raises
+    ------
+    SecondMaster
+        Another program of this account gives node ids on this bus; it is named.
+    """
+    _hold(connection, lambda: f"lss-{_place(connection)}", "the layer setting services of this bus", "LSS")
+
+
+def claim_identity(connection: Connection, vendor: int, product: int, serial: int) -> None:
+    """Lock a drive that has no node id yet, by what it says of itself; one without a serial number has no lock.
+
+    Raises
+    ------
+    SecondMaster
+        Another program of this account works with the drive; it is named.
+    """
+    if serial and vendor != reference_map().vendor:
+        _hold(connection, lambda: _name(vendor, product, serial), "this drive", f"serial {serial}")
+
+
+def _hold(connection: Connection, key: Callable[[], str], what: str, where: str, besides: str = "") -> None:
     if not connection.shared:
         return
     try:
         folder = user_folder() / "locks"
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder / f"{_key(connection, node_id)}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        descriptor = os.open(folder / f"{key()}.lock", os.O_RDWR | os.O_CREAT, 0o600)
     except (OSError, ConfigError):
         return  # nothing can be written for this user: no journal either, so nothing is downloaded
     if not _lock(descriptor):
         owner = one_line(os.read(descriptor, _LONGEST_OWNER).decode("utf-8", "replace").strip()) or "unknown"
         os.close(descriptor)
         raise SecondMaster(
-            f"another pmsmtool works with this drive: {owner}",
-            where=f"node {node_id}",
+            f"another pmsmtool works with {what}: {owner}",
+            where=where,
             likely="a second terminal, a script or a scheduled job",
-            hint=f"wait until it has ended, or end it; `pmsmtool stop -n {node_id}` works all the same",
+            hint=f"wait until it has ended, or end it{besides}",
         )
     connection.at_close.append(lambda: os.close(descriptor))
     os.ftruncate(descriptor, 0)
@@ -77,21 +110,24 @@ def _key(connection: Connection, node_id: int) -> str:
     sdo = SdoChannel(connection, node_id)
     sdo.finish_within(IDENTITY_S)
     try:
-        numbers = []
-        for sub in (1, 2, 4):
-            try:
-                numbers.append(int.from_bytes(sdo.read(objects.IDENTITY, sub, size=4), "little"))
-            except SdoAbort:
-                numbers.append(0)
+        vendor, product, serial = vendor_product_serial(sdo)
+    except SdoAbort:
+        vendor = product = serial = 0
     finally:
         sdo.close()
-    vendor, product, serial = numbers
-    name = f"{vendor:08x}-{product:08x}-{serial}"
+    name = _name(vendor, product, serial)
     if serial and vendor != reference_map().vendor:
         return name
+    return f"{name}-{_place(connection)}-{node_id}"
+
+
+def _name(vendor: int, product: int, serial: int) -> str:
+    return f"{vendor:08x}-{product:08x}-{serial}"
+
+
+def _place(connection: Connection) -> str:
     where = str(connection.bus.channel_info).rpartition("@")[2]  # of socketcand the server, whatever name is opened
-    place = hashlib.sha256(where.encode()).hexdigest()[:12]
-    return f"{name}-{place}-{node_id}"
+    return hashlib.sha256(where.encode()).hexdigest()[:12]
 
 
 def _lock(descriptor: int) -> bool:

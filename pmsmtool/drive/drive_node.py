@@ -118,22 +118,33 @@ class DriveNode:
         A number the node does not have is 0: only the vendor is mandatory (CiA 301, object 0x1018).
         """
         self.supervision.begin()
-        vendor = self._identity_number(1)
-        product, revision, serial = (self._identity_number(sub) for sub in (2, 3, 4))
+        vendor, product, serial = vendor_product_serial(self.sdo, self.map)
+        revision = identity_number(self.sdo, 3)
         name, hardware, software = (
             self._text(*where) for where in (objects.DEVICE_NAME, objects.HARDWARE_VERSION, objects.SOFTWARE_VERSION)
         )
         with contextlib.suppress(SdoAbort):
             self.supervision.heartbeat_period_s = self.get(objects.PRODUCER_HEARTBEAT_MS) / 1000.0 or None
-        return Identity(self.node, vendor, product, revision, serial, name, hardware, software)
+        doubt = self._doubt(vendor, product, name)
+        return Identity(self.node, vendor, product, revision, serial, name, hardware, software, doubt)
 
-    def _identity_number(self, sub: int) -> int:
-        try:
-            return int.from_bytes(self.sdo.read(objects.IDENTITY, sub, size=4), "little")
-        except SdoAbort as abort:
-            if sub > 1 and abort.code in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX):
-                return 0
-            raise
+    def _doubt(self, vendor: int, product: int, name: str) -> str:
+        """Say why a drive of a shared vendor number is not taken for its map's; empty when it is."""
+        drive_map = _map_of(self.map, vendor, product)
+        if drive_map is None or not drive_map.identity.shared:
+            return ""
+        if any(word.lower() in name.lower() for word in drive_map.identity.names):
+            return ""
+        wrong = [
+            f"0x{index:04X}:{sub:02X}"
+            for index, sub, size in drive_map.identity.marks
+            if len(_held(self.sdo, index, sub)) != size
+        ]
+        if not wrong and drive_map.identity.marks:
+            return ""
+        own = f"calls itself {name!r}" if name else "has no name (0x1008)"
+        lacks = f" and lacks {', '.join(wrong)} of that family" if wrong else ""
+        return f"makers share vendor number {vendor:#010x}: this drive {own}{lacks}, so it is no {drive_map.name}"
 
     def _text(self, index: int, sub: int) -> str:
         try:
@@ -306,6 +317,49 @@ class DriveNode:
             self.connection.collect()
             self.supervision.take_note_of_emergencies()
             self.supervision.stop_at_emergency = before
+
+
+def vendor_product_serial(sdo: SdoChannel, drive_map: DriveMap | None = None) -> tuple[int, int, int]:
+    """Read who a drive is; the serial number where its family keeps it, if 0x1018:04 is absent or 0.
+
+    Parameters
+    ----------
+    drive_map : DriveMap, optional
+        A map that may name the drive; otherwise the shipped one for its vendor and product is asked.
+    """
+    vendor, product, serial = (identity_number(sdo, sub) for sub in (1, 2, 4))
+    known = None if serial else _map_of(drive_map, vendor, product)
+    if known is not None and known.identity.serial is not None:
+        index, sub, size = known.identity.serial
+        data = _held(sdo, index, sub)
+        serial = int.from_bytes(data, "little") if len(data) == size else 0
+    return vendor, product, serial
+
+
+def identity_number(sdo: SdoChannel, sub: int) -> int:
+    """Return a number of the identity object, 0 where the node lacks it; the vendor (1) is mandatory."""
+    try:
+        return int.from_bytes(sdo.read(objects.IDENTITY, sub, size=4), "little")
+    except SdoAbort as abort:
+        if sub > 1 and abort.code in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX):
+            return 0
+        raise
+
+
+def _map_of(drive_map: DriveMap | None, vendor: int, product: int) -> DriveMap | None:
+    if drive_map is not None and drive_map.is_for(vendor, product):
+        return drive_map
+    from pmsmtool.drive_maps.shipped_maps import family_of  # reads every map: not for a command on a drive of its map
+
+    return family_of(vendor, product)
+
+
+def _held(sdo: SdoChannel, index: int, sub: int) -> bytes:
+    """Return an object's bytes, none where the node does not show it."""
+    try:
+        return sdo.upload(index, sub, longest=LONGEST_NAME).data
+    except SdoAbort:
+        return b""
 
 
 def is_safe(state: State | None) -> bool:

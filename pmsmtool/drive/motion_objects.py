@@ -48,6 +48,10 @@ OVER_SPEED_TRIP, TRIP_RATIO = "protection.n_trip_rpm", 1.5
 above what the tool's own look sees first, so that the limit is named."""
 TRIP_LEAST = 0.25
 """Smallest speed for it, of the trip that the drive holds: a rotor that aligns with a vector is fast for a moment."""
+TORQUE_SLOPE = DriveObject(0x6087, 0, "I")
+SLOW_SLOPE_S = 0.5
+"""Time to the rated torque from which a slope of the drive's own leaves nothing of a push: the shortest lasts 40 ms. As
+stored, one maker's drive takes 10 s; others take no time (0), or 0.1 ms."""
 _ABSENT = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX)
 
 
@@ -174,6 +178,8 @@ def undecided(node: DriveNode, rated: float) -> bool:
 def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
     """Return what takes a torque current: mode 4, else 10, as 0x6502 announces, else the maker's own.
 
+    A drive whose own slope (0x6087) is too slow for a push takes it in mode 10, if it has that: this program ramps it.
+
     Raises
     ------
     NotAvailable
@@ -181,7 +187,8 @@ def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
     """
     modes = int(held(node, objects.SUPPORTED_MODES) or 0)
     if node.map.capabilities.torque_mode and held(node, objects.TARGET_TORQUE_PERMILLE) is not None:
-        for mode in (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE):
+        order = (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE)
+        for mode in reversed(order) if slow_slope_s(node) else order:
             if modes >> mode - 1 & 1:
                 return TorqueTarget(Quantity(objects.TARGET_TORQUE_PERMILLE, 1e-3 * rated), mode)
     own = _own(node, "target_current")
@@ -205,6 +212,12 @@ def cyclic_period_s(node: DriveNode, wanted_s: float) -> float:
                 node.put(item, number)
     exponent = held(node, PERIOD_EXPONENT)
     return node.get(PERIOD_VALUE) * 10.0 ** (-3 if exponent is None else exponent)
+
+
+def slow_slope_s(node: DriveNode) -> float:
+    """Return the time (s) that the drive's slope takes to its rated torque where it is too long for a push, else 0."""
+    slope = held(node, TORQUE_SLOPE) or math.inf  # permille per second; 0 is none
+    return 1000.0 / slope if 1000.0 / slope > SLOW_SLOPE_S else 0.0
 
 
 def limited_speed(node: DriveNode) -> LimitedSpeed:
@@ -311,4 +324,9 @@ def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
             "speed     no limit in the drive (0x6080): this program looks every 50 ms and removes the voltage at the "
             "limit itself"
         )
+    slope_s = slow_slope_s(node)
+    if slope_s:
+        cyclic = bool(int(held(node, objects.SUPPORTED_MODES) or 0) >> Mode.CYCLIC_TORQUE - 1 & 1)
+        told = "mode 10, which it does not act in, and this program ramps" if cyclic else "pushes are slow, or none"
+        lines.append(f"slope     {slope_s:.3g} s to the rated torque in mode 4 (0x6087): {told}")
     return lines

@@ -36,9 +36,17 @@ class Shape(IntEnum):
     HYSTERESIS = 8
 
 
+SERIAL_BITS = 64
+"""Of a serial number outside 0x1018."""
+
+
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Identity object 0x1018 and names of a drive."""
+    """Identity object 0x1018 and names of a drive.
+
+    ``serial`` is the maker's own object where 0x1018:04 is absent or 0 and the map names one; 0: the drive tells none.
+    ``doubt`` says why its vendor number, which makers share, does not make it the map's drive; empty: nothing does.
+    """
 
     node: int
     vendor: int
@@ -48,6 +56,12 @@ class Identity:
     name: str = ""
     hardware: str = ""
     software: str = ""
+    doubt: str = ""
+
+    @property
+    def vendor_product(self) -> tuple[int, int]:
+        """Vendor and product for which a map may be chosen; in doubt a product that no map has."""
+        return self.vendor, -1 if self.doubt else self.product
 
 
 @dataclass(frozen=True, slots=True)

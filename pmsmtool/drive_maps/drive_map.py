@@ -11,11 +11,12 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
 from pmsmtool.data_types import DATA_TYPES
+from pmsmtool.drive_maps.identity_rows import IdentityRows
 from pmsmtool.drive_maps.map_tables import decode_table, encode_table, shortest_binary32
 from pmsmtool.drive_maps.motion_objects import MotionObject
 from pmsmtool.drive_maps.recorder_map import RecorderMap, Recording
@@ -264,6 +265,8 @@ class DriveMap:
         Where the facts come from.
     vendor_tuning : VendorTuning or None
         How the drive's own identification is started and read.
+    identity : IdentityRows
+        What beyond vendor and product tells whether a drive is the map's.
     """
 
     name: str
@@ -280,6 +283,7 @@ class DriveMap:
     left_out: Mapping[str, str] = field(default_factory=dict)
     sources: Mapping[str, str] = field(default_factory=dict)
     vendor_tuning: VendorTuning | None = None
+    identity: IdentityRows = field(default_factory=IdentityRows)
 
     def is_for(self, vendor: int, product: int) -> bool:
         """Whether a drive of this identity belongs to the family."""
@@ -322,7 +326,7 @@ class DriveMap:
 
     def missing(self, wanted: ParameterSet) -> tuple[str, ...]:
         """Return the entries of a set that this drive has no object for."""
-        return tuple(n for n in [*wanted.values, *wanted.tables] if n not in self.cells and n not in self.tables)
+        return tuple(self.not_written([*wanted.values, *wanted.tables]))
 
     def quantised(self, wanted: ParameterSet) -> ParameterSet:
         """Return what the drive will really hold of a set."""
@@ -339,6 +343,17 @@ class DriveMap:
         if address is None:
             raise KeyError(name)
         return address
+
+    def row_text(self, name: str) -> str:
+        """Return a row as messages name it: family, name, object, type and where it is from."""
+        row = self.cells.get(name) or self.signals.get(name) or self.motion[name]
+        source = f"{row.source}: {self.sources[row.source]}" if row.source in self.sources else "no source stated"
+        return f"{self.name} {name} 0x{row.index:04X}:{row.sub:02X} {row.wire} ({source})"
+
+    def not_written(self, names: Iterable[str]) -> dict[str, str]:
+        """Return the entries of a set that the map has no object for, and why."""
+        lacking = (name for name in names if name not in self.cells and name not in self.tables)
+        return {name: self.left_out.get(name, f"the map {self.name!r} has no row for it") for name in lacking}
 
     @property
     def scales(self) -> bool:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import Any, get_args
 
 from pmsmtool.drive_maps.drive_map import (
@@ -25,6 +25,8 @@ from pmsmtool.drive_maps.drive_map import (
     Rounding,
     SignalCell,
 )
+from pmsmtool.drive_maps.identity_rows import TABLE as IDENTITY
+from pmsmtool.drive_maps.identity_rows import IdentityRows, dump_identity, parse_identity
 from pmsmtool.drive_maps.map_lines import line_of
 from pmsmtool.drive_maps.motion_objects import TABLE as MOTION
 from pmsmtool.drive_maps.motion_objects import dump_motion, parse_motion
@@ -49,7 +51,7 @@ COMMANDS = frozenset({0x6040, 0x6060, 0x6071, 0x607A, 0x60B1, 0x60B2, 0x60FF})
 """Objects whose writing moves the machine: never a parameter."""
 POLE_PAIRS = "motor.pole_pairs"
 _HEAD = ("schema", "name", "vendor", "product", "more_products", "staging")
-_TABLES = ("capabilities", "objects", "signals", MOTION, RECORDER, "tables", "left_out", "sources", TABLE)
+_TABLES = (IDENTITY, "capabilities", "objects", "signals", MOTION, RECORDER, "tables", "left_out", "sources", TABLE)
 _CELL_KEYS = ("index", "sub", "type", "factor", "offset", "unit", "rounding", "form", "gain", "source")
 _TEXT_KEYS = ("type", "unit", "form", "rounding", "gain", "source")
 _SIGNAL_KEYS = ("index", "sub", "type", "unit", "source")
@@ -62,8 +64,8 @@ Complain = Callable[[str, str], None]
 
 
 def map_hash(drive_map: DriveMap) -> str:
-    """Return the content hash of a map: comments and order of the file do not count."""
-    return hashlib.sha256(dump_drive_map(drive_map).encode("utf-8")).hexdigest()
+    """Return the content hash of a map: comments, order of the file and what only identifies drives do not count."""
+    return hashlib.sha256(dump_drive_map(replace(drive_map, identity=IdentityRows())).encode("utf-8")).hexdigest()
 
 
 # ---- writing ----------------------------------------------------------------------------------------
@@ -79,10 +81,12 @@ def dump_drive_map(drive_map: DriveMap) -> str:
     plain = asdict(Capabilities())
     capabilities = {key: value for key, value in asdict(drive_map.capabilities).items() if value != plain[key]}
     tuning, recorder = drive_map.vendor_tuning, dump_recorder(drive_map.recorder)
+    identity = dump_identity(drive_map.identity)
     return toml_text(
         {
             **head,
             "staging": drive_map.staging,
+            **({IDENTITY: identity} if identity else {}),
             "capabilities": capabilities,
             "objects": {name: _cell_row(cell) for name, cell in drive_map.cells.items()},
             "signals": {name: _signal_row(cell) for name, cell in drive_map.signals.items()},
@@ -217,6 +221,7 @@ def _parse_tables(document: Mapping[str, Any], complain: Callable[[tuple[str, ..
         "left_out": _parse_left_out(table("left_out"), cells, complain),
         "sources": sources,
         TABLE: _parse_tuning(document.get(TABLE), cells, sources, complain),
+        IDENTITY: parse_identity(table(IDENTITY), sources, complain),
     }
 
 

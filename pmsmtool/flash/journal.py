@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pmsmtool.drive.port import Identity
+from pmsmtool.drive.port import SERIAL_BITS, Identity
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_bytes, read_text, write_file
 from pmsmtool.machine.key import Key, check_table
@@ -101,7 +101,7 @@ class Snapshot:
 
     def _body(self) -> dict[str, Any]:
         identity = asdict(self.identity)
-        del identity["node"]
+        del identity["node"], identity["doubt"]
         entries = [
             {"name": e.name, "object": f"0x{e.index:04X}:{e.sub:02X}", "old": e.old.hex()}
             | ({} if e.new is None else {"new": e.new.hex()})
@@ -205,7 +205,8 @@ _HEAD: tuple[Key, ...] = (
     _required("content", "content hash of the set"),
 )
 _IDENTITY: tuple[Key, ...] = (
-    *(_whole(name, _WORD, "object 0x1018") for name in ("vendor", "product", "revision", "serial")),
+    *(_whole(name, _WORD, "object 0x1018") for name in ("vendor", "product", "revision")),
+    _whole("serial", 1 << SERIAL_BITS, "object 0x1018, or the maker's own"),
     *(_required(name, "text of the drive") for name in ("name", "hardware", "software")),
 )
 _ENTRY: tuple[Key, ...] = (

@@ -10,13 +10,16 @@ decision, not an accident.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.drive_map_file import map_hash
 from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
-from pmsmtool.errors import ConfigError, SafetyRefusal
+from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
 from pmsmtool.files import read_text, write_file
 from pmsmtool.flash.journal import JournalFolder
 
@@ -57,7 +60,7 @@ def check_map(drive_map: DriveMap, identity: Identity, folder: JournalFolder) ->
 
 def check_family(drive_map: DriveMap, identity: Identity) -> None:
     """Refuse a drive of another identity than its map's; raises ``ConfigError``, nothing was moved or written."""
-    if not drive_map.is_for(identity.vendor, identity.product):
+    if not drive_map.is_for(*identity.vendor_product):
         raise _other_drive(drive_map, identity)
 
 
@@ -71,27 +74,58 @@ def check_motion(drive_map: DriveMap, identity: Identity) -> None:
     ConfigError
         The map is for another identity, or is no shipped one and says none.
     """
-    named = drive_map.vendor != UNKNOWN_VENDOR and drive_map.is_for(identity.vendor, identity.product)
+    named = drive_map.vendor != UNKNOWN_VENDOR and drive_map.is_for(*identity.vendor_product)
     if not named and drive_map != load_family(GENERIC):
         raise _other_drive(drive_map, identity)
 
 
-def other_drive(drive_map: DriveMap, vendor: int, product: int) -> str:
+def other_drive(drive_map: DriveMap, vendor: int, product: int, doubt: str = "") -> str:
     """Return how a map and a drive differ, empty when the map names the drive."""
     if drive_map.vendor == UNKNOWN_VENDOR:
         return f"the map {drive_map.name!r} does not say whose drive it is for (vendor 0)"
     if drive_map.is_for(vendor, product):
-        return ""
+        return doubt
     return (
         f"the map {drive_map.name!r} is for vendor {drive_map.vendor:#010x} product {drive_map.product:#x}, "
         f"the drive is vendor {vendor:#010x} product {product:#x}"
     )
 
 
+def unknown_firmware(drive_map: DriveMap, identity: Identity) -> str:
+    """Say that no source of the map describes the drive's firmware, empty where one does, or nothing is scaled."""
+    rows = drive_map.identity
+    if drive_map.staging or not drive_map.scales or identity.revision >> 16 in rows.revisions:
+        return ""
+    known = ", ".join(f"{number:#06x}" for number in rows.revisions)
+    says = f"describe {known} ({rows.source}: {drive_map.sources[rows.source]})" if known else "do not say for which"
+    return (
+        f"firmware {identity.revision:#010x} (0x1018:03) of family {drive_map.name}: the map's sources {says}; "
+        "compare types and units with your manual"
+    )
+
+
+def contradictions(node: DriveNode, names: Iterable[str]) -> dict[str, str]:
+    """Return the parameters whose object the drive does not have, or has in another size than its map, and which."""
+    wrong = {}
+    for cell in (node.map.cells[name] for name in names):
+        try:
+            size = len(node.sdo.upload(cell.index, cell.sub).data)
+        except SdoAbort as abort:
+            if abort.code not in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX):
+                raise
+            wrong[cell.name] = "the drive has no such object"
+            continue
+        if size != cell.size:
+            wrong[cell.name] = f"the drive holds {size} bytes there"
+    return wrong
+
+
 def _other_drive(drive_map: DriveMap, identity: Identity) -> ConfigError:
     """Return the refusal, with what leads on."""
     vendor, product = identity.vendor, identity.product
-    if drive_map.vendor == vendor == UNKNOWN_VENDOR:
+    if identity.doubt:
+        hint = "if it is one after all, give --map with a copy of the map whose [identity] names it"
+    elif drive_map.vendor == vendor == UNKNOWN_VENDOR:
         hint = "this drive names no vendor either: nothing can be written to it"
     elif drive_map.vendor == UNKNOWN_VENDOR:
         hint = f"copy it, write vendor = {vendor:#010x}, product = {product:#010x}, give it with --map"
@@ -99,7 +133,7 @@ def _other_drive(drive_map: DriveMap, identity: Identity) -> ConfigError:
         shipped = family_of(vendor, product)
         hint = f"give --map {shipped.name}" if shipped else "give the map of this drive with --map"
     return ConfigError(
-        other_drive(drive_map, vendor, product),
+        other_drive(drive_map, vendor, product, identity.doubt),
         where=_where(identity),
         likely="the map of another drive was given, or another drive answers on this node",
         hint=f"{hint}; nothing was moved or written",

@@ -78,18 +78,23 @@ class Plan:
     ----------
     entries : tuple of Change
         In writing order.
-    missing : tuple of str
-        Entries of the set the drive has no object for.
+    not_written : mapping of str to str
+        Entries of the set that the drive's map has no object for, and why.
     content : str
         Content hash of the set.
     reasons : mapping of str to str
-        Why the drive's map leaves an entry out, as far as it says.
+        What the drive's map leaves out by name: these entries are told one by one.
     """
 
     entries: tuple[Change, ...]
-    missing: tuple[str, ...] = ()
+    not_written: Mapping[str, str] = field(default_factory=dict)
     content: str = ""
     reasons: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Entries of the set that the drive has no object for."""
+        return tuple(self.not_written)
 
     @property
     def changes(self) -> tuple[Change, ...]:
@@ -162,7 +167,8 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
         values = (before.get(name, math.nan), wanted.values[name], held[name]) if scalar else (math.nan,) * 3
         unit = BY_NAME[name].unit if scalar else table_unit(name)
         entries.append(Change(name, index, sub, found[name], new, *values, unit))
-    return Plan(tuple(entries), drive_map.missing(wanted), wanted.content_hash(), drive_map.left_out)
+    lacking = drive_map.not_written([*wanted.values, *wanted.tables])
+    return Plan(tuple(entries), lacking, wanted.content_hash(), drive_map.left_out)
 
 
 def names_to_read(drive_map: DriveMap, wanted: ParameterSet) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from pmsmtool.bus.sdo import Mode
@@ -16,6 +16,7 @@ from pmsmtool.drive_maps.drive_map import DriveMap, address_in
 from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
 from pmsmtool.flash.download import Outcome
 from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
+from pmsmtool.flash.map_gate import contradictions
 from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
 from pmsmtool.flash.whole_drive import parameters_of
 from pmsmtool.params.catalogue import BY_NAME, layout_signature
@@ -56,9 +57,23 @@ def plan_download(node: DriveNode, wanted: ParameterSet) -> Plan:
     NotAvailable
         The drive's parameter set has another layout than this program's.
     ConfigError
-        Values out of bounds, or that do not fit the drive's types.
+        Values out of bounds, or that do not fit the drive's types; rows of the map that the drive contradicts.
     """
-    return make_plan(node.map, wanted, _settled(node).read(names_to_read(node.map, wanted)))
+    parameters, names = _settled(node), names_to_read(node.map, wanted)
+    if not node.map.staging:  # the reference drive shows the layout of its set
+        _refuse_contradictions(node, names)
+    return make_plan(node.map, wanted, parameters.read(names))
+
+
+def _refuse_contradictions(node: DriveNode, names: Sequence[str]) -> None:
+    wrong = contradictions(node, names)
+    if wrong:
+        raise ConfigError(
+            f"the drive contradicts {len(wrong)} row(s) of the map {node.map.name!r}",
+            where=f"node {node.node}", violations=[f"{node.map.row_text(name)}: {why}" for name, why in wrong.items()],
+            likely="another firmware than the map's sources describe",
+            hint="correct the rows in a copy of the map, and give it with --map; nothing was written",
+        )  # fmt: skip
 
 
 def plan_restore(node: DriveNode, snapshot: Snapshot) -> Plan:
@@ -182,7 +197,7 @@ def restore_plan(drive_map: DriveMap, snapshot: Snapshot, found: Mapping[str, by
         unit = BY_NAME[entry.name].unit if scalar else "" if by_address else table_unit(entry.name)
         change = Change(entry.name, entry.index, entry.sub, found[entry.name], entry.old, old_value, value, value, unit)
         entries.append(change)
-    return Plan(tuple(entries), (), snapshot.content)
+    return Plan(tuple(entries), {}, snapshot.content)
 
 
 def due_of_journal(snapshot: Snapshot, plan: Plan, folder: JournalFolder) -> Plan:

@@ -340,7 +340,7 @@ def with_supply(found: Capabilities) -> Capabilities:
 
 def choose_map(identity: Identity, given: DriveMap | None) -> DriveMap:
     """Return the map for a drive: the one given, the shipped one for its identity, else what CiA 402 says."""
-    return given or family_of(identity.vendor, identity.product) or load_family(GENERIC)
+    return given or family_of(*identity.vendor_product) or load_family(GENERIC)
 
 
 def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
@@ -353,6 +353,7 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     given : DriveMap, optional
         The map to use; default: by the drive's identity.
     """
+    node.map = given or node.map
     identity = node.identity()
     drive_map = choose_map(identity, given)
     node.map = drive_map
@@ -385,7 +386,7 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
             "averages": node.has(0x2063, 3),
             "recorder": node.has(0x2060, 8),
         }
-    named = identity.vendor != UNKNOWN_VENDOR and drive_map.is_for(identity.vendor, identity.product)
+    named = identity.vendor != UNKNOWN_VENDOR and drive_map.is_for(*identity.vendor_product)
     found = {name for name, there in has.items() if there}
     if named:  # whatever starts a drive's own identification is not tried on another drive
         found |= {f"vendor {name}" for name in _vendor_quantities(node, drive_map)}

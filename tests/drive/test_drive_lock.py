@@ -15,7 +15,7 @@ from benchmarks.two_tools import race
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.supervision import SecondMaster
 from pmsmtool.cli.main import run
-from pmsmtool.drive.drive_lock import claim
+from pmsmtool.drive.drive_lock import claim, claim_identity, claim_layer_setting
 from pmsmtool.sim.bus import PmsmSimBus
 from tests.bus.scripted import NODE, ScriptedBus, ScriptedSlave
 from tests.drive.served import serving
@@ -78,6 +78,35 @@ def test_a_drive_at_work_is_not_reset_by_nmt(
         assert run(command) == 3
         assert "another pmsmtool works with this drive" in capsys.readouterr().err
     assert run(command) == 0
+
+
+@pytest.mark.parametrize("command", [["scan"], ["set-node", "9"]])
+def test_one_program_gives_node_ids_on_a_bus(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Answers of layer setting services carry no node id: those to one master would be taken by the other."""
+    settle(tmp_path, monkeypatch)
+    monkeypatch.setattr(Connection, "shared", True)
+    channel = "interior-2k2?nv=:memory:&node=255"
+    given = ["-i", "pmsmsim", "-c", channel, "--yes", "lss", *command]
+    given = given if command[0] == "set-node" else [word for word in given if word != "--yes"]
+    with Connection(PmsmSimBus(channel)) as working:
+        claim_layer_setting(working)
+        assert run(given) == 3
+        assert "another pmsmtool works with the layer setting services of this bus" in capsys.readouterr().err
+    assert run(given) == 0
+
+
+def test_a_drive_without_a_node_id_has_the_same_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One gives it an id while the other, to whom it answered before its reset, still writes."""
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path))
+    first, second = connection(monkeypatch, 42), connection(monkeypatch, 42)
+    claim(first, NODE)
+    with pytest.raises(SecondMaster, match="another pmsmtool works with this drive"):
+        claim_identity(second, 7, 8, 42)
+    claim_identity(second, 7, 8, 43)
+    first.close()
+    claim_identity(second, 7, 8, 42)
 
 
 @pytest.mark.chain

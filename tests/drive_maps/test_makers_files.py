@@ -5,13 +5,17 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import pytest
 
+from pmsmtool.data_types import BY_SHORT
+from pmsmtool.drive_maps import sheet_check
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.shipped_maps import family_of, load_family
+from pmsmtool.sim.foreign.file_rows import read_makers_objects
 
 TABLE = Path(__file__).resolve().parents[2].parent / "shared" / "reference" / "drive-objects.csv"
 needs_table = pytest.mark.skipif(not TABLE.is_file(), reason="no table of makers' objects beside the checkout")
@@ -92,6 +96,28 @@ def test_a_vendor_number_is_there(maker: str) -> None:
 def test_products_of_the_epos4(product: int) -> None:
     found = family_of(0xFB, product)
     assert found is not None and found.name == "epos4"
+
+
+@needs_table
+@pytest.mark.parametrize("maker", FILES_OF)
+def test_every_row_that_contradicts_its_files_is_named_with_family_object_and_source(maker: str) -> None:
+    """Each row of the shipped map in turn, at an object that no file has, and in a type that none has there."""
+    drive_map = load_family(maker)
+    sheets = [read_makers_objects(f"{TABLE}#{file}") for file in makers_files(maker)]
+    types = [{place: BY_SHORT[row.type].name for place, row in sheet.rows.items()} for sheet in sheets]
+    turned = 0
+    for table in ("cells", "signals", "motion"):
+        for name, row in getattr(drive_map, table).items():
+            if not row.index:
+                continue
+            for wrong in (replace(row, index=0x5FF0), replace(row, wire="REAL32")):
+                edited = replace(drive_map, **{table: {**getattr(drive_map, table), name: wrong}})
+                for found in types:
+                    (line,) = sheet_check.contradictions(edited, found, [name])
+                    assert line.startswith(f"{maker} {name} 0x{wrong.index:04X}:{wrong.sub:02X}")
+                    assert drive_map.sources[row.source] in line
+                    turned += 1
+    assert turned or not any(True for _ in mapped(drive_map))
 
 
 @needs_table

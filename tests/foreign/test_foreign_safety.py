@@ -21,7 +21,7 @@ from pmsmtool.cia402 import State
 from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import WATCH_S, guarded
-from pmsmtool.drive.motion_objects import position_units
+from pmsmtool.drive.motion_objects import position_units, watched_by_tool
 from pmsmtool.drive.tier_drives import SpeedPushDrive, TorqueDrive, pushing_drive
 from pmsmtool.drive_maps.shipped_maps import family_of, load_family
 from pmsmtool.errors import DriveFault, LimitExceeded, NotAvailable, SafetyRefusal
@@ -98,8 +98,13 @@ def test_guarding_that_ends_takes_the_voltage_away(tmp_path: Path) -> None:
         assert rig.off_since is not None and 0.0 < rig.off_since - began <= DECLARED_S
 
 
-def test_a_drive_without_any_supervision_is_refused(tmp_path: Path) -> None:
-    rows = tuple(row for row in copley() if row not in GUARDING)
+PDO_TIME_OUT: tuple[Row, ...] = ((0x1400, 2, "U8", "rw", "255"), (0x1400, 5, "U16", "rw", "100"))
+"""A receive PDO that is missed after 100 ms: CiA 301 lets that be a message, and nothing else."""
+
+
+@pytest.mark.parametrize("more", [(), PDO_TIME_OUT])
+def test_a_drive_without_any_supervision_is_refused(tmp_path: Path, more: tuple[Row, ...]) -> None:
+    rows = (*(row for row in copley() if row not in GUARDING), *more)
     with opened(tmp_path, rows) as rig:
         with pytest.raises(SafetyRefusal, match="neither a consumer heartbeat"), guarded(rig.drive, ENVELOPE):
             pass
@@ -209,6 +214,33 @@ def test_a_torque_that_is_taken_at_once_is_ramped_here(tmp_path: Path) -> None:
 def test_the_mode_is_the_live_drives(tmp_path: Path, modes: int, mode: int) -> None:
     with opened(tmp_path, epos4(modes)) as rig:
         assert rig.drive.target.mode == mode
+
+
+SLOPE: tuple[Row, ...] = ((0x6087, 0, "U32", "rw", "100"),)
+"""10 % of the rated torque per second: as one maker's drive is stored."""
+
+
+@pytest.mark.parametrize(
+    ("modes", "slope", "mode"), [(0x22D, "100", 10), (0x22D, "3000", 4), (0x22D, "0", 4), (0x2D, "100", 4)]
+)
+def test_a_slope_too_slow_for_a_push_is_left_for_the_cyclic_mode(
+    tmp_path: Path, modes: int, slope: str, mode: int
+) -> None:
+    with opened(tmp_path, (*epos4(modes), (0x6087, 0, "U32", "rw", slope))) as rig:
+        assert rig.drive.target.mode == mode
+        told = [line for line in watched_by_tool(rig.drive.node, 10.0) if "0x6087" in line]
+        assert len(told) == (slope == "100") and all(("mode 10" in line) == (mode == 10) for line in told)
+
+
+def test_a_cyclic_torque_is_not_held_back_by_the_slope(tmp_path: Path) -> None:
+    """Two amperes within 20 ms in steps of a tenth of rated per millisecond; the slope would take 3 s."""
+    with opened(tmp_path, (*epos4(), *SLOPE)) as rig, guarded(rig.drive, ENVELOPE) as guard:
+        guard.enable()
+        guard.command_current(0.0, 2.0)
+        guard.wait(0.02)
+        assert rig.drive.live("i_q_a") > 1.0
+        assert rig.face.behind is not None and rig.face.behind.largest_step <= 0.101
+        assert rig.number(0x6087) == 100, "what the drive holds is left alone"
 
 
 def test_a_drive_without_torque_mode_has_no_target(tmp_path: Path) -> None:

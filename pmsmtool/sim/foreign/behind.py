@@ -104,6 +104,7 @@ class Behind:
     set_up: SetUp
     largest_step: float = 0.0
     _torque_nm: float = field(default=0.0, init=False)
+    _slope: float = field(default=0.0, init=False)
 
     # ---- what is shown --------------------------------------------------------------------------
 
@@ -143,8 +144,9 @@ class Behind:
         self.dictionary.write(inner, inner.encode(number))
 
     def command_mode(self, mode: int) -> None:
-        """Choose the mode that acts."""
+        """Choose the mode that acts; a cyclic torque has no slope of the drive's (CiA 402-2, mode 10)."""
         self._write("cia402.mode", INNER_MODES.get(mode, Mode.NONE))
+        self.torque_slope(self._slope)
 
     def command_torque(self, torque_nm: float) -> None:
         """Take a torque reference (N m)."""
@@ -196,7 +198,9 @@ class Behind:
 
     def torque_slope(self, permille_per_s: float) -> None:
         """Move a profile torque no faster (0: at once)."""
-        self._write("cia402.torque_slope", permille_per_s or NO_SLOPE)
+        self._slope = permille_per_s
+        cyclic = self.dictionary["cia402.mode"].integer() == Mode.CYCLIC_TORQUE
+        self._write("cia402.torque_slope", NO_SLOPE if cyclic or not permille_per_s else permille_per_s)
 
     def set_gains(self, K_p_v_per_a: float | None = None, K_i_v_per_as: float | None = None) -> None:
         """Change the gains of both current loops."""

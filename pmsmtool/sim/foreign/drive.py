@@ -37,6 +37,8 @@ PASSED_ON = (0x603F, 0x6040, 0x6041, 0x6007, 0x605A, 0x605E)
 """State machine and option codes: numbers of the standard, whoever the maker is."""
 HELD = (0x6072, 0x6073, 0x6087)
 """Limits whose stored value acts from the start."""
+REVISION = 3
+"""Sub-index of the identity object that the file gives; vendor and product it may leave blank."""
 SERIALS = ((0x1018, 4), (0x2100, 1), (0x6510, 1))
 """Where makers keep the serial number (EPOS4: 0x2100:01, Copley: 0x6510:01)."""
 
@@ -94,7 +96,7 @@ class ForeignDrive:
         for (index, sub), row in self.objects.rows.items():
             kept = server.get((index, sub))
             if index < LAST_COMMUNICATION and kept is not None and kept.row.type == row.type:
-                if index in COMMUNICATION and index != 0x1018 and row.default:
+                if index in COMMUNICATION and (index != 0x1018 or sub == REVISION) and row.default:
                     kept.value = row.default_bytes(0)
                 kept.row = replace(kept.row, stored=row.stored)
                 kept.readable, kept.writable = row.access != "wo", row.access in ("rw", "wo")
@@ -111,6 +113,8 @@ class ForeignDrive:
         dictionary.find(0x6502, 0).value = self._modes_word(dictionary)
         if not self.objects.has((0x6007, 0)):
             dictionary["cia402.abort_connection"].put(1)
+            if not self.objects.has((0x605E, 0)):
+                dictionary["cia402.fault_reaction"].put(0)
 
     def _modes_word(self, dictionary: Dictionary) -> bytes:
         modes = sum(1 << mode - 1 for mode in modes_of(self.objects) if mode > 0)

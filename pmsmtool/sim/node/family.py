@@ -110,6 +110,9 @@ class Face:
             dictionary.hide(index)
         for name, signal in self.drive_map.signals.items():
             dictionary.show(_signal_entry(name, signal, dictionary))
+        revisions = self.drive_map.identity.revisions
+        if revisions:
+            dictionary["identity.revision"].put(revisions[-1] << 16)
         tuning = self.drive_map.vendor_tuning
         own = () if tuning is None else (tuning.mode,)
         for entry in (*_modes(self.modes, dictionary, own), *_Parameters(self.drive_map, dictionary).entries()):

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: MIT
+"""Whether a maker's data sheet and a drive map are of one drive: identity, and every row the sheet contradicts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+from pmsmtool.data_types import DATA_TYPES
+from pmsmtool.drive_maps.drive_map import Cell, DriveMap, SignalCell
+from pmsmtool.drive_maps.eds import Eds, parse_integer
+from pmsmtool.drive_maps.motion_objects import MotionObject
+
+_IDENTITY = 0x1018
+_TYPE_NAMES = {row.code: row.name for row in DATA_TYPES.values()}
+
+
+def other_identity(sheet: Eds, drive_map: DriveMap) -> str:
+    """Say which vendor or product of a data sheet is not the map's; empty where they agree, or one says nothing."""
+    products = {drive_map.product, *drive_map.more_products}
+    checks = (("vendor", 1, sheet.vendor, {drive_map.vendor}), ("product", 2, sheet.product, products))
+    lines = [
+        f"{name} {number:#010x}, the map {drive_map.name!r} is for {', '.join(f'{one:#010x}' for one in sorted(known))}"
+        for name, sub, stated, known in checks
+        for number in sorted({*_told(sheet, sub), *([stated] if stated else [])} - known)
+        if any(known)  # 0 in a map: no source stated it
+    ]
+    return f"the file is for {'; '.join(lines)}" if lines else ""
+
+
+def _told(sheet: Eds, sub: int) -> Iterator[int]:
+    """Yield the numbers that the file's identity object states; 0 and blank state nothing."""
+    entry = sheet.objects.get((_IDENTITY, sub))
+    for text in (entry.value, entry.default) if entry is not None else ():
+        try:
+            number = parse_integer(text) if text else 0
+        except ValueError:
+            continue
+        if number:
+            yield number
+
+
+def types_of(sheet: Eds) -> dict[tuple[int, int], str]:
+    """Return the data types of a sheet's objects by address; one that CiA 301 does not know is empty."""
+    return {address: _TYPE_NAMES.get(entry.data_type, "") for address, entry in sheet.objects.items()}
+
+
+def contradictions(
+    drive_map: DriveMap, types: Mapping[tuple[int, int], str], names: Iterable[str] | None = None
+) -> list[str]:
+    """Return the rows of a map that a maker's file does not have, or has in another type, with family and source.
+
+    Parameters
+    ----------
+    types : mapping of (index, sub) to str
+        Data types of the file's objects (:func:`types_of`).
+    names : iterable of str, optional
+        Rows to look at: parameters, signals, motion; all of them when not given.
+    """
+    rows: dict[str, Cell | SignalCell | MotionObject] = {**drive_map.motion, **drive_map.signals, **drive_map.cells}
+    lines = []
+    for name in rows if names is None else names:
+        row = rows[name]
+        if not row.index:
+            continue  # a number that the maker fixes
+        found = types.get((row.index, row.sub))
+        if found is None:
+            lines.append(f"{drive_map.row_text(name)}: the file has no such object")
+        elif found != row.wire:
+            lines.append(f"{drive_map.row_text(name)}: the file has {found or 'another type'}")
+    return lines

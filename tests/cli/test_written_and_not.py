@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: MIT
+"""A file or a drive that is not the map's, and value by value what is written, what is not, and why."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.cli.main import run
+from pmsmtool.drive_maps.shipped_maps import family_names, load_family
+from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.params.parameter_set import ParameterSet
+from tests.foreign.data_sheets import Row, copley, epos4, write_eds
+from tests.simulated_bus import settle
+
+GAINS = {"current.K_p_q_v_per_a": 3.0, "current.K_i_q_v_per_as": 90.0, "motor.R_s_ohm": 0.5, "governor.k_max": 4.0}
+NOT_SAID = "0x3002:01 holds it; its scale"
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    settle(tmp_path, monkeypatch)
+    (tmp_path / "params.toml").write_text(ParameterSet(GAINS).to_toml())
+    return tmp_path
+
+
+def sheet(home: Path, rows: tuple[Row, ...], head: str = "") -> Path:
+    path = write_eds(home / "theirs.eds", rows)
+    path.write_text(path.read_text().replace("[DeviceInfo]", f"[DeviceInfo]\n{head}"))
+    return path
+
+
+def exported(home: Path, into: Path, *more: str) -> int:
+    out = home / "out.dcf"
+    return run(
+        ["export", "dcf", str(home / "params.toml"), "--into", str(into), "--map", "epos4", "-o", str(out), *more]
+    )
+
+
+# ---- a file of another drive ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("product", "head", "said"),
+    [
+        (0x65510000, "", ""),
+        (0x63220000, "", "product 0x63220000, the map 'epos4' is for 0x61500000, 0x65510000"),
+        (0x65510000, "VendorNumber=0xAB\nProductNumber=0x20B", "vendor 0x000000ab, the map 'epos4' is for 0x000000fb"),
+        (0x65510000, "VendorNumber=0\nProductNumber=0", ""),
+    ],
+)
+def test_export_says_that_file_and_map_are_of_two_drives(
+    home: Path, capsys: pytest.CaptureFixture[str], product: int, head: str, said: str
+) -> None:
+    assert exported(home, sheet(home, epos4(product=product), head)) == 0
+    told = capsys.readouterr().err
+    assert ("the file is for" in told) is bool(said) and said in told
+    flash = ["--sim", "interior-2k2?nv=:memory:&drive=epos4", "--yes", "flash-params", str(home / "out.dcf")]
+    assert run([*flash, "--map", "epos4", "--dry-run"]) == (2 if said else 0)
+    assert said in capsys.readouterr().err, "what was exported into it is not flashed as this map's"
+
+
+def test_a_row_that_the_file_contradicts_is_named_and_nothing_is_written(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = tuple(row for row in epos4() if row[:2] != (0x30A0, 2))
+    rows = tuple((*row[:2], "I32", *row[3:]) if row[:2] == (0x30A0, 1) else row for row in rows)
+    assert exported(home, sheet(home, rows)) == 2
+    told = capsys.readouterr().err
+    source = load_family("epos4").sources["being"]
+    assert f"epos4 current.K_p_q_v_per_a 0x30A0:01 UNSIGNED32 (being: {source}): the file has INTEGER32" in told
+    assert f"epos4 current.K_i_q_v_per_as 0x30A0:02 UNSIGNED32 (being: {source}): the file has no such" in told
+    assert not (home / "out.dcf").exists()
+
+
+# ---- value by value ---------------------------------------------------------------------------------
+
+
+def test_export_says_value_by_value_why_not(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exported(home, sheet(home, epos4())) == 0
+    told = capsys.readouterr().err
+    assert f"not written: motor.R_s_ohm: {NOT_SAID}" in told and "governor.k_max: " not in told
+    assert exported(home, home / "theirs.eds", "-v") == 0
+    told = capsys.readouterr().err
+    assert "not written: governor.k_max: the map 'epos4' has no row for it" in told
+    assert "written: epos4 current.K_p_q_v_per_a 0x30A0:01 UNSIGNED32" in told
+    assert run(["export", "csv", str(home / "params.toml"), "--map", "epos4"]) == 0
+    rows = {row["name"]: row for row in csv.DictReader(io.StringIO(capsys.readouterr().out))}
+    for name in GAINS:
+        assert bool(rows[name]["object"]) != bool(rows[name]["not written because"])
+
+
+@pytest.mark.parametrize("family", [name for name in family_names() if name != "pmsmsim"])
+def test_caps_says_of_every_parameter_whether_it_is_written(
+    family: str, home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive_map = load_family(family)
+    assert run(["--sim", f"interior-2k2?nv=:memory:&drive={family}", "caps", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    written, not_written = facts["written"], facts["not_written"]
+    assert set(written) | set(not_written) == set(BY_NAME) and not set(written) & set(not_written)
+    assert set(written) == (set(drive_map.cells) if drive_map.vendor else set())
+    assert all(not_written.values()) and {**not_written, **drive_map.left_out}.keys() >= not_written.keys()
+    assert run(["--sim", f"interior-2k2?nv=:memory:&drive={family}", "caps"]) == 0
+    out = capsys.readouterr().out
+    for name in written:
+        assert f"written: {drive_map.row_text(name)}" in out
+    for name, why in drive_map.left_out.items():
+        assert name not in BY_NAME or f"not written: {name}: {why}" in out
+
+
+def test_caps_says_which_rows_the_drive_contradicts(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Resistance and inductance in other sizes than the map's, and the torque slope is not there."""
+    rows = tuple((*row[:2], "U32", *row[3:]) if row[:2] == (0x6410, 7) else row for row in copley())
+    eds = write_eds(home / "drive.eds", rows)
+    assert run(["caps", "--eds", str(eds)]) == 0
+    out = capsys.readouterr().out
+    said = [line for line in out.splitlines() if line.startswith("not written: copley ")]
+    assert any("motor.R_s_ohm 0x6410:07" in line and "the drive holds 4 bytes there" in line for line in said)
+    assert any("torque_slope" in line and "the drive has no such object" in line for line in said)
+    assert any(line.startswith("written: copley motor.L_q_h 0x6410:08") for line in out.splitlines())
+
+
+def test_diff_says_what_is_equal_and_what_is_not_compared(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (home / "new.toml").write_text(ParameterSet({**GAINS, "current.K_p_q_v_per_a": 2.0}).to_toml())
+    command = ["param", "diff", str(home / "params.toml"), str(home / "new.toml"), "--map", "epos4"]
+    assert run([*command, "--json"]) == 0
+    told = capsys.readouterr()
+    facts = json.loads(told.out)
+    assert [row["name"] for row in facts["differences"]] == ["current.K_p_q_v_per_a"]
+    assert facts["equal"] == ["current.K_i_q_v_per_as"]
+    assert set(facts["not_written"]) == {"motor.R_s_ohm", "governor.k_max"}
+    assert f"not compared, not written: motor.R_s_ohm: {NOT_SAID}" in told.err
+    assert "1 entries that the map has no row for" in told.err
