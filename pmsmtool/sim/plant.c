@@ -257,11 +257,33 @@ static void step_open(pmsm_plant *m, double h, int moves_freely, double omega, d
     pmsm_plant_clear_current(m, PMSM_ALL_LEGS);
 }
 
+/* The second mass swings on the coupling while friction holds the rotor. */
+static void step_load(pmsm_plant *m, double h)
+{
+    static const double place[4] = {0.0, 0.5, 0.5, 1.0}, weight[4] = {1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0};
+    pmsm_plant_state *state = &m->state;
+    double rotor, kl = 0.0, wl = state->omega_load, twist = state->twist, sum_l = 0.0, sum_twist = 0.0;
+    for (int j = 0; j < 4; j++) {
+        if (j > 0) {
+            const double hj = place[j] * h;
+            twist = state->twist - hj * wl;
+            wl = state->omega_load + hj * kl;
+        }
+        accelerations(m, 0.0, state->theta_M, 0.0, twist, wl, &rotor, &kl);
+        sum_l += weight[j] * kl;
+        sum_twist -= weight[j] * wl;
+    }
+    state->omega_load += h * sum_l;
+    state->twist += h * sum_twist;
+}
+
 static void step(pmsm_plant *m, const pmsm_supply *supply, double h)
 {
     const int moves_freely = m->machine.rotor == PMSM_ROTOR_FREE && !m->state.sticking;
     const double omega = m->state.sticking ? 0.0 : m->state.omega_M;
     const double acceleration = m->machine.rotor == PMSM_ROTOR_DRIVEN ? m->acceleration : 0.0;
+    if (m->state.sticking && m->machine.J_load > 0.0)
+        step_load(m, h);
     if (supply->blocked == PMSM_ALL_LEGS) {
         step_open(m, h, moves_freely, omega, acceleration);
     } else if (moves_freely) {

@@ -109,6 +109,25 @@ def test_two_masses_swing_at_their_frequency():
     assert np.abs(twist - static * (1.0 - np.cos(w_0 * t))).max() < 1e-6 * static * 2e2  # RK4 over 180 swings
 
 
+@pytest.mark.parametrize(("load_nm", "held"), [(1.0, True), (1.5, False)])
+def test_the_second_mass_swings_while_friction_holds_the_rotor(load_nm, held):
+    """Its swing reaches twice the load's torque at the rotor: below the Coulomb torque it holds, above it gives way."""
+    J_load, stiffness, tau_c = 5e-3, 400.0, 2.5
+    change = free(J=2e-3, J_load=J_load, coupling_stiffness=stiffness, tau_c=tau_c)
+    simulation = idle(open_simulation(change))
+    simulation.library.pmsm_sim_set_load(simulation.sim, load_nm)
+    signals = [Truth.T, Truth.OMEGA_M, Truth.OMEGA_LOAD, Truth.TWIST]
+    t, omega, load, twist = record(simulation, signals, 2000)
+    expected = load_nm / stiffness * (1.0 - np.cos(math.sqrt(stiffness / J_load) * t))
+    if held:
+        assert np.all(omega == 0.0)
+        assert np.abs(twist - expected).max() < 1e-4 * load_nm / stiffness  # RK4 over 9 swings
+        assert np.abs(load).max() == pytest.approx(load_nm / math.sqrt(stiffness * J_load), rel=1e-3)
+        return
+    moves = int(np.argmax(omega != 0.0))
+    assert 0 < moves < len(t) and stiffness * abs(expected[moves]) == pytest.approx(tau_c, rel=0.03)
+
+
 def test_torque_drives_the_shaft():
     i_q, J = 8.0, 2e-3
     simulation = open_simulation(free(J=J))
