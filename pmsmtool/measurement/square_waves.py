@@ -20,9 +20,6 @@ BIAS_SHARE = 0.5
 BIAS_TRIES = 4
 BIAS_OFF_RAD = math.radians(6.0)
 """Angle between rotor and bias vector that a load or friction may make (electrical)."""
-STAYS_RAD, STAYS_LAGS, OFFSET_MOST_RAD = math.radians(0.5), 10.0, math.radians(12.0)
-"""Motion at half the bias that is none, the angle over friction's in the slow turn from which it is not friction, and
-the largest error of the coarse offset: a rotor of much inertia swings while it is turned over (8.5 deg, seen once)."""
 ALIGN_TRIES = 3
 """Times the frame follows a rotor that was moved by the change of the frame itself."""
 NOISE_RIPPLE = 25.0
@@ -115,7 +112,6 @@ class SquareStage:
         """Hold the bias, or as much of it as leaves the rotor's d axis on the vector; returns the plan with it."""
         wanted = plan.ripple_a
         floor = NOISE_RIPPLE * noise.sigma_a
-        before: tuple[float, square_injection.SquarePlan] | None = None
         for _ in range(BIAS_TRIES):
             self.say(f"L_d, L_q: square wave on {plan.bias_d_a:.3g} A, {plan.ripple_a:.3g} A peak to peak")
             square_injection.hold_bias(self.drive, plan)
@@ -132,10 +128,6 @@ class SquareStage:
                 ahead = self._rotor_ahead(encoder, aligned)
                 if abs(ahead) <= BIAS_ON_RAD:
                     return aligned
-            if before is not None and self._stays(encoder, before[0], ahead):
-                square_injection.hold_bias(self.drive, before[1])
-                return before[1]
-            before = ahead, plan
             wanted, bias = 0.5 * wanted, 0.5 * plan.bias_d_a
             plan = replace(plan, bias_d_a=bias, ripple_a=max(floor, clear_ripple(wanted, bias, knee_a)))
         raise refuse(
@@ -144,15 +136,6 @@ class SquareStage:
             stage="inductance",
             likely="a load on the shaft, or a machine with much more reluctance than magnet torque",
         )
-
-    @staticmethod
-    def _stays(encoder: EncoderResult, before_rad: float, ahead_rad: float) -> bool:
-        """Whether the rotor is on the vector and the coarse offset is what is off: half the bias does not move it.
-
-        A load would turn it further; friction, which could hold it there, has shown in the slow turn how little it can.
-        """
-        near = abs(ahead_rad - before_rad) < STAYS_RAD
-        return near and STAYS_LAGS * abs(encoder.lag_rad) < abs(ahead_rad) < OFFSET_MOST_RAD
 
     def _rotor_ahead(self, encoder: EncoderResult, plan: square_injection.SquarePlan) -> float:
         """Electrical angle of the rotor, with the coarse offset, ahead of the frozen frame (rad)."""
