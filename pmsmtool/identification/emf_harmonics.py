@@ -268,8 +268,8 @@ def _fit(
     """Return flux, standard deviation and degrees of freedom of the harmonics below and above an order."""
     w = np.array([row.w for row in rows]) / max(abs(row.w) for row in rows)
     s = np.sign([row.i_d for row in rows])
-    # 1/|w|: the error of the currents' own harmonics, and of a q current that holds the speed of a light shaft
-    matrix = np.stack([np.ones_like(w), w, s, s / w, s * np.sign(w), 1.0 / np.abs(w)], axis=1)
+    # 1/w^2: the currents' harmonics by the dead time, which falls with 1/w, pass through its error once more
+    matrix = np.stack([np.ones_like(w), w, s, s / w, s * np.sign(w), 1.0 / w**2], axis=1)
     values = np.array([row.flux(order, circuit) for row in rows])
     fit, _, rank, _ = np.linalg.lstsq(matrix, values, rcond=None)
     dof = len(rows) - int(rank)

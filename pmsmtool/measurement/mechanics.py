@@ -87,7 +87,8 @@ def measure_cogging(
     say(f"cogging: {slow_turns.TURNS:g} turns each way at {rpm_from_rad_s(speed):.0f} rpm")
     pole_pairs = round(drive.read("motor.pole_pairs"))
     slow_turns.record_slow_turns(drive, pole_pairs, speed, numbered(drive, SLOW_TRACE, keep))
-    _come_to_rest(drive, pole_pairs * speed)
+    # the records are whole: a shaft that does not come to rest is what the next experiment refuses
+    speed_run.reach(drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * pole_pairs * limits.omega_max_rad_s)
 
 
 def _come_to_rest(drive: Drive, reached_rad_s: float) -> None:
