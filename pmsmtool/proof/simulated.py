@@ -358,18 +358,22 @@ def _draw(
 def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
     """Draw eddy currents about those that the inductances were identified with; none where there were none.
 
-    The branch of an axis without them stays; the plant has one time constant for both.
+    Within a control period they are nothing but iron loss; slower ones are a branch, whose time constant the plant has
+    once for both axes.
     """
-    found = {axis: (machine.conditions.get(f"eddy_{axis}_s"), machine.conditions.get(f"eddy_{axis}_time_s"))
-             for axis in "dq"}  # fmt: skip
-    rates = [1.0 / tau for _, tau in found.values() if isinstance(tau, float)]
-    if not rates:
+    sizes_s = [machine.conditions.get(f"eddy_{axis}_s", 0.0) for axis in "dq"]
+    taus_s = [tau for axis in "dq" if isinstance(tau := machine.conditions.get(f"eddy_{axis}_time_s"), float)]
+    if not taus_s:
         return
-    out = setup.machine
-    out.eddy_rate = float(np.mean(rates)) * math.exp(rng.uniform(-1.0, 1.0) * math.log(EDDY_FACTOR))
-    for axis, (size_s, _) in found.items():
-        share = float(rng.uniform(*EDDY_SHARES)) * (size_s if isinstance(size_s, float) else 0.0)
-        setattr(out, f"eddy_{axis}", share * out.eddy_rate / getattr(out, f"L_{axis}"))
+    out, T_s = setup.machine, machine.inverter.T_s
+    sizes_s = [float(rng.uniform(*EDDY_SHARES)) * size_s for size_s in sizes_s]
+    tau_s = float(np.mean(taus_s)) * math.exp(rng.uniform(-1.0, 1.0) * math.log(EDDY_FACTOR))
+    per_volt = [size_s / L for size_s, L in zip(sizes_s, (out.L_d, out.L_q), strict=True)]
+    if np.mean(taus_s) < T_s:
+        out.R_iron = 2.0 / sum(per_volt) if sum(per_volt) > 0.0 else 0.0
+        return
+    out.eddy_rate = 1.0 / max(tau_s, T_s)  # shorter than a step of the plant would not be integrated
+    out.eddy_d, out.eddy_q = (amperes * out.eddy_rate for amperes in per_volt)
 
 
 def _timing(machine: MachineFile, rng: np.random.Generator, *, late: bool) -> tuple[float, float]:

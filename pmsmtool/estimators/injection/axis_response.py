@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,11 @@ class VoltageError:
         after = (1.0 - EDGE_SHARE) * early + EDGE_SHARE * late
         return np.asarray(before[..., :-1] + after[..., 1:], dtype=np.float64)
 
+LINE_SHARE = 0.2
+"""Part of a residual's power that a sine must be to be taken out: 4 % of ripple on a DC link is 0.8 of it."""
+LINE_APART, LINE_FINER = 3.0, 16
+"""Distance from the injection's harmonics, in the record's own resolution, and steps of the search in one of those."""
+
 
 @dataclass(frozen=True, slots=True)
 class Shot:
@@ -74,6 +79,8 @@ class Shot:
         Inverter error from the DC levels.
     pulse_v : float
         Voltage of the bridge's pulses along the axis (V); infinite: the mean voltage is taken for all of the period.
+    lines_hz : tuple of float
+        Frequencies that are not the injection's and count as slow: ripple of the DC link.
     """
 
     u_v: Vector
@@ -83,6 +90,7 @@ class Shot:
     period_s: float
     error: VoltageError | None = None
     pulse_v: float = math.inf
+    lines_hz: tuple[float, ...] = ()
 
     @property
     def pulses(self) -> Pulses | None:
@@ -93,12 +101,16 @@ class Shot:
         return Pulses(share, self.u_v / share, -float(np.mean(self.u_v)))
 
     def slow_basis(self) -> NDArray[np.float64]:
-        """Orthonormal cosines slower than the injection, shape (n - SKIP_SAMPLES, j)."""
+        """Orthonormal cosines slower than the injection, and its lines, shape (n - SKIP_SAMPLES, j)."""
         n = len(self.i_a) - SKIP_SAMPLES
         count = max(1, round(n / (self.half_period * SLOW_FRACTION)))
         k = np.arange(n) + 0.5
         basis = np.cos(np.pi * np.outer(k, np.arange(count)) / n)
-        return np.asarray(basis / np.sqrt(np.sum(basis**2, axis=0)))
+        basis /= np.sqrt(np.sum(basis**2, axis=0))
+        if self.lines_hz:
+            turns = 2.0 * np.pi * np.outer(k * self.period_s, self.lines_hz)
+            basis = np.linalg.qr(np.column_stack([basis, np.cos(turns), np.sin(turns)]))[0]
+        return np.asarray(basis)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +192,22 @@ def _fast_charge(fast: NDArray[np.float64], slow: NDArray[np.float64], T_s: floa
     np.cumsum(0.5 * T_s * (fast[:, 1:] + fast[:, :-1]), axis=1, out=charge[:, 1:])
     charge[:, -rows:] = projected(charge[:, -rows:], slow)
     return charge
+
+
+def with_line(shot: Shot, residual: Vector) -> Shot:
+    """Return the shot with the frequency of a sine that most of a fit's residual is; the same where it is none.
+
+    The ripple of a DC link is a voltage that the drive does not know. What lies on the injection's harmonics stays.
+    """
+    n = len(residual)
+    power = np.abs(np.fft.rfft(residual, LINE_FINER * n)) ** 2
+    hz = np.arange(len(power)) / (LINE_FINER * n * shot.period_s)
+    injected = 0.5 / (shot.half_period * shot.period_s)
+    power[np.abs(hz - injected * np.round(hz / injected)) < LINE_APART / (n * shot.period_s)] = 0.0
+    at = int(np.argmax(power))
+    if 2.0 * power[at] / n < LINE_SHARE * float(residual @ residual):
+        return shot
+    return replace(shot, lines_hz=(*shot.lines_hz, float(hz[at])))
 
 
 def initial_inductance(shot: Shot) -> float:

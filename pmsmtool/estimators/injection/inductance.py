@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, Verdict, chi2_gate, condition_gate, ljung_box
 from pmsmtool.estimators.injection.axis_fit import AxisFit, fit_axis
 from pmsmtool.estimators.injection.axis_layout import Motion
-from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, VoltageError, projected
+from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, VoltageError, projected, with_line
 from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstant
 from pmsmtool.estimators.injection.switching_ripple import LEG_ANGLES
 from pmsmtool.estimators.inverter_error import InverterCurve
@@ -49,6 +49,8 @@ with 2 kohm of iron loss, where L_q came out 12 % wrong, 41)."""
 CHI2_HOPELESS = 300.0
 """Reduced chi-square above which no number is given. Between it and the usual limit the interval is widened (ripple of
 3 % of a DC link: 37, L_d 0.1 % off) ..."""
+LINES_MOST = 2
+"""Sines beside the injection that are taken out of a record, one after the other."""
 IN_STEP = 0.2
 """... where a smaller part of the residual than this repeats with the square wave (that ripple: 0.0003; a current that
 is clipped: 0.91 to 0.98)."""
@@ -270,19 +272,26 @@ def estimate_inductances(
 
 
 def _fitted(
-    shots: Mapping[str, Sequence[Shot]],
+    shots: dict[str, list[Shot]],
     sigma_a: float,
     R_ohm: float,
     motion: Motion | None,
     instant: ShownInstant | None,
 ) -> dict[str, AxisFit]:
-    """Fit both axes, d first."""
+    """Fit both axes, d first; where a fit leaves sines that are not the injection's, again without these."""
     fits: dict[str, AxisFit] = {}
     for axis in "dq":
-        torque = axis == "q"
-        fits[axis] = fit_axis(
-            shots[axis], sigma_a, R_ohm, torque=torque, motion=motion, other=fits.get("d"), instant=instant
-        )
+        for _ in range(LINES_MOST + 1):
+            fits[axis] = fit_axis(
+                shots[axis], sigma_a, R_ohm, torque=axis == "q", motion=motion, other=fits.get("d") if axis == "q"
+                else None, instant=instant,
+            )  # fmt: skip
+            if not CHI2_REFUSE < fits[axis].chi2:
+                break
+            found = [with_line(shot, r) for shot, r in zip(shots[axis], fits[axis].residuals, strict=True)]
+            if all(new is old for new, old in zip(found, shots[axis], strict=True)):
+                break
+            shots[axis] = found
     return fits
 
 

@@ -165,9 +165,9 @@ class ShownInstant:
 
 
 def _place(grid: tuple[float, ...], value: float) -> tuple[int, float]:
-    """Interval of a grid and the place in it, 0 to 1; the ends beyond it."""
+    """Interval of a grid and the place in it, 0 to 1; beyond an end, of the last interval."""
     k = min(max(bisect.bisect_right(grid, value) - 1, 0), len(grid) - 2)
-    return k, min(max((value - grid[k]) / (grid[k + 1] - grid[k]), 0.0), 1.0)
+    return k, (value - grid[k]) / (grid[k + 1] - grid[k])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
