@@ -60,6 +60,13 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     "thresholds in the data sheet of the bridge's devices: bridge=0.9V:1.1V:0.2V.",
 )
 @click.option(
+    "--accuracy",
+    type=click.FloatRange(0.0, 0.1, min_open=True),
+    metavar="SHARE",
+    help="95 % half width of R, L and psi, relative, that is enough: the run then collects less. It is without the "
+    "sensors' part, which is printed beside it.",
+)
+@click.option(
     "--half-frequency",
     is_flag=True,
     help="Measure R at half the control frequency, too, and extrapolate to zero: takes the dead time out of R.",
@@ -83,6 +90,7 @@ def identify_command(
     runs: Path,
     sensor_tol: float | None,
     cal: tuple[str, ...],
+    accuracy: float | None,
     half_frequency: bool,
     supply: bool,
     map_file: Path | None,
@@ -111,6 +119,8 @@ def identify_command(
     if replay is not None:
         if half_frequency:
             raise click.UsageError("--half-frequency measures; with --replay the traces of the run decide")
+        if accuracy is not None:
+            raise click.UsageError("--accuracy says how much is measured; with --replay it is that of the run")
         from pmsmtool.identification.replay import MACHINE, REPLAYED
         from pmsmtool.identification.tier_evaluate import replay as recompute
         from pmsmtool.run_directory import RunDirectory
@@ -134,6 +144,7 @@ def identify_command(
         load=motion.load,
         brake=motion.brake,
         half_frequency=half_frequency,
+        accuracy=accuracy,
         tolerance=calibrated_tolerance(declared or SensorTolerance(), cal),
     )
     request.check()
@@ -142,6 +153,8 @@ def identify_command(
         raise NotAvailable(
             f"the method {how} has no measurement at half the control frequency", hint="leave --half-frequency out"
         )
+    if accuracy is not None and how != "inject":
+        raise NotAvailable(f"the method {how} has no choice of what it collects", hint="leave --accuracy out")
     if supply and not (how == "standard" and "R" in request.quantities):
         raise NotAvailable(f"the method {how} reads no bench supply", hint="leave --supply out, or ask for R")
     if how == "inject":
@@ -304,6 +317,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
 
     from pmsmtool.cli.output import table
     from pmsmtool.errors import IdentificationError, Partial
+    from pmsmtool.identification.accuracy import accuracy_line, accuracy_told
     from pmsmtool.report.report import total_interval
     from pmsmtool.report.verdict import on_which_drive
     from pmsmtool.units import format_estimate, format_quantity
@@ -331,9 +345,13 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
         "run": str(run.path), "values": list(stage.values), "status": stage.status, "refused": dict(stage.refused),
         "warnings": warnings,
     }  # fmt: skip
+    accuracy = accuracy_told(stage.values)
+    data |= {"accuracy": accuracy} if accuracy else {}
     out.result("identify", data, table(heads, rows))
     for line in warnings:
         out.warn(line)
+    if accuracy and stage.status == "pass":
+        out.note(accuracy_line(accuracy))  # one that is not reached is among the warnings
     out.note(on_which_drive(stage.summary, asdict(run.read())))
     for name in stage.files:
         if not name.startswith(("traces/", "nameplate", "request")):
@@ -343,6 +361,13 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
     refused = [f"{name}: {reason}" for name, reason in stage.refused.items()]
     if stage.status == "partial":
         where = "machine.toml" if any(name.endswith("machine.toml") for name in stage.files) else "run.json"
+        if not stage.refused:
+            raise Partial(
+                "the accuracy asked for is not reached; the values are good",
+                where=str(run.path),
+                hint="allow more current or speed (--i-max, --speed-max), or ask for less",
+                missing=[accuracy_line(accuracy)],
+            )
         raise Partial(
             f"{len(stage.refused)} of the quantities asked for {'is' if len(stage.refused) == 1 else 'are'} refused",
             where=str(run.path),

@@ -40,11 +40,14 @@ class MechanicsPlan:
         Length of the first push (s); the second is twice as long.
     omega_rad_s : float
         Mechanical speed they are to reach (rad/s).
+    rows : int
+        Largest number of rows of a push.
     """
 
     i_q_a: float
     unit_s: float
     omega_rad_s: float
+    rows: int = ROWS
 
     @property
     def coast_s(self) -> float:
@@ -84,7 +87,7 @@ def push_and_coast(drive: Drive, plan: MechanicsPlan, abort_speed_rad_s: float, 
     The drive is enabled and at rest on entry, and off on return. It ends a push by itself at the abort speed
     (electrical rad/s).
     """
-    first = _push(drive, plan.i_q_a, plan.unit_s, abort_speed_rad_s)
+    first = _push(drive, plan.i_q_a, plan.unit_s, plan.rows, abort_speed_rad_s)
     keep(first)
     coasting = _coast(drive, plan)
     keep(coasting)
@@ -92,7 +95,8 @@ def push_and_coast(drive: Drive, plan: MechanicsPlan, abort_speed_rad_s: float, 
     # what the first push really did decides how long the other one may be: the plan's inertia is a rough one
     both = min(2.0 * reached, reached + left, 2.0 * plan.omega_rad_s)
     drive.enable()
-    keep(_push(drive, -plan.i_q_a, plan.unit_s * both / max(reached, 0.1 * plan.omega_rad_s), abort_speed_rad_s))
+    back_s = plan.unit_s * both / max(reached, 0.1 * plan.omega_rad_s)
+    keep(_push(drive, -plan.i_q_a, back_s, plan.rows, abort_speed_rad_s))
     keep(_coast(drive, plan))
 
 
@@ -109,8 +113,8 @@ def _end_speed(trace: Trace) -> float:
     return float(trace["theta_M_rad"][-1] - trace["theta_M_rad"][-rows]) / ((rows - 1) * trace.period_s)
 
 
-def _push(drive: Drive, i_q_a: float, seconds: float, abort_speed_rad_s: float) -> Trace:
-    samples, decimation = _rows(drive, seconds, ROWS)
+def _push(drive: Drive, i_q_a: float, seconds: float, rows: int, abort_speed_rad_s: float) -> Trace:
+    samples, decimation = _rows(drive, seconds, rows)
     excitation = Excitation(
         shape=Shape.STEP,
         point=Injection.I_Q,

@@ -75,6 +75,8 @@ class SpeedPlan:
         Shortest window of a q current, which accelerates the shaft: whole electrical turns (s).
     per_ampere_rad_s2, acceleration_rad_s2 : float
         Rough mechanical acceleration per q current (rad/s2/A), and the one of the speed controller (rad/s2).
+    shares, d_shares, q_at : tuple
+        As :data:`SHARES`, :data:`D_SHARES` and :data:`Q_AT`.
     """
 
     omega_max_rad_s: float
@@ -87,21 +89,24 @@ class SpeedPlan:
     q_window_s: float = Q_WINDOW_S
     per_ampere_rad_s2: float = 0.0
     acceleration_rad_s2: float = math.inf
+    shares: tuple[float, ...] = SHARES
+    d_shares: tuple[tuple[float, ...], ...] = D_SHARES
+    q_at: tuple[int, ...] = Q_AT
 
     def stations(self) -> list[tuple[float, list[tuple[float, float]]]]:
         """Return the mechanical speeds in the order they are reached, and the vectors that are held at each."""
         found = []
         for k, sense in enumerate((1.0, -1.0)):
-            for n, share in enumerate(SHARES):
+            for n, share in enumerate(self.shares):
                 vectors = []
-                for m, part in enumerate(D_SHARES[n]):
+                for m, part in enumerate(self.d_shares[n]):
                     # the shaft slows down: which sign comes first takes turns
                     first = 1.0 if (k + n + m) % 2 else -1.0
                     vectors += [(first * part * self.i_d_a, 0.0), (-first * part * self.i_d_a, 0.0)]
-                if n in Q_AT:
+                if n in self.q_at:
                     # slower first, so that the two leave the speed where it was
                     vectors += [(0.0, -sense * self.i_q_a), (0.0, sense * self.i_q_a)]
-                found.append((sense * share / SHARES[-1] * self.omega_max_rad_s, vectors))
+                found.append((sense * share / self.shares[-1] * self.omega_max_rad_s, vectors))
         return found
 
 

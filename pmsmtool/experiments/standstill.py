@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.experiments.signals import readable, table
-from pmsmtool.experiments.vector_turn import turn_vector
+from pmsmtool.experiments.vector_turn import TURN_S, turn_vector
 from pmsmtool.trace import Trace
 
 NOISE_SAMPLES = 2048
@@ -32,7 +32,8 @@ TRIES = 6
 DRIFTED = 5e-4
 """Change of the voltage between the halves of a window, relative, that asks for another window."""
 CREPT = 1e-3
-"""The same of the current, of the largest level: a rotor that leaves a vector slowly turns the voltage into both."""
+"""The same of the current, of the largest level, where the voltage's limit is ``DRIFTED``: a rotor that leaves a vector
+slowly turns the voltage into both."""
 LOOK_S = 0.03
 ARRIVED = 0.03
 """Distance of the mean current vector from its set-point, relative, that counts as arrived."""
@@ -60,6 +61,10 @@ class LevelPlan:
         Control periods averaged per level, split into two halves.
     angle_rad : float
         Electrical angle of the vector in the stator frame.
+    drift : float
+        Change of the voltage between the halves of a window, relative, that asks for another window.
+    turn_s : float
+        Time of a turn of the vector, of the waits alone (s).
     """
 
     levels_a: Sequence[float]
@@ -68,6 +73,8 @@ class LevelPlan:
     settle_s: float = 0.06
     window_periods: int = LEVEL_WINDOW
     angle_rad: float = DC_ANGLE_RAD
+    drift: float = DRIFTED
+    turn_s: float = TURN_S
 
     def duration_s(self, period_s: float) -> float:
         """Return the time the levels take without waiting for the rotor (s)."""
@@ -139,7 +146,7 @@ PAIR_ARRIVED = 0.005
 time the controller of the parameter set is slow, and 2 % below its set-point it made 12 % of a slope."""
 
 
-def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float) -> Trace:
+def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s: float = TURN_S) -> Trace:
     """Hold two currents through each pair of phases, the third phase idle; return one row of means for each.
 
     Parameters
@@ -148,8 +155,9 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float) -> Tra
         Enabled; it holds zero current on return.
     i_a : float
         Larger current (A peak).
-    turn_a, start_rad : float
-        Current that turns the rotor from pair to pair (A peak), and the vector that was held last (rad electrical).
+    turn_a, start_rad, turn_s : float
+        Current that turns the rotor from pair to pair (A peak), the vector that was held last (rad electrical), and the
+        time of a turn (s).
     """
     names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
     half = PAIR_PERIODS // 2
@@ -160,7 +168,7 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float) -> Tra
     for k in range(3):
         target = DC_ANGLE_RAD + PHASE_ANGLES_RAD[k]
         if target != angle:
-            elapsed += turn_vector(drive, turn_a, angle, target)
+            elapsed += turn_vector(drive, turn_a, angle, target, turn_s)
             angle = target
         for share in PAIR_SHARES:
             drive.command_current(share * i_a, 0.0, fixed_angle_rad=angle)
@@ -240,7 +248,7 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
         sign = math.copysign(1.0, level)
         target = plan.angle_rad if sign > 0.0 else plan.angle_rad + math.pi
         if angle != target:
-            elapsed += turn_vector(drive, plan.turn_a, angle, target)
+            elapsed += turn_vector(drive, plan.turn_a, angle, target, plan.turn_s)
             angle = target
         # minus is the vector turned by half a turn, not a negative current: the controller does not notice
         drive.command_current(abs(level), 0.0, fixed_angle_rad=angle)
@@ -255,7 +263,8 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
             turned = abs(second["theta_m_rad"] - first["theta_m_rad"])
             drifted = abs(second["u_d_v"] - first["u_d_v"])
             crept = abs(second["i_d_a"] - first["i_d_a"])
-            moved = turned >= REST_RAD or drifted > DRIFTED * abs(first["u_d_v"]) or crept > CREPT * largest
+            still = drifted <= plan.drift * abs(first["u_d_v"]) and crept <= CREPT * (plan.drift / DRIFTED) * largest
+            moved = turned >= REST_RAD or not still
             if not moved:
                 break
         row = {name: 0.5 * (first[name] + second[name]) for name in MEANS}

@@ -35,13 +35,13 @@ def rising(steps: int) -> tuple[float, ...]:
     return tuple(0.5 - 0.5 * math.cos(math.pi * (k + 0.5) / steps) for k in range(steps))
 
 
-def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float) -> float:
+def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float, turn_s: float = TURN_S) -> float:
     """Turn a current vector along half a cosine, so that the rotor follows instead of jumping; return the time (s).
 
     A rotor left half an electrical turn off its vector stands on a top: friction holds it there until the current is
     large, and then it falls over with all of it.
     """
-    steps = round(TURN_S / TURN_DWELL_S)
+    steps = round(turn_s / TURN_DWELL_S)
     for k in range(1, steps + 1):
         way = 0.5 - 0.5 * math.cos(math.pi * k / steps)
         drive.command_current(i_a, 0.0, fixed_angle_rad=start_rad + (end_rad - start_rad) * way)

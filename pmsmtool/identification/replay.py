@@ -14,6 +14,7 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.resistance import copper_of
 from pmsmtool.files import read_text
 from pmsmtool.identification import flux_map, frequency_response, half_frequency, value_verdict
+from pmsmtool.identification.accuracy import accuracy_facts, accuracy_line
 from pmsmtool.identification.calibration import calibrated_tolerance
 from pmsmtool.identification.cogging import save_cogging
 from pmsmtool.identification.evaluate import Evaluation, evaluate
@@ -81,19 +82,25 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
     files |= {name: "" for name in (PREDICTED, REFUSED) if (run.path / name).is_file()}
     fallen = [f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback]
+    accuracy = accuracy_facts(request.accuracy, request.quantities, found)
+    missed = not all(fact["reached"] for fact in accuracy.values())
     facts = [
-        {**value_verdict.value_facts(name, estimate), "accepted": name not in rejected}
+        {
+            **value_verdict.value_facts(name, estimate),
+            "accepted": name not in rejected,
+            **({"accuracy": accuracy[name]} if name in accuracy else {}),
+        }
         for name, estimate in (found | parts | timing | kept.ripples()).items()
     ]
     summary = value_verdict.summary_of(kept, {name: e for name, e in found.items() if name not in rejected})
     return Stage(
         "identify",
-        verdicts.status,
+        "partial" if missed and verdicts.status == "pass" else verdicts.status,
         0.0,
         values=[*facts, *map(value_verdict.check_facts, evaluation.checks)],
         # what is refused is no criterion of the values that go on
         acceptance=[line for line in acceptance.values() if line.ok or verdicts.status == "fail"],
-        fallbacks=[*verdicts.lines(), *fallen],
+        fallbacks=[*verdicts.lines(), *fallen, *([accuracy_line(accuracy)] if missed else [])],
         files={**files, NAMEPLATE: "", REQUEST: "", **{f"traces/{path.name}": "" for path in _trace_files(run)}},
         note="; ".join(value_verdict.warnings_of(evaluation, request)),
         summary="; ".join(filter(None, (summary, *(f"{name} refused" for name in verdicts.refused)))),

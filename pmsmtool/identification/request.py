@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.identification import accuracy
 from pmsmtool.machine.shaft import Brake, Load, Shaft
 
 QUANTITIES = ("R", "L", "psi", "encoder", "poles", "inverter", "mechanics")
@@ -56,6 +57,8 @@ class IdentifyRequest:
         What hangs on the shaft and may happen to it.
     half_frequency : bool
         Whether R and inverter are measured at half the control frequency, too.
+    accuracy : float or None
+        Statistical 95 % half width, relative, of R, L and psi at which the run stops collecting; None: all of it.
     map_if_saturated : bool
         Whether a machine that the run over speeds shows to saturate is mapped, too.
     tolerance : SensorTolerance
@@ -69,6 +72,7 @@ class IdentifyRequest:
     load: Load = "none"
     brake: Brake = "none"
     half_frequency: bool = False
+    accuracy: float | None = None
     map_if_saturated: bool = False
     tolerance: SensorTolerance = field(default_factory=SensorTolerance)
 
@@ -91,6 +95,11 @@ class IdentifyRequest:
             raise ConfigError(
                 "pole pairs alone do not measure R", hint="leave --half-frequency out, or identify R, too"
             )
+        if self.accuracy is not None and not set(self.quantities) & set(accuracy.KEYS):
+            raise ConfigError(
+                f"--accuracy is that of {', '.join(accuracy.KEYS)}, and none of them is asked for",
+                hint="leave --accuracy out, or identify one of them, too",
+            )
         turning = [name for name in self.quantities if name != "map" and set(NEEDS[name]) & {"rotation", "speeds"}]
         if turning and self.shaft == "locked":
             raise NotAvailable(
@@ -102,6 +111,8 @@ class IdentifyRequest:
 def dump_request(request: IdentifyRequest) -> str:
     """Return a request as JSON: what an estimate depends on besides traces and nameplate."""
     facts = asdict(request)
+    if request.accuracy is None:
+        del facts["accuracy"]  # a run without one keeps its bytes
     if math.isinf(request.tolerance.U_dc_v):
         del facts["tolerance"]["U_dc_v"]  # comes from the nameplate, and JSON has no infinity
     return json.dumps(facts, indent=1) + "\n"

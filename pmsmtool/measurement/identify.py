@@ -123,7 +123,8 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
     if "rotation" in steps:
         lines.append("the shaft turns slowly through one turn each way")
     if "speeds" in steps:
-        lines.append("the shaft is pushed both ways and coasts with current from four speeds in each direction")
+        speeds = "four" if request.accuracy is None else "two to four"
+        lines.append(f"the shaft is pushed both ways and coasts with current from {speeds} speeds in each direction")
     if "turns" in steps:
         lines.append("it coasts with current from three speeds in each direction once more, for harmonics")
     if "coasting" in steps:
@@ -214,6 +215,7 @@ def _measure(
             say,
             held=locked,
             half_frequency=request.half_frequency,
+            accuracy=request.accuracy,
             map_if_saturated=request.map_if_saturated,
         )
         measurement.spent = lambda: (guard.energised_s, guard.energy_j)

@@ -17,10 +17,11 @@ from typing import Any, TypeVar
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError, PmsmtoolError
 from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_encoder_counts, estimate_encoder
-from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
+from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phases
-from pmsmtool.estimators.prediction import check_prediction, line_of, predict
+from pmsmtool.estimators.prediction import Prediction, check_prediction, line_of, predict
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
 from pmsmtool.experiments.current_limit import NOT_SHOWN, LimitCurrent, require_limit, show_current_limit
@@ -30,7 +31,9 @@ from pmsmtool.experiments.vector_turn import RAMP_S
 from pmsmtool.identification.evaluate import flux_of, resistance_of, tolerance_on
 from pmsmtool.identification.predicted_file import entry
 from pmsmtool.identification.request import steps_of
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import flux_map, frequency_response, mechanics, shaft_forecast
+from pmsmtool.measurement.effort import ALL, Effort, LevelEffort, effort_for, larger_levels
 from pmsmtool.measurement.half_frequency import measure_at_half_frequency
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.shaft_forecast import ShaftForecast, forecast_of
@@ -40,11 +43,6 @@ from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.trace import Trace
 
 PHASE_CHECK_SHARE = 0.05
-LEVELS = 12
-LOWEST_LEVEL = 0.08
-"""Lowest DC level of the sweep, of the largest; the low ones serve the inverter curve."""
-CURVE_SHARES = (0.02, 0.04)
-"""Levels for the inverter curve alone: a speed run at small current lives there."""
 TURN_SHARES = (0.15, 0.35, 0.6)
 """Currents that turn the rotor over, of the test current: the first that the encoder shows. A load whose friction takes
 15 % of the rated torque keeps the rotor from following the first."""
@@ -106,6 +104,8 @@ class Measurement:
         Ripple of the injection, peak to peak, of the rated current.
     held : bool
         Whether the shaft is locked.
+    accuracy : float or None
+        Statistical 95 % half width, relative, of R, L and psi that is enough; None: all is collected.
     half_frequency : bool
         Whether R is measured at half the control frequency, too.
     map_if_saturated : bool
@@ -127,6 +127,7 @@ class Measurement:
     ripple_share: float = RIPPLE_SHARE
     held: bool = False
     half_frequency: bool = False
+    accuracy: float | None = None
     map_if_saturated: bool = False
     spent: Callable[[], tuple[float, float]] | None = None
     limit_current: LimitCurrent | None = None
@@ -134,6 +135,7 @@ class Measurement:
     turn_share: float = TURN_SHARES[0]
     refused: dict[str, IdentificationError] = field(default_factory=dict)
     _kept: dict[str, Trace] = field(default_factory=dict)
+    _effort: Effort = ALL
 
     def run(self, quantities: tuple[str, ...]) -> None:
         """Run what the quantities need; what is refused (:attr:`refused`) takes along only what depends on it.
@@ -178,16 +180,23 @@ class Measurement:
 
     def _driven(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> bool:
         """Run what needs the rotor's angle; whether the machine runs under control by what was found."""
-        square = SquareStage(self.drive, self.limits, self._keep_for_later, self.say, self.ripple_share)
+        shots = self._effort.shot_samples
+        square = SquareStage(self.drive, self.limits, self._keep_for_later, self.say, self.ripple_share, shots)
         inductances = (
             self._attempt("L", lambda: square.measure(noise, resistance, encoder)) if "square" in steps else None
         )
         self._tell_spent()
         if inductances is None or "speeds" not in steps:
             return False
-        speeds = SpeedStage(self.drive, self.limits, self._keep_for_later, self.say)
+        speeds = SpeedStage(self.drive, self.limits, self._keep_for_later, self.say, self._effort.speeds)
 
-        plan = self._attempt("psi", lambda: speeds.measure(resistance, encoder, inductances))
+        def enough() -> bool:
+            try:
+                return self._within(self._flux(resistance).psi_f)
+            except IdentificationError:
+                return False
+
+        plan = self._attempt("psi", lambda: speeds.measure(resistance, encoder, inductances, enough))
         ran = plan is not None
         if plan is not None and "turns" in steps:
             self._attempt("harmonics", lambda: speeds.record_harmonics(plan))
@@ -201,8 +210,7 @@ class Measurement:
         if resistance is None:
             return False
         try:
-            rough = float(self.drive.read("motor.alpha_psi_per_k"))
-            flux = flux_of(self._kept, resistance, self.drive.period_s, rough, self._tolerance())
+            flux = self._flux(resistance)
         except IdentificationError:
             return False  # the evaluation says so
         if abs(flux.curvature) < SATURATED:
@@ -212,6 +220,15 @@ class Measurement:
             "a flux map is measured"
         )
         return True
+
+    def _flux(self, resistance: ResistanceResult) -> FluxResult:
+        """Return what the speed run shows, with rough inductances and the drive's own temperature coefficient."""
+        rough = float(self.drive.read("motor.alpha_psi_per_k"))
+        return flux_of(self._kept, resistance, self.drive.period_s, rough, self._tolerance())
+
+    def _within(self, estimate: Estimate) -> bool:
+        """Whether a value is as accurate as was asked; always without that."""
+        return self.accuracy is None or statistical_half_width(estimate) <= self.accuracy * abs(estimate.value)
 
     def _attempt(self, quantity: str, measure: Callable[[], _Found]) -> _Found | None:
         """Measure; a refusal is kept and said, and the drive is off until the next experiment enables it."""
@@ -242,7 +259,9 @@ class Measurement:
 
             self._attempt(
                 "mechanics",
-                lambda: mechanics.measure_mechanics(self.drive, self.limits, self.keep, self.say, pushes),
+                lambda: mechanics.measure_mechanics(
+                    self.drive, self.limits, self.keep, self.say, pushes, self._effort.speeds.mechanics_rows
+                ),
             )
             self._tell_spent()
         if "slow" in steps:
@@ -303,16 +322,22 @@ class Measurement:
         limits = self.limits
         if "levels" not in steps:
             return
-        prediction = predict(
-            noise,
-            standstill.calm_sequence(self._magnitudes()),
-            standstill.LEVEL_WINDOW,
-            self.ripple_share * limits.I_test_apk,
-            2 * square_injection.SHOT_SAMPLES,
-            max(abs(z * i) for z, i in zip(phases.impedance_ohm, phases.currents_a, strict=True)),
-            EMF_SHARE * limits.V_max_v * speed_run.SHARES[1],
-            self._tolerance(),
-        )
+        dead_time_v = max(abs(z * i) for z, i in zip(phases.impedance_ohm, phases.currents_a, strict=True))
+
+        def predicted(effort: Effort) -> Prediction:
+            return predict(
+                noise,
+                standstill.calm_sequence(effort.levels.magnitudes(limits.I_test_apk)),
+                effort.levels.window,
+                self.ripple_share * limits.I_test_apk,
+                2 * effort.shot_samples,
+                dead_time_v,
+                EMF_SHARE * limits.V_max_v * speed_run.SHARES[1],
+                self._tolerance(),
+            )
+
+        self._effort = effort_for(self.accuracy, predicted)
+        prediction = predicted(self._effort)
         values = prediction.values(steps)
         self.say(line_of(values))
         later = shaft_forecast.later_line(steps)
@@ -322,14 +347,6 @@ class Measurement:
             entry("levels", values, later=[what for step, what in shaft_forecast.LATER.items() if step in steps])
         )
         check_prediction(values)
-
-    def _magnitudes(self) -> list[float]:
-        """DC levels that are held with both signs (A)."""
-        largest = self.limits.I_test_apk
-        ratio = (1.0 / LOWEST_LEVEL) ** (1.0 / (LEVELS - 1))
-        magnitudes = [largest * max(LOWEST_LEVEL, (k + 1) / LEVELS) for k in range(LEVELS)]
-        magnitudes[:2] = [largest * LOWEST_LEVEL, largest * LOWEST_LEVEL * ratio]
-        return sorted(set(magnitudes))
 
     def _phase_check(self, noise: Noise) -> PhaseCheck:
         i_a = PHASE_CHECK_SHARE * self.limits.I_test_apk
@@ -359,26 +376,46 @@ class Measurement:
         self.keep("first_turn", trace)
 
     def _levels(self, noise: Noise, start_rad: float) -> ResistanceResult:
-        largest = self.limits.I_test_apk
-        low = [largest * share for share in CURVE_SHARES]
-        plan = standstill.LevelPlan(
-            standstill.calm_sequence(self._magnitudes(), low),
-            turn_a=self.turn_share * largest,
-            start_rad=start_rad,
-        )
-        self.say(f"R and inverter: {len(plan.levels_a)} levels up to {largest:.3g} A")
-        trace = standstill.hold_levels(self.drive, plan)
+        """Hold levels; a sweep of less effort that is refused, or not as good as was asked, is followed by the next."""
+        efforts = (self._effort.levels, *larger_levels(self._effort.levels)[:1])
+        for effort in efforts:
+            plan = self._level_plan(effort, start_rad)
+            self.say(f"R and inverter: {len(plan.levels_a)} levels up to {self.limits.I_test_apk:.3g} A")
+            trace = standstill.hold_levels(self.drive, plan)
+            start_rad = plan.angle_rad  # the last level is positive
+            try:
+                resistance = resistance_of(trace, noise, tolerance=self._tolerance())
+                if effort is efforts[-1] or self._within(resistance.R_s):
+                    break
+            except IdentificationError:
+                self.keep("levels", trace)
+                if effort is efforts[-1] or trace["flagged"][-1] > 0.0:
+                    raise
+            self.say("  the accuracy asked for is not reached: more levels")
         self.keep("levels", trace)
         resistance = resistance_of(trace, noise)
         measure_at_half_frequency(self.drive, plan, resistance, self.half_frequency, self.keep, self.say)
         return resistance
+
+    def _level_plan(self, effort: LevelEffort, start_rad: float) -> standstill.LevelPlan:
+        largest = self.limits.I_test_apk
+        return standstill.LevelPlan(
+            standstill.calm_sequence(effort.magnitudes(largest), [largest * share for share in effort.low]),
+            turn_a=self.turn_share * largest,
+            start_rad=start_rad,
+            window_periods=effort.window,
+            settle_s=effort.settle_s,
+            drift=effort.drift,
+            turn_s=self._effort.turn_s,
+        )
 
     def _pairs(self, noise: Noise, resistance: ResistanceResult) -> None:
         """Compare the phases; current sensors that differ spoil every value, so that ends the run."""
         largest = self.limits.I_test_apk
         strongest = max(standstill.PAIR_SHARES) * largest
         self.say(f"pairs of phases: two currents up to {strongest:.3g} A through each")
-        pairs = standstill.hold_pairs(self.drive, largest, self.turn_share * largest, standstill.DC_ANGLE_RAD)
+        turn_a, turn_s = self.turn_share * largest, self._effort.turn_s
+        pairs = standstill.hold_pairs(self.drive, largest, turn_a, standstill.DC_ANGLE_RAD, turn_s)
         self.keep("phase_pairs", pairs)
         check_pairs(pairs, noise, resistance.curve)
 
@@ -389,7 +426,7 @@ class Measurement:
         serves: on the largest current a rotor with much reluctance rests beside the vector.
         """
         jumped: list[tuple[EncoderResult, tuple[Trace, Trace]]] = []
-        for share, step_rad, dwell_s, ramp_s in ROTATIONS:
+        for share, step_rad, dwell_s, ramp_s in (*self._effort.rotations, *ROTATIONS):
             step, dwell = rotation.step_within(step_rad, dwell_s, self.limits.omega_max_rad_s)
             plan = rotation.RotationPlan(share * self.limits.I_test_apk, step, dwell, ramp_s=ramp_s)
             self.say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")

@@ -55,16 +55,18 @@ def measure_mechanics(
     keep: Callable[[str, Trace], None],
     say: Callable[[str], None],
     planned: Callable[[MechanicsPlan], None] | None = None,
+    rows: int = mechanics_run.ROWS,
 ) -> None:
     """Run the steps; the drive holds current gains, flux linkage and rough inertia of the runs before.
 
-    ``planned`` is told the plan before anything of it moves the shaft.
+    ``planned`` is told the plan before anything of it moves the shaft; ``rows`` is the largest number per push.
     """
     pole_pairs = drive.read("motor.pole_pairs")
     psi, J, L_q = (drive.read(f"motor.{name}") for name in ("psi_f_wb", "J_kgm2", "L_q_h"))
     current = I_SHARE * limits.I_test_apk
     largest = min(limits.omega_max_rad_s, EMF_SHARE * limits.V_max_v / (pole_pairs * math.hypot(psi, L_q * current)))
     plan = mechanics_run.plan_mechanics(current, SPEED_SHARE * largest, J, torque_per_ampere(pole_pairs, psi))
+    plan = replace(plan, rows=rows)
     say(
         f"J, B, tau_c: pushes of {plan.i_q_a:.3g} A up to about {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm and "
         f"coasting with the voltage off, {plan.duration_s:.2g} s"

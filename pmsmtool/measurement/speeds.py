@@ -19,6 +19,7 @@ from pmsmtool.experiments.shaft_answer import FIRST_S, FIRST_SHARE
 from pmsmtool.experiments.speed_run import SpeedPlan
 from pmsmtool.identification.emf_harmonics import TRACE as EMF_TRACE
 from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.measurement.effort import ALL_SPEEDS, SpeedEffort
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.mechanics import numbered
 from pmsmtool.trace import Trace
@@ -31,7 +32,8 @@ RUN_BANDWIDTH_RAD_S = 2.0 * math.pi * 120.0
 more."""
 PUSH_SHARE = 0.5
 PUSH_SPEED_SHARE = 0.12
-PUSH_SAMPLES = 1024
+PUSH_TAIL = 16
+"""Last part of a push whose means count: one of so many."""
 PUSH_END_SHARE, SLOW_PUSH_SHARE = 0.9, 0.5
 """Speed at which the drive ends a push by itself, of the speed limit; the speed of one that would get there."""
 PUSH_REACHED = 0.4
@@ -72,17 +74,25 @@ def run_d_current(limits: Limits, L_h: tuple[float, float], period_s: float) -> 
 
 @dataclass(frozen=True, slots=True)
 class SpeedStage:
-    """The pushes and the flux run on one drive; the fields are those of ``measure.Measurement``."""
+    """The pushes and the flux run on one drive: how much is collected, and the fields of ``measure.Measurement``."""
 
     drive: Drive
     limits: Limits
     keep: Callable[[str, Trace], None]
     say: Callable[[str], None]
+    effort: SpeedEffort = ALL_SPEEDS
 
-    def measure(self, resistance: ResistanceResult, encoder: EncoderResult, L: tuple[float, float]) -> SpeedPlan:
+    def measure(
+        self,
+        resistance: ResistanceResult,
+        encoder: EncoderResult,
+        L: tuple[float, float],
+        enough: Callable[[], bool] = lambda: True,
+    ) -> SpeedPlan:
         """Push the shaft, then coast with current through the speeds, under control by what was found so far.
 
-        Returns what was held at which speeds.
+        Returns what was held at which speeds. Where what was kept is not ``enough``, the coasting is repeated with all
+        of the effort.
         """
         pole_pairs = round(encoder.pole_pairs.value)
         alpha = min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s))
@@ -102,7 +112,11 @@ class SpeedStage:
         )
         self.drive.enable()
         psi, J = self._pushes(resistance, pole_pairs)
-        return self._speeds(psi, J, pole_pairs, L, resistance.V_dead_v)
+        plan = self._speeds(psi, J, pole_pairs, L, resistance.V_dead_v)
+        if self.effort == ALL_SPEEDS or enough():
+            return plan
+        self.say("  the accuracy asked for is not reached: all speeds")
+        return replace(self, effort=ALL_SPEEDS)._speeds(psi, J, pole_pairs, L, resistance.V_dead_v)
 
     def record_harmonics(self, plan: SpeedPlan) -> None:
         """Record voltages and currents over turns at the speeds of the flux run, whose gains the drive holds."""
@@ -120,19 +134,19 @@ class SpeedStage:
 
     def _pushes(self, resistance: ResistanceResult, pole_pairs: int) -> tuple[float, float]:
         """Push the rotor there and back; return flux linkage (Wb) and inertia (kg m2), good for a speed controller."""
-        limits = self.limits
+        limits, samples = self.limits, self.effort.push_samples
         self.say("flux and inertia, roughly: short pushes both ways")
         target = PUSH_SPEED_SHARE * limits.omega_max_rad_s
         rate = self._acceleration_per_ampere(target, pole_pairs)
         current = PUSH_SHARE * limits.I_test_apk
-        decimation = max(1, round(target / (rate * current) / (PUSH_SAMPLES * self.drive.period_s)))
-        reached = rate * current * PUSH_SAMPLES * decimation * self.drive.period_s
+        decimation = max(1, round(target / (rate * current) / (samples * self.drive.period_s)))
+        reached = rate * current * samples * decimation * self.drive.period_s
         if reached > PUSH_END_SHARE * limits.omega_max_rad_s:  # within the shortest record
             current *= SLOW_PUSH_SHARE * limits.omega_max_rad_s / reached
             reached = SLOW_PUSH_SHARE * limits.omega_max_rad_s
-        tail = slice(-64, None)
+        tail = slice(-(samples // PUSH_TAIL), None)
         for _ in range(PUSH_TRIES):
-            pushes = [self._push(sign * current, PUSH_SAMPLES, decimation, pole_pairs) for sign in (1.0, -1.0)]
+            pushes = [self._push(sign * current, samples, decimation, pole_pairs) for sign in (1.0, -1.0)]
             fastest = max(pushes, key=lambda trace: float(abs(trace["omega_e_rad_s"][tail].mean())))
             omega = float(fastest["omega_e_rad_s"][tail].mean())
             if abs(omega) >= PUSH_REACHED * reached * pole_pairs:
@@ -193,7 +207,7 @@ class SpeedStage:
             self.drive.read("motor.R_s_ohm"),
             L,
             V_dead_v,
-            min(map(min, speed_run.D_SHARES)) * run_i_d,
+            min(map(min, self.effort.d_shares)) * run_i_d,
             self.drive.period_s,
             min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s)),
         )
@@ -224,6 +238,9 @@ class SpeedStage:
             first_s=2.0 * loop.settle_s,
             per_ampere_rad_s2=per_ampere,
             acceleration_rad_s2=per_ampere * i_run,
+            shares=self.effort.shares,
+            d_shares=self.effort.d_shares,
+            q_at=self.effort.q_at,
         )
         rows = speed_run.coast_through(self.drive, plan, pole_pairs)
         speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)

@@ -68,13 +68,14 @@ def bias_and_ripple(I_test_apk: float, ripple_share: float, knee_a: float) -> tu
 
 @dataclass(frozen=True, slots=True)
 class SquareStage:
-    """The shots on one drive; the fields are those of ``measure.Measurement``."""
+    """The shots on one drive, of so many samples; the other fields are those of ``measure.Measurement``."""
 
     drive: Drive
     limits: Limits
     keep: Callable[[str, Trace], None]
     say: Callable[[str], None]
     ripple_share: float
+    samples: int = square_injection.SHOT_SAMPLES
 
     def measure(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult) -> tuple[float, float]:
         """Record the shots; return rough inductances (H) from ripple and voltage, enough for a current controller."""
@@ -91,7 +92,7 @@ class SquareStage:
         self.drive.enable()
         knee = resistance.curve.knee_a(max(0.0, resistance.V_dead_v))
         bias, ripple = bias_and_ripple(limits.I_test_apk, self.ripple_share, knee)
-        plan = square_injection.SquarePlan(bias_d_a=bias, ripple_a=ripple, u_max_v=U_SHARE * limits.V_max_v)
+        plan = square_injection.SquarePlan(bias, ripple, U_SHARE * limits.V_max_v, samples=self.samples)
         plan = self._hold_stable_bias(plan, encoder, knee, noise)
         rough: list[float] = []
         first_v = None

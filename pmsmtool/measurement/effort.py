@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: MIT
+"""How much is collected for an accuracy that was asked for: levels, windows, shots and speeds, by what they predict.
+
+Without one everything is collected. The short lists begin with what the estimators need at least: both signs and five
+levels above their least one, two half periods, five pairs of d currents over two speeds in each direction, three of
+them with the largest, which show the sampling instant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR
+from pmsmtool.estimators.prediction import Prediction
+from pmsmtool.experiments import mechanics_run, rotation, speed_run, square_injection, standstill, vector_turn
+
+Rotation = tuple[float, float, float, float]
+
+LEVELS = 12
+LOWEST_LEVEL = 0.08
+"""Lowest DC level of the sweep, of the largest; the low ones serve the inverter curve."""
+
+
+@dataclass(frozen=True, slots=True)
+class LevelEffort:
+    """DC levels and how they are held.
+
+    Attributes
+    ----------
+    shares : tuple of float or None
+        Of the largest; None: :data:`LEVELS` of them.
+    low : tuple of float
+        Those for the inverter curve alone: a speed run at small current lives there.
+    window, drift, settle_s
+        As ``standstill.LevelPlan``.
+    """
+
+    shares: tuple[float, ...] | None = None
+    low: tuple[float, ...] = (0.02, 0.04)
+    window: int = standstill.LEVEL_WINDOW
+    drift: float = standstill.DRIFTED
+    settle_s: float = 0.06
+
+    def magnitudes(self, largest_a: float) -> list[float]:
+        """Return the currents that are held with both signs (A), rising."""
+        if self.shares is not None:
+            return [largest_a * share for share in self.shares]
+        ratio = (1.0 / LOWEST_LEVEL) ** (1.0 / (LEVELS - 1))
+        magnitudes = [largest_a * max(LOWEST_LEVEL, (k + 1) / LEVELS) for k in range(LEVELS)]
+        magnitudes[:2] = [largest_a * LOWEST_LEVEL, largest_a * LOWEST_LEVEL * ratio]
+        return sorted(set(magnitudes))
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedEffort:
+    """Speeds and d currents of the flux run (``speed_run.SpeedPlan``), and rows of the pushes before and after it."""
+
+    shares: tuple[float, ...] = speed_run.SHARES
+    d_shares: tuple[tuple[float, ...], ...] = speed_run.D_SHARES
+    q_at: tuple[int, ...] = speed_run.Q_AT
+    push_samples: int = 1024
+    mechanics_rows: int = mechanics_run.ROWS
+
+
+ALL_SPEEDS = SpeedEffort()
+ALL_LEVELS = LevelEffort()
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """What is collected; the default is all of it. ``rotations`` are tried before the usual slow turns."""
+
+    levels: LevelEffort = ALL_LEVELS
+    turn_s: float = vector_turn.TURN_S
+    rotations: tuple[Rotation, ...] = ()
+    shot_samples: int = square_injection.SHOT_SAMPLES
+    speeds: SpeedEffort = ALL_SPEEDS
+
+
+ALL = Effort()
+LEVEL_EFFORTS = (
+    LevelEffort((0.08, 0.16, 0.3, 0.42, 0.6, 0.8, 1.0), (0.03,), 400, 4.0 * standstill.DRIFTED, 0.03),
+    LevelEffort((0.08, 0.12, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0), (0.02, 0.04), 800, 2.0 * standstill.DRIFTED),
+    ALL_LEVELS,
+)
+SHOT_EFFORTS = (512, 1024, square_injection.SHOT_SAMPLES)
+SPEED_EFFORTS = (
+    SpeedEffort((0.42, 0.85), ((1.0, 1.0), (1.0 / 3.0, 2.0 / 3.0, 1.0)), (0,), push_samples=256, mechanics_rows=800),
+    ALL_SPEEDS,
+)
+QUICK_TURN_S = 0.4
+QUICK_ROTATION: Rotation = (0.35, math.radians(30.0), rotation.QUICK_DWELL_S, 0.35)
+"""Current, step, dwell and ramp of a slow turn that is tried first (``measure.ROTATIONS``): what swings with it takes
+those. It serves pole pairs and direction; the offset comes from the speed run."""
+R_MISFIT, L_MISFIT, PSI_MISFIT = 1.5, 1.5, 1.5
+"""Half width that is found at the least effort, of the predicted one: it has the model's misfit, too."""
+
+
+def effort_for(accuracy: float | None, predicted: Callable[[Effort], Prediction]) -> Effort:
+    """Return the least effort whose predicted 95 % half widths are within an accuracy (1); all without one.
+
+    Each experiment is chosen by itself; one that would miss it with all of its effort gets all of it.
+    """
+    if accuracy is None:
+        return ALL
+
+    def enough(std: float, misfit: float) -> bool:
+        return misfit * COVERAGE_FACTOR * std <= accuracy
+
+    levels = next(
+        (one for one in LEVEL_EFFORTS if enough(predicted(Effort(levels=one)).R_s, R_MISFIT)), LEVEL_EFFORTS[-1]
+    )
+    shots = next(
+        (one for one in SHOT_EFFORTS if enough(predicted(Effort(shot_samples=one)).L, L_MISFIT)), SHOT_EFFORTS[-1]
+    )
+    speeds = SPEED_EFFORTS[0 if enough(predicted(ALL).psi_f, PSI_MISFIT) else -1]
+    return Effort(levels, QUICK_TURN_S, (QUICK_ROTATION,), shots, speeds)
+
+
+def larger_levels(effort: LevelEffort) -> tuple[LevelEffort, ...]:
+    """Return the next larger efforts of the levels."""
+    return LEVEL_EFFORTS[LEVEL_EFFORTS.index(effort) + 1 :]
