@@ -186,6 +186,7 @@ def _asked(
     wanted = IdentifyRequest(
         quantities=(*QUANTITIES, "map") if flux_map else QUANTITIES,
         map_if_saturated=not flux_map,
+        resonance=True,
         i_max_apk=motion.i_max_apk,
         speed_max_rad_s=motion.speed_max_rad_s,
         shaft=motion.shaft or "free",

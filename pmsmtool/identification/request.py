@@ -61,6 +61,9 @@ class IdentifyRequest:
         Statistical 95 % half width, relative, of R, L and psi at which the run stops collecting; None: all of it.
     map_if_saturated : bool
         Whether a machine that the run over speeds shows to saturate is mapped, too.
+    resonance : bool
+        Whether the shaft's frequency response is measured without being judged: an elastic shaft decides the speed
+        loop, and nothing else shows it.
     tolerance : SensorTolerance
         Declared sensor tolerances.
     """
@@ -74,7 +77,13 @@ class IdentifyRequest:
     half_frequency: bool = False
     accuracy: float | None = None
     map_if_saturated: bool = False
+    resonance: bool = False
     tolerance: SensorTolerance = field(default_factory=SensorTolerance)
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Quantities whose experiments are run."""
+        return (*self.quantities, "frf") if self.resonance and self.shaft != "locked" else self.quantities
 
     def check(self) -> None:
         """Refuse what cannot be asked.

@@ -115,7 +115,7 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
 
 def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineFile) -> list[str]:
     """Return what a person reads before consenting: the envelope and what will happen inside it."""
-    steps = steps_of(request.quantities, request.shaft == "locked")
+    steps = steps_of(request.measured, request.shaft == "locked")
     allowed = [*envelope.lines(), *unused_current(envelope.i_max_apk, nameplate, pulses="map" in steps)]
     lines = [*allowed, f"the rotor aligns with current vectors: it may jump by half an electrical turn; {HOMING_LOST}"]
     if request.half_frequency:
@@ -163,7 +163,7 @@ def identify_stage(
     request.check()
     envelope = envelope_of(nameplate, request)
     envelope.refuse_gravity()
-    steps = steps_of(request.quantities, request.shaft == "locked")
+    steps = steps_of(request.measured, request.shaft == "locked")
     if "speeds" in steps:
         require_speed(envelope.speed_max_rad_s, nameplate.machine.n_max_rpm or 0.0)
     if "rotation" in steps:
@@ -228,7 +228,7 @@ def _measure(
 
         measurement.predicted = predicted
         try:
-            measurement.run(request.quantities)
+            measurement.run(request.measured)
         finally:
             if measurement.refused:
                 run.save(REFUSED, dump_refused(measurement.refused))

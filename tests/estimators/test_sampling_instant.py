@@ -11,8 +11,11 @@ from hypothesis import strategies as st
 
 from pmsmtool.estimators.injection.output_error import AxisModel, Pulses, respond
 from pmsmtool.estimators.injection.sampling_instant import (
+    INSTANTS,
+    LAGS,
     CoastingPairs,
     Sampling,
+    ShownInstant,
     course_s2,
     sampled_ripple,
     shown_instant,
@@ -175,3 +178,13 @@ def test_too_few_pairs_show_nothing() -> None:
     rows = _run(0.0, 0.0)
     few = CoastingPairs(rows.w, rows.u_d, rows.i_d, rows.i_q, rows.v_d, rows.v_q, list(rows.pairs)[:4])
     assert shown_instant(few, 0.4, 0.1, MODULATION, 1.0) is None
+
+
+def test_just_beyond_the_grid_the_distance_goes_on() -> None:
+    """A sample older than the grid knows: without a slope there L came out 50 % wide (encoder age 1 us of 34)."""
+    table = np.tile(np.array(INSTANTS)[:, None] * T_S, (1, len(LAGS)))
+    shown = ShownInstant(0.0, 0.01 * T_S, T_S, 0.0, 1.0, table)
+    for delay in (1.05, 0.9, 0.8):
+        assert shown.distance(delay, 0.0) == pytest.approx((1.0 - delay) / 0.01)
+    late = [shown.distance(delay, 0.0) for delay in (1.0601, 1.0701, 1.3, 3.0)]
+    assert late[1] - late[0] < -0.5 and late[2] > -9.0 and late[3] > -9.0, "what lies far outside is no instant"

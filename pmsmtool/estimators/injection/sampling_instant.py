@@ -165,9 +165,14 @@ class ShownInstant:
 
 
 def _place(grid: tuple[float, ...], value: float) -> tuple[int, float]:
-    """Interval of a grid and the place in it, 0 to 1; beyond an end, of the last interval."""
+    """Interval of a grid and the place in it, 0 to 1; beyond an end it nears one more interval.
+
+    What lies far outside is no instant, but at the end itself a change must still be seen, or it decides nothing.
+    """
     k = min(max(bisect.bisect_right(grid, value) - 1, 0), len(grid) - 2)
-    return k, (value - grid[k]) / (grid[k + 1] - grid[k])
+    x = (value - grid[k]) / (grid[k + 1] - grid[k])
+    inside = min(max(x, 0.0), 1.0)
+    return k, inside + (x - inside) / (1.0 + abs(x - inside))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
