@@ -1,11 +1,23 @@
 # SPDX-License-Identifier: MIT
 """Machine time of ``identify`` on random drives, without and with ``--accuracy``; one process.
 
-    nice -n 5 python -m benchmarks.machine_time --drives 12 --first 880100
+    nice -n 5 python -m benchmarks.machine_time --drives 12 --first 880211
 
 Machine time is that of the bus clock from consent to the restored drive, all default quantities. Printed per accuracy:
 median and largest time, errors, how often the total 95 % interval holds the truth, the statistical half widths, how
 often the accuracy was said to be reached, and the half width that was found over the one that was predicted.
+
+Of these 12 drives (block timing), seconds of machine time, relative errors and statistical 95 % half widths in percent,
+the largest of the drives; R at the temperature of the measurement:
+
+    asked     median  largest   error: R    L     psi    half width: R    L     psi   truth in total 95 %
+    nothing    45.6    50.2        0.11   0.08   0.12           0.30   0.25   0.32    60 of 60
+    0.03       31.1    34.0        0.16   0.13   0.13           0.45   0.36   0.32    60 of 60
+    0.01       31.1    34.0        0.16   0.13   0.13           0.45   0.36   0.32    60 of 60
+
+Both shares get the least effort, which leaves twice the accuracy of 1 %. What is left is no matter of how much is
+collected. Of 29.4 s of ``interior-2k2``: dead-man and noise 1.5, phases and current limit 2.8, first turn 1.2,
+levels 4.3, pairs of phases 1.9, slow turn 4.3, square waves 2.7, pushes 2.0, speeds 6, mechanics 3.
 """
 
 from __future__ import annotations
@@ -113,7 +125,7 @@ def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--drives", type=int, default=12, help="number of drives")
-    parser.add_argument("--first", type=int, default=880100, help="first seed")
+    parser.add_argument("--first", type=int, default=880211, help="first seed")
     parser.add_argument("--block", choices=["ideal", "timing", "gains"], default="timing")
     parser.add_argument("--accuracy", type=float, nargs="*", default=[0.0, 0.03, 0.01], help="0: without")
     parser.add_argument("--rows", action="store_true", help="one JSON line per identification, too")

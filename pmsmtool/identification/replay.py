@@ -100,9 +100,11 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         values=[*facts, *map(value_verdict.check_facts, evaluation.checks)],
         # what is refused is no criterion of the values that go on
         acceptance=[line for line in acceptance.values() if line.ok or verdicts.status == "fail"],
-        fallbacks=[*verdicts.lines(), *fallen, *([accuracy_line(accuracy)] if missed else [])],
+        fallbacks=[*verdicts.lines(), *fallen],
         files={**files, NAMEPLATE: "", REQUEST: "", **{f"traces/{path.name}": "" for path in _trace_files(run)}},
-        note="; ".join(value_verdict.warnings_of(evaluation, request)),
+        note="; ".join(
+            [*([accuracy_line(accuracy)] if missed else []), *value_verdict.warnings_of(evaluation, request)]
+        ),
         summary="; ".join(filter(None, (summary, *(f"{name} refused" for name in verdicts.refused)))),
         refused=dict(verdicts.refused),
     )

@@ -383,19 +383,21 @@ class Measurement:
             self.say(f"R and inverter: {len(plan.levels_a)} levels up to {self.limits.I_test_apk:.3g} A")
             trace = standstill.hold_levels(self.drive, plan)
             start_rad = plan.angle_rad  # the last level is positive
-            try:
-                resistance = resistance_of(trace, noise, tolerance=self._tolerance())
-                if effort is efforts[-1] or self._within(resistance.R_s):
-                    break
-            except IdentificationError:
-                self.keep("levels", trace)
-                if effort is efforts[-1] or trace["flagged"][-1] > 0.0:
-                    raise
+            self.keep("levels", trace)
+            if effort is efforts[-1] or self._enough_levels(trace, noise):
+                break
             self.say("  the accuracy asked for is not reached: more levels")
-        self.keep("levels", trace)
         resistance = resistance_of(trace, noise)
         measure_at_half_frequency(self.drive, plan, resistance, self.half_frequency, self.keep, self.say)
         return resistance
+
+    def _enough_levels(self, trace: Trace, noise: Noise) -> bool:
+        if trace["flagged"][-1] > 0.0:
+            return True  # the estimator refuses it; nothing is held once more
+        try:
+            return self._within(resistance_of(trace, noise, tolerance=self._tolerance()).R_s)
+        except IdentificationError:
+            return False
 
     def _level_plan(self, effort: LevelEffort, start_rad: float) -> standstill.LevelPlan:
         largest = self.limits.I_test_apk
