@@ -57,7 +57,7 @@ class VoltageError:
 
 LINE_SHARE = 0.2
 """Part of a residual's power that a sine must be to be taken out: 4 % of ripple on a DC link is 0.8 of it."""
-LINE_APART, LINE_FINER = 3.0, 16
+LINE_APART, LINE_FINER = 1.5, 16
 """Distance from the injection's harmonics, in the record's own resolution, and steps of the search in one of those."""
 
 
