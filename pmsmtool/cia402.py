@@ -153,6 +153,15 @@ ERROR_TEXTS: dict[int, str] = {
 """Error codes of object 0x603F and of emergency messages (CiA 301 table 26, CiA 402-2)."""
 
 
+ERROR_CAUSES: dict[int, str] = {
+    0x2350: "more current, or for longer, than the winding is said to stand",
+    0x3210: "the shaft was braked and nothing takes its energy: no chopper, or a supply that cannot sink",
+    0x3220: "the supply is in current limit, or weaker than the drive asks for",
+    0x4310: "the winding is still warm from what ran before: let it cool, then go on",
+}
+"""Likely cause of some of them."""
+
+
 def state_of(statusword: int) -> State | None:
     """Return the state a statusword shows, None for a pattern the standard does not define."""
     short = statusword & _MASK_SHORT

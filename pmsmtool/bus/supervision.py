@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.nmt import HEARTBEAT_ID, NMT_ID, TOOL_NODE, NmtState
-from pmsmtool.cia402 import error_text
+from pmsmtool.cia402 import ERROR_CAUSES, error_text
 from pmsmtool.errors import BusError, DriveFault
 
 HEARTBEAT_TOLERANCE = 2.5
@@ -209,8 +209,9 @@ class Supervision:
         for emergency in fresh:
             if self.stop_at_emergency and emergency.code >> 12 in STOPPING_CLASSES:
                 raise DriveFault(
-                    str(emergency), where=f"node {self.node}", hint=f"`pmsmtool fault show -n {self.node}`"
-                )
+                    str(emergency), where=f"node {self.node}", likely=ERROR_CAUSES.get(emergency.code, ""),
+                    hint=f"`pmsmtool fault show -n {self.node}`",
+                )  # fmt: skip
 
     def _check_heartbeat(self) -> None:
         if self._overdue() and not self._connection.in_callback():

@@ -12,7 +12,15 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.nmt import NmtCommand, NmtState, reset_node, send_nmt
 from pmsmtool.bus.sdo import Retry, SdoChannel
 from pmsmtool.bus.supervision import Supervision
-from pmsmtool.cia402 import EXCITATION_ABORTED, Command, State, command_towards_enabled, error_text, state_of
+from pmsmtool.cia402 import (
+    ERROR_CAUSES,
+    EXCITATION_ABORTED,
+    Command,
+    State,
+    command_towards_enabled,
+    error_text,
+    state_of,
+)
 from pmsmtool.drive import objects
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Identity
@@ -234,7 +242,7 @@ class DriveNode:
         return DriveFault(
             f"the drive is in fault {code:#06x}: {error_text(code)}",
             where=f"node {self.node}, 0x603F:00",
-            likely="current or speed left the limits of the envelope" if aborted else "",
+            likely="current or speed left the limits of the envelope" if aborted else ERROR_CAUSES.get(code, ""),
             hint=f"{cause}, then `pmsmtool fault reset -n {self.node}`",
         )
 

@@ -94,11 +94,12 @@ def measure_cogging(
 
 
 def _come_to_rest(drive: Drive, reached_rad_s: float) -> None:
-    """Stop the shaft by the speed controller; the speed is electrical."""
+    """Stop the shaft by the speed controller, from the speed it has or that of the pushes (electrical)."""
+    from_rad_s = max(reached_rad_s, abs(drive.live("omega_e_rad_s")))
     drive.command_speed(0.0)
     band = REST_SHARE * reached_rad_s
     rate = rad_s_from_rpm(drive.read("speed.acceleration_rpm_per_s")) * drive.read("motor.pole_pairs")
-    ramp_s = min(speed_run.RAMP_MOST_S, speed_run.RAMP_DOUBT * reached_rad_s / rate) if rate > 0.0 else 0.0
+    ramp_s = min(speed_run.RAMP_MOST_S, speed_run.RAMP_DOUBT * from_rad_s / rate) if rate > 0.0 else 0.0
     waited = speed_run.reach(drive, 0.0, limit_s=speed_run.REACH_LIMIT_S + ramp_s, band_rad_s=band)
     if waited >= speed_run.REACH_LIMIT_S + ramp_s:
         raise refuse(

@@ -107,8 +107,9 @@ def test_emergency_of_a_stopping_class(
 ) -> None:
     bus.deliver(0x080 + NODE, code.to_bytes(2, "little") + b"\x03\x01\x02\x03\x04\x05")
     connection.collect()
-    with pytest.raises(DriveFault, match=f"{code:#06x}"):
+    with pytest.raises(DriveFault, match=f"{code:#06x}") as caught:
         supervision.check()
+    assert ("let it cool" in caught.value.likely) is (code == 0x4310)
     supervision.check()  # told once
 
 

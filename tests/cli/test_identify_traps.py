@@ -101,8 +101,8 @@ TRAPS: dict[str, tuple[str, Spoil, str]] = {
     ),
     "rotor leaves the turning vector": (
         "rotation_forward",
-        lambda t: {"theta_M_rad": t["theta_M_rad"] + 0.4 * np.sin(6.0 * t["theta_imposed_rad"])},
-        "E_ROTOR_MOVED",
+        lambda t: {"theta_M_rad": t["theta_M_rad"] + 0.6 * np.sin(6.0 * t["theta_imposed_rad"])},
+        "E_POLE_PAIRS",
     ),
     "one direction only": ("speeds", one_way, "E_EXCITATION"),
     "shaft is braked while it coasts": ("speeds", lambda t: slower(t, 0.5), "E_NOT_SETTLED"),

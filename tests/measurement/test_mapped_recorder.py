@@ -55,6 +55,8 @@ def completed(*without: str, identity: str = IDENTITY) -> str:
         if name not in without
     )
     text = dump_drive_map(load_family("copley")).replace("[left_out]", rows + "[left_out]")
+    if identity != IDENTITY:  # another maker's: Copley's name and marks do not tell it
+        text = re.sub(r"^\[identity\]\n.*?(?=^\[capabilities\])", "", text, flags=re.MULTILINE | re.DOTALL)
     return re.sub(r"^vendor = .*\nproduct = .*\n", identity, text, count=1, flags=re.MULTILINE)
 
 
