@@ -14,8 +14,7 @@ from pmsmtool.experiments.shaft_answer import FIRST_S, ShaftAnswer
 from pmsmtool.experiments.standstill import ARRIVAL_LIMIT_S
 
 LimitCurrent = Callable[[float], float | None]
-"""Sets the drive's own limit (A peak), at most to the envelope's, and returns what it keeps; None where it takes none.
-"""
+"""Sets the drive's own limit (A peak), at most to the envelope's; returns what it keeps, None where it takes none."""
 ASKED, OVER = 0.15, 1.5
 """Current that is asked for, of the rated one, and how many times the limit it is."""
 MOST = 1.1
@@ -51,12 +50,22 @@ class LimitShown:
         shown = f"asked for {self.asked_a:.3g} A, limit {self.kept_a:.3g} A, the drive gave at most {self.seen_a:.3g} A"
         if not self.acts:
             return f"the drive does not keep its own current limit: {shown}"
-        if self.seen_a < LEAST * self.kept_a:
-            return f"current limit not proven: {shown}"
-        return f"current limit proven: {shown}"
+        return f"current limit {'proven' if self.proven else 'not proven'}: {shown}"
+
+    @property
+    def proven(self) -> bool:
+        """Whether the limit was reached, and no more flowed."""
+        return self.acts and self.seen_a >= LEAST * self.kept_a
 
 
 NOT_SHOWN = "current limit not proven: the drive has none that can be lowered; every command is bounded here"
+
+
+def unproven(shown: LimitShown | None) -> str:
+    """Return what a report says of a limit that was not proven, empty where it was."""
+    if shown is None:
+        return NOT_SHOWN
+    return "" if shown.proven else f"{shown}; every command is bounded here, and this program looks"
 
 
 def show_current_limit(

@@ -92,4 +92,9 @@ def save_response(run: RunDirectory, result: FrequencyResponse | None) -> dict[s
 
 def response_summary(result: FrequencyResponse | None) -> str:
     """Return what a person reads of the response behind the other values."""
-    return "" if result is None else f"; frequency response: {result.reason}"
+    return "" if result is None else f"; frequency response: {result.reason.partition(':')[0]}"
+
+
+def response_note(result: FrequencyResponse | None) -> str:
+    """Return why no resonance is claimed, and which one would have been seen; empty where there is one."""
+    return "" if result is None or result.found else f"frequency response: {result.reason}"

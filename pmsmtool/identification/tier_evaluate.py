@@ -103,6 +103,8 @@ class TierFacts:
         Names of the traces in the order they were taken.
     current_undecided : bool
         Whether no source says if the drive's amperes are peak or rms; they were read as rms.
+    limit : str
+        What is said of a current limit that was not proven.
     """
 
     kind: Literal["recorder", "standard"]
@@ -117,6 +119,7 @@ class TierFacts:
     source: str = ""
     traces: tuple[str, ...] = ()
     current_undecided: bool = False
+    limit: str = ""
 
 
 def tier_result(
@@ -324,7 +327,9 @@ def evaluated_stage(
         place, prefix = place_of(run, text)
         place.save(MACHINE, text)
         files[f"{prefix}{MACHINE}"] = ""
-    return replace(stage_of(result.estimates, result.missing, made, judgement, facts.source), files=files)
+    stage = stage_of(result.estimates, result.missing, made, judgement, facts.source)
+    fallbacks = [*stage.fallbacks, facts.limit] if facts.limit else stage.fallbacks
+    return replace(stage, files=files, fallbacks=fallbacks)
 
 
 def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibration: Sequence[str] = ()) -> Stage:

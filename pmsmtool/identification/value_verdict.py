@@ -123,6 +123,8 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
         lines.append(f"L: {'depends on frequency on ' + dependent if dependent else 'chi-square above its limit'}")
     if evaluation.flux_map is not None:
         lines += evaluation.flux_map.notes
+    if "frf" in request.quantities:
+        lines += filter(None, [frequency_response.response_note(evaluation.frequency_response)])
     return lines
 
 

@@ -182,7 +182,7 @@ def identify_stage(
     clock = drive.node.connection.clock
     start = clock.now()
     try:
-        _measure(run, drive, envelope, limits, request, say)
+        unproven = _measure(run, drive, envelope, limits, request, say)
     except (DriveFault, IdentificationError, SafetyRefusal) as error:
         # what was measured before is not lost: it is evaluated and recorded, and the run ends as it did
         with contextlib.suppress(PmsmtoolError):
@@ -190,7 +190,8 @@ def identify_stage(
             run.add(replace(kept, status=status_of(error), note=text_of(error), seconds=clock.now() - start))
         raise
     stage = evaluated_stage(run, nameplate, request)
-    return replace(stage, seconds=clock.now() - start)
+    fallbacks = [*stage.fallbacks, unproven] if unproven else stage.fallbacks
+    return replace(stage, seconds=clock.now() - start, fallbacks=fallbacks)
 
 
 def _measure(
@@ -200,8 +201,11 @@ def _measure(
     limits: Limits,
     request: IdentifyRequest,
     say: Callable[[str], None],
-) -> None:
-    """Run the experiments inside the guard; traces, predictions and refusals go into the run."""
+) -> str:
+    """Run the experiments inside the guard; traces, predictions and refusals go into the run.
+
+    Returns what a report says of a current limit that was not proven.
+    """
 
     def keep(name: str, trace: Trace) -> None:
         run.save(f"traces/{name}.npz", trace_npz(trace))
@@ -232,3 +236,4 @@ def _measure(
         finally:
             if measurement.refused:
                 run.save(REFUSED, dump_refused(measurement.refused))
+    return measurement.unproven

@@ -24,7 +24,7 @@ from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phase
 from pmsmtool.estimators.prediction import Prediction, check_prediction, line_of, predict
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
-from pmsmtool.experiments.current_limit import NOT_SHOWN, LimitCurrent, require_limit, show_current_limit
+from pmsmtool.experiments.current_limit import NOT_SHOWN, LimitCurrent, require_limit, show_current_limit, unproven
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.experiments.vector_turn import RAMP_S
@@ -116,6 +116,8 @@ class Measurement:
         Current that turns the rotor over, of the test current; more where it did not follow.
     limit_current : callable or None
         Sets the drive's own current limit (A peak) and returns what it keeps; with it the limit is shown to act.
+    unproven : str
+        What a report says of a current limit that could not be shown to act.
     predicted : callable or None
         Told every prediction (``identification/predicted_file``) before the machine moves for it.
     """
@@ -133,6 +135,7 @@ class Measurement:
     limit_current: LimitCurrent | None = None
     predicted: Callable[[dict[str, Any]], None] | None = None
     turn_share: float = TURN_SHARES[0]
+    unproven: str = ""
     refused: dict[str, IdentificationError] = field(default_factory=dict)
     _kept: dict[str, Trace] = field(default_factory=dict)
     _effort: Effort = ALL
@@ -360,6 +363,7 @@ class Measurement:
             shown = show_current_limit(self.drive, self.limit_current, limits.I_nom_apk, limits.i_max_apk, angle)
             self.say(f"  {shown or NOT_SHOWN}")
             require_limit(shown)
+            self.unproven = unproven(shown)
         return found
 
     def _encoder_counts(self, start_rad: float, end_rad: float) -> None:

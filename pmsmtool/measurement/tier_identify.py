@@ -25,7 +25,7 @@ from pmsmtool.drive.tier_drives import SpeedPushDrive, TorqueDrive, pushing_driv
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.experiments.current_limit import NOT_SHOWN, LimitShown, require_limit, show_torque_limit
+from pmsmtool.experiments.current_limit import LimitShown, require_limit, show_torque_limit, unproven
 from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, push_both_ways, run_to_voltage
 from pmsmtool.experiments.recorded_push import PushPlan, swing
 from pmsmtool.experiments.rotation import STEP_RAD, RotationPlan, dwell_within, rotate_vector
@@ -159,13 +159,14 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say 
     shows_voltage = all(name in drive.node.map.signals for name in ("u_d_v", "u_q_v"))
     U_dc = _link_v(drive)
     drive.top_rad_s = ASKED_SHARE * largest
+    limit: list[str] = []
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
         say(f"J/psi, tau_c/psi: torque pushes up to {max(plan.shares) * plan.i_test_a:.3g} A, polled")
 
         def answered(answer: ShaftAnswer) -> None:
             if not isinstance(drive, SpeedPushDrive):  # its limit is the push
-                show_limit(guard, answer, min(plan.i_test_a, plan.most_a(answer, 0.0)), say)
+                limit.append(unproven(show_limit(guard, answer, min(plan.i_test_a, plan.most_a(answer, 0.0)), say)))
 
         answer = push_both_ways(guard, plan, keep, answered)
         if shows_voltage:
@@ -179,17 +180,14 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say 
     voltage: Voltage = "machine" if shows_voltage else "link" if U_dc > 0.0 else ""
     return TierFacts(
         "standard", pushed=True, voltage=voltage, top_rpm=plan.omega_top_rad_s / RPM, U_dc_v=max(0.0, U_dc),
-        current_undecided=drive.current_undecided,
+        current_undecided=drive.current_undecided, limit="".join(limit),
     )  # fmt: skip
 
 
 def show_limit(guard: GuardedDrive, answer: ShaftAnswer, most_a: float, say: Say) -> LimitShown | None:
     """Say whether the drive keeps its own current limit, asked for at most a torque current (A peak)."""
     shown = show_torque_limit(guard, guard.limit_current, answer, most_a)
-    if shown is None:
-        say(NOT_SHOWN)
-    else:
-        say(str(shown) if shown.acts else f"{shown}; every command is bounded here, and this program looks")
+    say(unproven(shown) or str(shown))
     return shown
 
 
@@ -233,17 +231,22 @@ def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: 
         omega_failure_rad_s=math.inf if trips_itself(drive.node) else OVERSHOOT * envelope.speed_max_rad_s,
         off_s=OFF_S,
     )
+    limit: list[str] = []
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
         say(f"R, psi, L_q, J: {4 * len(plan.shares)} recorded torque pushes up to {plan.i_test_a:.3g} A")
 
         def answered(answer: ShaftAnswer) -> None:
             most = min(plan.i_test_a, answer.most_a(plan.omega_failure_rad_s, plan.off_s))
-            require_limit(show_limit(guard, answer, most, say))
+            shown = show_limit(guard, answer, most, say)
+            require_limit(shown)
+            limit.append(unproven(shown))
 
         swing(guard, plan, keep, answered)
     T_winding_c, T_magnet_c = (_temperature(drive, name) for name in ("T_winding_c", "T_magnet_c"))
-    return TierFacts("recorder", drive.period_s, pole_pairs, T_winding_c, T_magnet_c)
+    return TierFacts(
+        "recorder", drive.period_s, pole_pairs, T_winding_c, T_magnet_c, limit="".join(limit),
+    )  # fmt: skip
 
 
 def _temperature(drive: RecorderDrive, name: str) -> float | None:

@@ -41,9 +41,12 @@ from pmsmtool.experiments.current_limit import (
     require_limit,
     show_current_limit,
     show_torque_limit,
+    unproven,
 )
 from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
+from pmsmtool.identification.tier_evaluate import dump_facts, parse_facts
 from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.measurement.tier_identify import push_by_torque
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.session import Session
@@ -444,7 +447,7 @@ def test_the_current_limit_is_shown_to_act(name: str, tmp_path: Path) -> None:
             limit = [rig.session.dictionary["cia402.max_current"].number()]
             shown = shown_limit(rig, guard)
             assert [rig.session.dictionary["cia402.max_current"].number()] == limit, "the envelope's holds again"
-        assert shown is not None and shown.acts and "proven" in str(shown)
+        assert shown is not None and shown.proven and "limit proven" in str(shown) and not unproven(shown)
         assert shown.asked_a >= OVER * shown.kept_a * (1.0 - 1e-9)
         assert shown.seen_a == pytest.approx(shown.kept_a, rel=SHOWN)
         assert rig.memory() == before
@@ -460,8 +463,22 @@ def test_a_current_limit_that_does_not_act_is_told(name: str, tmp_path: Path, mo
         shown = shown_limit(rig, guard)
         assert shown is not None and not shown.acts
         assert shown.seen_a == pytest.approx(shown.asked_a, rel=SHOWN)
+        assert "every command is bounded here" in unproven(shown), "a line of the report"
         with pytest.raises(SafetyRefusal, match="does not keep its own current limit"):
             require_limit(shown)
+
+
+@pytest.mark.chain
+def test_a_limit_that_does_not_act_is_kept_with_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every command is bounded, so the run goes on; its report says it, replayed or not."""
+    monkeypatch.setattr(
+        Session, "_load_core", lambda self: self.hardware.take_parameters(self.parameters.active.copy().pack())
+    )
+    with opened("torque", tmp_path) as rig:
+        assert isinstance(rig.drive, TorqueDrive)
+        facts = push_by_torque(rig.drive, ENVELOPE, lambda name, trace: None)
+    assert facts.limit.startswith("the drive does not keep its own current limit")
+    assert parse_facts(dump_facts(facts), where="run").limit == facts.limit
 
 
 def test_a_supervision_that_only_reports_is_refused(rig: Rig) -> None:
