@@ -146,6 +146,11 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     for axis, fit in () if evaluation.inductance is None else evaluation.inductance.axes.items():
         if "eddy" in fit.effects:
             conditions |= {f"eddy_{axis}_s": fit.eddy_s, f"eddy_{axis}_time_s": fit.eddy_tau_s}
+    if evaluation.mechanics is not None and evaluation.mechanics.drag is not None:
+        conditions["drag_nms2"] = evaluation.mechanics.drag.value
+    if evaluation.cogging is not None and evaluation.cogging.harmonics.acceleration_rad_s2:
+        largest = max(evaluation.cogging.harmonics.acceleration_rad_s2, key=lambda h: h.amplitude)
+        conditions |= {"cogging_nm": evaluation.cogging.J.value * largest.amplitude, "cogging_periods": largest.order}
     if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
         conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
     return conditions

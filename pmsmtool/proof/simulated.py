@@ -63,8 +63,9 @@ TIMING_COVERAGE = 2.0
 OFFSET_SHARE = 0.001
 MISMATCH = 0.002
 """Standard deviations of sensor offsets (of I_max) and of the phases' gains against each other."""
-EDDY_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
-"""Range of identified eddy currents, and factor either way of their time constant: one branch stands for many."""
+SEEN_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
+"""Range of identified eddy currents, drag and cogging, and factor either way of the currents' time constant: one branch
+stands for many, one order for the orders of the cogging."""
 BASE_SPEED = (-0.03, 0.01)
 """Relative range of the speed that is held before current steps: what coasting lets it lose, too."""
 COAST_PERIODS = 64
@@ -348,6 +349,7 @@ def _draw(
     known = [machine.conditions.get(f"sensor_gain_{phase}_over_mean", 1.0) for phase in "abc"]
     setup.sensors.gain[:] = list(rng.normal(1.0, MISMATCH, 3) * np.array(known))
     _draw_eddy_currents(setup, machine, rng)
+    _draw_torques(setup, machine, rng)
     _draw_inverter(setup, machine, rng)
     setup.sensor_lag, setup.sampling_shift = _timing(machine, rng, late=setup.delay > 0)
     setup.theta_M = float(rng.uniform(-math.pi, math.pi))
@@ -366,7 +368,7 @@ def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Gener
     if not taus_s:
         return
     out, T_s = setup.machine, machine.inverter.T_s
-    sizes_s = [float(rng.uniform(*EDDY_SHARES)) * size_s for size_s in sizes_s]
+    sizes_s = [float(rng.uniform(*SEEN_SHARES)) * size_s for size_s in sizes_s]
     tau_s = float(np.mean(taus_s)) * math.exp(rng.uniform(-1.0, 1.0) * math.log(EDDY_FACTOR))
     per_volt = [size_s / L for size_s, L in zip(sizes_s, (out.L_d, out.L_q), strict=True)]
     if np.mean(taus_s) < T_s:
@@ -374,6 +376,16 @@ def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Gener
         return
     out.eddy_rate = 1.0 / max(tau_s, T_s)  # shorter than a step of the plant would not be integrated
     out.eddy_d, out.eddy_q = (amperes * out.eddy_rate for amperes in per_volt)
+
+
+def _draw_torques(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
+    """Draw the drag and the largest order of the cogging about those that the mechanics were identified with."""
+    out, seen = setup.machine, machine.conditions
+    if isinstance(drag := seen.get("drag_nms2"), float):
+        out.drag = float(rng.uniform(*SEEN_SHARES)) * drag
+    torque_nm, periods = seen.get("cogging_nm"), seen.get("cogging_periods")
+    if isinstance(torque_nm, float) and isinstance(periods, int):
+        out.cogging, out.cogging_periods = float(rng.uniform(*SEEN_SHARES)) * torque_nm, float(periods)
 
 
 def _timing(machine: MachineFile, rng: np.random.Generator, *, late: bool) -> tuple[float, float]:

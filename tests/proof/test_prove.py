@@ -31,6 +31,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.errors import Declined, Interrupted, VerifyMismatch
 from pmsmtool.flash.restore import take_backup
+from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.proof import measured
 from pmsmtool.proof import stage as stages
@@ -153,17 +154,26 @@ def test_a_spoiled_drive_is_caught_and_the_cause_named(kind: str, cause: str, de
         assert "OUTSIDE its band" in report_page(run.path)
 
 
-@pytest.mark.chain
-def test_what_identification_saw_of_iron_and_sensors_is_in_the_band() -> None:
-    """Eddy currents in 15 % of the inductances and sensors 2 % apart, as the machine file's conditions say them."""
-    share, tau_s = 0.15, 1e-4
-    known = {
-        **{f"eddy_{axis}_s": tau_s * share / (1.0 - share) for axis in "dq"},
-        **{f"eddy_{axis}_time_s": tau_s for axis in "dq"},
+IRON_AND_SENSORS = (
+    {
+        **{f"eddy_{axis}_s": 1e-4 * 0.15 / (1.0 - 0.15) for axis in "dq"},
+        **{f"eddy_{axis}_time_s": 1e-4 for axis in "dq"},
         "sensor_gain_a_over_mean": 1.02,
-    }
+    },
+    {"eddy_share": 0.15, "eddy_time_s": 1e-4, "sensor_gain_a": 1.02},
+)
+"""Eddy currents in 15 % of the inductances and sensors 2 % apart: as a machine file's conditions and as simulated."""
+DRAG_AND_COGGING = (
+    {"drag_nms2": 1e-4, "cogging_nm": 0.5, "cogging_periods": 36},
+    {"drag_nms2": 1e-4, "cogging_nm": 0.5, "cogging_periods": 36},
+)
+"""Of the rated 14 N m, 18 % at the rated speed and 4 %."""
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize(("known", "settings"), [IRON_AND_SENSORS, DRAG_AND_COGGING], ids=["iron", "drag"])
+def test_what_identification_saw_is_in_the_band(known: dict[str, Value], settings: dict[str, Value]) -> None:
     design = tune(replace(machine(), conditions=known), TuneRequest(field_weakening="lookup"))
-    settings = {"eddy_share": share, "eddy_time_s": tau_s, "sensor_gain_a": 1.02}
     with flashed(design, truth=replace(machine(), simulation={**machine().simulation, **settings})) as drive:
         _, stage = prove(drive, design)
     assert stage.status == "pass", stage.note
