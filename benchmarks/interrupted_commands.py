@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Interrupt every writing or moving command at many moments, by Ctrl-C and by pulling the adapter.
+"""Interrupt every writing or moving command at many moments, in five ways, and look at the drive and at what was said.
 
-    python -m benchmarks.interrupted_commands                                   # all commands, both ways, 50 moments
+    python -m benchmarks.interrupted_commands                                   # all commands, all ways, 50 moments
     python -m benchmarks.interrupted_commands --command jog flash-params --how adapter --moments 10
+    python -m benchmarks.interrupted_commands --command flash-params restore --every 10
+    python -m benchmarks.interrupted_commands --command flash-params --store-window
 
-A moment is a CAN frame that the tool sends or hears; the moments are spread evenly over the whole run, each is tried in
-a run of its own, and the drive stays powered.
+A moment is a CAN frame that the tool sends or hears; the moments are spread evenly over the whole run (or: every N-th
+frame, or every millisecond from the request to store on), each is tried in a run of its own.
 
-*Ctrl-C*: SIGINT at that frame. Wanted: exit code 130, statusword off, everything the drive holds as before; a download
+*ctrl-c*: SIGINT at that frame. Wanted: exit code 130, statusword off, everything the drive holds as before; a download
 that was through may also leave exactly the new set. A command that only writes says which of them the drive holds.
+*adapter*: from that frame on nothing is sent and nothing received, as when a server vanishes. Wanted: exit code 8 where
+the machine was energised (the hardware stop is named), otherwise 3 (or 8).
+*kill*: the tool is gone. *power*: the drive loses its supply, the tool goes on; it is back when the tool has ended.
+*freeze*: the tool stands still for three seconds and goes on; the commands end as they do, but not in a traceback.
 
-*Adapter*: from that frame on nothing is sent and nothing received. Wanted: exit code 8 where the machine was energised
-(the hardware stop is named), otherwise 3 (or 8); the drive, still powered, off by itself a second later, and its set
-the old or the new one, never mixed.
+After each: the drive off by itself within a second, its set the old or the new one, never mixed. An open journal may be
+left where the tool was killed or cut off; then `restore` must end well, with exactly the old set.
 
 A line per moment that breaks this, and a summary; exit 1 when there is one.
 """
@@ -40,6 +45,7 @@ from pmsmtool.commissioning.export import image_of
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.firmware.image import crc32
+from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.restore import take_backup
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.sim.bus import PmsmSimBus
@@ -50,13 +56,20 @@ LIMIT_OBJECTS = ((0x6073, 0), (0x6080, 0), (0x1016, 1), (0x6007, 0))
 OWN_STOP_S = 1.0
 """The declared dead-man time is 0.35 s."""
 NEW_SET = "new/params.toml"
-WAYS = ("ctrl-c", "adapter")
+WAYS = ("ctrl-c", "adapter", "kill", "power", "freeze")
+FREEZE_S = 3.0
+KILLED = -9
+STORE_WINDOW_MS = 380
+"""From the request to the last frame (320 ms the store, 35 to 57 what follows)."""
+MEMORY_WAIT_S = 2.0
+"""A store that was under way ends, a node that booted is up."""
+_STORE_REQUESTED = b"\x23\x10\x10\x01"
 _CONTROLWORD_WRITTEN = b"\x2b\x40\x60\x00"
 _STATUSWORD_READ = b"\x4b\x41\x60\x00"
 TO_DO = ("hardware stop", "reset the drive")
 MEASURING = ("identify", "commission")
 JOURNALED = ("flash-params", "restore", "commission")
-WRITING = ("flash-params", "restore", "param set")
+WRITING = ("flash-params", "restore", "param set", "param set --store")
 OLD_SET = ("the set that it held before", "exactly the old set")
 COMMANDS = {
     "jog": ("jog", "--current", "2Apk", "--for", "1s"),
@@ -65,7 +78,13 @@ COMMANDS = {
     "flash-params": ("flash-params", NEW_SET),
     "restore": ("restore", "old.backup"),
     "param set": ("param", "set", "speed.K_p_nms_per_rad=0.0421"),
+    "param set --store": ("param", "set", "speed.K_p_nms_per_rad=0.0421", "--store"),
 }
+ONE_VALUE = ("param set", "param set --store")
+
+
+class Killed(BaseException):
+    """SIGKILL, as far as one process can have it: nothing the tool sends afterwards has an effect."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +117,7 @@ class Held:
     crc: int
     stored: int
     off: bool
+    journal: str
 
 
 def held(channel: str) -> Held:
@@ -108,7 +128,9 @@ def held(channel: str) -> Held:
         entries = {name: data for name, data in entries.items() if not name.startswith("configuration_")}
         limits = [drive.node.sdo.read(*where) for where in LIMIT_OBJECTS]
         crcs = drive.parameters.crc_active, drive.parameters.crc_stored
-        found = Held((entries, limits), *crcs, is_safe(drive.node.state()))
+        journal = JournalFolder(drive.identity).last()
+        off = is_safe(drive.node.state())
+        found = Held((entries, limits), *crcs, off, "none" if journal is None else journal.state)
         drive.close()
     return found
 
@@ -136,36 +158,63 @@ class Watch:
     Parameters
     ----------
     how : str
-        ``ctrl-c`` or ``adapter``.
+        Of ``WAYS``.
     moment : int or None
-        Number of the frame; ``None``: nothing happens.
+        Number of the frame, or milliseconds after the request to store; ``None``: nothing happens.
+    line : PmsmSimBus
+        A member of the line that stays.
+    in_store : bool
+        The moment counts from the request to store.
     """
 
-    def __init__(self, how: str, moment: int | None) -> None:
+    def __init__(self, how: str, moment: int | None, line: PmsmSimBus, *, in_store: bool = False) -> None:
         self.how = how
         self.moment = moment
+        self.line = line
+        self.in_store = in_store
         self.frames = 0
+        self.stored_after = 0
+        """Frames until the drive was asked to store."""
         self.enabled = False
         """As the tool knows it: by the controlword it sent and the statusword it read."""
+        self.happened = False
+        self._frozen = False
+        self._thaws = False
 
     @property
-    def gone(self) -> bool:
-        """Whether the adapter has been pulled."""
-        return self.how == "adapter" and self.moment is not None and self.frames >= self.moment
+    def cut_off(self) -> bool:
+        """Whether nothing that the tool sends gets through."""
+        return self._frozen or (self.happened and self.how in ("adapter", "kill"))
 
-    def passes(self, frame: can.Message) -> bool:
-        """Count a frame; return whether it gets through."""
+    def passes(self, frame: can.Message) -> None:
+        """Count a frame, and let happen what happens at it."""
         self.frames += 1
-        if self.gone:
-            return False
-        if self.frames == self.moment:
-            signal.raise_signal(signal.SIGINT)
         data = bytes(frame.data)
         if data[:4] == _CONTROLWORD_WRITTEN and data[4] & 0x0F == Command.ENABLE_OPERATION:
             self.enabled = True
         elif data[:4] == _STATUSWORD_READ:
             self.enabled = state_of(int.from_bytes(data[4:6], "little")) is State.OPERATION_ENABLED
-        return True
+        if data[:4] == _STORE_REQUESTED and not self.stored_after:
+            self.stored_after = self.frames
+            if self.in_store and self.moment is not None:
+                self.line.clock.after(self.moment / 1000.0, self.happen)
+        if not self.in_store and self.frames == self.moment:
+            self.happen()
+
+    def happen(self) -> None:
+        """Let it happen."""
+        self.happened = True
+        if self.how == "ctrl-c":
+            signal.raise_signal(signal.SIGINT)
+        elif self.how == "power":
+            self.line.line.nodes[0].power_cut()
+        self._thaws = self.how == "freeze"
+
+    def stand_still(self) -> None:
+        """A frozen tool sends nothing, the heartbeat least of all; what arrives waits in its queue."""
+        self._thaws, self._frozen = False, True
+        self.line.clock.wait(FREEZE_S)
+        self._frozen = False
 
     @contextlib.contextmanager
     def on(self) -> Iterator[None]:
@@ -173,13 +222,21 @@ class Watch:
         send, receive = PmsmSimBus.send, PmsmSimBus.recv
 
         def sending(bus: PmsmSimBus, msg: can.Message, timeout: float | None = None) -> None:
-            if not self.passes(msg):
+            if self.cut_off and self.how == "adapter":
                 raise can.CanOperationError("No such device")
-            send(bus, msg, timeout)
+            if not self.cut_off:
+                send(bus, msg, timeout)
+                self.passes(msg)
 
         def receiving(bus: PmsmSimBus, timeout: float | None = None) -> can.Message | None:
+            if self._thaws:
+                self.stand_still()
             frame = receive(bus, timeout)
-            return frame if frame is not None and self.passes(frame) else None
+            if self.cut_off and self.how == "kill":
+                raise Killed
+            if frame is not None and not self.cut_off:
+                self.passes(frame)
+            return None if self.cut_off else frame
 
         setattr(PmsmSimBus, "send", sending)  # noqa: B010 - methods are replaced on purpose
         setattr(PmsmSimBus, "recv", receiving)  # noqa: B010
@@ -190,32 +247,51 @@ class Watch:
             setattr(PmsmSimBus, "recv", receive)  # noqa: B010
 
 
-def interrupted(how: str, command: str, moment: int | None) -> Outcome:
-    """Run a command and interrupt it at the n-th frame; ``None``: a whole run."""
+def interrupted(how: str, command: str, moment: int | None, *, in_store: bool = False) -> Outcome:
+    """Run a command and interrupt it at the n-th frame, or so many ms into the store; ``None``: a whole run."""
     channel = f"{PROFILE}?nv=drive.nv"
-    watch = Watch(how, moment)
     with prepared(), powered(channel) as line:
+        watch = Watch(how, moment, line, in_store=in_store)
         prepare(command, channel)
         before = held(channel)
         signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it
         with watch.on():
             code, told = commanded(*COMMANDS[command], "-i", "pmsmsim", "-c", channel, "--yes")
-        if moment is None:
-            return Outcome(watch.frames, code, "whole run", code == 0)
-        if how == "adapter":
-            line.clock.wait(OWN_STOP_S)
+            if how == "kill" and watch.happened:
+                code, told = KILLED, "nothing"
+            if moment is None:
+                return Outcome(watch.stored_after if in_store else watch.frames, code, "whole run", code == 0)
+            if how != "ctrl-c":
+                line.clock.wait(OWN_STOP_S)
+        line.line.nodes[0].power_on()
+        line.clock.wait(MEMORY_WAIT_S)
         after = held(channel)
-        verdict, kept = _compare(command, before, after, gone=how == "adapter")
+        verdict, kept = _compare(command, before, after, gone=how in ("adapter", "kill", "power"))
+        if kept and after.journal == "open":
+            verdict, kept = _recovered(verdict, channel, before, may=how in ("adapter", "kill", "power"))
     if how == "ctrl-c":
-        wanted = code == 130
-        if command in WRITING and not _names_the_set(told, after, before):
+        wanted = code == 130 or not watch.happened
+        if command in WRITING and watch.happened and not _names_the_set(told, after, before):
             verdict, wanted = f"{verdict}; the set is not named rightly: {told[-300:]!r}", False
-    else:
+    elif how == "adapter":
         wanted = code == 8 and all(word in told for word in TO_DO) if watch.enabled else code in (3, 8)
         verdict += ", the machine energised when it went" if watch.enabled else ", nothing energised"
+    else:
+        wanted = code != 70 and (code != 0 or after.off)
     if not told.strip() or "Traceback" in told:
         verdict, wanted = f"{verdict}; said: {told[-300:]!r}", False
-    return Outcome(watch.frames, code, verdict, after.off and kept and wanted)
+    return Outcome(watch.frames, code, verdict, after.off and kept and (wanted or not watch.happened))
+
+
+def _recovered(verdict: str, channel: str, before: Held, *, may: bool) -> tuple[str, bool]:
+    """Whether `restore` closes a journal that was left open, with exactly what was held before."""
+    if not may:
+        return f"{verdict}; THE JOURNAL IS LEFT OPEN", False
+    code, told = commanded("restore", "-i", "pmsmsim", "-c", channel, "--yes")
+    found = held(channel)
+    if code == 0 and found.crc == before.crc and found.stored in (before.stored, found.crc) and found.journal != "open":
+        return f"{verdict}; restored", True
+    return f"{verdict}; RESTORE FAILED, exit {code}: {told[-300:]!r}", False
 
 
 def _names_the_set(told: str, after: Held, before: Held) -> bool:
@@ -239,32 +315,48 @@ def _compare(command: str, before: Held, after: Held, *, gone: bool) -> tuple[st
         return "off, exactly the new set", True
     if command == "restore" and after.crc != before.crc:
         return "off, exactly the old set", True
-    if command == "param set" and after.everything[1] == before.everything[1]:
+    if command in ONE_VALUE and _differ(before, after) <= 1:
         return "off, the one value written", True
-    if gone and after.crc == before.crc:
+    if gone and after.crc == before.crc and after.stored in {before.stored, *new}:
         return "off, the active set as before", True
     if gone and command in MEASURING and after.stored == before.stored:
         return "off, values of the measurement until the next reset, the stored set as before", True
     return "CHANGED", False
 
 
-def one(job: tuple[str, str, int]) -> tuple[int, Outcome]:
+def _differ(before: Held, after: Held) -> int:
+    """Number of the values that a backup holds and that differ, but for the mark of the set."""
+    (old, limits), (new, limits_now) = before.everything, after.everything
+    changed = [name for name, data in new.items() if old.get(name) != data and name != "design_id"]
+    return len(changed) + int(limits != limits_now)
+
+
+def one(job: tuple[str, str, int, bool]) -> tuple[int, Outcome]:
     """Interrupt one run; for a pool."""
-    how, command, moment = job
-    return moment, interrupted(how, command, moment)
+    how, command, moment, in_store = job
+    return moment, interrupted(how, command, moment, in_store=in_store)
 
 
-def interrupt(command: str, how: str, moments: int, processes: int) -> int:
+def interrupt(command: str, how: str, options: argparse.Namespace) -> int:
     """Print the moments that went wrong and a summary; return their number."""
-    whole = interrupted(how, command, None)
-    places = sorted({max(1, math.ceil((k + 0.5) * whole.moments / moments)) for k in range(moments)})
+    in_store = bool(options.store_window)
+    whole = interrupted(how, command, None, in_store=in_store)
+    if in_store:
+        places = list(range(STORE_WINDOW_MS)) if whole.moments else []
+    elif options.every:
+        places = list(range(1, whole.moments + 1, options.every))
+    else:
+        places = sorted(
+            {max(1, math.ceil((k + 0.5) * whole.moments / options.moments)) for k in range(options.moments)}
+        )
     print(
         f"{command}, {how}: {whole.moments} moments in a whole run (exit {whole.code}), {len(places)} tried", flush=True
     )
     outcomes: Counter[tuple[int, str]] = Counter()
     wrong = 0 if whole.good else 1
-    with multiprocessing.Pool(processes, maxtasksperchild=4) as pool:
-        for moment, outcome in pool.imap(one, [(how, command, place) for place in places], chunksize=1):
+    with multiprocessing.Pool(options.processes, maxtasksperchild=16) as pool:
+        jobs = [(how, command, place, in_store) for place in places]
+        for moment, outcome in pool.imap(one, jobs, chunksize=1):
             outcomes[outcome.code, outcome.verdict] += 1
             if not outcome.good:
                 wrong += 1
@@ -280,13 +372,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--command", nargs="+", choices=COMMANDS, default=list(COMMANDS))
     parser.add_argument("--how", nargs="+", choices=WAYS, default=WAYS)
     parser.add_argument("--moments", type=int, default=50)
+    parser.add_argument("--every", type=int, help="every N-th frame instead")
+    parser.add_argument("--store-window", action="store_true", help="every ms from the request to store on instead")
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args(argv)
-    wrong = sum(
-        interrupt(command, how, options.moments, options.processes)
-        for command in options.command
-        for how in options.how
-    )
+    wrong = sum(interrupt(command, how, options) for command in options.command for how in options.how)
     print(f"{wrong} moments went wrong")
     return 1 if wrong else 0
 

@@ -65,7 +65,7 @@ def test_ctrl_c_at_any_moment_leaves_a_drive_that_is_off_and_as_before(
     moment: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One run waits 1600 times: the dead-man up to 48, phases to 155, levels to 731, rotation to 1073, square wave to
-    1206, pushes to 1256, and the speeds to the end. All moments: ``benchmarks/interrupted_identification.py``.
+    1206, pushes to 1256, and the speeds to the end. All moments: ``benchmarks/interrupted_commands.py``.
     """
     count = 0
     pass_time = VirtualClock.wait
