@@ -26,7 +26,7 @@ from pmsmtool.identification.request import REQUEST, parse_request
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.run_account import account_lines
 from pmsmtool.npz_file import read_npz
-from pmsmtool.proof.judgement import judge
+from pmsmtool.proof.judgement import judge, with_ripple
 from pmsmtool.proof.stage import read_proof, responses
 from pmsmtool.report import figures
 from pmsmtool.report.report import Change, Figure, render
@@ -200,12 +200,16 @@ def _proof_figures(run: RunDirectory, record: RunRecord) -> Iterator[Figure]:
         return
     prediction, traces = read_proof((run.path / names[0]).parent)
     found = responses(traces, prediction)
+    prediction = with_ripple(prediction, traces)
     judgement = judge(prediction, found)
     for number, (experiment, text) in enumerate(zip(prediction.t_s, prediction.facts["experiments"], strict=True), 1):
         measured = {signal: values for (name, signal), values in found.items() if name == experiment}
         shares = [line.share for line in judgement.seen if line.what.startswith(f"{experiment}: ")]
         verdict = "not run" if not shares else "inside its band" if max(shares) <= 1.0 else "OUTSIDE its band"
-        caption = f"Proof {number}, {verdict}: {text}. Grey: the band predicted and committed before the first step."
+        caption = (
+            f"Proof {number}, {verdict}: {text}. Grey: the band predicted and committed before the first step, wider "
+            "by the ripple of the record itself."
+        )
         yield figures.proof_figure(prediction, experiment, measured, caption)
 
 

@@ -120,6 +120,8 @@ class Experiment:
         Scale of its currents (A) and of its electrical speed (rad/s).
     settle_s : float
         Time at the speed held before, after it is reached (s).
+    steady_rows : int
+        So many rows at the end are steady: what they shake by is the machine's ripple.
     """
 
     name: str
@@ -133,6 +135,7 @@ class Experiment:
     scale_a: float = 1.0
     scale_rad_s: float = 1.0
     settle_s: float = 0.0
+    steady_rows: int = 0
 
     @property
     def pattern_rows(self) -> int:
@@ -230,6 +233,11 @@ class _Sizes:
         )  # fmt: skip
 
     @property
+    def crossover_rad_s(self) -> float:
+        """Crossover of the speed loop."""
+        return float(self.design.facts.get("speed_crossover_rad_s", 50.0))
+
+    @property
     def omega_steps(self) -> float:
         """Speed of the current steps."""
         return min(STEP_SPEED_SHARE * self.omega_base, 0.7 * self.omega_max) if self.turns else 0.0
@@ -241,22 +249,24 @@ class _Sizes:
 
 def _speed_step(s: _Sizes) -> Experiment:
     speed = s.omega_steps / s.p
-    rows, decimation = _speed_record(s, speed)
+    ramp_s = speed / (s.design["speed.acceleration_rpm_per_s"] * RPM)
+    rows, decimation = _record_of(s, ramp_s)
     text = f"speed step from standstill to {speed / RPM:.4g} rpm"
     return Experiment("speed_step", text, 0.0, _speed_excitation(s, speed, rows, decimation), rows, decimation,
                       judged=("i_d_a", "i_q_a", "omega_e_rad_s"), scale_a=s.I_test,
-                      scale_rad_s=s.omega_steps)  # fmt: skip
-
-
-def _speed_record(s: _Sizes, step_rad_s: float) -> tuple[int, int]:
-    return _record_of(s, step_rad_s / (s.design["speed.acceleration_rpm_per_s"] * RPM))
+                      scale_rad_s=s.omega_steps, steady_rows=_steady_rows(s, ramp_s, rows, decimation))  # fmt: skip
 
 
 def _record_of(s: _Sizes, ramp_s: float) -> tuple[int, int]:
-    crossover = float(s.design.facts.get("speed_crossover_rad_s", 50.0))
-    seconds = min(LONGEST_S, ramp_s + SPEED_SETTLE / crossover)
+    seconds = min(LONGEST_S, ramp_s + SPEED_SETTLE / s.crossover_rad_s)
     decimation = max(1, math.ceil(seconds / (SPEED_ROWS * s.T_s)))
     return SPEED_ROWS, decimation
+
+
+def _steady_rows(s: _Sizes, ramp_s: float, rows: int, decimation: int) -> int:
+    """Rows from half of the settling after a ramp on."""
+    steady_from = math.ceil((ramp_s + 0.5 * SPEED_SETTLE / s.crossover_rad_s) / (decimation * s.T_s))
+    return max(0, rows - steady_from)
 
 
 def _speed_excitation(s: _Sizes, step_rad_s: float, rows: int, decimation: int) -> Excitation:
@@ -349,7 +359,6 @@ def _weakening(s: _Sizes) -> Experiment | str:
     start, step = WEAKENING_START * corner / s.p, (end - WEAKENING_START * corner) / s.p
     slope = WEAKENING_SLOPE * s.design["speed.acceleration_rpm_per_s"] * RPM
     rows, decimation = _record_of(s, step / slope)
-    settle = SPEED_SETTLE / float(s.design.facts.get("speed_crossover_rad_s", 50.0))
     levels, hold = rows // WEAKENING_HOLD, WEAKENING_HOLD * decimation
     rise = slope * hold * s.T_s
     # one level more than the record has; then down by the levels it came, unrecorded: from there in one step, the
@@ -359,4 +368,5 @@ def _weakening(s: _Sizes) -> Experiment | str:
     text = f"speed ramp from {start / RPM:.4g} to {end / s.p / RPM:.4g} rpm, into field weakening"
     return Experiment("weakening", text, start, excitation, rows, decimation,
                       judged=("i_d_a", "i_q_a", "omega_e_rad_s"), scale_a=s.I_test, scale_rad_s=end,
-                      settle_s=settle)  # fmt: skip
+                      settle_s=SPEED_SETTLE / s.crossover_rad_s,
+                      steady_rows=_steady_rows(s, step / slope, rows, decimation))  # fmt: skip

@@ -242,6 +242,7 @@ def predict_proof(
         "conditions": conditions.facts(),
         "experiments": [e.text for e in plan.experiments],
         "left_out": list(plan.left_out),
+        "steady_rows": {e.name: e.steady_rows for e in plan.experiments},
         "runs": runs,
         "seed": seed,
     }

@@ -38,7 +38,7 @@ from pmsmtool.files import write_file
 from pmsmtool.flash.restore import plan_download
 from pmsmtool.machine.shaft import Brake, Load, Shaft
 from pmsmtool.npz_file import npz_bytes, read_npz
-from pmsmtool.proof.judgement import Judgement, judge
+from pmsmtool.proof.judgement import Judgement, judge, with_ripple
 from pmsmtool.proof.measured import SpeedNotReached, run_experiments
 from pmsmtool.proof.plan import RPM, Conditions, Experiment, ProofPlan, plan_proof
 from pmsmtool.proof.prediction_file import from_arrays, to_arrays
@@ -101,6 +101,7 @@ class _Record:
         self.save(f"{experiment.name}.npz", trace_npz(trace))
         self.done.append(experiment.name)
         self.measured |= responses({experiment.name: trace}, self.prediction)
+        self.prediction = with_ripple(self.prediction, {experiment.name: trace})
         shares = [self.prediction.bands[key].largest(v)[0] for key, v in self.measured.items()
                   if key[0] == experiment.name]  # fmt: skip
         return max(shares) <= GROSS
@@ -167,7 +168,7 @@ def prove_stage(
         if isinstance(error, SdoAbort):
             raise
         event = error  # the guard has stopped the machine and restored the drive
-    stage = _stage(plan, prediction, record, event, digest, folder)
+    stage = _stage(plan, record, event, digest, folder)
     return replace(stage, not_checked=_beyond(design, conditions))
 
 
@@ -271,7 +272,7 @@ def band_lines(prediction: Prediction) -> list[str]:
     """Return the predicted band as lines: final value and width of every signal, and every derived quantity."""
     lines = []
     for (experiment, signal), band in prediction.bands.items():
-        half = band.factor * band.std
+        half = band.half
         lines.append(
             f"predicted {experiment} {signal}: {float(band.mean.min()):.4g} to {float(band.mean.max()):.4g}, "
             f"95 % within +-{float(np.median(half)):.2g} (median), +-{float(half.max()):.2g} (largest)"
@@ -310,10 +311,8 @@ def read_proof(folder: Path) -> tuple[Prediction, dict[str, Trace]]:
     return prediction, {name: read_trace(folder / f"{name}.npz") for name in names}
 
 
-def _stage(
-    plan: ProofPlan, prediction: Prediction, record: _Record, event: PmsmtoolError | None, digest: str, folder: str
-) -> Stage:
-    found = judge(prediction, record.measured)
+def _stage(plan: ProofPlan, record: _Record, event: PmsmtoolError | None, digest: str, folder: str) -> Stage:
+    found = judge(record.prediction, record.measured)
     missing = [e.name for e in plan.experiments if e.name not in record.done]
     criteria = [Acceptance(line.what, f"{100.0 * line.share:.3g} % of the band: {line.where}", "<= 100 %", line.inside)
                 for line in found.seen]  # fmt: skip
@@ -321,7 +320,7 @@ def _stage(
     if happened or missing:
         what = happened or f"not run after a response far outside its band: {', '.join(missing)}"
         criteria.append(Acceptance("all experiments are run to their end", what, "all", False))
-    slow = _too_slow(prediction, record.measured)
+    slow = _too_slow(record.prediction, record.measured)
     if slow:
         criteria.append(Acceptance("the speed is reached", slow, "within the band", False))
     good = bool(found.seen) and all(line.ok for line in criteria)

@@ -12,8 +12,9 @@ import pytest
 from pmsmtool.design.prediction import LEAST_FACTOR, Direction, Prediction, predict
 from pmsmtool.errors import ConfigError
 from pmsmtool.npz_file import npz_bytes
-from pmsmtool.proof.judgement import judge
+from pmsmtool.proof.judgement import judge, with_ripple
 from pmsmtool.proof.prediction_file import from_arrays, to_arrays
+from pmsmtool.trace import Trace
 
 ROWS = 120
 KEY = ("step", "i_q_a")
@@ -139,6 +140,47 @@ def test_a_response_in_which_no_run_differs_from_another_is_predicted() -> None:
     assert found.quantities == {}, "what shows in nothing is not judged"
     assert judge(found, {key: values[0] for key, values in runs.items()}).inside
     assert not judge(found, {KEY: runs[KEY][0], still: np.ones(ROWS)}).inside
+
+
+def steady(found: Prediction) -> Prediction:
+    return replace(found, facts={**found.facts, "steady_rows": {"step": 40}})
+
+
+def recorded(values: np.ndarray) -> dict[str, Trace]:  # type: ignore[type-arg]
+    return {"step": Trace(1e-4 * np.arange(values.size), {"i_q_a": values}, {"i_q_a": "A"})}
+
+
+def half(found: Prediction) -> float:
+    return float(np.median(found.bands[KEY].half))
+
+
+def test_a_machine_that_shakes_passes_and_one_that_shakes_too_much_does_not() -> None:
+    found = steady(prediction())
+    band, angle = found.bands[KEY], np.arange(ROWS) * 2.0
+    for size, passes in ((0.8, True), (3.0, False)):
+        shaken = band.mean + 0.5 * half(found) + size * half(found) * np.sin(angle)
+        assert not judge(found, {KEY: shaken}).seen[0].inside
+        wider = with_ripple(found, recorded(shaken))
+        assert judge(wider, {KEY: shaken}).seen[0].inside == passes
+        assert "ripple" in judge(wider, {KEY: shaken}).seen[0].where
+        assert half(wider) <= 2.0 * half(found) * 1.001
+
+
+def test_what_is_off_or_still_on_its_way_is_no_ripple() -> None:
+    found = steady(prediction())
+    for off in (1.5 * half(found), 3.0 * half(found) * (1.0 - T_S / T_S[-1])):
+        response = found.bands[KEY].mean + off
+        wider = with_ripple(found, recorded(response))
+        assert half(wider) == pytest.approx(half(found), rel=1e-6) and not judge(wider, {KEY: response}).inside
+
+
+def test_of_a_repeated_pattern_the_ripple_is_what_its_average_holds() -> None:
+    found = prediction()
+    rng = np.random.default_rng(0)
+    shaken = np.tile(found.bands[KEY].mean, 8) + 0.01 * rng.standard_normal(8 * ROWS)
+    wider = with_ripple(found, recorded(shaken))
+    assert wider.bands[KEY].ripple == pytest.approx(3.0 * 0.01 / math.sqrt(8.0), rel=0.1)
+    assert np.max(np.abs(shaken.reshape(8, -1).mean(axis=0) - found.bands[KEY].mean)) < 1.3 * wider.bands[KEY].ripple
 
 
 def test_another_length_is_refused() -> None:

@@ -35,7 +35,7 @@ from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.proof import measured
 from pmsmtool.proof import stage as stages
-from pmsmtool.proof.judgement import judge
+from pmsmtool.proof.judgement import judge, with_ripple
 from pmsmtool.proof.plan import Conditions
 from pmsmtool.proof.stage import ProofRequest, _too_slow, prove_stage, read_proof, responses
 from pmsmtool.resources import data_folder
@@ -127,7 +127,7 @@ def test_a_healthy_drive_passes_and_the_prediction_came_first(design: Design) ->
     prediction, traces = read_proof(folder)
     assert prediction.facts["design"] == design.content_hash()
     assert list(traces) == ["speed_step", "q_steps", "d_steps", "unreachable", "weakening"]
-    again = judge(prediction, responses(traces, prediction))
+    again = judge(with_ripple(prediction, traces), responses(traces, prediction))
     assert [line.share for line in again.seen] == [v["value"] for v in stage.values if "where" in v]
     page = report_page(run.path)
     assert page.count("inside its band") == 5 and "Behaviour: the drive" not in page
