@@ -353,6 +353,9 @@ def _draw(
     _draw_torques(setup, machine, rng)
     _draw_inverter(setup, machine, rng)
     setup.sensor_lag, setup.sampling_shift = _timing(machine, rng, late=setup.delay > 0)
+    if (machine.inverter.sampling_instant_s or 0.0) > 0.0 and rng.random() < 0.5:
+        # what shows a late sample at speed shows an encoder angle that is so old as well
+        setup.sensors.encoder_latency, setup.sampling_shift = max(0.0, setup.sampling_shift), 0.0
     setup.theta_M = float(rng.uniform(-math.pi, math.pi))
     setup.seed = int(rng.integers(2**62))
     return setup

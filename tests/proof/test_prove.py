@@ -170,10 +170,21 @@ DRAG_AND_COGGING = (
 """Of the rated 14 N m, 18 % at the rated speed and 4 %."""
 
 
+OLD_ANGLE: tuple[dict[str, Value], dict[str, Value]] = ({}, {"encoder_latency_s": 4e-5})
+"""An angle that is 40 us old looks like currents sampled 40 us late."""
+
+
 @pytest.mark.chain
-@pytest.mark.parametrize(("known", "settings"), [IRON_AND_SENSORS, DRAG_AND_COGGING], ids=["iron", "drag"])
+@pytest.mark.parametrize(
+    ("known", "settings"), [IRON_AND_SENSORS, DRAG_AND_COGGING, OLD_ANGLE], ids=["iron", "drag", "age"]
+)
 def test_what_identification_saw_is_in_the_band(known: dict[str, Value], settings: dict[str, Value]) -> None:
-    design = tune(replace(machine(), conditions=known), TuneRequest(field_weakening="lookup"))
+    age_s = settings.get("encoder_latency_s")
+    source = machine()
+    inverter = (
+        source.inverter if age_s is None else replace(source.inverter, sampling_instant_s=age_s, current_lag_s=age_s)
+    )  # type: ignore[arg-type]
+    design = tune(replace(source, conditions=known, inverter=inverter), TuneRequest(field_weakening="lookup"))
     with flashed(design, truth=replace(machine(), simulation={**machine().simulation, **settings})) as drive:
         _, stage = prove(drive, design)
     assert stage.status == "pass", stage.note
