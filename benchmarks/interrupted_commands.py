@@ -178,6 +178,7 @@ class Watch:
         self.enabled = False
         """As the tool knows it: by the controlword it sent and the statusword it read."""
         self.happened = False
+        self.over = False
         self._frozen = False
         self._thaws = False
 
@@ -202,7 +203,9 @@ class Watch:
             self.happen()
 
     def happen(self) -> None:
-        """Let it happen."""
+        """Let it happen, unless the command has ended."""
+        if self.over:
+            return
         self.happened = True
         if self.how == "ctrl-c":
             signal.raise_signal(signal.SIGINT)
@@ -257,6 +260,7 @@ def interrupted(how: str, command: str, moment: int | None, *, in_store: bool = 
         signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it
         with watch.on():
             code, told = commanded(*COMMANDS[command], "-i", "pmsmsim", "-c", channel, "--yes")
+            watch.over = True
             if how == "kill" and watch.happened:
                 code, told = KILLED, "nothing"
             if moment is None:
