@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -33,8 +33,6 @@ LEAST_CHANGE = 0.1
 the loop gain, a tenth of a period. No fault is smaller, and no model that precise."""
 FLOOR_SHARE = 0.005
 """Standard deviation that every point has at least, of the scale of its signal: ripple, quantisation, cogging."""
-RIPPLE_MOST = 1.0
-"""Most ripple that counts, of the half width without: what shakes more than it may be off is not healthy."""
 LEAST_FACTOR = 2.0
 """Half width over the standard deviation is never less: a signal that no drawn parameter moves keeps its floor."""
 NORMALISING_QUANTILE = 0.9
@@ -76,10 +74,6 @@ class Band:
     def high(self) -> Array:
         """Upper edge, shape (n,)."""
         return self.mean + self.half
-
-    def with_ripple(self, ripple: float) -> Band:
-        """Return the band wider by a ripple, of which no more counts than :data:`RIPPLE_MOST`."""
-        return replace(self, ripple=min(ripple, RIPPLE_MOST * float(np.median(self.factor * self.std))))
 
     def largest(self, measured: Array) -> tuple[float, int]:
         """Return the largest deviation over the half width, and its row; what is no number deviates infinitely."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -41,7 +42,7 @@ from pmsmtool.identification.cogging import Cogging, cogging_of
 from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
 from pmsmtool.identification.half_frequency import resistance_at_two_frequencies
-from pmsmtool.identification.mechanics import mechanics_of
+from pmsmtool.identification.mechanics import agree, mechanics_of
 from pmsmtool.identification.sampling import resistance_as_sampled
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
@@ -263,9 +264,19 @@ def evaluate(
         dead_time_s = max(0.0, result.resistance.V_dead_v) * period_s / U_dc_v
     shaft = result
     rough_L_h = _rough_inductance(traces, "d"), _rough_inductance(traces, "q")
-    mechanics = attempt("mechanics", lambda: mechanics_of(traces, shaft, tolerance, dead_time_s, period_s, rough_L_h))
-    moving = replace(shaft, mechanics=mechanics)
+    moved = partial(mechanics_of, traces, shaft, tolerance, dead_time_s, period_s, rough_L_h)
+    moving = replace(shaft, mechanics=attempt("mechanics", moved))
     response = attempt("frf", lambda: frequency_response.frequency_response_of(traces, moving, tolerance, dead_time_s))
+    rigid = refused.get("mechanics")
+    inertia = None if response is None else response.inertia
+    if rigid is not None and rigid.reason == "E_MODEL_MISMATCH" and inertia is not None:
+        # pushes of a shaft that is not rigid still tell its friction, if they tell the inertia of the other method
+        del refused["mechanics"]
+        elastic = attempt("mechanics", partial(moved, elastic=True))
+        if elastic is not None and agree(elastic.J, inertia):
+            moving = replace(moving, mechanics=elastic)
+        else:
+            refused["mechanics"] = rigid
     modulation = None
     if shaft.resistance is not None and shaft.inductance is not None and "speeds" in traces:
         L_h = shaft.inductance.L_d.value, shaft.inductance.L_q.value

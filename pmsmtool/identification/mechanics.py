@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_instant_s
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult, Torque, estimate_mechanics
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
 from pmsmtool.trace import Trace
 
@@ -44,6 +45,8 @@ def mechanics_of(
     dead_time_s: float = 0.0,
     period_s: float = 0.0,
     rough_L_h: tuple[float, float] = (0.0, 0.0),
+    *,
+    elastic: bool = False,
 ) -> MechanicsResult | None:
     """Return inertia and friction; None without the run, or without a flux linkage.
 
@@ -59,6 +62,8 @@ def mechanics_of(
         Of a leg, and of the control (s): they displace the samples of the current.
     rough_L_h : (float, float)
         Inductances (H) for that displacement where they are refused; 0: not known.
+    elastic : bool
+        Take any torque that a rigid shaft does not explain for noise.
 
     Raises
     ------
@@ -96,7 +101,13 @@ def mechanics_of(
         direction=direction,
         tolerance=tolerance,
         tilt_std=math.hypot(TILT_FLOOR, tilt),
+        elastic=elastic,
     )
+
+
+def agree(one: Estimate, other: Estimate) -> bool:
+    """Whether two inertias of the same currents lie within their joint interval; the torque's scale is common."""
+    return abs(one.value - other.value) <= COVERAGE_FACTOR * math.hypot(one.std, other.std)
 
 
 def torque_doubt(flux: FluxResult, displaced: float = 0.0, *, mapped: bool = False) -> float:

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import detrend
 
 from pmsmtool.design.prediction import Array, Prediction, Quantity
 from pmsmtool.errors import ConfigError
@@ -19,6 +18,8 @@ CLEARLY = 0.7
 """A fault is named when it leaves at most this share of the squared deviation, and at most this share of what the next
 one leaves (measured on the spoiled drives of the tests: 0.32 and 0.37; on a saturated machine without a map: 0.88)."""
 
+RIPPLE_MOST = 1.0
+"""Most ripple that counts, of the half width without: what shakes more than it may be off is not healthy."""
 RIPPLE_SIGMAS = 3.0
 """Largest of some hundred averages, in their standard deviations."""
 LEAST_STEADY_ROWS = 16
@@ -80,8 +81,10 @@ def with_ripple(prediction: Prediction, traces: Mapping[str, Trace]) -> Predicti
         if len(repeats) > 1:
             ripple = RIPPLE_SIGMAS * math.sqrt(float(np.mean(np.var(repeats, axis=0, ddof=1))) / len(repeats))
         elif steady >= LEAST_STEADY_ROWS:
-            ripple = float(np.max(np.abs(detrend((repeats[0] - band.mean)[-steady:]))))
-        bands[experiment, signal] = band.with_ripple(ripple if math.isfinite(ripple) else 0.0)
+            end, k = (repeats[0] - band.mean)[-steady:], np.arange(steady)
+            ripple = float(np.max(np.abs(end - np.polyval(np.polyfit(k, end, 1), k))))
+        most = RIPPLE_MOST * float(np.median(band.half))
+        bands[experiment, signal] = replace(band, ripple=min(ripple, most) if math.isfinite(ripple) else 0.0)
     return replace(prediction, bands=bands)
 
 

@@ -66,6 +66,8 @@ MISMATCH = 0.002
 SEEN_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
 """Range of identified eddy currents, drag and cogging, and factor either way of the currents' time constant: one branch
 stands for many, one order for the orders of the cogging."""
+RESONANCE_RANGE, ZETA_FACTOR = (0.98, 1.02), 2.0
+"""Range of identified resonance and antiresonance, and factor either way of the damping."""
 BASE_SPEED = (-0.03, 0.01)
 """Relative range of the speed that is held before current steps: what coasting lets it lose, too."""
 COAST_PERIODS = 64
@@ -343,6 +345,7 @@ def _draw(
     out.L_d, out.L_q = (getattr(out, n) * varied.get(f"{n}_h", 1.0) for n in ("L_d", "L_q"))
     out.psi_f *= varied.get("psi_f_wb", 1.0)
     out.J *= varied.get("J_kgm2", 1.0)
+    _draw_elastic_shaft(setup, machine, rng)
     out.B, out.tau_c = _friction(machine, rng)
     setup.T_winding, setup.T_magnet, setup.U_dc = (varied[n] for n in ("T_winding_c", "T_magnet_c", "U_dc_v"))
     setup.sensors.encoder_offset_e += varied["encoder_rad"]
@@ -380,6 +383,22 @@ def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Gener
         return
     out.eddy_rate = 1.0 / max(tau_s, T_s)  # shorter than a step of the plant would not be integrated
     out.eddy_d, out.eddy_q = (amperes * out.eddy_rate for amperes in per_volt)
+
+
+def _draw_elastic_shaft(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
+    """Divide the inertia into the two masses that resonance and antiresonance tell; nothing without them."""
+    known, out = machine.machine, setup.machine
+    if known.resonance_hz is None or known.antiresonance_hz is None:
+        return
+    places = (known.resonance_hz, known.antiresonance_hz)
+    w_r, w_a = (2.0 * math.pi * place * float(rng.uniform(*RESONANCE_RANGE)) for place in places)
+    if w_a >= w_r:
+        return
+    out.J_load = out.J * (1.0 - (w_a / w_r) ** 2)
+    out.J -= out.J_load
+    out.coupling_stiffness = out.J_load * w_a**2
+    zeta = (known.resonance_zeta or 0.0) * math.exp(rng.uniform(-1.0, 1.0) * math.log(ZETA_FACTOR))
+    out.coupling_damping = 2.0 * zeta * out.coupling_stiffness / w_r
 
 
 def _draw_torques(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:

@@ -146,6 +146,7 @@ def estimate_mechanics(
     direction: int = 1,
     tolerance: SensorTolerance | None = None,
     tilt_std: float = TILT_FLOOR,
+    elastic: bool = False,
 ) -> MechanicsResult:
     """Estimate inertia and friction.
 
@@ -168,6 +169,8 @@ def estimate_mechanics(
         Declared sensor tolerances.
     tilt_std : float
         Relative standard deviation of the pushes' torque at their fastest speed, less at others.
+    elastic : bool
+        Count any deviation of the torque as noise: the caller has another method to compare the inertia with.
 
     Raises
     ------
@@ -193,10 +196,10 @@ def estimate_mechanics(
     start = _start(blocks)
     if harmonics.acceleration_rad_s2:
         for _ in range(COGGING_FITS - 1):  # the torque over the angle is known as an acceleration
-            found = _fit(blocks_of(math.exp(start[0])), start)[0].x
+            found = _fit(blocks_of(math.exp(start[0])), start, elastic)[0].x
             start = np.delete(found, range(SHAFT, len(found) - 2 * len(runs)))
         blocks = blocks_of(math.exp(start[0]))
-    with_drag, chi2, noisy = _fit(blocks, start)
+    with_drag, chi2, noisy = _fit(blocks, start, elastic)
     before, noise = _noise(blocks), _noise(noisy)
     unexplained = any(noise[kind] > UNEXPLAINED * max(before[kind], COASTING_FLOOR) for kind in noise)
     without = _minimum(noisy, np.delete(with_drag.x, SHAFT), sizes_of(blocks))
@@ -204,6 +207,8 @@ def estimate_mechanics(
     condition_gate(condition, "B and tau_c", STAGE)
     _, widen = chi2_gate(chi2, STAGE)
     share = float(information_weights([without.cost, with_drag.cost + DRAG_PENALTY])[1])
+    if elastic:  # so much noise may hide a drag: what it may be is then in the intervals of B and tau_c
+        share = max(share, 0.5)
     of_drag, _ = information_bound(with_drag.jacobian)
     values, deviations = [], []
     for k in range(SHAFT):
@@ -298,7 +303,7 @@ def _start(runs: Sequence[Run]) -> Array:
     return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
 
 
-def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, Sequence[Run]]:
+def _fit(runs: Sequence[Run], start: Array, elastic: bool) -> tuple[Fit, float, Sequence[Run]]:
     """Return the fit with drag, its reduced chi-square, and the runs with the torque's noise that it took."""
     largest = largest_torque(runs)
     scale = sizes_of(runs, drag=True)
@@ -317,7 +322,7 @@ def _fit(runs: Sequence[Run], start: Array) -> tuple[Fit, float, Sequence[Run]]:
         noise = _noise(runs)
         ripple = max(noise.values())
         noisier = _noisier(runs, fit.residual, largest)
-        if ripple > RIPPLE_MOST:
+        if ripple > RIPPLE_MOST and not elastic:
             raise refuse(
                 "E_MODEL_MISMATCH",
                 f"torque off by {100.0 * ripple:.2g} % of the push's, and more, from one {1e3 * runs[0].T:.2g} ms to "
