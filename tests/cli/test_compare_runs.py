@@ -20,8 +20,8 @@ from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.run_directory import RunDirectory, RunRecord
 
-R = Estimate(0.5, 0.001, 0.005, "ohm")
-PSI = Estimate(0.1, 0.0001, 0.001, "Wb")
+R = Estimate(0.5, 0.001, 0.005, "ohm", T_c=25.0)
+PSI = Estimate(0.1, 0.0001, 0.001, "Wb", T_c=25.0)
 
 
 def moved(estimate: Estimate, share: float) -> Estimate:
@@ -56,6 +56,25 @@ def test_the_sensors_part_counts_between_two_drives_only() -> None:
     assert two.interval == pytest.approx(math.sqrt(2) * math.hypot(1.96 * 0.001, 0.005), rel=1e-3)
     (gone,) = differences({"R_s_ohm": R}, {}, same_sensors=True)
     assert gone.verdict == "only in the first" and math.isnan(gone.difference)
+
+
+def test_the_way_to_the_reference_temperature_counts_on_one_drive_too() -> None:
+    """35 K apart one machine showed 2 % of R, 3.6 of the scattering intervals: its devices are no copper."""
+    machine = load_machine_file(machine_path("interior-2k2")).machine
+    first = {"R_s_ohm": R, "psi_f_wb": PSI, "offset_rad": Estimate(3.14, 0.001, 0.0, "rad")}
+
+    def verdicts(share: float, T_c: float, offset: float = 3.14, **known: float) -> list[str]:
+        second = {name: replace(moved(e, share), T_c=T_c) for name, e in first.items()}
+        second["offset_rad"] = replace(first["offset_rad"], value=offset)
+        rows = differences(first, second, same_sensors=True, machine=replace(machine, **known))
+        return [row.verdict for row in rows]
+
+    R_s, offset, psi = range(3)
+    assert verdicts(0.02, 25.0)[R_s] == "differs" and verdicts(0.02, 60.0)[R_s] == "agrees"
+    assert verdicts(0.02, 60.0, R_winding_ohm=0.4)[R_s] == "differs", "the copper part is known"
+    assert verdicts(0.05, 60.0)[R_s] == "differs" and verdicts(0.05, math.nan)[R_s] == "agrees"
+    assert verdicts(0.02, 60.0)[psi] == "agrees" and verdicts(0.02, 60.0, alpha_psi_per_k=-0.001)[psi] == "differs"
+    assert verdicts(0.0, 25.0, -3.142)[offset] == "agrees" and verdicts(0.0, 25.0, -3.1)[offset] == "differs"
 
 
 def test_values_that_scatter_as_they_say_differ_in_one_of_twenty() -> None:
