@@ -6,10 +6,10 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width, total_half_width
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, statistical_half_width, total_half_width
 from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.machine.temperature import UNKNOWN_T_RANGE_C, magnet_tolerance_per_k
 from pmsmtool.units import format_quantity
@@ -57,6 +57,7 @@ def differences(
     *,
     same_sensors: bool,
     machine: MachineParameters | None = None,
+    together: bool = False,
 ) -> list[Difference]:
     """Return every quantity of either run, in the order of the names; angles the short way round.
 
@@ -67,6 +68,8 @@ def differences(
     machine : MachineParameters, optional
         What is known of winding and magnets. With it the way to the reference temperature counts on one drive, too
         (:func:`thermal_half_width`); without it only where ``same_sensors`` does not hold.
+    together : bool
+        Whether the 95 % are those of all quantities together (Bonferroni's inequality) instead of each one's.
     """
     half = statistical_half_width if same_sensors else total_half_width
     rows = []
@@ -82,7 +85,11 @@ def differences(
             change = math.remainder(change, 2.0 * math.pi) if a.unit == "rad" else change
             thermal = thermal_half_width(name, a, b, machine) if same_sensors and machine is not None else 0.0
             rows.append(Difference(name, a.unit, a.value, b.value, change, math.hypot(half(a), half(b), thermal)))
-    return rows
+    if not together:
+        return rows
+    count = max(1, sum(row.interval > 0.0 for row in rows))
+    wider = statistics.NormalDist().inv_cdf(1.0 - 0.025 / count) / COVERAGE_FACTOR
+    return [replace(row, interval=wider * row.interval) for row in rows]
 
 
 def thermal_half_width(name: str, first: Estimate, second: Estimate, machine: MachineParameters) -> float:
