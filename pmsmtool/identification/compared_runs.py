@@ -113,10 +113,13 @@ def thermal_half_width(name: str, first: Estimate, second: Estimate, machine: Ma
     return share * abs(first.value)
 
 
+DRIVE = ("vendor", "product", "serial")
+"""What names a drive (0x1018): node id and firmware may change, and a commissioning records its level, too."""
+
+
 def same_drive(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
-    """Return whether two records name one drive, by a serial number and all else it says of itself."""
-    one, other = ({key: drive.get(key) for key in drive if key != "doubt"} for drive in (first, second))
-    return bool(one.get("serial")) and one == other  # older records do not have the doubt
+    """Return whether two records name one drive; never where it tells no serial number."""
+    return bool(first.get("serial")) and all(first.get(key) == second.get(key) for key in DRIVE)
 
 
 def told(row: Difference) -> tuple[str, ...]:

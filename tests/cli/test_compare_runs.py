@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
 from pmsmtool.errors import CheckFailed, ConfigError
-from pmsmtool.identification.compared_runs import LEAST_SERIES, differences, series
+from pmsmtool.identification.compared_runs import LEAST_SERIES, differences, same_drive, series
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
@@ -84,6 +84,14 @@ def test_values_that_scatter_as_they_say_differ_in_one_of_twenty() -> None:
     two = [({"R": replace(R, value=a)}, {"R": replace(R, value=b)}) for a, b in pairs]
     found = [differences(*both, same_sensors=True)[0].verdict for both in two]
     assert 0.01 < found.count("differs") / 400 < 0.09
+
+
+def test_a_drive_is_known_by_its_serial_number_whatever_else_was_recorded() -> None:
+    """A commissioning records level and map of the drive, too: `diff` took it for another one."""
+    drive = {"node": 1, "vendor": 5, "product": 2, "serial": 7, "software": "1.0"}
+    assert same_drive(drive, {**drive, "node": 3, "software": "1.1", "tier": "full", "map": "pmsmsim"})
+    assert not same_drive(drive, {**drive, "serial": 8}) and not same_drive(drive, {**drive, "product": 3})
+    assert not same_drive({**drive, "serial": 0}, {**drive, "serial": 0})
 
 
 def test_two_runs_on_the_command_line(tmp_path: Path) -> None:
