@@ -114,6 +114,7 @@ def test_the_same_motor_passes_also_round_the_circle(tmp_path: Path) -> None:
     stage = compared(tmp_path, then, now)
     now.add(stage)
     assert stage.status == "pass" and not stage.note and verdict(now.path).word == "PASS"
+    assert "identify and fingerprint, 7 criteria, all met" in verdict(now.path).headline
     assert {line.what.split(":")[0] for line in stage.acceptance} == {*VALUES, "direction"}
     assert f"as in {then.path.name}" in report_page(now.path)
 
