@@ -48,6 +48,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("info", "pmsmtool.cli.info:info_command", Section.LOOK, "Show identity, state and parameter set."),
     Row("caps", "pmsmtool.cli.caps:caps_command", Section.LOOK, "Show what a drive can give, and what is missing."),
     Row("monitor", "pmsmtool.cli.monitor:monitor_command", Section.LOOK, "Show live values."),
+    Row("scope", "pmsmtool.cli.scope:scope_command", Section.LOOK, "Show live signals on a local page."),
     Row("fault", "pmsmtool.cli.fault:fault_command", Section.LOOK, "Show or reset faults."),
     Row("commission", "pmsmtool.cli.commission:commission_command", Section.MOVE, "Identify, design, flash, prove."),
     Row("nmt", "pmsmtool.cli.nmt:nmt_command", Section.WRITE, "Send a network management command."),

@@ -12,7 +12,7 @@ from pmsmtool.cli.options import examples, output_options
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
-    from pmsmtool.machine.parameters import Estimate
+    from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.run_directory import RunRecord
 
 MOST_RUNS = 10_000
@@ -34,26 +34,15 @@ def diff_command(first: Path, second: Path, check: bool, out: Output) -> None:
     """Compare what two runs identified, with the 95 % interval of the difference.
 
     Runs of one drive share its sensors, so only what scatters counts; of two drives the whole interval does. Resistance
-    and flux linkage are compared at their reference temperature.
+    and flux linkage are compared at their reference temperature, with what the way there leaves open.
     """
     from pmsmtool.errors import CheckFailed
-    from pmsmtool.identification.compared_runs import differences
-    from pmsmtool.units import format_quantity
+    from pmsmtool.identification.compared_runs import differences, same_drive, told
 
-    (record, found), (other_record, other) = _read(first), _read(second)
-    same = bool(record.drive.get("serial")) and _who(record) == _who(other_record)
-    rows = differences(found, other, same_sensors=same)
-
-    def told(value: float | None, unit: str) -> str:
-        return "-" if value is None or value != value else format_quantity(value, unit)
-
-    cells = [
-        (
-            row.name, told(row.first, row.unit), told(row.second, row.unit), told(row.difference, row.unit),
-            "-" if row.interval != row.interval else f"+-{format_quantity(row.interval, row.unit, 2)}", row.verdict,
-        )
-        for row in rows
-    ]  # fmt: skip
+    (record, file), (other_record, other) = _read(first), _read(second)
+    same = same_drive(record.drive, other_record.drive)
+    rows = differences(file.estimates, other.estimates, same_sensors=same, machine=file.machine)
+    cells = [(*told(row), row.verdict) for row in rows]
     changed = [row.name for row in rows if row.verdict != "agrees"]
     last = f"{len(rows) - len(changed)} of {len(rows)} quantities agree"
     last += " (one drive: without its sensors' part)" if same else " (two drives: with the sensors' part)"
@@ -81,7 +70,7 @@ def fleet_command(folder: Path, out: Output) -> None:
     runs, unread = [], []
     for path in paths:
         try:
-            runs.append((path.name, _read(path)[1]))
+            runs.append((path.name, _read(path)[1].estimates))
         except PmsmtoolError as error:
             unread.append(f"{path.name}: {error.what}")
     if not runs:
@@ -103,17 +92,13 @@ def fleet_command(folder: Path, out: Output) -> None:
     out.result("fleet", {"runs": len(runs), "left_out": unread, "quantities": [_facts(row) for row in rows]}, lines)
 
 
-def _who(record: RunRecord) -> dict[str, object]:
-    return {key: value for key, value in record.drive.items() if key != "doubt"}  # older records do not have it
-
-
 def _facts(row: object) -> dict[str, object]:
     from dataclasses import asdict
 
     return asdict(row)  # type: ignore[call-overload,no-any-return]
 
 
-def _read(path: Path) -> tuple[RunRecord, dict[str, Estimate]]:
+def _read(path: Path) -> tuple[RunRecord, MachineFile]:
     from pmsmtool.errors import ConfigError
     from pmsmtool.identification.replay import MACHINE
     from pmsmtool.machine.machine_file import load_machine_file
@@ -125,4 +110,4 @@ def _read(path: Path) -> tuple[RunRecord, dict[str, Estimate]]:
             f"the run has no {MACHINE}: nothing was identified", where=str(path),
             hint="`pmsmtool report RUN` says how it ended",
         )  # fmt: skip
-    return record, dict(load_machine_file(path / MACHINE).estimates)
+    return record, load_machine_file(path / MACHINE)

@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
     from pmsmtool.cli.consent import Consent
+    from pmsmtool.cli.fingerprint import Comparison
+    from pmsmtool.identification.fingerprint import Earlier
     from pmsmtool.identification.request import IdentifyRequest
     from pmsmtool.measurement.capabilities import Capabilities
     from pmsmtool.run_directory import RunDirectory, Stage
@@ -31,7 +34,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
         "pmsmtool --sim interior-2k2 --yes identify",
         "pmsmtool -i socketcan -c can0 -n 5 identify R L --i-max 6Apk",
         "pmsmtool --sim saturated-pmsyrm --yes identify map --i-max 20Apk",
-        "pmsmtool identify --replay runs/20260101T120000Z-000055f1",
+        "pmsmtool -n 5 identify --fingerprint runs/20260101T120000Z-000055f1  # is that the same motor?",
     ),
 )
 @click.argument(
@@ -44,6 +47,8 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     help="How; auto: the best this drive can (`pmsmtool caps`).",
 )
 @click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="Recompute from the traces of a run; moves nothing.")
+@click.option("--fingerprint", type=FOLDER, metavar="RUN", help="Measure R, L, psi, encoder and pole pairs again, in "
+              "short, and compare them with those of a run: exit code 1 where one differs.")  # fmt: skip
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
 @click.option(
     "--sensor-tol",
@@ -87,6 +92,7 @@ def identify_command(
     quantities: tuple[str, ...],
     method: str,
     replay: Path | None,
+    fingerprint: Path | None,
     runs: Path,
     sensor_tol: float | None,
     cal: tuple[str, ...],
@@ -109,7 +115,11 @@ def identify_command(
     The limits are printed and consent is asked before anything moves. Every number comes with its statistical and its
     systematic part; what cannot be trusted is refused by name. The run directory keeps raw traces and machine.toml;
     nothing is stored in the drive.
+
+    --fingerprint asks whether this is the motor of an earlier run, as after a swap: by the method and with the limits
+    and sensor tolerances of that run where none are given. Each value is SAME or DIFFERENT, with the likely cause.
     """
+    from pmsmtool.cli.fingerprint import compare, earlier_run, like_then
     from pmsmtool.errors import NotAvailable
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.identification.calibration import calibrated_tolerance
@@ -117,6 +127,8 @@ def identify_command(
 
     declared = None if sensor_tol is None else SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol)
     if replay is not None:
+        if fingerprint is not None:
+            raise click.UsageError("--fingerprint measures; `pmsmtool diff` compares two runs that are there")
         if half_frequency:
             raise click.UsageError("--half-frequency measures; with --replay the traces of the run decide")
         if accuracy is not None:
@@ -147,8 +159,15 @@ def identify_command(
         accuracy=accuracy,
         tolerance=calibrated_tolerance(declared or SensorTolerance(), cal),
     )
+    earlier, asked = None, request.quantities
+    if fingerprint is not None:
+        earlier, asked = earlier_run(fingerprint, quantities, method)
+        own_tolerance = declared is not None or bool(cal)
+        request = like_then(replace(request, quantities=asked), earlier, own_tolerance=own_tolerance)
+        method = earlier.level
     request.check()
-    found, how, request = _choose(bus, map_file, method, request, everything=not quantities, supply=supply)
+    everything = not quantities and earlier is None
+    found, how, request = _choose(bus, map_file, method, request, everything=everything, supply=supply)
     if half_frequency and how != "inject":
         raise NotAvailable(
             f"the method {how} has no measurement at half the control frequency", hint="leave --half-frequency out"
@@ -158,19 +177,17 @@ def identify_command(
     if supply and not (how == "standard" and "R" in request.quantities):
         raise NotAvailable(f"the method {how} reads no bench supply", hint="leave --supply out, or ask for R")
     if how == "inject":
-        run, stage = _measure(bus, motion, out, request, runs, found)
+        run, stage = _measure(bus, motion, out, request, runs, found, earlier)
     else:
         run, stage = _measure_without_injection(bus, motion, out, request, runs, found, how, supply=supply)
         _tell_more(found, request, out)
-    _show(run, stage, out)
+    _show(run, stage, out, None if earlier is None else compare(earlier, run, asked))
 
 
 def _choose(
     bus: BusOptions, map_file: Path | None, method: str, request: IdentifyRequest, *, everything: bool, supply: bool
 ) -> tuple[Capabilities, str, IdentifyRequest]:
     """Ask the drive what it can; return the method, and without a choice of quantities those it gives."""
-    from dataclasses import replace
-
     from pmsmtool.cli.drive_access import open_node, read_map
     from pmsmtool.flash.map_gate import check_motion
     from pmsmtool.measurement.capabilities import MEASURING, Method, examine, with_supply
@@ -253,6 +270,7 @@ def _measure(
     request: IdentifyRequest,
     runs: Path,
     found: Capabilities,
+    earlier: Earlier | None,
 ) -> tuple[RunDirectory, Stage]:
     from dataclasses import asdict
 
@@ -260,7 +278,7 @@ def _measure(
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.cli.drive_access import choose_node
     from pmsmtool.commissioning.tier_stages import open_tier_drive
-    from pmsmtool.measurement.identify import identify_stage, nameplate_of
+    from pmsmtool.measurement.identify import identify_stage, nameplate_of, with_limits_of
     from pmsmtool.run_directory import RunDirectory, new_record
 
     with bus.connect() as connection:
@@ -274,6 +292,8 @@ def _measure(
             versions={"pmsmtool": __version__},
         )
         nameplate = nameplate_of(drive, identity.name or f"drive {identity.serial:#010x}")
+        if earlier is not None:
+            request = with_limits_of(earlier.request, request, nameplate)
         run = RunDirectory.create(runs, identity.serial, record)
 
         def allow(lines: Any) -> None:
@@ -306,13 +326,13 @@ def _accounted(run: RunDirectory, out: Output) -> Iterator[Callable[[str], None]
 
 def _keep(run: RunDirectory, given: Consent) -> None:
     """Put the consent into the record before anything moves: somebody signs it, however the run ends."""
-    from dataclasses import asdict, replace
+    from dataclasses import asdict
 
     record = run.read()
     run.write(replace(record, consents=(*record.consents, asdict(given))))
 
 
-def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
+def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison | None = None) -> None:
     from dataclasses import asdict
 
     from pmsmtool.cli.output import table
@@ -347,7 +367,9 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
     }  # fmt: skip
     accuracy = accuracy_told(stage.values)
     data |= {"accuracy": accuracy} if accuracy else {}
-    out.result("identify", data, table(heads, rows))
+    compared = [] if comparison is None else comparison.lines()
+    data |= {} if comparison is None else {"fingerprint": comparison.facts()}
+    out.result("identify", data, [*table(heads, rows), *compared])
     for line in warnings:
         out.warn(line)
     if accuracy and stage.status == "pass":
@@ -356,6 +378,10 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
     for name in stage.files:
         if not name.startswith(("traces/", "nameplate", "request")):
             out.note(f"-> {run.path / name}")
+    if comparison is not None:
+        comparison.require_same(run)
+    if stage.status == "pass" and comparison is not None:
+        comparison.require_whole(run)
     if stage.status == "pass":
         return
     refused = [f"{name}: {reason}" for name, reason in stage.refused.items()]

@@ -6,18 +6,12 @@ from __future__ import annotations
 import math
 import re
 import sys
-from typing import TYPE_CHECKING
 
 import click
 
 from pmsmtool.cli.drive_access import LOOKING_S, open_node, warn_of_other_drive
 from pmsmtool.cli.options import FREQUENCY, TIME, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from pmsmtool.drive.drive_node import DriveNode
 
 DEFAULT_RATE_HZ = 5.0
 
@@ -71,6 +65,7 @@ def monitor_command(
     as_csv: bool,
 ) -> None:
     """Show live values with their minimum, maximum and standard deviation; one JSON object per reading with --json."""
+    from pmsmtool.drive.live_readings import available, readings, sent
     from pmsmtool.drive.objects import signal_unit
     from pmsmtool.errors import ConfigError
 
@@ -84,14 +79,14 @@ def monitor_command(
     period_s = 1.0 / (rate_hz or DEFAULT_RATE_HZ)
     with open_node(bus, within_s=LOOKING_S) as node:
         warn_of_other_drive(node, out)
-        names = _available(node, wanted)
+        names = available(node, wanted.search)
         node.sdo.finish_within(math.inf)
         if as_csv:
             click.echo(",".join(["t_s", *names]))
             click.echo(",".join(["s", *map(signal_unit, names)]))
         columns = {name: _Column() for name in names}
         try:
-            source = _sent if pdo else _readings
+            source = sent if pdo else readings
             for t_s, values in source(node, names, period_s, seconds):
                 for name, value in values.items():
                     columns[name].add(value)
@@ -107,47 +102,6 @@ def monitor_command(
                 raise  # asked for a time and interrupted before
     if not (as_csv or out.json or sys.stdout.isatty()):
         click.echo("\n".join(_lines(columns)))
-
-
-def _available(node: DriveNode, wanted: re.Pattern[str]) -> list[str]:
-    from pmsmtool.drive.objects import LIVE
-    from pmsmtool.errors import NotAvailable
-
-    names = [name for name, item in LIVE.items() if wanted.search(name) and node.has(item.index, item.sub)]
-    if not names:
-        raise NotAvailable("the drive has no live quantity of that name", hint=f"there are {', '.join(LIVE)}")
-    return names
-
-
-def _readings(
-    node: DriveNode, names: list[str], period_s: float, seconds: float | None
-) -> Iterator[tuple[float, dict[str, float]]]:
-    from pmsmtool.drive.objects import LIVE
-
-    clock = node.connection.clock
-    start = clock.now()
-    number = 0
-    while seconds is None or clock.now() - start < seconds:
-        yield clock.now() - start, {name: node.get(LIVE[name]) for name in names}
-        number += 1
-        node.connection.wait(max(0.0, start + number * period_s - clock.now()))
-        node.supervision.check()
-
-
-def _sent(
-    node: DriveNode, names: list[str], period_s: float, seconds: float | None
-) -> Iterator[tuple[float, dict[str, float]]]:
-    """As :func:`_readings`, of what the drive sends by itself."""
-    from pmsmtool.drive.process_data import live_values
-
-    clock = node.connection.clock
-    with live_values(node, names, period_s) as live:
-        start = clock.now()
-        while seconds is None or clock.now() - start < seconds:
-            node.connection.wait(period_s)
-            node.supervision.check()
-            if len(live.values) == len(names):
-                yield clock.now() - start, {name: live.values[name] for name in names}
 
 
 def _lines(columns: dict[str, _Column]) -> list[str]:

@@ -106,6 +106,7 @@ TIME = Quantity("time")
 LARGEST_CURRENT = Quantity("current", positive=True)
 LARGEST_SPEED = Quantity("angular speed", positive=True)
 DURATION = Quantity("time", positive=True)
+RATE = Quantity("frequency", positive=True)
 
 
 def examples(*lines: str) -> str:

@@ -35,7 +35,7 @@ from pmsmtool.units import UNITS
 SCHEMA = "pmsmtool.anonymous/1"
 DIGITS = 9
 """Of every number: a binary32 is told by nine."""
-STAGES = ("check", "identify", "tune", "lut", "margins", "flash", "verify", "prove", "track", "learn")
+STAGES = ("check", "identify", "tune", "lut", "margins", "flash", "verify", "prove", "track", "learn", "fingerprint")
 PROGRAMS = ("pmsmtool", "python", "numpy", "scipy", "python-can")
 INTERFACES = (
     "pmsmsim", "socketcan", "socketcand", "virtual", "udp_multicast", "slcan", "pcan", "ixxat", "kvaser", "vector",

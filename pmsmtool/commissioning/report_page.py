@@ -21,6 +21,7 @@ from pmsmtool.design.loops.open_loops import open_loops
 from pmsmtool.errors import IdentificationError
 from pmsmtool.files import read_text
 from pmsmtool.identification.evaluate import Evaluation, evaluate, shots_of
+from pmsmtool.identification.fingerprint import STAGE as FINGERPRINT
 from pmsmtool.identification.replay import NAMEPLATE, evaluation_of, stored_traces
 from pmsmtool.identification.request import REQUEST, parse_request
 from pmsmtool.machine.machine_file import load_machine_file
@@ -90,7 +91,7 @@ def verdict(path: Path) -> Verdict:
 def _complete(record: RunRecord) -> Sequence[str]:
     """Return the stages that a run must have: of a command of one stage that one, else those of a commissioning."""
     command = next((word for word in record.command if word in (*ONE_STAGE, *CHAINS)), "")
-    others = {stage.name for stage in record.stages} - {command}
+    others = {stage.name for stage in record.stages} - {command, FINGERPRINT}
     return (command,) if command in ONE_STAGE and not others else COMPLETE
 
 

@@ -16,7 +16,7 @@ from pmsmtool.bus.nmt import NmtCommand, NmtState, send_nmt
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.objects import LIVE, DriveObject
-from pmsmtool.errors import NotAvailable, SdoAbort
+from pmsmtool.errors import BusError, NotAvailable, SdoAbort
 
 BORROWED = (2, 3, 4)
 """Numbers of the transmit PDOs in use."""
@@ -102,6 +102,7 @@ def live_values(
         brought_back = True
         _bring_back(node, before)
 
+    lost: BusError | None = None
     node.before_close.append(bring_back)  # a signal between two bytecodes of a `with` statement calls no exit
     try:
         for number, cob_id, group in zip(BORROWED, cob_ids, groups, strict=False):
@@ -116,9 +117,16 @@ def live_values(
         raise NotAvailable(
             "the drive cannot send these as process data", where=abort.where, hint="leave --pdo out"
         ) from abort
+    except BusError as error:
+        lost = error
+        raise
     finally:
         with interrupts_deferred() as noted:
-            bring_back()
+            try:
+                bring_back()
+            except BusError:
+                if lost is None:
+                    raise  # else what was lost first says more
         if noted:
             raise KeyboardInterrupt
 

@@ -113,6 +113,20 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
     )
 
 
+def with_limits_of(earlier: IdentifyRequest, request: IdentifyRequest, nameplate: MachineFile) -> IdentifyRequest:
+    """Return a request with the limits of an earlier one where it has none: values are compared at like currents.
+
+    They are never above the ratings of the drive, whose motor may be another one now.
+    """
+    own = envelope_of(nameplate, replace(request, i_max_apk=None, speed_max_rad_s=None))
+    i_max, speed = request.i_max_apk, request.speed_max_rad_s
+    if i_max is None and earlier.i_max_apk is not None:
+        i_max = min(earlier.i_max_apk, own.i_max_apk)
+    if speed is None and earlier.speed_max_rad_s is not None:
+        speed = min(earlier.speed_max_rad_s, own.speed_max_rad_s)
+    return replace(request, i_max_apk=i_max, speed_max_rad_s=speed)
+
+
 def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineFile) -> list[str]:
     """Return what a person reads before consenting: the envelope and what will happen inside it."""
     steps = steps_of(request.measured, request.shaft == "locked")

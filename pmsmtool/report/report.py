@@ -10,11 +10,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pmsmtool.report.comparison import HEADS, table_cells
 from pmsmtool.report.verdict import COMPLETE, comparison_of, latest_of, verdict_of
 from pmsmtool.units import format_estimate, format_quantity
+
+if TYPE_CHECKING:
+    import jinja2
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,15 +65,11 @@ def render(
     ended : sequence of str
         How a run ended that did not come to its end.
     """
-    import jinja2
-
-    source = resources.files("pmsmtool.report").joinpath("templates/report.html.j2").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     latest = latest_of(record.get("stages", ()))
     drive = record.get("drive", {})
     name = str(drive.get("name") or "drive")
     found, rows = verdict_of(record, complete), comparison_of(latest)
-    return environment.from_string(source).render(
+    return template("report.html.j2").render(
         title=f"Commissioning of {name}, serial {int(drive.get('serial', 0)):#010x}",
         subtitle=f"started {record['started_utc']} by {record['operator']}",
         verdict=found,
@@ -95,6 +94,17 @@ def render(
         # A later stage may write a file of an earlier one again: the last digest is that of the file.
         files=sorted({name: digest for stage in latest for name, digest in stage.get("files", {}).items()}.items()),
     )
+
+
+def template(name: str) -> jinja2.Template:
+    """Return a page's template; what it is given is escaped."""
+    import jinja2
+
+    folder = resources.files("pmsmtool.report").joinpath("templates")
+    loader = jinja2.FunctionLoader(lambda part: folder.joinpath(part).read_text(encoding="utf-8"))
+    return jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    ).get_template(name)
 
 
 def _estimate_row(value: Mapping[str, Any]) -> dict[str, str]:

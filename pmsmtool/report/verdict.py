@@ -207,7 +207,8 @@ def _counted(ran: Sequence[Mapping[str, Any]], latest: Sequence[Mapping[str, Any
     criteria = sum(len(stage.get("acceptance", ())) for stage in ran)
     met = {0: "no criteria", 1: "1 criterion, met"}.get(criteria, f"{criteria} criteria, all met")
     if len(complete) == 1:
-        return f"{complete[0]} alone, {met}" if latest else f"{complete[0]} did not run"
+        names = " and ".join(str(stage["name"]) for stage in latest)
+        return f"{names}{' alone' if len(latest) == 1 else ''}, {met}" if names else f"{complete[0]} did not run"
     count = sum(stage["name"] in complete for stage in ran)
     proven = "" if any(stage["name"] == "prove" for stage in ran) else ", behaviour not proven"
     return f"{count} of {len(complete)} stages ran, {met}{proven}"

@@ -14,14 +14,14 @@ from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
 from pmsmtool.errors import CheckFailed, ConfigError
-from pmsmtool.identification.compared_runs import LEAST_SERIES, differences, series
+from pmsmtool.identification.compared_runs import LEAST_SERIES, differences, same_drive, series
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.run_directory import RunDirectory, RunRecord
 
-R = Estimate(0.5, 0.001, 0.005, "ohm")
-PSI = Estimate(0.1, 0.0001, 0.001, "Wb")
+R = Estimate(0.5, 0.001, 0.005, "ohm", T_c=25.0)
+PSI = Estimate(0.1, 0.0001, 0.001, "Wb", T_c=25.0)
 
 
 def moved(estimate: Estimate, share: float) -> Estimate:
@@ -58,6 +58,25 @@ def test_the_sensors_part_counts_between_two_drives_only() -> None:
     assert gone.verdict == "only in the first" and math.isnan(gone.difference)
 
 
+def test_the_way_to_the_reference_temperature_counts_on_one_drive_too() -> None:
+    """35 K apart one machine showed 2 % of R, 3.6 of the scattering intervals: its devices are no copper."""
+    machine = load_machine_file(machine_path("interior-2k2")).machine
+    first = {"R_s_ohm": R, "psi_f_wb": PSI, "offset_rad": Estimate(3.14, 0.001, 0.0, "rad")}
+
+    def verdicts(share: float, T_c: float, offset: float = 3.14, **known: float) -> list[str]:
+        second = {name: replace(moved(e, share), T_c=T_c) for name, e in first.items()}
+        second["offset_rad"] = replace(first["offset_rad"], value=offset)
+        rows = differences(first, second, same_sensors=True, machine=replace(machine, **known))
+        return [row.verdict for row in rows]
+
+    R_s, offset, psi = range(3)
+    assert verdicts(0.02, 25.0)[R_s] == "differs" and verdicts(0.02, 60.0)[R_s] == "agrees"
+    assert verdicts(0.02, 60.0, R_winding_ohm=0.4)[R_s] == "differs", "the copper part is known"
+    assert verdicts(0.05, 60.0)[R_s] == "differs" and verdicts(0.05, math.nan)[R_s] == "agrees"
+    assert verdicts(0.02, 60.0)[psi] == "agrees" and verdicts(0.02, 60.0, alpha_psi_per_k=-0.001)[psi] == "differs"
+    assert verdicts(0.0, 25.0, -3.142)[offset] == "agrees" and verdicts(0.0, 25.0, -3.1)[offset] == "differs"
+
+
 def test_values_that_scatter_as_they_say_differ_in_one_of_twenty() -> None:
     """400 pairs: 5 % of 95 % intervals, here at most 9 % (measured 4.5)."""
     rng = np.random.default_rng(7)
@@ -65,6 +84,14 @@ def test_values_that_scatter_as_they_say_differ_in_one_of_twenty() -> None:
     two = [({"R": replace(R, value=a)}, {"R": replace(R, value=b)}) for a, b in pairs]
     found = [differences(*both, same_sensors=True)[0].verdict for both in two]
     assert 0.01 < found.count("differs") / 400 < 0.09
+
+
+def test_a_drive_is_known_by_its_serial_number_whatever_else_was_recorded() -> None:
+    """A commissioning records level and map of the drive, too: `diff` took it for another one."""
+    drive = {"node": 1, "vendor": 5, "product": 2, "serial": 7, "software": "1.0"}
+    assert same_drive(drive, {**drive, "node": 3, "software": "1.1", "tier": "full", "map": "pmsmsim"})
+    assert not same_drive(drive, {**drive, "serial": 8}) and not same_drive(drive, {**drive, "product": 3})
+    assert not same_drive({**drive, "serial": 0}, {**drive, "serial": 0})
 
 
 def test_two_runs_on_the_command_line(tmp_path: Path) -> None:

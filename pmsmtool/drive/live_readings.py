@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: MIT
+"""Live quantities of a drive, reading after reading: asked for one by one, or as the drive sends them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.objects import LIVE
+from pmsmtool.drive.process_data import live_values
+from pmsmtool.errors import DriveTimeout, NotAvailable
+
+SILENT_S = 1.0
+"""A drive that was told to send by a timer and sends nothing for this long, and for three periods, is lost."""
+
+Readings = Generator[tuple[float, dict[str, float]], None, None]
+"""Time since the first reading (s), and the value of every quantity by its name."""
+
+
+def available(node: DriveNode, wanted: Callable[[str], object]) -> list[str]:
+    """Return the names of the live quantities that are wanted and that the drive has; raises ``NotAvailable``."""
+    names = [name for name, item in LIVE.items() if wanted(name) and node.has(item.index, item.sub)]
+    if not names:
+        raise NotAvailable("the drive has no live quantity of that name", hint=f"there are {', '.join(LIVE)}")
+    return names
+
+
+def readings(node: DriveNode, names: list[str], period_s: float, seconds: float | None) -> Readings:
+    """Read the quantities one after the other, once per period, for a time or for ever."""
+    clock = node.connection.clock
+    start = clock.now()
+    number = 0
+    while seconds is None or clock.now() - start < seconds:
+        yield clock.now() - start, {name: node.get(LIVE[name]) for name in names}
+        number += 1
+        node.connection.wait(max(0.0, start + number * period_s - clock.now()))
+        node.supervision.check()
+
+
+def sent(node: DriveNode, names: list[str], period_s: float, seconds: float | None) -> Readings:
+    """As :func:`readings`, of what the drive sends by itself.
+
+    Raises
+    ------
+    DriveTimeout
+        It sends nothing any more.
+    """
+    clock = node.connection.clock
+    with live_values(node, names, period_s) as live:
+        start = clock.now()
+        received, silent_s = 0, 0.0
+        while seconds is None or clock.now() - start < seconds:
+            node.connection.wait(period_s)
+            node.supervision.check()
+            # in periods waited for, not by the clock: a computer that stood still is no drive that fell silent
+            silent_s = silent_s + period_s if live.received == received else 0.0
+            received = live.received
+            if silent_s > max(SILENT_S, 3.0 * period_s):
+                raise DriveTimeout(
+                    f"the drive has sent no process data for {silent_s:.1f} s",
+                    where=f"node {node.node}",
+                    likely="the node lost its supply, or the cable is open",
+                    hint="check both, and reset the drive: its PDOs may still be the borrowed ones",
+                )
+            if len(live.values) == len(names):
+                yield clock.now() - start, {name: live.values[name] for name in names}
