@@ -99,6 +99,26 @@ def test_the_resonance_of_an_elastic_shaft_its_notch_and_its_replay(tmp_path: Pa
     assert {name: run.sha256(name) for name in before} == before
 
 
+@pytest.mark.chain
+def test_pushes_of_an_elastic_shaft_tell_friction_where_both_inertias_agree(tmp_path: Path) -> None:
+    """Fifteen times the rotor's inertia behind a spring, 150 Hz: a rigid shaft is off by three times the push."""
+    truth = load_machine_file(machine_path("interior-2k2"))
+    spring = {"J_kgm2": 0.001, "J_load_kgm2": 0.015, "coupling_stiffness_nm_per_rad": 833.0,
+              "coupling_damping_nms_per_rad": 0.03}  # fmt: skip
+    path = tmp_path / "elastic.toml"
+    path.write_text(dump_machine_file(replace(truth, simulation={**truth.simulation, **spring})))
+    with Connection(PmsmSimBus(f"{path}?nv=:memory:")) as connection:
+        drive = CanopenDrive(connection, 1)
+        run = RunDirectory.create(tmp_path, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
+        request = IdentifyRequest(("mechanics", "frf"))
+        stage = identify_stage(run, drive, nameplate_of(drive, "bench"), request, lambda plan: None, lambda line: None)
+        drive.close()
+    assert "mechanics" not in stage.refused
+    found = load_machine_file(run.path / MACHINE).estimates
+    for name, true in (("J_kgm2", 0.016), ("B_nms", truth.machine.B_nms), ("tau_c_nm", truth.machine.tau_c_nm)):
+        assert abs(found[name].value - (true or 0.0)) < total_half_width(found[name])
+
+
 def test_no_notch_without_a_resonance_and_none_beyond_the_speed_controller() -> None:
     rigid = load_machine_file(machine_path("interior-2k2"))
     assert tune(rigid, TuneRequest())["speed.notch_hz"] == 0.0

@@ -143,10 +143,28 @@ def test_the_prediction_samples_when_the_identified_sensors_do() -> None:
         ).setups
         lags, shifts = (np.array([getattr(one, name) for one in drawn]) for name in ("sensor_lag", "sampling_shift"))
         if known:
+            ages = np.array([one.sensors.encoder_latency for one in drawn])
             assert lags == pytest.approx(lag, abs=3.0 * std) and np.ptp(lags) > std
-            assert lags + shifts == pytest.approx(lag + instant)
+            assert shifts.any() and ages.any() and not np.any(shifts * ages), "one looks like the other"
+            assert lags + shifts + ages == pytest.approx(lag + instant)
         else:
             assert 0.0 <= lags.min() and lags.max() <= 0.1 * inverter.T_s and not shifts.any()
+
+
+def test_the_prediction_has_the_two_masses_that_the_resonance_tells() -> None:
+    base = light()
+    resonance, antiresonance, zeta = 150.0, 60.0, 0.02
+    known = {"resonance_hz": resonance, "antiresonance_hz": antiresonance, "resonance_zeta": zeta}
+    made = tune(replace(base, machine=replace(base.machine, **known)), TuneRequest(notch_hz=0.0))
+    limits = conditions(made, U_dc_v=24.0)
+    for setup in SimulatedDrives(made, limits, plan_proof(made, limits), 8, 0).setups:
+        m = setup.machine
+        assert m.J / (m.J + m.J_load) == pytest.approx((antiresonance / resonance) ** 2, rel=0.09)
+        alone, both = m.coupling_stiffness / m.J_load, m.coupling_stiffness * (1.0 / m.J + 1.0 / m.J_load)
+        assert math.sqrt(alone) / (2.0 * math.pi) == pytest.approx(antiresonance, rel=0.02)
+        assert math.sqrt(both) / (2.0 * math.pi) == pytest.approx(resonance, rel=0.02)
+        damping = 0.5 * m.coupling_damping * math.sqrt(both) / m.coupling_stiffness
+        assert zeta / 2.0 <= damping <= 2.0 * zeta
 
 
 def test_a_locked_shaft_leaves_the_current_steps() -> None:
