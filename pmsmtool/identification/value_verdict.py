@@ -8,6 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS
 from pmsmtool.estimators.cross_check import CrossCheck
 from pmsmtool.estimators.estimate import Verdict, coverage_factor, statistical_half_width, total_half_width
 from pmsmtool.estimators.resistance import at_the_test
@@ -146,8 +147,12 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     for axis, fit in () if evaluation.inductance is None else evaluation.inductance.axes.items():
         if "eddy" in fit.effects:
             conditions |= {f"eddy_{axis}_s": fit.eddy_s, f"eddy_{axis}_time_s": fit.eddy_tau_s}
-    if evaluation.mechanics is not None and evaluation.mechanics.drag is not None:
-        conditions["drag_nms2"] = evaluation.mechanics.drag.value
+    if evaluation.mechanics is not None:
+        if evaluation.mechanics.drag is not None:
+            conditions["drag_nms2"] = evaluation.mechanics.drag.value
+        often = dict(zip(ENCODER_ORDERS, ("once", "twice"), strict=True))
+        for h in evaluation.mechanics.harmonics.encoder_rad:
+            conditions[f"encoder_{often[h.order]}_rad"] = h.amplitude
     if evaluation.cogging is not None and evaluation.cogging.harmonics.acceleration_rad_s2:
         largest = max(evaluation.cogging.harmonics.acceleration_rad_s2, key=lambda h: h.amplitude)
         conditions |= {"cogging_nm": evaluation.cogging.J.value * largest.amplitude, "cogging_periods": largest.order}

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pmsmtool.design.prediction import Array, Prediction, Quantity
+from pmsmtool.design.prediction import Array, Band, Prediction, Quantity
 from pmsmtool.errors import ConfigError
 from pmsmtool.trace import Trace
 
@@ -20,6 +20,10 @@ one leaves (measured on the spoiled drives of the tests: 0.32 and 0.37; on a sat
 
 RIPPLE_MOST = 1.0
 """Most ripple that counts, of the half width without: what shakes more than it may be off is not healthy."""
+SHAKES = (
+    "the machine shakes in steady state by more than the band: an encoder off centre behind a stiff speed loop, an "
+    "elastic shaft, cogging, or a link with ripple"
+)
 RIPPLE_SIGMAS = 3.0
 """Largest of some hundred averages, in their standard deviations."""
 LEAST_STEADY_ROWS = 16
@@ -137,7 +141,14 @@ def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> 
     cause = likely_cause(prediction, {key: measured[key] for key in sorted(keys)})
     if not cause and only_quantities:  # no response alone is far enough off to tell, but what they tell together is
         cause = _cause_of_quantities(prediction, deviation)
+    if not cause and any(_shakes_most(prediction.bands[key]) for key in keys):
+        cause = SHAKES
     return Judgement(found.seen, cause)
+
+
+def _shakes_most(band: Band) -> bool:
+    """Whether more ripple was seen than counts."""
+    return band.ripple >= RIPPLE_MOST * (float(np.median(band.half)) - band.ripple) * (1.0 - 1e-9)
 
 
 def _cause_of_quantities(prediction: Prediction, deviation: Mapping[tuple[str, str], Array]) -> str:

@@ -64,8 +64,8 @@ OFFSET_SHARE = 0.001
 MISMATCH = 0.002
 """Standard deviations of sensor offsets (of I_max) and of the phases' gains against each other."""
 SEEN_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
-"""Range of identified eddy currents, drag and cogging, and factor either way of the currents' time constant: one branch
-stands for many, one order for the orders of the cogging."""
+"""Range of identified eddy currents, drag, cogging and encoder errors, and factor either way of the currents' time
+constant: one branch stands for many, one order for the orders of the cogging."""
 RESONANCE_RANGE, ZETA_FACTOR = (0.98, 1.02), 2.0
 """Range of identified resonance and antiresonance, and factor either way of the damping."""
 BASE_SPEED = (-0.03, 0.01)
@@ -353,7 +353,7 @@ def _draw(
     known = [machine.conditions.get(f"sensor_gain_{phase}_over_mean", 1.0) for phase in "abc"]
     setup.sensors.gain[:] = list(rng.normal(1.0, MISMATCH, 3) * np.array(known))
     _draw_eddy_currents(setup, machine, rng)
-    _draw_torques(setup, machine, rng)
+    _draw_shaft_effects(setup, machine, rng)
     _draw_inverter(setup, machine, rng)
     setup.sensor_lag, setup.sampling_shift = _timing(machine, rng, late=setup.delay > 0)
     if (machine.inverter.sampling_instant_s or 0.0) > 0.0 and rng.random() < 0.5:
@@ -401,9 +401,12 @@ def _draw_elastic_shaft(setup: Setup, machine: MachineFile, rng: np.random.Gener
     out.coupling_damping = 2.0 * zeta * out.coupling_stiffness / w_r
 
 
-def _draw_torques(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
-    """Draw the drag and the largest order of the cogging about those that the mechanics were identified with."""
+def _draw_shaft_effects(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
+    """Draw what the mechanics were identified with: drag, the largest order of the cogging, the encoder's errors."""
     out, seen = setup.machine, machine.conditions
+    for name in ("encoder_once", "encoder_twice"):
+        if isinstance(error_rad := seen.get(f"{name}_rad"), float):
+            setattr(setup.sensors, name, float(rng.uniform(*SEEN_SHARES)) * error_rad)
     if isinstance(drag := seen.get("drag_nms2"), float):
         out.drag = float(rng.uniform(*SEEN_SHARES)) * drag
     torque_nm, periods = seen.get("cogging_nm"), seen.get("cogging_periods")
