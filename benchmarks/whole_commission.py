@@ -3,17 +3,21 @@
 
     python -m benchmarks.whole_commission --drives 200 --first 120000 --results results.jsonl
     python -m benchmarks.whole_commission --real --drives 400 --first 160000 --results real.jsonl
+    python -m benchmarks.whole_commission --second-plant --drives 60 --first 170000 --results second.jsonl
 
 Drives follow from their seeds (``sim/random_drives.py``: switched inverter, half of the encoders reversed, half of
 the machines with two leads swapped, 5 to 90 degC, three kinds of sensors in turn). FILE is a data sheet within its
 tolerances, and the drive's memory holds the set of another motor. The command runs in the process, over frames, with
 its default options. Every result is appended to the file as it comes; a seed in the file is not run again, and
 ``--drives 0`` only sums up. A false alarm: a right file that the comparison of the values contradicts.
+With ``--second-plant`` motor, shaft and bridge are those of ``benchmarks/second_plant``, and every result names them
+by the sha256 of their sources.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import multiprocessing
 import statistics
@@ -25,6 +29,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks import second_plant
 from benchmarks.commissioning import QUANTITIES, commanded, errors_of, prepared
 from benchmarks.real_population import draw_real
 from pmsmtool.commissioning.report_page import verdict
@@ -86,6 +91,15 @@ def commission_one(seed: int, drive: MachineFile | None = None) -> dict[str, Any
     return {**result, "seconds": time.process_time() - start}
 
 
+def commission_job(seed: int, *, real: bool, second: bool) -> dict[str, Any]:
+    """Commission one drive of a population, on the project's plant or on the second one."""
+    commission = commission_real if real else commission_one
+    if not second:
+        return commission(seed)
+    with second_plant.used() as digest:
+        return commission(seed) | {"plant": digest}
+
+
 def ended(result: dict[str, Any]) -> str:
     """Return PASS, PARTIAL or FAIL."""
     return {0: "PASS", PARTIAL: "PARTIAL"}.get(result["code"], "FAIL")
@@ -124,13 +138,18 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=200)
     parser.add_argument("--first", type=int, default=120_000, help="first seed")
     parser.add_argument("--real", action="store_true", help="with effects of real machines (real_population.py)")
+    parser.add_argument("--second-plant", action="store_true", help="motor, shaft and bridge of second_plant/")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--results", type=Path, default=Path("whole_commission.jsonl"))
     asked = parser.parse_args()
     done = {result["seed"] for result in read_results(asked.results)}
     seeds = [seed for seed in range(asked.first, asked.first + asked.drives) if seed not in done]
+    if asked.second_plant:
+        second_plant.build()
+        print(f"second plant, sha256 of its sources {second_plant.digest()}", flush=True)
+    commission = functools.partial(commission_job, real=asked.real, second=asked.second_plant)
     with multiprocessing.Pool(asked.processes, maxtasksperchild=1) as pool, asked.results.open("a") as file:
-        for result in pool.imap_unordered(commission_real if asked.real else commission_one, seeds, chunksize=1):
+        for result in pool.imap_unordered(commission, seeds, chunksize=1):
             file.write(json.dumps(result) + "\n")
             file.flush()
             print(f"{result['seed']} {ended(result)} {result['stage']} {result['seconds']:.0f} s", flush=True)

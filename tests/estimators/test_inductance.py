@@ -12,6 +12,7 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, Verdict
 from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.inductance import EDGE_STD, FrameAhead, InductanceResult, estimate_inductances
+from pmsmtool.estimators.injection.output_error import AxisModel
 from pmsmtool.estimators.injection.sampling_instant import INSTANTS, LAGS, ShownInstant
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
@@ -386,6 +387,28 @@ def test_ripple_of_a_link_is_a_line_of_its_own(plain: Shots, rate: float) -> Non
     quiet, loud = _shaken(plain, lambda n: np.sin(rate * n + 1.0) + 0.3 * np.sin(2.0 * rate * n))
     assert loud.axes["d"].chi2 < 1.5  # measured 0.99 to 1.05
     assert loud.L_d.std < 1.5 * quiet.L_d.std
+
+
+@pytest.mark.parametrize(("R_iron", "L_branch"), [(200.0, 1e-9), (20.0, 5e-3), (60.0, 0.03)])
+def test_what_eddy_currents_drop_over_the_winding_is_not_inductance(R_iron: float, L_branch: float) -> None:
+    """Winding in front of flux and branch, split into the two poles that a fit finds. L was 2 R/R_iron too large."""
+    R, L = 2.0, 2e-3
+    through = [L + L_branch, R_iron]
+    flux_and_branch = np.polyadd([L * L_branch, L * R_iron, 0.0], R * np.array([0.0, *through]))
+    poles = np.sort(np.roots(flux_and_branch).real)
+    fast, slow = (np.polyval(through, pole) / np.polyval(np.polyder(flux_and_branch), pole) for pole in poles)
+    model = AxisModel(
+        L_h=1.0 / slow,
+        R_ohm=-poles[1] / slow,
+        delay=1.0,
+        lag_s=0.0,
+        eddy_s=-fast / poles[0] / slow,
+        eddy_tau_s=-1.0 / poles[0],
+    )
+    assert model.flux_inductance_h == pytest.approx(L, rel=1e-6)
+    assert replace(model, eddy_s=0.0).flux_inductance_h == model.L_h
+    if L_branch < 1e-6:
+        assert model.L_h == pytest.approx((1.0 + R / R_iron) ** 2 * L, rel=1e-4)
 
 
 @pytest.mark.parametrize(("flux", "tau"), [(0.3, 0.0), (0.08, 1.5)])

@@ -334,12 +334,12 @@ def _average(
     if not rows:
         raise refuse("E_NOT_CONVERGED", "no model of the axis could be fitted", stage="inductance")
     weights = information_weights([_criterion(fit, layout, timing) for _, fit, layout, _ in rows])
-    L = float(sum(w * row[2].L_scale * math.exp(row[1].x[0]) for w, row in zip(weights, rows, strict=True)))
+    L_each = [layout.responses(fit.x)[0].model.flux_inductance_h for _, fit, layout, _ in rows]
+    L = float(weights @ np.array(L_each))
     variance = 0.0
-    for w, (_, fit, layout, covariance) in zip(weights, rows, strict=True):
+    for w, L_m, (_, fit, layout, covariance) in zip(weights, L_each, rows, strict=True):
         if w > NEGLIGIBLE_WEIGHT:
-            L_m = layout.L_scale * math.exp(float(fit.x[0]))
-            sizes = [response.model.L_h for response in layout.responses(fit.x)]
+            sizes = [response.model.flux_inductance_h for response in layout.responses(fit.x)]
             # an inductance that depends on the frequency is not known better than by half that difference
             spread = DISPERSION_SHARE * (max(sizes) - min(sizes))
             variance += float(w) * (L_m**2 * float(covariance[0, 0]) + (L_m - L) ** 2 + spread**2)
@@ -353,8 +353,8 @@ def _average(
     return AxisFit(
         L_h=L,
         std_h=math.sqrt(variance),
-        bound_h=first.model.L_h * math.sqrt(float(covariance[0, 0])),
-        L_by_shot_h=tuple(response.model.L_h for response in responses),
+        bound_h=first.model.flux_inductance_h * math.sqrt(float(covariance[0, 0])),
+        L_by_shot_h=tuple(response.model.flux_inductance_h for response in responses),
         R_ohm=first.model.R_ohm,
         delay=first.model.delay,
         lag_s=first.model.lag_s,
@@ -373,6 +373,6 @@ def _average(
             if w > NEGLIGIBLE_WEIGHT
             for model in [layout.responses(fit.x)[0].model]
         ),
-        eddy_s=first.model.eddy_s,
+        eddy_s=first.model.eddy_s * first.model.flux_inductance_h / first.model.L_h,
         eddy_tau_s=first.model.eddy_tau_s,
     )

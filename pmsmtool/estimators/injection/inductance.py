@@ -61,8 +61,8 @@ eddy losses leave 0.3 to 3 %; a current that is clipped, or a rotor that swings,
 EDGE_STD = 0.05
 """Standard deviation of the instant at which a leg's error depends on its current (T_s): a fifth of its distance."""
 EDDY_STD = 5e-3
-"""Relative standard deviation of L beside eddy currents, whose branch has one time constant (5 % of iron loss: 0.2 to
-0.8 % too large; an eddy branch of 5 %: 0.0 to 0.3 %)."""
+"""Relative standard deviation of L beside eddy currents, whose branch has one time constant (8 % of iron loss: 0.0 to
+0.3 % off; an eddy branch of 10 %: 0.1 %)."""
 MINIMUM_PERIODS = 20
 """Full periods of the square wave below which a shot is not an excitation."""
 CURVE_POINTS = 256

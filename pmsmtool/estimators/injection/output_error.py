@@ -66,6 +66,16 @@ class AxisModel:
     eddy_s: float = 0.0
     eddy_tau_s: float = 1.0
 
+    @property
+    def flux_inductance_h(self) -> float:
+        """Inductance of the flux alone (H): what eddy currents drop over R makes ``L_h`` larger.
+
+        A branch across the flux behind R has an admittance of two poles, those of this model: Y = 1/(R + s L) +
+        g/(1 + s tau) with g = ``eddy_s``/L. The flux's inductance is the slope of 1/Y at s = 0.
+        """
+        shunt = self.eddy_s / self.L_h
+        return (self.L_h + shunt * self.eddy_tau_s * self.R_ohm**2) / (1.0 + shunt * self.R_ohm) ** 2
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pulses:

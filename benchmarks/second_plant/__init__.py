@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""A second simulated motor, shaft and bridge, to judge the tool on a world it was not developed with.
+
+The C sources of this folder define what ``sim/plant.h`` and ``sim/inverter.h`` declare and the closed loop calls; they
+take the places of the project's own plant and bridge in a library of their own. Sensors, control core, application
+and node stay the project's. The sources were written from the data sheet (the structs of those headers) without the
+project's plant, bridge or estimators having been read: phase equations and winding functions where the first plant has
+a stationary-frame flux, Kirchhoff's equations of the legs where it has sources and hold voltages, and another
+integrator. Where the data sheet leaves it open: the core loss is a resistor across each coil at every instant (with a
+switching bridge a sample in the zero voltage holds none of it), field harmonics follow the magnet's temperature.
+
+The sources are fixed by :func:`digest` before the first commissioning; a change afterwards needs a fault that physics
+shows, and is recorded here with the old and the new digest:
+
+a3db7fe80fbb79337235f9a8e310313a6baf6a44513be2c807f5fc83aa6f4d88  since the first commissioning (drive 170000)
+
+Known differences from the first plant, neither of them numerics. Core loss: with the voltage off it brakes this shaft
+(1.5 p^2 psi^2/R_iron, from the energy balance) and not the first one's, so B identified by coasting holds it; a sample
+of the first plant holds the core's mean current of the last period, one of this plant that of the sampling instant.
+Field harmonics: the first plant's keep their size when the magnet warms.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import hashlib
+import tempfile
+import unittest.mock
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pmsmtool import native
+from pmsmtool.errors import ConfigError
+from pmsmtool.native import library_name
+from pmsmtool.packaging.build_kernels import PACKAGE
+from pmsmtool.packaging.compiler import build_compiler, compile_library
+from pmsmtool.packaging.kernels import HEADERS, Kernel
+from pmsmtool.sim import kernel
+from pmsmtool.sim.kernel import Setup, Simulation
+
+FOLDER = Path(__file__).resolve().parent
+NAME = "pmsm_sim"
+REPLACED = ("plant.c", "plant_circuit.c", "inverter.c", "leg_circuit.c")
+"""Sources of the kernel that this folder's take the place of."""
+
+
+def sources() -> list[Path]:
+    """Return the plant's own sources."""
+    return sorted([*FOLDER.glob("*.c"), *FOLDER.glob("*.h")])
+
+
+def digest() -> str:
+    """Return the sha256 of the plant's sources, name and content of each."""
+    found = hashlib.sha256()
+    for path in sources():
+        found.update(path.name.encode() + b"\0" + path.read_bytes().replace(b"\r\n", b"\n") + b"\0")
+    return found.hexdigest()
+
+
+@functools.cache
+def build() -> Path:
+    """Compile the kernel with this plant into the folder for temporary files, once per state of all its sources.
+
+    Raises
+    ------
+    CompilerError
+        No compiler works here.
+    """
+    kept = [path for path in (PACKAGE / "sim").glob("*.c") if path.name not in REPLACED]
+    row = Kernel(
+        NAME,
+        (
+            *(path.relative_to(PACKAGE).as_posix() for path in kept),
+            *(f"{folder}/*.c" for folder in ("machine", "firmware/core")),
+            f"../{FOLDER.parent.name}/{FOLDER.name}/*.c",
+        ),
+    )
+    inputs = {*(PACKAGE / path for path in row.source_files(PACKAGE)), *sources()}
+    inputs |= {path for pattern in HEADERS for path in PACKAGE.glob(pattern)}
+    state = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(inputs))).hexdigest()[:16]
+    library = Path(tempfile.gettempdir()) / f"pmsm-second-plant-{state}" / library_name(NAME)
+    if not library.is_file():
+        library.parent.mkdir(parents=True, exist_ok=True)
+        compile_library(build_compiler(), row, PACKAGE, library, strict=True)
+    return library
+
+
+@contextlib.contextmanager
+def used() -> Iterator[str]:
+    """Simulate with this plant inside the block, in this process; gives :func:`digest`.
+
+    Raises
+    ------
+    CompilerError
+        No compiler works here.
+    ConfigError
+        From a simulation that is opened inside: it has a flux map, which this plant does not know.
+    """
+    own, first_load, first_init = ctypes.CDLL(str(build())), native.load, Simulation.__init__
+
+    def load(name: str) -> Any:
+        return own if name == NAME else first_load(name)
+
+    def init(self: Simulation, setup: Setup, image: bytes, keep: object = None) -> None:
+        if setup.machine.map:
+            raise ConfigError(
+                "the second plant has constant inductances and cannot simulate a flux map",
+                hint="run this machine on the project's own plant",
+            )
+        first_init(self, setup, image, keep)
+
+    with unittest.mock.patch.object(native, "load", load), unittest.mock.patch.object(Simulation, "__init__", init):
+        kernel.library.cache_clear()
+        try:
+            yield digest()
+        finally:
+            kernel.library.cache_clear()
