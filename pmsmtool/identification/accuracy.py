@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pmsmtool.estimators.estimate import statistical_half_width
-from pmsmtool.estimators.prediction import NAMES
+from pmsmtool.identification.prediction import NAMES
 from pmsmtool.machine.parameters import Estimate
 
 KEYS: Mapping[str, tuple[str, ...]] = {"R": ("R_s_ohm",), "L": ("L_d_h", "L_q_h"), "psi": ("psi_f_wb",)}

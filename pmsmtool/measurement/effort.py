@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
-from pmsmtool.estimators.prediction import Prediction
 from pmsmtool.experiments import mechanics_run, rotation, speed_run, square_injection, standstill, vector_turn
+from pmsmtool.identification.prediction import Prediction
 
 Rotation = tuple[float, float, float, float]
 

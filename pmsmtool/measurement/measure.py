@@ -21,7 +21,6 @@ from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phases
-from pmsmtool.estimators.prediction import Prediction, check_prediction, line_of, predict
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
 from pmsmtool.experiments.current_limit import NOT_SHOWN, LimitCurrent, require_limit, show_current_limit, unproven
@@ -30,6 +29,7 @@ from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.experiments.vector_turn import RAMP_S
 from pmsmtool.identification.evaluate import flux_of, resistance_of, tolerance_on
 from pmsmtool.identification.predicted_file import entry
+from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
 from pmsmtool.identification.request import steps_of
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import flux_map, frequency_response, mechanics, shaft_forecast

@@ -17,7 +17,6 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.prediction import line_of
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.estimators.shaft.frequency_response import INERTIA_FLOOR
 from pmsmtool.estimators.shaft.position import encoder_step
@@ -26,6 +25,7 @@ from pmsmtool.identification import shaft_prediction
 from pmsmtool.identification.evaluate import flux_of
 from pmsmtool.identification.frequency_response import small_signal_doubt
 from pmsmtool.identification.mechanics import SAMPLE_DOUBT, torque_doubt
+from pmsmtool.identification.prediction import line_of
 from pmsmtool.identification.shaft_prediction import RoughShaft
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace

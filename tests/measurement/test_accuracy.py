@@ -16,8 +16,8 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import run as main
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.errors import ConfigError, ExitCode, NotAvailable
-from pmsmtool.estimators.prediction import Prediction
 from pmsmtool.identification.accuracy import accuracy_facts, accuracy_line
+from pmsmtool.identification.prediction import Prediction
 from pmsmtool.identification.request import IdentifyRequest, dump_request, parse_request
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import Estimate

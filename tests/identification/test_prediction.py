@@ -9,7 +9,7 @@ import pytest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.prediction import Prediction, check_prediction, line_of, predict
+from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
 
 LEVELS = [sign * k / 12.0 for k in range(1, 13) for sign in (1.0, -1.0)] * 2
 EXACT = SensorTolerance(bridge_threshold_v=0.0)
