@@ -30,7 +30,7 @@ from pmsmtool.identification.request import (
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, MachineLimits, MachineParameters
 from pmsmtool.measurement import flux_map, frequency_response, half_frequency, mechanics
-from pmsmtool.measurement.limits import HEADROOM, Limits, require_speed, unused_current
+from pmsmtool.measurement.limits import DURATION_S, HEADROOM, Limits, require_speed, unused_current
 from pmsmtool.measurement.measure import Measurement, starting_gains
 from pmsmtool.measurement.run_account import status_of, text_of
 from pmsmtool.run_directory import RunDirectory, Stage
@@ -104,7 +104,7 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
     return Envelope(
         i_max_apk=i_max,
         speed_max_rad_s=speed,
-        duration_s=300.0,
+        duration_s=DURATION_S,
         shaft=request.shaft,
         load=request.load,
         brake=request.brake,

@@ -46,6 +46,7 @@ from pmsmtool.identification.tier_evaluate import (
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import InverterParameters
 from pmsmtool.measurement.capabilities import QUANTITIES, Capabilities, Method
+from pmsmtool.measurement.limits import DURATION_S
 from pmsmtool.measurement.supply_reading import hold_for_supply
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.trace import Trace
@@ -62,8 +63,6 @@ STEP_PARTS = 3
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 SWING_SHARE = 0.4
 """Speed of the recorded pushes, of the largest one."""
-DURATION_S = 600.0
-"""Longest time the machine is energised."""
 ASKED_SHARE = 0.75
 """Speed that a drive without a torque mode is asked for, of the largest: above the pushes, with room to overshoot."""
 TOP_SHARE = 0.98

@@ -55,6 +55,7 @@ class VoltageError:
         after = (1.0 - EDGE_SHARE) * early + EDGE_SHARE * late
         return np.asarray(before[..., :-1] + after[..., 1:], dtype=np.float64)
 
+
 LINE_SHARE = 0.2
 """Part of a residual's power that a sine must be to be taken out: 4 % of ripple on a DC link is 0.8 of it."""
 LINE_APART, LINE_FINER = 1.5, 16
