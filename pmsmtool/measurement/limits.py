@@ -17,7 +17,7 @@ current for 20 ms, brings a drive with an acceleration time of 50 ms to 2.7 % of
 as an inverter's error."""
 
 DURATION_S = 600.0
-"""Longest time the machine is energised by `identify` (a shaft of 27 times the rotor's inertia took more than 300 s)."""
+"""Longest time the machine is energised by `identify` (27 times the rotor's inertia took more than 300 s)."""
 HEADROOM = 1.2
 """Largest current of an envelope, of the rated one, where none is asked for."""
 TRIP_SHARE = 0.85
