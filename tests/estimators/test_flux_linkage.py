@@ -288,6 +288,18 @@ def test_a_shaft_that_slows_down_in_a_window_costs_nothing(lost: float) -> None:
     assert found.std > 0.02 * lag_s * lost / 0.05 * PSI
 
 
+def test_windows_driven_at_a_higher_speed_are_no_fastest_pair() -> None:
+    """A light shaft with friction had them; repeated without their i_q, they showed a magnet 3.5 % weaker."""
+    speeds = Population(11).speeds(0)
+    k = fastest_pair(speeds)[0]
+    driven = {"i_d_a": 0.0, "i_q_a": 4.0, "omega_e_rad_s": 1.2 * speeds["omega_e_rad_s"][k]}
+    rows = {
+        name: np.concatenate([values[:k], [driven.get(name, values[k])], values[k:]])
+        for name, values in speeds.signals.items()
+    }
+    assert fastest_pair(Trace(np.arange(len(speeds.t_s) + 1.0), rows, speeds.units)) == (k + 1, k + 2)
+
+
 @pytest.mark.parametrize("T_after_c", [math.nan, 24.0, 40.0])
 def test_a_magnet_that_lost_flux_is_told_from_a_warmer_one(T_after_c: float) -> None:
     population = Population(11)

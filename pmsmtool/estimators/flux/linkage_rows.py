@@ -84,9 +84,12 @@ def pairs_of(speeds: Trace) -> list[tuple[int, int]]:
 
 
 def fastest_pair(speeds: Trace) -> tuple[int, int]:
-    """Return the rows of the run's highest speed that hold i_d with both signs, one after the other."""
-    first = int(np.argmax(speeds["omega_e_rad_s"]))
-    return first, first + 1
+    """Return the rows of the run's highest speed that hold i_d with both signs, one after the other.
+
+    A shaft that does not coast through a window is driven through some at a higher speed; those hold i_q. Without a
+    pair, which no estimate takes, the first two rows.
+    """
+    return max(pairs_of(speeds), key=lambda rows: float(speeds["omega_e_rad_s"][rows[0]]), default=(0, 1))
 
 
 def corrected(
