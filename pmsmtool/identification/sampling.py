@@ -37,6 +37,8 @@ def resistance_as_sampled(
 ) -> ResistanceResult:
     """Return R for the mean current: what is sampled late in the zero vector is less by R t/L of it.
 
+    Where an old encoder angle would show the same, R is the middle of both.
+
     Parameters
     ----------
     resistance : ResistanceResult
@@ -56,12 +58,13 @@ def resistance_as_sampled(
     late = np.array([standstill_instant_s(sampling, modulation) for _, sampling in inductance.samplings])
     mean_s = float(np.average(late, weights=weights))
     instant_std_s = math.hypot(shown.std_s, math.sqrt(float(np.average((late - mean_s) ** 2, weights=weights))))
-    value = measured.value / (1.0 + rate * mean_s)
+    half_apart = 0.5 * rate * max(0.0, shown.value_s)  # to what an old angle leaves: the middle, both are inside
+    value = measured.value / (1.0 + rate * mean_s) * (1.0 + half_apart)
     at_mean = replace(
         measured,
         value=value,
         std=math.hypot(measured.std, value * rate * instant_std_s),
-        systematic=math.hypot(measured.systematic, value * rate * tolerance.encoder_latency_s),
+        systematic=math.hypot(measured.systematic, value * rate * tolerance.encoder_latency_s) + value * half_apart,
     )
     normal = replace(normalised(at_mean, copper, tolerance), fallback=resistance.R_s.fallback)
     return replace(resistance, R_measured=at_mean, R_s=normal)
@@ -96,5 +99,5 @@ def timing_warnings(shown: ShownInstant | None) -> list[str]:
         return []
     return [
         f"the d voltage at speed shows currents sampled {1e6 * shown.value_s:+.2g} us beside the middle of the "
-        "zero vector or an encoder angle that is so old; the values are corrected for the former"
+        "zero vector or an encoder angle that is so old; R and L lie in the middle, and both are in the intervals"
     ]

@@ -214,10 +214,12 @@ def estimate_flux_linkage(
         own = math.sqrt(max(0.0, driven.std**2 - common**2 + std**2 - common**2))
         apart = abs(driven.value - psi) if abs(driven.value - psi) > COVERAGE_FACTOR * own else 0.0
     std = math.hypot(std, apart)
+    # an old angle shows what a late sample does, and wants less of a correction
+    if_old = 0.0 if shown is None else per_instant * max(0.0, shown.value_s)
     measured = Estimate(
         value=psi,
         std=std,
-        systematic=math.hypot(tolerance.flux * psi, per_instant * tolerance.encoder_latency_s),
+        systematic=math.hypot(tolerance.flux * psi, per_instant * tolerance.encoder_latency_s) + abs(if_old),
         unit="Wb",
         n=len(rows.w),
         chi2=math.nan,

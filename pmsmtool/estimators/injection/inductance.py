@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,6 +249,13 @@ def estimate_inductances(
         )
         for axis in fits
     }
+    # an angle that is old shows what a late sample does and leaves L larger by R t: L is the middle, both are inside
+    half_apart = 0.5 * R_ohm * (0.0 if instant is None else max(0.0, instant.value_s))
+    if half_apart > 0.0:
+        estimates = {
+            axis: replace(L, value=L.value + half_apart, systematic=L.systematic + half_apart)
+            for axis, L in estimates.items()
+        }
     warned = bool(dependent) or any(verdict is Verdict.WARN for verdict, *_ in widen.values())
     return InductanceResult(
         L_d=estimates["d"],
