@@ -81,10 +81,9 @@ def test_a_drive_that_samples_in_time_is_not_warned_of() -> None:
 AGE_S = 9.2e-6
 
 
-@pytest.mark.parametrize("seed", [12, 171006])
-def test_an_old_encoder_angle_is_in_the_intervals(seed: int) -> None:
-    """It is read as a late sample, which left L 2.1 and 2.8 % too small, 1.5 and 1.9 times the interval."""
-    drive = drawn("", seed, "ideal")
+def test_an_old_encoder_angle_is_in_the_intervals() -> None:
+    """It is read as a late sample, which left L 2.8 % too small, 1.9 times the interval."""
+    drive = drawn("", 171006, "ideal")
     drive = replace(drive, simulation={**drive.simulation, "encoder_latency_s": AGE_S})
     traces, nameplate, _ = measured(drive)
     evaluation = evaluated(traces, nameplate)
