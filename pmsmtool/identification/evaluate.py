@@ -42,7 +42,7 @@ from pmsmtool.identification.cogging import Cogging, cogging_of
 from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
 from pmsmtool.identification.half_frequency import resistance_at_two_frequencies
-from pmsmtool.identification.mechanics import agree, mechanics_of
+from pmsmtool.identification.mechanics import elastic_mechanics, mechanics_of
 from pmsmtool.identification.sampling import resistance_as_sampled
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
@@ -270,13 +270,10 @@ def evaluate(
     rigid = refused.get("mechanics")
     inertia = None if response is None else response.inertia
     if rigid is not None and rigid.reason == "E_MODEL_MISMATCH" and inertia is not None:
-        # pushes of a shaft that is not rigid still tell its friction, if they tell the inertia of the other method
-        del refused["mechanics"]
-        elastic = attempt("mechanics", partial(moved, elastic=True))
-        if elastic is not None and agree(elastic.J, inertia):
+        elastic = elastic_mechanics(partial(moved, elastic=True), inertia)
+        if elastic is not None:
+            del refused["mechanics"]
             moving = replace(moving, mechanics=elastic)
-        else:
-            refused["mechanics"] = rigid
     modulation = None
     if shaft.resistance is not None and shaft.inductance is not None and "speeds" in traces:
         L_h = shaft.inductance.L_d.value, shaft.inductance.L_q.value

@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance
+from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.cross_check import cross_check
+from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_instant_s
 from pmsmtool.estimators.injection.switching_ripple import Modulation
@@ -28,6 +30,7 @@ Array = NDArray[np.float64]
 
 TRACE = "inertia_"
 """Followed by a number: push, coasting, push the other way, coasting."""
+ELASTIC_FALLBACK = "pushes of a shaft that is not rigid; J agrees with the frequency response"
 SATURATION_DOUBT = 0.25
 """Relative standard deviation of the torque without a flux map, of the curvature of psi_d over i_d: the flux that a q
 current takes from the d axis is not seen. The saturated profile has a curvature of 3 % and its J was 0.77 % off."""
@@ -105,9 +108,24 @@ def mechanics_of(
     )
 
 
-def agree(one: Estimate, other: Estimate) -> bool:
-    """Whether two inertias of the same currents lie within their joint interval; the torque's scale is common."""
-    return abs(one.value - other.value) <= COVERAGE_FACTOR * math.hypot(one.std, other.std)
+def elastic_mechanics(estimate: Callable[[], MechanicsResult | None], inertia: Estimate) -> MechanicsResult | None:
+    """Return what pushes of a shaft that is not rigid tell; None unless J is that of the frequency response.
+
+    Parameters
+    ----------
+    estimate : callable
+        :func:`mechanics_of` with ``elastic``.
+    inertia : Estimate
+        By the frequency response (kg m2); both have the torque's scale in common.
+    """
+    try:
+        found = estimate()
+    except IdentificationError:
+        return None
+    if found is None or not cross_check("J_kgm2", "J_kgm2", found.J, inertia).agrees:
+        return None
+    J, B, tau_c = (replace(value, fallback=ELASTIC_FALLBACK) for value in (found.J, found.B, found.tau_c))
+    return replace(found, J=J, B=B, tau_c=tau_c)
 
 
 def torque_doubt(flux: FluxResult, displaced: float = 0.0, *, mapped: bool = False) -> float:

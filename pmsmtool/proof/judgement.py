@@ -87,8 +87,9 @@ def with_ripple(prediction: Prediction, traces: Mapping[str, Trace]) -> Predicti
         elif steady >= LEAST_STEADY_ROWS:
             end, k = (repeats[0] - band.mean)[-steady:], np.arange(steady)
             ripple = float(np.max(np.abs(end - np.polyval(np.polyfit(k, end, 1), k))))
-        most = RIPPLE_MOST * float(np.median(band.half))
-        bands[experiment, signal] = replace(band, ripple=min(ripple, most) if math.isfinite(ripple) else 0.0)
+        bands[experiment, signal] = replace(
+            band, ripple=min(ripple, _most_ripple(band)) if math.isfinite(ripple) else 0.0
+        )
     return replace(prediction, bands=bands)
 
 
@@ -141,14 +142,14 @@ def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> 
     cause = likely_cause(prediction, {key: measured[key] for key in sorted(keys)})
     if not cause and only_quantities:  # no response alone is far enough off to tell, but what they tell together is
         cause = _cause_of_quantities(prediction, deviation)
-    if not cause and any(_shakes_most(prediction.bands[key]) for key in keys):
+    if not cause and any(b.ripple >= _most_ripple(b) for b in map(prediction.bands.__getitem__, keys)):
         cause = SHAKES
     return Judgement(found.seen, cause)
 
 
-def _shakes_most(band: Band) -> bool:
-    """Whether more ripple was seen than counts."""
-    return band.ripple >= RIPPLE_MOST * (float(np.median(band.half)) - band.ripple) * (1.0 - 1e-9)
+def _most_ripple(band: Band) -> float:
+    """Return the ripple from which on no more counts."""
+    return RIPPLE_MOST * float(np.median(band.factor * band.std))
 
 
 def _cause_of_quantities(prediction: Prediction, deviation: Mapping[tuple[str, str], Array]) -> str:

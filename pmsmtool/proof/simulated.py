@@ -67,7 +67,8 @@ SEEN_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
 """Range of identified eddy currents, drag, cogging and encoder errors, and factor either way of the currents' time
 constant: one branch stands for many, one order for the orders of the cogging."""
 RESONANCE_RANGE, ZETA_FACTOR = (0.98, 1.02), 2.0
-"""Range of identified resonance and antiresonance, and factor either way of the damping."""
+"""Range of identified resonance and antiresonance, and factor either way of the damping (found within 0.03 % and 14 %,
+``tests/measurement/test_frequency_response``; a shaft has more than two masses)."""
 BASE_SPEED = (-0.03, 0.01)
 """Relative range of the speed that is held before current steps: what coasting lets it lose, too."""
 COAST_PERIODS = 64
@@ -355,10 +356,8 @@ def _draw(
     _draw_eddy_currents(setup, machine, rng)
     _draw_shaft_effects(setup, machine, rng)
     _draw_inverter(setup, machine, rng)
-    setup.sensor_lag, setup.sampling_shift = _timing(machine, rng, late=setup.delay > 0)
-    if (machine.inverter.sampling_instant_s or 0.0) > 0.0 and rng.random() < 0.5:
-        # what shows a late sample at speed shows an encoder angle that is so old as well
-        setup.sensors.encoder_latency, setup.sampling_shift = max(0.0, setup.sampling_shift), 0.0
+    setup.sensor_lag, setup.sampling_shift, age_s = _timing(machine, rng, late=setup.delay > 0)
+    setup.sensors.encoder_latency = age_s
     setup.theta_M = float(rng.uniform(-math.pi, math.pi))
     setup.seed = int(rng.integers(2**62))
     return setup
@@ -414,19 +413,24 @@ def _draw_shaft_effects(setup: Setup, machine: MachineFile, rng: np.random.Gener
         out.cogging, out.cogging_periods = float(rng.uniform(*SEEN_SHARES)) * torque_nm, float(periods)
 
 
-def _timing(machine: MachineFile, rng: np.random.Generator, *, late: bool) -> tuple[float, float]:
-    """Draw the lag of the current sensors and the sampling instant (s): about what was identified, else a short lag.
+def _timing(machine: MachineFile, rng: np.random.Generator, *, late: bool) -> tuple[float, float, float]:
+    """Draw the lag of the current sensors, the sampling instant and the age of the encoder's angle (s).
 
-    What both do together is known better than either: what one is drawn longer, the other is earlier.
+    About what was identified, else a short lag. What lag and instant do together is known better than either: what one
+    is drawn longer, the other is earlier. An old angle shows at speed what a late sample does: half of the drives have
+    the one, half the other.
     """
     lag, instant, T_s = machine.inverter.current_lag_s, machine.inverter.sampling_instant_s, machine.inverter.T_s
     where = float(rng.uniform(0.0, 1.0))
     if lag is None or instant is None:
-        return where * LAG_SHARE * T_s, 0.0
+        return where * LAG_SHARE * T_s, 0.0, 0.0
     stds = [machine.estimates[name].std for name in (LAG, INSTANT) if name in machine.estimates]
     apart = (2.0 * where - 1.0) * TIMING_COVERAGE * math.hypot(*stds)
     shift = max(-T_s, min(T_s, instant - apart))
-    return max(0.0, lag + apart), shift if late else min(0.0, shift)
+    lag_s, shift_s = max(0.0, lag + apart), shift if late else min(0.0, shift)
+    if instant > 0.0 and rng.random() < 0.5:
+        return lag_s, 0.0, max(0.0, shift_s)
+    return lag_s, shift_s, 0.0
 
 
 def _draw_inverter(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:

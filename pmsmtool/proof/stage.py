@@ -272,10 +272,9 @@ def band_lines(prediction: Prediction) -> list[str]:
     """Return the predicted band as lines: final value and width of every signal, and every derived quantity."""
     lines = []
     for (experiment, signal), band in prediction.bands.items():
-        half = band.half
         lines.append(
             f"predicted {experiment} {signal}: {float(band.mean.min()):.4g} to {float(band.mean.max()):.4g}, "
-            f"95 % within +-{float(np.median(half)):.2g} (median), +-{float(half.max()):.2g} (largest)"
+            f"95 % within +-{float(np.median(band.half)):.2g} (median), +-{float(band.half.max()):.2g} (largest)"
         )
     lines += [f"predicted {name}: {q.low:.3g} to {q.high:.3g}" for name, q in prediction.quantities.items()]
     return lines

@@ -17,12 +17,16 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.errors import NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.identification.frequency_response import RESPONSE_FILE
 from pmsmtool.identification.identified_machine import RESONANCE
+from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, elastic_mechanics
 from pmsmtool.identification.predicted_file import PREDICTED
 from pmsmtool.identification.replay import MACHINE, replay
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.measurement.frequency_response import PLAN_LINE
 from pmsmtool.measurement.identify import identify_stage, nameplate_of
@@ -117,6 +121,23 @@ def test_pushes_of_an_elastic_shaft_tell_friction_where_both_inertias_agree(tmp_
     found = load_machine_file(run.path / MACHINE).estimates
     for name, true in (("J_kgm2", 0.016), ("B_nms", truth.machine.B_nms), ("tau_c_nm", truth.machine.tau_c_nm)):
         assert abs(found[name].value - (true or 0.0)) < total_half_width(found[name])
+        assert found[name].fallback == ELASTIC_FALLBACK and any(ELASTIC_FALLBACK in text for text in stage.fallbacks)
+
+
+def test_pushes_that_tell_another_inertia_tell_nothing() -> None:
+    def of(J_kgm2: float) -> MechanicsResult:
+        values = [Estimate(value, 0.01 * value, 0.0, unit) for value, unit in
+                  ((J_kgm2, "kg m2"), (1e-3, "N m s"), (0.1, "N m"))]  # fmt: skip
+        return MechanicsResult(*values, (0.0, 0.0, 0.0), 1.0, 1.0, 1.0, True)
+
+    def refused() -> MechanicsResult:
+        raise refuse("E_NOT_CONVERGED", "no minimum", stage="mechanics")
+
+    inertia = Estimate(0.016, 1.6e-4, 0.0, "kg m2")
+    agreeing = elastic_mechanics(lambda: of(0.0162), inertia)
+    assert agreeing is not None and agreeing.tau_c.fallback == ELASTIC_FALLBACK
+    assert elastic_mechanics(lambda: of(0.0170), inertia) is None
+    assert elastic_mechanics(refused, inertia) is None is elastic_mechanics(lambda: None, inertia)
 
 
 def test_no_notch_without_a_resonance_and_none_beyond_the_speed_controller() -> None:
