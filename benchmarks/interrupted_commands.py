@@ -5,6 +5,7 @@
     python -m benchmarks.interrupted_commands --command jog flash-params --how adapter --moments 10
     python -m benchmarks.interrupted_commands --command flash-params restore --every 10
     python -m benchmarks.interrupted_commands --command flash-params --store-window
+    python -m benchmarks.interrupted_commands --command "commission --resume" --every 10   # its flash stage
 
 A moment is a CAN frame that the tool sends or hears; the moments are spread evenly over the whole run (or: every N-th
 frame, or every millisecond from the request to store on), each is tried in a run of its own.
@@ -28,8 +29,10 @@ import argparse
 import contextlib
 import math
 import multiprocessing
+import shutil
 import signal
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -51,6 +54,8 @@ from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.sim.bus import PmsmSimBus
 
 PROFILE = "interior-2k2"
+CHANNEL = f"{PROFILE}?nv=drive.nv"
+ON_THE_DRIVE = ("-i", "pmsmsim", "-c", CHANNEL, "--yes")
 LIMIT_OBJECTS = ((0x6073, 0), (0x6080, 0), (0x1016, 1), (0x6007, 0))
 """Beside what a backup holds; the configuration date is left out, a value that was written has a new one."""
 OWN_STOP_S = 1.0
@@ -63,18 +68,23 @@ STORE_WINDOW_MS = 380
 """From the request to the last frame (320 ms the store, 35 to 57 what follows)."""
 MEMORY_WAIT_S = 2.0
 """A store that was under way ends, a node that booted is up."""
+BEFORE_THE_STORE = 20
+"""Frames: a commission interrupted there has written a part of the set, and takes it back."""
 _STORE_REQUESTED = b"\x23\x10\x10\x01"
 _CONTROLWORD_WRITTEN = b"\x2b\x40\x60\x00"
 _STATUSWORD_READ = b"\x4b\x41\x60\x00"
 TO_DO = ("hardware stop", "reset the drive")
 MEASURING = ("identify", "commission")
-JOURNALED = ("flash-params", "restore", "commission")
+FLASH_STAGE = "commission --resume"
+"""A commission that ended while it wrote goes on; the moments lie in its flash stage, with which it begins."""
+JOURNALED = ("flash-params", "restore", "commission", FLASH_STAGE)
 WRITING = ("flash-params", "restore", "param set", "param set --store")
 OLD_SET = ("the set that it held before", "exactly the old set")
 COMMANDS = {
     "jog": ("jog", "--current", "2Apk", "--for", "1s"),
     "identify": ("identify",),
     "commission": ("commission",),
+    FLASH_STAGE: ("commission", "--resume"),
     "flash-params": ("flash-params", NEW_SET),
     "restore": ("restore", "old.backup"),
     "param set": ("param", "set", "speed.K_p_nms_per_rad=0.0421"),
@@ -120,9 +130,9 @@ class Held:
     journal: str
 
 
-def held(channel: str) -> Held:
+def held() -> Held:
     """Read a drive through a connection of its own."""
-    with Connection(PmsmSimBus(channel)) as connection:
+    with Connection(PmsmSimBus(CHANNEL)) as connection:
         drive = CanopenDrive(connection, 1)
         entries = {entry.name: entry.old for entry in take_backup(drive.node, drive.identity).entries}
         entries = {name: data for name, data in entries.items() if not name.startswith("configuration_")}
@@ -135,15 +145,31 @@ def held(channel: str) -> Held:
     return found
 
 
-def prepare(command: str, channel: str) -> None:
+def begin_commission(folder: Path) -> None:
+    """Leave in a folder the run and the drive's memory of a commission that was interrupted while it wrote."""
+    moment = None
+    for _ in range(2):  # the first run tells when
+        with prepared():
+            with powered(CHANNEL) as line:
+                watch = Watch("ctrl-c", moment, line)
+                signal.signal(signal.SIGINT, signal.default_int_handler)
+                with watch.on():
+                    code, told = commanded("commission", *ON_THE_DRIVE)
+            if code != (0 if moment is None else 130):
+                raise RuntimeError(f"the preparation ended with exit code {code}: {told}")
+            if moment is not None:
+                shutil.copytree(Path.cwd(), folder, dirs_exist_ok=True)
+            moment = watch.stored_after - BEFORE_THE_STORE
+
+
+def prepare(command: str) -> None:
     """Lay down what the command works on: the new set of a download, the old one of a restore."""
-    arguments = ("-i", "pmsmsim", "-c", channel, "--yes")
     if command in ("flash-params", "restore"):
         Path("new").mkdir()
         _must(commanded("tune", PROFILE, "-o", "new/design.toml"))
-        _must(commanded("backup", *arguments[:-1], "-o", "old.backup"))
+        _must(commanded("backup", *ON_THE_DRIVE[:-1], "-o", "old.backup"))
     if command == "restore":
-        _must(commanded("flash-params", NEW_SET, *arguments))
+        _must(commanded("flash-params", NEW_SET, *ON_THE_DRIVE))
 
 
 def _must(result: tuple[int, str]) -> None:
@@ -175,6 +201,8 @@ class Watch:
         self.frames = 0
         self.stored_after = 0
         """Frames until the drive was asked to store."""
+        self.stored_until = 0
+        """Frames until it has stored and answered."""
         self.enabled = False
         """As the tool knows it: by the controlword it sent and the statusword it read."""
         self.happened = False
@@ -197,6 +225,7 @@ class Watch:
             self.enabled = state_of(int.from_bytes(data[4:6], "little")) is State.OPERATION_ENABLED
         if data[:4] == _STORE_REQUESTED and not self.stored_after:
             self.stored_after = self.frames
+            self.line.clock.after(STORE_WINDOW_MS / 1000.0, self._stored)
             if self.in_store and self.moment is not None:
                 self.line.clock.after(self.moment / 1000.0, self.happen)
         if not self.in_store and self.frames == self.moment:
@@ -212,6 +241,9 @@ class Watch:
         elif self.how == "power":
             self.line.line.nodes[0].power_cut()
         self._thaws = self.how == "freeze"
+
+    def _stored(self) -> None:
+        self.stored_until = self.frames
 
     def stand_still(self) -> None:
         """A frozen tool sends nothing, the heartbeat least of all; what arrives waits in its queue."""
@@ -250,29 +282,35 @@ class Watch:
             setattr(PmsmSimBus, "recv", receive)  # noqa: B010
 
 
-def interrupted(how: str, command: str, moment: int | None, *, in_store: bool = False) -> Outcome:
+def interrupted(how: str, command: str, moment: int | None, begun: Path, *, in_store: bool = False) -> Outcome:
     """Run a command and interrupt it at the n-th frame, or so many ms into the store; ``None``: a whole run."""
-    channel = f"{PROFILE}?nv=drive.nv"
-    with prepared(), powered(channel) as line:
+    arguments = COMMANDS[command]
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(prepared())
+        if command == FLASH_STAGE:
+            shutil.copytree(begun, Path.cwd(), dirs_exist_ok=True)
+            arguments = (*arguments, *map(str, Path("runs").iterdir()))
+        line = stack.enter_context(powered(CHANNEL))
         watch = Watch(how, moment, line, in_store=in_store)
-        prepare(command, channel)
-        before = held(channel)
+        prepare(command)
+        before = held()
         signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it
         with watch.on():
-            code, told = commanded(*COMMANDS[command], "-i", "pmsmsim", "-c", channel, "--yes")
+            code, told = commanded(*arguments, *ON_THE_DRIVE)
             watch.over = True
             if how == "kill" and watch.happened:
                 code, told = KILLED, "nothing"
             if moment is None:
-                return Outcome(watch.stored_after if in_store else watch.frames, code, "whole run", code == 0)
+                frames = watch.stored_until if command == FLASH_STAGE else watch.frames
+                return Outcome(watch.stored_after if in_store else frames, code, "whole run", code == 0)
             if how != "ctrl-c":
                 line.clock.wait(OWN_STOP_S)
         line.line.nodes[0].power_on()
         line.clock.wait(MEMORY_WAIT_S)
-        after = held(channel)
+        after = held()
         verdict, kept = _compare(command, before, after, gone=how in ("adapter", "kill", "power"))
         if kept and after.journal == "open":
-            verdict, kept = _recovered(verdict, channel, before, may=how in ("adapter", "kill", "power"))
+            verdict, kept = _recovered(verdict, before, may=how in ("adapter", "kill", "power"))
     if how == "ctrl-c":
         wanted = code == 130 or not watch.happened
         if command in WRITING and watch.happened and not _names_the_set(told, after, before):
@@ -287,12 +325,12 @@ def interrupted(how: str, command: str, moment: int | None, *, in_store: bool = 
     return Outcome(watch.frames, code, verdict, after.off and kept and (wanted or not watch.happened))
 
 
-def _recovered(verdict: str, channel: str, before: Held, *, may: bool) -> tuple[str, bool]:
+def _recovered(verdict: str, before: Held, *, may: bool) -> tuple[str, bool]:
     """Whether `restore` closes a journal that was left open, with exactly what was held before."""
     if not may:
         return f"{verdict}; THE JOURNAL IS LEFT OPEN", False
-    code, told = commanded("restore", "-i", "pmsmsim", "-c", channel, "--yes")
-    found = held(channel)
+    code, told = commanded("restore", *ON_THE_DRIVE)
+    found = held()
     if code == 0 and found.crc == before.crc and found.stored in (before.stored, found.crc) and found.journal != "open":
         return f"{verdict}; restored", True
     return f"{verdict}; RESTORE FAILED, exit {code}: {told[-300:]!r}", False
@@ -335,16 +373,16 @@ def _differ(before: Held, after: Held) -> int:
     return len(changed) + int(limits != limits_now)
 
 
-def one(job: tuple[str, str, int, bool]) -> tuple[int, Outcome]:
+def one(job: tuple[str, str, int, Path, bool]) -> tuple[int, Outcome]:
     """Interrupt one run; for a pool."""
-    how, command, moment, in_store = job
-    return moment, interrupted(how, command, moment, in_store=in_store)
+    how, command, moment, begun, in_store = job
+    return moment, interrupted(how, command, moment, begun, in_store=in_store)
 
 
-def interrupt(command: str, how: str, options: argparse.Namespace) -> int:
+def interrupt(command: str, how: str, begun: Path, options: argparse.Namespace) -> int:
     """Print the moments that went wrong and a summary; return their number."""
     in_store = bool(options.store_window)
-    whole = interrupted(how, command, None, in_store=in_store)
+    whole = interrupted(how, command, None, begun, in_store=in_store)
     if in_store:
         places = list(range(STORE_WINDOW_MS)) if whole.moments else []
     elif options.every:
@@ -359,7 +397,7 @@ def interrupt(command: str, how: str, options: argparse.Namespace) -> int:
     outcomes: Counter[tuple[int, str]] = Counter()
     wrong = 0 if whole.good else 1
     with multiprocessing.Pool(options.processes, maxtasksperchild=16) as pool:
-        jobs = [(how, command, place, in_store) for place in places]
+        jobs = [(how, command, place, begun, in_store) for place in places]
         for moment, outcome in pool.imap(one, jobs, chunksize=1):
             outcomes[outcome.code, outcome.verdict] += 1
             if not outcome.good:
@@ -380,7 +418,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--store-window", action="store_true", help="every ms from the request to store on instead")
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args(argv)
-    wrong = sum(interrupt(command, how, options) for command in options.command for how in options.how)
+    with tempfile.TemporaryDirectory() as folder:
+        begun = Path(folder)
+        if FLASH_STAGE in options.command:
+            begin_commission(begun)
+        wrong = sum(interrupt(command, how, begun, options) for command in options.command for how in options.how)
     print(f"{wrong} moments went wrong")
     return 1 if wrong else 0
 
