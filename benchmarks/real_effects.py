@@ -28,6 +28,7 @@ from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.identification.replay import MACHINE, replay
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.torque import iron_drag
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.random_drives import draw_drive
@@ -172,6 +173,8 @@ def values_of(drive: MachineFile, folder: Path) -> dict[str, tuple[float, float]
     truth = {name: truth_of(drive, name) for name in QUANTITIES}
     if "J_load_kgm2" in drive.simulation:
         truth["J_kgm2"] += truth_of(drive, "J_load_kgm2")
+    if truth_of(drive, "iron_loss_ohm"):
+        truth["B_nms"] += iron_drag(*(truth_of(drive, name) for name in ("pole_pairs", "psi_f_wb", "iron_loss_ohm")))
     return {
         name: (
             100.0 * (found[name].value / truth[name] - 1.0),

@@ -14,10 +14,8 @@ shows, and is recorded here with the old and the new digest:
 
 a3db7fe80fbb79337235f9a8e310313a6baf6a44513be2c807f5fc83aa6f4d88  since the first commissioning (drive 170000)
 
-Known differences from the first plant, neither of them numerics. Core loss: with the voltage off it brakes this shaft
-(1.5 p^2 psi^2/R_iron, from the energy balance) and not the first one's, so B identified by coasting holds it; a sample
-of the first plant holds the core's mean current of the last period, one of this plant that of the sampling instant.
-Field harmonics: the first plant's keep their size when the magnet warms.
+A known difference from the first plant that is not numerics: a sample of the first plant holds the core's mean current
+of the last period, one of this plant that of the sampling instant.
 """
 
 from __future__ import annotations

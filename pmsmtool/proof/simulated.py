@@ -26,6 +26,7 @@ from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.flux_map_scaled import FluxScale, ScalableMap
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.torque import iron_drag
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.proof.defects import DEFECTS, QUANTITIES, Defect, is_possible
 from pmsmtool.proof.plan import SIGNALS, Conditions, Experiment, ProofPlan
@@ -378,7 +379,9 @@ def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Gener
     tau_s = float(np.mean(taus_s)) * math.exp(rng.uniform(-1.0, 1.0) * math.log(EDDY_FACTOR))
     per_volt = [size_s / L for size_s, L in zip(sizes_s, (out.L_d, out.L_q), strict=True)]
     if np.mean(taus_s) < T_s:
-        out.R_iron = 2.0 / sum(per_volt) if sum(per_volt) > 0.0 else 0.0
+        if sum(per_volt) > 0.0:
+            out.R_iron = 2.0 / sum(per_volt)
+            out.B = max(0.0, out.B - iron_drag(out.pole_pairs, out.psi_f, out.R_iron))  # identified as one
         return
     out.eddy_rate = 1.0 / max(tau_s, T_s)  # shorter than a step of the plant would not be integrated
     out.eddy_d, out.eddy_q = (amperes * out.eddy_rate for amperes in per_volt)

@@ -110,19 +110,6 @@ static void catch_currents(const pmsm_sim *sim, double i[3])
     const pmsm_plant *plant = &sim->plant;
     for (int x = 0; x < 3; x++)
         i[x] = sim->lag.tau > 0.0 ? sim->lag.value[x] : pmsm_plant_leg_current(plant, x);
-    if (plant->machine.R_iron > 0.0 && sim->inverter.gates) {
-        /* iron current of the mean terminal voltage: the averaged model's instant, the last period's with ripple */
-        const int ripple = sim->inverter.setup.model == PMSM_INVERTER_SWITCHED && sim->inverter.elapsed > 0.0;
-        const double u_alpha = ripple ? sim->inverter.volt_seconds_alpha / sim->inverter.elapsed : plant->u_alpha;
-        const double u_beta = ripple ? sim->inverter.volt_seconds_beta / sim->inverter.elapsed : plant->u_beta;
-        const double k = plant->iron_factor / plant->machine.R_iron;
-        const double a = (u_alpha - plant->R * plant->state.i_alpha) * k;
-        const double b = (u_beta - plant->R * plant->state.i_beta) * k;
-        const double iron[3] = {a, -0.5 * a + 0.5 * PMSM_REAL64_SQRT3 * b, -0.5 * a - 0.5 * PMSM_REAL64_SQRT3 * b};
-        for (int x = 0; x < 3; x++)
-            if (!sim->setup.inverter.open[x])
-                i[x] += iron[x];
-    }
 }
 
 /* A low-side shunt reads its leg only while the bottom transistor conducts long enough around the sample. */

@@ -381,6 +381,20 @@ static void run_substeps(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_curren
     }
 }
 
+/* The resistor across the flux voltage: of this instant in the averaged model, of the last whole period with ripple,
+ * which it would show in every sample of a zero vector; none with a leg open, or with the gates off. */
+static void find_iron_current(const pmsm_inverter *inverter, pmsm_plant *plant)
+{
+    const uint32_t *open = inverter->setup.open;
+    if (!inverter->gates || open[0] || open[1] || open[2])
+        plant->iron_alpha = plant->iron_beta = 0.0;
+    else if (inverter->setup.model == PMSM_INVERTER_AVERAGED)
+        pmsm_plant_set_iron_current(plant, plant->u_alpha, plant->u_beta);
+    else if (inverter->elapsed >= inverter->T_s)
+        pmsm_plant_set_iron_current(plant, inverter->volt_seconds_alpha / inverter->elapsed,
+                                    inverter->volt_seconds_beta / inverter->elapsed);
+}
+
 void pmsm_inverter_run(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double t_from, double t_to)
 {
     pmsm_current_lag *active = lag && lag->tau > 0.0 ? lag : NULL;
@@ -400,6 +414,8 @@ void pmsm_inverter_run(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_
         }
     }
     inverter->elapsed = t_to;
+    if (plant->machine.R_iron > 0.0)
+        find_iron_current(inverter, plant);
 }
 
 double pmsm_inverter_smallest_capacitance(double dead_time, double L_min)

@@ -17,7 +17,7 @@ static inline void terminal_voltage(const pmsm_plant *m, const pmsm_supply *supp
 {
     if (general) {
         double v[3];
-        pmsm_point_leg_voltages(supply, at, v);
+        pmsm_point_leg_voltages(m, supply, at, v);
         if (supply->blocked >= 0)
             v[supply->blocked] = pmsm_point_hold_voltage(m, at, omega_e, supply->blocked, v, NULL);
         pmsm_leg_vector(v, u_alpha, u_beta);
@@ -222,7 +222,7 @@ static inline void step_free(pmsm_plant *m, const pmsm_supply *supply, double h,
     pmsm_keep_point(m, &at);
 }
 
-/* No current flows all along: the shaft alone, and the flux is the magnet's. */
+/* No current flows all along: the shaft alone, the flux is the magnet's, and its iron loss comes from the shaft. */
 static void step_open(pmsm_plant *m, double h, int moves_freely, double omega, double acceleration)
 {
     static const double place[4] = {0.0, 0.5, 0.5, 1.0}, weight[4] = {1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0};
@@ -237,7 +237,7 @@ static void step_open(pmsm_plant *m, double h, int moves_freely, double omega, d
             twist = state->twist + hj * (w - wl);
             w = state->omega_M + hj * kw;
             wl = state->omega_load + hj * kl;
-            accelerations(m, 0.0, state->theta_M + at, w, twist, wl, &kw, &kl);
+            accelerations(m, -m->iron_drag * w, state->theta_M + at, w, twist, wl, &kw, &kl);
             sum_w += weight[j] * kw;
             sum_l += weight[j] * kl;
             sum_theta += weight[j] * w;
@@ -253,7 +253,7 @@ static void step_open(pmsm_plant *m, double h, int moves_freely, double omega, d
     set_angle(state, state->theta_M + d_theta);
     pmsm_real64_sincos(m->machine.pole_pairs * state->theta_M, &state->sin_e, &state->cos_e);
     state->turned = 0;
-    m->u_alpha = m->u_beta = 0.0;
+    m->u_alpha = m->u_beta = m->iron_alpha = m->iron_beta = 0.0;
     pmsm_plant_clear_current(m, PMSM_ALL_LEGS);
 }
 

@@ -81,12 +81,15 @@ typedef struct {
     uint64_t event_overruns;       /* intervals left before all their events were resolved */
     /* of the temperatures, by pmsm_plant_set_temperatures() */
     double R, psi_m, psi_shift;    /* ohm; Wb, magnet flux; Wb, its difference to the one at T_ref */
+    double magnet_strength;        /* magnet flux and its harmonics over those at T_ref */
     double L_d_inverse, L_q_inverse, iron_factor;
+    double iron_drag;              /* N m s/rad, of a rotor that turns without stator current */
     double psi_zero_d, psi_zero_q; /* Wb: flux of the map without current, at T_ref */
     double friction_sign;          /* of the Coulomb torque during this interval: -1, 0, 1 */
     /* rotation over the last interval length and speed, a constant-speed run uses it again */
     double rotation_h, rotation_omega, half_cos, half_sin, full_cos, full_sin;
     double u_alpha, u_beta;        /* V, at the end of the last interval */
+    double iron_alpha, iron_beta;  /* A, in the iron-loss resistor: the terminals carry it beside i_alpha, i_beta */
 } pmsm_plant;
 
 /* Rotor at theta_M, speed omega_M, no current. machine and temperatures are set before. */
@@ -94,6 +97,9 @@ void pmsm_plant_start(pmsm_plant *plant, double theta_M, double omega_M);
 
 /* Let R(T) and psi(T) follow the temperatures; the stator flux keeps its value. */
 void pmsm_plant_set_temperatures(pmsm_plant *plant, double T_winding, double T_magnet);
+
+/* Let the iron-loss resistor take what a mean terminal voltage drives through it. */
+void pmsm_plant_set_iron_current(pmsm_plant *plant, double u_alpha, double u_beta);
 
 /* Integrate over one interval, stick-slip of the rotor included. */
 void pmsm_plant_advance(pmsm_plant *plant, const pmsm_supply *supply, double h);
@@ -118,7 +124,8 @@ static const double pmsm_leg_beta[3] = {0.0, 0.86602540378443864676, -0.86602540
 /* Current of leg x (A). */
 static inline double pmsm_plant_leg_current(const pmsm_plant *plant, int x)
 {
-    return pmsm_leg_alpha[x] * plant->state.i_alpha + pmsm_leg_beta[x] * plant->state.i_beta;
+    return pmsm_leg_alpha[x] * (plant->state.i_alpha + plant->iron_alpha)
+           + pmsm_leg_beta[x] * (plant->state.i_beta + plant->iron_beta);
 }
 
 /* Copper loss heats the winding over h seconds. */

@@ -12,7 +12,7 @@ static void find_reluctance(const pmsm_plant *m, const pmsm_point *at, double g[
     if (m->machine.map) {
         double h[2] = {0.0, 0.0}, dh[2], i[2];
         if (pmsm_has_harmonics(&m->machine))
-            pmsm_magnet_harmonics(&m->machine, at->c, at->s, h, dh);
+            pmsm_magnet_harmonics(m, at->c, at->s, h, dh);
         const double psi_d = at->c * at->psi_alpha + at->s * at->psi_beta - h[0] - m->psi_shift;
         const double psi_q = at->c * at->psi_beta - at->s * at->psi_alpha - h[1];
         (void)pmsm_flux_map_current_jacobian(m->machine.map, psi_d, psi_q, i, g);
@@ -28,10 +28,11 @@ static void find_reluctance(const pmsm_plant *m, const pmsm_point *at, double g[
     }
 }
 
-void pmsm_point_leg_voltages(const pmsm_supply *supply, const pmsm_point *at, double v[3])
+void pmsm_point_leg_voltages(const pmsm_plant *m, const pmsm_supply *supply, const pmsm_point *at, double v[3])
 {
     for (int x = 0; x < 3; x++) {
-        const double i = pmsm_leg_alpha[x] * at->i_alpha + pmsm_leg_beta[x] * at->i_beta;
+        const double i = pmsm_leg_alpha[x] * (at->i_alpha + m->iron_alpha)
+                         + pmsm_leg_beta[x] * (at->i_beta + m->iron_beta);
         v[x] = supply->v[x] - supply->r[x] * i;
         if (supply->error)
             v[x] -= pmsm_leg_error_voltage(supply->error, x, i);
@@ -52,7 +53,7 @@ double pmsm_point_hold_voltage(const pmsm_plant *m, const pmsm_point *at, double
     double d_psi_q = c * w_beta - s * w_alpha - omega_e * psi_d;
     if (pmsm_has_harmonics(&m->machine)) {
         double h[2], dh[2];
-        pmsm_magnet_harmonics(&m->machine, c, s, h, dh);
+        pmsm_magnet_harmonics(m, c, s, h, dh);
         d_psi_d -= omega_e * dh[0];
         d_psi_q -= omega_e * dh[1];
     }
@@ -92,7 +93,10 @@ void pmsm_plant_set_temperatures(pmsm_plant *m, double T_winding, double T_magne
     m->R = k->R_copper * (1.0 + k->alpha_R * (T_winding - k->T_ref)) + k->R_fixed;
     m->psi_shift = k->psi_f * k->alpha_psi * (T_magnet - k->T_ref);
     m->psi_m = k->psi_f + m->psi_shift;
+    m->magnet_strength = 1.0 + k->alpha_psi * (T_magnet - k->T_ref);
     m->iron_factor = k->R_iron > 0.0 ? 1.0 / (1.0 + m->R / k->R_iron) : 1.0;
+    const double psi_open = k->map ? m->psi_zero_d + m->psi_shift : m->psi_m;
+    m->iron_drag = k->R_iron > 0.0 ? 1.5 * k->pole_pairs * k->pole_pairs * psi_open * psi_open / k->R_iron : 0.0;
 }
 
 /* Flux of the inverse table at zero current, by Newton from the map's own value. */
@@ -122,8 +126,7 @@ void pmsm_plant_start(pmsm_plant *m, double theta_M, double omega_M)
     m->L_d_inverse = m->machine.map ? 0.0 : 1.0 / m->machine.L_d;
     m->L_q_inverse = m->machine.map ? 0.0 : 1.0 / m->machine.L_q;
     m->rotation_h = -1.0;
-    m->u_alpha = 0.0;
-    m->u_beta = 0.0;
+    m->u_alpha = m->u_beta = m->iron_alpha = m->iron_beta = 0.0;
     if (m->machine.map)
         find_zero_flux(m);
     pmsm_plant_set_temperatures(m, m->T_winding, m->T_magnet);
@@ -136,7 +139,7 @@ double pmsm_plant_hold_voltage(const pmsm_plant *m, const pmsm_supply *supply, i
 {
     const pmsm_point at = pmsm_point_here(&m->state);
     double v[3];
-    pmsm_point_leg_voltages(supply, &at, v);
+    pmsm_point_leg_voltages(m, supply, &at, v);
     return pmsm_point_hold_voltage(m, &at, m->machine.pole_pairs * m->state.omega_M, x, v, slope_per_volt);
 }
 
@@ -144,7 +147,7 @@ static void zero_current_flux(const pmsm_plant *m, double c, double s, double *p
 {
     double h[2] = {0.0, 0.0}, dh[2];
     if (pmsm_has_harmonics(&m->machine))
-        pmsm_magnet_harmonics(&m->machine, c, s, h, dh);
+        pmsm_magnet_harmonics(m, c, s, h, dh);
     *psi_d = (m->machine.map ? m->psi_zero_d + m->psi_shift : m->psi_m) + h[0];
     *psi_q = (m->machine.map ? m->psi_zero_q : 0.0) + h[1];
 }
@@ -155,10 +158,17 @@ void pmsm_plant_emf(const pmsm_plant *m, double emf[3])
     double psi_d, psi_q, h[2], dh[2] = {0.0, 0.0};
     zero_current_flux(m, c, s, &psi_d, &psi_q);
     if (pmsm_has_harmonics(&m->machine))
-        pmsm_magnet_harmonics(&m->machine, c, s, h, dh);
+        pmsm_magnet_harmonics(m, c, s, h, dh);
     const double u_d = omega_e * (dh[0] - psi_q), u_q = omega_e * (dh[1] + psi_d);
     for (int x = 0; x < 3; x++)
         emf[x] = pmsm_leg_alpha[x] * (c * u_d - s * u_q) + pmsm_leg_beta[x] * (s * u_d + c * u_q);
+}
+
+void pmsm_plant_set_iron_current(pmsm_plant *m, double u_alpha, double u_beta)
+{
+    const double per_volt = m->machine.R_iron > 0.0 ? m->iron_factor / m->machine.R_iron : 0.0;
+    m->iron_alpha = (u_alpha - m->R * m->state.i_alpha) * per_volt;
+    m->iron_beta = (u_beta - m->R * m->state.i_beta) * per_volt;
 }
 
 void pmsm_plant_clear_current(pmsm_plant *m, int x)
@@ -179,7 +189,8 @@ void pmsm_plant_clear_current(pmsm_plant *m, int x)
             find_reluctance(m, &at, g);
             const double n_d = at.c * pmsm_leg_alpha[x] + at.s * pmsm_leg_beta[x];
             const double n_q = at.c * pmsm_leg_beta[x] - at.s * pmsm_leg_alpha[x];
-            const double i = pmsm_leg_alpha[x] * at.i_alpha + pmsm_leg_beta[x] * at.i_beta;
+            const double i = pmsm_leg_alpha[x] * (at.i_alpha + m->iron_alpha)
+                             + pmsm_leg_beta[x] * (at.i_beta + m->iron_beta);
             const double k = -i / (n_d * (g[0] * n_d + g[1] * n_q) + n_q * (g[2] * n_d + g[3] * n_q));
             at.psi_alpha += k * pmsm_leg_alpha[x];
             at.psi_beta += k * pmsm_leg_beta[x];

@@ -15,17 +15,19 @@ typedef struct {
 } pmsm_point;
 
 /* Harmonics of the magnet flux at angle (c, s): value and derivative with respect to theta_e. */
-static inline void pmsm_magnet_harmonics(const pmsm_machine *machine, double c, double s, double h[2], double dh[2])
+static inline void pmsm_magnet_harmonics(const pmsm_plant *m, double c, double s, double h[2], double dh[2])
 {
+    const double psi_6 = m->magnet_strength * m->machine.psi_6, psi_7 = m->magnet_strength * m->machine.psi_7;
+    const double psi_12 = m->magnet_strength * m->machine.psi_12;
     const double c2 = c * c - s * s, s2 = 2.0 * c * s;
     const double c3 = c2 * c - s2 * s, s3 = s2 * c + c2 * s;
     const double c6 = c3 * c3 - s3 * s3, s6 = 2.0 * c3 * s3;
     const double c12 = c6 * c6 - s6 * s6, s12 = 2.0 * c6 * s6;
-    const double even = machine->psi_6 + machine->psi_7, odd = machine->psi_6 - machine->psi_7;
-    h[0] = even * c6 + machine->psi_12 * c12;
-    h[1] = -odd * s6 - machine->psi_12 * s12;
-    dh[0] = -6.0 * even * s6 - 12.0 * machine->psi_12 * s12;
-    dh[1] = -6.0 * odd * c6 - 12.0 * machine->psi_12 * c12;
+    const double even = psi_6 + psi_7, odd = psi_6 - psi_7;
+    h[0] = even * c6 + psi_12 * c12;
+    h[1] = -odd * s6 - psi_12 * s12;
+    dh[0] = -6.0 * even * s6 - 12.0 * psi_12 * s12;
+    dh[1] = -6.0 * odd * c6 - 12.0 * psi_12 * c12;
 }
 
 static inline int pmsm_has_harmonics(const pmsm_machine *machine)
@@ -41,7 +43,7 @@ static inline void pmsm_find_currents(pmsm_plant *m, pmsm_point *at)
     double psi_q = c * at->psi_beta - s * at->psi_alpha;
     if (pmsm_has_harmonics(&m->machine)) {
         double h[2], dh[2];
-        pmsm_magnet_harmonics(&m->machine, c, s, h, dh);
+        pmsm_magnet_harmonics(m, c, s, h, dh);
         psi_d -= h[0];
         psi_q -= h[1];
     }
@@ -68,7 +70,7 @@ static inline double pmsm_air_gap_torque(const pmsm_plant *m, const pmsm_point *
     double flux_current = at->psi_alpha * at->i_beta - at->psi_beta * at->i_alpha;
     if (pmsm_has_harmonics(&m->machine)) { /* from the co-energy: i . d psi_pm / d theta_e */
         double h[2], dh[2];
-        pmsm_magnet_harmonics(&m->machine, at->c, at->s, h, dh);
+        pmsm_magnet_harmonics(m, at->c, at->s, h, dh);
         flux_current += at->i_d * dh[0] + at->i_q * dh[1];
     }
     return 1.5 * m->machine.pole_pairs * flux_current;
@@ -109,7 +111,7 @@ static inline pmsm_point pmsm_point_here(const pmsm_plant_state *state)
 }
 
 /* Leg voltages behind slope and error at the point's currents. */
-void pmsm_point_leg_voltages(const pmsm_supply *supply, const pmsm_point *at, double v[3]);
+void pmsm_point_leg_voltages(const pmsm_plant *m, const pmsm_supply *supply, const pmsm_point *at, double v[3]);
 
 /* Voltage of leg x that keeps its current, the others at v: solves d i_x/dt = 0, which is linear in v_x.
  * slope_per_volt may be null. */

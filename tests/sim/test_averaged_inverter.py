@@ -302,11 +302,14 @@ def test_eddy_branch_lowers_the_inductance_that_fast_changes_see():
     assert slow[-1].real == pytest.approx(i, rel=1e-6)
 
 
-def test_flux_harmonics_are_in_the_back_emf_and_conserve_power():
+@pytest.mark.parametrize("T_magnet_c", [20.0, 70.0])
+def test_flux_harmonics_are_in_the_back_emf_and_conserve_power(T_magnet_c: float):
+    """They are the magnets', so they weaken with the fundamental."""
     psi_6, omega = 2e-3, 100.0
 
     def change(setup: Setup) -> None:
         turning(omega)(setup)
+        setup.T_magnet = T_magnet_c
         setup.machine.psi_6, setup.machine.psi_12 = psi_6, 0.5 * psi_6
         setup.machine.R_copper = 1e-9
         setup.machine.L_d = setup.machine.L_q = 1.0  # next to no current: the voltage integral is the magnet's flux
@@ -321,8 +324,9 @@ def test_flux_harmonics_are_in_the_back_emf_and_conserve_power():
     i_d = np.array(simulation.signal(Truth.I_D))
     assert np.isfinite(i_d)
     # flux in the stator frame stays, so i = (psi_stator - psi_magnet)/L: the start value minus the harmonics
-    magnet = PSI + psi_6 * np.exp(-6j * theta) + 0.5 * psi_6 * np.exp(-12j * theta)
-    start = PSI + 1.5 * psi_6
+    strength = 1.0 - 0.0012 * (T_magnet_c - 20.0)
+    magnet = strength * (PSI + psi_6 * np.exp(-6j * theta) + 0.5 * psi_6 * np.exp(-12j * theta))
+    start = strength * (PSI + 1.5 * psi_6)
     found = simulation.signal(Truth.I_D) + 1j * simulation.signal(Truth.I_Q)
     expected = start * np.exp(-1j * theta[-1]) - magnet[-1]
     assert found == pytest.approx(expected, rel=1e-6)
@@ -365,3 +369,28 @@ def test_saturated_free_rotor_uses_the_map():
     t, omega, torque = record(simulation, [Truth.T, Truth.OMEGA_M, Truth.TORQUE], 2400)
     integral = np.concatenate(([0.0], np.cumsum(0.5 * (torque[1:] + torque[:-1]) * np.diff(t)))) / 0.02
     assert np.abs(omega - integral).max() < 2e-3 * omega.max()
+
+
+@pytest.mark.parametrize("model", [0, 1])
+def test_the_dead_time_acts_on_the_iron_current_too(model: int):
+    """The bridge carries it, so with i_d alone at the terminals the lost voltage is the one without iron loss.
+
+    Measured: 1.6 % apart in both models; without the iron current in the legs 12 %.
+    """
+    omega = 2.0 * math.pi / (400.0 * T_S * POLE_PAIRS)
+
+    def voltage(dead: float, R_iron: float) -> complex:
+        def change(setup: Setup) -> None:
+            lossy(SIGN, dead=(dead,) * 3)(setup)
+            turning(omega)(setup)
+            setup.inverter.model = model
+            setup.machine.R_iron = R_iron
+
+        simulation = open_simulation(change)
+        simulation.reference.i_d_ref = 6.0
+        simulation.run(4000)
+        u_alpha, u_beta, theta = record(simulation, [Truth.U_ALPHA, Truth.U_BETA, Truth.THETA_E], 800)
+        return complex(np.mean((u_alpha + 1j * u_beta) * np.exp(-1j * theta)))
+
+    with_iron, without = (voltage(DEAD, R_iron) - voltage(0.0, R_iron) for R_iron in (25.0, 0.0))
+    assert with_iron == pytest.approx(without, rel=0.02)

@@ -51,6 +51,20 @@ def test_viscous_coasting_is_exponential():
     assert np.abs(omega / (100.0 * np.exp(-B / J * t)) - 1.0).max() < 1e-12  # measured 3e-14
 
 
+def test_the_iron_brakes_a_rotor_without_current():
+    """1.5 p^2 psi^2 omega / R_iron, from the energy balance of the resistor that the back-EMF feeds."""
+    J, R_iron = 2e-3, 50.0
+
+    def warm(setup):
+        setup.T_magnet = 70.0
+
+    simulation = idle(open_simulation(both(free(J=J, R_iron=R_iron), coasting, warm)))
+    t, omega = record(simulation, [Truth.T, Truth.OMEGA_M], 2000)
+    psi = PSI * (1.0 - 0.0012 * 50.0)
+    drag = 1.5 * POLE_PAIRS**2 * psi**2 / R_iron
+    assert np.abs(omega / (100.0 * np.exp(-drag / J * t)) - 1.0).max() < 1e-12  # measured 2e-14
+
+
 def test_coulomb_friction_stops_the_shaft_and_holds_it():
     J, tau_c = 2e-3, 0.3
     simulation = idle(open_simulation(both(free(J=J, tau_c=tau_c), coasting)))
