@@ -24,13 +24,13 @@ EXIT_CODES: dict[ExitCode, str] = {
     ExitCode.DRIVE: "the drive is in fault, or refused a value (SDO abort)",
     ExitCode.SAFETY: "refused by a safety limit before anything moved",
     ExitCode.NOT_TRUSTWORTHY: "the measurement is not trustworthy, so no number is given (help refusals)",
-    ExitCode.DECLINED: "declined at a prompt, or nobody could be asked; nothing was done",
+    ExitCode.DECLINED: "declined at a prompt, or no terminal; nothing was done",
     ExitCode.STOP_NOT_CONFIRMED: "STOP NOT CONFIRMED: the machine may be energised, use the hardware stop",
     ExitCode.NOT_AVAILABLE: "this drive cannot give that; what is missing is named",
     ExitCode.PARTIAL: "partial: what ran is good, but something asked for could not be had; it is named",
-    ExitCode.INTERNAL: "a bug in pmsmtool; the traceback is kept in the file that is named",
-    ExitCode.INTERRUPTED: "interrupted; a machine that moved was stopped, and the stop confirmed",
-    ExitCode.READER_GONE: "whoever read the output went away (| head), as with any filter",
+    ExitCode.INTERNAL: "a bug in pmsmtool; the traceback is in the file that is named",
+    ExitCode.INTERRUPTED: "interrupted; a machine that moved was stopped, and the stop was confirmed",
+    ExitCode.READER_GONE: "the reader of the output went away (| head), as with any filter",
 }
 
 SAFETY = """\
