@@ -81,7 +81,7 @@ class Row:
         return self.node, f"{self.tier}, {self.map}", self.identify, self.commission, self.flash, why
 
 
-HEADS = ("node", "`caps`: tier, map", "`identify`", "`commission`", "`flash-params`", "what is not had, and why")
+HEADS = ("node", "`caps`: level, map", "`identify`", "`commission`", "`flash-params`", "what is not had, and why")
 
 
 def files_of(sources: list[str], families: list[str]) -> Iterator[str]:
@@ -308,7 +308,7 @@ def main() -> int:
     good = all(row.good for row in rows)
     nodes, moved, told = counted(rows)
     sums = [
-        f"{moved} of {nodes} drives moved; {told} told J/psi, by `identify` alone or with the pole pairs of the "
+        f"{moved} of {nodes} drives moved; {told} gave J/psi, by `identify` alone or with the pole pairs of the "
         "machine file in `commission`; "
         f"{'every' if good else 'NOT every'} truth within its interval; {judged} rows of maps counted in the node's "
         f"own units, {'none' if good else 'SOME'} wrong."

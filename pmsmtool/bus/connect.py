@@ -140,7 +140,7 @@ def _why_closed(name: str | None, error: Exception) -> str:
     if isinstance(error, (can.CanInterfaceNotImplementedError, ImportError)):
         return "the adapter's driver or python-can's extra for it is not installed"
     if isinstance(error, TimeoutError):
-        return "whoever listens there is no socketcand server, or it hangs" if name == "socketcand" else "it hangs"
+        return "what listens there is no socketcand server, or it hangs" if name == "socketcand" else "it hangs"
     if isinstance(error, ConnectionError):
         return "no server listens there; `pmsmtool sim serve` starts one"
     if getattr(error, "errno", None) == errno.EAFNOSUPPORT:

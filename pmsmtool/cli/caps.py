@@ -34,7 +34,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
     """Show every quantity, the methods to it, the interval to expect, and what this drive lacks for it.
 
     The drive is only read. Without --map the map of its identity is used, and without one what CiA 402 says. The
-    intervals were measured on simulated drives of the same tier; where nothing was measured, nothing is promised.
+    intervals were measured on simulated drives of the same capability level; where none was measured, none is printed.
 
     With --eds no bus is needed: a simulated drive with exactly the file's objects is asked, a motor set up in it.
     """
@@ -142,7 +142,7 @@ def _lines(found: Capabilities, denied: Mapping[str, str]) -> list[str]:
     lines = [
         f"node {identity.node}  {identity.name}  vendor {identity.vendor:#010x}  product {identity.product:#x}  "
         f"serial {identity.serial}",
-        f"map {found.drive_map.name} ({len(found.drive_map.cells)} parameters)  tier {found.tier}",
+        f"map {found.drive_map.name} ({len(found.drive_map.cells)} parameters)  capability level {found.tier}",
         *([f"recorder: {found.recorder}"] if found.recorder else []),
         *found.replaced,
         "",

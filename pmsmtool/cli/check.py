@@ -133,8 +133,8 @@ def _check_below_full(
         envelope.refuse_gravity()
         lines = [
             *envelope.lines(),
-            f"the shaft is turned or pushed by at most half a turn; {HOMING_LOST}",
-            f"this drive is of the {found.tier} level: what it cannot show is listed as NOT CHECKED",
+            f"torque pulses turn the shaft by at most half a turn; {HOMING_LOST}",
+            f"capability level {found.tier}: what it cannot show is listed as NOT CHECKED",
             "nothing is stored in the drive; every changed object is restored",
         ]
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)

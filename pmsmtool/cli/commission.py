@@ -93,14 +93,16 @@ def commission_command(
 ) -> None:
     """Identify the machine, design its control, make the table, judge the margins, flash, verify, prove, report.
 
-    MACHINE is a machine file with what is known (ratings, limits); without it the drive's own ratings are the start.
+    MACHINE is a machine file with what is known (ratings, limits), or a profile. Without it the drive's own ratings
+    are the start.
     Consents are asked one by one: the motion envelope before anything moves, the list of differences before anything
     is written, and the envelope of the proof, which runs the flashed drive up to its designed limits. The chain ends
     at the first criterion that is not met, with the drive off and as it was; --resume goes on there. A simulated drive
     starts from factory memory unless its channel names a memory file (nv=).
 
-    On a drive that gives less than the reference drive (`pmsmtool caps`) every stage runs as far as its tier and its
-    map go: what it cannot measure is taken from MACHINE and marked so, and a stage that cannot run says what it needs.
+    On a drive that gives less than the reference drive (`pmsmtool caps`) every stage runs as far as its capability
+    level and its map allow. What is not measured is taken from MACHINE and marked so; a stage that cannot run names
+    what it needs.
     --rehearse and --eds need no hardware: MACHINE runs simulated behind the dictionary of such a drive.
 
     The verdict is PASS (exit 0) only when all seven stages ran and nothing stayed unchecked, FAIL (exit 1) when a
@@ -118,7 +120,7 @@ def commission_command(
             raise click.UsageError("--resume goes on with the drive of its run: not together with --rehearse or --eds")
         bus = rehearsal_bus(bus, eds=eds, family=rehearse, machine=machine)
     if accept and motion.yes:
-        raise click.UsageError("--accept-contradiction is a person's decision: not together with --yes")
+        raise click.UsageError("--accept-contradiction needs a person at the terminal: not together with --yes")
     check_accepted(accept)
     refuse_unattended("--accept-limit", accept_limits, motion, simulated=bus.simulated())
 
@@ -182,6 +184,7 @@ def _asked(
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.identification.request import QUANTITIES, IdentifyRequest
     from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.machine.profile import machine_path
 
     wanted = IdentifyRequest(
         quantities=(*QUANTITIES, "map") if flux_map else QUANTITIES,
@@ -196,7 +199,7 @@ def _asked(
     )
     wanted.check()
     return {
-        "nameplate": None if machine is None else load_machine_file(machine),
+        "nameplate": None if machine is None else load_machine_file(machine_path(machine)),
         "identify": wanted,
         "tune": TuneRequest(**design),
     }

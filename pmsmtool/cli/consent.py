@@ -3,7 +3,7 @@
 
 Each is asked on its own. ``--yes`` answers them on a simulated bus; on a real one only together with ``--i-max``,
 ``--speed-max``, ``--shaft`` and the serial number of the very drive that answered, so that a line from a script's
-history cannot move another machine; a drive that tells none is not moved or written by it at all. Where nobody can be
+history cannot move another machine; a drive that shows none is not moved or written by it at all. Where nobody can be
 asked, nothing is done (exit code 7).
 """
 
@@ -126,7 +126,7 @@ def _ask(
         )
     missing = missing_for_yes(options)
     if not serial:
-        missing.append("a drive that tells its serial number")
+        missing.append("a drive that shows its serial number")
     if options.yes and (simulated or not missing):
         return Consent(subject, "--yes", text)
     if options.yes:
@@ -151,7 +151,7 @@ def _ask(
 
 def _lacking(missing: list[str], serial: int) -> str:
     if not serial:
-        return "run it in a terminal: this drive tells no serial number, and without one only a person may consent"
+        return "run it in a terminal: this drive shows no serial number; without one --yes is not possible"
     return f"--yes {' '.join(f'{name} ...' for name in missing)}"
 
 

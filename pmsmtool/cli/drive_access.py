@@ -48,7 +48,7 @@ def read_map(path: Path | None) -> DriveMap:
 
     if path is None:
         return reference_map()
-    if str(path) in family_names() and not path.is_file():
+    if not path.is_file() and (str(path) in family_names() or (path.name == str(path) and not path.suffix)):
         return load_family(str(path))
     hint = "give a map file in UTF-8 that you may read, or the name of a shipped family"
     return parse_drive_map(read_text(path, hint=hint), str(path))

@@ -27,7 +27,10 @@ SHOWN = 5
 """Parameters that a warning names."""
 
 
-@click.group("export")
+@click.group(
+    "export",
+    epilog=examples("pmsmtool export c design.toml -o firmware", "pmsmtool export csv design.toml -o parameters.csv"),
+)
 def export_command() -> None:
     """Write a design as files for other programs.
 

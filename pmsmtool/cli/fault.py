@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
 
 
-@click.group("fault")
+@click.group("fault", epilog=examples("pmsmtool -n 5 fault show", "pmsmtool -n 5 fault reset"))
 def fault_command() -> None:
     """Show a drive's faults, or reset them."""
 

@@ -24,28 +24,28 @@ EXIT_CODES: dict[ExitCode, str] = {
     ExitCode.DRIVE: "the drive is in fault, or refused a value (SDO abort)",
     ExitCode.SAFETY: "refused by a safety limit before anything moved",
     ExitCode.NOT_TRUSTWORTHY: "the measurement is not trustworthy, so no number is given (help refusals)",
-    ExitCode.DECLINED: "declined at a prompt, or nobody could be asked; nothing was done",
+    ExitCode.DECLINED: "declined at a prompt, or no terminal; nothing was done",
     ExitCode.STOP_NOT_CONFIRMED: "STOP NOT CONFIRMED: the machine may be energised, use the hardware stop",
     ExitCode.NOT_AVAILABLE: "this drive cannot give that; what is missing is named",
     ExitCode.PARTIAL: "partial: what ran is good, but something asked for could not be had; it is named",
-    ExitCode.INTERNAL: "a bug in pmsmtool; the traceback is kept in the file that is named",
-    ExitCode.INTERRUPTED: "interrupted; a machine that moved was stopped, and the stop confirmed",
-    ExitCode.READER_GONE: "whoever read the output went away (| head), as with any filter",
+    ExitCode.INTERNAL: "a bug in pmsmtool; the traceback is in the file that is named",
+    ExitCode.INTERRUPTED: "interrupted; a machine that moved was stopped, and the stop was confirmed",
+    ExitCode.READER_GONE: "the reader of the output went away (| head), as with any filter",
 }
 
 SAFETY = """\
-Nothing moves and nothing is written without a consent, and there are two of them, never one:
+Nothing moves and nothing is written without your consent; the two are asked one by one:
   motion   before the first current the envelope is printed: largest current, energy, speed, travel, duration, and
            what the shaft may do (--shaft, --load, --brake).
   writing  before the first write the list of differences is printed: name, old, new, unit.
 --yes answers them on a simulated drive. On a real bus it needs --i-max, --speed-max, --shaft and --serial as well, and
-the serial number must be that of the drive that answers: one that tells none is moved and written by a person at a
-terminal only. --yes cannot be set by an environment variable. Where nobody can be asked (no terminal) and --yes does
+the serial number must be that of the drive that answers: one that shows none is moved and written by a person at a
+terminal only. --yes cannot be set by an environment variable. Without a terminal, and where --yes does
 not hold, nothing is done: exit 7.
 
-Every way out of a command that moved the machine is the same: voltage off, zero current, parameters restored, and the
+A command that moved the machine always ends in the same way: voltage off, zero current, parameters restored, and the
 stop confirmed from the statusword. If the drive does not confirm it, the exit code is 8 whatever else went wrong: use
-the hardware stop. Ctrl-C, SIGTERM and a closed terminal take that way too; a second Ctrl-C removes the voltage at once.
+the hardware stop. Ctrl-C, SIGTERM and a closed terminal do the same; a second Ctrl-C removes the voltage at once.
 
 A software stop is no safety function. Keep a hardware stop within reach."""
 
@@ -220,6 +220,11 @@ def _command_help(ctx: click.Context, names: tuple[str, ...]) -> str:
         group = context.command
         command = group.get_command(context, name) if isinstance(group, click.Group) else None
         if command is None:
-            raise click.UsageError(f"no topic and no command: {' '.join(names)}; topics: {', '.join(TOPICS)}", ctx)
+            known = [*TOPICS, *group.list_commands(context)] if isinstance(group, click.Group) else []
+            from difflib import get_close_matches
+
+            near = get_close_matches(name, known, n=1)
+            guess = f"did you mean {near[0]}?" if near else f"topics: {', '.join(TOPICS)}"
+            raise click.UsageError(f"no topic and no command: {' '.join(names)}; {guess}", ctx)
         context = click.Context(command, parent=context, info_name=name)
     return context.get_help()

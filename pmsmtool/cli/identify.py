@@ -104,8 +104,8 @@ def identify_command(
     """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
 
     "map" measures the flux linkages over the plane of currents with saturation and cross-saturation; a held rotor
-    (--shaft locked) allows R, inverter and map. "mechanics" fits inertia, viscous and Coulomb friction to pushes and
-    coasting; "cogging" finds the torque over the angle in slow turns, or the least that would have been found;
+    (--shaft locked) allows R, inverter and map. "mechanics" fits inertia, viscous and Coulomb friction to torque pulses
+    and coasting; "cogging" finds the torque over the angle in slow turns, or the least that would have been found;
     "harmonics" records voltages and currents over turns for the 5th, 7th, 11th and 13th of the back-EMF; "frf" measures
     the mechanical frequency response, and a resonance where the data support one. Without a quantity all but map, frf,
     cogging and harmonics are measured; with "all", all.

@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from pmsmtool.bus.lss import LssAddress
 
 
-@click.group("lss")
+@click.group(
+    "lss",
+    epilog=examples("pmsmtool -i socketcan -c can0 lss scan", "pmsmtool -i socketcan -c can0 lss set-node 5 --store"),
+)
 def lss_command() -> None:
     """Find nodes that have no node id, and give them one (CiA 305)."""
 

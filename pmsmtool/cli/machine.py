@@ -16,18 +16,38 @@ _BETWEEN = click.Choice(["line-line", "phase"])
 _SOURCE = click.Choice(["datasheet", "meter", "guess"])
 
 
-@click.group("machine")
+@click.group("machine", epilog=examples("pmsmtool machine new --help", "pmsmtool machine map measured.npz"))
 def machine_command() -> None:
     """Make machine files; check and repair flux maps."""
 
 
+_ONE_OF = (("--l, or --l-d and --l-q", ("L_h", "L_d_h", "L_q_h")), ("--ke or --kt", ("ke", "kt")))
+"""Options of `machine new` of which one must be there."""
+
+
+class _AllMissingAtOnce(click.Command):
+    """A command that names every missing option in one error."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse as click does; where an option is missing, look for all others that are."""
+        typed = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except click.MissingParameter as error:
+            given, _, _ = self.make_parser(ctx).parse_args(args=typed)
+            missing = [max(p.opts, key=len) for p in self.params if p.required and p.name not in given]
+            missing += [text for text, names in _ONE_OF if not any(name in given for name in names)]
+            raise click.UsageError(f"missing options: {', '.join(missing)}", ctx) from error
+
+
 @machine_command.command(
     "new",
+    cls=_AllMissingAtOnce,
     epilog=examples(
-        "pmsmtool machine new --name m1 --pole-pairs 4 --r 0.274ohm --l 4.4mH --ke 60.7Vrms/krpm \\",
-        "    --ke-between line-line --i-nom 19.8Arms --u-dc 540V --pwm 12kHz -o m1.toml",
-        "pmsmtool machine new --name m2 --pole-pairs 3 --connection delta --r 3.2ohm --r-between phase --l-d 30mH \\",
-        "    --l-q 42mH --l-between phase --kt 0.9Nm/Arms --u-dc 325V --pwm 10kHz --source meter -o m2.toml",
+        "pmsmtool machine new --name m1 --pole-pairs 4 --r 0.274ohm --l 4.4mH --ke 60.7Vrms/krpm "
+        "--ke-between line-line --i-nom 19.8Arms --u-dc 540V --pwm 12kHz -o m1.toml",
+        "pmsmtool machine new --name m2 --pole-pairs 3 --connection delta --r 3.2ohm --r-between phase --l-d 30mH "
+        "--l-q 42mH --l-between phase --kt 0.9Nm/Arms --u-dc 325V --pwm 10kHz --source meter -o m2.toml",
     ),
 )
 @click.option("--name", required=True, help="Name of the machine.")

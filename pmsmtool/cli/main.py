@@ -43,7 +43,7 @@ them on the way, and once more at exit, took 30 of 240 ms."""
     epilog=examples("pmsmtool help units", "pmsmtool help exit-codes"),
 )
 @global_options
-@click.version_option(__version__, prog_name=PROGRAM, message="%(prog)s %(version)s")
+@click.version_option(__version__, "-V", "--version", prog_name=PROGRAM, message="%(prog)s %(version)s")
 def cli(**_: Any) -> None:
     """Commission permanent-magnet synchronous motor drives over CANopen.
 

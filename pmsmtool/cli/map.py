@@ -32,7 +32,7 @@ DURATION_S = 120.0
 NORMAL = 1.96
 
 
-@click.group("map")
+@click.group("map", epilog=examples("pmsmtool map learn --help"))
 def map_group() -> None:
     """Find out what the objects of a drive count."""
 
@@ -41,8 +41,7 @@ def map_group() -> None:
     "learn",
     epilog=examples(
         "pmsmtool -n 5 map learn --machine motor.toml -o my-drive.toml --shaft free",
-        "pmsmtool -n 5 map learn speed.K_p_nms_per_rad=0x30A2:01 speed.K_i_nm_per_rad=0x30A2:02 --map epos4 "
-        "--machine motor.toml -o my-drive.toml",
+        "pmsmtool -n 5 map learn speed.K_p_nms_per_rad=0x30A2:01 --map epos4 --machine motor.toml -o my-drive.toml",
     ),
 )
 @click.argument("names", metavar="[NAME[=0xINDEX:SUB]]...", nargs=-1)

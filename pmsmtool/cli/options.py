@@ -109,9 +109,32 @@ DURATION = Quantity("time", positive=True)
 RATE = Quantity("frequency", positive=True)
 
 
+_EXAMPLE_WIDTH = 76
+"""Columns of an example; the help puts four blanks before it, and a terminal has 80."""
+
+
 def examples(*lines: str) -> str:
-    """Return the epilog of a command's help: lines that can be pasted."""
-    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
+    """Return the epilog of a command's help: lines that can be pasted, what ``#`` explains in a line before.
+
+    A line that is too long for a terminal goes on behind a backslash.
+    """
+    shown: list[str] = []
+    for line in lines:
+        command, _, why = line.partition("  # ")
+        shown += ([f"# {why.strip()}"] if why else []) + _continued(command.rstrip())
+    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in shown)
+
+
+def _continued(command: str) -> list[str]:
+    """Break a command between its options."""
+    lines = [""]
+    for part in re.split(r" (?=-)", command):
+        if len(lines[-1]) + len(part) + 3 > _EXAMPLE_WIDTH and lines[-1]:
+            lines[-1] += " \\"
+            lines.append("    " + part)
+        else:
+            lines[-1] += (" " if lines[-1] else "") + part
+    return lines
 
 
 # ---- the options themselves; auto: whether the environment may give them ----------------------------------

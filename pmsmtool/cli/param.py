@@ -6,6 +6,7 @@ from __future__ import annotations
 import fnmatch
 import math
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +42,10 @@ if TYPE_CHECKING:
 _ADDRESS = re.compile(r"(0[xX][0-9a-fA-F]{1,4})(?::([0-9a-fA-F]{1,2}))?")
 
 
-@click.group("param")
+@click.group(
+    "param",
+    epilog=examples("pmsmtool -i pmsmsim param get 'motor.*'", "pmsmtool param help current.K_p_d_v_per_a"),
+)
 def param_command() -> None:
     """Read, write, compare and explain parameters, by catalogue name (wildcards) or as 0x2010:02."""
 
@@ -237,14 +241,20 @@ def _resolve(text: str, drive_map: DriveMap) -> list[_Entry]:
         return [(names[0] if names else "", wanted)]
     found = [name for name in drive_map.cells if fnmatch.fnmatchcase(name, text)]
     if not found:
-        import difflib
-
-        near = difflib.get_close_matches(text, drive_map.cells, n=1)
+        near = _near(text, drive_map.cells)
         raise ConfigError(
             f"no parameter is named {text!r}",
-            hint=f"did you mean {near[0]}?" if near else "pmsmtool param help '*' lists them",
+            hint=f"did you mean {' or '.join(near)}?" if near else "pmsmtool param help '*' lists them",
         )
     return [(name, drive_map.address(name)) for name in found]
+
+
+def _near(text: str, names: Collection[str]) -> list[str]:
+    """Return at most three names that were probably meant: those that contain the text, else those alike."""
+    import difflib
+
+    alike = [name for name in names if text.lower() in name.lower()] or difflib.get_close_matches(text, names, n=1)
+    return alike[:3]
 
 
 def _assignment(text: str, drive_map: DriveMap) -> dict[str, float]:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The command reference of the README, from the commands themselves: ``python -m pmsmtool.cli.reference [--write]``.
+"""The command reference of the documentation, from the commands: ``python -m pmsmtool.cli.reference [--write]``.
 
-Without ``--write`` the text is printed; with it the part of README.md between the two markers is replaced. A test
-compares both, so that the README cannot say what the program does not.
+Without ``--write`` the text is printed; with it the part of docs/commands.md between the two markers is replaced. A
+test compares both, so that the page cannot say what the program does not.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pmsmtool.cli.lazy_group import leaves
 from pmsmtool.cli.main import PROGRAM, cli
 from pmsmtool.errors import ConfigError
 
+PAGE = "docs/commands.md"
 BEGIN = "<!-- made by python -m pmsmtool.cli.reference --write; do not edit -->"
 END = "<!-- end of the command reference -->"
 
@@ -39,7 +40,7 @@ def reference() -> str:
     for section in Section:
         rows = [row for row in COMMANDS if row.section is section]
         if rows:
-            parts.append(f"### {section.value}\n")
+            parts.append(f"## {section.value}\n")
             parts += [_command_text(typed, command) for row in rows for typed, command in leaves([row])]
     return "\n".join(parts).rstrip("\n") + "\n"
 
@@ -105,31 +106,31 @@ def _first_sentence(text: str | None) -> str:
     return sentence if keeps_capital else sentence[:1].lower() + sentence[1:]
 
 
-def replaced(readme: str) -> str:
-    """Return the README with the present reference between its markers.
+def replaced(page: str) -> str:
+    """Return the page with the present reference between its markers.
 
     Raises
     ------
     ConfigError
         The markers are not there, or not in order.
     """
-    before, begin, rest = readme.partition(BEGIN)
+    before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise ConfigError(
             "the markers of the command reference are missing",
-            where="README.md",
+            where=PAGE,
             hint="put both markers of pmsmtool/cli/reference.py around the section",
         )
     return f"{before}{BEGIN}\n\n{reference()}\n{END}{after}"
 
 
 def main(arguments: list[str]) -> int:
-    """Print the reference, or write it into README.md of the current folder."""
+    """Print the reference, or write it into its page below the current folder."""
     if arguments != ["--write"]:
         click.echo(reference(), nl=False)
         return 0
-    path = Path("README.md")
+    path = Path(PAGE)
     try:
         path.write_text(replaced(path.read_text(encoding="utf-8")), encoding="utf-8")
     except (OSError, ConfigError) as error:

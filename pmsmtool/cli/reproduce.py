@@ -39,7 +39,7 @@ _SUFFIXES = (".json", ".csv", ".txt")
 def reproduce_command(
     figure: str | None, path: Path | None, figure_path: Path | None, seed: int, list_only: bool, out: Output
 ) -> None:
-    """Recompute FIGURE and print its tables; each printed number stands beside ours.
+    """Recompute FIGURE and print its tables; each number stands beside the printed one.
 
     A folder for -o receives the tables (.txt, .json), what is plotted (.csv) and the plot (.svg). Exit code 1 when a
     checked number is out of its range. Same seed, same bytes. Nothing is touched.
@@ -76,7 +76,7 @@ def reproduce_command(
             f"checked numbers are out of range: {len(outside)}",
             where="reproduce",
             likely="; ".join(outside),
-            hint="the table shows the printed or expected number, ours and the allowed range",
+            hint="the table shows the printed or expected number, the recomputed one and the allowed range",
         )
 
 

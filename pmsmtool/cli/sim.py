@@ -35,13 +35,14 @@ faults=FILE  faults on purpose; `pmsmtool sim faults` prints an example
 bitrate=B    bit-exact frame times; default: nominal times at 1 Mbit/s
 node=ID      node id of the first drive; 255: unconfigured (LSS)
 nodes=N      number of drives on the line
-drive=FAMILY the drive behind another family's objects (epos4, ingenia, cia402, ...; `firmware-params`)
-tier=TIER    inject or recorder: without averages, without its own excitation too
-speed=X      idle time passes X times as fast as the wall clock; default: at once
+drive=FAMILY the objects of another family: epos4, ingenia, cia402, ...
+level=LEVEL  capability level: inject (no averages), or recorder (neither
+             averages nor excitation)
+speed=X      idle time in multiples of the wall clock; default: at once
 """
 
 
-@click.group("sim", help=_HELP)
+@click.group("sim", help=_HELP, epilog=examples("pmsmtool sim list", "pmsmtool sim serve interior-2k2 --nodes 2"))
 def sim_command() -> None:
     """Group of the commands below."""
 
@@ -49,10 +50,10 @@ def sim_command() -> None:
 @sim_command.command(
     "serve",
     epilog=examples(
-        "pmsmtool sim serve                          # then: pmsmtool -i socketcand -c vcan0 scan",
+        "pmsmtool sim serve  # then `pmsmtool -i socketcand -c vcan0 scan` finds the drive",
         "pmsmtool sim serve jercic-2017 --port 0 --json",
         "pmsmtool sim serve --nodes 3 --faults lossy.toml --bitrate 500000",
-        "pmsmtool sim serve --scenario operation     # then: pmsmtool -i socketcand -c vcan0 track --for 30s",
+        "pmsmtool sim serve --scenario operation  # for `pmsmtool -i socketcand -c vcan0 track`",
     ),
 )
 @click.argument("profile", required=False)
@@ -160,7 +161,7 @@ def _serve(server: SocketcandServer) -> None:
     "clone",
     epilog=examples(
         "pmsmtool -i socketcan -c can0 -n 5 sim clone runs/20260101T120000Z-000055f1 -o twin.toml",
-        "pmsmtool sim clone machine.toml -n 5 -o twin.toml --draw 1   # then: pmsmtool --sim twin.toml info",
+        "pmsmtool sim clone machine.toml -n 5 -o twin.toml --draw 1   # a drive for `--sim twin.toml`",
     ),
 )
 @click.argument("machine")

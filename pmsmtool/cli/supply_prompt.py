@@ -32,7 +32,7 @@ def supply_reader(connection: Connection, node: int, *, simulated: bool) -> Read
         return lambda i_a: connection.bus.read_supply(node)  # type: ignore[attr-defined]
     if not person_present():
         raise Declined(
-            "nobody can be asked what the bench supply shows: nothing was done",
+            "no terminal to ask what the bench supply shows: nothing was done",
             likely="standard input or standard error is not a terminal",
             hint="run it in a terminal, or leave --supply out",
         )

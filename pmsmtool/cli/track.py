@@ -62,7 +62,7 @@ def track_command(
     runs: Path,
     map_file: Path | None,
 ) -> None:
-    """Follow R(T) and psi(T) while somebody else runs the machine; nothing is commanded.
+    """Follow R(T) and psi(T) while another program runs the machine; nothing is commanded.
 
     The values, their statistical and systematic intervals and the temperatures they mean are printed. What the
     operating points do not show is refused by name (exit code 6): R needs current, psi needs speed, both need change.

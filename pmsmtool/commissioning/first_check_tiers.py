@@ -129,7 +129,7 @@ def check_below_full(
                     turn = lead_half_a_turn(guard, i_a, pole_pairs, 0.0, signals=("theta_m_rad", "i_q_a", *link))
                     judged = [*judge_current(turn, i_a), *judge_turn(turn, pole_pairs, counts_against=False)]
                 else:
-                    say(f"shaft: torque pushes up to {i_a:.3g} A, forth and back")
+                    say(f"shaft: torque pulses up to {i_a:.3g} A, forth and back")
                     judged = judge_push(push_forth_and_back(guard, i_a, 0.5 * envelope.speed_max_rad_s))
             rows = [row for row in rows if row.looked_at not in {each.looked_at for each in judged}] + judged
         except IdentificationError as error:

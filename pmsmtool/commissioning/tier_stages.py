@@ -109,7 +109,7 @@ class TierStages:
         """Return what the chain will do, one line per stage, before anything moves."""
         drive_map, tier = self.found.drive_map, self.found.tier
         known = self.known()
-        lines = [f"tier {tier}, map {drive_map.name}: {len(drive_map.cells)} parameters"]
+        lines = [f"capability level {tier}, map {drive_map.name}: {len(drive_map.cells)} parameters"]
         lines.append("identify: " + ("; ".join(self._measurable()) or f"not available: {self._nothing()}"))
         rest = "what is measured"
         if known is not None:

@@ -112,13 +112,13 @@ class ClosedDrive:
         if not (math.isfinite(self.filter_s) and self.filter_s >= 0.0):
             wrong.append(f"filter_s = {self.filter_s!r} is negative")
         if wrong:
-            raise ConfigError("the request cannot be used", where="closed drive", violations=wrong)
+            raise ConfigError("the request cannot be used", where="drive with fixed firmware", violations=wrong)
         missing = [name for name in (RATED, SLOPE) if name not in self.offers]
         missing += [] if self.offers & {TORQUE, CURRENT} else [f"{TORQUE} or {CURRENT}"]
         if missing:
             raise NotAvailable(
                 f"the drive map {self.name!r} has no object for {', '.join(missing)}",
-                where="closed drive",
+                where="drive with fixed firmware",
                 likely="its maker documents no torque mode with a slope and a limit (0x6087, 0x6072, 0x6076)",
                 hint="design without --map: `flash-params --map` and `commission` write what the drive takes; a master "
                 "that limits the slope of 0x6071 itself has the effect of these limits",
@@ -196,8 +196,8 @@ class Guarantee:
             f"in profile torque mode: voltage demand <= {self.demand_v:.4g} V (limit {self.limit_v:.4g} V of "
             f"{self.V_max_v:.4g} V) and current <= {self.I_apk + self.deviation_a:.4g} A for every torque set-point "
             f"within +-{self.tau_nm:.4g} N m, every speed within +-{self.n_rpm:.4g} rpm and every acceleration up to "
-            f"{self.acceleration_rpm_per_s:.3g} rpm/s, delay and intervals included; beyond that speed nothing is "
-            f"promised. Cost: {100.0 * self.torque_loss:.1f} % of the full governor's torque at that speed, "
+            f"{self.acceleration_rpm_per_s:.3g} rpm/s, delay and intervals included; no guarantee above "
+            f"that speed. Cost: {100.0 * self.torque_loss:.1f} % of the full governor's torque at that speed, "
             f"{100.0 * self.standstill_loss:.1f} % at standstill; {1e3 * self.rise_s:.3g} ms to the torque limit "
             f"instead of {1e3 * self.governed_rise_s:.3g} ms"
         )
@@ -255,7 +255,7 @@ def _as_controlled(design: Design, drive: ClosedDrive) -> Design:
     else:
         raise ConfigError(
             f"the gains of {drive.name!r} cannot be written, and its current bandwidth is not known",
-            where="closed drive",
+            where="drive with fixed firmware",
             hint="give --drive-bandwidth-hz, as the maker's tool or manual says",
         )
     judged = (CURRENT_LOOPS,) if lacking_gains(drive.offers)[SPEED_LOOP] else (CURRENT_LOOPS, SPEED_LOOP)
@@ -269,7 +269,7 @@ def current_loops(design: Design, drive: ClosedDrive) -> CurrentLoops:
     if whole > 1:
         raise ConfigError(
             f"{inverter.delay_periods:g} periods of delay are not modelled",
-            where="closed drive",
+            where="drive with fixed firmware",
             hint="the guarantee covers up to 1.5 periods: correct inverter.delay_periods, or leave --map out",
         )
     K_p_d, K_i_d, K_p_q, K_i_q = (design[name] for name in CURRENT_GAINS)
@@ -313,13 +313,13 @@ class _Projection:
         if machine.psi_f_wb == 0.0:
             raise DesignInfeasible(
                 "without a magnet there is no torque at i_d = 0",
-                where="closed drive",
+                where="drive with fixed firmware",
                 hint="leave the limits out: a reluctance machine needs i_d, which such a drive does not take",
             )
         if machine.J_kgm2 is None and drive.acceleration_rpm_per_s is None:
             raise ConfigError(
                 "neither the inertia J_kgm2 nor the largest acceleration is known",
-                where="closed drive",
+                where="drive with fixed firmware",
                 hint="put J_kgm2 into the machine file, or give --limit-acceleration-rpm-per-s",
             )
         J = tolerance.factors["J_kgm2"].half_width if "J_kgm2" in tolerance.factors else 0.0
@@ -345,8 +345,8 @@ class _Projection:
                     raise
                 top_rpm *= LOWER
         raise DesignInfeasible(
-            "the current loops of the closed drive are unstable",
-            where="closed drive",
+            "the current loops of the drive with fixed firmware are unstable",
+            where="drive with fixed firmware",
             hint="give a smaller bandwidth, or a lower speed",
         )
 
@@ -393,7 +393,7 @@ class _Projection:
             demand, _ = self.demand(0.0, 0.0, last + 1)
             raise DesignInfeasible(
                 f"no torque is admissible up to {speeds_rpm[last]:.5g} rpm",
-                where="closed drive",
+                where="drive with fixed firmware",
                 likely=f"without any torque the demand is bounded by {demand:.4g} V, the limit is {self.limit:.4g} V",
                 hint="ask for a lower speed, a longer rise, or a smaller acceleration",
             )

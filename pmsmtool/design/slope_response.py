@@ -283,8 +283,8 @@ def slope_response(box: MachineBox, loops: CurrentLoops, omega_e_max: float, spe
     radius = float(np.abs(np.linalg.eigvals(at.A)).max())
     if radius >= LARGEST_RADIUS:
         raise DesignInfeasible(
-            f"the current loop of the closed drive is unstable below {omega_e_max:.4g} rad/s",
-            where="closed drive",
+            f"the current loop of the drive with fixed firmware is unstable below {omega_e_max:.4g} rad/s",
+            where="drive with fixed firmware",
             likely=f"its slowest motion keeps {radius:.6g} of itself per period",
             hint="give the bandwidth its maker's tool shows, or a lower speed",
         )

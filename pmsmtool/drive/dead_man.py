@@ -74,7 +74,7 @@ class DeadManProof:
 
     def __str__(self) -> str:
         return (
-            f"dead-man proven: {self.by} stopped, voltage off after {1000 * self.measured_s:.0f} ms "
+            f"supervision tested: {self.by} stopped, voltage off after {1000 * self.measured_s:.0f} ms "
             f"(declared {1000 * self.declared_s:.0f} ms), to {self.left_for.name.replace('_', ' ')}"
         )
 
@@ -110,7 +110,7 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
             if proof is not None:
                 return proof
     raise SafetyRefusal(
-        f"the dead-man could not be shown in {TRIES} tries: this computer was too busy to measure it",
+        f"the supervision could not be tested in {TRIES} tries: this computer was too busy to measure it",
         where=f"node {node.node}",
         likely="other programs keep the tool from running, so its heartbeat stays away",
         hint="end them, then run the command again; nothing was moved",

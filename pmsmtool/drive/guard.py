@@ -109,7 +109,7 @@ class GuardedDrive:
         self.envelope.refuse_gravity()
         if not is_safe(self._node.state()):
             raise SafetyRefusal(
-                f"the drive is in {state_text(self._node.state())}: somebody else has enabled it",
+                f"the drive is in {state_text(self._node.state())}: another program has enabled it",
                 where=f"node {self._node.node}, 0x6041:00",
                 hint=f"`pmsmtool stop -n {self._node.node}`, then run the command again",
             )
@@ -258,7 +258,7 @@ class GuardedDrive:
             )
         if self.proof is None:
             raise SafetyRefusal(
-                "the dead-man was not proven, so nothing is enabled", where=f"node {self._node.node}",
+                "the supervision was not tested, so nothing is enabled", where=f"node {self._node.node}",
                 hint=_BUG,
             )  # fmt: skip
         self._heartbeat.resume()  # after the dead-man ended operation nobody else would watch

@@ -60,7 +60,7 @@ def sent(node: DriveNode, names: list[str], period_s: float, seconds: float | No
                     f"the drive has sent no process data for {silent_s:.1f} s",
                     where=f"node {node.node}",
                     likely="the node lost its supply, or the cable is open",
-                    hint="check both, and reset the drive: its PDOs may still be the borrowed ones",
+                    hint="check both, and reset the drive: its PDOs may still be the temporary ones",
                 )
             if len(live.values) == len(names):
                 yield clock.now() - start, {name: live.values[name] for name in names}

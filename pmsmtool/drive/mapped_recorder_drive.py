@@ -110,7 +110,7 @@ class MappedRecorderDrive(RecorderDrive, TorqueDrive):
     def begin_record(self, recording: Recording, wait: Callable[[float], None]) -> None:
         """Start the recorder; where it holds fewer rows, they are taken further apart."""
         if recording.excitation is not None:
-            raise NotAvailable("only torque pushes are recorded on this drive", where=f"node {self.node.node}")
+            raise NotAvailable("only torque pulses are recorded on this drive", where=f"node {self.node.node}")
         names = self._names(recording.signals)
         self._apart = max(1, math.ceil(recording.samples / max(1, self.traces.room(names))))
         rows = max(1, recording.samples // self._apart)

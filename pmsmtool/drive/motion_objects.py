@@ -327,6 +327,6 @@ def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
     slope_s = slow_slope_s(node)
     if slope_s:
         cyclic = bool(int(held(node, objects.SUPPORTED_MODES) or 0) >> Mode.CYCLIC_TORQUE - 1 & 1)
-        told = "mode 10, which it does not act in, and this program ramps" if cyclic else "pushes are slow, or none"
+        told = "mode 10 ignores it, and this program ramps" if cyclic else "torque pulses are slow, or impossible"
         lines.append(f"slope     {slope_s:.3g} s to the rated torque in mode 4 (0x6087): {told}")
     return lines

@@ -122,7 +122,7 @@ def parse_vendor_tuning(
 def _check_pole_pairs(results: Mapping[str, Cell], cells: Mapping[str, Cell], tell: Complain, table: str) -> None:
     needs = results["motor.psi_f_wb"].gain
     if needs and needs not in results and needs not in cells:
-        tell((table, "motor.psi_f_wb"), f"motor.psi_f_wb: its form needs {needs}, which this map does not tell")
+        tell((table, "motor.psi_f_wb"), f"motor.psi_f_wb: its form needs {needs}, which this map does not have")
 
 
 # ---- kind "mode" -----------------------------------------------------------------------------------

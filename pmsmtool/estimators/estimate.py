@@ -181,11 +181,11 @@ def scaled_covariance(jacobian: NDArray[np.float64]) -> tuple[NDArray[np.float64
 
 
 def condition_gate(condition: float, pair: str, stage: str) -> None:
-    """Refuse a fit whose parameters cannot be told apart; ``pair`` names them."""
+    """Refuse a fit whose parameters cannot be separated; ``pair`` names them."""
     if condition > CONDITION_LIMIT:
         raise refuse(
             "E_NOT_IDENTIFIABLE",
-            f"{pair} cannot be told apart, scaled condition number {condition:.2g} > {CONDITION_LIMIT:g}",
+            f"{pair} cannot be separated, scaled condition number {condition:.2g} > {CONDITION_LIMIT:g}",
             stage=stage,
         )
 

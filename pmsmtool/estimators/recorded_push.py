@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Resistance, flux linkage, L_q and frame offset from recorded torque pushes, as estimates with intervals.
+"""Resistance, flux linkage, L_q and frame offset from recorded torque pulses, as estimates with intervals.
 
 Currents of several sizes and both signs at every speed, and the way from one to the next
 (``experiments/recorded_push``), separate what single operating points mix (docs/identification.md, 8). The
@@ -48,7 +48,7 @@ R_PER_ERROR = 0.012
 """More of it per V over the largest R i: up to 4 % where that is 1 to 5, 34 % on one drive where it was 8."""
 R_LIMIT = 0.15
 """Largest relative 95 % half width of R: above, it cannot be told from the inverter's error."""
-METHOD = "regression over recorded torque pushes"
+METHOD = "regression over recorded torque pulses"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ def estimate_pushes(
     """
     tolerance = tolerance or SensorTolerance()
     if len(pushes) < LEAST_PUSHES:
-        raise refuse("E_EXCITATION", f"{len(pushes)} pushes, {LEAST_PUSHES} needed", stage=STAGE)
+        raise refuse("E_EXCITATION", f"{len(pushes)} torque pulses, {LEAST_PUSHES} needed", stage=STAGE)
     blocks = [push_blocks(push, period_s, pole_pairs) for push in pushes]
     found = resolve(blocks)
     R_ohm, psi_q, psi_d, L_q_h, V_dead = (float(value) for value in found.value)
@@ -114,10 +114,10 @@ def estimate_pushes(
     if statistical_half_width(psi) > PSI_LIMIT * psi.value:
         raise refuse(
             "E_NOT_IDENTIFIABLE",
-            f"psi scatters by {100.0 * statistical_half_width(psi) / psi.value:.2g} % between the pushes, limit "
+            f"psi scatters by {100.0 * statistical_half_width(psi) / psi.value:.2g} % between the torque pulses, limit "
             f"{100.0 * PSI_LIMIT:g} %",
             stage=STAGE,
-            likely="pushes too short or too weak against friction, or a drive that limits its voltage",
+            likely="torque pulses too short or too weak against friction, or a drive that limits its voltage",
         )
     doubt = max(float(push.meta.get(DELAY_DOUBT, DELAY_DOUBT_PERIODS)) for push in pushes)
     delay = size * doubt * period_s * float(np.median([push.rate / abs(push.i_q) for push in blocks]))

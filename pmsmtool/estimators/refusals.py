@@ -86,7 +86,7 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
     ),
     (
         "E_NOT_IDENTIFIABLE",
-        "two quantities cannot be told apart with these data",
+        "two quantities cannot be separated with these data",
         "too narrow a range of current or speed",
         "widen the range: allow more current (--i-max) or speed (--speed-max)",
     ),

@@ -434,7 +434,7 @@ def _check_result(R: float, std: float, half_width_limit: float) -> None:
     if not R > 0.0 or COVERAGE_FACTOR * std > half_width_limit * R:
         raise refuse(
             "E_NOT_IDENTIFIABLE",
-            f"R_s and V_dead cannot be told apart: R = {R:.4g} +- {COVERAGE_FACTOR * std:.2g} ohm (95 %), "
+            f"R_s and V_dead cannot be separated: R = {R:.4g} +- {COVERAGE_FACTOR * std:.2g} ohm (95 %), "
             f"limit {100 * half_width_limit:g} %",
             stage=STAGE,
             hint="allow a higher peak current (--i-max)",

@@ -42,7 +42,7 @@ from pmsmtool.estimators.estimate import CONDITION_LIMIT, scaled_covariance
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.trace import Trace
 
-STAGE = "recorded pushes"
+STAGE = "recorded torque pulses"
 BLOCK = 8
 """Samples averaged to one row."""
 LEAST_BLOCKS = 8
@@ -167,7 +167,7 @@ def push_blocks(push: Trace, period_s: float, pole_pairs: int) -> Blocks:
     """
     blocks = len(push) // BLOCK
     if blocks < LEAST_BLOCKS:
-        raise refuse("E_EXCITATION", f"a push of {len(push)} samples is too short", stage=STAGE)
+        raise refuse("E_EXCITATION", f"a torque pulse of {len(push)} samples is too short", stage=STAGE)
 
     def means(name: str) -> Vector:
         signal = np.asarray(push[name], dtype=np.float64)[: blocks * BLOCK]
@@ -175,7 +175,7 @@ def push_blocks(push: Trace, period_s: float, pole_pairs: int) -> Blocks:
 
     clean = means("flagged") == 0.0
     if clean.mean() < CLEAN_SHARE:
-        raise refuse("E_CLIPPED", f"{100.0 * (1.0 - clean.mean()):.0f} % of a push were limited", stage=STAGE)
+        raise refuse("E_CLIPPED", f"{100.0 * (1.0 - clean.mean()):.0f} % of a torque pulse were limited", stage=STAGE)
     spacing_s = float(push.t_s[1] - push.t_s[0])
     step_s = BLOCK * spacing_s
     # the mean angle of a block belongs to its middle: differences of neighbours
@@ -277,7 +277,7 @@ def _fit(columns: Sequence[Rows], u: Rows, weight: Vector, owner: NDArray[np.int
     measured, whose = np.concatenate([u.real, u.imag]), np.concatenate([owner, owner])
     scale = np.sqrt(np.mean(matrix**2, axis=0))
     if np.any(scale[:TOLD] == 0.0):
-        raise refuse("E_NOT_IDENTIFIABLE", "the pushes hold no speed or no current", stage=STAGE)
+        raise refuse("E_NOT_IDENTIFIABLE", "the shaft did not turn during the torque pulses", stage=STAGE)
     there = scale > 0.0
     matrix, scale = matrix[:, there] / scale[there], scale[there]
     beats = np.concatenate([weight, weight]) ** 2

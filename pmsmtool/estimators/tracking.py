@@ -316,7 +316,7 @@ def _refuse_entangled(
     partner = max((other for other in STATES if other != name), key=lambda o: abs(correlation[own, STATES.index(o)]))
     blind = {"R_s_ohm": "no current flows", "psi_f_wb": "the shaft hardly turns"}[name]
     seen = float(information[own, own]) ** -0.5 <= LIMIT[name]  # alone, all else given
-    told = f"{name} and {partner} cannot be told apart" if seen else f"{name} shows in nothing: {blind}"
+    told = f"{name} and {partner} cannot be separated" if seen else f"{name} shows in nothing: {blind}"
     raise refuse(
         "E_NOT_IDENTIFIABLE",
         f"{told}; its standard deviation is {relative:.3g} %, limit {100.0 * LIMIT[name]:g} %",

@@ -76,7 +76,7 @@ def push_forth_and_back(drive: Drive, i_a: float, speed_rad_s: float) -> Trace:
 def _answered(way_rad: float, seconds: float) -> bool:
     if way_rad <= ANSWER_RAD and seconds > LONGEST_S:
         raise IdentificationError(
-            "E_EXCITATION", "the shaft does not answer a tenth of the rated current", where="torque push",
+            "E_EXCITATION", "the shaft does not answer a tenth of the rated current", where="torque pulse",
             likely="brake shut, or the shaft is held; a commutation that is not set up",
             hint="free the shaft; run the maker's own set-up first",
         )  # fmt: skip

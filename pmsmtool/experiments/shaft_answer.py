@@ -83,8 +83,8 @@ def acceleration_per_ampere(drive: Drive, i_test_a: float, answered: Callable[[f
             seconds *= LONGER
     raise IdentificationError(
         "E_EXCITATION",
-        "the shaft does not answer a torque push",
-        where="torque push",
+        "the shaft does not move under a torque pulse",
+        where="torque pulse",
         likely="a locked shaft or a closed brake, or a drive whose commutation is not set up",
         hint="free the shaft; run the maker's own set-up first",
     )

@@ -225,7 +225,7 @@ class Download:
         refuse_while_enabled(self.node)
         if self._parameters.is_staged():
             raise SafetyRefusal(
-                "the drive holds a staged set that somebody else has begun",
+                "the drive holds a staged set that another program has begun",
                 where=f"node {self.node.node}, 0x2000:07",
                 likely="another tool is at work, or one was interrupted while this plan was made",
                 hint="make sure that no other tool is connected, then run the command again",

@@ -274,7 +274,8 @@ def _fit(
     fit, _, rank, _ = np.linalg.lstsq(matrix, values, rcond=None)
     dof = len(rows) - int(rank)
     if dof < 1 or rank < matrix.shape[1]:
-        raise refuse("E_EXCITATION", f"{len(rows)} records do not tell the dead time from the back-EMF", stage=STAGE)
+        what = f"{len(rows)} records do not separate the dead time from the back-EMF"
+        raise refuse("E_EXCITATION", what, stage=STAGE)
     share = float(np.linalg.inv(matrix.T @ matrix)[0, 0])
     power = np.sum(np.abs(values - matrix @ fit) ** 2, axis=0) / (2.0 * dof)
     stds = np.sqrt(share * power)

@@ -229,7 +229,7 @@ def integral_scale(
     if chi_squares[best] > FITS:
         return unknown("no form explains how the response follows both gains")
     if chi_squares[second] - chi_squares[best] < APART:
-        return unknown(f"the forms {best!r} and {second!r} are not told apart")
+        return unknown(f"the forms {best!r} and {second!r} cannot be separated")
     if best not in UNITS:
         return unknown(f"its form is {best!r}, which a drive map cannot say")
     relative = best != "value"
@@ -268,5 +268,5 @@ def convention(
     if misses[best] > NOT_SAME:
         return Convention(None, *facts, f"torque per shown ampere is {math.exp(found):.2f} of the peak one")
     if misses[second] < EXCLUDED:
-        return Convention(None, *facts, f"{best} and {second} are not told apart")
+        return Convention(None, *facts, f"{best} and {second} cannot be separated")
     return Convention(best, *facts)

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 TRACE = "inertia_"
 """Followed by a number: push, coasting, push the other way, coasting."""
-ELASTIC_FALLBACK = "pushes of a shaft that is not rigid; J agrees with the frequency response"
+ELASTIC_FALLBACK = "torque pulses on a shaft that is not rigid; J agrees with the frequency response"
 SATURATION_DOUBT = 0.25
 """Relative standard deviation of the torque without a flux map, of the curvature of psi_d over i_d: the flux that a q
 current takes from the d axis is not seen. The saturated profile has a curvature of 3 % and its J was 0.77 % off."""

@@ -6,7 +6,7 @@ At a rotor that rests on a current vector of length i the supply gives
     P = P_0 + k i + 3/2 R i^2:
 
 what the drive takes by itself, drops and switching losses in proportion to the current, and the loop resistance. What
-grows with the square of the current besides it cannot be told apart, and is doubt.
+grows with the square of the current besides it cannot be separated, and is doubt.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def resistance_by_supply(levels: Trace, *, tolerance: SensorTolerance | None = N
     if half > STATISTICAL_LIMIT:
         raise refuse(
             "E_SNR",
-            f"the readings tell R to {100.0 * half:.0f} %, limit {100.0 * STATISTICAL_LIMIT:.0f} %",
+            f"the readings determine R to {100.0 * half:.0f} %, limit {100.0 * STATISTICAL_LIMIT:.0f} %",
             stage=STAGE,
             likely="a display too coarse for the copper loss of this machine, or readings that were mixed up",
             hint="allow more current (--i-max), lower the DC link, or read a power meter with more digits",

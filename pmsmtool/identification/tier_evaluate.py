@@ -317,7 +317,7 @@ def evaluated_stage(
         result = replace(result, missing={**result.missing, "J_per_psi, psi_f_wb": NO_POLE_PAIRS})
     if not any(set(TOLD_BY.get(name, ())) & set(result.estimates) for name in request.quantities):
         reasons = [f"{name}: not available: {why}" for name, why in result.missing.items()]
-        raise NotAvailable("\n  - ".join(["nothing of what was asked could be told", *reasons]), where=str(run.path))
+        raise NotAvailable("\n  - ".join(["nothing that was asked for was identified", *reasons]), where=str(run.path))
     designed = tier_machine(known, result.estimates, facts.source).machine
     judgement = judged(result.estimates, result.missing, request.quantities, designed)
     made = tier_machine(known, judgement.kept(result.estimates), facts.source)
@@ -382,7 +382,7 @@ def parse_facts(text: str, *, where: str) -> TierFacts:
             raise ValueError(f"no kind {found.kind!r}")
     except (ValueError, TypeError, KeyError) as error:
         raise ConfigError(
-            f"the record of the tier is damaged: {error}",
+            f"the record of the capability level is damaged: {error}",
             where=where,
             hint="identify again; or take the file from a copy of the run",
         ) from error

@@ -116,7 +116,7 @@ def _at_reference(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[di
             doubt = abs(alpha) * UNKNOWN_TEMPERATURE_K * estimate.value
             values[name] = replace(estimate, systematic=math.hypot(estimate.systematic, doubt))
             notes.append(
-                f"{name}: no sensor tells its temperature; {known.machine.T_ref_c:g} +-{UNKNOWN_TEMPERATURE_K:g} degC "
+                f"{name}: no sensor shows its temperature; {known.machine.T_ref_c:g} +-{UNKNOWN_TEMPERATURE_K:g} degC "
                 "is assumed"
             )
     return values, tuple(notes)

@@ -86,7 +86,7 @@ def stage_of(
         if name not in rejected
     )
     said = {key for name in verdicts.refused for key in TOLD_BY[name]}
-    lost = [f"{name} not told: {why}" for name, why in missing.items() if said & set(name.split(", "))]
+    lost = [f"{name} not identified: {why}" for name, why in missing.items() if said & set(name.split(", "))]
     unsaid = {name: why for name, why in missing.items() if not said & set(name.split(", "))}
     refused = [f"{name} refused" for name, why in verdicts.refused.items() if why.startswith(NOT_ACCEPTED)]
     fallen = [f"{name}: {estimate.fallback}" for name, estimate in estimates.items() if estimate.fallback]

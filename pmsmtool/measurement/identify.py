@@ -138,7 +138,8 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
         lines.append("the shaft turns slowly through one turn each way")
     if "speeds" in steps:
         speeds = "four" if request.accuracy is None else "two to four"
-        lines.append(f"the shaft is pushed both ways and coasts with current from {speeds} speeds in each direction")
+        lines.append("torque pulses turn the shaft both ways")
+        lines.append(f"it coasts with current from {speeds} speeds in each direction")
     if "turns" in steps:
         lines.append("it coasts with current from three speeds in each direction once more, for harmonics")
     if "coasting" in steps:

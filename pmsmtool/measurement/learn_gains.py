@@ -171,7 +171,7 @@ def _refuse_turning(drive: SpeedLoopDrive) -> None:
     if abs(drive.live("theta_m_rad") - first) > REST_RAD:
         raise SafetyRefusal(
             "the shaft turns although the drive is off", where=f"node {drive.node.node}",
-            likely="somebody or something moves it", hint="bring it to rest",
+            likely="it is moved from outside", hint="bring it to rest",
         )  # fmt: skip
 
 

@@ -69,7 +69,7 @@ def require_speed(omega_max_rad_s: float, n_max_rpm: float) -> None:
             f"the speed limit {given:.4g} rpm is below {least:.4g} rpm, {100.0 * LEAST_SPEED_SHARE:g} % of the largest "
             "speed",
             stage="speed limit",
-            likely="the shaft leaves it at the first short push, and the back-emf within it is too small to measure",
+            likely="the first short torque pulse exceeds it, and the back-EMF below it is too small to measure",
             hint=f"allow at least --speed-max {math.ceil(least)}rpm, or identify R, L and inverter only",
         )
 

@@ -32,7 +32,7 @@ SLOW_SHARE = 0.2
 """Largest speed of the slow turns, of the speed limit."""
 REST_SHARE = 0.02
 """Largest speed before the first push, of the speed that it is to reach."""
-PLAN_LINE = "pushes turn the shaft both ways, and it coasts with the voltage off"
+PLAN_LINE = "torque pulses turn the shaft both ways, and it coasts with the voltage off"
 
 
 def numbered(drive: Drive, name: str, keep: Callable[[str, Trace], None]) -> Callable[[Trace], None]:
@@ -68,7 +68,7 @@ def measure_mechanics(
     plan = mechanics_run.plan_mechanics(current, SPEED_SHARE * largest, J, torque_per_ampere(pole_pairs, psi))
     plan = replace(plan, rows=rows)
     say(
-        f"J, B, tau_c: pushes of {plan.i_q_a:.3g} A up to about {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm and "
+        f"J, B, tau_c: torque pulses of {plan.i_q_a:.3g} A up to about {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm and "
         f"coasting with the voltage off, {plan.duration_s:.2g} s"
     )
     if planned is not None:

@@ -35,7 +35,7 @@ RECORD_ROWS, RECORD_WINDOWS = 1024, 4
 """Rows of one recording, and observations that it makes."""
 RECORD_S = 0.2
 """Time of one recording (s)."""
-GIVEN_BACK = "nothing was commanded, and what was borrowed of the drive is as it was"
+GIVEN_BACK = "nothing was commanded; all temporarily changed objects were restored"
 """What is said, and kept in the account of a run, when an observation is over."""
 SAY_S = 1.0
 LOOK_S = 0.05

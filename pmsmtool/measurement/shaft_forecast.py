@@ -42,8 +42,8 @@ def later_line(steps: set[str]) -> str:
     if not asked:
         return ""
     return (
-        f"not predictable yet: {', '.join(asked)}; the inertia is not known before the first push, the prediction "
-        "follows before the shaft is moved for them"
+        f"not predictable yet: {', '.join(asked)}; the inertia is not known before the first torque pulse; the "
+        "prediction follows before the shaft is moved for them"
     )
 
 
@@ -153,7 +153,7 @@ def forecast_of(
 def mechanics_line(values: Mapping[str, float]) -> str:
     """Return the prediction as a person reads it, and what it does not hold."""
     if not values:
-        return "predicted standard deviation: none, the rough pushes tell too little of J, B, tau_c"
+        return "predicted standard deviation: none, the first torque pulses do not determine J, B, tau_c"
     without = [name for key, name in (("B_nms", "B"), ("tau_c_nm", "tau_c")) if key not in values]
     unseen = f"; {', '.join(without)}: the run over speeds shows none to predict it from" if without else ""
     return line_of(values) + unseen

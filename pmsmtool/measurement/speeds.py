@@ -135,7 +135,7 @@ class SpeedStage:
     def _pushes(self, resistance: ResistanceResult, pole_pairs: int) -> tuple[float, float]:
         """Push the rotor there and back; return flux linkage (Wb) and inertia (kg m2), good for a speed controller."""
         limits, samples = self.limits, self.effort.push_samples
-        self.say("flux and inertia, roughly: short pushes both ways")
+        self.say("flux and inertia, first estimate: short torque pulses both ways")
         target = PUSH_SPEED_SHARE * limits.omega_max_rad_s
         rate = self._acceleration_per_ampere(target, pole_pairs)
         current = PUSH_SHARE * limits.I_test_apk
@@ -162,7 +162,7 @@ class SpeedStage:
                 "E_EXCITATION",
                 f"the voltage at {omega:.3g} rad/s shows no flux linkage ({psi:.3g} Wb)",
                 stage="speed run",
-                likely="the pushes were too slow for this inverter's dead time",
+                likely="the torque pulses were too slow for this inverter's dead time",
                 hint="allow a higher --speed-max",
             )
         return psi, torque_per_ampere(pole_pairs, psi) / rate
@@ -185,7 +185,7 @@ class SpeedStage:
                 seconds *= min(4.0, 0.5 * target / max(abs(change), 1e-3 * target))
         raise refuse(
             "E_EXCITATION",
-            "the shaft does not answer a push",
+            "the shaft does not move under a torque pulse",
             stage="speed run",
             likely="a locked shaft, a brake that is closed, or an encoder that does not count",
         )

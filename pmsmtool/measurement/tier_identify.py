@@ -4,7 +4,7 @@
 ``standard``: pole pairs, direction and encoder offset from a vector turned by the commutation angle 0x60EA; inertia and
 friction over the flux linkage from torque pushes; the flux linkage from the voltage of the coasting machine where the
 drive shows it, else from the speed at which the voltage ends.
-``recorder``: resistance, flux linkage, L_q and inertia from recorded torque pushes.
+``recorder``: resistance, flux linkage, L_q and inertia from recorded torque pulses.
 
 What the traces tell is decided in ``tier_evaluate``.
 """
@@ -68,7 +68,7 @@ ASKED_SHARE = 0.75
 TOP_SHARE = 0.98
 """Speed at which a run-up is given up, of the largest one."""
 NO_LIMIT_RPM = 100_000.0
-OVER_TORQUE_CONSTANT = "J/K_T, tau_c/K_T from polled torque pushes; J/psi and psi need the pole pairs"
+OVER_TORQUE_CONSTANT = "J/K_T, tau_c/K_T from polled torque pulses; J/psi and psi need the pole pairs"
 """What is told without pole pairs: nothing a design goes on from."""
 UNLIMITED_RPM = 1000.0
 """Largest speed on a drive that has no limit of its own and tells none, unless a person or a machine file says more."""
@@ -161,7 +161,7 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say 
     limit: list[str] = []
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
-        say(f"J/psi, tau_c/psi: torque pushes up to {max(plan.shares) * plan.i_test_a:.3g} A, polled")
+        say(f"J/psi, tau_c/psi: torque pulses up to {max(plan.shares) * plan.i_test_a:.3g} A, polled")
 
         def answered(answer: ShaftAnswer) -> None:
             if not isinstance(drive, SpeedPushDrive):  # its limit is the push
@@ -233,7 +233,7 @@ def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: 
     limit: list[str] = []
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
-        say(f"R, psi, L_q, J: {4 * len(plan.shares)} recorded torque pushes up to {plan.i_test_a:.3g} A")
+        say(f"R, psi, L_q, J: {4 * len(plan.shares)} recorded torque pulses up to {plan.i_test_a:.3g} A")
 
         def answered(answer: ShaftAnswer) -> None:
             most = min(plan.i_test_a, answer.most_a(plan.omega_failure_rad_s, plan.off_s))
@@ -320,7 +320,7 @@ def can_measure(
         Quantities.
     """
     if isinstance(drive, RecorderDrive):
-        return ["R, psi, L_q, J, tau_c from recorded torque pushes"]
+        return ["R, psi, L_q, J, tau_c from recorded torque pulses"]
     lines = []
     turns = found.row("poles", Method.STANDARD).available
     if turns and {"poles", "encoder"} & set(asked):
@@ -328,7 +328,7 @@ def can_measure(
     pole_pairs = turns or known is not None or "motor.pole_pairs" in found.drive_map.cells
     available = found.row("mechanics", Method.STANDARD).available
     if available and pole_pairs and {"psi", "mechanics"} & set(asked):
-        lines.append("J/psi, tau_c/psi from polled torque pushes, psi from the voltage limit or the coasting machine")
+        lines.append("J/psi, tau_c/psi from polled torque pulses, psi from the voltage limit or the coasting machine")
     elif available and "mechanics" in asked:
         lines.append(OVER_TORQUE_CONSTANT)
     return lines
@@ -363,7 +363,7 @@ def tier_stage(
     Raises
     ------
     NotAvailable
-        The shaft is locked, the pole pairs are not known, or nothing of what was asked could be told.
+        The shaft is locked, the pole pairs are not known, or nothing that was asked for could be identified.
     Declined
         The person did not consent; nothing was moved.
     IdentificationError, StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded

@@ -246,7 +246,7 @@ def _wrong_set_up(drive: CanopenDrive, own: Stage) -> str:
     held = round(drive.parameters.read_value("motor.pole_pairs"))
     if held == told:
         return ""
-    return f"torque pushes: not available: the drive is set to {held} pole pairs and measures {told}; set it up first"
+    return f"torque pulses: not available: the drive is set to {held} pole pairs and measures {told}; set it up first"
 
 
 def _joined(run: RunDirectory, own: Stage, rest: Stage, known: Known) -> Stage:

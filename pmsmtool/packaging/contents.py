@@ -21,6 +21,7 @@ SOURCE_FILES: tuple[str, ...] = (
     "CONTRIBUTING.md",
     "CHANGELOG.md",
     "CITATION.cff",
+    "mkdocs.yml",
     ".gitignore",
     ".editorconfig",
     ".pre-commit-config.yaml",

@@ -255,7 +255,7 @@ class Reproduction:
 
 def check_table(checks: Sequence[Check]) -> Table:
     """Return the checks as a table."""
-    heads = ("number", "printed", "expected", "ours", "unit", "allowed", "within", "source")
+    heads = ("number", "printed", "expected", "pmsmtool", "unit", "allowed", "within", "source")
     rows = tuple(
         (c.what, *c.two_columns, c.ours, c.unit, c.allowed, "yes" if c.within else "NO", c.where) for c in checks
     )

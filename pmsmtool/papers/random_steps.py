@@ -119,7 +119,7 @@ def _notes() -> tuple[str, ...]:
         "|v_ss| at most 0.98 V_max before and 0.92 V_max after; V_dc 210 V, circle",
         "settling: the first sample from which on the vector stays within 2 % of the step",
         f"with noise ({NOISE_APK:g} A rms, 0.05 A grid) the band is {NOISE_BAND_A:g} A wider",
-        "a difference is claimed only where its interval leaves out zero",
+        "a difference counts only where its interval leaves out zero",
         "paper mode: its p95 over 1459 such steps is 1.410 (1.384 to 1.455), over the some 140 of one seed 1.33 to "
         "1.58 by chance (seeds 1 to 10: 1.35 to 1.52), so the lower end of its bootstrap interval is checked",
         "that tail is the law's own: back-calculation has 1.448, the best mode at the same bandwidth 1.292 "
@@ -381,7 +381,7 @@ def voltage_limit(seed: int, cases: int = 1000) -> Reproduction:
         Column("applied/V_max", "", 8),
     )  # fmt: skip
     table = Table(f"{cases} random steps, half of them to unreachable currents, 10 ms each", heads, tuple(rows))
-    notes = ("a check, not a claim: row 0 can always be met, and the applied voltage is limited whatever is demanded",)
+    notes = ("a check only: row 0 can always be met, and the applied voltage is limited whatever is demanded",)
     return Reproduction(
         "governor-voltage-limit", "Voltage demand under the governor", OURS, (table,), (), tuple(checks), notes
     )

@@ -15,7 +15,7 @@ from pmsmtool.machine.key import did_you_mean
 from pmsmtool.papers.figure import Reproduction
 
 JERCIC = "Jercic et al. 2017, DOI 10.1080/00051144.2018.1453441"
-OURS = "ours; scenarios of Jercic et al. 2017"
+OURS = "pmsmtool; scenarios of Jercic et al. 2017"
 MIYAJIMA = "Miyajima, Fujimoto, Fujitsuna 2013"
 
 

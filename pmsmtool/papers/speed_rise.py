@@ -194,7 +194,7 @@ def _common_checks(row: Row) -> list[Check]:
 def _notes() -> tuple[str, ...]:
     return (
         "V_dc 210 V; at 900 rpm the voltage limit leaves no i_d = 0 operation, at 1200 rpm it forces |i| > 56 A",
-        "back-calculation turns to full braking torque: nothing tells it which current the voltage can hold",
+        "back-calculation turns to full braking torque: it does not know which current the voltage can hold",
         "voltage regained: first sample with |v_ss(i)| <= 1.0005 V_max after it was left; beside it the largest later",
     )
 

@@ -359,7 +359,7 @@ def _too_slow(prediction: Prediction, measured: Mapping[tuple[str, str], Array])
         low, high = float(band.low[-1]), float(band.high[-1])
         if high - low > 2.0 * WIDEST_BAND * abs(band.mean[-1]):
             ends = f"between {low:.4g} and {high:.4g} rad/s (electrical)"
-            lines.append(f"{experiment} is predicted to end {ends}, which tells no speed to prove")
+            lines.append(f"{experiment} is predicted to end {ends}, so no speed can be judged")
         elif abs(values[-1]) < max(low, -high):  # a band on both sides of standstill has no edge near it
             lines.append(f"{experiment} ends at {values[-1]:.4g} instead of {band.mean[-1]:.4g} rad/s (electrical)")
     return ", ".join(lines)
@@ -377,7 +377,7 @@ def not_proven(stage: Stage, run: RunDirectory) -> PmsmtoolError:
 
     cause = next((str(v["value"]) for v in stage.values if v["name"] == "cause"), "")
     return CheckFailed(
-        f"the drive does not do what the design promises: {stage.note}",
+        f"the drive does not behave as predicted: {stage.note}",
         where=str(run.path), likely=cause, hint=f"pmsmtool report {run.path}",
     )  # fmt: skip
 

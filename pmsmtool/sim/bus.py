@@ -155,7 +155,7 @@ class PmsmSimBus(can.BusABC):
         with clock.held:
             if self._unacknowledged >= TRANSMIT_QUEUE:
                 if not self.line.is_acknowledged(self):
-                    raise can.CanOperationError("transmit queue full: nobody acknowledges", errno.ENOBUFS)
+                    raise can.CanOperationError("transmit queue full: no node acknowledges", errno.ENOBUFS)
                 self._unacknowledged = 0
             self._in_flight += 1
             self.line.queue(self, frame)

@@ -14,7 +14,8 @@ NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
            the reference drive's own
 ``eds``    EDS or DCF of a maker's drive, or ``TABLE.csv#FAMILY``: the drive has those objects and no others
 ``gains``  seed that draws what the gains of a drive made by ``eds`` mean; default: they mean nothing
-``tier``   ``inject`` or ``recorder``: the reference drive without its averages, without its excitation too
+``level``  capability level, ``inject`` or ``recorder``: the reference drive without its averages, or without its
+           excitation, too; ``tier`` is the older name of this key
 ``filter`` time constant (s) of a set-point filter behind the torque slope; default: none
 ``jitter`` how late (s) a process data object is sent at most; default: not late
 ``speed``  how fast idle time passes at most, as a multiple of the wall clock; default: at once
@@ -77,7 +78,7 @@ class Channel:
     drive: str | None = None
     eds: str | None = None
     gains: int | None = None
-    tier: str | None = None
+    level: str | None = None
     filter: float = 0.0
     jitter: float = 0.0
 
@@ -106,7 +107,7 @@ def _short_time(text: str) -> float:
     return value
 
 
-def _tier(text: str) -> str:
+def _level(text: str) -> str:
     if text not in TIER_HIDES:
         raise ValueError(f"must be one of {', '.join(TIER_HIDES)}")
     return text
@@ -123,10 +124,14 @@ _KEYS: dict[str, Callable[[str], Any]] = {
     "drive": str,
     "eds": str,
     "gains": _whole(0, 2**63 - 1),
-    "tier": _tier,
+    "level": _level,
     "filter": _short_time,
     "jitter": _short_time,
 }
+
+
+_OLDER = {"tier": "level"}
+"""Older names of keys, which scripts may still use."""
 
 
 @next_step(NEXT_STEP)
@@ -141,7 +146,8 @@ def parse_channel(text: str | None) -> Channel:
     name, _, query = (text or "").partition("?")
     values: dict[str, Any] = {}
     violations = []
-    for key, value in parse_qsl(query, keep_blank_values=True):
+    for typed, value in parse_qsl(query, keep_blank_values=True):
+        key = _OLDER.get(typed, typed)
         if key not in _KEYS:
             near = get_close_matches(key, _KEYS, 1)
             violations.append(f"{key}: unknown key" + (f", did you mean {near[0]}?" if near else ""))
@@ -173,14 +179,14 @@ def _face(channel: Channel, machine_file: MachineFile) -> DriveFace | None:
     Raises
     ------
     ConfigError
-        There is no such family or file, or a tier of a family that is not the reference drive.
+        There is no such family or file, or a level of a family that is not the reference drive.
     """
     if channel.eds is not None:
         return _makers_drive(channel, machine_file)
     if channel.drive in (None, OWN_FAMILY):
-        return None if channel.tier is None else Reduced(channel.tier)
-    if channel.tier is not None:
-        raise ConfigError("tier is of the reference drive, not of another family", where=f"channel {channel.name}")
+        return None if channel.level is None else Reduced(channel.level)
+    if channel.level is not None:
+        raise ConfigError("level= is for the reference drive, not for another family", where=f"channel {channel.name}")
     return Face(_map(str(channel.drive)))
 
 
@@ -190,8 +196,8 @@ def _makers_drive(channel: Channel, machine_file: MachineFile) -> DriveFace:
     from pmsmtool.sim.foreign.drive import ForeignDrive
     from pmsmtool.sim.foreign.file_rows import read_makers_objects
 
-    if channel.drive is not None or channel.tier is not None:
-        raise ConfigError("eds says what the drive has; drive and tier do, too", where=f"channel {channel.name}")
+    if channel.drive is not None or channel.level is not None:
+        raise ConfigError("the channel names an EDS file and also a drive or a level", where=f"channel {channel.name}")
     objects, motor = read_makers_objects(str(channel.eds)), set_up_of(machine_file)
     return ForeignDrive(objects, motor, None if channel.gains is None else draw_gains(channel.gains, objects, motor))
 

@@ -82,7 +82,7 @@ class Operation:
             raise ConfigError(
                 "only the reference drive runs by itself",
                 where=f"node {node.node_id}",
-                hint="leave drive= and tier= out of the channel",
+                hint="leave drive= and level= out of the channel",
             )
         if not (n_rpm and torque and machine.J_kgm2):
             raise ConfigError(

@@ -133,5 +133,5 @@ def test_without_a_serial_number_only_a_person_consents(monkeypatch: pytest.Monk
     for ask in (consent.ask_motion, consent.ask_writing):
         with pytest.raises(Declined, match="nothing was done") as caught:
             ask(["i_max 5 A"], given, simulated=False, serial=0, out=Output())
-        assert "tells no serial number" in caught.value.hint
+        assert "shows no serial number" in caught.value.hint
         assert ask(["i_max 5 A"], given, simulated=True, serial=0, out=Output()).answer == "--yes"

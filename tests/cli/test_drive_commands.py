@@ -493,7 +493,7 @@ def test_a_current_limit_that_limits_nothing_is_refused_before_anything_is_energ
     assert code == 5, err
     assert "the current limit of 1e+05 A (peak) is none" in err and "at most 30 times that" in err
     assert "0x6075" in err and "--i-max" in err
-    assert "dead-man proven" not in err
+    assert "supervision tested" not in err
 
 
 def test_lss_works_as_often_as_it_is_asked_between_two_power_ons(tool: Tool) -> None:

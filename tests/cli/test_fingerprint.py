@@ -173,7 +173,7 @@ def broken(run: RunDirectory, kind: str) -> None:
 
 BROKEN: dict[str, str] = {
     "no identification": "nothing was identified", "no values": "no value of R, L, psi", "no record": "run.json",
-    "by the drive itself": "no interval", "level damaged": "tier is damaged", "another level": "--method recorder",
+    "by the drive itself": "no interval", "level damaged": "level is damaged", "another level": "--method recorder",
     "no request": "request.json", "request damaged": "request is damaged", "machine damaged": "machine.toml",
     "record damaged": "record is damaged",
 }  # fmt: skip

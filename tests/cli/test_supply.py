@@ -60,7 +60,7 @@ def test_what_needs_the_person_is_said_before(monkeypatch: pytest.MonkeyPatch, t
 def test_a_person_types_what_the_supply_shows(monkeypatch: pytest.MonkeyPatch) -> None:
     with connect("pmsmsim", CHANNEL) as connection:
         monkeypatch.setattr("pmsmtool.cli.supply_prompt.person_present", lambda: False)
-        with pytest.raises(Declined, match="nobody can be asked what the bench supply shows"):
+        with pytest.raises(Declined, match="no terminal to ask what the bench supply shows"):
             supply_reader(connection, 1, simulated=False)
         monkeypatch.setattr("pmsmtool.cli.supply_prompt.person_present", lambda: True)
         ask = supply_reader(connection, 1, simulated=False)

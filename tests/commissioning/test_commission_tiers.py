@@ -211,7 +211,7 @@ def test_a_drive_that_cannot_be_reflashed_is_kept_out_of_saturation_by_its_limit
     assert all(held[name] <= design[name] * (1.0 + 1e-14) for name in (SLOPE, TORQUE, SPEED)), "the guarantee's range"
     stage = run.read().stage("tune")
     assert stage is not None and {RATED, SLOPE, TORQUE, SPEED} <= {value["name"] for value in stage.values}
-    assert any("Cost: " in line and "nothing is promised" in line for line in stage.fallbacks)
+    assert any("Cost: " in line and "no guarantee above" in line for line in stage.fallbacks)
     assert {"voltage demand within the limits", "current within the limits"} <= {a.what for a in stage.acceptance}
     assert "a voltage that it does not record" in run.read().stage("prove").note  # type: ignore[union-attr]
     source, largest = with_simulation(sheet, {"thermal_on": False}), 3.0 * sheet.machine.I_max_apk  # type: ignore[operator]
@@ -331,7 +331,7 @@ def test_the_plan_is_told_before_anything_moves(tmp_path: Path, monkeypatch: pyt
     outcome = CliRunner().invoke(
         cli, ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=elmo", "commission", str(PROFILE)], input=""
     )
-    assert outcome.exit_code != 0 and "tier standard, map elmo" in outcome.stderr
+    assert outcome.exit_code != 0 and "capability level standard, map elmo" in outcome.stderr
     assert "flash, verify: not available: needs a map" in outcome.stderr
     assert not isinstance(outcome.exception, NotAvailable)
 

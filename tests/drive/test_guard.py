@@ -301,13 +301,13 @@ def test_gravity_load_is_refused_before_anything_is_sent(bench: SimBench) -> Non
 
 def test_drive_that_somebody_else_enabled_is_left_alone(bench: SimBench) -> None:
     bench.drive.node.enable()
-    with pytest.raises(SafetyRefusal, match="somebody else"), guarded(bench.drive, ENVELOPE):
+    with pytest.raises(SafetyRefusal, match="another program"), guarded(bench.drive, ENVELOPE):
         pass
     assert bench.session.power.state is State.OPERATION_ENABLED
 
 
 def test_nothing_is_enabled_without_the_proof(bench: SimBench) -> None:
-    with pytest.raises(SafetyRefusal, match="not proven"), guarded(bench.drive, ENVELOPE, prove=False) as guard:
+    with pytest.raises(SafetyRefusal, match="not tested"), guarded(bench.drive, ENVELOPE, prove=False) as guard:
         guard.enable()
 
 
@@ -374,7 +374,7 @@ def test_ctrl_c_between_the_guard_and_its_block_restores_too(number: int) -> Non
 
     def say(text: str) -> None:
         said.append(text)
-        if text.startswith("dead-man"):
+        if text.startswith("supervision"):
             moment.arm()
 
     bench = None

@@ -62,7 +62,7 @@ def jogging(server: Server, home: Path) -> subprocess.Popen[str]:
     STARTED.append(process)
     assert process.stderr is not None
     for line in process.stderr:
-        if line.startswith("dead-man proven"):
+        if line.startswith("supervision tested"):
             return process
     raise AssertionError("the jog never began")
 

@@ -178,7 +178,7 @@ def test_files_that_are_no_drives_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
         build_line(parse_channel(f"interior-2k2?nv=:memory:&eds={tmp_path / 'none.eds'}"))
     path = write_eds(tmp_path / "drive.eds", epos4())
-    with pytest.raises(ConfigError, match="eds says what the drive has"):
+    with pytest.raises(ConfigError, match="names an EDS file and also a drive"):
         build_line(parse_channel(f"interior-2k2?nv=:memory:&drive=epos4&eds={path}"))
 
 

@@ -76,7 +76,7 @@ def test_node_guarding_is_proven_where_there_is_no_heartbeat(tmp_path: Path) -> 
     with opened(tmp_path, copley()) as rig:
         before = rig.memory()
         with guarded(rig.drive, ENVELOPE) as guard:
-            assert guard.proof is not None and str(guard.proof).startswith("dead-man proven: node guarding stopped")
+            assert guard.proof is not None and str(guard.proof).startswith("supervision tested: node guarding stopped")
             assert guard.proof.abort_connection is None and guard.proof.measured_s <= DECLARED_S
             assert rig.number(0x2110) == 300, "counts of 0.01 A peak"
             guard.enable()

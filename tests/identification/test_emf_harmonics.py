@@ -137,5 +137,5 @@ def test_limited_records_are_left_out_and_too_few_refused() -> None:
     assert fifth.value == pytest.approx(0.004 * PSI, rel=0.05)
     with pytest.raises(IdentificationError, match="E_CLIPPED.*7 left"):
         identified([*runs[:6], *runs[9:]], 0.0)
-    with pytest.raises(IdentificationError, match="8 records do not tell the dead time"):
+    with pytest.raises(IdentificationError, match="8 records do not separate the dead time"):
         identified([*runs[10:], *runs[10:], *runs[4:5], *runs[4:5], *runs[10:]], 0.0)

@@ -54,7 +54,7 @@ def test_what_is_not_told_apart_stays_unknown() -> None:
     base, _, integral_changed = observed("value")
     between = Observation(1400, INTEGRALS, loop(0.7 * A0, math.sqrt(0.7) * A0 * RATE))
     found = integral_scale(base, between, integral_changed, ROTOR, I)
-    assert found.scale is None and "not told apart" in found.why
+    assert found.scale is None and "cannot be separated" in found.why
 
 
 def test_steps_of_two_sizes_say_what_friction_leaves() -> None:

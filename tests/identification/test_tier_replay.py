@@ -103,7 +103,7 @@ def test_a_run_without_a_machine_file_is_replayed_from_the_command_line(tmp_path
     facts = parse_facts((run.path / FACTS).read_text(encoding="utf-8"), where="")
     assert facts.traces[:2] == ("rotation_forward", "rotation_backward") and facts.pushed and facts.voltage == "link"
     run.save(FACTS, "{}")
-    with pytest.raises(ConfigError, match="the record of the tier is damaged"):
+    with pytest.raises(ConfigError, match="the record of the capability level is damaged"):
         replay(run)
     run.save(ANSWERS, "{}")
     with pytest.raises(ConfigError, match="nothing of that can be recomputed"):

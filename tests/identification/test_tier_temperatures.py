@@ -78,7 +78,7 @@ def test_a_machine_takes_the_values_once_and_inertia_by_the_flux_of_the_run(
     assert made.machine.psi_f_wb == psi
     assert made.machine.J_kgm2 == pytest.approx(ratio * psi * (1.0 + ALPHA_PSI * RISE_K))
     cold = tier_machine(known, unknown.estimates, "as given")
-    assert cold.machine is not None and any("no sensor tells its temperature" in note for note in cold.notes)
+    assert cold.machine is not None and any("no sensor shows its temperature" in note for note in cold.notes)
     assert cold.machine.systematic["R_s_ohm"] == unknown.estimates["R_s_ohm"].systematic, "not widened twice"
     assert cold.machine.estimates["R_s_ohm_measured"] == unknown.estimates["R_s_ohm_measured"]
     raw = unknown.estimates["psi_f_wb"]

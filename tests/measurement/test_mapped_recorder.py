@@ -178,7 +178,7 @@ def test_what_it_does_not_show_or_take_is_said(pushed: tuple[MappedRecorderDrive
     with pytest.raises(NotAvailable, match="no signal kappa"):
         drive.record(("kappa",), 10)
     step = Excitation(Shape.STEP, Injection.SPEED, 10.0)
-    with pytest.raises(NotAvailable, match="only torque pushes"):
+    with pytest.raises(NotAvailable, match="only torque pulses"):
         drive.record(("i_q_a",), 10, excitation=step)
 
 
@@ -190,7 +190,7 @@ def test_the_chain_measures_by_it_and_says_what_is_left(tmp_path: Path, monkeypa
     asked = ["commission", str(machine_path("interior-2k2")), "--map", str(path), "--runs", str(tmp_path / "runs")]
     result = CliRunner().invoke(cli, [*bus, *asked, "--yes"])
     assert isinstance(result.exception, Partial), result.output
-    assert "recorded torque pushes" in result.output
+    assert "recorded torque pulses" in result.output
     for line in ("identify  PASS", "flash     PASS", "verify    PASS", "prove     NOT AVAILABLE"):
         assert line in result.output
     assert "SIMULATED DRIVE, PARTIAL: 4 of 7 stages ran" in result.output

@@ -54,7 +54,7 @@ def test_a_strongly_saturated_machine_gives_what_it_can(capsys: pytest.CaptureFi
 def test_what_the_pushes_cannot_tell_is_exit_9_with_its_reason(capsys: pytest.CaptureFixture[str]) -> None:
     assert identified("fast-ipm", "mechanics") == 9
     told = capsys.readouterr().err
-    assert "nothing of what was asked could be told" in told and "needs current set-points" in told
+    assert "nothing that was asked for was identified" in told and "needs current set-points" in told
     assert largest_current_a() < 1.2 * 160.0 * 1.25, "measured 204; 333 before"
 
 

@@ -344,7 +344,7 @@ def test_nothing_is_started_on_a_drive_that_the_map_does_not_name(tmp_path: Path
 
 def test_caps_shows_the_tier(tmp_path: Path) -> None:
     outcome = run("--sim", channel(tmp_path, without_torque(load_family("synapticon"))), "caps")
-    assert "tier vendor" in outcome.stdout
+    assert "capability level vendor" in outcome.stdout
     line = next(line for line in outcome.stdout.splitlines() if line.startswith("R ") and "vendor" in line)
     assert "no interval" in line
     outcome = run("--sim", "interior-2k2?nv=:memory:&drive=nanotec", "caps", "--map", "nanotec", "--json")

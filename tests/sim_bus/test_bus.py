@@ -139,7 +139,7 @@ def test_nobody_to_acknowledge_fills_the_queue_and_says_so(bench: Bench) -> None
     bench.node.plugged = False
     for _ in range(8):
         bench.bus.send(message(0x601, READ_SERIAL))
-    with pytest.raises(can.CanOperationError, match="nobody acknowledges") as caught:
+    with pytest.raises(can.CanOperationError, match="no node acknowledges") as caught:
         bench.bus.send(message(0x601, READ_SERIAL))
     assert caught.value.error_code is not None
     bench.node.plug_in()

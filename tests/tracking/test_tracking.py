@@ -99,7 +99,7 @@ def test_one_operating_point_is_refused_naming_the_pair() -> None:
     trace = warming_run(machine(), 3.0, 4, vary=False)
     observations = condense(trace, ROWS)
     with pytest.raises(
-        IdentificationError, match="R_s_ohm and (psi_f_wb|inverter error) cannot be told apart"
+        IdentificationError, match="R_s_ohm and (psi_f_wb|inverter error) cannot be separated"
     ) as caught:
         track(observations, known(machine()))
     assert caught.value.reason == "E_NOT_IDENTIFIABLE"

@@ -447,7 +447,7 @@ def _unmix(
     if abs(eps) > math.radians(30.0):
         raise refuse(
             "E_NOT_IDENTIFIABLE",
-            f"the frame is {math.degrees(eps):.3g} deg off the d axis: L_d and L_q cannot be told apart",
+            f"the frame is {math.degrees(eps):.3g} deg off the d axis: L_d and L_q cannot be separated",
             stage="inductance",
             likely="wrong encoder offset",
             hint="check the coupling of the encoder and its increments per turn, then repeat",

@@ -61,7 +61,7 @@ simulated drive: 0.014 too much, 0.005 by the fit."""
 INERTIA_FLOOR = 1e-3
 """Relative deviation of the inertia beyond the fit's and the torque's: see
 ``tests/measurement/test_frequency_response``."""
-INERTIA_FALLBACK = "from the frequency response, without pushes and coasting; friction is not known"
+INERTIA_FALLBACK = "from the frequency response, without torque pulses and coasting; friction is not known"
 METHOD = "random torque at speed, maximum likelihood in the frequency domain"
 
 
@@ -199,7 +199,7 @@ def estimate_frequency_response(
     estimates = _estimates(two, chi2)
     against = _against(two, chi2, gain, estimates, frequency)
     if against:
-        reason = f"no resonance is claimed up to {highest:.3g} Hz: {against}"
+        reason = f"no resonance found up to {highest:.3g} Hz: {against}"
         return FrequencyResponse(*facts, chi2, gain, reason=f"{reason}; {shown}", inertia=one)
     resonance, antiresonance = estimates["resonance_hz"].value, estimates["antiresonance_hz"].value
     reason = f"two masses, J_load/J_motor {(resonance / antiresonance) ** 2 - 1.0:.3g}, over {highest:.3g} Hz"

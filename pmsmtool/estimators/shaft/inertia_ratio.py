@@ -39,7 +39,7 @@ MODEL_FLOOR = 0.01
 """Relative 95 % model error of J/psi: torque ripple, temperature of the magnets during the run."""
 FRICTION_FLOOR = 0.01
 """95 % model error of tau_c/psi, relative to the torque of the smallest push; seen: 0.4 % (seeds 2000 to 2005)."""
-METHOD = "regression over torque pushes"
+METHOD = "regression over torque pulses"
 
 Vector = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ def estimate_ratios(
     tolerance = tolerance or SensorTolerance()
     parts = [part for part in (_part(push) for push in pushes) if part is not None]
     if len(parts) < LEAST_PUSHES:
-        raise refuse("E_EXCITATION", f"{len(parts)} usable pushes, {LEAST_PUSHES} needed", stage=STAGE)
+        raise refuse("E_EXCITATION", f"{len(parts)} usable torque pulses, {LEAST_PUSHES} needed", stage=STAGE)
     sense = math.copysign(1.0, sum(float(p[0][-1] - p[0][0]) * float(p[1][-1]) for p in parts))
     full = _ratios(parts, sense, pole_pairs)
     n = len(parts)
@@ -85,9 +85,9 @@ def estimate_ratios(
     if not full[0] > 0.0 or half > RATIO_LIMIT * full[0]:
         raise refuse(
             "E_NOT_IDENTIFIABLE",
-            f"J/psi is {full[0]:.3g} +-{half:.2g} kg m2/Wb between the pushes, limit {100.0 * RATIO_LIMIT:g} %",
+            f"J/psi is {full[0]:.3g} +-{half:.2g} kg m2/Wb between the torque pulses, limit {100.0 * RATIO_LIMIT:g} %",
             stage=STAGE,
-            likely="pushes too short or too weak against friction, a load, or a drive that limits its current",
+            likely="torque pulses too short or too weak against friction, a load, or a drive that limits its current",
         )
     return found
 

@@ -80,7 +80,7 @@ NOISY_TORQUE = "cogging, a load or a gear on the shaft, an elastic coupling, an 
 SCALE_FLOOR = 3e-4
 """Relative deviation of the torque's scale beyond that of the flux linkage and of the samples' displacement."""
 NO_HARMONICS = AngleHarmonics()
-METHOD = "pushes and coasting, output error on position, whitened"
+METHOD = "torque pulses and coasting, output error on position, whitened"
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +130,8 @@ class MechanicsResult:
             lines.append(f"cogging of {torque:.3g} N m (orders per turn: {orders}) was taken out of J, B and tau_c")
         if self.unexplained and self.ripple >= NOTED:
             lines.append(
-                f"J, B and tau_c: torque noise of {100.0 * self.ripple:.2g} % of the push's, counted in their "
-                f"intervals; likely {NOISY_TORQUE}"
+                f"J, B and tau_c: torque noise of {100.0 * self.ripple:.2g} % of that of the pulses, counted in "
+                f"their intervals; likely {NOISY_TORQUE}"
             )
         return "; ".join(lines)
 
@@ -325,8 +325,8 @@ def _fit(runs: Sequence[Run], start: Array, elastic: bool) -> tuple[Fit, float, 
         if ripple > RIPPLE_MOST and not elastic:
             raise refuse(
                 "E_MODEL_MISMATCH",
-                f"torque off by {100.0 * ripple:.2g} % of the push's, and more, from one {1e3 * runs[0].T:.2g} ms to "
-                f"the next, limit {100.0 * RIPPLE_MOST:g} %",
+                f"torque off by {100.0 * ripple:.2g} % of that of the pulses, and more, from one "
+                f"{1e3 * runs[0].T:.2g} ms to the next, limit {100.0 * RIPPLE_MOST:g} %",
                 stage=STAGE,
                 likely=NOISY_TORQUE,
                 hint="`identify R L psi encoder poles inverter frf` finds the resonance of an elastic shaft, and J",

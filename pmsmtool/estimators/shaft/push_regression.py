@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The regression over torque pushes and its spread between the pushes."""
+"""The regression over torque pulses and its spread between the pushes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def regress(columns: Sequence[Vector], measured: Vector, *, what: str, stage: st
     matrix = np.column_stack(columns)
     scale = np.sqrt(np.mean(matrix**2, axis=0))
     if np.any(scale == 0.0):
-        raise refuse("E_NOT_IDENTIFIABLE", f"the pushes hold no speed or no current, for {what}", stage=stage)
+        raise refuse("E_NOT_IDENTIFIABLE", f"the shaft did not turn during the torque pulses, for {what}", stage=stage)
     solution, _, _, singular = np.linalg.lstsq(matrix / scale, measured, rcond=None)
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf
     if condition > CONDITION_LIMIT:
