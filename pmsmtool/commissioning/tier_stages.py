@@ -53,7 +53,7 @@ NOT_SHOWN = (
     "; the guarantee of its limits bounds a voltage that it does not record (on a simulated node: `pmsmtool reproduce "
     "closed-drive`)"
 )
-FOR_READING = "the drive takes no table: it is for reading"
+FOR_READING = "the drive has no object for the table"
 Allow = Callable[[Sequence[str]], None]
 Say = Callable[[str], None]
 

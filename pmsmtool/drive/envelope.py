@@ -95,7 +95,7 @@ class Envelope:
             raise SafetyRefusal(
                 "a gravity load falls when the torque is zero, and every stop ends at zero torque",
                 likely="--load gravity was given and the shaft is not locked",
-                hint="uncouple the load, or lock the shaft and say --shaft locked",
+                hint="uncouple the load, or lock the shaft and give --shaft locked",
             )
 
 
