@@ -188,7 +188,7 @@ def _accepted(name: str, estimate: Estimate, needs: Sequence[Need]) -> Acceptanc
     binding = min(needs, key=lambda need: need.reserve)
     return Acceptance(
         what,
-        f"{width}, over it {binding.what} {_number(binding.worst, binding.unit)}",
+        f"{width}, least within it: {binding.what} {_number(binding.worst, binding.unit)}",
         _number(binding.least, binding.unit),
         all(need.ok for need in needs),
     )
