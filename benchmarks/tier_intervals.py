@@ -168,7 +168,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
 
     refused = Counter(row["refused"] for row in rows if "refused" in row)
     for row in rows:
-        refused.update(f"{name} not told" for name in row.get("missing", ()))
+        refused.update(f"{name} not identified" for name in row.get("missing", ()))
     lines = [f"refused: {dict(refused)}"]
     lines.append("quantity            n   error: median    p90      max   half width: median   p90    covered, p")
     for name in dict.fromkeys(name for row in rows for name in row.get("found", ())):

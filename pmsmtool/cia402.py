@@ -154,9 +154,9 @@ ERROR_TEXTS: dict[int, str] = {
 
 
 ERROR_CAUSES: dict[int, str] = {
-    0x2350: "more current, or for longer, than the winding is said to stand",
+    0x2350: "more current, or for longer, than the winding can carry",
     0x3210: "the shaft was braked and nothing takes its energy: no chopper, or a supply that cannot sink",
-    0x3220: "the supply is in current limit, or weaker than the drive asks for",
+    0x3220: "the supply is in current limit, or weaker than the drive needs",
     0x4310: "the winding is still warm from what ran before: let it cool, then go on",
 }
 """Likely cause of some of them."""

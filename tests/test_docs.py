@@ -24,6 +24,8 @@ from pmsmtool.errors import ConfigError, ExitCode
 from pmsmtool.machine.machine_keys import machine_file_keys
 from pmsmtool.params.catalogue import CATALOGUE
 from tests.pages import fenced, links, rows_of, sentences
+from tests.recorded import assert_printed
+from tests.simulated_bus import settle
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("*.md"))}
@@ -128,6 +130,17 @@ def test_no_sentence_of_a_guide_is_too_long() -> None:
     for name in GUIDES:
         for sentence in sentences(PAGES[f"{name}.md"].split(BEGIN)[0]):
             assert len(sentence.split()) <= WORDS_MAX, (name, sentence)
+
+
+def test_the_first_steps_with_an_own_drive_are_what_the_program_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the recorded commands the two that move nothing; the rehearsal itself takes ten seconds."""
+    settle(tmp_path, monkeypatch)
+    commands = session(PAGES["your-drive.md"])
+    assert [typed.split()[1] for typed, _ in commands] == ["machine", "info", "check", "commission"]
+    for typed, shown in commands[:2]:
+        assert_printed(typed, shown)
 
 
 def test_python_blocks_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

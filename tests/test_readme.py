@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,25 +13,20 @@ import pmsmtool
 from benchmarks.recorded_sessions import (
     CUT,
     PICTURES,
-    RUN,
     as_cut,
-    printed,
     session,
     terminal_picture,
-    with_present_run,
 )
 from tests.pages import fenced, sentences
+from tests.recorded import assert_printed
 from tests.simulated_bus import settle
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 LINES_MAX = 220
 """Of a README that is read to its end; it had 728."""
 WORDS_MEDIAN_MAX, WORDS_MAX = 18, 30
 """Words of a sentence; the text measures 10 and 23."""
-SESSION_TOLERANCE = 0.05
-"""How far numbers of the session may differ: last digits depend on the platform's linear algebra."""
 
 
 def test_the_first_two_blocks_set_up_run_and_test() -> None:
@@ -70,22 +64,13 @@ def test_the_documentation_says_what_the_version_is() -> None:
 # ---- the first session and its pictures --------------------------------------------------------------------
 
 
-def as_shown(line: str) -> tuple[str, list[float]]:
-    """A line without its numbers and without the columns' widths, and its numbers."""
-    line = RUN.sub("RUN", line)
-    return " ".join(NUMBER.sub("#", line).split()), [float(text) for text in NUMBER.findall(line)]
-
-
 @pytest.mark.chain
 def test_the_first_session_is_what_the_program_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settle(tmp_path, monkeypatch)
     commands = session(README)
     assert commands[0][0].split()[:2] == ["pmsmtool", "commission"]
     for typed, shown in commands:
-        told = as_cut(printed(with_present_run(typed)), shown)
-        assert [as_shown(line)[0] for line in told] == [as_shown(line)[0] for line in shown]
-        for line, expected in zip(told, shown, strict=True):
-            assert as_shown(line)[1] == pytest.approx(as_shown(expected)[1], rel=SESSION_TOLERANCE), (line, expected)
+        assert_printed(typed, shown)
 
 
 def test_the_terminal_picture_is_the_recorded_session() -> None:

@@ -26,17 +26,18 @@ if TYPE_CHECKING:
         "pmsmtool caps --eds maker.eds",
     ),
 )
-@click.option("--eds", metavar="FILE", help="Ask no drive: what one with the objects of this EDS or DCF will give.")
+@click.option("--eds", metavar="FILE", help="Ask no drive: what a drive with the objects of this EDS or DCF allows.")
 @map_option
 @bus_options
 @output_options
 def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str | None) -> None:
     """Show every quantity, the methods to it, the interval to expect, and what this drive lacks for it.
 
-    The drive is only read. Without --map the map of its identity is used, and without one what CiA 402 says. The
-    intervals were measured on simulated drives of the same capability level; where none was measured, none is printed.
+    The drive is only read. Without --map the map for its vendor and product is used; without such a map the objects of
+    CiA 402. The intervals were measured on simulated drives of the same capability level; where none was measured, none
+    is printed.
 
-    With --eds no bus is needed: a simulated drive with exactly the file's objects is asked, a motor set up in it.
+    With --eds no bus is needed: a simulated drive with the objects of the file is read, with a motor set up in it.
     """
     from pmsmtool.drive_maps.shipped_maps import GENERIC
     from pmsmtool.flash.map_gate import contradictions, other_drive, unknown_firmware

@@ -38,9 +38,11 @@ def check_command(
     """Look for wrong wiring at a first power-on: a tenth of the rated current, half a turn, 15 s at most.
 
     One table names what is wrong with supply, phases, current sensors, shaft or brake, pole pairs, counts per turn and
-    encoder sign, the most likely cause first. MACHINE says what is connected; without it the drive's own set does.
-    Nothing is stored in the drive. Exit code 1 when something is wrong, 10 when phases, shaft or pole pairs could not
-    be judged: so at the levels recorder and standard, where it is listed what the drive cannot show.
+    encoder sign, the most likely cause first. MACHINE is the connected motor; without it the values of the drive are
+    used. Nothing is stored in the drive.
+
+    Exit code 1 when something is wrong, 10 when phases, shaft or pole pairs could not be judged. Drives of the levels
+    recorder and standard cannot show all of these; what they cannot show is listed.
     """
     from pmsmtool.cia402 import HOMING_LOST
     from pmsmtool.cli.consent import ask_motion
@@ -116,7 +118,7 @@ def _check_below_full(
         missing = found.row("mechanics", Method.STANDARD).missing
         raise NotAvailable(
             f"nothing can be moved on this drive: it needs {', '.join(missing) or 'objects of CiA 402'}",
-            where=f"node {found.identity.node}", hint="`pmsmtool caps` lists what it can give",
+            where=f"node {found.identity.node}", hint="`pmsmtool caps` lists what it can measure",
         )  # fmt: skip
     if path is None:
         raise ConfigError(

@@ -46,7 +46,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("doctor", "pmsmtool.cli.doctor:doctor_command", Section.LOOK, "Examine adapters, wiring and bit rate."),
     Row("scan", "pmsmtool.cli.scan:scan_command", Section.LOOK, "List the nodes on a bus."),
     Row("info", "pmsmtool.cli.info:info_command", Section.LOOK, "Show identity, state and parameter set."),
-    Row("caps", "pmsmtool.cli.caps:caps_command", Section.LOOK, "Show what a drive can give, and what is missing."),
+    Row("caps", "pmsmtool.cli.caps:caps_command", Section.LOOK, "Show what a drive can measure, and what is missing."),
     Row("monitor", "pmsmtool.cli.monitor:monitor_command", Section.LOOK, "Show live values."),
     Row("scope", "pmsmtool.cli.scope:scope_command", Section.LOOK, "Show live signals on a local page."),
     Row("fault", "pmsmtool.cli.fault:fault_command", Section.LOOK, "Show or reset faults."),

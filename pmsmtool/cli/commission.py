@@ -59,8 +59,8 @@ LIMITS = ("current", "speed")
     default="lookup",
     help="Where the drive's current references come from: the table, or an optimisation in the drive.",
 )
-@click.option("--drive-bandwidth-hz", type=click.FloatRange(0.0, min_open=True), metavar="HZ", help="Bandwidth of the "
-              "current control of a drive that takes no gains; its limits are then designed.")  # fmt: skip
+@click.option("--drive-bandwidth-hz", type=click.FloatRange(0.0, min_open=True), metavar="HZ", help="Current "
+              "bandwidth of a drive with fixed firmware; its limits are then designed.")  # fmt: skip
 @click.option("--require", multiple=True, type=click.Choice(STAGES), metavar="STAGE", help="A stage without which the "
               "run fails (exit 1) instead of ending partial (exit 10); may be repeated.")  # fmt: skip
 @click.option("--accept-limit", "accept_limits", multiple=True, type=click.Choice(LIMITS), metavar="NAME",
@@ -137,7 +137,7 @@ def commission_command(
         if drive_bandwidth_hz is not None and found.drive_map.staging:
             raise ConfigError(
                 f"--drive-bandwidth-hz: for a drive that cannot be reflashed, and {found.drive_map.name!r} is none",
-                hint="leave it out: this drive takes the gains that are designed",
+                hint="leave it out: the designed gains can be written to this drive",
             )
         run = begun or begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=_recorded(bus), tier=found.tier)
         progress = StageProgress(out)
@@ -299,9 +299,9 @@ def _partial(found: Verdict, run: RunDirectory) -> Partial:
     from pmsmtool.errors import Partial
 
     return Partial(
-        f"{found.lines[0].split(',')[0]}; the reasons stand above",
+        f"{found.lines[0].split(',')[0]}; the reasons are printed above",
         where=str(run.path),
-        hint="`pmsmtool caps` lists what this drive can give; --require STAGE makes a missing stage exit 1",
+        hint="`pmsmtool caps` lists what this drive can measure; --require STAGE makes a missing stage exit 1",
     )
 
 

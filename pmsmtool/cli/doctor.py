@@ -33,8 +33,8 @@ WITHIN_S = 60.0
 def doctor_command(bus: BusOptions, out: Output, find_bitrate: bool, listen_s: float) -> None:
     """Examine adapters, then the bus: listen first, ask then; nothing is written to any node.
 
-    Says what each usual adapter needs on this system and what to type then. Exit code 3 when a bus is configured and no
-    node answers on it. Ends within 60 s and the time of listening, whatever a driver does.
+    Lists what each usual adapter needs on this system, and the options for it. Exit code 3 when a bus is configured and
+    no node answers on it. Ends within 60 s and the time of listening.
     """
     from pmsmtool.bus.in_time import in_time
     from pmsmtool.errors import BusError

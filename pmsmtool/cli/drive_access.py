@@ -181,7 +181,7 @@ def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[C
                 "this drive does not have the objects that experiments and commissioning need",
                 where=abort.where,
                 likely="a drive of another family",
-                hint="`pmsmtool caps` lists what it can give and what is missing",
+                hint="`pmsmtool caps` lists what it can measure and what is missing",
             ) from abort
         check_motion(drive.node.map, drive.identity)
         yield drive

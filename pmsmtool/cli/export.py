@@ -117,7 +117,7 @@ def dcf_command(design: Path, into: Path | None, node_id: int, map_file: Path | 
 def cdcf_command(design: Path, map_file: Path | None, out: Output) -> bytes:
     """Write a concise DCF (CiA 302-2): what a CANopen manager sends at boot-up.
 
-    A complete set is framed by the staging commands of the drive, which then takes it as a whole.
+    A complete set is framed by the staging commands of the drive, so that the drive activates it as a whole.
     """
     from pmsmtool.commissioning.export import concise_dcf
 

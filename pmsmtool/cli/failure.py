@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _DISK = (errno.ENOSPC, errno.EROFS, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC))
 """Errors of writing that name no file, such as those of standard output."""
 _DISK_HINT = "check the path, your rights there and the space on the disk"
-_WHAT_IT_GIVES = "`pmsmtool caps` shows what this drive gives"
+_WHAT_IT_GIVES = "`pmsmtool caps` shows what this drive can measure"
 """Next step of what a drive cannot give, where none is named."""
 
 

@@ -39,9 +39,9 @@ Nothing moves and nothing is written without your consent; the two are asked one
            what the shaft may do (--shaft, --load, --brake).
   writing  before the first write the list of differences is printed: name, old, new, unit.
 --yes answers them on a simulated drive. On a real bus it needs --i-max, --speed-max, --shaft and --serial as well, and
-the serial number must be that of the drive that answers: one that shows none is moved and written by a person at a
-terminal only. --yes cannot be set by an environment variable. Without a terminal, and where --yes does
-not hold, nothing is done: exit 7.
+the serial number must be that of the drive that answers. A drive that shows no serial number is moved and written by
+a person at a terminal only. --yes cannot be set by an environment variable. Without a terminal and without a valid
+--yes nothing is done: exit 7.
 
 A command that moved the machine always ends in the same way: voltage off, zero current, parameters restored, and the
 stop confirmed from the statusword. If the drive does not confirm it, the exit code is 8 whatever else went wrong: use
@@ -106,7 +106,7 @@ def _exit_codes() -> str:
 def _refusals() -> str:
     from pmsmtool.estimators.refusals import REFUSALS
 
-    parts = ["Identification gives no number it does not trust; it ends with exit code 6 and one of these names."]
+    parts = ["A value that cannot be trusted is refused: exit code 6, and one of these names."]
     for row in REFUSALS.values():
         parts.append(f"\n{row.name}\n  {row.meaning}\n  likely: {row.likely}\n  try:    {row.next_step}")
     return "\n".join(parts)
@@ -154,7 +154,7 @@ def _simulation() -> str:
 
     return "\n".join(
         [
-            "[simulation] of a machine file is what only the simulated drive knows; design commands look away.",
+            "[simulation] of a machine file is for the simulated drive alone; design commands ignore it.",
             "Each key is a switch: `simulate --set KEY=VALUE` changes it for one run.",
             "",
             *_keys(SIMULATION_KEYS),
@@ -193,7 +193,7 @@ TOPICS: dict[str, tuple[str, Callable[[], str]]] = {
     "simulation": ("keys of [simulation]: what the simulated drive is like", _simulation),
     "scenario": ("what can happen in a simulation", _scenario),
     "environment": ("environment variables and their order", _environment),
-    "refusals": ("named reasons to give no number", _refusals),
+    "refusals": ("named reasons for a refused value", _refusals),
 }
 """Topic -> one line, text."""
 

@@ -61,7 +61,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     multiple=True,
     metavar="V_dc|I=SHOWN:TRUE:TOL",
     help="What an instrument read while the drive showed SHOWN, and its 95 % tolerance, with units: "
-    "V_dc=540V:537V:0.5V, I=5.00Apk:5.02Apk:0.2%; takes that scale out. So does bridge=SWITCH:DIODE:TOL, the "
+    "V_dc=540V:537V:0.5V, I=5.00Apk:5.02Apk:0.2%; corrects that scale. So does bridge=SWITCH:DIODE:TOL, the "
     "thresholds in the data sheet of the bridge's devices: bridge=0.9V:1.1V:0.2V.",
 )
 @click.option(
@@ -74,7 +74,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 @click.option(
     "--half-frequency",
     is_flag=True,
-    help="Measure R at half the control frequency, too, and extrapolate to zero: takes the dead time out of R.",
+    help="Measure R at half the control frequency, too, and extrapolate to zero: removes the dead time from R.",
 )
 @click.option(
     "--supply",
@@ -103,22 +103,25 @@ def identify_command(
 ) -> None:
     """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
 
-    "map" measures the flux linkages over the plane of currents with saturation and cross-saturation; a held rotor
-    (--shaft locked) allows R, inverter and map. "mechanics" fits inertia, viscous and Coulomb friction to torque pulses
-    and coasting; "cogging" finds the torque over the angle in slow turns, or the least that would have been found;
-    "harmonics" records voltages and currents over turns for the 5th, 7th, 11th and 13th of the back-EMF; "frf" measures
-    the mechanical frequency response, and a resonance where the data support one. Without a quantity all but map, frf,
-    cogging and harmonics are measured; with "all", all.
+    Without a quantity all but map, frf, cogging and harmonics are measured.
 
-    With --method vendor the drive measures by itself, as its map says (`pmsmtool caps`); such values have no interval.
+    \b
+    map        flux linkages over the current plane, with saturation
+    mechanics  inertia, viscous and Coulomb friction: torque pulses, coasting
+    frf        mechanical frequency response, and its resonance
+    cogging    torque over the angle, in slow turns
+    harmonics  5th, 7th, 11th and 13th harmonic of the back-EMF
+    A locked rotor (--shaft locked) allows R, inverter and map.
 
-    The limits are printed and consent is asked before anything moves. Every number comes with its statistical and its
-    systematic part; what cannot be trusted is refused by name. The run directory keeps raw traces and machine.toml;
-    nothing is stored in the drive.
+    The limits are printed and consent is asked before anything moves. Every value has a statistical and a systematic
+    part; a value that cannot be trusted is refused by name. The run directory keeps the traces and machine.toml.
+    Nothing is stored in the drive.
 
-    --fingerprint asks whether this is the motor of an earlier run, as after a swap: by the method and with the limits
-    and sensor tolerances of that run where none are given. Each value is SAME or DIFFERENT, with the likely cause.
-    """
+    --method vendor starts the drive's own identification (`pmsmtool caps`); such values have no interval.
+
+    --fingerprint compares the motor with that of an earlier run, for example after a repair. Method, limits and sensor
+    tolerances of that run are used where none are given. Each value is SAME or DIFFERENT, with the likely cause.
+    """  # noqa: D301 - click reads the control character
     from pmsmtool.cli.fingerprint import compare, earlier_run, like_then
     from pmsmtool.errors import NotAvailable
     from pmsmtool.estimators.estimate import SensorTolerance
@@ -397,7 +400,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison |
         raise Partial(
             f"{len(stage.refused)} of the quantities asked for {'is' if len(stage.refused) == 1 else 'are'} refused",
             where=str(run.path),
-            hint=f"the accepted values stand in {where}; `pmsmtool help refusals` explains each name",
+            hint=f"the accepted values are in {where}; `pmsmtool help refusals` explains each name",
             missing=refused,
         )
     from pmsmtool.commissioning.commission import NOT_ACCEPTED

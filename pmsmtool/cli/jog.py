@@ -59,7 +59,7 @@ def jog_command(
 ) -> None:
     """Hold a current vector at a fixed angle, or run at a speed, for a short time; then stop and restore everything.
 
-    A speed jog needs a drive that knows its machine: pole pairs, encoder offset, gains.
+    A speed jog needs a drive that is set up: pole pairs, encoder offset, gains.
     """
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.drive.envelope import Envelope

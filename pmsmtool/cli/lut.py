@@ -63,9 +63,10 @@ def lut_command(
 ) -> None:
     """Make the current references of SOURCE, a machine file, a design, a run directory or a profile.
 
-    Least loss for every torque and speed within current, voltage, demagnetisation and map; motoring and generating;
-    with the limit that binds and the margins of every cell. Without bounds, the largest grid that fits the drive's
-    memory is taken and named; exit code 1 when bounds that are given do not fit it.
+    Each cell has the currents of least loss for its torque and speed, motoring and generating. Limits are current,
+    voltage, demagnetisation and the range of the flux map; the cell names the one that binds, and its margins.
+
+    Without bounds the largest grid that fits the drive's memory is used. Exit code 1 when given bounds do not fit.
     """
     from pmsmtool.design.lookup.design import LookupRequest, design_table
     from pmsmtool.design.lookup.file import table_csv, table_facts, table_npz

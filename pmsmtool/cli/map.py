@@ -208,6 +208,6 @@ def _tell(
         )  # fmt: skip
     unknown = [name for name, result in results.items() if result.scale is None]
     if len(unknown) == len(results):
-        raise IdentificationError("E_EXCITATION", "no gain was decided", hint="the table says why of each")
+        raise IdentificationError("E_EXCITATION", "no gain was decided", hint="the table has the reason of each")
     if unknown:
-        raise Partial(f"not decided: {', '.join(unknown)}", hint="the table says why")
+        raise Partial(f"not decided: {', '.join(unknown)}", hint="the table has the reason")

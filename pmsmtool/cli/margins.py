@@ -123,8 +123,8 @@ def margins_command(
         raise NotAvailable(
             f"loop margins: {why_not_judged(source)}",
             where=str(file),
-            hint="`pmsmtool tune --map FAMILY --drive-bandwidth-hz HZ` judges the loops that a drive says it has; "
-            "--voltage-headroom, --current-headroom and --thermal-headroom judge the rest",
+            hint="`pmsmtool tune --map FAMILY --drive-bandwidth-hz HZ` checks the loops of a drive with fixed "
+            "firmware; --voltage-headroom, --current-headroom and --thermal-headroom judge the rest",
         )
 
 
@@ -151,7 +151,7 @@ def _lines(report: MarginReport, simulated: SimulatedMargins | None) -> Iterator
         phase = min((s for s in report.loops if s.name.endswith("_phase")), key=lambda s: s.worst)
         yield f"worst {phase.name}: {_sample(phase.worst_sample)}"
     else:
-        yield f"no loop margins: the drive does not take the gains; headroom {over}"
+        yield f"no loop margins: the gains cannot be written to the drive; headroom {over}"
     yield ""
     yield "limit headroom of the references for the nominal machine (1: nothing needed, 0: at the limit)"
     yield from _table(report.headroom)

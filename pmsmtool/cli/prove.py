@@ -47,10 +47,12 @@ def prove_command(
 ) -> None:
     """Predict the response of a flashed DESIGN, run it on the machine, compare; exit code 1 outside the 95 % band.
 
-    DESIGN is design.toml or a run directory; a proof of a run goes into that run. The drive must hold the design's
-    bytes. The band (from the intervals of the machine in the design) and its SHA-256 are printed before the first step:
-    a speed step, current steps of two sizes and both signs, a governed unreachable reference, entry into field
-    weakening. The shaft must carry what the design was made for. Nothing is stored in the drive.
+    DESIGN is design.toml or a run directory; the proof of a run is kept in that run. The drive must hold the values of
+    the design, and the shaft must carry the same load as in the design. Nothing is stored in the drive.
+
+    The band follows from the intervals of the machine in the design. It is printed with its SHA-256 before the first
+    step. The steps: speed, current in two sizes and both signs, a governed unreachable reference, entry into field
+    weakening.
     """
     from dataclasses import asdict
 

@@ -29,11 +29,11 @@ from pmsmtool.files import write_file
 def report_command(run: Path, path: Path | None, anonymous: bool, out: Output) -> None:
     """Write the report of a RUN directory: one self-contained HTML page, verdict first.
 
-    Every figure is drawn again from the files of the run. The exit code says whether the page was written, not whether
-    the run was good.
+    Every figure is drawn from the files of the run. The exit code is that of writing the page, not the verdict of the
+    run.
 
-    --anonymous is for owners of real drives who let others learn from theirs: no serial number, no name of a person,
-    drive, machine, computer or file, no date, no text of the run at all. Read it before you send it: it is plain text.
+    --anonymous makes a file to send to the authors of pmsmtool: no serial number, no name of a person, drive, machine,
+    computer or file, no date, no text of the run. Read it before you send it: it is plain text.
     """
     if anonymous:
         _write_anonymous(run, run / "anonymous.json" if path is None else path, out)

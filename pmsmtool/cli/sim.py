@@ -63,7 +63,7 @@ def sim_command() -> None:
     "--speed",
     type=click.FloatRange(0, 1000, min_open=True),
     default=1.0,
-    help="Multiple of the wall clock. Motion wants 0.8 to 2: a tool's heartbeat and time-outs are real time.",
+    help="Multiple of the wall clock. Motion needs 0.8 to 2: a tool's heartbeat and time-outs are real time.",
 )
 @click.option("--bitrate", type=BITRATE, metavar="BIT/S", help="Pace the frames bit by bit; default: not paced.")
 @click.option("--node", type=_NODE_ID, metavar="ID", help="Node id of the first drive; 255: unconfigured (LSS).")

@@ -86,8 +86,8 @@ if TYPE_CHECKING:
     help="auto: a table for a saturated machine, else the accelerated optimisation.",
 )
 @map_option
-@click.option("--drive-bandwidth-hz", type=float, metavar="HZ", help="Current bandwidth of a drive of --map that takes "
-              "no gains.")  # fmt: skip
+@click.option("--drive-bandwidth-hz", type=float, metavar="HZ", help="Current bandwidth of a drive with fixed "
+              "firmware (--map).")  # fmt: skip
 @click.option("--limit-speed-rpm", type=float, metavar="RPM", help="Speed up to which a drive of --map never saturates."
               "  [default: at the most torque x speed]")  # fmt: skip
 @click.option("--limit-rise-s", type=float, default=0.02, metavar="S", help="Its time from zero to its torque limit.")
@@ -99,14 +99,13 @@ def tune_command(
 ) -> None:
     """Design the control of MACHINE (a machine file, a run directory or a profile).
 
-    With --map of a drive that keeps its own control: the torque or current limit, the slope and the speed limit that
-    keep its voltage demand within its limit; the guarantee and its cost are said. The map must have objects for a
-    slope and a limit of the torque or current: of the families that are shipped, cia402 and copley. Loops are judged
-    with the gains the drive will hold, or with those that its --drive-bandwidth-hz stands for. What other drives take
-    of a design, `commission` and `flash-params` write.
+    Writes the design: the machine, and every gain with its unit, method and achieved margin. The parameter set for
+    flash-params is written beside it. Exit code 1 when the margins asked for cannot be met.
 
-    Writes the design with the machine embedded and every gain with its unit, method and achieved margin, and beside it
-    the parameter set that flash-params sends. Exit code 1 when the margins asked for cannot be met.
+    With --map of a drive with fixed firmware: the limits of torque or current, slope and speed are designed, so that
+    its voltage demand stays within the limit. Guarantee and cost are printed. The map must have objects for slope and
+    limit; cia402 and copley have them. Loops are checked with the rounded gains of the drive, or with gains of the
+    bandwidth in --drive-bandwidth-hz.
     """
     from pmsmtool.design.design_file import design_text
     from pmsmtool.machine.machine_file import load_machine_file

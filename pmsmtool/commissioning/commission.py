@@ -111,10 +111,10 @@ def due_stages(run: RunDirectory, record: RunRecord) -> tuple[str, ...]:
 
 NOTHING_GIVEN = (
     "write a machine file from a data sheet or a meter (`pmsmtool machine new`) and begin anew with it: `pmsmtool "
-    "commission MACHINE`; `pmsmtool caps` lists what this drive can give"
+    "commission MACHINE`; `pmsmtool caps` lists what this drive can measure"
 )
 NOTHING_TAKEN = (
-    "`pmsmtool caps` lists what this drive can give; `pmsmtool tune MACHINE -o design.toml` designs for the machine "
+    "`pmsmtool caps` lists what this drive can measure; `pmsmtool tune MACHINE -o design.toml` designs for the machine "
     "alone"
 )
 """Next steps after a run of which nothing was available: the same run gives the same again."""

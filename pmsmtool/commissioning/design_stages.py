@@ -118,7 +118,7 @@ def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
     ]
     files = ("lut.npz", "lut.csv", "design.toml", "params.toml")
     summary = f"{shape} cells, {made.stored}; torque to {torque:.4g} N m, speed to {table.y[-1]:.5g} rpm"
-    notes = made.notes if used else (*made.notes, "the table is for reading: this design finds its references itself")
+    notes = made.notes if used else (*made.notes, "the table is not used: the drive calculates the references")
     return _stage("lut", summary, criteria, values=values, files=files, fallbacks=notes)
 
 

@@ -54,7 +54,7 @@ UNSEEN = {
     "phases": "the drive shows no current of a single phase",
     "current sensors": "the drive shows no current of a single phase",
     "shaft": "what is wrong comes first",
-    "pole pairs": "the drive turns no vector: it takes no commutation angle (0x60EA)",
+    "pole pairs": "the drive cannot turn a current vector: it has no commutation angle (0x60EA)",
     "encoder sign": "what is wrong comes first",
 }
 FAULT_BY = "safe torque off or the enable input open, no DC link; a limit switch; then " + TURNED_BY

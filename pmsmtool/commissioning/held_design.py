@@ -74,8 +74,8 @@ def why_not_judged(design: Design) -> str:
     """Return why no loop of a design is judged; empty when one is."""
     if design.loops:
         return ""
-    drive = design.request.get("drive", "the drive")
-    return f"needs the gains of the current loops, which {drive!r} does not take; they stand in the design for reading"
+    drive = design.request.get("drive", "of the drive")
+    return f"the map {drive!r} has no object for the gains of the current loops; the design lists them"
 
 
 def _rated(design: Design, drive_map: DriveMap) -> dict[str, DesignValue]:

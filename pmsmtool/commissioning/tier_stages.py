@@ -53,7 +53,7 @@ NOT_SHOWN = (
     "; the guarantee of its limits bounds a voltage that it does not record (on a simulated node: `pmsmtool reproduce "
     "closed-drive`)"
 )
-FOR_READING = "the drive takes no table: it is for reading"
+FOR_READING = "the drive has no object for the table"
 Allow = Callable[[Sequence[str]], None]
 Say = Callable[[str], None]
 
@@ -114,7 +114,7 @@ class TierStages:
         rest = "what is measured"
         if known is not None:
             rest = f"{rest}, the rest {known[1]}" if self._measurable() else f"values {known[1]}"
-        design = f"on {rest}" if self._complete(known) else f"not available: {_machine_needed(NEEDED)}"
+        design = f"with {rest}" if self._complete(known) else f"not available: {_machine_needed(NEEDED)}"
         lines.append(f"tune, lut, margins: {design}")
         lacking = lacking_gains(drive_map.cells)[CURRENT_LOOPS]
         if not drive_map.staging and lacking and self.drive_bandwidth_hz is None and self._complete(known):
@@ -125,7 +125,7 @@ class TierStages:
             reason = why_no_limits(drive_map, self.drive_bandwidth_hz)
             lines.append(f"{LIMITS}: " + (f"not available: {reason}" if reason else "judged by what they guarantee"))
         flash = self._no_writing()
-        lines.append("flash, verify: " + (f"not available: {flash}" if flash else "what the map has an object for"))
+        lines.append("flash, verify: " + (f"not available: {flash}" if flash else "parameters that the map has"))
         proof = self._no_proof()
         lines.append("prove: " + (f"not available: {proof}" if proof else self._provable()))
         return lines

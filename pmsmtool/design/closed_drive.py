@@ -250,7 +250,7 @@ def _as_controlled(design: Design, drive: ClosedDrive) -> Design:
     elif drive.bandwidth_hz is not None:
         alpha = 2.0 * math.pi * drive.bandwidth_hz
         stated = (alpha * machine.L_d_h, alpha * machine.R_s_ohm, alpha * machine.L_q_h, alpha * machine.R_s_ohm)
-        how = f"{drive.name}: what its bandwidth of {drive.bandwidth_hz:.5g} Hz stands for, not written"
+        how = f"{drive.name}: from its bandwidth of {drive.bandwidth_hz:.5g} Hz, not written"
         gains = {name: DesignValue(value, how) for name, value in zip(CURRENT_GAINS, stated, strict=True)}
     else:
         raise ConfigError(
@@ -314,7 +314,7 @@ class _Projection:
             raise DesignInfeasible(
                 "without a magnet there is no torque at i_d = 0",
                 where="drive with fixed firmware",
-                hint="leave the limits out: a reluctance machine needs i_d, which such a drive does not take",
+                hint="leave the limits out: a reluctance machine needs i_d, which cannot be commanded on such a drive",
             )
         if machine.J_kgm2 is None and drive.acceleration_rpm_per_s is None:
             raise ConfigError(

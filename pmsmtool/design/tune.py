@@ -222,7 +222,7 @@ def _design_speed(
     if J is None:
         off = DesignValue(0.0, "off: the inertia J_kgm2 is not known", "")
         values |= {"speed.K_p_nms_per_rad": off, "speed.K_i_nm_per_rad": off}
-        return _Part(values, {}, {}, ("speed control is off: the machine file gives no inertia J_kgm2", *notes))
+        return _Part(values, {}, {}, ("speed control is off: the machine file has no inertia J_kgm2", *notes))
     path = SpeedPath(J, source.machine.B_nms or 0.0, current.loop("q"), decimation, pll, filter_hz, notch)
     gains = _speed_gains(request, path, current.alpha)
     found = margins(speed_loop(gains, path))

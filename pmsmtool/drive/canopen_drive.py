@@ -172,7 +172,7 @@ class CanopenDrive:
             raise NotAvailable(
                 f"the drive has no mode of operation{_mode_name(mode)} ({int(mode)})",
                 where=f"node {self.node.node}, 0x6060:00",
-                hint="`pmsmtool caps` lists what this drive can give",
+                hint="`pmsmtool caps` lists what this drive can measure",
             ) from abort
 
     # ---- measurements ---------------------------------------------------------------------------

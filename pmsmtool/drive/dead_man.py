@@ -191,7 +191,7 @@ def _set_consumer(drive: CanopenDrive) -> bool:
         if abort.code in ABSENT:
             return False
         raise _refused(
-            "the drive does not take a consumer heartbeat (0x1016): it would not notice that the tool died", drive
+            "the consumer heartbeat (0x1016) cannot be written: the drive would not notice that the tool failed", drive
         ) from abort
     return True
 
@@ -265,7 +265,7 @@ def _abort_option(drive: CanopenDrive) -> AbortConnection | None:
     except SdoAbort as abort:
         if abort.code in ABSENT and drive.commands_bounded_current:
             return None
-        raise _refused("the drive does not say what it does when the connection is lost (0x6007)", drive) from abort
+        raise _refused("the drive has no object for its reaction to a lost connection (0x6007)", drive) from abort
     if option not in _STOPPING:
         raise _refused(f"abort connection option code {option} does not stop the machine", drive)
     return AbortConnection(option)

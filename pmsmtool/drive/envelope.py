@@ -69,7 +69,7 @@ class Envelope:
         if self.acceleration_rad_s2 is None:
             gain = "the speed gained until then is not known (no inertia is given)"
         else:
-            gain = f"until then all torque would add {rpm_from_rad_s(self.acceleration_rad_s2 * OFF_S):.3g} rpm"
+            gain = f"until then full torque adds up to {rpm_from_rad_s(self.acceleration_rad_s2 * OFF_S):.3g} rpm"
         travel = "not limited" if math.isinf(self.travel_rad) else f"{math.degrees(self.travel_rad):.4g} deg (mech)"
         energy = "not limited" if math.isinf(self.energy_j) else f"{self.energy_j:.4g} J"
         return [
@@ -79,7 +79,7 @@ class Envelope:
             f"energy    {energy} in the winding",
             f"duration  at most {self.duration_s:.4g} s",
             f"failure   of the tool: voltage off after {OFF_S:g} s; {gain}",
-            "stop      voltage off, the shaft coasts; by the drive's ramp only once its speed loop has kept a speed",
+            "stop      voltage off, the shaft coasts; with the drive's ramp only after its speed loop held a speed",
             f"shaft     {self.shaft}: {_MAY[self.shaft]}; load {self.load}, brake {self.brake}",
         ]
 
@@ -95,7 +95,7 @@ class Envelope:
             raise SafetyRefusal(
                 "a gravity load falls when the torque is zero, and every stop ends at zero torque",
                 likely="--load gravity was given and the shaft is not locked",
-                hint="uncouple the load, or lock the shaft and say --shaft locked",
+                hint="uncouple the load, or lock the shaft and give --shaft locked",
             )
 
 

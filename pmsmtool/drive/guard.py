@@ -48,12 +48,12 @@ declared time, together 0.5 s."""
 LOCKED_TRAVEL_RAD = math.radians(20.0)
 """A clamp and its coupling give by a few degrees; a shaft that goes further is not locked."""
 _BUG = "this is a bug worth reporting"
-_TURNS = "the shaft turns, though it is said to be locked"
+_TURNS = "the shaft turns, but --shaft locked is given"
 _NEXT_STEP = {
     "current": "raise the limit knowingly (--i-max), or ask for less",
     "d current": "state i_d_min_apk in the machine file where the magnets stand more, or ask for less",
     "speed": "raise the limit knowingly (--speed-max), or ask for less",
-    "travel": "clamp the shaft, or say --shaft free where it may turn",
+    "travel": "clamp the shaft, or give --shaft free where it may turn",
 }
 OVERSHOOT = 1.25
 """Measured current or speed over its limit that ends an experiment: regulation overshoots, noise peaks."""
@@ -236,7 +236,7 @@ class GuardedDrive:
         if held != data:
             raise SafetyRefusal(
                 f"the drive holds {held.hex(' ')}, not the {data.hex(' ')} that was written", where=where,
-                likely="the drive limits the gain, or takes it at another occasion",
+                likely="the drive limits the gain, or activates it later",
                 hint="nothing is learned from this gain; it was restored",
             )  # fmt: skip
 
@@ -361,9 +361,9 @@ class GuardedDrive:
     def _refuse_turning(self) -> None:
         if self.envelope.shaft == "locked":
             raise SafetyRefusal(
-                "a speed is asked for, and the shaft is said to be locked",
+                "a speed is commanded, but --shaft locked is given",
                 where=f"node {self._node.node}",
-                hint="unlock the shaft and say --shaft free or coupled",
+                hint="unlock the shaft and give --shaft free or coupled",
             )
 
     def _is_watched(self) -> bool:

@@ -140,7 +140,7 @@ def rated_apk(node: DriveNode) -> float:
     if own is None or found is None:
         raise NotAvailable(
             f"the drive does not say {NO_RATED}", where=f"node {node.node}",
-            hint="`pmsmtool caps` lists what this drive can give",
+            hint="`pmsmtool caps` lists what this drive can measure",
         )  # fmt: skip
     return own.per_count * found
 
@@ -195,7 +195,7 @@ def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
     if own is not None and held(node, own.item) is not None:
         return TorqueTarget(own, node.map.motion["target_current"].mode)
     raise NotAvailable(
-        f"the drive has no torque mode that this program knows (0x6502 = {modes:#x})", where=f"node {node.node}"
+        f"the drive has no torque mode that pmsmtool supports (0x6502 = {modes:#x})", where=f"node {node.node}"
     )
 
 
@@ -259,7 +259,7 @@ def position_units(node: DriveNode) -> float:
         return sign * feed / max(1.0, held(node, FEED_TURNS) or 1.0) / gear
     if gear != 1.0:
         raise NotAvailable(
-            f"a gear of {gear:.4g} is set (0x6091), and nothing says whether position is of the motor or behind it",
+            f"a gear of {gear:.4g} is set (0x6091), and the position may be of the motor or behind it",
             where=f"node {node.node}, 0x6091", hint="set it to 1:1, or the feed (0x6092), with the maker's software",
         )  # fmt: skip
     counts = held(node, ENCODER_COUNTS)

@@ -99,7 +99,7 @@ def _refuse_no_limit(node: DriveNode, rated: float, i_max: float) -> None:
             f"at most {RATED_RATIO:g} times that, {largest:.4g} A, counts as a limit; nothing was energised",
             where=f"node {node.node}, 0x6075:00",
             likely="a wrong digit or unit in --i-max, or the drive holds the rated current of a much smaller motor",
-            hint="give --i-max what the motor stands, or write the motor's rated current to 0x6075 first",
+            hint="give --i-max within what the motor can carry, or write the motor's rated current to 0x6075 first",
         )
 
 

@@ -108,7 +108,7 @@ class DriveParameters:
         if (schema, signature) != (SCHEMA_VERSION, layout_signature()):
             raise NotAvailable(
                 f"the drive's parameter set has schema {schema}, signature {signature:#010x}; "
-                f"this program knows schema {SCHEMA_VERSION}, signature {layout_signature():#010x}",
+                f"pmsmtool supports schema {SCHEMA_VERSION}, signature {layout_signature():#010x}",
                 where=f"node {self.node.node}, 0x2000:02",
                 likely="firmware and tool are of different versions",
                 hint="update the older of the two",

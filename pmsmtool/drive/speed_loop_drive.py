@@ -104,7 +104,7 @@ class SpeedLoopDrive(TorqueDrive):
         if not offered or held(self.node, objects.TARGET_VELOCITY_MRPM) is None:
             raise NotAvailable(
                 f"the drive has no velocity mode (0x6502 = {modes:#x}, 0x60FF)", where=f"node {node_id}",
-                hint="`pmsmtool caps` lists what this drive can give",
+                hint="`pmsmtool caps` lists what this drive can measure",
             )  # fmt: skip
         self.mode = offered[0]
         self.rad_s_per_count = LARGEST_COUNT

@@ -134,7 +134,7 @@ class StandardDrive(CanopenDrive):
     def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
         """Hold a current vector at a fixed electrical angle: torque current behind a commutation angle."""
         if fixed_angle_rad is None and (i_d_a or i_q_a):
-            raise NotAvailable("the drive takes no current in the rotor's frame", where=f"node {self.node.node}")
+            raise NotAvailable("the drive has no d and q current set-points", where=f"node {self.node.node}")
         length = math.hypot(i_d_a, i_q_a)
         if fixed_angle_rad is not None:
             angle = fixed_angle_rad + math.atan2(i_q_a, i_d_a) - QUARTER_TURN
@@ -203,7 +203,7 @@ class TorqueCurrent(CanopenDrive):
     def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
         """Ask for the torque of a q current."""
         if i_d_a or fixed_angle_rad is not None:
-            raise NotAvailable("the drive takes no current set-point, only torque", where=f"node {self.node.node}")
+            raise NotAvailable("the drive has no current set-point, only torque", where=f"node {self.node.node}")
         steps = 1
         if self.target.cyclic:  # taken at once: ramped here
             steps = max(1, math.ceil(abs(i_q_a - self._asked_a) / (MOST_STEP * self._rated_apk)))

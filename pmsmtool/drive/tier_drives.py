@@ -132,7 +132,7 @@ class SpeedPushDrive(TorqueDrive):
     def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
         """Let the drive push with a q current towards the top speed."""
         if i_d_a or fixed_angle_rad is not None:
-            raise NotAvailable("the drive takes no current set-point, only a limit", where=f"node {self.node.node}")
+            raise NotAvailable("the drive has no current set-point, only a limit", where=f"node {self.node.node}")
         limit, speed = self.push.limit, self.push.speed
         self.node.put(limit.item, 0)
         self.node.put(speed.item, math.floor(self.top_rad_s / speed.per_count) * _sign(i_q_a) if i_q_a else 0)

@@ -183,7 +183,7 @@ class VendorDrive(StandardDrive):
     def _check_answer(self, step: VendorStep, answer: bytes) -> None:
         if answer[0] not in (FAILED, FAILED_WITH_CODE):
             return
-        text = "it says no reason"
+        text = "no reason is given"
         if answer[0] == FAILED_WITH_CODE:
             code = answer[DATA_AT]
             known = step.failures.get(code) or self.tuning.failures.get(code)

@@ -128,7 +128,7 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
     ),
     (
         "E_POLE_PAIRS",
-        "the number of pole pairs does not come out as an integer",
+        "the measured number of pole pairs is not an integer",
         "the rotor slips or is loaded, or the encoder resolution is set wrongly",
         "free the shaft, raise the current (--i-max), check the increments per turn",
     ),

@@ -41,7 +41,7 @@ def hold_at_half_frequency(drive: Drive, plan: LevelPlan) -> Trace:
     except (NotAvailable, ConfigError, DriveFault, SdoAbort) as refusal:
         drive.enable()
         raise NotAvailable(
-            "the drive does not take half its control frequency",
+            "half of the control frequency cannot be set on this drive",
             likely=str(refusal).splitlines()[0],
             hint="identify without --half-frequency",
         ) from refusal

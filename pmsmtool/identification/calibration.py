@@ -113,7 +113,7 @@ def calibrated_traces(traces: Mapping[str, Trace], tolerance: SensorTolerance) -
     """
     if tolerance.bridge_difference_v is not None and math.isinf(tolerance.U_dc_v):
         raise NotAvailable(
-            "the thresholds of the bridge act on a DC link that this run does not know",
+            "the thresholds of the bridge act on a DC link that this run did not record",
             likely="a recorder, whose traces hold voltages and no DC link",
             hint=f"leave --cal {BRIDGE} out",
         )

@@ -231,7 +231,7 @@ def integral_scale(
     if chi_squares[second] - chi_squares[best] < APART:
         return unknown(f"the forms {best!r} and {second!r} cannot be separated")
     if best not in UNITS:
-        return unknown(f"its form is {best!r}, which a drive map cannot say")
+        return unknown(f"its form is {best!r}, which a drive map cannot describe")
     relative = best != "value"
     observed = (base[0], gain_changed, integral_changed[0], base[1])  # the smallest K_i is known least
     logs = []

@@ -90,7 +90,7 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
     """Return what a reader should know about a result that was accepted all the same."""
     lines = []
     if request.half_frequency and evaluation.split is None:
-        lines.append("R_s is from one control frequency: the drive does not take half of it")
+        lines.append("R_s is from one control frequency: half of it cannot be set on this drive")
     if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
         lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
     if evaluation.mismatch is not None and evaluation.mismatch.corrected:
@@ -188,7 +188,7 @@ def _accepted(name: str, estimate: Estimate, needs: Sequence[Need]) -> Acceptanc
     binding = min(needs, key=lambda need: need.reserve)
     return Acceptance(
         what,
-        f"{width}, over it {binding.what} {_number(binding.worst, binding.unit)}",
+        f"{width}, least within it: {binding.what} {_number(binding.worst, binding.unit)}",
         _number(binding.least, binding.unit),
         all(need.ok for need in needs),
     )

@@ -299,7 +299,7 @@ class Capabilities:
             if candidate in MEASURING and all(self.row(name, candidate).available for name in quantities):
                 return candidate
         raise NotAvailable(
-            "\n  - ".join(["this drive cannot give what was asked", *self._reasons(quantities, method)]),
+            "\n  - ".join(["this drive cannot measure what was asked for", *self._reasons(quantities, method)]),
             where=f"node {self.identity.node}",
             hint="`pmsmtool caps` lists what it can; `pmsmtool machine new` takes numbers of a datasheet or a meter",
         )

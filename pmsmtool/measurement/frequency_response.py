@@ -27,7 +27,7 @@ EMF_SHARE = 0.6
 ABORT_SHARE = 0.95
 REST_S = 0.5
 """Time at zero speed before the voltage is removed."""
-PLAN_LINE = "the shaft turns steadily while a random torque shakes it"
+PLAN_LINE = "the shaft turns at a constant speed with a random torque added"
 
 
 def measure_frequency_response(

@@ -39,7 +39,7 @@ def measure_at_half_frequency(
     if not asked:
         if resistance.hardness > HARD_RATIO:
             say(
-                f"  one control frequency: not asked for half of it; dead time and devices take "
+                f"  one control frequency (no --half-frequency); dead time and devices drop "
                 f"{resistance.hardness:.1f} R I here, --half-frequency halves the statistical interval of R"
             )
         return

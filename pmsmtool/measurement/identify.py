@@ -83,7 +83,7 @@ def nameplate_of(drive: Drive, name: str) -> MachineFile:
         inverter,
         encoder=EncoderParameters(),
         limits=limits,
-        provenance={"source": "parameter set and ratings of the drive; what was identified stands in [estimate]"},
+        provenance={"source": "parameter set and ratings of the drive; the measured values are in [estimate]"},
     )
 
 

@@ -139,9 +139,9 @@ def refuse_unsafe(node: DriveNode, envelope: Envelope) -> None:
     """
     if envelope.shaft != "free" or envelope.load != "none":
         raise SafetyRefusal(
-            f"gains are changed only with a free shaft and no load; said are shaft {envelope.shaft}, load "
+            f"gains are changed only with a free shaft and no load; given are shaft {envelope.shaft}, load "
             f"{envelope.load}",
-            where=f"node {node.node}", hint="uncouple the machine, then say --shaft free",
+            where=f"node {node.node}", hint="uncouple the machine, then give --shaft free",
         )  # fmt: skip
     for sub in (1, 2, 3):
         word = held(node, DriveObject(0x1010, sub, "I"))

@@ -172,7 +172,7 @@ def _steps(own: VendorDrive, request: IdentifyRequest) -> tuple[VendorStep, ...]
     if request.brake == "drive" and any(step.turns for step in steps):
         raise NotAvailable(
             "the drive's own identification must turn the shaft, and in its mode the drive may leave its brake closed",
-            hint="open the brake otherwise and say --brake open, or ask for less",
+            hint="open the brake otherwise and give --brake open, or reduce the torque",
         )
     return steps
 

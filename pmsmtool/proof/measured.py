@@ -159,7 +159,7 @@ def _why_not(state: Mapping[str, float], limited: bool, design: Design, conditio
         return "the torque at the current limit does not suffice: something brakes the shaft"
     if used_up:
         return "the voltage is too low: none is left at this speed"
-    return "the drive asks for no more current: a speed or torque limit of its own"
+    return "the drive commands no more current: a speed or torque limit of its own"
 
 
 def _approach(drive: Drive, speed_rad_s: float, pole_pairs: int) -> None:

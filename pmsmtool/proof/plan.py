@@ -214,7 +214,7 @@ class _Sizes:
         I_nom = design["motor.I_nom_apk"]
         if I_nom <= 0.0:
             raise ConfigError(
-                "the design gives no rated current",
+                "the design has no rated current",
                 where="motor.I_nom_apk",
                 hint="give I_nom_apk in the machine file, then tune again",
             )

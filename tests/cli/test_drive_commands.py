@@ -369,7 +369,7 @@ def test_jog_current(tool: Tool) -> None:
         (("--current", "2Apk"), 7, "at most 2 Apk"),
         (("--current", "50Apk", "--yes"), 5, "the machine's largest"),
         (("--speed", "9000rpm", "--yes"), 5, "the machine's largest"),
-        (("--speed", "100rpm", "--shaft", "locked", "--yes"), 5, "said to be locked"),
+        (("--speed", "100rpm", "--shaft", "locked", "--yes"), 5, "--shaft locked is given"),
         (("--current", "2Apk", "--i-max", "0Apk", "--yes"), 2, "above zero"),
         (("--current", "2Apk", "--for", "0s", "--yes"), 2, "above zero"),
         (("--current", "2Apk", "--load", "gravity", "--yes"), 5, "gravity"),

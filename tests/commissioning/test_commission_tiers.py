@@ -344,7 +344,7 @@ def test_the_plan_of_a_drive_that_takes_nothing_promises_no_loop(
     outcome = CliRunner().invoke(cli, [*bus, "commission", str(PROFILE), "--yes"])
     assert isinstance(outcome.exception, Partial), "what it can give: a table for reading"
     plan = outcome.stderr.splitlines()
-    assert "lut: on values as given; the drive takes no table: it is for reading" in plan
+    assert "lut: on values as given; the drive has no object for the table" in plan
     assert any(line.startswith("tune, margins: not available: needs the gains of the current loops") for line in plan)
 
 
@@ -364,7 +364,7 @@ def test_what_a_drive_lacks_is_said_before_a_consent_and_leads_on(
     outcome = CliRunner().invoke(cli, [*bus, "commission", str(PROFILE), "--yes", "--json"])
     assert isinstance(outcome.exception, Partial) and json.loads(outcome.stdout)["verdict"] == "PARTIAL"
     stages = {stage["name"]: stage for stage in json.loads(outcome.stdout)["stages"]}
-    assert stages["tune"]["status"] == "not available" and "'elmo' does not take" in stages["tune"]["note"]
+    assert stages["tune"]["status"] == "not available" and "the map 'elmo' has no object" in stages["tune"]["note"]
     assert all(stage["note"] for stage in stages.values() if stage["status"] == "not available")
 
 

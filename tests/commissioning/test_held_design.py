@@ -118,7 +118,7 @@ def test_margins_of_a_drive_that_takes_no_gains_are_not_available(
     design = held_design(designed(), load_family("faulhaber"))
     (tmp_path / "d.toml").write_text(design_text(design), encoding="utf-8")
     code, out, error = run("margins", "d.toml")
-    assert isinstance(error, NotAvailable) and "'faulhaber' does not take" in str(error)
+    assert isinstance(error, NotAvailable) and "the map 'faulhaber' has no object" in str(error)
     assert "current_d_phase" not in out and "headroom_voltage" in out
     code, out, error = run("margins", "d.toml", "--thermal-headroom", "-1")
     assert code == 0, "what is asked of the headroom is judged"

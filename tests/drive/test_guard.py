@@ -94,7 +94,7 @@ def test_envelope_reaches_the_drive_itself(bench: SimBench) -> None:
 
 def test_a_shaft_said_to_be_locked_is_not_turned(bench: SimBench) -> None:
     locked = replace(ENVELOPE, shaft="locked")
-    with pytest.raises(SafetyRefusal, match="said to be locked"), guarded(bench.drive, locked) as guard:
+    with pytest.raises(SafetyRefusal, match="--shaft locked is given"), guarded(bench.drive, locked) as guard:
         guard.enable()
         guard.command_speed(5.0)
     assert bench.drive.node.state() is State.SWITCH_ON_DISABLED
@@ -108,7 +108,7 @@ def test_a_shaft_that_turns_though_said_to_be_locked_is_stopped(bench: SimBench)
             guard.command_current(2.0, 0.0, fixed_angle_rad=float(angle))
             guard.wait(0.05)
     assert bench.drive.node.state() is State.SWITCH_ON_DISABLED
-    assert "said to be locked" in caught.value.likely and "clamp the shaft" in caught.value.hint
+    assert "--shaft locked is given" in caught.value.likely and "clamp the shaft" in caught.value.hint
 
 
 @pytest.mark.parametrize("moment", range(INTERRUPTIONS))

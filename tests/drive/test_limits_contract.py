@@ -262,7 +262,7 @@ def test_a_locked_shaft_that_turns(rig: Rig) -> None:
         rig, replace(ENVELOPE, shaft="locked"), lambda guard: rig.show_angle(at + BEYOND * LOCKED_TRAVEL_RAD),
         "travel", WATCH_S + STOP_S, allowed=lambda guard: rig.show_angle(at + WITHIN * LOCKED_TRAVEL_RAD),
     )  # fmt: skip
-    assert isinstance(error, PmsmtoolError) and "said to be locked" in error.likely
+    assert isinstance(error, PmsmtoolError) and "--shaft locked is given" in error.likely
 
 
 def test_over_current(rig: Rig) -> None:

@@ -126,5 +126,5 @@ def test_an_instrument_scales_what_a_recorder_told(tmp_path: Path) -> None:
     assert scaled["psi_f_wb"]["value"] / plain["psi_f_wb"]["value"] == pytest.approx(0.99, rel=1e-3)
     assert scaled["R_s_ohm"]["value"] / plain["R_s_ohm"]["value"] == pytest.approx(0.99 / 1.01, rel=1e-3)
     assert scaled["psi_f_wb"]["systematic"] < 0.8 * plain["psi_f_wb"]["systematic"]
-    with pytest.raises(NotAvailable, match="does not know"):
+    with pytest.raises(NotAvailable, match="did not record"):
         replay(run, None, ["bridge=1V:1.2V:0.2V"])

@@ -107,7 +107,7 @@ def test_a_hard_drive_gets_half_the_interval_and_its_inverter_in_two_parts(seed:
     plan = LevelPlan([1.0], turn_a=1.0)
     with Connection(PmsmSimBus(CHANNEL)) as connection:
         measure_at_half_frequency(CanopenDrive(connection, 1), plan, once, False, traces.__setitem__, told.append)
-    assert len(told) == 1 and "not asked for" in told[0] and TRACE not in traces
+    assert len(told) == 1 and "no --half-frequency" in told[0] and TRACE not in traces
 
     text = (run.path / MACHINE).read_bytes()
     (run.path / MACHINE).unlink()
@@ -205,7 +205,7 @@ def test_a_drive_that_refuses_the_period_is_identified_at_its_own_and_says_so(
         drive.close()
     assert stage.status == "pass"
     assert any("not used" in line and "the period is fixed" in line for line in said)
-    assert "the drive does not take half of it" in stage.note
+    assert "half of it cannot be set" in stage.note
     assert TRACE not in stored_traces(run)
     assert "two control" not in load_machine_file(run.path / MACHINE).estimates["R_s_ohm"].method
 

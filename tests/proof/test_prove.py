@@ -265,7 +265,7 @@ def test_a_speed_that_is_not_reached_is_named(design: Design, monkeypatch: pytes
         ({"i_d_a": -1.0, "i_q_a": 4.9}, True, "torque at the current limit does not suffice"),
         ({"u_q_lim_v": 311.0}, False, "the voltage is too low: none is left"),
         ({"U_dc_v": 480.0}, True, "the DC link falls to 480 V, at rest it shows 540 V"),
-        ({}, False, "asks for no more current"),
+        ({}, False, "commands no more current"),
     ],
 )
 def test_what_the_drive_shows_tells_why_a_speed_is_not_reached(

@@ -166,7 +166,7 @@ def design_table(
     problem = _Problem(machine, source, rated, request, voltage_margin)
     y, notes = problem.second_axis()
     if loss_map is not known:
-        notes = (*notes, "a flux table knows no speed: least copper loss, the iron-loss map is left out")
+        notes = (*notes, "a flux table has no speed axis: least copper loss, the iron-loss map is left out")
     torque = problem.largest_torque()
     if request.torque_points is not None and request.y_points is not None:
         x = np.linspace(-torque, torque, request.torque_points)
@@ -297,7 +297,7 @@ class _Problem:
         unused = np.maximum(real.largest_nm - without.largest_nm, without.least_nm - real.least_nm)
         lost = max(float(np.nanmax(unused, initial=0.0)), 0.0)
         return (
-            f"a flux table knows no resistance: at {V:.4g} V its points need up to {over:.3g} V "
+            f"a flux table contains no resistance: at {V:.4g} V its points need up to {over:.3g} V "
             f"({100.0 * over / V:.2g} %) more than the limit and leave up to {lost:.3g} N m unused; "
             "a table over speed does neither: prefer it",
         )

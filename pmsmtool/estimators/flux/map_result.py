@@ -287,7 +287,7 @@ def _supported(
         f"only {100 * covered:.0f} % of the current plane up to {RADII[-1] * i_max:.3g} A is covered by data, "
         f"{100 * COVERED_SHARE:g} % needed",
         stage=STAGE,
-        likely="pulses that did not reach their currents, or a held rotor whose encoder offset the drive does not know",
+        likely="pulses that did not reach their currents, or a held rotor with an unknown encoder offset in the drive",
     )
 
 
