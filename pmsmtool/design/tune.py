@@ -29,7 +29,7 @@ from pmsmtool.design.loops.speed_loop import (
     symmetric_optimum,
     symmetric_ratio,
 )
-from pmsmtool.design.ratings import Ratings, rating_values, ratings
+from pmsmtool.design.ratings import Ratings, rating_values, ratings, reaction_of
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
@@ -77,13 +77,16 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
     rated = ratings(source, (1.0 - request.voltage_margin) * source.inverter.V_max_v)
     values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}
     values |= rating_values(source, rated)
+    reaction = reaction_of(source, rated, values)
+    told = (reaction.note,) if reaction.note else ()
+    generation = {} if math.isinf(reaction.generation_rpm) else {"generation_rpm": reaction.generation_rpm}
     choice = choose_current(source, request, rated.I_max_apk)
     weakening = design_field_weakening(source, rated, _weakening_mode(source, request), request.voltage_margin)
     parts = [
         _design_current(choice),
         _design_speed(source, request, rated, choice, weakening.ramp_limit_rpm_per_s),
         _design_governor(source, request, rated, choice),
-        _Part(dict(weakening.values), {}, dict(weakening.facts), ()),
+        _Part(dict(weakening.values), {}, {**generation, **weakening.facts}, told),
     ]
     tables: dict[str, tuple[float, ...]] = {}
     if weakening.values["field_weakening.mode"].value == FIELD_WEAKENING["lookup"]:

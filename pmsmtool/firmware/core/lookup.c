@@ -2,6 +2,8 @@
 /* Currents of a torque from the tables behind the parameters: linear in each axis, clamped at the ends. */
 #include "pmsm_period.h"
 
+#define CURRENT_MOST PMSM_C(1e6) /* A, in a cell; NaN marks one without an operating point */
+
 typedef struct {
     uint32_t index;    /* left node of the cell */
     pmsm_real weight;  /* of the right node */
@@ -48,7 +50,8 @@ static axis_place find(const uint32_t *axis, uint32_t count, pmsm_real x, uint32
     }
     const pmsm_real left = node_at(axis, low);
     place.index = low;
-    place.weight = (x - left) / (node_at(axis, high) - left);
+    const pmsm_real weight = (x - left) / (node_at(axis, high) - left);
+    place.weight = (weight >= PMSM_C(0.0) && weight <= PMSM_C(1.0)) ? weight : PMSM_C(0.0); /* axis destroyed */
     return place;
 }
 
@@ -80,7 +83,7 @@ static void add_corner(corner_sum *sum, const uint32_t *tables, uint32_t stride,
     }
     const pmsm_real i_d = entry(tables, cell, params);
     const pmsm_real i_q = entry(tables + stride, cell, params);
-    if (i_d != i_d || i_q != i_q) {
+    if (!(pmsm_abs(i_d) + pmsm_abs(i_q) <= CURRENT_MOST)) { /* nor a number, nor one of a current */
         sum->hole = 1u;
         return;
     }
