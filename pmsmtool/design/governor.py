@@ -160,8 +160,8 @@ def design_governor(
     found = horizon(model, omega, V_max, chosen) if predicts else None
     listed = {f"k_max_eps_{e:g}": _fact(horizon(model, omega, V_max, e)) for e in EPS_LISTED if predicts}
     observer = 0.0 if source.flux_map is not None else min(1.0, source.inverter.T_s / OBSERVER_TIME_S)
-    steers = source.flux_map is None and saliency(source) <= STEERED_SALIENCY
-    options, how = _options(mode, predictor, steers)
+    apart = _not_steered(source, predictor)
+    options, how = _options(mode, predictor, apart)
     values = {
         "governor.mode": DesignValue(MODES[mode], f"{mode}, as asked for"),
         "governor.k_max": _k_max(found),
@@ -228,7 +228,16 @@ def saliency(source: MachineFile) -> float:
     return max(pair) / min(pair)
 
 
-def _options(mode: str, predictor: bool, steers: bool) -> tuple[int, str]:
+def _not_steered(source: MachineFile, predictor: bool) -> str:
+    """Return why the flux is not steered along the minimum-time direction; empty when it is."""
+    if source.flux_map is not None or saliency(source) > STEERED_SALIENCY:
+        return "on the way the reluctance torque would overshoot"
+    if source.inverter.delay_periods >= 1.0 and not predictor:  # 43 of 80 unreachable steps: up to 1.27 I_max
+        return "without the predictor it passes the current limit during the delay"
+    return ""
+
+
+def _options(mode: str, predictor: bool, apart: str) -> tuple[int, str]:
     parts: dict[str, tuple[tuple[int, str], ...]] = {
         "off": (),
         "paper": (),
@@ -238,15 +247,15 @@ def _options(mode: str, predictor: bool, steers: bool) -> tuple[int, str]:
         "best": (
             (CURRENT_ROW, "current row"),
             (PRE_PROJECTION, "pre-projection"),
-            *(((MINIMUM_TIME, "minimum-time direction"),) if steers else ()),
+            *(((MINIMUM_TIME, "minimum-time direction"),) if not apart else ()),
         ),
     }
     chosen = parts[mode]
     bits = sum(bit for bit, _ in chosen) | (PREDICTOR if predictor and mode != "off" else 0)
     names = [name for _, name in chosen] + (["predictor"] if bits & PREDICTOR else [])
     how = ", ".join(names) or "none"
-    if mode == "best" and not steers:
-        how += "; no minimum-time direction: on the way the reluctance torque would overshoot"
+    if mode == "best" and apart:
+        how += f"; no minimum-time direction: {apart}"
     return bits, how
 
 
