@@ -19,6 +19,7 @@ from pmsmtool.design.design_file import DesignValue, Scalar
 from pmsmtool.design.lookup.table import RPM
 from pmsmtool.design.loops.current_loop import CurrentGains
 from pmsmtool.design.ratings import Ratings
+from pmsmtool.design.slope_response import matrix_exponential
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import K_MAX_NOT_DETERMINED
@@ -90,8 +91,8 @@ def euler_error(model: PredictionModel, omega_e: float, V_max: float, I_a: float
     emf = np.array([0.0, -omega_e * model.psi_f / L[1]])
     joint = np.zeros((5, 5))
     joint[:2, :2], joint[:2, 2:4], joint[:2, 4], joint[2:4, 2:4] = F, np.diag(1.0 / L), emf, turn
-    exact = _exponential(T * joint)
-    back = _exponential(-0.5 * T * turn)
+    exact = matrix_exponential(T * joint)
+    back = matrix_exponential(-0.5 * T * turn)
     angle = 2.0 * math.pi * np.arange(EULER_ANGLES) / EULER_ANGLES
     circle = np.array([np.cos(angle), np.sin(angle)])
     i, u = I_a * circle[:, :, None], V_max * circle[:, None, :]
@@ -101,19 +102,6 @@ def euler_error(model: PredictionModel, omega_e: float, V_max: float, I_a: float
     euler = i + T * (np.einsum("ab,bjk->ajk", F, i) + u / L[:, None, None] + emf[:, None, None])
     K_p = np.array([model.gains_d.K_p, model.gains_q.K_p])[:, None, None]
     return float(np.sqrt((((after - euler) * K_p) ** 2).sum(axis=0)).max() / V_max)
-
-
-def _exponential(matrix: Array) -> Array:
-    """Matrix exponential by scaling and Taylor's series (the norm is that of one control period)."""
-    halvings = max(0, math.ceil(math.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300))) + 4)
-    small = matrix / 2.0**halvings
-    term, total = np.eye(len(matrix)), np.eye(len(matrix))
-    for k in range(1, 16):
-        term = term @ small / k
-        total = total + term
-    for _ in range(halvings):
-        total = total @ total
-    return total
 
 
 def design_governor(

@@ -10,6 +10,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from pmsmtool.design.design_file import DesignValue
 from pmsmtool.design.lookup.table import RPM, torque_limits
 from pmsmtool.design.operating_machine import at_temperature
@@ -23,6 +25,9 @@ from pmsmtool.params.catalogue import BY_NAME
 
 TRIP_CURRENT_RATIO = 1.5
 """Trip over I_max: room for the overshoot of a current step under 40 % too little inductance, and for noise."""
+
+SAG_SHARE = 0.7
+"""Share of its voltage to which the DC link may sag: what that costs is said, and a table reaches as far."""
 
 TRIP_SPEED_RATIO = 1.2
 """Overspeed trip over the largest speed."""
@@ -224,6 +229,17 @@ def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
     }
     reaction = reaction_of(source, rated, found)
     return found | {"protection.n_short_circuit_rpm": DesignValue(reaction.short_from_rpm, reaction.how)}
+
+
+def sag_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict[str, float]:
+    """Return the share of the largest torque that a sagged link leaves, at base speed and at the largest speed."""
+    plane, facts = at_temperature(source.machine, source.flux_map), {}
+    for where, rpm in (("base_speed", rated.base_speed_rpm), ("n_max", rated.n_max_rpm)):
+        V = [SAG_SHARE * V_limit_v, V_limit_v]
+        found = torque_limits(plane, [rpm / RPM * plane.pole_pairs], V, rated.I_max_apk, rated.i_d_min_a)
+        sagged, full = (float(x) for x in np.nan_to_num(found.largest_nm[0]))
+        facts[f"sag_torque_share_{where}"] = max(sagged, 0.0) / full if full > 0.0 else 0.0
+    return facts
 
 
 def reaction_of(source: MachineFile, rated: Ratings, values: Mapping[str, DesignValue]) -> FaultReaction:

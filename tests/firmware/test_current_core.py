@@ -126,6 +126,7 @@ def test_lookup_equals_the_twin_in_both_formats(kind: int, n_z: int, holes: bool
             loop.binding.library.pmsm_step(loop.state, loop.params, loop.lut, m, loop.reference, loop.output)
             twin.flags = 0
             i = twin.torque_to_current(f(tau), f(omega) / f(4), f(omega), f(U_dc))
+            twin.held_q = i[1]
             live = loop.state.live
             assert bits(live.i_d_req, live.i_q_req) == bits(*i), k
             assert live.flags & (FLAG_CURRENT | FLAG_EDGE | FLAG_NO_POINT) == twin.flags, k
