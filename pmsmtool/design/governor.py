@@ -19,6 +19,7 @@ from pmsmtool.design.design_file import DesignValue, Scalar
 from pmsmtool.design.lookup.table import RPM
 from pmsmtool.design.loops.current_loop import CurrentGains
 from pmsmtool.design.ratings import Ratings
+from pmsmtool.design.slope_response import matrix_exponential
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import K_MAX_NOT_DETERMINED
@@ -90,8 +91,8 @@ def euler_error(model: PredictionModel, omega_e: float, V_max: float, I_a: float
     emf = np.array([0.0, -omega_e * model.psi_f / L[1]])
     joint = np.zeros((5, 5))
     joint[:2, :2], joint[:2, 2:4], joint[:2, 4], joint[2:4, 2:4] = F, np.diag(1.0 / L), emf, turn
-    exact = _exponential(T * joint)
-    back = _exponential(-0.5 * T * turn)
+    exact = matrix_exponential(T * joint)
+    back = matrix_exponential(-0.5 * T * turn)
     angle = 2.0 * math.pi * np.arange(EULER_ANGLES) / EULER_ANGLES
     circle = np.array([np.cos(angle), np.sin(angle)])
     i, u = I_a * circle[:, :, None], V_max * circle[:, None, :]
@@ -101,19 +102,6 @@ def euler_error(model: PredictionModel, omega_e: float, V_max: float, I_a: float
     euler = i + T * (np.einsum("ab,bjk->ajk", F, i) + u / L[:, None, None] + emf[:, None, None])
     K_p = np.array([model.gains_d.K_p, model.gains_q.K_p])[:, None, None]
     return float(np.sqrt((((after - euler) * K_p) ** 2).sum(axis=0)).max() / V_max)
-
-
-def _exponential(matrix: Array) -> Array:
-    """Matrix exponential by scaling and Taylor's series (the norm is that of one control period)."""
-    halvings = max(0, math.ceil(math.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300))) + 4)
-    small = matrix / 2.0**halvings
-    term, total = np.eye(len(matrix)), np.eye(len(matrix))
-    for k in range(1, 16):
-        term = term @ small / k
-        total = total + term
-    for _ in range(halvings):
-        total = total @ total
-    return total
 
 
 def design_governor(
@@ -160,8 +148,8 @@ def design_governor(
     found = horizon(model, omega, V_max, chosen) if predicts else None
     listed = {f"k_max_eps_{e:g}": _fact(horizon(model, omega, V_max, e)) for e in EPS_LISTED if predicts}
     observer = 0.0 if source.flux_map is not None else min(1.0, source.inverter.T_s / OBSERVER_TIME_S)
-    steers = source.flux_map is None and saliency(source) <= STEERED_SALIENCY
-    options, how = _options(mode, predictor, steers)
+    apart = _not_steered(source, predictor)
+    options, how = _options(mode, predictor, apart)
     values = {
         "governor.mode": DesignValue(MODES[mode], f"{mode}, as asked for"),
         "governor.k_max": _k_max(found),
@@ -228,7 +216,16 @@ def saliency(source: MachineFile) -> float:
     return max(pair) / min(pair)
 
 
-def _options(mode: str, predictor: bool, steers: bool) -> tuple[int, str]:
+def _not_steered(source: MachineFile, predictor: bool) -> str:
+    """Return why the flux is not steered along the minimum-time direction; empty when it is."""
+    if source.flux_map is not None or saliency(source) > STEERED_SALIENCY:
+        return "on the way the reluctance torque would overshoot"
+    if source.inverter.delay_periods >= 1.0 and not predictor:  # 43 of 80 unreachable steps: up to 1.27 I_max
+        return "without the predictor it passes the current limit during the delay"
+    return ""
+
+
+def _options(mode: str, predictor: bool, apart: str) -> tuple[int, str]:
     parts: dict[str, tuple[tuple[int, str], ...]] = {
         "off": (),
         "paper": (),
@@ -238,15 +235,15 @@ def _options(mode: str, predictor: bool, steers: bool) -> tuple[int, str]:
         "best": (
             (CURRENT_ROW, "current row"),
             (PRE_PROJECTION, "pre-projection"),
-            *(((MINIMUM_TIME, "minimum-time direction"),) if steers else ()),
+            *(((MINIMUM_TIME, "minimum-time direction"),) if not apart else ()),
         ),
     }
     chosen = parts[mode]
     bits = sum(bit for bit, _ in chosen) | (PREDICTOR if predictor and mode != "off" else 0)
     names = [name for _, name in chosen] + (["predictor"] if bits & PREDICTOR else [])
     how = ", ".join(names) or "none"
-    if mode == "best" and not steers:
-        how += "; no minimum-time direction: on the way the reluctance torque would overshoot"
+    if mode == "best" and apart:
+        how += f"; no minimum-time direction: {apart}"
     return bits, how
 
 

@@ -16,13 +16,18 @@ from pmsmtool.design.design_file import DesignValue
 from pmsmtool.design.lookup.table import RPM, torque_limits
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.errors import ConfigError
+from pmsmtool.machine.dead_time import dead_time_compensation
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.machine.parameters import InverterParameters, MachineParameters
+from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import loop_coefficient_per_k
+from pmsmtool.machine.uncontrolled_generation import FaultReaction, fault_reaction
 from pmsmtool.params.catalogue import BY_NAME
 
 TRIP_CURRENT_RATIO = 1.5
 """Trip over I_max: room for the overshoot of a current step under 40 % too little inductance, and for noise."""
+
+SAG_SHARE = 0.7
+"""Share of its voltage to which the DC link may sag: what that costs is said, and a table reaches as far."""
 
 TRIP_SPEED_RATIO = 1.2
 """Overspeed trip over the largest speed."""
@@ -201,28 +206,6 @@ def _inverter(source: MachineFile) -> dict[str, DesignValue]:
     }
 
 
-def dead_time_compensation(inverter: InverterParameters) -> tuple[float, float, str]:
-    """Return plateau (V), knee (A) and method of the drive's ramp-shaped voltage-error compensation.
-
-    Where only the identified table is given, the plateau is its last value and the knee makes the ramp miss the same
-    area below the plateau as the table does.
-    """
-    if inverter.V_dead_v is not None:
-        return inverter.V_dead_v, inverter.i_knee_apk or _KNEE_DEFAULT_A, GIVEN
-    current, error = np.asarray(inverter.voltage_error_i_apk), np.asarray(inverter.voltage_error_v)
-    positive = current > 0.0
-    if not positive.any() or error[positive][-1] <= 0.0:
-        return 0.0, _KNEE_DEFAULT_A, "off: no voltage error is identified"
-    i, v = np.concatenate(([0.0], current[positive])), np.concatenate(([0.0], error[positive]))
-    missing = float(np.sum(np.diff(i) * (v[-1] - 0.5 * (v[1:] + v[:-1]))))
-    knee = 2.0 * missing / float(v[-1])
-    return float(v[-1]), max(knee, _KNEE_LEAST_A), "ramp of equal area to the identified voltage error"
-
-
-_KNEE_DEFAULT_A = 0.5
-_KNEE_LEAST_A = 1e-3
-
-
 def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
     limits, U_dc = source.limits, source.inverter.U_dc_v
     low, high = U_DC_RANGE
@@ -231,7 +214,7 @@ def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
     def either(given: float | None, assumed: float, how: str) -> DesignValue:
         return DesignValue(assumed, how) if given is None else DesignValue(given, GIVEN)
 
-    return {
+    found = {
         "protection.i_trip_apk": either(
             limits.i_trip_apk, TRIP_CURRENT_RATIO * rated.I_max_apk, f"{TRIP_CURRENT_RATIO:g} I_max"
         ),
@@ -244,6 +227,25 @@ def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
         "protection.I_cont_apk": DesignValue(rated.I_cont_apk, rated.methods["I_cont"]),
         "governor.I_transient_apk": DesignValue(rated.I_max_apk, "I_max"),
     }
+    reaction = reaction_of(source, rated, found)
+    return found | {"protection.n_short_circuit_rpm": DesignValue(reaction.short_from_rpm, reaction.how)}
+
+
+def sag_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict[str, float]:
+    """Return the share of the largest torque that a sagged link leaves, at base speed and at the largest speed."""
+    plane, facts = at_temperature(source.machine, source.flux_map), {}
+    for where, rpm in (("base_speed", rated.base_speed_rpm), ("n_max", rated.n_max_rpm)):
+        V = [SAG_SHARE * V_limit_v, V_limit_v]
+        found = torque_limits(plane, [rpm / RPM * plane.pole_pairs], V, rated.I_max_apk, rated.i_d_min_a)
+        sagged, full = (float(x) for x in np.nan_to_num(found.largest_nm[0]))
+        facts[f"sag_torque_share_{where}"] = max(sagged, 0.0) / full if full > 0.0 else 0.0
+    return facts
+
+
+def reaction_of(source: MachineFile, rated: Ratings, values: Mapping[str, DesignValue]) -> FaultReaction:
+    """Return what a fault does to the inverter, by the limits among the values."""
+    U_max, n_trip = (float(values[f"protection.{name}"].value) for name in ("U_dc_max_v", "n_trip_rpm"))
+    return fault_reaction(source.machine, source.inverter.U_dc_v, U_max, n_trip, rated.i_d_min_a)
 
 
 def _encoder(source: MachineFile) -> dict[str, DesignValue]:

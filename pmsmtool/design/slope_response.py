@@ -103,13 +103,13 @@ def sampled_machine(R: Array, L_d: Array, L_q: Array, omega_e: Array, T_s: float
     F[..., 0, 0], F[..., 0, 1], F[..., 0, 2] = -R / L_d, w * L_q / L_d, 1.0 / L_d
     F[..., 1, 0], F[..., 1, 1], F[..., 1, 3], F[..., 1, 4] = -w * L_d / L_q, -R / L_q, 1.0 / L_q, -w / L_q
     F[..., 2, 3], F[..., 3, 2] = w, -w
-    X = _exponential(F * T_s)
+    X = matrix_exponential(F * T_s)
     turn = 0.5 * w * T_s
     rotation = np.stack([np.stack([np.cos(turn), -np.sin(turn)], -1), np.stack([np.sin(turn), np.cos(turn)], -1)], -2)
     return Sampled(X[..., :2, :2], X[..., :2, 2:4] @ rotation, X[..., :2, 4])
 
 
-def _exponential(X: Array) -> Array:
+def matrix_exponential(X: Array) -> Array:
     """Matrix exponential by its series; the entries are a period's and small."""
     total = term = np.broadcast_to(np.eye(X.shape[-1]), X.shape).copy()
     for k in range(1, TAYLOR_TERMS):

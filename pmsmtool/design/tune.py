@@ -29,7 +29,7 @@ from pmsmtool.design.loops.speed_loop import (
     symmetric_optimum,
     symmetric_ratio,
 )
-from pmsmtool.design.ratings import Ratings, rating_values, ratings
+from pmsmtool.design.ratings import Ratings, rating_values, ratings, reaction_of, sag_facts
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
@@ -74,16 +74,20 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
         The margins asked for cannot be met with the bandwidth asked for, or a value leaves the drive's range.
     """
     request = TuneRequest() if request is None else request
-    rated = ratings(source, (1.0 - request.voltage_margin) * source.inverter.V_max_v)
+    V_limit = (1.0 - request.voltage_margin) * source.inverter.V_max_v
+    rated = ratings(source, V_limit)
     values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}
     values |= rating_values(source, rated)
+    reaction = reaction_of(source, rated, values)
+    told = (reaction.note,) if reaction.note else ()
+    generation = {} if math.isinf(reaction.generation_rpm) else {"generation_rpm": reaction.generation_rpm}
     choice = choose_current(source, request, rated.I_max_apk)
     weakening = design_field_weakening(source, rated, _weakening_mode(source, request), request.voltage_margin)
     parts = [
         _design_current(choice),
         _design_speed(source, request, rated, choice, weakening.ramp_limit_rpm_per_s),
         _design_governor(source, request, rated, choice),
-        _Part(dict(weakening.values), {}, dict(weakening.facts), ()),
+        _Part(dict(weakening.values), {}, {**generation, **sag_facts(source, rated, V_limit), **weakening.facts}, told),
     ]
     tables: dict[str, tuple[float, ...]] = {}
     if weakening.values["field_weakening.mode"].value == FIELD_WEAKENING["lookup"]:

@@ -128,6 +128,7 @@ def _declare(library: ctypes.CDLL, types: Mapping[str, CType]) -> None:
     signatures: dict[str, tuple[CType, list[CType]]] = {
         "pmsm_init": (None, [state]),
         "pmsm_parameters_changed": (None, [state]),
+        "pmsm_reset_fault": (None, [state]),
         "pmsm_step": (
             None,
             [state, params, words, *(pointer(types[name]) for name in _STEP_ARGUMENTS)],

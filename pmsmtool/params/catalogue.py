@@ -169,6 +169,18 @@ _ROWS: tuple[tuple[str, int, int, WireType, str, float, float, float, bool, str]
         False,
         "current limit once the I2t budget is used",
     ),
+    (
+        "protection.n_short_circuit_rpm",
+        0x2012,
+        0x07,
+        _F32,
+        "rpm",
+        0,
+        0,
+        2e6,
+        False,
+        "a fault above it shorts the windings, below it removes the gates; 0: removes them at every speed",
+    ),
     # 0x2013 encoder
     (
         "encoder.offset_rad",

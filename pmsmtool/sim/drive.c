@@ -13,6 +13,8 @@
 #define BRAKE_KNEE_SHARE 0.25        /* of n_max: below it the brake torque falls with the speed */
 #define BRAKE_DAMPING 6.0            /* mechanical brake pole stays this far below the speed estimate's */
 #define STANDSTILL_SHARE 0.01        /* of n_max */
+#define SAMPLE_MOST 1e7F             /* A, V: what is larger is no sample */
+#define ANGLE_MOST 1e9               /* rad, mechanical: a year at 300 rpm */
 #define RPM 9.54929658551372         /* rpm per rad/s */
 
 enum { QUICK_STOP_INACTIVE = 0, QUICK_STOP_STOPPING = 1, QUICK_STOP_STOPPED = 2 };
@@ -62,6 +64,7 @@ uint32_t pmsm_drive_load(pmsm_drive *drive, const uint8_t *image, uint32_t size)
 void pmsm_drive_reset_fault(pmsm_drive *drive)
 {
     drive->trip = PMSM_TRIP_NONE;
+    pmsm_reset_fault(&drive->control);
 }
 
 /* Mechanical speed along the phase order. The angle is unwrapped and double, so no digits are lost over many turns;
@@ -70,7 +73,7 @@ static void estimate_speed(pmsm_drive *drive)
 {
     const double T_s = 1e-9 * (double)drive->params.inverter_T_s_ns;
     const double theta = (drive->params.encoder_reversed != 0u) ? -drive->sensors.theta_M : drive->sensors.theta_M;
-    if (!isfinite(theta)) {
+    if (!(fabs(theta) <= ANGLE_MOST)) {
         drive->pll_follows = 0u; /* trips; the speed estimate must survive it, the rotor turns on unseen */
         return;
     }
@@ -90,9 +93,10 @@ static uint32_t find_trip(const pmsm_drive *drive)
     const pmsm_sensors *s = &drive->sensors;
     const pmsm_params *p = &drive->params;
     const float limit = p->protection_i_trip_apk;
-    const float sum = ((s->i_a + s->i_b) + s->i_c) + s->U_dc;
-    if (!isfinite(sum) || !isfinite(s->theta_M)) {
-        return PMSM_TRIP_INTERNAL;
+    const float T = isnan(s->T_winding) ? 0.0F : s->T_winding; /* no sensor */
+    const float sum = fabsf(s->i_a) + fabsf(s->i_b) + fabsf(s->i_c) + fabsf(s->U_dc) + fabsf(T);
+    if (!(sum <= SAMPLE_MOST)) {
+        return PMSM_TRIP_NONE; /* no sample to judge: the core holds its voltage, and trips at the second */
     }
     if (fabsf(s->i_a) > limit || fabsf(s->i_b) > limit || fabsf(s->i_c) > limit) {
         return PMSM_TRIP_OVERCURRENT;
@@ -208,13 +212,18 @@ void pmsm_drive_period(pmsm_drive *drive, const pmsm_sensors *sensors, pmsm_outp
     }
     pmsm_drive_excite(drive, &reference, &angle);
     apply_quick_stop(drive, &reference, &angle);
-    if (drive->enabled == 0u || drive->trip != PMSM_TRIP_NONE) {
+    if (drive->trip != PMSM_TRIP_NONE) {
+        reference.mode = PMSM_MODE_FAULT;
+    } else if (drive->enabled == 0u) {
         reference.mode = PMSM_MODE_OFF;
     }
     drive->applied = reference;
     drive->applied_angle = angle;
     measure(drive, angle, &measurement);
     pmsm_step(&drive->control, &drive->params, drive->lut, &measurement, &reference, output);
+    if (drive->trip == PMSM_TRIP_NONE && drive->control.fault != (uint32_t)PMSM_FAULT_NONE) {
+        drive->trip = PMSM_TRIP_INTERNAL;
+    }
     drive->control.live.flags |= (sensors->adc_clipped != 0u) ? (uint32_t)PMSM_FLAG_ADC_CLIPPED : 0u;
     drive->control.live.flags |= (drive->excitation_active != 0u) ? (uint32_t)PMSM_FLAG_EXCITATION : 0u;
     pmsm_drive_record(drive);

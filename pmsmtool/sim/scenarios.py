@@ -190,6 +190,8 @@ def _profile(name: str, nodes: Any, wrong: list[str]) -> Profile:
 # ---- built-in -----------------------------------------------------------------------------------------------------
 
 
+SAG_FALL_S = 0.005
+"""Time (s) in which the link falls to the share of its voltage that designs reckon with, and comes back."""
 REACHED_SHARE = 0.95
 """End of the field-weakening sweep over the speed whose back-EMF the most negative i_d still holds."""
 
@@ -204,6 +206,7 @@ class _Scale:
     n_top_rpm: float
     torque_nm: float
     J_kgm2: float
+    U_dc_v: float
 
 
 def _scale(machine_file: MachineFile, values: Mapping[str, float]) -> _Scale:
@@ -222,6 +225,7 @@ def _scale(machine_file: MachineFile, values: Mapping[str, float]) -> _Scale:
         n_top_rpm=max(n_rpm, min(machine.n_max_rpm or 2.0 * n_rpm, REACHED_SHARE * reached_rpm)),
         torque_nm=abs(machine.torque_nm(0.0, i_a)),
         J_kgm2=machine.J_kgm2 or 0.0,
+        U_dc_v=machine_file.inverter.U_dc_v,
     )
 
 
@@ -307,6 +311,24 @@ def _field_weakening_sweep(scale: _Scale, name: str) -> Scenario:
     )
 
 
+def _dc_sag(scale: _Scale, name: str) -> Scenario:
+    from pmsmtool.design.ratings import SAG_SHARE
+
+    U, low = scale.U_dc_v, SAG_SHARE * scale.U_dc_v
+    return Scenario(
+        name=name,
+        duration_s=0.3,
+        mode="torque",
+        rotor="driven",
+        start_rpm=scale.n_rpm,
+        schedule={
+            "torque_nm": ((0.0, 0.0), (0.05, 0.5 * scale.torque_nm)),
+            "driven_rpm": ((0.0, scale.n_rpm),),
+            "U_dc_v": ((0.0, U), (0.1, U), (0.1 + SAG_FALL_S, low), (0.2, low), (0.2 + SAG_FALL_S, U)),
+        },
+    )
+
+
 BUILT_IN: dict[str, tuple[str, Callable[[_Scale, str], Scenario]]] = {
     "current-steps": ("steps of i_d and i_q at half the rated speed, rotor driven", _current_steps),
     "q-step": ("one step of i_q to the rated current at half the rated speed, rotor driven", _q_step),
@@ -316,6 +338,7 @@ BUILT_IN: dict[str, tuple[str, Callable[[_Scale, str], Scenario]]] = {
         "half the rated torque while the rotor is driven to n_max, or as far as i_d_min holds the voltage",
         _field_weakening_sweep,
     ),
+    "dc-sag": ("the DC link falls to 70 % and comes back under half the rated torque at the rated speed", _dc_sag),
 }
 """Built-in scenarios: what they do, and how they are sized for a machine."""
 

@@ -86,7 +86,17 @@ def test_a_salient_machine_is_not_steered_through_its_reluctance_torque() -> Non
     design = tune(load_machine_file(PROFILES / "mtpv-test.toml"))
     assert not int(design["governor.options"]) & MINIMUM_TIME
     assert "reluctance" in design.values["governor.options"].method
-    assert int(tune(load_machine_file(PROFILES / "jercic-2017.toml"))["governor.options"]) & MINIMUM_TIME
+    source = load_machine_file(PROFILES / "jercic-2017.toml")
+    assert int(tune(source, TuneRequest(predictor=True))["governor.options"]) & MINIMUM_TIME
+
+
+def test_a_delay_without_predictor_is_not_steered_past_the_current_limit() -> None:
+    """Seen: 43 of 80 unreachable steps of drawn machines above 1.05 I_max, up to 1.27; none without the direction."""
+    source = load_machine_file(PROFILES / "jercic-2017.toml")
+    assert not int(tune(source)["governor.options"]) & MINIMUM_TIME
+    assert "during the delay" in tune(source).values["governor.options"].method
+    prompt = replace(source, inverter=replace(source.inverter, delay_periods=0.5))
+    assert int(tune(prompt)["governor.options"]) & MINIMUM_TIME
 
 
 def test_overshoot_of_the_reference_ramps() -> None:

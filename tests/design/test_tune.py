@@ -19,10 +19,11 @@ from pmsmtool.design.loops.bandwidth import choose_current, least_inductance
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.design.loops.sampled_loop import margins
 from pmsmtool.design.operating_machine import at_temperature
-from pmsmtool.design.ratings import base_speed_rpm, dead_time_compensation, ratings
+from pmsmtool.design.ratings import base_speed_rpm, ratings
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible
+from pmsmtool.machine.dead_time import dead_time_compensation
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import InverterParameters, MachineLimits, MachineParameters

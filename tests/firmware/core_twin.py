@@ -69,6 +69,7 @@ class Twin:
     tables: tuple[np.ndarray, ...] = ()
     x: list[np.float32] = field(default_factory=lambda: [f(0), f(0)])
     flags: int = 0
+    held_q: np.float32 = field(default_factory=lambda: f(0))
 
     def __getitem__(self, name: str) -> np.float32:
         return f(self.values[name])
@@ -94,16 +95,26 @@ class Twin:
         k = int(np.searchsorted(axis, x, side="right")) - 1
         return k, (x - axis[k]) / (axis[k + 1] - axis[k])
 
-    def second_coordinate(self, omega_M: np.float32, omega_e: np.float32, V_max: np.float32) -> np.float32:
+    def equivalent_rpm(self, rpm: np.float32, U_dc: np.float32) -> np.float32:
+        if len(self.axes[2]) > 1 or U_dc == self.axes[2][0]:
+            return rpm
+        braking = -self.held_q if rpm < 0 else self.held_q
+        drop = self["motor.R_s_ohm"] * braking / self["inverter.voltage_utilisation"]
+        left, left_table = U_dc - drop, self.axes[2][0] - drop
+        ratio = left_table / left if left * f(1e3) > left_table else f(1e3)
+        return rpm * ratio if left_table > 0 else rpm
+
+    def second_coordinate(self, omega_M: np.float32, omega_e: np.float32, U_dc: np.float32) -> np.float32:
         if int(self.values["lut.axis_kind"]) == 0:
-            return omega_M * RPM
+            return self.equivalent_rpm(omega_M * RPM, U_dc)
+        V_max = self["inverter.voltage_utilisation"] * U_dc
         top = self.axes[1][-1]
         V_m = (f(1.0) - self["field_weakening.margin"]) * V_max
         omega = abs(omega_e)
         return top if omega * top <= V_m else V_m / omega
 
     def lookup(self, tau: np.float32, omega_M: np.float32, omega_e: np.float32, U_dc: np.float32) -> Vector:
-        y = self.second_coordinate(omega_M, omega_e, self["inverter.voltage_utilisation"] * U_dc)
+        y = self.second_coordinate(omega_M, omega_e, U_dc)
         sign = f(1)
         if omega_M < 0 and self.axes[1][0] >= 0:
             sign, y = f(-1), abs(y)
@@ -235,4 +246,5 @@ class Twin:
             self.flags |= 2 | (int(self.values["current.options"]) & 8 and 1)
             realised = park(clarke(*(U_dc * d for d in duties)), s_out, c_out)
         self.integrate(reference, i, u, realised)
+        self.held_q = reference[1]
         return duties, u, realised

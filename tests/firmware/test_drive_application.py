@@ -426,10 +426,16 @@ def test_trips_latch_and_remove_the_gates(code: int, member: str, value: float) 
     def call(s: Any) -> None:
         bench.library.pmsm_drive_period(ctypes.byref(bench.drive), ctypes.byref(s), ctypes.byref(bench.output))
 
+    no_sample = not math.isfinite(value)
     call(sensors)
+    if no_sample:  # one is held
+        assert (bench.drive.trip, bench.output.gates) == (0, 1)
+        call(sensors)
     assert (bench.drive.trip, bench.output.gates) == (code, 0)
     bench.library.pmsm_drive_reset_fault(ctypes.byref(bench.drive))
     call(sensors)
+    if no_sample:
+        call(sensors)
     assert bench.drive.trip == code  # the cause persists
     healthy = bench.types["pmsm_sensors"](T_winding=20.0, U_dc=210.0)
     call(healthy)

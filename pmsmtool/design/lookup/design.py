@@ -31,7 +31,7 @@ from pmsmtool.design.lookup.table import (
     torque_limits,
 )
 from pmsmtool.design.operating_machine import OperatingMachine, at_temperature
-from pmsmtool.design.ratings import Ratings
+from pmsmtool.design.ratings import SAG_SHARE, Ratings
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile
@@ -261,10 +261,11 @@ class _Problem:
     def second_axis(self) -> tuple[tuple[Array, Array], tuple[str, ...]]:
         """Return the first nodes for refinement, the uniform axis, and notes."""
         n_wanted = self.rated.n_max_rpm if self.request.n_max_rpm is None else self.request.n_max_rpm
-        n_max = largest_speed_rpm(self._reachable, n_wanted)
+        sags = self.request.axis == "speed" and len(self.U_dc) == 1  # the drive looks up at n U_dc / U_now
+        n_max = largest_speed_rpm(self._reachable, n_wanted / SAG_SHARE if sags else n_wanted)
         if not n_max > 0.0:
             raise DesignInfeasible("no operating point at any speed", where="look-up table", hint="check U_dc and R_s")
-        notes = () if n_max == n_wanted else (_unreachable(n_max, n_wanted),)
+        notes = () if n_max >= n_wanted else (_unreachable(n_max, n_wanted),)
         points = FIRST_SPEEDS if self.request.y_points is None else self.request.y_points
         if self.request.axis == "speed":
             return (np.linspace(0.0, n_max, FIRST_SPEEDS), np.linspace(0.0, n_max, points)), notes

@@ -2,6 +2,8 @@
 /* Currents of a torque from the tables behind the parameters: linear in each axis, clamped at the ends. */
 #include "pmsm_period.h"
 
+#define CURRENT_MOST PMSM_C(1e6) /* A, in a cell; NaN marks one without an operating point */
+
 typedef struct {
     uint32_t index;    /* left node of the cell */
     pmsm_real weight;  /* of the right node */
@@ -48,7 +50,8 @@ static axis_place find(const uint32_t *axis, uint32_t count, pmsm_real x, uint32
     }
     const pmsm_real left = node_at(axis, low);
     place.index = low;
-    place.weight = (x - left) / (node_at(axis, high) - left);
+    const pmsm_real weight = (x - left) / (node_at(axis, high) - left);
+    place.weight = (weight >= PMSM_C(0.0) && weight <= PMSM_C(1.0)) ? weight : PMSM_C(0.0); /* axis destroyed */
     return place;
 }
 
@@ -80,7 +83,7 @@ static void add_corner(corner_sum *sum, const uint32_t *tables, uint32_t stride,
     }
     const pmsm_real i_d = entry(tables, cell, params);
     const pmsm_real i_q = entry(tables + stride, cell, params);
-    if (i_d != i_d || i_q != i_q) {
+    if (!(pmsm_abs(i_d) + pmsm_abs(i_q) <= CURRENT_MOST)) { /* nor a number, nor one of a current */
         sum->hole = 1u;
         return;
     }
@@ -89,12 +92,33 @@ static void add_corner(corner_sum *sum, const uint32_t *tables, uint32_t stride,
     sum->weight += weight;
 }
 
+#define LINK_RATIO_MOST PMSM_C(1e3) /* nominal over present link voltage */
+
+/* Speed at which the voltage of the table leaves the same flux as the present one does now. The resistance takes the
+ * same voltage from both, and gives it to both where the machine brakes: what is left, exact without resistance, turns
+ * the flux. By the current of the last reference, which does not shake. */
+static pmsm_real equivalent_rpm(const pmsm_period *period, pmsm_real U_table)
+{
+    const pmsm_real rpm = period->omega_M * PMSM_RPM;
+    if (period->U_dc == U_table) {
+        return rpm;
+    }
+    const pmsm_real i_q = period->state->reference_held.q;
+    const pmsm_real drop = period->R_s * ((rpm < PMSM_C(0.0)) ? -i_q : i_q) /
+                           (pmsm_real)period->params->inverter_voltage_utilisation;
+    const pmsm_real left = period->U_dc - drop;
+    const pmsm_real left_table = U_table - drop;
+    const pmsm_real ratio = (left * LINK_RATIO_MOST > left_table) ? left_table / left : LINK_RATIO_MOST;
+    return (left_table > PMSM_C(0.0)) ? rpm * ratio : rpm;
+}
+
 /* Second axis: mechanical speed (rpm), or the flux the voltage leaves, V_m/|omega_e| (Wb). */
 static pmsm_real second_coordinate(const pmsm_period *period, const uint32_t *axis)
 {
     const pmsm_params *params = period->params;
     if (params->lut_axis_kind == PMSM_LUT_SPEED_RPM) {
-        return period->omega_M * PMSM_RPM;
+        const pmsm_real U_table = node_at(axis, params->lut_n_y);
+        return (params->lut_n_z > 1u) ? period->omega_M * PMSM_RPM : equivalent_rpm(period, U_table);
     }
     const pmsm_real top = node_at(axis, params->lut_n_y - 1u);
     const pmsm_real V_m = (PMSM_C(1.0) - (pmsm_real)params->field_weakening_margin) * period->V_max;

@@ -107,3 +107,16 @@ void pmsm_modulate(pmsm_period *period, pmsm_output *output)
     output->u_beta = stator.beta;
     output->gates = 1u;
 }
+
+/* The rotor turns on under a held voltage. */
+void pmsm_hold_output(const pmsm_state *state, pmsm_output *output)
+{
+    pmsm_real sine;
+    pmsm_real cosine;
+    pmsm_sincos(state->derived.T_s * state->live.omega_e, &sine, &cosine);
+    const pmsm_ab held = pmsm_park_inverse(state->voltage_committed, sine, cosine);
+    (void)set_duties(pmsm_clarke_inverse(held), state->U_dc_before, output);
+    output->u_alpha = held.alpha;
+    output->u_beta = held.beta;
+    output->gates = state->gates_before;
+}

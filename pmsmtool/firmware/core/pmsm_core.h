@@ -22,7 +22,15 @@ enum pmsm_mode {
     PMSM_MODE_VOLTAGE = 1, /* u_d_inject, u_q_inject are the whole voltage */
     PMSM_MODE_CURRENT = 2, /* i_d_ref, i_q_ref */
     PMSM_MODE_TORQUE = 3,  /* tau_ref through look-up or field weakening */
-    PMSM_MODE_SPEED = 4    /* omega_M_ref through the speed controller */
+    PMSM_MODE_SPEED = 4,   /* omega_M_ref through the speed controller */
+    PMSM_MODE_FAULT = 5    /* the fault reaction of the parameters: the application has tripped */
+};
+
+/* Why pmsm_state.fault stands, until pmsm_reset_fault(). */
+enum pmsm_fault {
+    PMSM_FAULT_NONE = 0,
+    PMSM_FAULT_INPUT = 1,  /* measurement or reference held no usable number in two periods running */
+    PMSM_FAULT_RESULT = 2  /* no duty ratios came out of two periods running */
 };
 
 /* Bits of pmsm_live.flags. */
@@ -37,7 +45,9 @@ enum pmsm_flag {
     PMSM_FLAG_FW_EMPTY = 1u << 7,         /* no current satisfies voltage and current limit */
     PMSM_FLAG_I2T = 1u << 8,              /* the time-limited current budget is used up */
     PMSM_FLAG_ADC_CLIPPED = 1u << 9,      /* set by the drive: a current sample was at full scale */
-    PMSM_FLAG_EXCITATION = 1u << 10       /* set by the drive: an excitation is running */
+    PMSM_FLAG_EXCITATION = 1u << 10,      /* set by the drive: an excitation is running */
+    PMSM_FLAG_HELD = 1u << 11,            /* no usable numbers: the last voltage is held, the rest stands still */
+    PMSM_FLAG_FAULT = 1u << 12            /* pmsm_state.fault is latched: fault reaction */
 };
 
 typedef struct {            /* sampled at the start of the period */
@@ -123,6 +133,11 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     uint32_t fw_empty;       /* 1: it found no current that satisfies both limits */
     pmsm_real i2t_carry;     /* rounding remainder of i2t */
     uint32_t i2t_exhausted;  /* 1 from a used-up budget until a tenth of it has recovered */
+    uint32_t bad_periods;    /* running, up to now */
+    uint32_t fault;          /* enum pmsm_fault, latched */
+    uint32_t gates_before;   /* of the last period */
+    uint32_t shorted;        /* 1: the fault reaction shorts the windings */
+    pmsm_real U_dc_before;   /* V, of the last good period */
     uint32_t prepared;       /* 0 fresh from pmsm_init(), 1 derived is valid, 2 derived is stale */
     pmsm_derived derived;
 } pmsm_state;
@@ -133,7 +148,12 @@ PMSM_EXPORT void pmsm_init(pmsm_state *state);
 /* Parameters changed while the controller runs (live gains): keep its memory, renew what was derived from them. */
 PMSM_EXPORT void pmsm_parameters_changed(pmsm_state *state);
 
-/* One PWM period. lut points to the words behind pmsm_params in the image, may be NULL if lut_format is 0. */
+/* After a latched fault: control again from the next period on, from rest. */
+PMSM_EXPORT void pmsm_reset_fault(pmsm_state *state);
+
+/* One PWM period. A period whose inputs are no usable numbers (NaN but for T_winding, where it says that there is no
+ * sensor; infinite; larger than any drive's) holds the last voltage and changes nothing else; a second one running is
+ * a latched fault. lut points to the words behind pmsm_params in the image, may be NULL if lut_format is 0. */
 PMSM_EXPORT void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut,
                            const pmsm_measurement *measurement, const pmsm_reference *reference,
                            pmsm_output *output);

@@ -17,6 +17,14 @@
 #endif
 #endif
 
+#ifndef PMSM_ABS /* one instruction; a comparison and a branch otherwise */
+#ifdef PMSM_REAL_DOUBLE
+#define PMSM_ABS(x) __builtin_fabs(x)
+#else
+#define PMSM_ABS(x) __builtin_fabsf(x)
+#endif
+#endif
+
 #define PMSM_PI PMSM_C(3.14159265358979323846)
 #define PMSM_SQRT3 PMSM_C(1.73205080756887729353)
 #define PMSM_RPM (PMSM_C(30.0) / PMSM_PI) /* rpm per rad/s */
@@ -118,7 +126,7 @@ static inline pmsm_real pmsm_wrap(pmsm_real x)
 
 static inline pmsm_real pmsm_abs(pmsm_real x)
 {
-    return (x < PMSM_C(0.0)) ? -x : x;
+    return PMSM_ABS(x);
 }
 
 static inline pmsm_real pmsm_clamp(pmsm_real x, pmsm_real low, pmsm_real high)

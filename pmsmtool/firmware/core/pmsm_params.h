@@ -10,8 +10,8 @@ extern "C" {
 #endif
 
 #define PMSM_PARAMS_SCHEMA_VERSION 1u
-#define PMSM_PARAMS_SIGNATURE 0xC9A43E1Fu /* CRC-32 of name:type:dim:unit:scale in struct order */
-#define PMSM_PARAMS_WORDS 84u
+#define PMSM_PARAMS_SIGNATURE 0xEFF2C7ACu /* CRC-32 of name:type:dim:unit:scale in struct order */
+#define PMSM_PARAMS_WORDS 85u
 #define PMSM_PARAMS_LUT_WORDS_MAX 8192u
 #define PMSM_K_MAX_NOT_DETERMINED 255u
 
@@ -48,6 +48,8 @@ typedef struct pmsm_params {
     float    protection_n_trip_rpm;          /* [rpm] overspeed trip */
     float    protection_T_winding_max_c;     /* [degC] winding over-temperature trip */
     float    protection_I_cont_apk;          /* [A] current limit once the I2t budget is used */
+    float    protection_n_short_circuit_rpm; /* [rpm] a fault above it shorts the windings, below it removes the
+                                                gates; 0: removes them at every speed */
     float    encoder_offset_rad;             /* [rad] theta_e = direction p theta_M - offset */
     uint32_t encoder_reversed;               /* 1: the encoder counts against the phase order */
     float    encoder_pll_bandwidth_rad_s;    /* [rad/s] natural frequency of the speed estimate */

@@ -35,6 +35,7 @@ const pmsm_param_limit pmsm_param_limits[PMSM_PARAMS_WORDS] = {
     {1.0F, 2000000.0F, 0u}, /* protection.n_trip_rpm */
     {20.0F, 300.0F, 0u}, /* protection.T_winding_max_c */
     {0.00100000005F, 100000.0F, 0u}, /* protection.I_cont_apk */
+    {0.0F, 2000000.0F, 0u}, /* protection.n_short_circuit_rpm */
     {-6.28318548F, 6.28318548F, 0u}, /* encoder.offset_rad */
     {0.0F, 1.0F, 1u}, /* encoder.reversed */
     {1.0F, 100000.0F, 0u}, /* encoder.pll_bandwidth_rad_s */

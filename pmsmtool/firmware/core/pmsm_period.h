@@ -88,5 +88,6 @@ void pmsm_polar_settle(pmsm_period *period);
 /* modulation.c */
 pmsm_real pmsm_voltage_radius(const pmsm_period *period, pmsm_dq u); /* what the inverter gives in direction u */
 void pmsm_modulate(pmsm_period *period, pmsm_output *output);
+void pmsm_hold_output(const pmsm_state *state, pmsm_output *output); /* the voltage of the last period, turned */
 
 #endif

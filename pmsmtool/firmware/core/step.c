@@ -2,6 +2,10 @@
 /* One PWM period. */
 #include "pmsm_period.h"
 
+#define BANDWIDTH_LEAST PMSM_C(1e-3) /* rad/s, of the bias loop */
+#define LINK_LEAST PMSM_C(1e-3)      /* V; duty ratios divide by it */
+#define SHORT_ENDS PMSM_C(0.9)       /* of the speed at which a short circuit began */
+
 void pmsm_init(pmsm_state *state)
 {
     const pmsm_state zero = {0};
@@ -49,11 +53,23 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     }
 }
 
-/* x - x is zero for every number, and NaN for infinity and NaN. */
-static uint32_t is_usable(const pmsm_measurement *m, pmsm_real advance)
+#define INPUT_MOST PMSM_C(1e7) /* A, V, N m, rad/s, K: far above every drive's, far below what overflows */
+
+/* Every comparison with NaN is false, and a sum of sizes shows each of them. A bandwidth may be zero, not tiny: gains
+ * divide. */
+static uint32_t is_usable(const pmsm_measurement *m, const pmsm_reference *r, pmsm_real turn, pmsm_real advance)
 {
-    const pmsm_real sum = ((m->i_a + m->i_b) + m->i_c) + m->U_dc;
-    return (sum - sum == PMSM_C(0.0) && pmsm_abs(m->theta_e) + pmsm_abs(advance) <= PMSM_ANGLE_MAX) ? 1u : 0u;
+    const pmsm_real T = (m->T_winding == m->T_winding) ? m->T_winding : PMSM_C(0.0);
+    const pmsm_real sampled = pmsm_abs(m->i_a) + pmsm_abs(m->i_b) + pmsm_abs(m->i_c) + pmsm_abs(m->U_dc) + pmsm_abs(T);
+    const pmsm_real asked = pmsm_abs(r->i_d_ref) + pmsm_abs(r->i_q_ref) + pmsm_abs(r->tau_ref) +
+                            pmsm_abs(r->omega_M_ref) + pmsm_abs(r->u_d_inject) + pmsm_abs(r->u_q_inject) +
+                            pmsm_abs(r->bias_bandwidth);
+    const uint32_t tiny = (r->bias_bandwidth > PMSM_C(0.0) && r->bias_bandwidth < BANDWIDTH_LEAST) ? 1u : 0u;
+    return (sampled + asked <= INPUT_MOST && pmsm_abs(turn) <= PMSM_PI &&
+            pmsm_abs(m->theta_e) + pmsm_abs(advance) <= PMSM_ANGLE_MAX && r->mode <= (uint32_t)PMSM_MODE_FAULT &&
+            tiny == 0u)
+               ? 1u
+               : 0u;
 }
 
 static pmsm_real winding_resistance(const pmsm_params *params, pmsm_real T_winding)
@@ -80,8 +96,8 @@ static void transform(pmsm_period *period, const pmsm_measurement *m, pmsm_real 
     period->i_model = period->i;
     period->omega_e = m->omega_e;
     period->omega_M = m->omega_e / period->state->derived.pole_pairs;
-    period->U_dc = m->U_dc;
-    period->V_max = (pmsm_real)period->params->inverter_voltage_utilisation * m->U_dc;
+    period->U_dc = (m->U_dc > LINK_LEAST) ? m->U_dc : PMSM_C(0.0);
+    period->V_max = (pmsm_real)period->params->inverter_voltage_utilisation * period->U_dc;
     period->R_s = winding_resistance(period->params, m->T_winding);
     period->hexagon = uses_hexagon(period->params);
 }
@@ -156,6 +172,53 @@ static void gates_off(pmsm_state *state, pmsm_output *output, pmsm_real omega_M)
     state->live.i_q_req = PMSM_C(0.0);
 }
 
+/* A fault: gates off. Above the speed of the parameters the diodes would rectify the EMF into the link: the lower
+ * switches short the windings there. Not both in turn around that speed, hence the lower end. */
+static void react(pmsm_state *state, const pmsm_params *params, pmsm_real omega_e, pmsm_output *output)
+{
+    const pmsm_real from = (pmsm_real)params->protection_n_short_circuit_rpm;
+    const pmsm_real omega_M = omega_e / state->derived.pole_pairs;
+    const pmsm_real rpm = pmsm_abs(omega_M) * PMSM_RPM;
+    const pmsm_real limit = (state->shorted != 0u) ? SHORT_ENDS * from : from;
+    gates_off(state, output, omega_M);
+    state->shorted = (from > PMSM_C(0.0) && rpm > limit) ? 1u : 0u;
+    if (state->shorted != 0u) {
+        output->duty_a = PMSM_C(0.0);
+        output->duty_b = PMSM_C(0.0);
+        output->duty_c = PMSM_C(0.0);
+        output->gates = 1u;
+    }
+}
+
+/* A period without usable inputs or result: the first holds the last voltage, the second is a fault. */
+static void bad_period(pmsm_state *state, const pmsm_params *params, uint32_t fault, pmsm_output *output)
+{
+    pmsm_live *live = &state->live;
+    if (state->bad_periods != 0u && state->fault == (uint32_t)PMSM_FAULT_NONE) {
+        state->fault = fault;
+    }
+    state->bad_periods = 1u;
+    live->flags = (uint32_t)PMSM_FLAG_HELD;
+    if (state->fault != (uint32_t)PMSM_FAULT_NONE) {
+        react(state, params, live->omega_e, output); /* at the last known speed */
+        live->flags = (uint32_t)PMSM_FLAG_FAULT;
+    } else {
+        pmsm_hold_output(state, output);
+        state->voltage_before = state->voltage_committed;
+        state->voltage_committed.d = output->u_alpha;
+        state->voltage_committed.q = output->u_beta;
+    }
+    state->gates_before = output->gates;
+}
+
+void pmsm_reset_fault(pmsm_state *state)
+{
+    state->fault = (uint32_t)PMSM_FAULT_NONE;
+    state->bad_periods = 0u;
+    state->shorted = 0u;
+    state->gates_before = 0u;
+}
+
 static void publish(pmsm_period *period, const pmsm_measurement *m)
 {
     pmsm_live *live = &period->state->live;
@@ -186,10 +249,11 @@ void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut
             state->omega_ref_ramped = state->omega_filtered;
         }
     }
+    const pmsm_real turn = state->derived.T_s * measurement->omega_e;
     const pmsm_real advance =
         (pmsm_real)params->inverter_delay_periods * state->derived.T_s * measurement->omega_e;
-    if (is_usable(measurement, advance) == 0u) {
-        gates_off(state, output, PMSM_C(0.0));
+    if (is_usable(measurement, reference, turn, advance) == 0u) {
+        bad_period(state, params, (uint32_t)PMSM_FAULT_INPUT, output);
         return;
     }
     period.params = params;
@@ -209,18 +273,34 @@ void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut
     transform(&period, measurement, advance);
     pmsm_update_i2t(&period);
     state->omega_filtered += state->derived.speed_filter * (period.omega_M - state->omega_filtered);
-    if (reference->mode == PMSM_MODE_OFF) {
+    if (state->fault != (uint32_t)PMSM_FAULT_NONE || reference->mode == PMSM_MODE_FAULT) {
+        react(state, params, measurement->omega_e, output);
+        period.flags |= (state->fault != (uint32_t)PMSM_FAULT_NONE) ? (uint32_t)PMSM_FLAG_FAULT : 0u;
+    } else if (reference->mode == PMSM_MODE_OFF) {
         gates_off(state, output, period.omega_M);
+        state->shorted = 0u;
     } else {
         if (reference->mode == PMSM_MODE_VOLTAGE) {
             inject_only(&period, output);
         } else {
             control(&period, output);
         }
+        const pmsm_real duties = (output->duty_a + output->duty_b) + output->duty_c;
+        if (!(duties >= PMSM_C(0.0))) { /* whatever stands in the memory: from rest again */
+            const pmsm_dq committed = state->voltage_committed;
+            reset_controllers(state, period.omega_M);
+            state->voltage_committed = committed;
+            bad_period(state, params, (uint32_t)PMSM_FAULT_RESULT, output);
+            return;
+        }
+        state->shorted = 0u;
         state->voltage_before = state->voltage_committed;
         state->voltage_committed.d = output->u_alpha;
         state->voltage_committed.q = output->u_beta;
     }
+    state->bad_periods = 0u;
+    state->gates_before = output->gates;
+    state->U_dc_before = period.U_dc;
     state->current_before = period.i;
     publish(&period, measurement);
 }

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: MIT
+"""The design as ``tune`` makes it unasked, on drawn machines: what its governor is worth, whether it keeps I_max.
+
+Run from the repository: ``python benchmarks/default_governor.py [--machines 24] [--seed 1] [--steps 12]``; some two
+seconds per machine. A third of the machines is saturated (around the profile ``saturated-pmsyrm``), a third has a
+saliency of 1.5 to 3, a third less; delay 1.5 periods. Each law drives the project's own plant with ideal sensors and an
+ideal bridge at a constant speed of up to 1.2 of the base speed either way: from one reachable current to another, or to
+one that the voltage does not reach. Settled: within 2 % of the step (1 % of I_max at least) of where the current ends.
+
+Laws: the default; the same without governor; both with predictor. Settling is compared case by case. Exit code 1: the
+default exceeds ``OVER`` on a machine without saturation, or is slower than ``SLOWER`` on reachable steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from pmsmtool.design.operating_machine import at_temperature
+from pmsmtool.design.ratings import ratings
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.profile import machine_path
+from pmsmtool.papers.governed_drive import IDEAL
+from pmsmtool.papers.statistics import BAND
+from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.sim.closed_loop import simulate
+from pmsmtool.sim.kernel import Application
+from pmsmtool.sim.random_drives import draw_around, draw_drive
+from pmsmtool.sim.scenarios import Scenario
+
+BEFORE_S, AFTER_S = 0.06, 0.12
+"""The start is held this long, and the target."""
+HELD_SHARE, MISSED_SHARE = 0.90, 1.05
+"""A reachable current takes at most this much of V_max, an unreachable one at least."""
+OVER = 1.05
+"""Largest current over I_max."""
+SLOWER = 1.02
+"""Upper end of the interval of the paired settling, over that without governor."""
+KINDS = ("linear", "salient", "saturated")
+REQUESTS = {
+    "default": TuneRequest(),
+    "no governor": TuneRequest(governor="off"),
+    "predictor": TuneRequest(predictor=True),
+    "predictor, no governor": TuneRequest(predictor=True, governor="off"),
+}
+
+
+def draw(kind: str, seed: int) -> MachineFile:
+    """Return a machine of a kind, its sensors and bridge ideal."""
+    rng = np.random.default_rng([20261123, seed])
+    if kind == "saturated":
+        base = draw_around(load_machine_file(machine_path("saturated-pmsyrm")), seed, spread=0.2)
+    else:
+        base = draw_drive(seed)
+        low, high = (1.0, 1.5) if kind == "linear" else (1.5, 3.0)
+        L_d = base.machine.L_d_h
+        base = replace(base, machine=replace(base.machine, L_q_h=L_d * float(rng.uniform(low, high))))
+    truth = {"R_s_ohm": base.machine.R_s_ohm} if kind == "saturated" else {}
+    return replace(base, simulation={**IDEAL, **truth}, inverter=replace(base.inverter, V_dead_v=0.0))
+
+
+class Steps:
+    """Random steps of one machine: speed (rpm), start and target (A)."""
+
+    def __init__(self, source: MachineFile, seed: int) -> None:
+        self.source, self.rng = source, np.random.default_rng([7, seed])
+        self.rated = ratings(source, 0.92 * source.inverter.V_max_v)
+        self.machine = at_temperature(source.machine, source.flux_map)
+
+    def voltage(self, i: tuple[float, float], rpm: float) -> float:
+        """Share of V_max that holds a current."""
+        machine = self.machine
+        omega = rpm * math.pi / 30.0 * machine.pole_pairs
+        psi_d, psi_q = (float(x) for x in machine.flux(*i))
+        u = machine.R * i[0] - omega * psi_q, machine.R * i[1] + omega * psi_d
+        return math.hypot(*u) / self.source.inverter.V_max_v
+
+    def current(self) -> tuple[float, float]:
+        """Any current inside I_max and the limit of i_d."""
+        while True:
+            radius, angle = self.rated.I_max_apk * math.sqrt(self.rng.uniform()), self.rng.uniform(-math.pi, math.pi)
+            i = radius * math.cos(angle), radius * math.sin(angle)
+            if self.rated.i_d_min_a <= i[0] <= 0.3 * self.rated.I_max_apk:
+                return i
+
+    def draw(self, reachable: bool) -> tuple[float, tuple[float, float], tuple[float, float]]:
+        """Speed (rpm), start and target."""
+        while True:
+            rpm = float(self.rng.uniform(-1.2, 1.2)) * self.rated.base_speed_rpm
+            start, target = self.current(), self.current()
+            share = self.voltage(target, rpm)
+            good = share <= HELD_SHARE if reachable else share >= MISSED_SHARE
+            if (
+                good
+                and self.voltage(start, rpm) <= HELD_SHARE
+                and math.dist(start, target) > 0.2 * self.rated.I_max_apk
+            ):
+                return rpm, start, target
+
+
+def run(
+    source: MachineFile, params: ParameterSet, step: tuple[float, tuple[float, float], tuple[float, float]]
+) -> tuple[float, float]:
+    """Return settling (s; the whole time when it does not settle) and largest current over I_max."""
+    rpm, start, target = step
+    schedule = {
+        name: ((0.0, a), (BEFORE_S, a), (BEFORE_S, b))
+        for name, a, b in zip(("i_d_a", "i_q_a"), start, target, strict=True)
+    }
+    scenario = Scenario("step", BEFORE_S + AFTER_S, "current", {**schedule, "driven_rpm": ((0.0, rpm),)}, "driven", rpm)
+    trace = simulate(source, params, scenario, application=Application.CORE)
+    i = np.stack([trace["i_d_true_a"], trace["i_q_true_a"]])
+    k = int(np.searchsorted(trace.t_s, BEFORE_S - 1e-9))
+    before = i[:, k - 50 : k].mean(axis=1)
+    after = i[:, k:]
+    end = after[:, -200:].mean(axis=1)
+    band = max(BAND * math.dist(before, end), 0.01 * (source.machine.I_max_apk or 1.0))
+    off = np.flatnonzero(np.hypot(*(after - end[:, None])) > band)
+    settled = (0 if not len(off) else int(off[-1]) + 1) * float(trace.t_s[1] - trace.t_s[0])
+    return settled, float(np.hypot(*after).max())
+
+
+def ratio(pairs: np.ndarray) -> tuple[float, float, float]:
+    """Geometric mean of the first column over the second, with its 95 % interval by the bootstrap."""
+    log = np.log(pairs[:, 0] / pairs[:, 1])
+    draws = np.random.default_rng(1).choice(log, (2000, len(log))).mean(axis=1)
+    mean, low, high = (float(x) for x in np.exp([log.mean(), *np.percentile(draws, (2.5, 97.5))]))
+    return mean, low, high
+
+
+def main() -> int:
+    """Print the tables; exit code 1 where a limit is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--machines", type=int, default=24)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--steps", type=int, default=12)
+    parser.add_argument("--kind", choices=KINDS)
+    parser.add_argument("--list", action="store_true", help="print every case")
+    asked = parser.parse_args()
+    rows: dict[str, list[tuple[str, int, bool, float, float]]] = {law: [] for law in REQUESTS}
+    for k in range(asked.machines):
+        kind = asked.kind or KINDS[k % len(KINDS)]
+        source = draw(kind, 1000 * asked.seed + k)
+        steps = Steps(source, 1000 * asked.seed + k)
+        cases = [(reachable, steps.draw(reachable)) for reachable in (True, False) for _ in range(asked.steps)]
+        for law, request in REQUESTS.items():
+            params = tune(source, request).parameter_set()
+            for n, (reachable, step) in enumerate(cases):
+                settled, peak = run(source, params, step)
+                rows[law].append((kind, k, reachable, settled, peak / steps.rated.I_max_apk))
+                if asked.list:
+                    print(
+                        law,
+                        kind,
+                        k,
+                        n,
+                        reachable,
+                        step,
+                        f"{1e3 * settled:.2f} ms",
+                        f"{rows[law][-1][-1]:.3f}",
+                        flush=True,
+                    )
+    failed = False
+    for kind in KINDS:
+        for reachable in (True, False):
+            chosen = {law: np.array([r[3:] for r in rows[law] if r[0] == kind and r[2] == reachable]) for law in rows}
+            if not len(chosen["default"]):
+                continue
+            for law, found in chosen.items():
+                ms = 1e3 * found[:, 0]
+                print(
+                    f"{kind:10s} {'reachable' if reachable else 'unreachable':12s} {law:24s} settling ms median "
+                    f"{np.median(ms):6.2f} p95 {np.percentile(ms, 95):6.2f} max {ms.max():6.2f}; over "
+                    f"{OVER:g} I_max {int((found[:, 1] > OVER).sum())} of {len(ms)}, most {found[:, 1].max():.3f}"
+                )
+            failed |= kind != "saturated" and bool((chosen["default"][:, 1] > OVER).any())
+            for law, other in (
+                ("default", "no governor"),
+                ("predictor", "predictor, no governor"),
+                ("predictor", "default"),
+            ):
+                pairs = np.stack([chosen[law][:, 0], chosen[other][:, 0]], axis=1)
+                mean, low, high = ratio(pairs)
+                print(f"    {law} / {other}: {mean:.3f} ({low:.3f} to {high:.3f})")
+                failed |= reachable and (law, other) == ("default", "no governor") and high > SLOWER
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

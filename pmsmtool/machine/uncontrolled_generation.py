@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: MIT
+"""The speed from which a machine without control charges the DC link, and what a short circuit does instead.
+
+With the gates off the diodes rectify the back-EMF: above the speed at which its line-to-line amplitude reaches the
+link's limit the rotor drives the voltage there (Jahns and Caliskan, IEEE Trans. Ind. Appl. 35 (1999) 1347-1357).
+Shorted windings keep the link out of it; their flux linkage stands still in the stator frame while the rotor turns, so
+i_d passes -(psi_f + |psi|)/L_d, |psi| being the linkage at the instant of the short circuit; R takes some of that away.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.temperature import magnet_flux_at
+from pmsmtool.units import rpm_from_rad_s
+
+COLD_C = 0.0
+"""Temperature (degC) of the strongest magnet that is reckoned with: started up in an unheated hall."""
+
+
+def generation_rpm(machine: MachineParameters, U_dc_max_v: float) -> float:
+    """Return U / (sqrt(3) p psi_cold) as a mechanical speed (rpm); infinity without a magnet."""
+    psi = _cold(machine)
+    return rpm_from_rad_s(U_dc_max_v / (math.sqrt(3.0) * machine.pole_pairs * psi)) if psi > 0.0 else math.inf
+
+
+def _cold(machine: MachineParameters) -> float:
+    return float(max(magnet_flux_at(machine, COLD_C), machine.psi_f_wb))
+
+
+@dataclass(frozen=True, slots=True)
+class FaultReaction:
+    """What a fault does to the inverter.
+
+    Attributes
+    ----------
+    generation_rpm : float
+        Speed of uncontrolled generation (rpm).
+    short_from_rpm : float
+        Speed (rpm) above which a fault shorts the windings; 0: it removes the gates at every speed.
+    how : str
+        Why.
+    note : str
+        What a person must see to; empty when there is nothing.
+    """
+
+    generation_rpm: float
+    short_from_rpm: float
+    how: str
+    note: str
+
+
+def fault_reaction(
+    machine: MachineParameters, U_dc_nom_v: float, U_dc_max_v: float, n_trip_rpm: float, i_d_min_a: float
+) -> FaultReaction:
+    """Choose between gates off and, above the speed of uncontrolled generation, a short circuit.
+
+    Parameters
+    ----------
+    machine : MachineParameters
+        Magnet, inductance and pole pairs.
+    U_dc_nom_v, U_dc_max_v : float
+        Nominal voltage of the link and its limit (V).
+    n_trip_rpm : float
+        Largest speed at which a fault can occur (rpm).
+    i_d_min_a : float
+        Most negative i_d that the magnet stands (A).
+    """
+    from_rpm = generation_rpm(machine, U_dc_max_v)
+    if n_trip_rpm <= from_rpm:
+        return FaultReaction(from_rpm, 0.0, "gates off: the back-EMF stays below U_dc_max at n_trip", "")
+    psi = _cold(machine)
+    # the voltage limit at that speed bounds the linkage there: V_max / omega = psi U_nom / U_max
+    peak = -psi * (1.0 + U_dc_nom_v / U_dc_max_v) / machine.L_d_decoupling_h
+    if peak >= i_d_min_a:
+        how = f"short circuit above uncontrolled generation: i_d to {peak:.4g} A at most, {i_d_min_a:.4g} A allowed"
+        return FaultReaction(from_rpm, from_rpm, how, "")
+    note = (
+        f"a fault above {from_rpm:.4g} rpm charges the DC link over {U_dc_max_v:.4g} V (uncontrolled generation, up to "
+        f"n_trip {n_trip_rpm:.4g} rpm), and a short circuit would take i_d to {peak:.4g} A, beyond the "
+        f"{i_d_min_a:.4g} A allowed: fit a brake chopper, or lower n_max"
+    )
+    return FaultReaction(from_rpm, 0.0, "gates off: a short circuit takes i_d beyond its limit", note)
