@@ -344,7 +344,7 @@ def test_the_plan_of_a_drive_that_takes_nothing_promises_no_loop(
     outcome = CliRunner().invoke(cli, [*bus, "commission", str(PROFILE), "--yes"])
     assert isinstance(outcome.exception, Partial), "what it can give: a table for reading"
     plan = outcome.stderr.splitlines()
-    assert "lut: on values as given; the drive has no object for the table" in plan
+    assert "lut: with values as given; the drive has no object for the table" in plan
     assert any(line.startswith("tune, margins: not available: needs the gains of the current loops") for line in plan)
 
 
