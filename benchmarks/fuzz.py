@@ -222,7 +222,8 @@ def _trace() -> Trace:
 
 _BACKUP = _backup()
 SNAPSHOT = replace(SNAPSHOT, identity=_BACKUP.identity)
-_SCRATCH = Path(tempfile.mkdtemp(prefix="fuzz-"))
+_FOLDER = tempfile.TemporaryDirectory(prefix="fuzz-")  # goes with the program
+_SCRATCH = Path(_FOLDER.name)
 _MACHINE = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
 _EDS = (data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds").read_bytes()
 _SHORT_EDS = _EDS[_EDS.index(b"[FileInfo") : 4000].decode() + "\n" + _EDS[_EDS.index(b"[2010]") :][:4000].decode()

@@ -169,7 +169,8 @@ def _scenario() -> str:
 
     return "\n".join(
         [
-            f"Built in: {', '.join(BUILT_IN)} (`pmsmtool simulate --list`). A scenario file:",
+            f"Built in (`pmsmtool simulate --list`): {', '.join(BUILT_IN)}",
+            "A scenario file:",
             "",
             FILE_EXAMPLE,
             f"mode: {', '.join(MODES)}",
