@@ -27,7 +27,11 @@ __attribute__((visibility("default"))) int pmsm_shown(int x) { return hidden(x);
 @pytest.mark.skipif(sys.platform != "linux", reason="ELF")
 def test_elf_object_tells_shown_hidden_and_missing(tmp_path: Path) -> None:
     (tmp_path / "x.c").write_text(SOURCE)
-    command = [*compiler.build_compiler().command, *COMPILE_FLAGS, "-c", "x.c", "-o", "x.o"]
+    try:
+        found = compiler.build_compiler()
+    except compiler.CompilerError as error:
+        pytest.skip(f"no compiler: {error}")
+    command = [*found.command, *COMPILE_FLAGS, "-c", "x.c", "-o", "x.o"]
     subprocess.run(command, cwd=tmp_path, check=True)
     binary = read_binary((tmp_path / "x.o").read_bytes())
     assert binary.exported == {"pmsm_shown"}
