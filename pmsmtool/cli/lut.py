@@ -72,6 +72,7 @@ def lut_command(
     from pmsmtool.design.lookup.file import table_csv, table_facts, table_npz
     from pmsmtool.design.lookup.iron_loss import load_iron_loss_map
     from pmsmtool.design.lookup.loci import loci
+    from pmsmtool.design.ratings import rating_values, reaction_of
     from pmsmtool.machine.flux_map_check import check_flux_map
     from pmsmtool.machine.profile import machine_path
 
@@ -93,8 +94,11 @@ def lut_command(
 
         save_figure(lookup_figure(made.table, lines), plot_path)
         written.append(plot_path)
-    out.result("lut", {"files": written, "notes": made.notes, **facts, **_counts(made)}, lambda: _lines(made))
-    for note in (*made.notes, *(check_flux_map(machine.flux_map).complaints if machine.flux_map else ())):
+    notes = list(made.notes)
+    if at_a_fault := reaction_of(machine, rated, rating_values(machine, rated)).note:
+        notes.append(at_a_fault)
+    out.result("lut", {"files": written, "notes": notes, **facts, **_counts(made)}, lambda: _lines(made))
+    for note in (*notes, *(check_flux_map(machine.flux_map).complaints if machine.flux_map else ())):
         out.note(note)
     out.note(f"wrote {', '.join(map(str, written))}")
 

@@ -31,6 +31,8 @@ STEP_SHARE = 0.5
 """Larger current step, of the rated current."""
 STEP_VOLTAGE_SHARE = 0.7
 """And its first voltage K_p i, of what the back-EMF leaves: the steps are to show the linear loop."""
+GENERATION_SHARE = 0.97
+"""Largest speed of the proof, of that of uncontrolled generation: room for what a ramp overshoots."""
 STEP_SPEED_SHARE = 0.4
 """Speed of the current steps, of the base speed: fast enough to show the decoupling."""
 STEP_SPEED_RISE = 0.25
@@ -223,7 +225,10 @@ class _Sizes:
         V = inverter.voltage_utilisation * conditions.U_dc_v
         psi, L_q = machine.psi_f_wb, machine.L_q_decoupling_h
         p = machine.pole_pairs
-        omega_max = SPEED_SHARE * p * min(conditions.speed_max_rad_s, design["motor.n_max_rpm"] * RPM)
+        omega_max = p * min(
+            SPEED_SHARE * min(conditions.speed_max_rad_s, design["motor.n_max_rpm"] * RPM),
+            GENERATION_SHARE * _generation_rpm(design) * RPM,
+        )
         omega_base = V / math.hypot(psi, L_q * I_test)
         turns = conditions.shaft != "locked" and design["speed.K_p_nms_per_rad"] > 0.0
         return cls(
@@ -245,6 +250,12 @@ class _Sizes:
     def rise(self, i_q_a: float) -> float:
         """Rise of the electrical speed per control period at i_d = 0 (rad/s); none where the inertia is not known."""
         return torque_per_ampere(self.p**2, self.psi) * i_q_a / self.J * self.T_s if self.J > 0.0 else 0.0
+
+
+def _generation_rpm(design: Design) -> float:
+    """Speed (rpm) above which a fault charges the DC link; infinity where a fault shorts the windings there."""
+    shorted = design["protection.n_short_circuit_rpm"] > 0.0
+    return math.inf if shorted else float(design.facts.get("generation_rpm", math.inf))
 
 
 def _speed_step(s: _Sizes) -> Experiment:
@@ -352,9 +363,12 @@ def _weakening(s: _Sizes) -> Experiment | str:
     psi_end = s.psi + s.L_d * i_d
     end = min(WEAKENING_END * corner, s.omega_max, s.V_weakening / psi_end if psi_end > 0.0 else math.inf)
     if end < WEAKENING_LEAST * corner:
+        above = _generation_rpm(s.design)
+        bound = s.omega_max >= GENERATION_SHARE * above * RPM * s.p
+        why = f"; above {above:.4g} rpm a fault would charge the DC link" if bound else ""
         return (
             f"entry into field weakening: it begins at {corner / s.p / RPM:.4g} rpm, "
-            f"{end / s.p / RPM:.4g} rpm are within the limits"
+            f"{end / s.p / RPM:.4g} rpm are within the limits{why}"
         )
     start, step = WEAKENING_START * corner / s.p, (end - WEAKENING_START * corner) / s.p
     slope = WEAKENING_SLOPE * s.design["speed.acceleration_rpm_per_s"] * RPM

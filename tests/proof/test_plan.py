@@ -66,6 +66,20 @@ def test_nothing_leaves_the_envelope(seed: int) -> None:
         assert experiment.rows % experiment.repeats == 0
 
 
+def test_the_proof_stays_below_uncontrolled_generation_unless_a_fault_shorts_the_windings() -> None:
+    made = design()
+    free = replace(made, facts={**made.facts, "generation_rpm": 1e6})
+    for limit_rpm, bounded in ((1900.0, True), (1000.0, False)):
+        close = replace(made, facts={**made.facts, "generation_rpm": limit_rpm})
+        plan = plan_proof(close, conditions(close))
+        reached = [e.base_rad_s + e.excitation.amplitude for e in plan.experiments if e.name == "weakening"]
+        assert bool(reached) == bounded and all(speed <= limit_rpm * RPM for speed in reached)
+        if not bounded:
+            assert any("above 1000 rpm a fault would charge the DC link" in line for line in plan.left_out)
+        shorted = changed(close, protection__n_short_circuit_rpm=limit_rpm)
+        assert plan_proof(shorted, conditions(shorted)) == plan_proof(free, conditions(free))
+
+
 def light(J_kgm2: float = 1.2e-5, psi_f_wb: float = 0.02) -> MachineFile:
     """A 24-V machine that its own torque speeds up to the base speed within milliseconds."""
     return MachineFile(
