@@ -69,7 +69,7 @@ TYPES_ONLY = "pmsmtool.drive.port"
 
 SLOW_LIBRARIES = frozenset({"scipy", "matplotlib", "filterpy"})
 """0.2 to 0.6 s each: imported inside the function that needs them (start-up budget)."""
-SLOW_FOR_CLI = SLOW_LIBRARIES | {"numpy", "can", "canopen", "rich", "jinja2", "tomlkit"}
+SLOW_FOR_CLI = SLOW_LIBRARIES | {"numpy", "can", "canopen", "rich", "jinja2"}
 
 MAY_PRINT = frozenset({"cli", "packaging"})
 RANDOM_TYPES = frozenset({"Generator", "BitGenerator", "SeedSequence", "PCG64", "Philox", "default_rng"})

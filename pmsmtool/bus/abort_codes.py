@@ -42,40 +42,6 @@ class AbortCode(IntEnum):
     NO_DATA = 0x08000024
 
 
-ABORT_TEXT: dict[int, str] = {
-    AbortCode.TOGGLE: "toggle bit not alternated",
-    AbortCode.TIMED_OUT: "SDO protocol timed out",
-    AbortCode.COMMAND: "command specifier not valid or unknown",
-    AbortCode.BLOCK_SIZE: "invalid block size",
-    AbortCode.SEQUENCE: "invalid sequence number",
-    AbortCode.CRC: "CRC error",
-    AbortCode.MEMORY: "out of memory",
-    AbortCode.ACCESS: "unsupported access to an object",
-    AbortCode.WRITE_ONLY: "attempt to read a write-only object",
-    AbortCode.READ_ONLY: "attempt to write a read-only object",
-    AbortCode.NO_OBJECT: "object does not exist in the object dictionary",
-    AbortCode.NOT_MAPPABLE: "object cannot be mapped to a PDO",
-    AbortCode.PDO_LENGTH: "mapped objects exceed the PDO length",
-    AbortCode.INCOMPATIBLE: "general parameter incompatibility",
-    AbortCode.INTERNAL: "general internal incompatibility in the device",
-    AbortCode.HARDWARE: "access failed due to a hardware error",
-    AbortCode.LENGTH: "data type does not match, length of service parameter does not match",
-    AbortCode.TOO_LONG: "data type does not match, length of service parameter too high",
-    AbortCode.TOO_SHORT: "data type does not match, length of service parameter too low",
-    AbortCode.NO_SUBINDEX: "sub-index does not exist",
-    AbortCode.VALUE: "invalid value for the parameter",
-    AbortCode.VALUE_HIGH: "value of the parameter too high",
-    AbortCode.VALUE_LOW: "value of the parameter too low",
-    AbortCode.RANGE_INVERTED: "maximum value is less than minimum value",
-    AbortCode.RESOURCE: "resource not available",
-    AbortCode.GENERAL: "general error",
-    AbortCode.NOT_STORED: "data cannot be transferred or stored to the application",
-    AbortCode.LOCAL_CONTROL: "data cannot be transferred or stored because of local control",
-    AbortCode.DEVICE_STATE: "data cannot be transferred or stored because of the present device state",
-    AbortCode.NO_DICTIONARY: "object dictionary not present",
-    AbortCode.NO_DATA: "no data available",
-}
-
 TRANSPORT_CODES = frozenset(
     {AbortCode.TOGGLE, AbortCode.TIMED_OUT, AbortCode.COMMAND, AbortCode.BLOCK_SIZE, AbortCode.SEQUENCE, AbortCode.CRC}
 )
@@ -97,8 +63,11 @@ _LIKELY: dict[int, tuple[str, str]] = {
 
 
 def abort_text(code: int) -> str:
-    """Return the meaning of an abort code; codes outside the table are named as such."""
-    return ABORT_TEXT.get(code, "abort code not in CiA 301")
+    """Return the meaning of an abort code as the package ``canopen`` words it; other codes are named as such."""
+    from canopen.sdo.exceptions import SdoAbortedError
+
+    text = SdoAbortedError.CODES.get(code, "abort code not in CiA 301")
+    return text if text[1].isupper() else text[0].lower() + text[1:]
 
 
 def abort_advice(code: int) -> tuple[str, str]:

@@ -42,7 +42,7 @@ from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.scenarios import BUILT_IN, SCHEDULES
 
 ROOT = Path(__file__).resolve().parents[2]
-SLOW = ("numpy", "scipy", "can", "canopen", "matplotlib", "rich", "jinja2", "tomlkit", "filterpy")
+SLOW = ("numpy", "scipy", "can", "canopen", "matplotlib", "rich", "jinja2", "filterpy")
 
 
 def fresh(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:

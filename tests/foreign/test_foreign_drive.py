@@ -6,8 +6,9 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import can
 import pytest
@@ -17,9 +18,11 @@ from pmsmtool.bus.connect import connect
 from pmsmtool.bus.nmt import HEARTBEAT_ID
 from pmsmtool.cia402 import State
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive_maps.eds import Eds, parse_eds
 from pmsmtool.errors import ConfigError, SdoAbort
 from pmsmtool.sim import foreign
 from pmsmtool.sim.channel import build_line, parse_channel
+from pmsmtool.sim.foreign import file_rows
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.node.node import Node
@@ -169,6 +172,23 @@ def test_a_table_and_an_eds_say_the_same(tmp_path: Path) -> None:
     }
     with pytest.raises(ConfigError, match="no rows of family 'yours'"):
         read_makers_objects(f"{table}#yours")
+
+
+def test_an_eds_is_read_by_another_reader_than_the_tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_eds(tmp_path / "drive.eds", epos4())
+    right = read_makers_objects(str(path)).rows
+
+    def mistaken(*args: Any) -> Eds:
+        sheet = parse_eds(*args)
+        wrong = {at: replace(entry, data_type=5, access="ro", value="7") for at, entry in sheet.objects.items()}
+        return replace(sheet, objects=wrong)
+
+    monkeypatch.setattr(file_rows, "parse_eds", mistaken)
+    assert read_makers_objects(str(path)).rows == right
+    # canopen rejects a file with an object that says no access; what the tool reads counts then
+    path.write_text(path.read_text() + "\n[2FFF]\nParameterName=odd\nObjectType=0x7\nDataType=0x5\n")
+    with pytest.raises(ConfigError, match="profile 7"):
+        read_makers_objects(str(path))
 
 
 def test_files_that_are_no_drives_are_refused(tmp_path: Path) -> None:

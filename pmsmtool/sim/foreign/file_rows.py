@@ -34,6 +34,9 @@ MAPPINGS = frozenset((*range(0x1600, 0x1800), *range(0x1A00, 0x1C00)))
 CONSUMER_LIMIT = 0x7FFFFF
 """Largest entry of 0x1016: a node id above 16 bits of time (CiA 301); files with 65535 leave no room for the node."""
 
+NODE_ID = 1
+"""Of the drive that the file describes, where a value depends on it."""
+
 MANDATORY: tuple[tuple[int, int, str, str, str], ...] = (
     (0x1000, 0, "U32", "const", "0x00020192"),
     (0x1001, 0, "U8", "ro", "0"),
@@ -117,25 +120,36 @@ def read_makers_objects(where: str) -> MakersObjects:
 
 
 def _of_eds(data: bytes, path: Path) -> Iterator[tuple[tuple[int, int], ObjectRow]]:
-    eds = parse_eds(data, str(path), 1)
+    eds = parse_eds(data, str(path), NODE_ID)
     identity = {1: eds.vendor, 2: eds.product, 3: eds.revision}
+    read = _as_canopen_reads(decode(data)[0])
     for (index, sub), entry in eds.objects.items():
-        value = entry.value or entry.default
+        ours = entry.data_type, entry.access, entry.value or entry.default
+        data_type, access, value = read.get((index, sub), ours)
         if index == 0x1018 and not value and identity.get(sub) is not None:
             value = str(identity[sub])
-        yield (
-            (index, sub),
-            _row(
-                index,
-                sub,
-                entry.name,
-                _CODES.get(entry.data_type, "DOMAIN"),
-                entry.access,
-                value,
-                entry.low,
-                entry.high,
-            ),
-        )
+        kind = _CODES.get(data_type, "DOMAIN")
+        yield (index, sub), _row(index, sub, entry.name, kind, access, value, entry.low, entry.high)
+
+
+def _as_canopen_reads(text: str) -> dict[tuple[int, int], tuple[int, str, str]]:
+    """Return type, access and value of every object as the package ``canopen`` reads them; none of a file it rejects.
+
+    A simulated drive that was built with the tool's own reader alone would share its mistakes.
+    """
+    from canopen.objectdictionary import ODVariable
+    from canopen.objectdictionary.eds import import_eds
+
+    try:
+        dictionary = import_eds(io.StringIO(text), NODE_ID)  # type: ignore[no-untyped-call]
+    except Exception:  # no family of errors: KeyError, ValueError, those of configparser
+        return {}
+    found = {}
+    for entry in dictionary.values():
+        for variable in (entry,) if isinstance(entry, ODVariable) else entry.values():
+            value = getattr(variable, "value_raw", "") or getattr(variable, "default_raw", "")
+            found[variable.index, variable.subindex] = (variable.data_type or 0, variable.access_type, value)
+    return found
 
 
 def _of_table(data: bytes, path: Path, family: str) -> Iterator[tuple[tuple[int, int], ObjectRow]]:
@@ -161,7 +175,7 @@ def _of_table(data: bytes, path: Path, family: str) -> Iterator[tuple[tuple[int,
 
 def _limit(text: str, kind: str) -> int | float | None:
     try:
-        value = float(text) if BY_SHORT[kind].is_float else parse_integer(text, 1) if text.strip() else None
+        value = float(text) if BY_SHORT[kind].is_float else parse_integer(text, NODE_ID) if text.strip() else None
     except ValueError:
         return None
     bits = 8 * BY_SHORT[kind].size
@@ -190,7 +204,7 @@ def _value(text: str, kind: str) -> str:
     try:
         if code.is_float:
             return str(float(text))
-        value = parse_integer(text, 1)
+        value = parse_integer(text, NODE_ID)
     except ValueError:
         return "0"
     if "$NODEID" in text.upper():
