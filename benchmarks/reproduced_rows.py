@@ -37,7 +37,7 @@ def rows(seed: int, only: list[str]) -> tuple[list[str], int]:
     for figure in FIGURES:
         if only and figure.name not in only:
             continue
-        checks = reproduce(figure, seed).checks
+        checks = reproduce(figure.name, seed).checks
         lines += ["", f"{figure.name}: {figure.title}", *(line(check) for check in checks)]
         count += len(checks)
         missed += sum(not check.within for check in checks)

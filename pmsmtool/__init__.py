@@ -30,8 +30,12 @@ if TYPE_CHECKING:
     from pmsmtool.machine.parameters import Estimate as Estimate
     from pmsmtool.machine.parameters import InverterParameters as InverterParameters
     from pmsmtool.machine.parameters import MachineParameters as MachineParameters
+    from pmsmtool.papers.registry import reproduce as reproduce
     from pmsmtool.params.parameter_set import ParameterSet as ParameterSet
+    from pmsmtool.sim.scenarios import Scenario as Scenario
+    from pmsmtool.sim.simulate import simulate as simulate
     from pmsmtool.trace import Trace as Trace
+    from pmsmtool.trace_file import read_trace as read_trace
 
 __version__ = "0.1.0"
 
@@ -39,6 +43,7 @@ _HOME = {
     "PmsmtoolError": "pmsmtool.errors",
     "ExitCode": "pmsmtool.errors",
     "Trace": "pmsmtool.trace",
+    "read_trace": "pmsmtool.trace_file",
     "Estimate": "pmsmtool.machine.parameters",
     "MachineParameters": "pmsmtool.machine.parameters",
     "InverterParameters": "pmsmtool.machine.parameters",
@@ -51,6 +56,9 @@ _HOME = {
     "load_design": "pmsmtool.design.design_file",
     "tolerance_box": "pmsmtool.design.tolerance",
     "margin_report": "pmsmtool.design.loops.margins",
+    "Scenario": "pmsmtool.sim.scenarios",
+    "simulate": "pmsmtool.sim.simulate",
+    "reproduce": "pmsmtool.papers.registry",
     "connect": "pmsmtool.bus.connect",
     "CanopenDrive": "pmsmtool.drive.canopen_drive",
     "Envelope": "pmsmtool.drive.envelope",
@@ -64,6 +72,7 @@ __all__ = [
     "PmsmtoolError",
     "ExitCode",
     "Trace",
+    "read_trace",
     "Estimate",
     "MachineParameters",
     "InverterParameters",
@@ -76,6 +85,9 @@ __all__ = [
     "load_design",
     "tolerance_box",
     "margin_report",
+    "Scenario",
+    "simulate",
+    "reproduce",
     "connect",
     "CanopenDrive",
     "Envelope",

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import doctest
 import importlib.util
+import json
 import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
@@ -151,6 +154,19 @@ def test_python_blocks_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert "True" in capsys.readouterr().out
 
 
+def test_the_notebook_runs_and_shows_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    import matplotlib as mpl
+
+    monkeypatch.chdir(ROOT)
+    mpl.use("agg")
+    names: dict[str, Any] = {}
+    for cell in json.loads((ROOT / "docs/governed-step.ipynb").read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
+    assert names["held"]["off"] < 0.55 * 40.0 and names["held"]["best"] > 0.9 * 40.0
+    assert len(names["top"].lines) == 2
+
+
 def test_toml_blocks_are_toml() -> None:
     import tomllib
 
@@ -177,6 +193,8 @@ def test_the_python_names_are_the_documented_ones() -> None:
     assert named == set(pmsmtool.__all__)
     for name in pmsmtool.__all__:
         assert getattr(pmsmtool, name).__doc__, name
+        for example in doctest.DocTestFinder(recurse=False).find(getattr(pmsmtool, name), name):
+            assert doctest.DocTestRunner().run(example).failed == 0, name
     with pytest.raises(AttributeError):
         _ = pmsmtool.nonsense
 

@@ -184,7 +184,6 @@ def _asked(
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.identification.request import QUANTITIES, IdentifyRequest
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.machine.profile import machine_path
 
     wanted = IdentifyRequest(
         quantities=(*QUANTITIES, "map") if flux_map else QUANTITIES,
@@ -199,7 +198,7 @@ def _asked(
     )
     wanted.check()
     return {
-        "nameplate": None if machine is None else load_machine_file(machine_path(machine)),
+        "nameplate": None if machine is None else load_machine_file(machine),
         "identify": wanted,
         "tune": TuneRequest(**design),
     }

@@ -63,7 +63,7 @@ def reproduce_command(
     data: list[dict[str, Any]] = []
     for row in rows:
         out.status(f"{row.name} (about {row.run_s:g} s)")
-        found = reproduce(row, seed)
+        found = reproduce(row.name, seed)
         _write(found, path, figure_path, out)
         data.append(_data(found))
         if not out.json:

@@ -126,10 +126,9 @@ def _without_memory(channel: Channel) -> Channel:
 
 def _operate(line: Line, channel: Channel, out: Output) -> None:
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.machine.profile import machine_path
     from pmsmtool.sim.operation import operate
 
-    operate(line, load_machine_file(machine_path(channel.name)), out.note)
+    operate(line, load_machine_file(channel.name), out.note)
 
 
 def _how_to_join(host: str, port: int) -> str:
@@ -180,11 +179,10 @@ def clone_command(
     from pmsmtool.cli.drive_access import open_node, read_map, warn_of_other_drive
     from pmsmtool.files import write_file
     from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-    from pmsmtool.machine.profile import machine_path
     from pmsmtool.measurement.capabilities import examine
     from pmsmtool.measurement.clone import clone_drive
 
-    machine_file = load_machine_file(machine_path(machine))
+    machine_file = load_machine_file(machine)
     with open_node(bus) as node:
         found = examine(node, None if map_file is None else read_map(map_file))
         if map_file is not None:
@@ -218,12 +216,12 @@ def faults_command() -> None:
 def list_command(out: Output) -> None:
     """List the profiles that ship with the package."""
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.machine.profile import machine_path, profile_names
+    from pmsmtool.machine.profile import profile_names
     from pmsmtool.sim.channel import DEFAULT_PROFILE
 
     rows = []
     for name in profile_names():
-        machine_file = load_machine_file(machine_path(name))
+        machine_file = load_machine_file(name)
         machine, inverter = machine_file.machine, machine_file.inverter
         rows.append(
             {

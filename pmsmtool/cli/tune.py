@@ -109,10 +109,9 @@ def tune_command(
     """
     from pmsmtool.design.design_file import design_text
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.machine.profile import machine_path
 
     drive_map = read_map(map_file)
-    design = _design(load_machine_file(machine_path(machine)), drive_map, asked)
+    design = _design(load_machine_file(machine), drive_map, asked)
     params = design.parameter_set()
     params_path = _params_path(path) if params_path is None else params_path
     write_file(path, design_text(design))

@@ -28,6 +28,7 @@ from pmsmtool.machine.parameters import (
     MachineLimits,
     MachineParameters,
 )
+from pmsmtool.machine.profile import machine_path
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS, resolved_simulation
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
@@ -94,14 +95,15 @@ class MachineFile:
 
 
 @next_step(NEXT_STEP)
-def load_machine_file(path: Path) -> MachineFile:
-    """Read a machine file and the flux map it names.
+def load_machine_file(source: str | Path) -> MachineFile:
+    """Read a machine file, or that of a run directory or of a shipped profile's name, and the flux map it names.
 
     Raises
     ------
     ConfigError
-        The file cannot be read, or everything that is wrong in it.
+        There is no such file, it cannot be read, or everything that is wrong in it.
     """
+    path = machine_path(source)
     text = read_text(path, hint="`pmsmtool sim list` names the profiles")
     return parse_machine(text, where=str(path), folder=Path(path).parent)
 

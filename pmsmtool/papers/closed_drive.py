@@ -13,7 +13,6 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.papers.closed_node import STANDARD, ClosedNode, Nodes, OpenDrive, Seat
 from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, at_least, at_most
 from pmsmtool.papers.registry import OURS
@@ -37,7 +36,7 @@ LEAST_TIGHT = 0.6
 
 def source() -> MachineFile:
     """Return the machine: the profile at a constant temperature."""
-    return with_simulation(load_machine_file(machine_path(PROFILE)), {"thermal_on": False})
+    return with_simulation(load_machine_file(PROFILE), {"thermal_on": False})
 
 
 def design(request: TuneRequest, speed_rpm: float = SPEED_RPM) -> tuple[Design, Guarantee]:

@@ -20,7 +20,6 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.papers.figure import Array
 from pmsmtool.sim.kernel import Application, Rotor, Setup, Simulation, Target
@@ -138,7 +137,7 @@ TABLE_2B = Condition("Table 2 (b): 0.7 psi, 1.5 R", R=1.5, psi=0.7)
 @cache
 def source() -> MachineFile:
     """Return the machine file of the profile."""
-    return load_machine_file(machine_path(PROFILE))
+    return load_machine_file(PROFILE)
 
 
 def V_max() -> float:

@@ -13,7 +13,6 @@ from pmsmtool.design.polar_laws import LAWS
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.papers.figure import (
     Check,
     Column,
@@ -73,7 +72,7 @@ REACH_SHARE = 0.99
 @cache
 def interior(name: str = INTERIOR) -> MachineFile:
     """Return an interior-magnet machine behind an inverter without a period of delay."""
-    source = load_machine_file(machine_path(name))
+    source = load_machine_file(name)
     return replace(source, inverter=replace(source.inverter, delay_periods=0.5))
 
 

@@ -20,7 +20,6 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import simulate
 from pmsmtool.sim.kernel import Application
@@ -166,7 +165,7 @@ BASELINES = (FOC, GOVERNOR)
 @cache
 def machine_file(delay_periods: float = 1.5) -> MachineFile:
     """Return the assumed machine of the paper behind an inverter with a delay."""
-    source = load_machine_file(machine_path(PROFILE))
+    source = load_machine_file(PROFILE)
     return replace(source, inverter=replace(source.inverter, delay_periods=delay_periods))
 
 

@@ -94,8 +94,22 @@ def find(name: str) -> Row:
     raise ConfigError(f"there is no figure {name!r}{did_you_mean(name, names)}", hint="`pmsmtool reproduce --list`")
 
 
-def reproduce(row: Row, seed: int) -> Reproduction:
-    """Compute a figure."""
-    module, _, name = row.target.partition(":")
-    function: Callable[[int], Reproduction] = getattr(importlib.import_module(f"{__package__}.{module}"), name)
+def reproduce(name: str, seed: int = 1) -> Reproduction:
+    """Compute a figure or a table of the papers.
+
+    Parameters
+    ----------
+    name : str
+        As ``pmsmtool reproduce --list`` names it.
+    seed : int
+        Of random cases and of noise.
+
+    Raises
+    ------
+    ConfigError
+        No figure has that name.
+    """
+    row = find(name)
+    module, _, function_name = row.target.partition(":")
+    function: Callable[[int], Reproduction] = getattr(importlib.import_module(f"{__package__}.{module}"), function_name)
     return function(seed)

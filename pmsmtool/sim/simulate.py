@@ -6,20 +6,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pmsmtool.errors import ConfigError
 from pmsmtool.machine.key import Value
-from pmsmtool.machine.machine_file import SCHEMA as MACHINE_SCHEMA
-from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.params.parameter_set import ParameterSet, read_parameter_set
-from pmsmtool.sim.closed_loop import drive_values, simulate
+from pmsmtool.sim import closed_loop
+from pmsmtool.sim.closed_loop import drive_values
 from pmsmtool.sim.scenarios import Scenario, built_in, load_scenario
 from pmsmtool.sim.simulated_machine import with_simulation
-from pmsmtool.toml_file import read_toml
 from pmsmtool.trace import Trace
 
-DESIGN_SCHEMA = "pmsmtool.design/1"
+if TYPE_CHECKING:
+    from pmsmtool.design.design_file import Design
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,15 +44,15 @@ class SimulatedDrive:
     notes: tuple[str, ...] = ()
 
 
-def find_drive(source: str, params: Path | None = None) -> SimulatedDrive:
+def find_drive(source: str | Path | Design | MachineFile, params: Path | None = None) -> SimulatedDrive:
     """Return the drive that a design, a machine file, a run directory or a profile's name describes.
 
     A machine without a design is given the parameters that ``tune`` makes for it.
 
     Parameters
     ----------
-    source : str
-        File, folder or profile name.
+    source : str, Path, Design or MachineFile
+        File, folder or profile name, or what such a file holds.
     params : Path, optional
         A parameter set that is laid over the others.
 
@@ -63,39 +63,26 @@ def find_drive(source: str, params: Path | None = None) -> SimulatedDrive:
     DesignInfeasible
         No design for this machine.
     """
-    path = _path(source)
-    schema = _schema(path)
-    if schema == DESIGN_SCHEMA:
-        from pmsmtool.design.design_file import load_design
+    from pmsmtool.design.design_file import Design, load_machine_or_design
+    from pmsmtool.design.tune import tune
 
-        design = load_design(path)
-        found = SimulatedDrive(design.machine, design.parameter_set(), "design")
-    elif schema == MACHINE_SCHEMA:
-        from pmsmtool.design.tune import tune
-
-        machine_file = load_machine_file(path)
-        made = tune(machine_file)
-        found = SimulatedDrive(machine_file, made.parameter_set(), "designed by the rules of `tune`", made.notes)
+    if isinstance(source, Design):
+        machine, design = source.machine, source
+    elif isinstance(source, MachineFile):
+        machine, design = source, None
     else:
-        raise ConfigError(
-            f"schema is {schema!r}, expected {DESIGN_SCHEMA!r} or {MACHINE_SCHEMA!r}",
-            where=str(path),
-            hint="give a design.toml, a machine file or the name of a profile",
-        )
+        designed = Path(source) / "design.toml"
+        machine, design = load_machine_or_design(designed if designed.is_file() else machine_path(source))
+    if design is None:
+        made = tune(machine)
+        found = SimulatedDrive(machine, made.parameter_set(), "designed by the rules of `tune`", made.notes)
+    else:
+        found = SimulatedDrive(machine, design.parameter_set(), "design")
     if params is None:
         return found
     return replace(
         found, params=found.params.merged(read_parameter_set(params)), origin=f"{found.origin}, {params.name}"
     )
-
-
-def _path(source: str) -> Path:
-    design = Path(source) / "design.toml"
-    return design if design.is_file() else machine_path(source)
-
-
-def _schema(path: Path) -> object:
-    return read_toml(path, hint="`pmsmtool sim list` names the profiles").get("schema")
 
 
 def find_scenario(name: str, drive: SimulatedDrive) -> Scenario:
@@ -143,4 +130,35 @@ def run_scenario(
     if simulation:
         with_simulation(drive.machine, simulation)  # names the wrong keys before anything runs
         scenario = replace(scenario, simulation={**scenario.simulation, **simulation})
-    return simulate(drive.machine, drive.params, scenario, seed=seed)
+    return closed_loop.simulate(drive.machine, drive.params, scenario, seed=seed)
+
+
+def simulate(
+    source: str | Path | Design | MachineFile,
+    scenario: str | Scenario = "current-steps",
+    *,
+    seed: int | None = None,
+    duration_s: float | None = None,
+    simulation: Mapping[str, Value] | None = None,
+) -> Trace:
+    """Simulate a drive in closed loop and return its signals, as the command of the same name does.
+
+    Parameters
+    ----------
+    source : str, Path, Design or MachineFile
+        What is simulated; text names a file, a run directory or a shipped profile.
+    scenario : str or Scenario
+        Built-in name (``pmsmtool simulate --list``), scenario file, or a scenario.
+    seed, duration_s, simulation
+        As for :func:`run_scenario`.
+
+    Examples
+    --------
+    >>> import pmsmtool
+    >>> trace = pmsmtool.simulate("jercic-2017", "current-steps")
+    >>> trace.units["i_q_a"], bool(abs(trace["i_q_a"]).max() > 1.0)
+    ('A', True)
+    """
+    drive = find_drive(source)
+    wanted = scenario if isinstance(scenario, Scenario) else find_scenario(scenario, drive)
+    return run_scenario(drive, wanted, seed=seed, duration_s=duration_s, simulation=simulation)

@@ -35,7 +35,7 @@ PRINTED_FIGURES = {f"miyajima-fig{number}" for number in (2, 3, 4, 5, 7, 8, 9, 1
 
 
 def compute(name: str) -> Reproduction:
-    return REDUCED[name]() if name in REDUCED else reproduce(ROWS[name], 0)
+    return REDUCED[name]() if name in REDUCED else reproduce(name, 0)
 
 
 def test_every_plotted_figure_of_the_paper_is_there() -> None:
