@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -274,6 +275,7 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
     from pmsmtool.commissioning.commission import write_report
     from pmsmtool.errors import Declined
 
+    begun = time.monotonic()
     try:
         yield
     except BaseException as error:
@@ -282,13 +284,13 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
             raise
         try:
             write_report(run)
-            _show(run, out, ended=True)
+            _show(run, out, begun, ended=True)
             out.note(_next_step(run, error))
         except Exception as second:  # whatever it is, what ended the chain outranks it
             out.warn(f"the report could not be written: {type(second).__name__}: {second}")
         raise
     write_report(run)
-    found = _show(run, out)
+    found = _show(run, out, begun)
     if found.kind == "partial":
         raise _partial(found, run)
 
@@ -313,15 +315,17 @@ def _next_step(run: RunDirectory, error: BaseException) -> str:
     return f"go on with: pmsmtool commission --resume {run.path}"
 
 
-def _show(run: RunDirectory, out: Output, *, ended: bool = False) -> Verdict:
+def _show(run: RunDirectory, out: Output, begun: float, *, ended: bool = False) -> Verdict:
     """Show the verdict; of a run that an error ended as one object with ``--json``, else beside the error."""
     from pmsmtool.commissioning.report_page import verdict
 
     record, found = run.read(), verdict(run.path)
+    latest = [record.stage(name) for name in dict.fromkeys(stage.name for stage in record.stages)]
     stages = [
-        {key: getattr(stage, key) for key in ("name", "status", "summary", "note", "seconds")}
-        for name in dict.fromkeys(stage.name for stage in record.stages)
-        if (stage := record.stage(name)) is not None
+        {key: getattr(stage, key) for key in ("name", "status", "summary", "note", "seconds", "refused")}
+        | {"criteria": stage.acceptance}
+        for stage in latest
+        if stage is not None
     ]
     identified = record.stage("identify")
     data = {
@@ -330,6 +334,9 @@ def _show(run: RunDirectory, out: Output, *, ended: bool = False) -> Verdict:
         "verdict": found.word,
         "simulated": found.simulated,
         "reasons": found.lines,
+        "drive": record.drive,
+        "limits": [line for given in record.consents if given["subject"] == "motion" for line in given["text"]],
+        "seconds": {"wall": time.monotonic() - begun, "bus": sum(stage.seconds for stage in latest if stage)},
         "stages": stages,
         "values": [] if identified is None else list(identified.values),
         "comparison": [] if identified is None else list(identified.comparison),

@@ -116,8 +116,10 @@ def _ask(
     serial: int,
     out: Output,
 ) -> Consent:
-    for line in text:
-        click.echo(plain(line), err=True)  # shown even when quiet: nobody consents to what he has not seen
+    # shown even when quiet: nobody consents to what he has not seen; a simulated drive may go without
+    if not (simulated and options.yes and out.verbosity < 0):
+        for line in text:
+            click.echo(plain(line), err=True)
     if options.serial is not None and options.serial != serial:
         raise Declined(
             f"the drive's serial number is {serial}, --serial says {options.serial}: nothing was done",

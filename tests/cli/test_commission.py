@@ -124,6 +124,10 @@ def test_from_unknown_machine_to_the_proof(name: str, model: str, mapped: bool, 
     found = json.loads(out)
     assert found["schema"] == "pmsmtool.commission/1" and found["verdict"] == "PASS"
     assert [stage["name"] for stage in found["stages"]] == list(STAGES)
+    assert found["drive"]["node"] == 1 and found["drive"]["serial"] > 0
+    assert any(line.startswith("current   at most") for line in found["limits"])
+    assert all(criterion["ok"] for stage in found["stages"] for criterion in stage["criteria"])
+    assert 0.0 < found["seconds"]["wall"] and found["seconds"]["bus"] == sum(s["seconds"] for s in found["stages"])
     directory, record = the_run()
     assert record.stages[-1].name == "prove" and record.stages[-1].status == "pass"
     page = (directory.path / "report.html").read_text()

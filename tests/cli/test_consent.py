@@ -8,6 +8,7 @@ import os
 import select
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
@@ -135,3 +136,18 @@ def test_without_a_serial_number_only_a_person_consents(monkeypatch: pytest.Monk
             ask(["i_max 5 A"], given, simulated=False, serial=0, out=Output())
         assert "shows no serial number" in caught.value.hint
         assert ask(["i_max 5 A"], given, simulated=True, serial=0, out=Output()).answer == "--yes"
+
+
+@pytest.mark.parametrize("ask", [consent.ask_motion, consent.ask_writing])
+def test_only_a_simulated_drive_goes_without_its_lines_when_quiet(
+    ask: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quiet, given = Output(verbosity=-1), MotionOptions(yes=True)
+    ask(["i_max 5 A"], given, simulated=True, serial=7, out=quiet)
+    assert capsys.readouterr().err == ""
+    ask(["i_max 5 A"], given, simulated=True, serial=7, out=Output())
+    assert "i_max 5 A" in capsys.readouterr().err
+    monkeypatch.setattr(consent, "person_present", lambda: False)
+    with pytest.raises(Declined):
+        ask(["i_max 5 A"], given, simulated=False, serial=7, out=quiet)
+    assert "i_max 5 A" in capsys.readouterr().err
