@@ -5,7 +5,6 @@
         saturated-pmsyrm measured-map
     python -m benchmarks.identification_coverage --drives 400 --block timing
     python -m benchmarks.identification_coverage --drives 100 --first 10000 --hard
-    python -m benchmarks.identification_coverage --drives 24 --first 35000 --hard --half-frequency
     python -m benchmarks.identification_coverage --drives 400 --keep FOLDER --measure-only
     python -m benchmarks.identification_coverage --drives 400 --keep FOLDER --bridge 0.2
 
@@ -107,7 +106,6 @@ def is_hard(drive: MachineFile) -> bool:
 class Choice:
     """What is done with every drive."""
 
-    half_frequency: bool = False
     keep: Path | None = None
     measure_only: bool = False
     bridge_v: float = 0.0
@@ -197,12 +195,12 @@ def identify_one(job: tuple[str, int, str], choice: Choice) -> dict[str, Any]:
 def kept(job: tuple[str, int, str], drive: MachineFile, choice: Choice) -> Measured | Refusal:
     """Return what was kept of this drive, or measure and keep it."""
     profile, seed, block = job
-    name = f"{profile or 'population'}-{block}-{seed}{'-half' if choice.half_frequency else ''}.pickle"
+    name = f"{profile or 'population'}-{block}-{seed}.pickle"
     if choice.keep is not None and (choice.keep / name).exists():
         stored: Measured | Refusal = pickle.loads((choice.keep / name).read_bytes())
         return stored
     try:
-        found: Measured | Refusal = measured(drive, choice.half_frequency)
+        found: Measured | Refusal = measured(drive)
     except PmsmtoolError as error:
         found = Refusal.of(error)
     if choice.keep is not None:
@@ -212,12 +210,12 @@ def kept(job: tuple[str, int, str], drive: MachineFile, choice: Choice) -> Measu
     return found
 
 
-def measured(drive: MachineFile, half_frequency: bool = False) -> Measured:
+def measured(drive: MachineFile) -> Measured:
     """Run the experiments on a simulated drive; return traces, nameplate and time on the bus (s)."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.toml"
         path.write_text(dump_machine_file(drive, embed_flux_map=drive.flux_map is not None), encoding="utf-8")
-        return _measured(path, half_frequency)
+        return _measured(path)
 
 
 def evaluated(traces: dict[str, Trace], nameplate: MachineFile, tolerance: SensorTolerance | None = None) -> Evaluation:
@@ -226,7 +224,7 @@ def evaluated(traces: dict[str, Trace], nameplate: MachineFile, tolerance: Senso
     return evaluate(traces, inverter.T_s, T_ref_c=T_ref_c, U_dc_v=inverter.U_dc_v, tolerance=tolerance).whole()
 
 
-def _measured(path: Path, half_frequency: bool) -> Measured:
+def _measured(path: Path) -> Measured:
     traces: dict[str, Trace] = {}
     with connect("pmsmsim", f"{path}?nv=:memory:") as connection:
         drive = CanopenDrive(connection, 1)
@@ -242,7 +240,6 @@ def _measured(path: Path, half_frequency: bool) -> Measured:
         start = connection.clock.now()
         with guarded(drive, envelope) as guard:
             measurement = Measurement(guard, limits, traces.__setitem__, lambda text: None)
-            measurement.half_frequency = half_frequency
             measurement.run(ELECTRICAL)
         seconds = connection.clock.now() - start
         drive.close()
@@ -329,8 +326,6 @@ def main() -> None:
     around = "draw around these profiles; measured-map: the map in ../shared/maps"
     parser.add_argument("--around", nargs="*", default=[], metavar="PROFILE", help=around)
     parser.add_argument("--hard", action="store_true", help="only drives whose dead time takes 3 R I and more")
-    second = "measure R at half the control frequency, too"
-    parser.add_argument("--half-frequency", action="store_true", help=second)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--rows", type=Path, help="write every drive's result there (JSON lines)")
     parser.add_argument("--tabulate", type=Path, metavar="ROWS", help="only print the table of a file of --rows")
@@ -353,7 +348,7 @@ def main() -> None:
         jobs = (job for job in jobs if is_hard(drawn(*job)))
     with multiprocessing.Pool(options.processes) as pool:
         rows = []
-        choice = Choice(options.half_frequency, options.keep, options.measure_only, options.bridge)
+        choice = Choice(options.keep, options.measure_only, options.bridge)
         one = functools.partial(identify_one, choice=choice)
         for row in pool.imap_unordered(one, itertools.islice(jobs, options.drives)):
             rows.append(row)

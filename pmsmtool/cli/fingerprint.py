@@ -102,7 +102,6 @@ def like_then(request: IdentifyRequest, earlier: Earlier, *, own_tolerance: bool
         request,
         quantities=earlier.measurable(request.quantities),
         accuracy=(request.accuracy or ACCURACY) if inject else request.accuracy,
-        half_frequency=request.half_frequency or earlier.request.half_frequency,
         tolerance=request.tolerance if own_tolerance else earlier.request.tolerance,
     )
 

@@ -72,11 +72,6 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     "sensors' part, which is printed beside it.",
 )
 @click.option(
-    "--half-frequency",
-    is_flag=True,
-    help="Measure R at half the control frequency, too, and extrapolate to zero: removes the dead time from R.",
-)
-@click.option(
     "--supply",
     is_flag=True,
     help="R of a drive that shows no voltage: a person reads the bench supply's power at several currents.",
@@ -97,7 +92,6 @@ def identify_command(
     sensor_tol: float | None,
     cal: tuple[str, ...],
     accuracy: float | None,
-    half_frequency: bool,
     supply: bool,
     map_file: Path | None,
 ) -> None:
@@ -132,8 +126,6 @@ def identify_command(
     if replay is not None:
         if fingerprint is not None:
             raise click.UsageError("--fingerprint measures; `pmsmtool diff` compares two runs that are there")
-        if half_frequency:
-            raise click.UsageError("--half-frequency measures; with --replay the traces of the run decide")
         if accuracy is not None:
             raise click.UsageError("--accuracy says how much is measured; with --replay it is that of the run")
         from pmsmtool.identification.replay import MACHINE, REPLAYED
@@ -158,7 +150,6 @@ def identify_command(
         shaft=motion.shaft or "free",
         load=motion.load,
         brake=motion.brake,
-        half_frequency=half_frequency,
         accuracy=accuracy,
         tolerance=calibrated_tolerance(declared or SensorTolerance(), cal),
     )
@@ -171,10 +162,6 @@ def identify_command(
     request.check()
     everything = not quantities and earlier is None
     found, how, request = _choose(bus, map_file, method, request, everything=everything, supply=supply)
-    if half_frequency and how != "inject":
-        raise NotAvailable(
-            f"the method {how} has no measurement at half the control frequency", hint="leave --half-frequency out"
-        )
     if accuracy is not None and how != "inject":
         raise NotAvailable(f"the method {how} has no choice of what it collects", hint="leave --accuracy out")
     if supply and not (how == "standard" and "R" in request.quantities):

@@ -373,15 +373,6 @@ def settled_levels(levels: Trace, noise: Noise) -> tuple[Trace, int]:
     return Trace(levels.t_s[~moved], signals, levels.units, levels.meta), left_out
 
 
-def at_one_temperature(levels: Trace, R: Estimate, copper: Copper) -> Trace:
-    """Return levels with the voltage that the winding would take at the temperature of ``R``, where both are known."""
-    T = levels["T_winding_c"]
-    if not (math.isfinite(R.T_c) and np.all(np.isfinite(T))):
-        return levels
-    warmer = _per_k(R, copper) * (T - R.T_c) * levels["i_d_a"]
-    return replace(levels, signals={**levels.signals, "u_d_v": levels["u_d_v"] - warmer})
-
-
 def resistance_warmed(R: Estimate, T_c: float, copper: Copper) -> float:
     """Return a measured resistance at another temperature of the winding (ohm); as it is where either is unknown."""
     known = math.isfinite(T_c) and math.isfinite(R.T_c)

@@ -17,7 +17,6 @@ from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_enc
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.linkage import FluxResult, check_magnet, estimate_flux_linkage
 from pmsmtool.estimators.flux.map_result import FluxMapResult
-from pmsmtool.estimators.frequency_extrapolation import FrequencySplit
 from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.axis_response import initial_inductance
 from pmsmtool.estimators.injection.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
@@ -41,7 +40,6 @@ from pmsmtool.identification.calibration import calibrated_traces
 from pmsmtool.identification.cogging import Cogging, cogging_of
 from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
-from pmsmtool.identification.half_frequency import resistance_at_two_frequencies
 from pmsmtool.identification.mechanics import elastic_mechanics, mechanics_of
 from pmsmtool.identification.sampling import resistance_as_sampled
 from pmsmtool.machine.parameters import Estimate
@@ -74,7 +72,6 @@ class Evaluation:
     mismatch: SensorMismatch | None = None
     pairs: PairCheck | None = None
     resistance: ResistanceResult | None = None
-    split: FrequencySplit | None = None
     encoder: EncoderResult | None = None
     inductance: InductanceResult | None = None
     flux: FluxResult | None = None
@@ -179,8 +176,8 @@ def evaluate(
     ----------
     traces : mapping of str to Trace
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
-        ``levels_half_frequency``, ``phase_pairs``, ``rotation_forward``, ``rotation_backward``,
-        ``square_d_<half period>``, ``square_q_<half period>``, ``speeds``, ``map_<k>``, ``speeds_after_map``,
+        ``phase_pairs``, ``rotation_forward``, ``rotation_backward``, ``square_d_<half period>``,
+        ``square_q_<half period>``, ``speeds``, ``map_<k>``, ``speeds_after_map``,
         ``inertia_<k>``, ``frf_<k>``, ``turns_<k>``, ``slow_<k>``.
     period_s : float
         Control period (s).
@@ -229,11 +226,10 @@ def evaluate(
             return None
 
     if "levels" in traces:
-        found = attempt("R", lambda: resistances_of(traces, result.noise, copper, tolerance))
-        if found is not None:
-            R = found[0]
+        R = attempt("R", lambda: resistance_of(traces["levels"], result.noise, copper, tolerance))
+        if R is not None:
             R = replace(R, R_s=widened(R.R_s, mismatch), R_measured=widened(R.R_measured, mismatch))
-            result = replace(result, resistance=R, split=found[1])
+            result = replace(result, resistance=R)
     if "phase_pairs" in traces and result.resistance is not None:
         result = replace(result, pairs=check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve))
     if "rotation_backward" in traces:
@@ -295,14 +291,6 @@ def with_equal_sensors(traces: Mapping[str, Trace], mismatch: SensorMismatch | N
         **traces,
         **{n: without_mismatch(trace, mismatch, float(trace.meta["fixed_angle_rad"])) for n, trace in fixed.items()},
     }
-
-
-def resistances_of(
-    traces: Mapping[str, Trace], noise: Noise, copper: Copper, tolerance: SensorTolerance
-) -> tuple[ResistanceResult, FrequencySplit | None]:
-    """Return the resistance by one control frequency, or by two where both were measured."""
-    resistance = resistance_of(traces["levels"], noise, copper, tolerance)
-    return resistance_at_two_frequencies(traces, noise, resistance, copper, tolerance)
 
 
 def resistance_of(

@@ -13,7 +13,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.resistance import copper_of
 from pmsmtool.files import read_text
-from pmsmtool.identification import flux_map, frequency_response, half_frequency, value_verdict
+from pmsmtool.identification import flux_map, frequency_response, value_verdict
 from pmsmtool.identification.accuracy import accuracy_facts, accuracy_line
 from pmsmtool.identification.calibration import calibrated_tolerance
 from pmsmtool.identification.cogging import save_cogging
@@ -54,11 +54,8 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         A trap was seen; no machine file is written.
     """
     evaluation = evaluation_of(run, nameplate, request)
-    parts = half_frequency.split_estimates(evaluation.split, nameplate.inverter.U_dc_v, request.tolerance)
     timing = timing_estimates(evaluation.inductance, evaluation.shown, request.tolerance)
-    conditions = value_verdict.conditions_of(evaluation, request) | half_frequency.split_conditions(
-        evaluation.split, parts
-    )
+    conditions = value_verdict.conditions_of(evaluation, request)
     found = evaluation.estimates()
     designed = machine_of(evaluation, nameplate, conditions)
     acceptance = value_verdict.acceptance_of(evaluation, found, designed, request.quantities)
@@ -90,7 +87,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
             "accepted": name not in rejected,
             **({"accuracy": accuracy[name]} if name in accuracy else {}),
         }
-        for name, estimate in (found | parts | timing | kept.ripples()).items()
+        for name, estimate in (found | timing | kept.ripples()).items()
     ]
     summary = value_verdict.summary_of(kept, {name: e for name, e in found.items() if name not in rejected})
     return Stage(

@@ -55,8 +55,6 @@ class IdentifyRequest:
         Envelope (A peak, rad/s mechanical).
     shaft, load, brake : str
         What hangs on the shaft and may happen to it.
-    half_frequency : bool
-        Whether R and inverter are measured at half the control frequency, too.
     accuracy : float or None
         Statistical 95 % half width, relative, of R, L and psi at which the run stops collecting; None: all of it.
     map_if_saturated : bool
@@ -74,7 +72,6 @@ class IdentifyRequest:
     shaft: Shaft = "free"
     load: Load = "none"
     brake: Brake = "none"
-    half_frequency: bool = False
     accuracy: float | None = None
     map_if_saturated: bool = False
     resonance: bool = False
@@ -99,10 +96,6 @@ class IdentifyRequest:
         if unknown or not self.quantities:
             raise ConfigError(
                 f"cannot identify {', '.join(unknown) or 'nothing'}", hint=f"choose from {', '.join(NEEDS)}, or all"
-            )
-        if self.half_frequency and self.quantities == ("poles",):
-            raise ConfigError(
-                "pole pairs alone do not measure R", hint="leave --half-frequency out, or identify R, too"
             )
         if self.accuracy is not None and not set(self.quantities) & set(accuracy.KEYS):
             raise ConfigError(
@@ -137,6 +130,7 @@ def parse_request(text: str, *, where: str) -> IdentifyRequest:
     """
     try:
         facts = json.loads(text)
+        facts.pop("half_frequency", None)  # of runs before it was taken out
         tolerance = SensorTolerance(**facts.pop("tolerance"))
         request = IdentifyRequest(tolerance=tolerance, **{**facts, "quantities": tuple(facts["quantities"])})
     except (ValueError, TypeError, KeyError, AttributeError) as error:

@@ -89,8 +89,6 @@ def summary_of(evaluation: Evaluation, found: Mapping[str, Estimate]) -> str:
 def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
     """Return what a reader should know about a result that was accepted all the same."""
     lines = []
-    if request.half_frequency and evaluation.split is None:
-        lines.append("R_s is from one control frequency: half of it cannot be set on this drive")
     if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
         lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
     if evaluation.mismatch is not None and evaluation.mismatch.corrected:

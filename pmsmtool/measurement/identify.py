@@ -29,7 +29,7 @@ from pmsmtool.identification.request import (
 )
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, MachineLimits, MachineParameters
-from pmsmtool.measurement import flux_map, frequency_response, half_frequency, mechanics
+from pmsmtool.measurement import flux_map, frequency_response, mechanics
 from pmsmtool.measurement.limits import DURATION_S, HEADROOM, Limits, require_speed, unused_current
 from pmsmtool.measurement.measure import Measurement, starting_gains
 from pmsmtool.measurement.run_account import status_of, text_of
@@ -132,8 +132,6 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
     steps = steps_of(request.measured, request.shaft == "locked")
     allowed = [*envelope.lines(), *unused_current(envelope.i_max_apk, nameplate, pulses="map" in steps)]
     lines = [*allowed, f"the rotor aligns with current vectors: it may jump by half an electrical turn; {HOMING_LOST}"]
-    if request.half_frequency:
-        lines.append(half_frequency.PLAN_LINE)
     if "rotation" in steps:
         lines.append("the shaft turns slowly through one turn each way")
     if "speeds" in steps:
@@ -233,7 +231,6 @@ def _measure(
             keep,
             say,
             held=locked,
-            half_frequency=request.half_frequency,
             accuracy=request.accuracy,
             map_if_saturated=request.map_if_saturated,
         )

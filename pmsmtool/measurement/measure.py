@@ -34,7 +34,6 @@ from pmsmtool.identification.request import steps_of
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import flux_map, frequency_response, mechanics, shaft_forecast
 from pmsmtool.measurement.effort import ALL, Effort, LevelEffort, effort_for, larger_levels
-from pmsmtool.measurement.half_frequency import measure_at_half_frequency
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.shaft_forecast import ShaftForecast, forecast_of
 from pmsmtool.measurement.speeds import EMF_SHARE, SpeedStage
@@ -106,8 +105,6 @@ class Measurement:
         Whether the shaft is locked.
     accuracy : float or None
         Statistical 95 % half width, relative, of R, L and psi that is enough; None: all is collected.
-    half_frequency : bool
-        Whether R is measured at half the control frequency, too.
     map_if_saturated : bool
         Whether a machine that saturates is mapped without being asked for it.
     spent : callable or None
@@ -128,7 +125,6 @@ class Measurement:
     say: Callable[[str], None]
     ripple_share: float = RIPPLE_SHARE
     held: bool = False
-    half_frequency: bool = False
     accuracy: float | None = None
     map_if_saturated: bool = False
     spent: Callable[[], tuple[float, float]] | None = None
@@ -391,9 +387,7 @@ class Measurement:
             if effort is efforts[-1] or self._enough_levels(trace, noise):
                 break
             self.say("  the accuracy asked for is not reached: more levels")
-        resistance = resistance_of(trace, noise)
-        measure_at_half_frequency(self.drive, plan, resistance, self.half_frequency, self.keep, self.say)
-        return resistance
+        return resistance_of(trace, noise)
 
     def _enough_levels(self, trace: Trace, noise: Noise) -> bool:
         if trace["flagged"][-1] > 0.0:
