@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A drive's own identification, started and read: OS commands of CiA 301, or a mode of operation of its maker's.
+"""A drive's own identification, started and read by OS commands of CiA 301.
 
 The drive moves the machine by itself. Of the envelope it keeps its own limits (0x6073, 0x6080); the rest is watched by
 the guard, which stops it. What it answers is taken as it is.
@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.sdo import Retry
-from pmsmtool.cia402 import Command, State
+from pmsmtool.cia402 import State
 from pmsmtool.drive import objects
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.standard_drive import StandardDrive
@@ -119,31 +119,8 @@ class VendorDrive(StandardDrive):
         DriveTimeout
             It does not end in its time.
         """
-        began = self.node.connection.clock.now()
-        run = self._run_command if self.tuning.kind == "os_command" else self._run_mode
-        data = run(step, wait, began + step.timeout_s)
-        seconds = self.node.connection.clock.now() - began
-        if self.tuning.kind == "os_command":
-            return VendorAnswer(step.name, data, seconds, self._answered(step, data, known), dict(known))
-        raw, values = b"", dict[str, float]()
-        for cell in sorted(self.tuning.results.values(), key=lambda cell: bool(cell.gain)):
-            found = self.node.sdo.read(cell.index, cell.sub, size=cell.size)
-            raw += found
-            values[cell.name] = cell.decode(found, {**known, **values})
-        return VendorAnswer(step.name, raw, seconds, values, {**known, **values})
-
-    def _too_long(self, step: VendorStep) -> DriveTimeout:
-        return DriveTimeout(
-            f"the drive's own identification ({step.title}) does not end within {step.timeout_s:g} s",
-            where=f"node {self.node.node}",
-            likely="a shaft that does not turn as it should, or other firmware than the map is for",
-            hint="timeout_s in [vendor_tuning] of the map, if this drive needs more time",
-        )
-
-    # ---- OS commands ----------------------------------------------------------------------------
-
-    def _run_command(self, step: VendorStep, wait: Wait, deadline_s: float) -> bytes:
         node = self.node
+        began = node.connection.clock.now()
         node.put(COMMAND_MODE, EXECUTE_AT_ONCE)
         if self._read_answer()[0] > FAILED_WITH_CODE:  # reading it also takes an old answer away
             raise DriveFault(
@@ -158,10 +135,18 @@ class VendorDrive(StandardDrive):
             if answer[0] <= FAILED_WITH_CODE:
                 self._commanded = False
                 self._check_answer(step, answer)
-                return answer
-            self._check_running()
-            if node.connection.clock.now() >= deadline_s:
-                raise self._too_long(step)
+                seconds = node.connection.clock.now() - began
+                return VendorAnswer(step.name, answer, seconds, self._answered(step, answer, known), dict(known))
+            if node.state() in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+                raise node.fault_error()
+            self.check_operating()
+            if node.connection.clock.now() >= began + step.timeout_s:
+                raise DriveTimeout(
+                    f"the drive's own identification ({step.title}) does not end within {step.timeout_s:g} s",
+                    where=f"node {node.node}",
+                    likely="a shaft that does not turn as it should, or other firmware than the map is for",
+                    hint="timeout_s in [vendor_tuning] of the map, if this drive needs more time",
+                )
             wait(POLL_S)
 
     def _read_answer(self) -> bytes:
@@ -173,12 +158,6 @@ class VendorDrive(StandardDrive):
                 hint="compare order and data of [vendor_tuning] in the map with the manual of this firmware",
             )
         return answer
-
-    def _check_running(self) -> None:
-        state = self.node.state()
-        if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-            raise self.node.fault_error()
-        self.check_operating()
 
     def _check_answer(self, step: VendorStep, answer: bytes) -> None:
         if answer[0] not in (FAILED, FAILED_WITH_CODE):
@@ -207,25 +186,3 @@ class VendorDrive(StandardDrive):
             )
         data = answer[DATA_AT : DATA_AT + cell.size]
         return {step.name: cell.decode(data[::-1] if self.tuning.order == "big" else data, known)}
-
-    # ---- a mode of its own ----------------------------------------------------------------------
-
-    def _run_mode(self, step: VendorStep, wait: Wait, deadline_s: float) -> bytes:
-        node = self.node
-        start, done = 1 << self.tuning.start_bit, 1 << self.tuning.done_bit
-        if node.whole(objects.STATUSWORD) & done:
-            raise DriveFault(
-                f"statusword bit {self.tuning.done_bit} is set before anything was started",
-                where=f"node {node.node}, 0x6041:00",
-                likely="other firmware than the map is for",
-                hint="switch the drive off and on; compare done_bit of the map with the manual of this firmware",
-            )
-        node.command(objects.CONTROLWORD, Command.ENABLE_OPERATION | start)
-        while not node.whole(objects.STATUSWORD) & done:
-            self._check_running()
-            if node.connection.clock.now() >= deadline_s:
-                raise self._too_long(step)
-            wait(POLL_S)
-        self._check_running()  # a fault may set the bit, too
-        node.command(objects.CONTROLWORD, Command.ENABLE_OPERATION)
-        return b""

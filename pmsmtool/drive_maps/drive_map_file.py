@@ -33,8 +33,7 @@ from pmsmtool.drive_maps.motion_objects import dump_motion, parse_motion
 from pmsmtool.drive_maps.recorder_map import Recording
 from pmsmtool.drive_maps.recorder_map_file import TABLE as RECORDER
 from pmsmtool.drive_maps.recorder_map_file import dump_recorder, parse_recorder
-from pmsmtool.drive_maps.vendor_tuning import VendorTuning
-from pmsmtool.drive_maps.vendor_tuning_file import TABLE, dump_vendor_tuning, parse_vendor_tuning
+from pmsmtool.drive_maps.vendor_tuning import TABLE, VendorTuning, dump_vendor_tuning, parse_vendor_tuning
 from pmsmtool.drive_maps.wire_units import as_peak, counted_in, wire_unit
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.params.catalogue import BY_NAME, EVERY, Parameter
@@ -234,11 +233,11 @@ def _parse_tuning(
     if not isinstance(table, dict):
         return None
 
-    def row_of(name: str, row: Any, path: tuple[str, ...], anywhere: bool) -> Cell | None:
+    def row_of(name: str, row: Any, path: tuple[str, ...]) -> Cell | None:
         def tell(key: str, what: str) -> None:
             complain((*path, key) if key else path, f"{path[-1]}: {what}")
 
-        return _parse_cell(name, row, sources, tell, anywhere=anywhere)
+        return _parse_cell(name, row, sources, tell, anywhere=True)
 
     return parse_vendor_tuning(table, cells, sources, complain, row_of)
 

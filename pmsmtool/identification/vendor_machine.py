@@ -56,7 +56,7 @@ def vendor_estimates(tuning: VendorTuning, answers: Mapping[str, VendorAnswer]) 
                 f"{key} = {format_quantity(value, bounds.unit)}",
                 stage=f"the drive's own {answer.step}",
             )
-        method = f"OS command {tuning.steps[answer.step].command}" if tuning.kind == "os_command" else "set-up mode"
+        method = f"OS command {tuning.steps[answer.step].command}"
         found[key] = Estimate(value, math.nan, 0.0, bounds.unit, method=f"the drive's own: {method}", source=SOURCE)
     return found
 
@@ -144,10 +144,14 @@ def _counts(cell: Cell, answer: VendorAnswer) -> float:
 
 def answer_facts(tuning: VendorTuning, answer: VendorAnswer) -> dict[str, Any]:
     """Return an answer as the run keeps it: the bytes as they came."""
-    facts: dict[str, Any] = {"step": answer.step, "seconds": round(answer.seconds, 3), "bytes": answer.data.hex(" ")}
-    if tuning.kind == "os_command":
-        facts |= {"object": f"0x{OS_COMMAND:04X}", "command": tuning.steps[answer.step].command}
-    return facts | {"values": answer.values}
+    return {
+        "step": answer.step,
+        "seconds": round(answer.seconds, 3),
+        "bytes": answer.data.hex(" "),
+        "object": f"0x{OS_COMMAND:04X}",
+        "command": tuning.steps[answer.step].command,
+        "values": answer.values,
+    }
 
 
 ANSWERS = "vendor_tuning.json"

@@ -418,17 +418,15 @@ def _told(ask: Callable[[], T]) -> T | None:
 
 
 def _vendor_quantities(node: DriveNode, drive_map: DriveMap) -> frozenset[str]:
-    """Return what the drive's own identification tells; an object that is not there tells nothing.
+    """Return what the drive's own identification tells; without OS commands it tells nothing.
 
     The answer of an OS command is not read here: reading it acknowledges it.
     """
     tuning = drive_map.vendor_tuning
     if tuning is None:
         return frozenset()
-    needed = [(OS_COMMAND, 2), (OS_COMMAND_MODE, 0)]
-    if tuning.kind == "mode":
-        needed = [(cell.index, cell.sub) for cell in tuning.results.values()]
-    return tuning.quantities if all(node.has(*address) for address in needed) else frozenset()
+    there = node.has(OS_COMMAND, 2) and node.has(OS_COMMAND_MODE, 0)
+    return tuning.quantities if there else frozenset()
 
 
 def _bit(mode: Mode) -> int:

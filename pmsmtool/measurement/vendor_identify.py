@@ -162,8 +162,7 @@ def _own_drive(drive: CanopenDrive, found: Capabilities) -> Iterator[VendorDrive
 def _steps(own: VendorDrive, request: IdentifyRequest) -> tuple[VendorStep, ...]:
     asked = frozenset(request.quantities)
     steps = own.tuning.steps_for(asked, turning=request.shaft != "locked")
-    names = set(own.tuning.results) if own.tuning.kind == "mode" and steps else {step.name for step in steps}
-    lacking = sorted(asked - {RESULTS[name] for name in names if name in RESULTS})
+    lacking = sorted(asked - {RESULTS[step.name] for step in steps if step.name in RESULTS})
     if lacking and request.shaft == "locked":
         raise NotAvailable(
             f"{', '.join(lacking)}: the drive's own identification turns the shaft, and it is locked",

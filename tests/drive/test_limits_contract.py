@@ -32,7 +32,7 @@ from pmsmtool.drive.recorded_means import RecordedMeans
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
 from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
-from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
+from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveFault, Interrupted, LimitExceeded, PmsmtoolError, SafetyRefusal, StopNotConfirmed
 from pmsmtool.experiments.current_limit import (
@@ -52,7 +52,6 @@ from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.session import Session
 from tests.drive.bench import COMMANDS
 from tests.measurement.test_mapped_recorder import completed
-from tests.measurement.vendor_rig import filled_in
 
 ENVELOPE = Envelope(i_max_apk=3.0, speed_max_rad_s=100.0)
 
@@ -101,7 +100,6 @@ CLASSES = {
     "mapped-rows": _written(completed(), MappedRecorderDrive),
     "mapped-index": _family("ingenia", MappedRecorderDrive),
     "vendor-os-command": _family("synapticon", VendorDrive),
-    "vendor-mode": _written(dump_drive_map(filled_in()), VendorDrive),
 }
 """Every class that is energised, with the recorders of the makers behind it."""
 

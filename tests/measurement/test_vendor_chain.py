@@ -27,7 +27,7 @@ from pmsmtool.proof.stage import ProofRequest
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.sim.bus import PmsmSimBus
 from tests.commissioning.audience import Quiet, Told
-from tests.measurement.vendor_rig import PROFILE, TRUTH, channel, filled_in, without_torque
+from tests.measurement.vendor_rig import PROFILE, TRUTH, channel, without_torque
 
 pytestmark = pytest.mark.chain
 
@@ -76,10 +76,8 @@ def chain(
     return run, progress, found.tier
 
 
-@pytest.mark.parametrize("kind", ["os_command", "mode"])
-def test_commission_of_the_vendor_tier_ends_green_with_what_it_gives(kind: str, tmp_path: Path) -> None:
-    drive_map = without_torque(load_family("synapticon") if kind == "os_command" else filled_in())
-    run, progress, tier = chain(tmp_path, drive_map)
+def test_commission_of_the_vendor_tier_ends_green_with_what_it_gives(tmp_path: Path) -> None:
+    run, progress, tier = chain(tmp_path, without_torque(load_family("synapticon")))
     assert tier is Tier.VENDOR
     assert progress.ended["identify"] == progress.ended["lut"] == "pass"
     assert set(progress.ended.values()) == {
@@ -93,7 +91,7 @@ def test_commission_of_the_vendor_tier_ends_green_with_what_it_gives(kind: str, 
     machine = load_machine_file(run.path / "machine.toml")
     assert machine.estimates["psi_f_wb"].source == "vendor" and "psi_f_wb" not in machine.std
     assert machine.machine.J_kgm2 == TRUTH.J_kgm2  # given: nothing pushed the shaft
-    assert ("L_d_h" in machine.estimates) == (kind == "mode")
+    assert "L_d_h" not in machine.estimates  # one inductance for both axes
     notes = tolerance_box(machine).notes
     assert "R_s_ohm: the drive's own value has no interval, 3 % assumed" in notes
     page = report_page(run.path)
@@ -101,9 +99,9 @@ def test_commission_of_the_vendor_tier_ends_green_with_what_it_gives(kind: str, 
 
 
 def test_without_a_data_sheet_the_drives_values_are_told_and_nothing_is_designed(tmp_path: Path) -> None:
-    run, progress, _ = chain(tmp_path, without_torque(filled_in()), sheet=False)
+    run, progress, _ = chain(tmp_path, without_torque(load_family("synapticon")), sheet=False)
     assert progress.ended["identify"] == "pass" and progress.ended["tune"] == "not available"
-    assert "needs ratings and the inverter" in run.read().stage("tune").note  # type: ignore[union-attr]
+    assert "needs L_d_h, L_q_h" in run.read().stage("tune").note  # type: ignore[union-attr]
 
 
 def test_measured_values_outrank_the_drives_own(tmp_path: Path) -> None:

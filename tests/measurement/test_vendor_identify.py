@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Identification by the drive itself: started, watched, read, restored; on OS commands and on a mode of its own."""
+"""Identification by the drive itself: started, watched, read, restored."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from pmsmtool.identification.vendor_machine import coarse_notes, vendor_estimate
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.vendor_identify import identify_vendor
 from pmsmtool.sim.node.session import Session
-from tests.measurement.vendor_rig import PROFILE, TRUTH, channel, filled_in, opened, without_torque
+from tests.measurement.vendor_rig import PROFILE, TRUTH, channel, opened, without_torque
 
 ENVELOPE = Envelope(7.3, 314.0)
 EVERY = frozenset(("R", "L", "psi", "poles"))
@@ -93,20 +93,6 @@ def test_os_commands_are_started_in_order_read_and_restored(tmp_path: Path) -> N
     assert sum(answer.seconds for answer in answers) > 5.0
 
 
-@pytest.mark.chain
-def test_a_mode_of_its_own_is_started_waited_for_and_read(tmp_path: Path) -> None:
-    with opened(tmp_path, filled_in()) as (drive, session):
-        before = held(session)
-        (answer,) = identified(drive)
-        assert held(session) == before
-        assert session.power.mode == 0
-    assert answer.values["motor.pole_pairs"] == TRUTH.pole_pairs
-    assert answer.values["motor.R_s_ohm"] == pytest.approx(TRUTH.R_s_ohm, rel=0.05)
-    assert answer.values["motor.L_d_h"] == pytest.approx(TRUTH.L_d_h, rel=0.03)
-    assert answer.values["motor.L_q_h"] == pytest.approx(TRUTH.L_q_h, rel=0.03)
-    assert answer.values["motor.psi_f_wb"] == pytest.approx(TRUTH.psi_f_wb, rel=0.03)
-
-
 def faulty(folder: Path, **simulation: str) -> str:
     text = PROFILE.read_text(encoding="utf-8")
     lines = "".join(f'{key} = "{value}"\n' for key, value in simulation.items())
@@ -135,14 +121,6 @@ def test_a_code_that_the_map_does_not_name_is_told_as_a_number(tmp_path: Path) -
         identified(drive)
 
 
-def test_a_mode_that_fails_is_the_drives_fault(tmp_path: Path) -> None:
-    machine = faulty(tmp_path, phase_open="b")
-    with opened(tmp_path, filled_in(), machine=machine) as (drive, session):
-        with pytest.raises(DriveFault, match="emergency|in fault 0xff20"):
-            identified(drive)
-        assert session.power.state is not State.OPERATION_ENABLED
-
-
 @pytest.mark.chain
 def test_a_command_that_takes_too_long_is_given_up_and_the_next_one_is_taken(tmp_path: Path) -> None:
     drive_map = load_family("synapticon")
@@ -159,22 +137,8 @@ def test_a_command_that_takes_too_long_is_given_up_and_the_next_one_is_taken(tmp
         assert identified(drive, frozenset("R"))[-1].values["motor.R_s_ohm"] == pytest.approx(TRUTH.R_s_ohm, rel=0.05)
 
 
-def test_a_mode_that_takes_too_long_is_stopped(tmp_path: Path) -> None:
-    drive_map = filled_in()
-    tuning = drive_map.vendor_tuning
-    assert tuning is not None
-    short = replace(tuning, steps={name: replace(step, timeout_s=1.0) for name, step in tuning.steps.items()})
-    with (
-        opened(tmp_path, replace(drive_map, vendor_tuning=short)) as (drive, _),
-        pytest.raises(DriveTimeout, match="does not end within 1 s"),
-    ):
-        identified(drive)
-
-
-@pytest.mark.parametrize("kind", ["os_command", "mode"])
-def test_ctrl_c_stops_gives_up_and_restores(kind: str, tmp_path: Path) -> None:
-    drive_map = load_family("synapticon") if kind == "os_command" else filled_in()
-    with opened(tmp_path, drive_map) as (drive, session):
+def test_ctrl_c_stops_gives_up_and_restores(tmp_path: Path) -> None:
+    with opened(tmp_path, load_family("synapticon")) as (drive, session):
         before = held(session)
         clock = drive.node.connection.clock
         clock.after(3.0, lambda: signal.raise_signal(signal.SIGINT))  # type: ignore[attr-defined]
@@ -325,13 +289,6 @@ def test_a_held_rotor_gives_its_resistance(rotor: str, tmp_path: Path) -> None:
         assert isinstance(outcome.exception, LimitExceeded) and "travel" in str(outcome.exception)
 
 
-def test_a_set_up_mode_that_turns_is_refused_on_a_held_rotor(tmp_path: Path) -> None:
-    machine = channel(tmp_path, filled_in())
-    outcome = run("--sim", machine, "--yes", "identify", "R", "--shaft", "locked", "--method", "vendor",
-                  "--map", str(tmp_path / "nanotec.toml"))  # fmt: skip
-    assert isinstance(outcome.exception, NotAvailable) and "turns the shaft, and it is locked" in str(outcome.exception)
-
-
 def test_nothing_is_started_on_a_drive_that_the_map_does_not_name(tmp_path: Path) -> None:
     other = replace(load_family("synapticon"), vendor=0x999)
     path = tmp_path / "other.toml"
@@ -347,6 +304,3 @@ def test_caps_shows_the_tier(tmp_path: Path) -> None:
     assert "capability level vendor" in outcome.stdout
     line = next(line for line in outcome.stdout.splitlines() if line.startswith("R ") and "vendor" in line)
     assert "no interval" in line
-    outcome = run("--sim", "interior-2k2?nv=:memory:&drive=nanotec", "caps", "--map", "nanotec", "--json")
-    ways = {(row["quantity"], row["method"]): row for row in json.loads(outcome.stdout)["quantities"]}
-    assert not ways["R", "vendor"]["available"]  # the procedure is known, the object of its result is not
