@@ -3,7 +3,7 @@
 
     python -m benchmarks.cogging --drives 20 --first 91000 --results cogging.jsonl
 
-Drives of ``sim/random_drives.py`` get cogging of 0.3 to 5 % of rated torque at the least common multiple of slots and
+Drives of ``random_drives.py`` get cogging of 0.3 to 5 % of rated torque at the least common multiple of slots and
 poles, a 5th of 0.5 to 5 % and a 7th of 0.3 to 3 % of the back-EMF, both drawn evenly over the logarithm. The whole of
 `identify --yes` runs over frames. A target is met within 10 % or 0.1 % of rated torque (of the fundamental), and 5
 degrees. Marks behind a row: X and P where amplitude and phase miss it, ! where their interval does not cover. With
@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.commissioning import commanded, prepared
+from benchmarks.random_drives import draw_drive
 from benchmarks.real_effects import EFFECTS, truth_of
 from benchmarks.real_population import draw_real
 from pmsmtool.errors import PmsmtoolError
@@ -34,7 +35,6 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_m
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
-from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import settings_of
 
 COGGING, FIFTH, SEVENTH = (0.3, 5.0), (0.5, 5.0), (0.3, 3.0)

@@ -22,13 +22,13 @@ from pathlib import Path
 
 import can
 
+from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.cli.main import run
 from pmsmtool.machine.flux_map_import import load_flux_map
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.random_drives import true_loop_resistance
 
 ROOT = Path(__file__).resolve().parent.parent
 MEASURED_MAP = ROOT.parent / "shared" / "maps" / "baldor_400rpm_map.npz"

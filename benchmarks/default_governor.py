@@ -23,6 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from benchmarks.random_drives import draw_around, draw_drive
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.tune import tune
@@ -34,7 +35,6 @@ from pmsmtool.papers.statistics import BAND
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import simulate
 from pmsmtool.sim.kernel import Application
-from pmsmtool.sim.random_drives import draw_around, draw_drive
 from pmsmtool.sim.scenarios import Scenario
 
 BEFORE_S, AFTER_S = 0.06, 0.12

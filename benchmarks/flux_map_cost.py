@@ -17,7 +17,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
-from pmsmtool.machine.analytic_saturation import saturated_pmsyrm_map
+from benchmarks.analytic_saturation import saturated_pmsyrm_map
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_cells import library
 

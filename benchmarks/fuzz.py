@@ -34,8 +34,7 @@ from pmsmtool.design.lookup.file import SCHEMA as LOOK_UP_SCHEMA
 from pmsmtool.design.lookup.file import table_parameters
 from pmsmtool.design.tune import tune
 from pmsmtool.drive.port import Identity
-from pmsmtool.drive_maps.dcf import Entry as Written
-from pmsmtool.drive_maps.dcf import read_concise, update_dcf, values_of, write_concise
+from pmsmtool.drive_maps.dcf import update_dcf, values_of
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.drive_maps.eds import parse_eds
@@ -244,7 +243,6 @@ TEXTS: dict[str, tuple[str, Callable[[str], object]]] = {
     "traces-csv": ("t_s,i_d_a\ns,A\n" + "".join(f"{k * 1e-4!r},{k * 0.1!r}\n" for k in range(20)), _use_trace_csv),
 }
 BINARIES: dict[str, tuple[Callable[[], bytes], Callable[[bytes], object]]] = {
-    "concise-dcf": (lambda: write_concise([Written(0x2010, 2, b"abcd"), Written(0x1017, 0, b"ab")]), read_concise),
     "flux-maps-npz": (lambda: flux_map_npz(_small_map()), _use_map_bytes(".npz")),
     "flux-maps-mat": (_mat, _use_map_bytes(".mat")),
     "traces-npz": (lambda: trace_npz(_trace()), _use_trace_npz),

@@ -8,7 +8,7 @@
     python -m benchmarks.identification_coverage --drives 400 --keep FOLDER --measure-only
     python -m benchmarks.identification_coverage --drives 400 --keep FOLDER --bridge 0.2
 
-Drives follow from their seeds (``sim/random_drives.py``); the tool sees their nameplate only. Printed per
+Drives follow from their seeds (``random_drives.py``); the tool sees their nameplate only. Printed per
 quantity: error quantiles, how often the statistical and the total (printed) 95 % interval holds the truth, with its
 Clopper-Pearson interval, and every refusal by name. ``R_at_T_ohm`` is the loop at the temperature of the measurement:
 the share of devices and copper, which no experiment sees, enters ``R_s_ohm`` only. The thresholds of the bridge's
@@ -39,6 +39,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.commissioning import drive_of
+from benchmarks.random_drives import draw_around, draw_drive, true_loop_resistance
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
@@ -50,7 +51,6 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.identify import envelope_of, nameplate_of
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
-from pmsmtool.sim.random_drives import draw_around, draw_drive, true_loop_resistance
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
 

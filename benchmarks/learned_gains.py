@@ -5,7 +5,7 @@
 
 A table has the columns of ``sim/foreign/file_rows.py``; the nodes are its families that have a velocity mode and gains
 of a speed loop (``sim/foreign/drawn_gains.py``), and one that keeps to CiA 402. Machines are random
-(``sim/random_drives.py``); the learner gets the inertia with an error drawn from the standard deviation it is told.
+(``random_drives.py``); the learner gets the inertia with an error drawn from the standard deviation it is told.
 
 A scale is right within 12 %; the truth is what one count does on this machine (its magnets are not at 20 degC, so the
 drive's own newton metre is not one). *Wrong* is a decided scale, form or convention that is not the truth. After every
@@ -29,6 +29,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.random_drives import draw_drive
 from pmsmtool.bus.connect import connect
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.drive_node import DriveNode
@@ -43,7 +44,6 @@ from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.measurement.learn_gains import GAIN, INTEGRAL, gain_object, learn_speed_loop, within_budget
 from pmsmtool.measurement.learned_rows import learned_gains, shown_currents
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
-from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.units import rad_s_from_rpm
 

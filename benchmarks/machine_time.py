@@ -35,6 +35,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks.identification_coverage import drawn
+from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.errors import PmsmtoolError
@@ -46,7 +47,6 @@ from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.identify import identify_stage, nameplate_of
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
-from pmsmtool.sim.random_drives import true_loop_resistance
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 
 NAMES = (R_MEASURED, "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")

@@ -7,7 +7,7 @@
 
 A table has the columns of ``sim/foreign/file_rows.py``; every family in it is a node. `caps`, `identify`, `commission`
 and `flash-params` run at their default options with consent, on the machine of a profile, or on random ones from their
-seeds (``sim/random_drives.py``); a drive that by its file cannot commutate that machine gets the first random one that
+seeds (``random_drives.py``); a drive that by its file cannot commutate that machine gets the first random one that
 it can. One row per node: tier and map, what was told with its error and half width against the simulated truth, the
 stages of the chain, what was written, and for what was not had the first reason. Every row that could be written is
 also counted against the node's own units. Exit code 1 where a truth lies outside its interval, or a unit is wrong.
@@ -31,6 +31,7 @@ from typing import Any
 
 from click.testing import CliRunner
 
+from benchmarks.random_drives import draw_drive
 from pmsmtool.cli.main import cli
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import PmsmtoolError
@@ -43,7 +44,6 @@ from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.foreign.behind import set_up_of
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.foreign.file_rows import MakersObjects, read_makers_objects
-from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import settings_of
 
 TOLD = ("J_per_psi", "J_per_kt")

@@ -4,7 +4,7 @@
     python -m benchmarks.mechanics_accuracy --drives 100 --first 1000
     python -m benchmarks.mechanics_accuracy --bound 200
 
-Drives follow from their seeds (``sim/random_drives.py``, switched inverter, ideal gains and timing); the tool sees
+Drives follow from their seeds (``random_drives.py``, switched inverter, ideal gains and timing); the tool sees
 their nameplate only. An error of the flux linkage goes into all three values one to one; ``J/psi`` is the error without
 it. Every standard deviation is compared with the one that was said before the machine moved for it. ``--rows FILE``
 keeps a line per drive and goes on from there; without drives the table is made of what it holds.
@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.identification_coverage import clopper_pearson
+from benchmarks.random_drives import draw_drive
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
@@ -42,7 +43,6 @@ from pmsmtool.machine.machine_file import dump_machine_file
 from pmsmtool.measurement.identify import envelope_of, nameplate_of
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
-from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace import Trace
 

@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks.commissioning import prepared
+from benchmarks.random_drives import data_sheet, draw_drive
 from pmsmtool.bus.connect import Connection
 from pmsmtool.commissioning.commission import Commissioning, Silent, begin_run
 from pmsmtool.commissioning.report_page import verdict
@@ -37,7 +38,6 @@ from pmsmtool.proof.stage import ProofRequest
 from pmsmtool.report.comparison import unchecked
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.random_drives import data_sheet, draw_drive
 
 LEVELS = {"full": "", "inject": "&tier=inject", "recorder": "&tier=recorder", "standard": "&drive=cia402"}
 ERRORS: dict[str, tuple[tuple[str, ...], float]] = {

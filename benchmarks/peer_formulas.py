@@ -27,7 +27,7 @@ from benchmarks.identification_coverage import drawn, evaluated, measured, truth
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.injection.axis_response import initial_inductance
 from pmsmtool.estimators.injection.inductance import bare_shot
-from pmsmtool.estimators.resistance import single_point_resistance, two_point_resistance
+from pmsmtool.estimators.resistance import two_point_slope
 from pmsmtool.identification.evaluate import Evaluation, shots_of
 from pmsmtool.trace import Trace
 
@@ -36,6 +36,17 @@ Traces = Mapping[str, Trace]
 Formula = Callable[[Traces, Evaluation], float]
 KNEES = np.geomspace(0.005, 1.0, 60)
 """Knees of the fixed curve that are tried, of the largest current."""
+
+
+def two_point_resistance(levels: Trace) -> float:
+    """Slope between two levels (ohm)."""
+    return two_point_slope(levels["i_d_a"], levels["u_d_v"])
+
+
+def single_point_resistance(levels: Trace) -> float:
+    """V/I at the largest level (ohm)."""
+    index = int(np.argmax(np.abs(levels["i_d_a"])))
+    return float(levels["u_d_v"][index] / levels["i_d_a"][index])
 
 
 def curve_fit_resistance(levels: Trace) -> float:

@@ -5,7 +5,7 @@
     python -m benchmarks.prove_verdicts --drives 40 --first 5000 --kinds gain_low gain_high
     python -m benchmarks.prove_verdicts --drives 300 --declared
 
-Drives follow from their seeds (``sim/random_drives.py``, switched inverter). Each is identified first, over the
+Drives follow from their seeds (``random_drives.py``, switched inverter). Each is identified first, over the
 bus as the tool does it; a drive that is refused there is counted apart. With ``--declared`` identification is skipped:
 the tool is given the true parameters off by draws from the intervals that it declares (:data:`DECLARED`). Then it
 designs, flashes over the bus, and proves. Every drive is proven healthy, and once more with one defect that its objects
@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.random_drives import draw_drive
 from pmsmtool.bus.connect import connect
 from pmsmtool.commissioning.commission import begin_run
 from pmsmtool.design.design_file import Design
@@ -50,7 +51,6 @@ from pmsmtool.proof.simulated import predict_proof
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.drive_kernel import KernelCore
 from pmsmtool.sim.kernel import Params
-from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import settings_of
 
 DECLARED: dict[str, tuple[float, float]] = {

@@ -4,7 +4,7 @@
     python -m benchmarks.real_effects --results effects.jsonl --keep runs
 
 The whole of `identify --yes` runs in the process, over frames, with its default options, on shipped profiles and on
-drives of ``sim/random_drives.py``. A row holds the exit code, what was refused, and of every value its error over
+drives of ``random_drives.py``. A row holds the exit code, what was refused, and of every value its error over
 the simulated truth and its total 95 % half width (%), of the values that were accepted. With ``--keep`` the runs stay:
 ``--replay`` makes the table anew from their traces, without the machine. ``--table`` only prints the results.
 """
@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.commissioning import commanded, prepared
+from benchmarks.random_drives import draw_drive
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.identification.replay import MACHINE, replay
@@ -31,7 +32,6 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_m
 from pmsmtool.machine.torque import iron_drag
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
-from pmsmtool.sim.random_drives import draw_drive
 
 BASES = ("interior-2k2", "fast-ipm", "random-7", "random-12")
 QUANTITIES = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2", "B_nms", "tau_c_nm")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The population of *real* drives: those of ``sim/random_drives.py``, each with four effects of real machines or more.
+"""The population of *real* drives: those of ``random_drives.py``, each with four effects of real machines or more.
 
 Every effect of ``benchmarks/real_effects.py`` is drawn by itself, with an even chance, from its usual range; a drive
 with fewer than ``LEAST_EFFECTS`` is drawn again. A drive follows from its seed alone.
@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from benchmarks.random_drives import Block, draw_drive
 from benchmarks.real_effects import EFFECTS, truth_of
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.sim.random_drives import Block, draw_drive
 
 LEAST_EFFECTS = 4
 CHANCE = 0.5

@@ -3,7 +3,7 @@
 
     python -m benchmarks.standstill_bounds --drives 10 --realisations 20 --write benchmarks/tables/standstill_bounds.txt
 
-Random drives (``sim/random_drives.py``) are identified once. The residual of the best fit is taken out of their
+Random drives (``random_drives.py``) are identified once. The residual of the best fit is taken out of their
 square-wave records and of their coasting windows, white noise of the measured size is put in, and the estimate is made
 again; the DC levels get the noise of their means. Each deviation from the mean of its drive is divided by the bound of
 the same record: for L that of the best model, all its nuisance parameters free, for R that of the tail 1/|i|, 1/|i|^2

@@ -6,7 +6,7 @@
     python -m benchmarks.tier_intervals recorder --drives 200 --first 5000
     python -m benchmarks.tier_intervals inject --drives 200 --first 7200
 
-Drives follow from their seeds (``sim/random_drives.py``). The simulated node has the objects of its tier only:
+Drives follow from their seeds (``random_drives.py``). The simulated node has the objects of its tier only:
 ``drive=cia402`` with the master's commutation angle, or the reference drive without excitation (``tier=recorder``) or
 averages (``tier=inject``). ``supply``: R of the standard tier from the readings of the simulated bench supply
 (``sim/bench_supply.py``). ``--speed`` is the largest speed that is allowed, over the nameplate's: the flux linkage of
@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.identification_coverage import clopper_pearson
+from benchmarks.random_drives import draw_drive
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
@@ -53,7 +54,6 @@ from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
 from pmsmtool.measurement.supply_reading import hold_for_supply
 from pmsmtool.measurement.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
-from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
 

@@ -29,7 +29,7 @@ from benchmarks.identification_coverage import clopper_pearson
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import track
-from pmsmtool.estimators.tracking_model import TRACKED, Known, condense
+from pmsmtool.estimators.tracking_model import TRACKED, Known, steady, windows
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.resources import data_folder
@@ -113,7 +113,7 @@ def one(seed: int) -> dict[str, tuple[float, bool, float]]:
         loads_nm=(-load, load),
         magnet_k_per_s=float(rng.uniform(*MAGNET_K_PER_S)),
     )
-    found = track(condense(trace, round(WINDOW_S / trace.period_s)), known)
+    found = track(steady([windows(trace, round(WINDOW_S / trace.period_s))])[0], known)
     truth = true_values(drive, trace, found.t_s)
     late = found.t_s > SETTLED_S
     row = {}

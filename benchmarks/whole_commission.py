@@ -5,7 +5,7 @@
     python -m benchmarks.whole_commission --real --drives 400 --first 160000 --results real.jsonl
     python -m benchmarks.whole_commission --second-plant --drives 60 --first 170000 --results second.jsonl
 
-Drives follow from their seeds (``sim/random_drives.py``: switched inverter, half of the encoders reversed, half of
+Drives follow from their seeds (``random_drives.py``: switched inverter, half of the encoders reversed, half of
 the machines with two leads swapped, 5 to 90 degC, three kinds of sensors in turn). FILE is a data sheet within its
 tolerances, and the drive's memory holds the set of another motor. The command runs in the process, over frames, with
 its default options. Every result is appended to the file as it comes; a seed in the file is not run again, and
@@ -31,6 +31,7 @@ from typing import Any
 
 from benchmarks import second_plant
 from benchmarks.commissioning import QUANTITIES, commanded, errors_of, prepared
+from benchmarks.random_drives import Block, data_sheet, draw_drive
 from benchmarks.real_population import draw_real
 from pmsmtool.commissioning.report_page import verdict
 from pmsmtool.estimators.estimate import total_half_width
@@ -41,7 +42,6 @@ from pmsmtool.sim.node.factory import factory_values, set_up_values
 from pmsmtool.sim.node.memory import FileStorage, Memory
 from pmsmtool.sim.node.parameter_set import ParameterImage
 from pmsmtool.sim.node.store import IMAGE_KEY, SIGNATURE_KEY, encode
-from pmsmtool.sim.random_drives import Block, data_sheet, draw_drive
 
 BLOCKS: tuple[Block, ...] = ("ideal", "timing", "gains")
 OTHER = 1_000_000

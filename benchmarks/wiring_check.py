@@ -5,7 +5,7 @@
     python -m benchmarks.wiring_check --level recorder --miswired 130 --healthy 65
     python -m benchmarks.wiring_check --level TABLE.csv#FAMILY --miswired 130 --healthy 65
 
-Drives follow from their seeds (``sim/random_drives.py``); FILE is a data sheet within its tolerances. A miswired
+Drives follow from their seeds (``random_drives.py``); FILE is a data sheet within its tolerances. A miswired
 one is named rightly when the first row that is wrong is about what was done to it. Below the full level `not shown`
 counts those of which the row is listed as NOT CHECKED and no other is wrong; exit code 0 would be a pass.
 """
@@ -21,8 +21,8 @@ from pathlib import Path
 
 from benchmarks.commissioning import prepared
 from benchmarks.motor_files import wrong_file
+from benchmarks.random_drives import data_sheet, draw_drive
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.sim.random_drives import data_sheet, draw_drive
 
 WIRED: dict[str, tuple[dict[str, object], str]] = {
     "phase a open": ({"phase_open": "a"}, "phases"),

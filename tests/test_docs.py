@@ -17,12 +17,12 @@ import click
 import pytest
 
 import pmsmtool
+from benchmarks.command_reference import BEGIN, END, reference, replaced
 from benchmarks.recorded_sessions import arguments, session
 from pmsmtool.cli.command_table import COMMANDS
 from pmsmtool.cli.help_topics import EXIT_CODES
 from pmsmtool.cli.lazy_group import leaves
 from pmsmtool.cli.main import cli
-from pmsmtool.cli.reference import BEGIN, END, reference, replaced
 from pmsmtool.errors import ConfigError, ExitCode
 from pmsmtool.machine.machine_keys import machine_file_keys
 from pmsmtool.params.catalogue import CATALOGUE
@@ -209,7 +209,7 @@ def test_the_exit_codes_are_those_of_the_program() -> None:
 
 def test_the_command_reference_is_up_to_date() -> None:
     part = PAGES["commands.md"].split(BEGIN, 1)[1].split(END, 1)[0].strip("\n")
-    assert part == reference().strip("\n"), "run python -m pmsmtool.cli.reference --write"
+    assert part == reference().strip("\n"), "run python -m benchmarks.command_reference --write"
 
 
 def test_the_reference_names_every_command_and_option() -> None:

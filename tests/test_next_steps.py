@@ -24,8 +24,7 @@ from pmsmtool.design.lookup.file import table_parameters
 from pmsmtool.design.lookup.iron_loss import load_iron_loss_map
 from pmsmtool.design.tune import tune
 from pmsmtool.drive.port import Identity
-from pmsmtool.drive_maps.dcf import Entry as Written
-from pmsmtool.drive_maps.dcf import read_concise, update_dcf, values_of, write_concise
+from pmsmtool.drive_maps.dcf import update_dcf, values_of
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.drive_maps.eds import parse_eds
@@ -157,9 +156,6 @@ BINARIES: dict[str, tuple[Callable[[], bytes], str, Callable[[Path], object]]] =
     "iron-loss map": (lambda: flux_map_npz(small_map()), "loss.npz", load_iron_loss_map),
     "look-up table": (lambda: trace_npz(a_trace()), "l.npz", lambda path: table_parameters(read_npz(path), str(path))),
     "prediction": (lambda: trace_npz(a_trace()), "p.npz", lambda path: from_arrays(read_npz(path))),
-    "concise dcf": (
-        lambda: write_concise([Written(0x2010, 2, b"\1\2\3\4")]), "c.bin", of_bytes(lambda d: read_concise(d, "c.bin"))
-    ),
     "matlab": (lambda: flux_map_npz(small_map()), "map.mat", load_flux_map),
 }  # fmt: skip
 

@@ -2,11 +2,8 @@
 """Shortest possible current transfer under a voltage limit: the bound every controller is held against.
 
 di/dt = F i + G u + e at constant speed, |u| <= V_max (circle) or u inside the inverter's hexagon, which stands still in
-the stator frame and so turns in this one. Two independent methods:
-
-* support function: a time T is enough iff for every direction q the target lies inside the reachable set,
-  q . (i_to - i_free(T)) - rho <= integral of the largest q . e^(F t) G u; the smallest such T is a root;
-* shooting (circle only): u = V_max G l/|G l| with dl/dt = -F^T l; unknown are the angle of l and T.
+the stator frame and so turns in this one. A time T is enough iff for every direction q the target lies inside the
+reachable set: q . (i_to - i_free(T)) - rho <= integral of the largest q . e^(F t) G u; the smallest such T is a root.
 """
 
 from __future__ import annotations
@@ -151,7 +148,7 @@ class _Reach:
         self.problem, self.start, self.end, self.radius = problem, start, end, radius
         self.voltage, self.theta_e = voltage, theta_e
         self.F, self.G, self.e = problem.system()
-        self.flow = _Flow(self.F)
+        self.flow = Flow(self.F)
         # the hexagon's support has corners in time: more points
         self.density = QUADRATURE * (8 if voltage == "hexagon" else 1)
 
@@ -195,7 +192,7 @@ _ZOOMS = 8
 """Refinements of the worst direction: 2 pi / 72 * 0.25^8 = 1e-6 rad, an error of its square."""
 
 
-class _Flow:
+class Flow:
     """e^(F t) and its integral in closed form for a 2 x 2 matrix."""
 
     def __init__(self, F: Array) -> None:
@@ -222,66 +219,6 @@ class _Flow:
         return np.asarray(0.5 * T * np.einsum("t,tab->ab", weights, self.at(0.5 * T * (nodes + 1.0))))
 
 
-# -- shooting --------------------------------------------------------------------------------------------------
-
-SHOOTING_STEPS = 60
-SHOOTING_DONE_A = 1e-9
-"""End error of a shot (A) that counts as a hit."""
-
-
-def shoot(
-    problem: TransferProblem, i_from: tuple[float, float], i_to: tuple[float, float], radius: float = 0.0
-) -> float:
-    """Return the shortest time (s) under the circle by the costate equations, from the flux-steering start.
-
-    Raises
-    ------
-    DesignInfeasible
-        Newton does not converge from any start (the target may be out of reach).
-    """
-    F, G, e = problem.system()
-    flow, back = _Flow(F), _Flow(-F.T)
-    nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE)
-    start, end = np.asarray(i_from, dtype=np.float64), np.asarray(i_to, dtype=np.float64)
-
-    def miss(angle: float, T: float) -> Array:
-        t = 0.5 * T * (nodes + 1.0)
-        costate = back.at(t) @ np.array([math.cos(angle), math.sin(angle)])
-        pushed = costate @ G
-        u = problem.V_max * pushed / np.hypot(pushed[:, 0], pushed[:, 1])[:, None]
-        driven = np.einsum("tab,tb->ta", flow.at(T - t), u @ G + e)
-        final = flow.at(np.array([T]))[0] @ start + 0.5 * T * weights @ driven
-        last = back.at(np.array([T]))[0] @ np.array([math.cos(angle), math.sin(angle)])
-        return np.asarray(final + radius * last / np.hypot(*last) - end)
-
-    shots = (_newton(miss, angle, T) for angle, T in _starts(problem, start, end))
-    found = [T for T in shots if T is not None]
-    if not found:
-        raise DesignInfeasible(
-            "no time-optimal transfer was found",
-            where="minimum time",
-            likely="out of reach",
-            hint="take a target nearer to the start, or a larger voltage",
-        )
-    return min(found)
-
-
-def _starts(problem: TransferProblem, start: Array, end: Array) -> list[tuple[float, float]]:
-    """Times and costate angles around steering the stator flux straight, as without resistance."""
-    T = flux_time(problem, start, end)
-    L = np.array([problem.L_d, problem.L_q])
-    guesses = []
-    for time in (T, 0.7 * T, 1.4 * T):
-        turn = cmath.exp(1j * problem.omega_e * time)
-        a = complex(problem.psi_f + L[0] * start[0], L[1] * start[1])
-        b = complex(problem.psi_f + L[0] * end[0], L[1] * end[1])
-        direction = turn * b - a
-        # G l is along the voltage: l = L direction
-        angle = math.atan2(L[1] * direction.imag, L[0] * direction.real)
-        guesses += [(angle + shift, time) for shift in (0.0, 0.3, -0.3, 0.8, -0.8)]
-    return guesses
-
-
 def flux_time(problem: TransferProblem, start: Array, end: Array) -> float:
     """Return the time (s) to steer the stator flux in a straight line, the drop taken at the mean current.
 
@@ -305,25 +242,3 @@ def flux_time(problem: TransferProblem, start: Array, end: Array) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if lack(middle) > 0.0 else (low, middle)
     return high
-
-
-def _newton(miss, angle: float, T: float) -> float | None:  # type: ignore[no-untyped-def]
-    error = miss(angle, T)
-    for _ in range(SHOOTING_STEPS):
-        if float(np.hypot(*error)) <= SHOOTING_DONE_A:
-            return T
-        h_angle, h_T = 1e-7, 1e-7 * T
-        slope = np.column_stack(((miss(angle + h_angle, T) - error) / h_angle, (miss(angle, T + h_T) - error) / h_T))
-        if abs(float(np.linalg.det(slope))) == 0.0:
-            return None
-        step = np.linalg.solve(slope, -error)
-        share = min(1.0, 0.5 / max(abs(float(step[0])), 1e-300), 0.5 * T / max(abs(float(step[1])), 1e-300))
-        for _ in range(20):
-            trial = miss(angle + share * step[0], T + share * step[1])
-            if float(np.hypot(*trial)) < float(np.hypot(*error)):
-                break
-            share *= 0.5
-        else:
-            return T if float(np.hypot(*error)) <= 1e3 * SHOOTING_DONE_A else None
-        angle, T, error = angle + share * float(step[0]), T + share * float(step[1]), trial
-    return None

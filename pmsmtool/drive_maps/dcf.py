@@ -258,30 +258,3 @@ def write_concise(entries: Sequence[Entry]) -> bytes:
     parts = [struct.pack("<I", len(entries))]
     parts += [struct.pack("<HBI", entry.index, entry.sub, len(entry.data)) + entry.data for entry in entries]
     return b"".join(parts)
-
-
-@next_step(NEXT_STEP)
-def read_concise(data: bytes, where: str = "concise DCF") -> list[Entry]:
-    """Return the entries of a concise DCF.
-
-    Raises
-    ------
-    ConfigError
-        If it ends early, or carries more than it announces.
-    """
-    entries: list[Entry] = []
-    try:
-        (count,) = struct.unpack_from("<I", data)
-        offset = 4
-        for _ in range(count):
-            index, sub, size = struct.unpack_from("<HBI", data, offset)
-            offset += 7
-            if offset + size > len(data):
-                raise struct.error
-            entries.append(Entry(index, sub, data[offset : offset + size]))
-            offset += size
-    except struct.error:
-        raise ConfigError(f"ends in entry {len(entries) + 1}", where=where, likely="the file is cut") from None
-    if offset != len(data):
-        raise ConfigError(f"{len(data) - offset} bytes after the announced {count} entries", where=where)
-    return entries

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -205,7 +205,7 @@ def estimate_resistance(
     i, v = levels["i_d_a"], levels["u_d_v"]
     samples = int(levels.meta["samples"])
     peak = float(np.max(np.abs(i)))
-    R_0 = _two_point_slope(i, v)
+    R_0 = two_point_slope(i, v)
     _check_levels(levels, i, peak, R_0, noise)
     noise_v = MEAN_NOISE_FACTOR * R_0 * noise.sigma_a / math.sqrt(samples)
     warmth = _warmth(levels.t_s, i, v, peak, math.hypot(noise_v, MODEL_FLOOR * R_0 * peak))
@@ -297,7 +297,7 @@ def _level_sigma(t: Vector, i: Vector, v: Vector, peak: float, R_0: float, noise
     return min(max(1.0, math.sqrt(scatter)) * least, math.hypot(noise_v, MODEL_FLOOR * R_0 * peak))
 
 
-def _two_point_slope(i: Vector, v: Vector) -> float:
+def two_point_slope(i: Vector, v: Vector) -> float:
     """Slope between the largest level and the one nearest to 60 % of it, mean of both signs (ohm)."""
     peak = float(np.max(np.abs(i)))
     high = np.abs(i) > 0.97 * peak
@@ -351,7 +351,7 @@ def _settling(levels: Trace, peak: float, R_0: float, noise: Noise) -> tuple[Vec
 def unsettled(levels: Trace, noise: Noise) -> NDArray[np.bool_]:
     """Levels whose voltage still moves: at some currents the rotor of a reluctance machine leaves the vector slowly."""
     i, v = levels["i_d_a"], levels["u_d_v"]
-    change, limit = _settling(levels, float(np.max(np.abs(i))), _two_point_slope(i, v), noise)
+    change, limit = _settling(levels, float(np.max(np.abs(i))), two_point_slope(i, v), noise)
     return np.asarray(np.abs(change) > limit)
 
 
@@ -477,24 +477,3 @@ def at_the_test(estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
     R, measured = estimates.get("R_s_ohm"), estimates.get(R_MEASURED)
     unknown = R is not None and measured is not None and not math.isfinite(R.T_c)
     return {**estimates, "R_s_ohm": measured} if unknown and measured is not None else dict(estimates)
-
-
-def two_point_resistance(levels: Trace) -> float:
-    """The two-point slope that simpler tools use (ohm); for comparison only, never a fallback."""
-    return _two_point_slope(levels["i_d_a"], levels["u_d_v"])
-
-
-def single_point_resistance(levels: Trace) -> float:
-    """V/I at the largest level (ohm); for comparison only, never a fallback."""
-    index = int(np.argmax(np.abs(levels["i_d_a"])))
-    return float(levels["u_d_v"][index] / levels["i_d_a"][index])
-
-
-def level_sequence(magnitudes: Sequence[float]) -> tuple[float, ...]:
-    """Order of the levels: + and - alternating, magnitudes up and then down (A).
-
-    The alternation makes the slope equal to R at the current-weighted mean temperature; up and down makes a drift
-    orthogonal to the slope.
-    """
-    up = sorted(magnitudes)
-    return tuple(sign * value for run in (up, up[::-1]) for value in run for sign in (1.0, -1.0))

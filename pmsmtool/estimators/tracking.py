@@ -205,7 +205,7 @@ def track(observations: Trace, known: Known, wanted: Sequence[str] = TRACKED) ->
     Parameters
     ----------
     observations : Trace
-        Signals of ``tracking_model.SIGNALS``, one row per window (``tracking_model.condense``).
+        Signals of ``tracking_model.SIGNALS``, one row per window (``tracking_model.windows``).
     known : Known
         What is known before.
     wanted : sequence of str

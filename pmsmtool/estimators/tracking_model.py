@@ -102,17 +102,6 @@ class Known:
 # ---- observations ---------------------------------------------------------------------------------------------
 
 
-def condense(trace: Trace, rows: int) -> Trace:
-    """Return means over windows of ``rows``, of the windows in which nothing was limited and the machine ran steadily.
-
-    Raises
-    ------
-    ValueError
-        The trace lacks a signal of :data:`SIGNALS`.
-    """
-    return steady([windows(trace, rows)])[0]
-
-
 def windows(trace: Trace, rows: int, period_s: float | None = None) -> Trace:
     """Return means and rises over all windows of ``rows``; :data:`LIMITED` tells in which something was limited.
 

@@ -18,6 +18,7 @@ from typing import Any
 import click
 import pytest
 
+from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli import consent
@@ -33,7 +34,6 @@ from pmsmtool.report.verdict import NEEDED
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, RunRecord, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.random_drives import true_loop_resistance
 from tests.cli.conftest import Tool
 from tests.drive.served import serving
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
@@ -19,7 +20,6 @@ from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.random_drives import true_loop_resistance
 from tests.cli.conftest import Tool
 
 TOLERANCE = 0.01

@@ -16,7 +16,7 @@ from pmsmtool.design.loops.current_loop import (
     axis_loop,
     imc,
     maximum_delay_periods,
-    modulus_optimum,
+    modulus_optimum_bandwidth,
     second_order,
 )
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
@@ -38,7 +38,8 @@ def spectral_radius(loop: SampledLoop) -> float:
 
 
 def test_modulus_optimum_of_the_reference_machine() -> None:
-    d, q = modulus_optimum(R, L_D, T_S, 1.5), modulus_optimum(R, L_Q, T_S, 1.5)
+    alpha = modulus_optimum_bandwidth(T_S, 1.5)
+    d, q = imc(R, L_D, alpha), imc(R, L_Q, alpha)
     assert (d.alpha, d.K_p, q.K_p, d.K_i) == pytest.approx((4000.0, 9.2, 8.4, 548.0), rel=1e-12)
 
 

@@ -8,8 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from pmsmtool.design.minimum_time import TransferProblem, flux_time, minimum_time, shoot
+from pmsmtool.design.minimum_time import TransferProblem, flux_time, minimum_time
 from pmsmtool.errors import DesignInfeasible
+from tests.design.shooting import shoot
 
 AGREEMENT = 1e-8
 """Support function against shooting, relative (measured 1e-12 to 3e-11)."""

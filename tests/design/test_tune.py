@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from benchmarks.random_drives import draw_drive
 from pmsmtool.cli.main import cli
 from pmsmtool.design.design_file import Design, design_text, load_design, parse_design
 from pmsmtool.design.lookup.table import torque_limits
@@ -29,7 +30,6 @@ from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import InverterParameters, MachineLimits, MachineParameters
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import parse_parameter_set
-from pmsmtool.sim.random_drives import draw_drive
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from benchmarks.random_drives import draw_drive
 from pmsmtool.bus.connect import connect
 from pmsmtool.cia402 import State
 from pmsmtool.cli.main import cli
@@ -39,7 +40,6 @@ from pmsmtool.measurement.capabilities import (
 )
 from pmsmtool.measurement.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
 from pmsmtool.resources import data_folder
-from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import settings_of
 
 COMMANDS = (0x604000, 0x206007)

@@ -301,3 +301,9 @@ def run(
         c, s = np.cos(g), np.sin(g)
         pending_a, pending_b = c * u_d - s * u_q, s * u_d + c * u_q
     return Run(*out)
+
+
+def level_sequence(magnitudes: Sequence[float]) -> tuple[float, ...]:
+    """Order of the levels: + and - alternating, magnitudes up and then down (A)."""
+    up = sorted(magnitudes)
+    return tuple(sign * value for run in (up, up[::-1]) for value in run for sign in (1.0, -1.0))

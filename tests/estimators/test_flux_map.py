@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.analytic_saturation import BridgeSaturation
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline, basis, break_points
 from pmsmtool.estimators.flux.map_fit import MagnetFlux, fit_coenergy
@@ -21,7 +22,6 @@ from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments.flux_map_scan import RECTANGLES, VOLTAGE_RATIOS
-from pmsmtool.machine.analytic_saturation import BridgeSaturation
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 from tests.estimators.pulse_plant import Currents, record_pulses

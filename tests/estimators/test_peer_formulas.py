@@ -6,8 +6,13 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.peer_formulas import curve_fit_resistance, speed_flux, table
-from pmsmtool.estimators.resistance import single_point_resistance, two_point_resistance
+from benchmarks.peer_formulas import (
+    curve_fit_resistance,
+    single_point_resistance,
+    speed_flux,
+    table,
+    two_point_resistance,
+)
 from pmsmtool.trace import Trace
 
 I_A = np.array([sign * k / 12.0 for k in range(1, 13) for sign in (1.0, -1.0)])

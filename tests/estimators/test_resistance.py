@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.peer_formulas import single_point_resistance, two_point_resistance
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, total_half_width
 from pmsmtool.estimators.inverter_error import InverterCurve
@@ -16,14 +17,11 @@ from pmsmtool.estimators.resistance import (
     Copper,
     ResistanceResult,
     estimate_resistance,
-    level_sequence,
-    single_point_resistance,
     tail_models,
-    two_point_resistance,
     unsettled,
 )
 from pmsmtool.trace import Trace
-from tests.estimators.plant import Drives, draw, inverter_shape
+from tests.estimators.plant import Drives, draw, inverter_shape, level_sequence
 
 Change = Callable[[Trace], Mapping[str, np.ndarray]]
 

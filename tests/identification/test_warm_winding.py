@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.bus.connect import Connection
 from pmsmtool.commissioning.contradiction import compare
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -20,7 +21,6 @@ from pmsmtool.proof.simulated import as_tested
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.random_drives import true_loop_resistance
 from pmsmtool.trace_file import trace_npz
 
 pytestmark = pytest.mark.chain

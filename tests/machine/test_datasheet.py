@@ -8,9 +8,9 @@ import math
 import pytest
 from click.testing import CliRunner
 
+from benchmarks.analytic_saturation import saturated_pmsyrm_map
 from pmsmtool.cli.machine import machine_command
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.analytic_saturation import saturated_pmsyrm_map
 from pmsmtool.machine.datasheet import (
     TOLERANCE,
     Datasheet,

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline, RectBivariateSpline, RegularGridInterpolator
 
+from benchmarks.analytic_saturation import BridgeSaturation, saturated_pmsyrm_map
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.analytic_saturation import BridgeSaturation, saturated_pmsyrm_map
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_cells import (
     NOT_CONVERGED,

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.analytic_saturation import BridgeSaturation, saturated_pmsyrm_map
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.analytic_saturation import BridgeSaturation, saturated_pmsyrm_map
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_check import check_flux_map, flux_range
 from pmsmtool.machine.flux_map_reciprocity import LoopIntegrals, reciprocal_change

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from benchmarks.analytic_saturation import saturated_pmsyrm_map
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.analytic_saturation import saturated_pmsyrm_map
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz, load_flux_map, read_flux_map
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from pmsmtool.machine.analytic_saturation import saturated_pmsyrm_map
+from benchmarks.analytic_saturation import saturated_pmsyrm_map
 from pmsmtool.machine.flux_map_check import check_flux_map
 from pmsmtool.machine.flux_map_import import flux_map_csv
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine

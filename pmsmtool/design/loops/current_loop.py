@@ -95,11 +95,6 @@ def imc(R: float, L: float, alpha: float) -> CurrentGains:
     return CurrentGains(alpha * L, alpha * R, alpha, Method.IMC)
 
 
-def modulus_optimum(R: float, L: float, T_s: float, delay_periods: float) -> CurrentGains:
-    """Cancel the plant's pole at the bandwidth of the modulus optimum."""
-    return replace(imc(R, L, modulus_optimum_bandwidth(T_s, delay_periods)), method=Method.MODULUS_OPTIMUM)
-
-
 def second_order(R: float, L: float, omega_n: float, zeta: float) -> CurrentGains:
     """Place s^2 + 2 zeta w_n s + w_n^2: K_p = 2 zeta w_n L - R, K_i = w_n^2 L.
 

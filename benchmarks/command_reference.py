@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The command reference of the documentation, from the commands: ``python -m pmsmtool.cli.reference [--write]``.
+"""The command reference of the documentation, from the commands: ``python -m benchmarks.command_reference [--write]``.
 
 Without ``--write`` the text is printed; with it the part of docs/commands.md between the two markers is replaced. A
 test compares both, so that the page cannot say what the program does not.
@@ -21,7 +21,7 @@ from pmsmtool.cli.main import PROGRAM, cli
 from pmsmtool.errors import ConfigError
 
 PAGE = "docs/commands.md"
-BEGIN = "<!-- made by python -m pmsmtool.cli.reference --write; do not edit -->"
+BEGIN = "<!-- made by python -m benchmarks.command_reference --write; do not edit -->"
 END = "<!-- end of the command reference -->"
 
 _SHARED: tuple[tuple[str, frozenset[str]], ...] = (
@@ -120,7 +120,7 @@ def replaced(page: str) -> str:
         raise ConfigError(
             "the markers of the command reference are missing",
             where=PAGE,
-            hint="put both markers of pmsmtool/cli/reference.py around the section",
+            hint="put both markers of benchmarks/command_reference.py around the section",
         )
     return f"{before}{BEGIN}\n\n{reference()}\n{END}{after}"
 
