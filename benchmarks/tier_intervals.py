@@ -43,16 +43,15 @@ from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
-from pmsmtool.experiments.supply_levels import ReadSupply
+from pmsmtool.experiments.supply_levels import ReadSupply, hold_supply_levels
 from pmsmtool.identification.evaluate import evaluate
 from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.tier_evaluate import TierFacts, TierResult, tier_result
+from pmsmtool.identification.tier_evaluate import SUPPLY_LEVELS, TierFacts, TierResult, tier_result
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement.identify import envelope_of, nameplate_of
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
-from pmsmtool.measurement.supply_reading import hold_for_supply
 from pmsmtool.measurement.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
@@ -118,7 +117,8 @@ def identify(tier: str, drive: MachineFile, path: Path, speed: float, *, given: 
 
 def _by_supply(drive: StandardDrive, envelope: Envelope, read: ReadSupply) -> TierResult:
     traces: dict[str, Trace] = {}
-    hold_for_supply(drive, envelope, envelope.i_max_apk / HEADROOM, read, traces.__setitem__, lambda text: None)
+    i_a = envelope.i_max_apk / HEADROOM
+    traces[SUPPLY_LEVELS] = hold_supply_levels(drive, envelope, i_a, read, lambda text: None)
     drive.close()
     return tier_result(traces, TierFacts("standard"))
 

@@ -18,8 +18,10 @@ from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, example
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
+    from pmsmtool.bus.connection import Connection
     from pmsmtool.cli.consent import Consent
     from pmsmtool.cli.fingerprint import Comparison
+    from pmsmtool.experiments.supply_levels import ReadSupply
     from pmsmtool.identification.fingerprint import Earlier
     from pmsmtool.identification.request import IdentifyRequest
     from pmsmtool.measurement.capabilities import Capabilities
@@ -205,6 +207,38 @@ def _tell_more(found: Capabilities, request: IdentifyRequest, out: Output) -> No
         out.note(f"{', '.join(more)}: the drive measures them by itself with --method vendor")
 
 
+def supply_reader(connection: Connection, node: int, *, simulated: bool) -> ReadSupply:
+    """Return what reads the supply that feeds a drive: a person is asked while a current flows.
+
+    Parameters
+    ----------
+    simulated : bool
+        The drive is simulated in this process, and its supply with it.
+
+    Raises
+    ------
+    Declined
+        Nobody can be asked; nothing was moved.
+    """
+    from pmsmtool.cli.consent import person_present
+    from pmsmtool.errors import Declined
+
+    def ask(i_a: float) -> tuple[float, float]:
+        click.echo(f"{i_a:.4g} Apk in the machine: what does the bench supply show?", err=True)
+        shown = [click.prompt(f"  {what}", type=click.FloatRange(min=0.0), err=True) for what in ("volts", "amperes")]
+        return shown[0], shown[1]
+
+    if simulated:
+        return lambda i_a: connection.bus.read_supply(node)  # type: ignore[attr-defined]
+    if not person_present():
+        raise Declined(
+            "no terminal to ask what the bench supply shows: nothing was done",
+            likely="standard input or standard error is not a terminal",
+            hint="run it in a terminal, or leave --supply out",
+        )
+    return ask
+
+
 def _measure_without_injection(
     bus: BusOptions,
     motion: MotionOptions,
@@ -221,7 +255,6 @@ def _measure_without_injection(
     from pmsmtool import __version__
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.cli.drive_access import choose_node
-    from pmsmtool.cli.supply_prompt import supply_reader
     from pmsmtool.commissioning.tier_stages import open_tier_drive
     from pmsmtool.measurement.tier_identify import tier_stage
     from pmsmtool.measurement.vendor_identify import vendor_stage

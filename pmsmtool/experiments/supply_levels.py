@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from pmsmtool.drive.port import Drive
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.experiments.signals import table
 from pmsmtool.experiments.vector_lead import lead_onto_vector
 from pmsmtool.trace import Trace
@@ -18,13 +20,13 @@ ReadSupply = Callable[[float], tuple[float, float]]
 """Given the current that flows (A peak), returns voltage (V) and current (A) of the supply."""
 
 
-def hold_supply_levels(drive: Drive, i_a: float, read: ReadSupply) -> Trace:
-    """Return the readings, one row per level; the vector stands where it was, at zero current, on return.
+def hold_supply_levels(
+    drive: StandardDrive, envelope: Envelope, i_a: float, read: ReadSupply, say: Callable[[str], None]
+) -> Trace:
+    """Return the readings, one row per level; the drive is off on return.
 
     Parameters
     ----------
-    drive : Drive
-        Enabled.
     i_a : float
         Largest length of the vector (A peak).
     read : ReadSupply
@@ -34,19 +36,27 @@ def hold_supply_levels(drive: Drive, i_a: float, read: ReadSupply) -> Trace:
     -------
     Trace
         ``i_command_a``, ``supply_v``, ``supply_i_a``.
+
+    Raises
+    ------
+    StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
+        As the guard ends the experiment.
     """
     rows: list[dict[str, float]] = []
     times: list[float] = []
     elapsed_s, led = 0.0, False
-    for share in LEVELS:
-        if share and not led:
-            lead_onto_vector(drive, share * i_a, 0.0)
-            led = True
-        drive.command_current(share * i_a, 0.0, fixed_angle_rad=0.0)
-        drive.wait(SETTLE_S)
-        elapsed_s += SETTLE_S
-        volts, amps = read(share * i_a)
-        rows.append({"i_command_a": share * i_a, "supply_v": volts, "supply_i_a": amps})
-        times.append(elapsed_s)
-    drive.command_current(0.0, 0.0, fixed_angle_rad=0.0)
+    with guarded(drive, envelope, say=say) as guard:
+        guard.enable()
+        say(f"R: the power of the bench supply, read {len(LEVELS)} times up to {i_a:.3g} A")
+        for share in LEVELS:
+            if share and not led:
+                lead_onto_vector(guard, share * i_a, 0.0)
+                led = True
+            guard.command_current(share * i_a, 0.0, fixed_angle_rad=0.0)
+            guard.wait(SETTLE_S)
+            elapsed_s += SETTLE_S
+            volts, amps = read(share * i_a)
+            rows.append({"i_command_a": share * i_a, "supply_v": volts, "supply_i_a": amps})
+            times.append(elapsed_s)
+        guard.command_current(0.0, 0.0, fixed_angle_rad=0.0)
     return table(rows, times)

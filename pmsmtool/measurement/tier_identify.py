@@ -30,12 +30,13 @@ from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, pu
 from pmsmtool.experiments.recorded_push import PushPlan, swing
 from pmsmtool.experiments.rotation import STEP_RAD, RotationPlan, dwell_within, rotate_vector
 from pmsmtool.experiments.shaft_answer import ShaftAnswer
-from pmsmtool.experiments.supply_levels import LEVELS, ReadSupply
+from pmsmtool.experiments.supply_levels import LEVELS, ReadSupply, hold_supply_levels
 from pmsmtool.experiments.vector_lead import lead_onto_vector
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
 from pmsmtool.identification.tier_evaluate import (
     FACTS,
     NO_POLE_PAIRS,
+    SUPPLY_LEVELS,
     TierFacts,
     TierResult,
     Voltage,
@@ -47,7 +48,6 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import InverterParameters
 from pmsmtool.measurement.capabilities import QUANTITIES, Capabilities, Method
 from pmsmtool.measurement.limits import DURATION_S
-from pmsmtool.measurement.supply_reading import hold_for_supply
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
@@ -423,7 +423,8 @@ def _standard(
     if reads or turns:
         turning = drive if type(drive) is StandardDrive else StandardDrive(connection, node, drive_map=found.drive_map)
         if reads and read_supply is not None:
-            hold_for_supply(turning, envelope, envelope.i_max_apk / HEADROOM, read_supply, keep, say)
+            i_a = envelope.i_max_apk / HEADROOM
+            keep(SUPPLY_LEVELS, hold_supply_levels(turning, envelope, i_a, read_supply, say))
         if turns:
             turn_both_ways(turning, envelope, keep, say)
     told = {"psi", "mechanics"} if turns or facts.pole_pairs else {"mechanics"}

@@ -11,8 +11,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from pmsmtool.bus.connect import connect
+from pmsmtool.cli.identify import supply_reader
 from pmsmtool.cli.main import cli
-from pmsmtool.cli.supply_prompt import supply_reader
 from pmsmtool.errors import Declined, NotAvailable
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
@@ -59,10 +59,10 @@ def test_what_needs_the_person_is_said_before(monkeypatch: pytest.MonkeyPatch, t
 
 def test_a_person_types_what_the_supply_shows(monkeypatch: pytest.MonkeyPatch) -> None:
     with connect("pmsmsim", CHANNEL) as connection:
-        monkeypatch.setattr("pmsmtool.cli.supply_prompt.person_present", lambda: False)
+        monkeypatch.setattr("pmsmtool.cli.consent.person_present", lambda: False)
         with pytest.raises(Declined, match="no terminal to ask what the bench supply shows"):
             supply_reader(connection, 1, simulated=False)
-        monkeypatch.setattr("pmsmtool.cli.supply_prompt.person_present", lambda: True)
+        monkeypatch.setattr("pmsmtool.cli.consent.person_present", lambda: True)
         ask = supply_reader(connection, 1, simulated=False)
 
     @click.command()
