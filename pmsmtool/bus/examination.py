@@ -7,7 +7,7 @@ import contextlib
 import importlib
 import logging
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,27 +49,21 @@ class Examination:
     ----------
     frames, error_frames : int
         Heard while only listening.
-    listened_s : float
-        For how long (s).
     load : float or None
         Share of the time frames took, from their exact lengths; None without a bit rate.
     state : str
         Controller state as the adapter tells it; empty where it does not.
     nodes : tuple of FoundNode
         Who answers or was heard.
-    round_trip_s : mapping of int to (float, float)
-        Median and 95th percentile of an SDO read by node (s).
     findings : tuple of (str, str)
         Verdict PASS, WARN or FAIL and its sentence.
     """
 
     frames: int
     error_frames: int
-    listened_s: float
     load: float | None
     state: str
     nodes: tuple[FoundNode, ...]
-    round_trip_s: Mapping[int, tuple[float, float]]
     findings: tuple[tuple[str, str], ...] = field(default=())
 
     @property
@@ -126,19 +120,17 @@ def examine(connection: Connection, bitrate: int | None, *, listen_s: float = LI
     bits.close()
     findings = [_heard(frames, error_frames, load)]
     nodes: tuple[FoundNode, ...] = ()
-    times: dict[int, tuple[float, float]] = {}
     try:
         nodes = tuple(find_nodes(connection))
         answering = [entry.node for entry in nodes if entry.device_type is not None]
-        times = {node: _round_trip(connection, node) for node in answering[:NODES_TIMED]}
-        findings.append(_answered(connection, nodes, answering))
-        findings += [_timing(node, *seconds) for node, seconds in times.items()]
+        timed = [_timing(node, *_round_trip(connection, node)) for node in answering[:NODES_TIMED]]
+        findings += [_answered(connection, nodes, answering), *timed]
     except BusError as error:
         findings.append(("FAIL", f"{error.what}; likely: {error.likely}"))
     state = _state(connection.bus)
     if state == "ERROR":
         findings.append(("FAIL", f"the controller is bus-off: wrong bit rate, a short circuit, or {TERMINATION}"))
-    return Examination(frames, error_frames, listen_s, load, state, nodes, times, tuple(findings))
+    return Examination(frames, error_frames, load, state, nodes, tuple(findings))
 
 
 def find_bitrate(

@@ -256,7 +256,6 @@ class CdmGains:
     K_I21: float
     K_P12: float
     K_I12: float
-    tau_12_s: float
 
 
 def cdm_gains(
@@ -278,7 +277,7 @@ def cdm_gains(
 
     K_P21, K_I21 = pair(tau_s, cosine)
     K_P12, K_I12 = pair(tau_12, -V_a * cosine)
-    return CdmGains(K_P21, K_I21, K_P12, K_I12, tau_12)
+    return CdmGains(K_P21, K_I21, K_P12, K_I12)
 
 
 @dataclass(frozen=True, slots=True)

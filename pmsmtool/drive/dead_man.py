@@ -48,8 +48,6 @@ class DeadManProof:
 
     Attributes
     ----------
-    consumer_s : float
-        Consumer heartbeat time of the drive (s).
     declared_s : float
         The voltage must be off within this time after the last heartbeat (s).
     measured_s : float
@@ -64,7 +62,6 @@ class DeadManProof:
         What stopped: the tool's ``heartbeat``, or its ``node guarding``.
     """
 
-    consumer_s: float
     declared_s: float
     measured_s: float
     abort_connection: AbortConnection | None
@@ -157,7 +154,7 @@ def _stop_and_measure(
         off = is_safe(state)
         if state is not None and off and passed <= declared:
             by = "heartbeat" if heartbeat.guarded_node is None else "node guarding"
-            return DeadManProof(1e-3 * CONSUMER_MS, declared, passed, abort_option, quick_stop, state, by)
+            return DeadManProof(declared, passed, abort_option, quick_stop, state, by)
         if off or asked > declared:
             if not off:
                 drive.quick_stop()

@@ -190,20 +190,6 @@ def condition_gate(condition: float, pair: str, stage: str) -> None:
         )
 
 
-def ljung_box(residual: NDArray[np.float64], lags: int = 10) -> float:
-    """p-value of the Ljung-Box test for whiteness (Biometrika 65, 297, 1978, DOI 10.1093/biomet/65.2.297)."""
-    from scipy.special import gammaincc
-
-    centred = residual - np.mean(residual)
-    n = len(centred)
-    power = float(centred @ centred)
-    if power == 0.0 or n <= lags + 1:
-        return 1.0
-    rho = [float(centred[k:] @ centred[:-k]) / power for k in range(1, lags + 1)]
-    statistic = n * (n + 2.0) * sum(r * r / (n - k) for k, r in enumerate(rho, start=1))
-    return float(gammaincc(lags / 2.0, statistic / 2.0))
-
-
 def information_weights(criteria: Sequence[float]) -> NDArray[np.float64]:
     """Weights of models with information criteria B (chi2 + k ln n): exp(-(B - min B)/2), normalised."""
     b = np.asarray(criteria, dtype=np.float64)

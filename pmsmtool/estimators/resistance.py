@@ -131,8 +131,6 @@ class ResistanceResult:
         Relative change of R over the sweep that the temperature reading does not explain.
     hardness : float
         V_dead/(R I): above 3 the class that is hard to separate.
-    weights : mapping of tuple to float
-        Information weight of each tail model.
     verdict : Verdict
         ``warn`` when the fit is above its chi-square limit.
     copper : Copper
@@ -145,14 +143,12 @@ class ResistanceResult:
     V_dead_v: float
     drift: float
     hardness: float
-    weights: dict[tuple[int, ...], float]
     verdict: Verdict
     copper: Copper = Copper()
 
 
 @dataclass(frozen=True, slots=True)
 class _TailFit:
-    powers: tuple[int, ...]
     x: Vector
     covariance: NDArray[np.float64]
     chi2: float
@@ -259,7 +255,6 @@ def estimate_resistance(
         V_dead_v=V_dead,
         drift=drift,
         hardness=hardness,
-        weights=dict(zip(tail_models(), (float(w) for w in weights), strict=True)),
         verdict=verdict,
         copper=copper,
     )
@@ -405,7 +400,7 @@ def _fit_tail(t: Vector, i: Vector, v: Vector, peak: float, sigma_v: float, powe
     odd_tail = (sign / u**p for p in powers)
     columns = np.stack([i, sign, np.ones_like(i), drift, *odd_tail, u**-EVEN_POWER], axis=1)
     x, covariance, residual, condition = linear_solve(columns, v, np.full_like(v, 1.0 / sigma_v))
-    return _TailFit(powers, x, covariance, float(residual @ residual), len(v) - len(x), condition)
+    return _TailFit(x, covariance, float(residual @ residual), len(v) - len(x), condition)
 
 
 def _criterion(fit: _TailFit, levels: int) -> float:

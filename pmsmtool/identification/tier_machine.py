@@ -38,8 +38,6 @@ class TierMachine:
         None when values are lacking.
     measured, given : tuple of str
         Keys by where their values come from.
-    lacking : tuple of str
-        Keys that nothing tells.
     notes : tuple of str
         What was done to the values.
     """
@@ -47,7 +45,6 @@ class TierMachine:
     machine: MachineFile | None
     measured: tuple[str, ...]
     given: tuple[str, ...]
-    lacking: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
     def given_values(self, source: str) -> list[Mapping[str, Any]]:
@@ -75,7 +72,7 @@ def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], sourc
     """
     if known is None:
         told = {"psi_f_wb", "pole_pairs", "R_s_ohm"} & set(found)
-        return TierMachine(None, tuple(sorted(told)), (), tuple(name for name in NEEDED if name not in told))
+        return TierMachine(None, tuple(sorted(told)), ())
     values, notes = _at_reference(known, found)
     psi = _flux_of_the_run(known, values.get("psi_f_wb"))
     for ratio, key in PER_PSI.items():
@@ -100,7 +97,7 @@ def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], sourc
         provenance={"source": f"measured: {', '.join(measured) or 'nothing'}; {source}: {', '.join(given)}"},
         simulation={},
     )
-    return TierMachine(machine, measured, given, (), (*notes, *more))
+    return TierMachine(machine, measured, given, (*notes, *more))
 
 
 def _at_reference(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[dict[str, Estimate], tuple[str, ...]]:

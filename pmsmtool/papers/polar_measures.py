@@ -44,8 +44,8 @@ class TorqueStep:
         Largest i_d after the step down (A).
     area_mas : float
         Integral of positive i_d over 30 ms after it (mA s).
-    before_a, end_a : float
-        i_d before the step up and at the end (A).
+    end_a : float
+        i_d at the end (A).
     loss_w : float
         Copper loss at the end of the large torque (W).
     """
@@ -56,7 +56,6 @@ class TorqueStep:
     over_down: float
     peak_a: float
     area_mas: float
-    before_a: float
     end_a: float
     loss_w: float
 
@@ -76,7 +75,6 @@ def torque_step(r: Response, up_s: float, down_s: float, low_nm: float, high_nm:
         over_down=100.0 * max(0.0, low - float(i_q[b:].min())) / step,
         peak_a=float(r.i_d[b:].max()),
         area_mas=1e3 * T_s * float(np.maximum(after, 0.0).sum()),
-        before_a=float(r.i_d[a - 50 : a].mean()),
         end_a=float(r.i_d[-50:].mean()),
         loss_w=machine_file().machine.R_s_ohm * float((r.i_d[b - 50 : b] ** 2 + r.i_q[b - 50 : b] ** 2).mean()),
     )

@@ -42,7 +42,7 @@ INDUCTANCE_LIMIT = 0.005
 
 def resistance(R: float = 0.6) -> ResistanceResult:
     value = Estimate(R, 1e-3 * R, 0.0, "ohm")
-    return ResistanceResult(value, value, IDEAL, 0.0, 0.0, 0.0, {}, "pass")  # type: ignore[arg-type]
+    return ResistanceResult(value, value, IDEAL, 0.0, 0.0, 0.0, "pass")  # type: ignore[arg-type]
 
 
 @cache

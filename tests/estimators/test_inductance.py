@@ -242,7 +242,7 @@ def test_two_frequencies_that_disagree_are_both_reported(plain: Shots) -> None:
     )
     assert result.frequency_dependent == ("d",)
     assert result.verdict == "warn"
-    (_, fast_L), (_, slow_L) = result.by_frequency["d"]
+    fast_L, slow_L = result.axes["d"].L_by_shot_h
     assert slow_L / fast_L == pytest.approx(1.1, rel=0.01)
 
 

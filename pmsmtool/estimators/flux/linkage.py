@@ -92,8 +92,6 @@ class FluxResult:
     L_q_app : Estimate
         Apparent L_q at the q currents of the run, a check only: beside a large dead time it says nothing, and its
         standard deviation says so (H).
-    angle_delay_s : float
-        Delay between angle and voltage that the drive does not compensate (s).
     curvature : float
         Mean of psi_d(i_d) and psi_d(-i_d) over psi_f, less one, at the largest d current.
     low_wb, low_std_wb, low_i_d_a : float
@@ -111,7 +109,6 @@ class FluxResult:
     driven: Estimate | None
     voltage_scale_std: float
     L_q_app: Estimate
-    angle_delay_s: float
     curvature: float
     low_wb: float
     low_std_wb: float
@@ -256,7 +253,6 @@ def estimate_flux_linkage(
             i_q_apk=float(np.mean(np.abs(rows.i_q[~rows.is_d]))) if not np.all(rows.is_d) else 0.0,
             dof=d_dof,
         ),
-        angle_delay_s=float(d_fit[2]) / psi,
         curvature=even.curvature,
         low_wb=math.hypot(even.low_wb, x2),
         low_std_wb=math.hypot(even.low_std_wb, model_std),

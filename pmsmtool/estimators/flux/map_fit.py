@@ -113,10 +113,10 @@ class CoenergyFit:
         Residuals.
     symmetric : bool
         Whether W is even in i_q.
-    asymmetry, asymmetry_std : float
-        Rms of the flux that breaks the symmetry in the free fit, and what noise alone would show (Wb).
-    axis_rad, axis_std_rad : float
-        Angle of the symmetry axis from the frame's d axis (rad electrical), and its standard deviation.
+    asymmetry : float
+        Rms of the flux that breaks the symmetry in the free fit (Wb).
+    axis_rad : float
+        Angle of the symmetry axis from the frame's d axis (rad electrical).
     skew : FittedSkew
         Flux that has no co-energy.
     frame : Frame
@@ -136,9 +136,7 @@ class CoenergyFit:
     n: int
     symmetric: bool
     asymmetry: float
-    asymmetry_std: float
     axis_rad: float
-    axis_std_rad: float
     skew: FittedSkew
     frame: Frame
     magnet_std_wb: float
@@ -277,7 +275,7 @@ def _fine_fit(
     sums = NormalEquations(with_skew.A[:own, :own], with_skew.b[:own], with_skew.c, with_skew.n)
     unit = _unit(sums, spline, priors, magnet, sigma_a)
     x, covariance = _solve(sums, spline, priors, magnet, unit)
-    asymmetry, asymmetry_std, axis, axis_std = _symmetry(spline, x, covariance, i)
+    asymmetry, asymmetry_std, axis = _symmetry(spline, x, covariance, i)
     symmetric = asymmetry <= max(SYMMETRIC_SIGMA * asymmetry_std, SYMMETRIC_SHARE * _span(spline, x, i))
     free, _ = _solve(with_skew, spline, priors, magnet, unit)
     rising = _falling(spline, x, i)
@@ -289,7 +287,7 @@ def _fine_fit(
         rising = np.concatenate([rising[0], more[0]]), np.concatenate([rising[1], more[1]])
     return CoenergyFit(
         spline, x[:k], covariance[:k, :k], float(x[k]), float(x[k + 1]), float(x[own - 1]), sigma_a,
-        sums.squares(x) / (sigma_a**2 * (sums.n - len(x))), sums.n, symmetric, asymmetry, asymmetry_std, axis, axis_std,
+        sums.squares(x) / (sigma_a**2 * (sums.n - len(x))), sums.n, symmetric, asymmetry, axis,
         FittedSkew(free[:k], skew, free[own:]), frame, magnet.std_wb,
     )  # fmt: skip
 
@@ -402,8 +400,8 @@ def _span(spline: CoenergySpline, x: Array, i: Array) -> float:
     return float(np.max(np.ptp(spline.flux(x[: spline.size], *disc(i)), axis=1)))
 
 
-def _symmetry(spline: CoenergySpline, x: Array, covariance: Array, i: Array) -> tuple[float, float, float, float]:
-    """Return the asymmetry in i_q (Wb), what noise shows, and the angle of the symmetry axis with its deviation."""
+def _symmetry(spline: CoenergySpline, x: Array, covariance: Array, i: Array) -> tuple[float, float, float]:
+    """Return the asymmetry in i_q (Wb), what noise shows, and the angle of the symmetry axis."""
     k = spline.size
     i_d, i_q = disc(i)
     rows = []
@@ -421,5 +419,4 @@ def _symmetry(spline: CoenergySpline, x: Array, covariance: Array, i: Array) -> 
     # without its mean: a held rotor shows no constant of psi_q
     per_radian = np.concatenate([-psi[1] + L_dd * i_q - L_dq * i_d, on_q - np.mean(on_q)])
     power = float(per_radian @ per_radian)
-    pick = (per_radian @ broken) / power
-    return rms, expected, float(per_radian @ a) / power, math.sqrt(max(0.0, float(pick @ C @ pick)))
+    return rms, expected, float(per_radian @ a) / power

@@ -76,8 +76,6 @@ class AxisFit:
         Sensor time constant, 0 where the data do not ask for one (s); far below T_s only delay + lag/T_s is known.
     motion_per_f : float
         Back-EMF per charge of the moving rotor, 1.5 p^2 psi^2/J (1/F).
-    bend_2_per_a, bend_3_per_a2 : float
-        Curvature of current over flux about the bias.
     chi2 : float
         Reduced chi-square of the best model.
     residuals : tuple of ndarray
@@ -102,8 +100,6 @@ class AxisFit:
     delay: float
     lag_s: float
     motion_per_f: float
-    bend_2_per_a: float
-    bend_3_per_a2: float
     chi2: float
     n: int
     residuals: tuple[Vector, ...]
@@ -359,8 +355,6 @@ def _average(
         delay=first.model.delay,
         lag_s=first.model.lag_s,
         motion_per_f=first.motion,
-        bend_2_per_a=first.c_2,
-        bend_3_per_a2=first.c_3,
         chi2=float(sum(r @ r for r in residuals)) / dof,
         n=problem.rows,
         residuals=residuals,

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, Verdict, chi2_gate, condition_gate, ljung_box
+from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, Verdict, chi2_gate, condition_gate
 from pmsmtool.estimators.injection.axis_fit import AxisFit, fit_axis
 from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, VoltageError, projected, with_line
@@ -101,14 +101,10 @@ class InductanceResult:
         Sample to acting voltage, mean of both axes (T_s).
     lag_s : float
         Time constant of the current sensor (s).
-    by_frequency : mapping of str to tuple of (float, float)
-        Per axis: injection frequency (Hz) and inductance (H) of every shot.
     frequency_dependent : tuple of str
         Axes whose inductances differ by more than 1 % between the injection frequencies.
-    axis_angle_rad, axis_angle_std_rad : float
+    axis_angle_rad : float
         Angle of the frame ahead of the axis of largest 1/L, from the cross responses; NaN for a round machine.
-    whiteness : mapping of str to float
-        Ljung-Box p-value of the residual of each axis.
     verdict : Verdict
         ``warn`` above the chi-square limit or when frequency dependent.
     sampling : Sampling or None
@@ -124,11 +120,8 @@ class InductanceResult:
     axes: Mapping[str, AxisFit]
     delay: float
     lag_s: float
-    by_frequency: Mapping[str, tuple[tuple[float, float], ...]]
     frequency_dependent: tuple[str, ...]
     axis_angle_rad: float
-    axis_angle_std_rad: float
-    whiteness: Mapping[str, float]
     verdict: Verdict
     sampling: Sampling | None = None
     samplings: tuple[tuple[float, Sampling], ...] = ()
@@ -212,13 +205,6 @@ def estimate_inductances(
             frame, fallback = FrameAhead(0.0, 0.0, 0.0), "frame offset unknown, machine nearly round: axes as they are"
     values, stds = _unmix(fits, {axis: factor for axis, (_, factor, _) in widen.items()}, frame)
     biases = {"d": _bias(d_shots, frame.d_rad), "q": _bias(q_shots, frame.q_rad)}
-    by_frequency = {
-        axis: tuple(
-            (1.0 / (2 * shot.half_period * shot.period_s), L)
-            for shot, L in zip(shots[axis], fits[axis].L_by_shot_h, strict=True)
-        )
-        for axis in fits
-    }
     dependent = tuple(
         axis
         for axis, fit in fits.items()
@@ -263,11 +249,8 @@ def estimate_inductances(
         axes=fits,
         delay=0.5 * (fits["d"].delay + fits["q"].delay),
         lag_s=0.5 * (fits["d"].lag_s + fits["q"].lag_s),
-        by_frequency=by_frequency,
         frequency_dependent=dependent,
         axis_angle_rad=angle,
-        axis_angle_std_rad=angle_std,
-        whiteness={axis: min(ljung_box(residual) for residual in fit.residuals) for axis, fit in fits.items()},
         verdict=Verdict.WARN if warned else Verdict.PASS,
         # the q axis was fitted with what the d axis says
         sampling=None if instant is None else instant.sampling(fits["q"].delay, fits["q"].lag_s),
