@@ -42,8 +42,8 @@ from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
 from pmsmtool.estimators.resistance import R_MEASURED
 from pmsmtool.identification.accuracy import accuracy_told
-from pmsmtool.identification.predicted_file import PREDICTED
 from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.run_files import PREDICTED
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.identify import identify_stage, nameplate_of
 from pmsmtool.run_directory import RunDirectory, Stage, new_record

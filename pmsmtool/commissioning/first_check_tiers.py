@@ -31,7 +31,7 @@ from pmsmtool.drive.tier_drives import TorqueDrive, pushing_drive
 from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, NotAvailable
 from pmsmtool.experiments.first_push import push_forth_and_back
 from pmsmtool.experiments.first_turn import lead_half_a_turn
-from pmsmtool.experiments.vector_lead import lead_onto_vector
+from pmsmtool.experiments.vector_turn import lead_onto_vector
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.identification.wiring import (
     COUNT_FACTORS,

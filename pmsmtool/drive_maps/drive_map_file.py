@@ -30,9 +30,8 @@ from pmsmtool.drive_maps.identity_rows import IdentityRows, dump_identity, parse
 from pmsmtool.drive_maps.map_lines import line_of
 from pmsmtool.drive_maps.motion_objects import TABLE as MOTION
 from pmsmtool.drive_maps.motion_objects import dump_motion, parse_motion
-from pmsmtool.drive_maps.recorder_map import Recording
-from pmsmtool.drive_maps.recorder_map_file import TABLE as RECORDER
-from pmsmtool.drive_maps.recorder_map_file import dump_recorder, parse_recorder
+from pmsmtool.drive_maps.recorder_map import TABLE as RECORDER
+from pmsmtool.drive_maps.recorder_map import Recording, dump_recorder, parse_recorder
 from pmsmtool.drive_maps.vendor_tuning import TABLE, VendorTuning, dump_vendor_tuning, parse_vendor_tuning
 from pmsmtool.drive_maps.wire_units import as_peak, counted_in, wire_unit
 from pmsmtool.errors import ConfigError, next_step

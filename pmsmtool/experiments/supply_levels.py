@@ -9,7 +9,7 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.experiments.signals import table
-from pmsmtool.experiments.vector_lead import lead_onto_vector
+from pmsmtool.experiments.vector_turn import lead_onto_vector
 from pmsmtool.trace import Trace
 
 LEVELS = (0.0, 0.5, 1.0, 0.25, 0.75, 1.0, 0.5, 0.0)

@@ -19,14 +19,13 @@ from pmsmtool.identification.calibration import calibrated_tolerance
 from pmsmtool.identification.cogging import save_cogging
 from pmsmtool.identification.evaluate import Evaluation, evaluate
 from pmsmtool.identification.identified_machine import machine_of
-from pmsmtool.identification.predicted_file import PREDICTED
-from pmsmtool.identification.refused_file import REFUSED, refused_in
 from pmsmtool.identification.request import (
     REQUEST,
     IdentifyRequest,
     dump_request,
     parse_request,
 )
+from pmsmtool.identification.run_files import PREDICTED, REFUSED, refused_in
 from pmsmtool.identification.sampling import timing_estimates, with_timing
 from pmsmtool.identification.verdicts import verdicts_of
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file

@@ -18,8 +18,6 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import ConfigError, DriveFault, IdentificationError, PmsmtoolError, SafetyRefusal
 from pmsmtool.experiments.rotation import dwell_within
-from pmsmtool.identification.predicted_file import PREDICTED, dump_predicted
-from pmsmtool.identification.refused_file import REFUSED, dump_refused
 from pmsmtool.identification.replay import NAMEPLATE, evaluated_stage
 from pmsmtool.identification.request import (
     REQUEST,
@@ -27,6 +25,7 @@ from pmsmtool.identification.request import (
     dump_request,
     steps_of,
 )
+from pmsmtool.identification.run_files import PREDICTED, REFUSED, dump_predicted, dump_refused
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, MachineLimits, MachineParameters
 from pmsmtool.measurement import flux_map, frequency_response, mechanics

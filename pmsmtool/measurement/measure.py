@@ -28,9 +28,9 @@ from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.experiments.vector_turn import RAMP_S
 from pmsmtool.identification.evaluate import flux_of, resistance_of, tolerance_on
-from pmsmtool.identification.predicted_file import entry
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
 from pmsmtool.identification.request import steps_of
+from pmsmtool.identification.run_files import entry
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import flux_map, frequency_response, mechanics, shaft_forecast
 from pmsmtool.measurement.effort import ALL, Effort, LevelEffort, effort_for, larger_levels
@@ -116,7 +116,7 @@ class Measurement:
     unproven : str
         What a report says of a current limit that could not be shown to act.
     predicted : callable or None
-        Told every prediction (``identification/predicted_file``) before the machine moves for it.
+        Told every prediction (``identification/run_files``) before the machine moves for it.
     """
 
     drive: Drive

@@ -31,7 +31,7 @@ from pmsmtool.experiments.recorded_push import PushPlan, swing
 from pmsmtool.experiments.rotation import STEP_RAD, RotationPlan, dwell_within, rotate_vector
 from pmsmtool.experiments.shaft_answer import ShaftAnswer
 from pmsmtool.experiments.supply_levels import LEVELS, ReadSupply, hold_supply_levels
-from pmsmtool.experiments.vector_lead import lead_onto_vector
+from pmsmtool.experiments.vector_turn import lead_onto_vector
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
 from pmsmtool.identification.tier_evaluate import (
     FACTS,

@@ -12,9 +12,9 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.errors import DriveFault, IdentificationError
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.identification.refused_file import REFUSED, refused_in
 from pmsmtool.identification.replay import MACHINE, replay
 from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.run_files import REFUSED, refused_in
 from pmsmtool.identification.verdicts import DESIGNED_FROM, ESSENTIAL, STEP, blocking, verdicts_of
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import MachineParameters

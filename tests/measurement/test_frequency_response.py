@@ -22,9 +22,9 @@ from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.identification.frequency_response import RESPONSE_FILE
 from pmsmtool.identification.identified_machine import RESONANCE
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, elastic_mechanics
-from pmsmtool.identification.predicted_file import PREDICTED
 from pmsmtool.identification.replay import MACHINE, replay
 from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.run_files import PREDICTED
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path

@@ -17,7 +17,7 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import IdentificationError
-from pmsmtool.experiments.vector_lead import FIRST_SHARE, LEAD_S, lead_onto_vector
+from pmsmtool.experiments.vector_turn import FIRST_SHARE, LEAD_S, lead_onto_vector
 from pmsmtool.identification.tier_evaluate import tier_result
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement import tier_identify

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pmsmtool.design.matched_filter import matched_filter
+from pmsmtool.design.prediction import matched_filter
 
 ROWS = 40
 T = np.linspace(0.0, 1.0, ROWS)

@@ -13,17 +13,20 @@ control period. The spread is a jackknife over the pushes: what is wrong with on
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
+from pmsmtool.estimators.estimate import CONDITION_LIMIT, SensorTolerance, statistical_half_width
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.estimators.shaft.push_regression import jackknife_variance, regress
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace
+
+Vector = NDArray[np.float64]
+Push = TypeVar("Push")
 
 STAGE = "inertia over flux linkage"
 BLOCKS = 24
@@ -40,8 +43,6 @@ MODEL_FLOOR = 0.01
 FRICTION_FLOOR = 0.01
 """95 % model error of tau_c/psi, relative to the torque of the smallest push; seen: 0.4 % (seeds 2000 to 2005)."""
 METHOD = "regression over torque pulses"
-
-Vector = NDArray[np.float64]
 
 
 def estimate_ratios(
@@ -129,3 +130,46 @@ def _ratios(parts: Sequence[tuple[Vector, ...]], sense: float, pole_pairs: int) 
         raise refuse("E_EXCITATION", "the shaft does not answer the current", stage=STAGE)
     ratio = torque_per_ampere(pole_pairs, 1.0) / rise
     return np.array([ratio, friction * ratio])
+
+
+def regress(columns: Sequence[Vector], measured: Vector, *, what: str, stage: str) -> Vector:
+    """Return the least-squares coefficients, shape (k,); columns are scaled to unit mean square.
+
+    Parameters
+    ----------
+    columns : sequence of ndarray, shape (n,)
+        Regressors.
+    measured : ndarray, shape (n,)
+        Left side.
+    what, stage : str
+        What is to be told apart and where, for the refusal.
+
+    Raises
+    ------
+    IdentificationError
+        ``E_NOT_IDENTIFIABLE``: a column of zeros, or columns that are nearly one another's sum.
+    """
+    matrix = np.column_stack(columns)
+    scale = np.sqrt(np.mean(matrix**2, axis=0))
+    if np.any(scale == 0.0):
+        raise refuse("E_NOT_IDENTIFIABLE", f"the shaft did not turn during the torque pulses, for {what}", stage=stage)
+    solution, _, _, singular = np.linalg.lstsq(matrix / scale, measured, rcond=None)
+    condition = float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf
+    if condition > CONDITION_LIMIT:
+        raise refuse("E_NOT_IDENTIFIABLE", f"condition {condition:.3g} of {what} together", stage=stage)
+    return np.asarray(solution / scale)
+
+
+def jackknife_variance(estimate: Callable[[Sequence[Push]], Vector], pushes: Sequence[Push]) -> Vector:
+    """Return the variance of an estimate over pushes left out one by one, shape (k,).
+
+    What is wrong with a push (friction, heating) is the same in all its samples, so that the samples' own scatter
+    would promise too much.
+
+    References
+    ----------
+    Tukey, J. W. Ann. Math. Statist. 29, 614 (1958), DOI 10.1214/aoms/1177706647.
+    """
+    n = len(pushes)
+    without = np.array([estimate([*pushes[:k], *pushes[k + 1 :]]) for k in range(n)])
+    return np.asarray((n - 1) / n * np.sum((without - without.mean(axis=0)) ** 2, axis=0))

@@ -1,13 +1,28 @@
 # SPDX-License-Identifier: MIT
-"""What was refused while it was measured, in the run: a replay is to give the same reasons."""
+"""``predicted.json`` of a run: what was said before the machine moved; ``refused.json``: what was refused meanwhile."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from typing import Any
 
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.run_directory import RunDirectory
+
+PREDICTED = "predicted.json"
+SCHEMA = "pmsmtool.predicted/1"
+
+
+def entry(before: str, relative_std: Mapping[str, float], **more: object) -> dict[str, Any]:
+    """Return one prediction: before which experiment it was said, and relative standard deviations by key."""
+    return {"before": before, "relative_std": dict(relative_std), **more}
+
+
+def dump_predicted(entries: list[dict[str, Any]]) -> str:
+    """Return the file's text."""
+    return json.dumps({"schema": SCHEMA, "predictions": entries}, indent=1) + "\n"
+
 
 REFUSED = "refused.json"
 """Experiments that ended before their traces were whole, by the keys of ``evaluate.Evaluation.refused``."""
