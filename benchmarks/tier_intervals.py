@@ -29,12 +29,15 @@ import math
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from benchmarks.identification_coverage import clopper_pearson
 from benchmarks.random_drives import draw_drive
 from pmsmtool.bus.connect import connect
+from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.recorded_means import RecordingDrive
@@ -48,11 +51,11 @@ from pmsmtool.identification.evaluate import evaluate
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.identification.tier_evaluate import SUPPLY_LEVELS, TierFacts, TierResult, tier_result
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.measurement.identify import envelope_of, nameplate_of
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
-from pmsmtool.measurement.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
+from pmsmtool.measurement.tier_identify import HEADROOM, Keep, Say, push_by_torque, swing_and_record, turn_both_ways
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
 
@@ -100,19 +103,30 @@ def identify(tier: str, drive: MachineFile, path: Path, speed: float, *, given: 
         if tier == "inject":
             return _by_injection(RecordingDrive(connection, 1))
         if tier == "recorder":
-            return identify_recorder(RecorderDrive(connection, 1), envelope)
+            return told_by(swing_and_record, RecorderDrive(connection, 1), envelope)
         family = load_family("cia402")
         turning = StandardDrive(connection, 1, drive_map=family)
         if tier == "supply":
             return _by_supply(turning, envelope, lambda i_a: connection.bus.read_supply(1))  # type: ignore[attr-defined]
-        found = identify_standard(turning, envelope)
+        found = told_by(turn_both_ways, turning, envelope)
         turning.close()
         pole_pairs = round(found.estimates["pole_pairs"].value)
         pushing = TorqueDrive(connection, 1, drive_map=family)
-        pushed = identify_by_torque(
-            pushing, envelope, pole_pairs=pole_pairs, inverter=drive.inverter if given else None
-        )
+        pushed = told_by(push_by_torque, pushing, envelope, drive.inverter if given else None, pole_pairs=pole_pairs)
         return TierResult({**found.estimates, **pushed.estimates}, pushed.missing, {})
+
+
+def told_by(
+    experiment: Callable[[Any, Envelope, Keep, Say], TierFacts],
+    drive: CanopenDrive,
+    envelope: Envelope,
+    inverter: InverterParameters | None = None,
+    **known: Any,
+) -> TierResult:
+    """Return what an experiment on a drive tells; ``known`` replaces what the drive says of itself."""
+    traces: dict[str, Trace] = {}
+    facts = experiment(drive, envelope, traces.__setitem__, lambda text: None)
+    return tier_result(traces, replace(facts, **known), None, inverter)
 
 
 def _by_supply(drive: StandardDrive, envelope: Envelope, read: ReadSupply) -> TierResult:

@@ -24,7 +24,6 @@ from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCu
 from pmsmtool.drive.tier_drives import SpeedPushDrive, TorqueDrive, pushing_drive
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
-from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.experiments.current_limit import LimitShown, require_limit, show_torque_limit, unproven
 from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, push_both_ways, run_to_voltage
 from pmsmtool.experiments.recorded_push import PushPlan, swing
@@ -38,14 +37,11 @@ from pmsmtool.identification.tier_evaluate import (
     NO_POLE_PAIRS,
     SUPPLY_LEVELS,
     TierFacts,
-    TierResult,
     Voltage,
     dump_facts,
     evaluated_stage,
-    tier_result,
 )
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.machine.parameters import InverterParameters
 from pmsmtool.measurement.capabilities import QUANTITIES, Capabilities, Method
 from pmsmtool.measurement.limits import DURATION_S
 from pmsmtool.run_directory import RunDirectory, Stage
@@ -79,11 +75,7 @@ Keep = Callable[[str, Trace], None]
 Say = Callable[[str], None]
 
 
-def _quiet(text: str) -> None:
-    """Say nothing."""
-
-
-def identify_standard(drive: StandardDrive, envelope: Envelope, say: Say = _quiet) -> TierResult:
+def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Say) -> TierFacts:
     """Turn a current vector through one mechanical turn each way; the drive is off on return.
 
     Raises
@@ -93,12 +85,6 @@ def identify_standard(drive: StandardDrive, envelope: Envelope, say: Say = _quie
     StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
         As the guard ends the experiment.
     """
-    traces: dict[str, Trace] = {}
-    return tier_result(traces, turn_both_ways(drive, envelope, traces.__setitem__, say))
-
-
-def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Say = _quiet) -> TierFacts:
-    """Run the experiment of :func:`identify_standard`; raises as it does."""
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
         for share, dwell_s in TURNS:
@@ -118,38 +104,16 @@ def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Sa
     return TierFacts("standard")
 
 
-def identify_by_torque(
-    drive: TorqueDrive,
-    envelope: Envelope,
-    *,
-    pole_pairs: int,
-    inverter: InverterParameters | None = None,
-    tolerance: SensorTolerance | None = None,
-    say: Say = _quiet,
-) -> TierResult:
+def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say) -> TierFacts:
     """Push the shaft by torque and poll it; run it up to its voltage, or let it coast; the drive is off on return.
-
-    Parameters
-    ----------
-    pole_pairs : int
-        As measured or given.
-    inverter : InverterParameters, optional
-        Its voltage utilisation and dead time, where known.
 
     Raises
     ------
     IdentificationError
-        The shaft does not answer; a single quantity that cannot be told is in ``missing``.
+        The shaft does not answer.
     StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
         As the guard ends the experiment.
     """
-    traces: dict[str, Trace] = {}
-    facts = push_by_torque(drive, envelope, traces.__setitem__, say)
-    return tier_result(traces, replace(facts, pole_pairs=pole_pairs), tolerance, inverter)
-
-
-def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say = _quiet) -> TierFacts:
-    """Run the experiments of :func:`identify_by_torque`; raises as it does."""
     largest = envelope.speed_max_rad_s
     plan = PolledPushPlan(
         envelope.i_max_apk / HEADROOM, SWING_SHARE * largest, TOP_SHARE * largest,
@@ -198,13 +162,7 @@ def _link_v(drive: TorqueCurrent) -> float:
         return 0.0
 
 
-def identify_recorder(
-    drive: RecorderDrive,
-    envelope: Envelope,
-    *,
-    tolerance: SensorTolerance | None = None,
-    say: Say = _quiet,
-) -> TierResult:
+def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: Say) -> TierFacts:
     """Swing the shaft by torque pushes and record them; the drive is off on return.
 
     Raises
@@ -214,12 +172,6 @@ def identify_recorder(
     StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
         As the guard ends the experiment.
     """
-    traces: dict[str, Trace] = {}
-    return tier_result(traces, swing_and_record(drive, envelope, traces.__setitem__, say), tolerance)
-
-
-def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: Say = _quiet) -> TierFacts:
-    """Run the experiment of :func:`identify_recorder`; raises as it does."""
     pole_pairs = round(drive.read("motor.pole_pairs"))
     U_dc = _link_v(drive)
     plan = PushPlan(

@@ -6,7 +6,6 @@ matplotlib is imported inside the functions: commands without a plot do not pay 
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -118,14 +117,3 @@ def thinned(t_s: NDArray[np.float64], value: NDArray[np.float64]) -> tuple[NDArr
     index = [start + int(pick(value[start : start + stretch])) for start in starts for pick in (np.argmin, np.argmax)]
     kept = np.unique([0, *index, n - 1])
     return t_s[kept], value[kept]
-
-
-def svg_text(figure: Figure) -> str:
-    """Return a figure as SVG text, the same bytes for the same figure."""
-    import matplotlib
-
-    out = io.BytesIO()
-    # fixed identifiers and no fonts of this machine: identical bytes everywhere
-    with matplotlib.rc_context({"svg.hashsalt": "pmsmtool", "svg.fonttype": "path"}):
-        figure.savefig(out, format="svg", metadata={"Date": None})
-    return out.getvalue().decode("utf-8")

@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from benchmarks.random_drives import draw_drive
+from benchmarks.tier_intervals import told_by
 from pmsmtool.bus.connect import connect
 from pmsmtool.cia402 import State
 from pmsmtool.cli.main import cli
@@ -38,7 +39,7 @@ from pmsmtool.measurement.capabilities import (
     examine,
     reference_capabilities,
 )
-from pmsmtool.measurement.tier_identify import HEADROOM, identify_by_torque, identify_recorder, identify_standard
+from pmsmtool.measurement.tier_identify import HEADROOM, push_by_torque, swing_and_record, turn_both_ways
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.simulated_machine import settings_of
 
@@ -124,7 +125,7 @@ def test_what_caps_promises_is_what_is_found_without_a_dead_time() -> None:
         with connect("pmsmsim", "interior-2k2?nv=:memory:&drive=epos4") as connection:
             drive = TorqueDrive(connection, 1, drive_map=load_family("epos4"))
             envelope = Envelope(i_max_apk=7.3, speed_max_rad_s=3000.0 * math.pi / 30.0, duration_s=600.0)
-            psi = identify_by_torque(drive, envelope, pole_pairs=3, inverter=inverter).estimates["psi_f_wb"]
+            psi = told_by(push_by_torque, drive, envelope, inverter, pole_pairs=3).estimates["psi_f_wb"]
             drive.close()
         half = 100.0 * total_half_width(psi) / psi.value
         assert 0.85 * promised[given] < half <= promised[given], "measured: 6.1 of 6.4 %, 3.7 of 3.7 %"
@@ -260,7 +261,7 @@ def test_pole_pairs_and_offset_of_a_random_drive_by_cia402(tmp_path: Path) -> No
     with connect("pmsmsim", f"{path}?nv=:memory:&drive=cia402") as connection:
         simulated = connection.bus.line.nodes[0].session  # type: ignore[attr-defined]
         standard = StandardDrive(connection, 1, drive_map=load_family("cia402"))
-        found = identify_standard(standard, envelope_for(drive)).estimates
+        found = told_by(turn_both_ways, standard, envelope_for(drive)).estimates
         assert not simulated.power.state.energised
         standard.close()
     truth = settings_of(drive).number("encoder_offset_rad")
@@ -291,7 +292,7 @@ def test_a_recorder_drive_that_does_not_commutate_is_refused(tmp_path: Path) -> 
     with connect("pmsmsim", f"{path}?nv=:memory:&tier=recorder") as connection:
         recorder = RecorderDrive(connection, 1)
         with pytest.raises(IdentificationError, match="E_EXCITATION"):
-            identify_recorder(recorder, envelope_for(drive))
+            told_by(swing_and_record, recorder, envelope_for(drive))
         assert not connection.bus.line.nodes[0].session.power.state.energised  # type: ignore[attr-defined]
         recorder.close()
 
@@ -312,11 +313,11 @@ def test_an_interrupted_run_is_stopped_and_restored(tier: str) -> None:
             if tier == "drive=cia402"
             else RecorderDrive(connection, 1)
         )
-        identify = identify_standard if isinstance(drive, StandardDrive) else identify_recorder
+        experiment = turn_both_ways if isinstance(drive, StandardDrive) else swing_and_record
         moment = connection.clock.now() + 2.5
         connection.clock.after(2.5, lambda: signal.raise_signal(signal.SIGINT))  # type: ignore[attr-defined]
         with pytest.raises(Interrupted):
-            identify(drive, Envelope(7.0, 300.0))  # type: ignore[arg-type, operator]
+            told_by(experiment, drive, Envelope(7.0, 300.0))  # type: ignore[arg-type]
         assert connection.clock.now() > moment
         assert session.power.state is State.SWITCH_ON_DISABLED
         assert drive.node.get(objects.TARGET_TORQUE_PERMILLE) == 0

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from benchmarks.tier_intervals import told_by
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
 from pmsmtool.commissioning.tier_stages import open_tier_drive
@@ -32,7 +33,7 @@ from pmsmtool.estimators.recorded_push import DELAY_DOUBT, estimate_pushes
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.measurement.capabilities import Capabilities, Method, Tier, examine
-from pmsmtool.measurement.tier_identify import identify_recorder
+from pmsmtool.measurement.tier_identify import swing_and_record
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
 
@@ -111,7 +112,7 @@ def pushed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[MappedRec
         drive = open_tier_drive(connection, 1, found)
         assert isinstance(drive, MappedRecorderDrive)
         envelope = Envelope(i_max_apk=7.0, speed_max_rad_s=280.0, duration_s=600.0)
-        yield drive, identify_recorder(drive, envelope)
+        yield drive, told_by(swing_and_record, drive, envelope)
         assert is_safe(drive.node.state())
         drive.close()
 
