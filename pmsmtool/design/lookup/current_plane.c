@@ -12,6 +12,7 @@
 #define ROOT_MOVED 1e-14    /* two iterates that are one, relative to the bracket */
 #define STEP_HALVINGS 24    /* of a step along a curve */
 #define TURN_COSINE 0.94    /* a step may turn the tangent by 20 degrees */
+#define STEP_FORWARD 0.5    /* and must get so far, of its length: a correction may throw a long one back */
 #define HALF_PI 1.57079632679489661923
 
 static double larger(double a, double b)
@@ -150,22 +151,21 @@ static double level_error(const pmsm_curve *curve, const pmsm_point *at, double 
 
 int32_t pmsm_curve_correct(const pmsm_curve *curve, pmsm_point *at)
 {
-    double before = INFINITY;
+    double before = INFINITY, error = INFINITY, floor = 0.0;
     for (int32_t k = 0; k < CORRECTIONS_MAX; k++) {
         double gradient[2], size, slope;
-        const double error = level_error(curve, at, &size);
+        error = level_error(curve, at, &size);
         if (fabs(error) <= CORRECTED * size)
             return 1;
-        if (!(fabs(error) < before))
-            return fabs(error) <= 64.0 * CORRECTED * size; /* rounding floor, else divergence */
-        before = fabs(error);
         level_gradient(curve, at, gradient);
         slope = square(gradient[0]) + square(gradient[1]);
-        if (!(slope > 0.0))
-            return 0;
+        floor = 64.0 * CORRECTED * larger(size, curve->plane->I_max * sqrt(slope)); /* of a flux that nearly cancels */
+        if (!(fabs(error) < before && slope > 0.0))
+            break;
+        before = fabs(error);
         pmsm_plane_at(curve->plane, at->d - error / slope * gradient[0], at->q - error / slope * gradient[1], at);
     }
-    return 0;
+    return fabs(error) <= floor; /* rounding, else divergence */
 }
 
 void pmsm_curve_tangent(const pmsm_curve *curve, const pmsm_point *at, double tangent[2])
@@ -309,14 +309,15 @@ int32_t pmsm_curve_root_between(const pmsm_curve *curve, enum pmsm_indicator wha
 
 int32_t pmsm_curve_step(const pmsm_curve *curve, const pmsm_point *from, double length, pmsm_point *to)
 {
-    double tangent[2], turned[2];
+    double tangent[2], turned[2], forward;
     pmsm_curve_tangent(curve, from, tangent);
     for (int32_t k = 0; k < STEP_HALVINGS; k++, length *= 0.5) {
         pmsm_plane_at(curve->plane, from->d + length * tangent[0], from->q + length * tangent[1], to);
         if (!pmsm_curve_correct(curve, to))
             continue;
         pmsm_curve_tangent(curve, to, turned);
-        if (tangent[0] * turned[0] + tangent[1] * turned[1] >= TURN_COSINE)
+        forward = ((to->d - from->d) * tangent[0] + (to->q - from->q) * tangent[1]) / length;
+        if (tangent[0] * turned[0] + tangent[1] * turned[1] >= TURN_COSINE && forward >= STEP_FORWARD)
             return 1;
     }
     return 0;

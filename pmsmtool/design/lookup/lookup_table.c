@@ -22,22 +22,28 @@
 
 /* ---- cell ------------------------------------------------------------------------------------------ */
 
-/* Both torque and squared voltage by Newton between two nodes; the bracketed root where that strays. */
+/* Whether a point of a short piece of a contour lies between its ends. */
+static int32_t between(const pmsm_point *a, const pmsm_point *b, const pmsm_point *at)
+{
+    const double d = b->d - a->d, q = b->q - a->q, along = (at->d - a->d) * d + (at->q - a->q) * q;
+    return along >= 0.0 && along <= d * d + q * q;
+}
+
+/* Both torque and squared voltage by Newton between two nodes; the bracketed root where that strays, or finds the far
+ * end of an admissible arc, which lies beyond them. */
 static int32_t voltage_point(const pmsm_curve *curve, const pmsm_point *a, const pmsm_point *b, double f_a, double f_b,
                              pmsm_point *at)
 {
     const double x = f_a / (f_a - f_b), reach = fabs(b->d - a->d) + fabs(b->q - a->q);
     const double d = a->d + x * (b->d - a->d), q = a->q + x * (b->q - a->q);
-    double before = INFINITY;
+    double before = INFINITY, error = INFINITY;
     pmsm_plane_at(curve->plane, d, q, at);
-    for (int32_t k = 0; k < NEWTON_STEPS; k++) {
-        double gradient[2], det, e_t, e_v, error;
-        e_t = at->t - curve->level;
-        e_v = pmsm_voltage_squared(curve->plane, at, curve->omega) - curve->V2;
+    for (int32_t k = 0; k < NEWTON_STEPS && fabs(at->d - d) + fabs(at->q - q) <= reach; k++) {
+        const double e_t = at->t - curve->level;
+        const double e_v = pmsm_voltage_squared(curve->plane, at, curve->omega) - curve->V2;
+        double gradient[2], det;
         error = fabs(e_t) / (sqrt(at->g * at->h) + fabs(curve->level)) + fabs(e_v) / curve->V2;
-        if (error <= NEWTON_DONE)
-            return 1;
-        if (!(error < before))
+        if (error <= NEWTON_DONE || !(error < before))
             break;
         before = error;
         pmsm_voltage_gradient(curve->plane, at, curve->omega, gradient);
@@ -46,12 +52,8 @@ static int32_t voltage_point(const pmsm_curve *curve, const pmsm_point *a, const
             break;
         pmsm_plane_at(curve->plane, at->d - (gradient[1] * e_t - at->t_q * e_v) / det,
                       at->q - (at->t_d * e_v - gradient[0] * e_t) / det, at);
-        if (!(fabs(at->d - d) + fabs(at->q - q) <= reach))
-            break;
     }
-    if (before <= 16.0 * NEWTON_DONE && fabs(at->d - d) + fabs(at->q - q) <= reach)
-        return 1;
-    return pmsm_curve_root(curve, PMSM_AT_VOLTAGE, a, b, at);
+    return (error <= 16.0 * NEWTON_DONE && between(a, b, at)) || pmsm_curve_root(curve, PMSM_AT_VOLTAGE, a, b, at);
 }
 
 typedef struct {
@@ -65,116 +67,143 @@ static double excess(const demand *want, const pmsm_point *at)
     return want->R2 * at->h + want->w2 * at->g - want->room;
 }
 
-/* First admissible node, or the admissible point between nodes where the voltage is least. */
-static int32_t first_admissible(const demand *want, const pmsm_curve *curve, const pmsm_branch *on, pmsm_point *inside)
+static int32_t admissible(const demand *want, const pmsm_point *at)
 {
-    int32_t best = 0;
-    double least = INFINITY;
+    return excess(want, at) <= FULL_VOLTAGE * want->V2;
+}
+
+/* An admissible arc between two nodes: its point of least voltage. */
+static int32_t arc_between(const demand *want, const pmsm_curve *curve, const pmsm_point *a, const pmsm_point *b,
+                           pmsm_point *inside)
+{
+    return pmsm_curve_root(curve, PMSM_AT_VOLTAGE_EXTREME, a, b, inside) && admissible(want, inside);
+}
+
+/* The first admissible part of a side begins between the node returned and *inside; -1: at the start of the side,
+ * PMSM_CONTOUR_NODES: there is none. *next: the first node after *inside. */
+static int32_t first_admissible(const demand *want, const pmsm_curve *curve, const pmsm_branch *on, pmsm_point *inside,
+                                int32_t *next)
+{
+    double before = INFINITY, f = excess(want, &on->at[0]);
     for (int32_t k = 0; k < on->n; k++) {
-        const double f = excess(want, &on->at[k]);
-        if (f <= FULL_VOLTAGE * want->V2)
-            return k;
-        if (f < least) {
-            least = f;
-            best = k;
+        const pmsm_point *at = &on->at[k];
+        const int32_t touches = f <= FULL_VOLTAGE * want->V2;
+        double after = INFINITY;
+        *next = k + 1;
+        *inside = *at;
+        if (f < 0.0)
+            return k - 1;
+        if (k + 1 < on->n)
+            after = excess(want, at + 1);
+        if (touches || (f <= before && f <= after)) { /* an arc between nodes shows as a least node beside it */
+            if (k > 0 && arc_between(want, curve, at - 1, at, inside)) {
+                *next = k;
+                return k - 1;
+            }
+            if (touches) {
+                *inside = *at;
+                return k - 1;
+            }
+            if (k + 1 < on->n && arc_between(want, curve, at, at + 1, inside))
+                return k;
         }
-    }
-    {
-        const pmsm_point *a = &on->at[best > 0 ? best - 1 : 0];
-        const pmsm_point *b = &on->at[best < on->n - 1 ? best + 1 : on->n - 1];
-        if (a != b && pmsm_curve_root(curve, PMSM_AT_VOLTAGE_EXTREME, a, b, inside)
-            && excess(want, inside) <= FULL_VOLTAGE * want->V2) {
-            const double side = (inside->d - on->at[best].d) * (b->d - a->d) + (inside->q - on->at[best].q) * (b->q - a->q);
-            return -1 - (side > 0.0 ? best : (best > 0 ? best - 1 : 0)); /* lies behind that node */
-        }
+        before = f;
+        f = after;
     }
     return PMSM_CONTOUR_NODES;
 }
 
-/* With iron loss the least total loss lies further along the admissible part of the contour. */
-static void least_loss(const demand *want, const pmsm_curve *curve, const pmsm_branch *on, int32_t from, pmsm_point *at)
+/* With iron loss the least total loss lies further along the admissible part of the contour: from *at by *b to the
+ * nodes that follow, or to the far end of that part. */
+static void least_loss(const demand *want, const pmsm_curve *curve, const pmsm_branch *on, const pmsm_point *b,
+                       int32_t next, pmsm_point *at)
 {
-    pmsm_point a = *at, b;
+    pmsm_point a = *at, from = *at, to = *at, root;
+    int32_t inside = 1;
     double loss = pmsm_plane_loss(want->plane, at, want->omega);
-    for (int32_t k = from; k < on->n; k++) {
-        const double next = pmsm_plane_loss(want->plane, &on->at[k], want->omega);
-        if (excess(want, &on->at[k]) > FULL_VOLTAGE * want->V2)
+    for (;; b = &on->at[next++]) {
+        double ahead;
+        inside = admissible(want, b);
+        if (!inside && !voltage_point(curve, b, &from, excess(want, b), excess(want, &from), &to))
             break;
-        b = on->at[k];
-        if (next >= loss) {
-            pmsm_point root;
-            if (pmsm_curve_root(curve, PMSM_AT_LOSS_EXTREME, &a, &b, &root)
-                && pmsm_plane_loss(want->plane, &root, want->omega) <= loss
-                && excess(want, &root) <= FULL_VOLTAGE * want->V2)
-                *at = root;
-            return;
+        if (inside)
+            to = *b;
+        ahead = pmsm_plane_loss(want->plane, &to, want->omega);
+        if (ahead < loss) {
+            a = from; /* the minimum lies between the last but one point and the next */
+            *at = to;
+            loss = ahead;
         }
-        a = *at; /* the minimum lies between the last but one node and the next */
-        *at = b;
-        loss = next;
+        if (ahead > loss || !inside || next >= on->n)
+            break;
+        from = to;
     }
-    {
-        pmsm_point root;
-        if (pmsm_curve_root(curve, PMSM_AT_LOSS_EXTREME, &a, at, &root)
-            && pmsm_plane_loss(want->plane, &root, want->omega) <= loss)
-            *at = root;
-    }
+    if (pmsm_curve_root(curve, PMSM_AT_LOSS_EXTREME, &a, &to, &root)
+        && pmsm_plane_loss(want->plane, &root, want->omega) <= loss && admissible(want, &root))
+        *at = root;
 }
 
-/* The least current of all admissible points of a side: minima and ends of its admissible parts. *at is admissible and
- * to be beaten when have is 1; returns whether there is one. */
-static int32_t least_of_all(const demand *want, const pmsm_curve *curve, const pmsm_branch *on, int32_t from,
-                            int32_t have, pmsm_point *at)
+typedef struct {
+    pmsm_point at;
+    int32_t have;
+} least_found;
+
+static void consider(least_found *best, const pmsm_point *at)
 {
-    const double slack = FULL_VOLTAGE * want->V2;
-    pmsm_point a = have ? *at : on->at[from - 1], best = a, found;
-    if (!have)
-        have = excess(want, &a) <= slack;
-    for (int32_t k = from; k < on->n; k++) {
-        const pmsm_point *b = &on->at[k];
-        const double f_a = excess(want, &a), f_b = excess(want, b);
-        const int32_t a_in = f_a <= slack, b_in = f_b <= slack;
-        if (a_in != b_in ? voltage_point(curve, &a, b, f_a, f_b, &found)
-                         : a_in && pmsm_curve_root(curve, PMSM_AT_CURRENT_EXTREME, &a, b, &found))
-            if ((!have || found.h < best.h) && excess(want, &found) <= slack) {
-                best = found;
-                have = 1;
-            }
-        if (b_in && (!have || b->h < best.h)) {
-            best = *b;
-            have = 1;
+    if (!best->have || at->h < best->at.h)
+        best->at = *at;
+    best->have = 1;
+}
+
+/* The least current between two points of a contour: ends and minima of the admissible part of that piece. */
+static void least_between(const demand *want, const pmsm_curve *curve, const pmsm_point *a, const pmsm_point *b,
+                          least_found *best)
+{
+    const int32_t a_in = admissible(want, a), b_in = admissible(want, b);
+    pmsm_point end, least;
+    if (!a_in && !b_in) {
+        pmsm_point inside;
+        if (arc_between(want, curve, a, b, &inside)) {
+            least_between(want, curve, a, &inside, best);
+            least_between(want, curve, &inside, b, best);
         }
-        a = *b;
+        return;
     }
-    if (have)
-        *at = best;
-    return have;
+    if (b_in)
+        consider(best, b);
+    if (a_in != b_in && voltage_point(curve, a, b, excess(want, a), excess(want, b), &end) && admissible(want, &end)) {
+        consider(best, &end);
+        if (a_in)
+            b = &end;
+        else
+            a = &end;
+    }
+    if (pmsm_curve_root(curve, PMSM_AT_CURRENT_EXTREME, a, b, &least) && admissible(want, &least))
+        consider(best, &least);
 }
 
 /* Least loss on one side of the contour; 0 when no point of it is admissible. */
 static int32_t solve_side(const demand *want, pmsm_curve *curve, const pmsm_branch *on, pmsm_point *at)
 {
     pmsm_point inside;
-    int32_t k = first_admissible(want, curve, on, &inside);
-    if (k == PMSM_CONTOUR_NODES)
+    int32_t next;
+    const int32_t behind = first_admissible(want, curve, on, &inside, &next);
+    if (behind == PMSM_CONTOUR_NODES)
         return 0;
-    if (k == 0) {
-        *at = on->at[0];
-        k = 1;
-    } else {
-        const int32_t behind = k < 0 ? -1 - k : k - 1;
-        const pmsm_point *a = &on->at[behind], *b = k < 0 ? &inside : &on->at[k];
-        const double f_a = excess(want, a), f_b = excess(want, b);
-        if (!(f_b < 0.0))
-            *at = *b;
-        else if (!voltage_point(curve, a, b, f_a, f_b, at))
+    *at = inside;
+    if (behind >= 0) {
+        const double f_a = excess(want, &on->at[behind]), f_b = excess(want, &inside);
+        if (f_b < 0.0 && !voltage_point(curve, &on->at[behind], &inside, f_a, f_b, at))
             return 0;
-        k = behind + 1;
     }
-    if (want->plane->loss)
-        least_loss(want, curve, on, k, at);
-    else if (!on->rising)
-        (void)least_of_all(want, curve, on, k, 1, at);
+    if (want->plane->loss) {
+        least_loss(want, curve, on, &inside, next, at);
+    } else if (!on->rising) {
+        least_found best = {*at, 1};
+        for (const pmsm_point *a = &inside; next < on->n; a = &on->at[next++])
+            least_between(want, curve, a, &on->at[next], &best);
+        *at = best.at;
+    }
     return 1;
 }
 
@@ -214,11 +243,15 @@ static int32_t solve_everywhere(const pmsm_contours *all, double T, double omega
                 || !pmsm_curve_root_between(&along, PMSM_AT_TORQUE, all->border.s[k - 1], all->border.s[k], &s, &c.start))
                 continue;
             for (int32_t side = 0; side < 2; side++) {
-                pmsm_point found;
+                const pmsm_branch *on = &c.side[side];
+                least_found best = {c.start, 0};
                 pmsm_contour_trace(&c, side, (side ? -PMSM_CONTOUR_STEP : PMSM_CONTOUR_STEP) * all->plane->I_max);
-                if (least_of_all(&want, &c.curve, &c.side[side], 1, 0, &found) && pmsm_on_branch(all->plane, &found)
-                    && (!have || found.h < at->h)) {
-                    *at = found;
+                if (admissible(&want, &c.start))
+                    consider(&best, &c.start);
+                for (int32_t n = 1; n < on->n; n++)
+                    least_between(&want, &c.curve, &on->at[n - 1], &on->at[n], &best);
+                if (best.have && pmsm_on_branch(all->plane, &best.at) && (!have || best.at.h < at->h)) {
+                    *at = best.at;
                     have = 1;
                 }
             }

@@ -53,8 +53,11 @@ static void follow(search *run, const pmsm_point *start, const pmsm_point *centr
         if (!pmsm_curve_step(&run->limit, &from, length, &to))
             return;
         leaving = k > 0 && pmsm_plane_outside(run->plane, &run->border->rectangle, &to) > 0.0;
-        if (leaving && !pmsm_curve_root(&run->limit, PMSM_AT_EDGE, &from, &to, &to))
-            return;
+        if (leaving) {
+            const pmsm_point beyond = to;
+            if (!pmsm_curve_root(&run->limit, PMSM_AT_EDGE, &from, &beyond, &to))
+                return;
+        }
         if (pmsm_curve_root(&run->limit, PMSM_AT_TORQUE_EXTREME, &from, &to, &top)
             && pmsm_plane_outside(run->plane, &run->border->rectangle, &top) <= ON_BORDER)
             consider(run, &top);
