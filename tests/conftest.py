@@ -18,6 +18,9 @@ from _pytest.runner import runtestprotocol
 # each other: an identification took 12 s of processor time instead of 1.6.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Tests start some hundred programs; without stored bytecode each compiles the package again, for a second.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 from tests import wall_clock
 
 # A background job of a shell without job control ignores SIGINT and hands that on to its children; tests of Ctrl-C

@@ -13,6 +13,7 @@ import sys
 import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -100,23 +101,27 @@ def _is_type_checking(node: ast.AST) -> bool:
     return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
 
 
-def imports(tree: ast.Module) -> Iterator[Import]:
-    """Yield every import of a module with its place."""
+@cache
+def imports(tree: ast.Module) -> tuple[Import, ...]:
+    """Return every import of a module with its place."""
+    found: list[Import] = []
 
-    def visit(node: ast.AST, top_level: bool, typing_only: bool) -> Iterator[Import]:
+    def visit(node: ast.AST, top_level: bool, typing_only: bool) -> None:
         for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.expr):
+                continue  # no expression holds a statement
             if isinstance(child, ast.Import):
-                for alias in child.names:
-                    yield Import(alias.name, child.lineno, top_level, typing_only)
+                found.extend(Import(alias.name, child.lineno, top_level, typing_only) for alias in child.names)
             elif isinstance(child, ast.ImportFrom):
                 source = child.module or ""
                 submodules = source == "pmsmtool"  # `from pmsmtool import trace` names rooms
                 for name in [f"{source}.{alias.name}" for alias in child.names] if submodules else [source]:
-                    yield Import(name, child.lineno, top_level, typing_only)
-            inside = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
-            yield from visit(child, top_level and not inside, typing_only or _is_type_checking(child))
+                    found.append(Import(name, child.lineno, top_level, typing_only))
+            inside = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef))
+            visit(child, top_level and not inside, typing_only or _is_type_checking(child))
 
-    yield from visit(tree, True, False)
+    visit(tree, True, False)
+    return tuple(found)
 
 
 def arrow_faults(module: str, tree: ast.Module) -> Iterator[str]:
@@ -157,10 +162,10 @@ def call_faults(module: str, tree: ast.Module) -> Iterator[str]:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
             if room(module) not in MAY_PRINT:
                 yield f"{node.lineno}: print outside cli"
-        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("np.random", "numpy.random"):
-            if node.attr not in RANDOM_TYPES:
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute) and node.value.attr == "random":
+            if ast.unparse(node.value) in ("np.random", "numpy.random") and node.attr not in RANDOM_TYPES:
                 yield f"{node.lineno}: global random state np.random.{node.attr}"
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("random.default_rng") and not node.args:
+        elif isinstance(node, ast.Call) and not node.args and ast.unparse(node.func).endswith("random.default_rng"):
             yield f"{node.lineno}: a random generator without a seed"
 
 
@@ -180,9 +185,15 @@ def name_faults(module: str, tree: ast.Module) -> Iterator[str]:
 RULES = (arrow_faults, start_up_faults, call_faults, name_faults)
 
 
+@cache
+def parsed(source: str) -> ast.Module:
+    """Return the syntax tree of a source."""
+    return ast.parse(source)
+
+
 def faults(module: str, source: str) -> list[str]:
     """Return all violations of one module."""
-    tree = ast.parse(source)
+    tree = parsed(source)
     return [fault for rule in RULES for fault in rule(module, tree)]
 
 
@@ -199,21 +210,19 @@ def test_module_keeps_the_rules(path: Path) -> None:
     assert faults(module_name(path), path.read_text(encoding="utf-8")) == []
 
 
+@cache
 def arrows() -> dict[str, set[str]]:
     """Every module of the package and the modules it imports, also for type checkers and inside functions."""
     known = {module_name(path) for path in MODULES}
     found: dict[str, set[str]] = {}
     for path in MODULES:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        tree = parsed(path.read_text(encoding="utf-8"))
         named = {item.module for item in imports(tree)}
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and node.module:
                 named |= {f"{node.module}.{alias.name}" for alias in node.names}
         found[module_name(path)] = named & known - {"pmsmtool"}
     return found
-
-
-ARROWS = arrows()
 
 
 def circle(graph: Mapping[str, Collection[str]]) -> list[str]:
@@ -253,16 +262,16 @@ def reached(module: str, modules: Mapping[str, Collection[str]]) -> set[str]:
 
 
 def test_no_circle_between_rooms() -> None:
-    assert circle(rooms(ARROWS)) == []
+    assert circle(rooms(arrows())) == []
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": ()}) == ["b", "c"]
 
 
 def test_identification_moves_nothing() -> None:
     """From stored traces to values, whoever imports it, years later, without a bus."""
-    mine = [module for module in ARROWS if room(module) == "identification"]
+    mine = [module for module in arrows() if room(module) == "identification"]
     assert mine
     for module in mine:
-        assert {room(there) for there in reached(module, ARROWS)} & {"drive", "experiments", "bus", "sim"} == set(), (
+        assert {room(there) for there in reached(module, arrows())} & {"drive", "experiments", "bus", "sim"} == set(), (
             module
         )
     assert reached("a", {"a": {"b"}, "b": {"c", "a"}}) == {"a", "b", "c"}
@@ -356,7 +365,7 @@ def test_every_third_party_import_is_declared() -> None:
     imported_as = {"python-can": "can"}
     declared = {imported_as.get(name, name) for name in names}
     for path in MODULES:
-        for found in imports(ast.parse(path.read_text(encoding="utf-8"))):
+        for found in imports(parsed(path.read_text(encoding="utf-8"))):
             top = found.module.split(".")[0]
             if top not in sys.stdlib_module_names and top != "pmsmtool":
                 assert top in declared, f"{path.name}:{found.line} imports {top}"
