@@ -20,7 +20,8 @@ PERIODS = 1800
 """0.15 s: both steps and 50 ms after the second one; the benchmark runs 1 s."""
 
 CLOSED_LOOP_LIMIT = 1e-6
-"""Required; measured over 0.2 s 1.3e-7 (S1), 2.7e-7 (S2), 4.6e-8 (S3), 7.0e-8 (S4), 3.1e-7 (S5)."""
+"""Required; measured over 0.2 s 1.3e-7 (S1), 2.7e-7 (S2), 4.6e-8 (S3), 7.0e-8 (S4, which runs below, at more
+speeds), 3.1e-7 (S5)."""
 PLANT_LIMIT = 1e-8
 """Required below 0.1 rad per period; measured 1.1e-10 (S1), 1.9e-9 (S2), 2.2e-9 (S3)."""
 PLANT_LIMIT_FAST = 1e-6
@@ -57,7 +58,7 @@ def test_plant_alone_against_the_exact_transition(scenario):
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+@pytest.mark.parametrize("scenario", LINEAR, ids=lambda s: s.name)
 def test_closed_loop_against_dop853(scenario):
     assert relative_error(simulate(scenario, PERIODS), reference_run(scenario, PERIODS)) <= CLOSED_LOOP_LIMIT
 
