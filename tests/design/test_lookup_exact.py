@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.analytic_saturation import BridgeSaturation
 from benchmarks.exact_points import Tally, as_map, check_speed, random_machine, speeds
 from pmsmtool.design.lookup.table import RPM, LookupTable, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
-from pmsmtool.machine.analytic_saturation import BridgeSaturation
 from pmsmtool.machine.flux_map import FluxMap
 from tests.design.exact_points import LinearCase
 
