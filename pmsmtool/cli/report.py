@@ -16,8 +16,8 @@ from pmsmtool.files import write_file
     "report",
     epilog=examples(
         "pmsmtool report runs/20260101T120000Z-000055f1",
-        "pmsmtool report runs/20260101T120000Z-000055f1 -o commissioning.html",
         "pmsmtool report runs/20260101T120000Z-000055f1 --json | jq .verdict",
+        "pmsmtool report --junit runs/20260101T120000Z-000055f1 -o result.xml",
         "pmsmtool report --anonymous runs/20260101T120000Z-000055f1 -o to-send.json",
     ),
 )
@@ -25,8 +25,10 @@ from pmsmtool.files import write_file
 @click.option("-o", "--output", "path", type=FILE, help="Page to write.  [default: report.html in the run directory]")
 @click.option("--anonymous", is_flag=True, help="Instead of the page one JSON file to send: traces, objects, verdicts, "
               "no names.  [default: anonymous.json in the run directory]")  # fmt: skip
+@click.option("--junit", is_flag=True, help="Instead of the page JUnit XML for a test system: a case per criterion.  "
+              "[default: junit.xml in the run directory]")  # fmt: skip
 @output_options
-def report_command(run: Path, path: Path | None, anonymous: bool, out: Output) -> None:
+def report_command(run: Path, path: Path | None, anonymous: bool, junit: bool, out: Output) -> None:
     """Write the report of a RUN directory: one self-contained HTML page, verdict first.
 
     Every figure is drawn from the files of the run. The exit code is that of writing the page, not the verdict of the
@@ -35,14 +37,24 @@ def report_command(run: Path, path: Path | None, anonymous: bool, out: Output) -
     --anonymous makes a file to send to the authors of pmsmtool: no serial number, no name of a person, drive, machine,
     computer or file, no date, no text of the run. Read it before you send it: it is plain text.
     """
+    if anonymous and junit:
+        raise click.UsageError("--anonymous and --junit make two different files: give one of them")
     if anonymous:
         _write_anonymous(run, run / "anonymous.json" if path is None else path, out)
         return
     from pmsmtool.commissioning.report_page import how_it_ended, report_page, verdict
 
-    path = run / "report.html" if path is None else path
-    write_file(path, report_page(run))
+    path = path or run / ("junit.xml" if junit else "report.html")
     found, ended = verdict(run), how_it_ended(run)
+    if junit:
+        from dataclasses import asdict
+
+        from pmsmtool.report.junit import junit_xml
+        from pmsmtool.run_directory import RunDirectory
+
+        write_file(path, junit_xml(asdict(RunDirectory(run).read()), found))
+    else:
+        write_file(path, report_page(run))
     data = {"file": path, "verdict": found.word, "simulated": found.simulated, "reasons": found.lines, "ended": ended}
     out.result("report", data, [found.headline, *found.details, *ended])
     out.note(f"wrote {path}")

@@ -8,6 +8,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -18,6 +19,7 @@ from pmsmtool.design.lookup.design import LookupRequest
 from pmsmtool.design.loops.open_loops import open_loops
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import IdentificationError
+from pmsmtool.report.junit import junit_xml
 from pmsmtool.report.verdict import Verdict
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage, new_record
@@ -202,3 +204,27 @@ def test_what_is_refused_is_left_out_until_something_remains(monkeypatch: pytest
     traces = {name: object() for name in ("zero_current", "phase_vectors", "levels", "rotation_forward", "square_d_6")}
     found = report_page._evaluated(traces, 1e-4, complete=True)  # type: ignore[arg-type]
     assert found == {"zero_current", "phase_vectors", "levels"}  # type: ignore[comparison-overlap]
+
+
+def test_junit_has_a_case_per_criterion_and_is_green_only_for_a_pass(made: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(made, tmp_path / "run")
+    refused = {"L_q": "noise\x1b[2J & <more>"}
+    failed = [Acceptance("R_s_ohm: interval", "9 %", "3 %", False)]
+    RunDirectory(folder).add(Stage("identify", "fail", 2.5, acceptance=failed, refused=refused, note="not accepted"))
+    RunDirectory(folder).add(Stage("prove", "not available", 0.0, note="no torque mode"))
+    assert program(["report", "--junit", str(folder), "-o", str(tmp_path / "out.xml"), "-q"]) == 0
+    suite = ElementTree.parse(tmp_path / "out.xml").getroot()
+    cases = {(case.get("classname"), case.get("name")): case for case in suite.iter("testcase")}
+    assert cases["pmsmtool.commissioning", "verdict"].find("failure") is not None
+    assert cases["pmsmtool.flash", "read back"].find("failure") is None
+    assert cases["pmsmtool.identify", "R_s_ohm: interval"].find("failure").text == "9 %, limit 3 %"  # type: ignore[union-attr]
+    assert cases["pmsmtool.identify", "ran"].get("time") == "2.500"
+    assert "\\x1b[2J & <more>" in str(cases["pmsmtool.identify", "L_q given"].find("skipped").text)  # type: ignore[union-attr]
+    assert cases["pmsmtool.prove", "ran"].find("skipped") is not None
+    assert {key: suite.get(key) for key in ("failures", "skipped")} == {"failures": "3", "skipped": "2"}
+    assert suite.get("tests") == str(len(cases))
+    record = {"started_utc": "", "stages": ()}
+    for kind, inside in (("pass", "system-out"), ("partial", "skipped")):
+        found = ElementTree.fromstring(junit_xml(record, Verdict(kind, "", ("x",))).encode())  # type: ignore[arg-type]
+        assert found.find(f"testcase/{inside}") is not None and found.get("failures") == "0"
+    assert program(["report", "--junit", "--anonymous", str(folder), "-q"]) == 2
