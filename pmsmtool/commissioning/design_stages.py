@@ -176,7 +176,9 @@ def with_table(design: Design, made: LookupDesign) -> Design:
     values, tables = lut_values(made.table, made.stored)
     how = f"look-up table, {made.stored}, error-bounded grid"
     entries = {**design.values, **{name: DesignValue(value, how) for name, value in values.items()}}
-    return replace(design, values={row.name: entries[row.name] for row in CATALOGUE}, tables=tables)
+    return replace(
+        design, values={row.name: entries[row.name] for row in CATALOGUE}, tables={**design.tables, **tables}
+    )
 
 
 def _stage(

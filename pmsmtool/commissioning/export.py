@@ -117,9 +117,9 @@ def concise_dcf(wanted: ParameterSet, *, drive_map: DriveMap | None = None) -> b
         complete = all(row.name in wanted.values for row in CATALOGUE)
         if complete:
             entries = [*_stage(SetCommand.BEGIN), *entries, *_take(crc32(image_of(wanted)))]
-        elif wanted.tables or any(name.startswith("lut.") for name in wanted.values):
+        elif wanted.tables or any(name.startswith(("lut.", "saturation.")) for name in wanted.values):
             raise ConfigError(
-                "a look-up table can be sent to this drive only together with the whole set",
+                "a table can be sent to this drive only together with the whole set",
                 where=wanted.name,
                 hint="export the design, or a complete params.toml",
             )

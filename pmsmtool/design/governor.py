@@ -210,15 +210,9 @@ def _k_max(found: Horizon | None) -> DesignValue:
     return DesignValue(min(found.k_max, ROWS_IN_DRIVE - 1), f"redundancy test over all states, eps {found.eps:g}")
 
 
-def saliency(source: MachineFile) -> float:
-    """Return the larger apparent inductance over the smaller."""
-    pair = source.machine.L_d_decoupling_h, source.machine.L_q_decoupling_h
-    return max(pair) / min(pair)
-
-
 def _not_steered(source: MachineFile, predictor: bool) -> str:
     """Return why the flux is not steered along the minimum-time direction; empty when it is."""
-    if source.flux_map is not None or saliency(source) > STEERED_SALIENCY:
+    if source.flux_map is not None or source.machine.saliency > STEERED_SALIENCY:
         return "on the way the reluctance torque would overshoot"
     if source.inverter.delay_periods >= 1.0 and not predictor:  # 43 of 80 unreachable steps: up to 1.27 I_max
         return "without the predictor it passes the current limit during the delay"
@@ -227,10 +221,6 @@ def _not_steered(source: MachineFile, predictor: bool) -> str:
 
 def _options(mode: str, predictor: bool, apart: str) -> tuple[int, str]:
     parts: dict[str, tuple[tuple[int, str], ...]] = {
-        "off": (),
-        "paper": (),
-        "linearised": (),
-        "observe": (),
         "line": ((CURRENT_ROW, "current row"), (PRE_PROJECTION, "pre-projection")),
         "best": (
             (CURRENT_ROW, "current row"),
@@ -238,7 +228,7 @@ def _options(mode: str, predictor: bool, apart: str) -> tuple[int, str]:
             *(((MINIMUM_TIME, "minimum-time direction"),) if not apart else ()),
         ),
     }
-    chosen = parts[mode]
+    chosen = parts.get(mode, ())
     bits = sum(bit for bit, _ in chosen) | (PREDICTOR if predictor and mode != "off" else 0)
     names = [name for _, name in chosen] + (["predictor"] if bits & PREDICTOR else [])
     how = ", ".join(names) or "none"

@@ -32,8 +32,10 @@ from pmsmtool.design.loops.speed_loop import (
 from pmsmtool.design.ratings import Ratings, rating_values, ratings, reaction_of, sag_facts
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
+from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.params.parameter_set import SATURATION
 
 PLL_PER_PERIOD = 0.1
 """Default pole of the speed estimate times T_s: a tenth of the sampling rate, 1200 rad/s at 12 kHz."""
@@ -83,16 +85,22 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
     generation = {} if math.isinf(reaction.generation_rpm) else {"generation_rpm": reaction.generation_rpm}
     choice = choose_current(source, request, rated.I_max_apk)
     weakening = design_field_weakening(source, rated, _weakening_mode(source, request), request.voltage_margin)
+    gains = {axis: choice.gains(axis) for axis in "dq"}
+    governor = design_governor(source, rated, gains, request.governor, predictor=request.predictor, eps=request.eps)
     parts = [
         _design_current(choice),
         _design_speed(source, request, rated, choice, weakening.ramp_limit_rpm_per_s),
-        _design_governor(source, request, rated, choice),
+        _Part(dict(governor.values), {}, dict(governor.facts), governor.notes),
         _Part(dict(weakening.values), {}, {**generation, **sag_facts(source, rated, V_limit), **weakening.facts}, told),
     ]
     tables: dict[str, tuple[float, ...]] = {}
     if weakening.values["field_weakening.mode"].value == FIELD_WEAKENING["lookup"]:
         table, tables = _design_table(source, request, rated)
         parts.append(table)
+    if source.flux_map is not None:
+        saturation, nodes = _design_saturation(source.flux_map, rated)
+        parts.insert(0, saturation)
+        tables |= nodes
     if request.controller == "polar":
         from pmsmtool.design.polar_values import polar_values
 
@@ -107,7 +115,7 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
         values,
         {name: loop for part in parts for name, loop in part.loops.items()},
         {name: fact for part in parts for name, fact in part.facts.items()},
-        (*_map_complaints(source), *(note for part in parts for note in part.notes)),
+        tuple(note for part in parts for note in part.notes),
         tables,
     )
     violations = design.parameter_set().violations()
@@ -118,14 +126,6 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
             hint="ask for another bandwidth, or correct the machine file",
         )
     return design
-
-
-def _map_complaints(source: MachineFile) -> tuple[str, ...]:
-    if source.flux_map is None:
-        return ()
-    from pmsmtool.machine.flux_map_check import check_flux_map
-
-    return check_flux_map(source.flux_map).complaints
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +176,17 @@ def _weakening_mode(source: MachineFile, request: TuneRequest) -> str:
     return "accelerated" if source.flux_map is None else "lookup"
 
 
-def _design_governor(source: MachineFile, request: TuneRequest, rated: Ratings, current: CurrentChoice) -> _Part:
-    gains = {axis: current.gains(axis) for axis in "dq"}
-    found = design_governor(source, rated, gains, request.governor, predictor=request.predictor, eps=request.eps)
-    return _Part(dict(found.values), {}, dict(found.facts), found.notes)
+def _design_saturation(flux_map: FluxMap, rated: Ratings) -> tuple[_Part, dict[str, tuple[float, ...]]]:
+    """The saturation table of a map, and what is to be said of the map."""
+    from pmsmtool.machine.flux_map_check import check_flux_map
+    from pmsmtool.machine.saturation_table import saturation_table
+
+    said, found = check_flux_map(flux_map).complaints, saturation_table(flux_map, rated.I_max_apk)
+    if found is None:
+        return _Part({}, {}, {}, (*said, "decoupling by constants: the flux map has nodes without inductance")), {}
+    values = {f"saturation.{k}": DesignValue(v, "flux map up to 1.1 I_max") for k, v in found.descriptor().items()}
+    nodes = tuple(found.nodes.ravel().tolist())
+    return _Part(values, {}, {"saturation_flux_error_wb": found.flux_error_wb}, said), {SATURATION: nodes}
 
 
 def _design_table(

@@ -20,7 +20,7 @@ from pmsmtool.drive_maps.map_tables import look_up_words
 from pmsmtool.errors import BusError, DriveFault, DriveTimeout, NotAvailable, SdoAbort, VerifyMismatch
 from pmsmtool.firmware.image import ImageStatus, crc32, pack_image, unpack_image
 from pmsmtool.params.catalogue import SCHEMA_VERSION, layout_signature
-from pmsmtool.params.parameter_set import TABLE_NAMES
+from pmsmtool.params.parameter_set import LUT_NAMES, SATURATION, TABLE_NAMES
 
 Progress = Callable[[int, int], None]
 """Called with objects done and objects in all."""
@@ -158,11 +158,10 @@ class DriveParameters:
         for name, data in new.items():
             if name in self.map.cells:
                 values[name] = self.map.cells[name].decode(data, values)
-        if not values["lut.format"]:
-            words = b""
-        elif any(name in new for name in (*TABLE_NAMES, "lut.format", "lut.n_x", "lut.n_y", "lut.n_z")):
-            missing = [name for name in TABLE_NAMES if name not in new]
-            words = look_up_words({**self.read(missing), **{n: new[n] for n in TABLE_NAMES if n in new}})
+        if any(name in TABLE_NAMES or name.startswith(("lut.", "saturation.")) for name in new):
+            used = (*(LUT_NAMES if values["lut.format"] else ()), *((SATURATION,) if values["saturation.n_d"] else ()))
+            missing = [name for name in used if name not in new]
+            words = look_up_words({**self.read(missing), **{n: new[n] for n in used if n in new}})
         return crc32(pack_image(values, words))
 
     # ---- writing --------------------------------------------------------------------------------

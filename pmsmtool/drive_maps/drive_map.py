@@ -25,7 +25,7 @@ from pmsmtool.drive_maps.wire_units import as_peak
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.params.catalogue import CATALOGUE
-from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
+from pmsmtool.params.parameter_set import SATURATION, TABLE_NAMES, ParameterSet
 
 _ADDRESS = re.compile(r"0x([0-9A-F]{4}):([0-9A-F]{2})(?: |\Z)")
 Rounding = Literal["nearest", "down", "up"]
@@ -46,8 +46,9 @@ REFERENCE_TABLES = {
     "lut.axis_x": (0x2044, 0),
     "lut.axis_y": (0x2045, 0),
     "lut.axis_z": (0x2046, 0),
+    SATURATION: (0x2049, 0),
 }
-"""DOMAIN objects of the reference drive's look-up table."""
+"""DOMAIN objects of the reference drive's tables."""
 
 
 @dataclass(frozen=True, slots=True)

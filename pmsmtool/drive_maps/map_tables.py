@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The look-up table's axes and tables as bytes of a DOMAIN, and binary32 with as few digits as it needs."""
+"""Look-up axes and tables and the saturation table as bytes of a DOMAIN; binary32 with as few digits as it needs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.image import LUT_FORMAT_INT16, LUT_INT16_NO_POINT
-from pmsmtool.params.parameter_set import TABLE_NAMES
+from pmsmtool.params.parameter_set import SATURATION, TABLE_NAMES
 
 
 def encode_table(name: str, numbers: Sequence[float], values: Mapping[str, float]) -> bytes:
@@ -21,7 +21,7 @@ def encode_table(name: str, numbers: Sequence[float], values: Mapping[str, float
         A number does not fit the format.
     """
     try:
-        if name.startswith("lut.axis_") or values.get("lut.format") != LUT_FORMAT_INT16:
+        if _is_binary32(name) or values.get("lut.format") != LUT_FORMAT_INT16:
             return struct.pack(f"<{len(numbers)}f", *numbers)
         lsb = values["lut.lsb_a"]
         steps = (LUT_INT16_NO_POINT if math.isnan(x) else round(x / lsb) for x in numbers)
@@ -35,7 +35,7 @@ def encode_table(name: str, numbers: Sequence[float], values: Mapping[str, float
 
 def decode_table(name: str, data: bytes, values: Mapping[str, float]) -> tuple[float, ...]:
     """Return the numbers of a DOMAIN; the inverse of :func:`encode_table`."""
-    if name.startswith("lut.axis_") or values.get("lut.format") != LUT_FORMAT_INT16:
+    if _is_binary32(name) or values.get("lut.format") != LUT_FORMAT_INT16:
         return tuple(map(shortest_binary32, struct.unpack(f"<{len(data) // 4}f", data[: len(data) // 4 * 4])))
     lsb = values["lut.lsb_a"]
     cells = math.prod(int(values.get(f"lut.n_{axis}", 0)) for axis in "xyz") or len(data) // 2
@@ -43,8 +43,13 @@ def decode_table(name: str, data: bytes, values: Mapping[str, float]) -> tuple[f
     return tuple(math.nan if k == LUT_INT16_NO_POINT else k * lsb for k in steps)
 
 
+def _is_binary32(name: str) -> bool:
+    """Whether a table has one format only."""
+    return name.startswith("lut.axis_") or name == SATURATION
+
+
 def look_up_words(encoded: Mapping[str, bytes]) -> bytes:
-    """Return axes and tables as they stand in the parameter image, one after the other."""
+    """Return axes and tables, then the saturation table, as they stand in the parameter image, one after the other."""
     return b"".join(encoded.get(name, b"") for name in TABLE_NAMES)
 
 

@@ -19,7 +19,7 @@ from importlib import resources
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.export_example import example_source
-from pmsmtool.firmware.image import LUT_FORMAT_BINARY32, crc32, pack_image, unpack_image
+from pmsmtool.firmware.image import LUT_FORMAT_BINARY32, crc32, pack_image, saturation_words, unpack_image
 from pmsmtool.firmware.params_header import SPDX, c_float, commented
 from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, layout_signature
 
@@ -182,9 +182,33 @@ def _lut_initialiser(values: Mapping[str, float], lut: bytes) -> str:
     if not lut:
         return ""
     words = struct.unpack(f"<{len(lut) // 4}I", lut)
+    end = len(words) - saturation_words(values)
+    lines = [
+        "    .lut = {",
+        *_look_up_lines(values, lut[: 4 * end], words[:end]),
+        *_saturation_lines(values, words[end:]),
+    ]
+    return "\n".join([*lines, "    }"])
+
+
+def _saturation_lines(values: Mapping[str, float], words: tuple[int, ...]) -> list[str]:
+    """The nodes along i_q under a comment with their i_d."""
+    n_d = int(values["saturation.n_d"])
+    row = len(words) // max(n_d, 1)
+    low, high = values["saturation.i_d_min_a"], values["saturation.i_d_max_a"]
+    lines = ["        /* saturation: psi_d [Wb], psi_q/i_q, dpsi_d/di_d, dpsi_q/di_q [H] */"] if words else []
+    for k in range(n_d):
+        lines += [f"        /* at i_d = {low + k * (high - low) / (n_d - 1):.9g} A */"]
+        lines += _word_lines(words[k * row : (k + 1) * row])
+    return lines
+
+
+def _look_up_lines(values: Mapping[str, float], lut: bytes, words: tuple[int, ...]) -> list[str]:
+    if not words:
+        return []
     n_x, n_y, n_z = (int(values[f"lut.n_{axis}"]) for axis in "xyz")
     second = "speed [rpm]" if values["lut.axis_kind"] == 0 else "flux limit [Wb]"
-    lines = ["    .lut = {"]
+    lines = []
     start = 0
     for count, what in ((n_x, "torque [N m]"), (n_y, second), (n_z, "U_dc [V]")):
         numbers = ", ".join(f"{number:.9g}" for number in struct.unpack_from(f"<{count}f", lut, 4 * start))
@@ -198,7 +222,7 @@ def _lut_initialiser(values: Mapping[str, float], lut: bytes) -> str:
             at = f" at {torques[offset // row_words]:.9g} N m" if row_words < size else ", two int16 a word"
             lines += [f"        /* {table}{at} */", *_word_lines(words[start + offset : start + offset + row_words])]
         start += size
-    return "\n".join([*lines, "    }"])
+    return lines
 
 
 def _word_lines(words: tuple[int, ...]) -> list[str]:

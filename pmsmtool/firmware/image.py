@@ -20,7 +20,10 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import (
     CATALOGUE,
     CLOSED_DRIVE,
+    FLUX_MOST_WB,
+    INDUCTANCE_RANGE_H,
     LUT_CAPACITY_WORDS,
+    SATURATION_VALUES,
     SCHEMA_VERSION,
     Parameter,
     layout_signature,
@@ -108,7 +111,16 @@ def _check_ranges(values: Mapping[str, float]) -> None:
 
 
 def lut_size_words(values: Mapping[str, float]) -> int:
-    """Return the four-byte words of axes and tables that the ``lut.*`` values announce."""
+    """Return the four-byte words of all axes and tables that the ``lut.*`` and ``saturation.*`` values announce."""
+    return _look_up_words(values) + saturation_words(values)
+
+
+def saturation_words(values: Mapping[str, float]) -> int:
+    """Return the four-byte words of the saturation table, the last ones of the image."""
+    return int(values["saturation.n_d"] * values["saturation.n_q"]) * SATURATION_VALUES
+
+
+def _look_up_words(values: Mapping[str, float]) -> int:
     kind = int(values["lut.format"])
     if kind == LUT_FORMAT_NONE:
         return 0
@@ -124,6 +136,7 @@ def _check_lut(values: Mapping[str, float], lut: bytes) -> None:
         raise ImageRefused(
             ImageStatus.LUT_SIZE, f"look-up data of {len(lut)} bytes, the descriptor announces {4 * words}"
         )
+    _check_saturation(values, lut[4 * _look_up_words(values) :])
     if int(values["lut.format"]) == LUT_FORMAT_NONE:
         return
     counts = [int(values[f"lut.n_{axis}"]) for axis in "xyz"]
@@ -140,6 +153,25 @@ def _check_lut(values: Mapping[str, float], lut: bytes) -> None:
         start += count
         if not all(map(math.isfinite, nodes)) or any(b <= a for a, b in itertools.pairwise(nodes)):
             raise ImageRefused(ImageStatus.LUT_AXIS, f"axis {axis} of the look-up table does not increase")
+
+
+def _check_saturation(values: Mapping[str, float], nodes: bytes) -> None:
+    n_d, n_q = int(values["saturation.n_d"]), int(values["saturation.n_q"])
+    if n_d == n_q == 0:
+        return
+    if min(n_d, n_q) < 2:
+        raise ImageRefused(ImageStatus.LUT_SIZE, f"a saturation table of {n_d} x {n_q} nodes: either axis needs 2")
+    low, high, q = (to_binary32(values[f"saturation.{key}_a"]) for key in ("i_d_min", "i_d_max", "i_q_max"))
+    if not (low < high and q > 0.0):
+        raise ImageRefused(ImageStatus.LUT_AXIS, f"the saturation table spans i_d {low:g}..{high:g} A, i_q 0..{q:g} A")
+    numbers = struct.unpack(f"<{len(nodes) // 4}f", nodes)
+    least, most = map(to_binary32, INDUCTANCE_RANGE_H)
+    if not all(-FLUX_MOST_WB <= psi <= FLUX_MOST_WB for psi in numbers[::SATURATION_VALUES]) or not all(
+        least <= L <= most for k, L in enumerate(numbers) if k % SATURATION_VALUES
+    ):
+        raise ImageRefused(
+            ImageStatus.RANGE, f"the saturation table holds no flux, or an inductance not above {least:g} H"
+        )
 
 
 def pack_image(values: Mapping[str, float], lut: bytes = b"") -> bytes:

@@ -316,6 +316,12 @@ _ROWS: tuple[tuple[str, int, int, WireType, str, float, float, float, bool, str]
     ("lut.n_y", 0x2041, 0x04, _U8, "1", 0, 0, 255, False, "nodes of the speed or flux axis"),
     ("lut.n_z", 0x2041, 0x05, _U8, "1", 0, 0, 16, False, "nodes of the U_dc axis, 1 when there is none"),
     ("lut.lsb_a", 0x2041, 0x06, _F32, "A", 0, 0, 100, False, "current of one int16 step"),
+    # 0x2047 saturation table (its nodes are the DOMAIN object 0x2049)
+    ("saturation.n_d", 0x2047, 0x01, _U8, "1", 0, 0, 32, False, "nodes along i_d, 0 without saturation"),
+    ("saturation.n_q", 0x2047, 0x02, _U8, "1", 0, 0, 32, False, "nodes along i_q, from 0 on"),
+    ("saturation.i_d_min_a", 0x2047, 0x03, _F32, "A", 0, -1e5, 0, False, "first node along i_d"),
+    ("saturation.i_d_max_a", 0x2047, 0x04, _F32, "A", 0, 0, 1e5, False, "last node along i_d"),
+    ("saturation.i_q_max_a", 0x2047, 0x05, _F32, "A", 0, 0, 1e5, False, "last node along i_q"),
     # 0x2048 polar-coordinate controller (Miyajima et al. 2013)
     (
         "polar.mode",
@@ -418,13 +424,19 @@ LUT_CAPACITY_WORDS = 8192
 """Four-byte words the drive reserves for axes and tables (32 KiB)."""
 
 LUT_LAYOUT = "lut:axis_x,axis_y,axis_z:binary32;table_i_d,table_i_q:format;row-major x,y,z;padded to 4 bytes"
-"""What follows the scalars in the image; part of the signature."""
+SATURATION_LAYOUT = "saturation:nodes:binary32;row-major d,q,(psi_d,psi_q/i_q,dpsi_d/di_d,dpsi_q/di_q)"
+"""What follows the scalars in the image, one after the other; part of the signature."""
+
+SATURATION_VALUES = 4
+"""Numbers of a node: psi_d (Wb), psi_q/i_q, dpsi_d/di_d and dpsi_q/di_q (H)."""
+FLUX_MOST_WB, INDUCTANCE_RANGE_H = 100.0, (1e-7, 10.0)
+"""Bounds of those numbers."""
 
 
 def layout_text() -> str:
     """Return the lines ``name:type:dim:unit:scale`` in struct order that the signature covers."""
     lines = [f"{row.name}:{'u32' if row.is_integer else 'f32'}:1:{row.unit}:1" for row in CATALOGUE]
-    return "\n".join([*lines, LUT_LAYOUT])
+    return "\n".join([*lines, LUT_LAYOUT, SATURATION_LAYOUT])
 
 
 def layout_signature() -> int:

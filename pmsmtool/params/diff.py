@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pmsmtool.params.catalogue import BY_NAME, EVERY
-from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
+from pmsmtool.params.parameter_set import SATURATION, TABLE_NAMES, ParameterSet
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,5 +76,5 @@ def _compare_tables(name: str, old: Sequence[float], new: Sequence[float]) -> Di
 
 def table_unit(name: str) -> str:
     """Return the unit of a look-up axis or table, the second axis's only in words (it has two kinds)."""
-    units = {"lut.axis_x": "N m", "lut.axis_y": "rpm or Wb", "lut.axis_z": "V"}
+    units = {"lut.axis_x": "N m", "lut.axis_y": "rpm or Wb", "lut.axis_z": "V", SATURATION: "Wb and H"}
     return BY_NAME[name].unit if name in BY_NAME else units.get(name, "A")

@@ -19,7 +19,7 @@ from typing import Any
 
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
-from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY, LUT_CAPACITY_WORDS
+from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY, LUT_CAPACITY_WORDS, SATURATION_VALUES
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_text
 
@@ -29,8 +29,14 @@ NEXT_STEP = (
 
 SCHEMA = "pmsmtool.params/1"
 
-TABLE_NAMES = ("lut.axis_x", "lut.axis_y", "lut.axis_z", "lut.i_d_a", "lut.i_q_a")
+LUT_NAMES = ("lut.axis_x", "lut.axis_y", "lut.axis_z", "lut.i_d_a", "lut.i_q_a")
 """Axes (torque in N m; rpm or Wb; V) and tables (A peak, row-major x, y, z) of the reference look-up."""
+
+SATURATION = "saturation.nodes"
+"""The saturation table: nodes of ``SATURATION_VALUES`` numbers (Wb and H), row-major i_d, i_q."""
+
+TABLE_NAMES = (*LUT_NAMES, SATURATION)
+"""Every table, in the order of the parameter image."""
 
 _INTEGER_LIMIT = 2**64
 
@@ -208,7 +214,22 @@ def _bound_violations(name: str, value: float) -> list[str]:
 
 
 def _table_violations(values: Mapping[str, float], tables: Mapping[str, Sequence[float]]) -> list[str]:
-    """Compare the tables with the descriptor, as far as the set holds it; NaN marks a cell without a point."""
+    """Compare the tables with their descriptors, as far as the set holds them."""
+    look_up = {name: table for name, table in tables.items() if name in LUT_NAMES}
+    return [*_saturation_violations(values, tables.get(SATURATION, ())), *_look_up_violations(values, look_up)]
+
+
+def _saturation_violations(values: Mapping[str, float], nodes: Sequence[float]) -> list[str]:
+    n_d, n_q = (values.get(f"saturation.n_{axis}", math.nan) for axis in "dq")
+    if math.isnan(n_d + n_q):
+        return [f"{SATURATION} without its descriptor saturation.n_d, saturation.n_q"] if nodes else []
+    if len(nodes) != n_d * n_q * SATURATION_VALUES:
+        return [f"{SATURATION} has {len(nodes)} numbers, the descriptor says {n_d * n_q * SATURATION_VALUES:g}"]
+    return []
+
+
+def _look_up_violations(values: Mapping[str, float], tables: Mapping[str, Sequence[float]]) -> list[str]:
+    """NaN marks a cell without a point."""
     found = []
     for name, table in tables.items():
         axis = name.startswith("lut.axis_")

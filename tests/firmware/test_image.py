@@ -24,6 +24,7 @@ from pmsmtool.firmware.image import (
     crc32,
     lut_size_words,
     pack_image,
+    saturation_words,
     to_binary32,
     unpack_image,
 )
@@ -56,17 +57,21 @@ def random_values(rng: np.random.Generator) -> dict[str, float]:
         "lut.n_x": int(rng.integers(2, 6)),
         "lut.n_y": int(rng.integers(2, 6)),
         "lut.n_z": int(rng.integers(1, 4)),
+        "saturation.i_d_max_a": rng.uniform(1.0, 50.0),
+        "saturation.i_q_max_a": rng.uniform(1.0, 50.0),
     }
-    return values
+    counts = rng.integers(2, 5, 2).tolist() if rng.random() < 0.5 else (0, 0)
+    return values | {"saturation.n_d": counts[0], "saturation.n_q": counts[1]}
 
 
 def random_lut(values: dict[str, float], rng: np.random.Generator) -> bytes:
+    nodes = rng.uniform(1e-4, 1.0, saturation_words(values)).astype("<f4").tobytes()
     if values["lut.format"] == 0:
-        return b""
+        return nodes
     axes = b"".join(
         np.cumsum(rng.uniform(0.1, 2, int(values[f"lut.n_{axis}"]))).astype("<f4").tobytes() for axis in "xyz"
     )
-    return axes + rng.bytes(4 * lut_size_words(values) - len(axes))
+    return axes + rng.bytes(4 * lut_size_words(values) - len(axes) - len(nodes)) + nodes
 
 
 def c_image(values: dict[str, float], lut: bytes) -> bytes:

@@ -26,7 +26,7 @@ from pmsmtool.design.lookup.loci import Locus
 from pmsmtool.design.lookup.table import AxisKind, LookupTable
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.npz_file import npz_bytes
-from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
+from pmsmtool.params.parameter_set import LUT_NAMES, ParameterSet
 
 NEXT_STEP = "make the table again: `pmsmtool lut DESIGN -o lut.npz`"
 
@@ -196,7 +196,7 @@ def _values(
         "lut.n_z": float(parts[2].size),
         "lut.lsb_a": int16_step_a(*parts[3:]) if stored == "int16" else 0.0,
     }
-    return values, {name: tuple(array.ravel().tolist()) for name, array in zip(TABLE_NAMES, parts, strict=True)}
+    return values, {name: tuple(array.ravel().tolist()) for name, array in zip(LUT_NAMES, parts, strict=True)}
 
 
 def _words(stored: StoredFormat, parts: _Parts) -> bytes:

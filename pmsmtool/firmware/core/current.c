@@ -24,14 +24,13 @@ static current_gains select_gains(const pmsm_period *period)
     const pmsm_real bandwidth = period->request->bias_bandwidth;
     current_gains gains;
     if (bandwidth > PMSM_C(0.0)) {
-        gains.K_p.d = bandwidth * (pmsm_real)params->motor_L_d_h;
-        gains.K_p.q = bandwidth * (pmsm_real)params->motor_L_q_h;
+        gains.K_p.d = bandwidth * period->magnetics->L_d;
+        gains.K_p.q = bandwidth * period->magnetics->L_q;
         gains.K_i.d = bandwidth * (pmsm_real)params->motor_R_s_ohm;
         gains.K_i.q = gains.K_i.d;
         return gains;
     }
-    gains.K_p.d = (pmsm_real)params->current_K_p_d_v_per_a;
-    gains.K_p.q = (pmsm_real)params->current_K_p_q_v_per_a;
+    gains.K_p = period->magnetics->K_p;
     gains.K_i.d = (pmsm_real)params->current_K_i_d_v_per_as;
     gains.K_i.q = (pmsm_real)params->current_K_i_q_v_per_as;
     return gains;
@@ -44,25 +43,29 @@ static pmsm_dq feed_forward(const pmsm_period *period, pmsm_dq i)
     pmsm_dq u = {PMSM_C(0.0), PMSM_C(0.0)};
     pmsm_real psi_d = PMSM_C(0.0);
     if ((params->current_options & PMSM_CURRENT_DECOUPLING) != 0u) {
-        u.d = -(period->omega_e * (pmsm_real)params->motor_L_q_app_h) * i.q;
-        psi_d = (pmsm_real)params->motor_L_d_app_h * i.d;
+        u.d = -(period->omega_e * period->magnetics->L_q_app) * i.q;
+        psi_d = period->magnetics->L_d_app * i.d;
     }
     if ((params->current_options & PMSM_CURRENT_EMF) != 0u) {
-        psi_d += (pmsm_real)params->motor_psi_f_wb;
+        psi_d += period->magnetics->psi_f;
     }
     u.q = period->omega_e * psi_d;
     return u;
 }
 
-void pmsm_current_demand(pmsm_period *period)
+static pmsm_dq demand(const pmsm_period *period, pmsm_dq K_p, pmsm_dq reference)
 {
     const pmsm_state *state = period->state;
-    const current_gains gains = select_gains(period);
     const pmsm_dq i = period->i_model;
     const pmsm_dq rotation = feed_forward(period, i);
-    const pmsm_dq reference = period->reference;
-    period->u.d = gains.K_p.d * (reference.d - i.d) + state->integrator.d + rotation.d + period->request->u_d_inject;
-    period->u.q = gains.K_p.q * (reference.q - i.q) + state->integrator.q + rotation.q + period->request->u_q_inject;
+    const pmsm_dq u = {K_p.d * (reference.d - i.d) + state->integrator.d + rotation.d + period->request->u_d_inject,
+                       K_p.q * (reference.q - i.q) + state->integrator.q + rotation.q + period->request->u_q_inject};
+    return u;
+}
+
+void pmsm_current_demand(pmsm_period *period)
+{
+    period->u = demand(period, select_gains(period).K_p, period->reference);
 }
 
 uint32_t pmsm_uses_predictor(const pmsm_params *params)
@@ -80,29 +83,26 @@ pmsm_dq pmsm_hold_voltage(const pmsm_period *period, pmsm_dq i)
     return u;
 }
 
-void pmsm_current_row(pmsm_period *period, pmsm_row *row)
+void pmsm_current_row(const pmsm_period *period, pmsm_row *row)
 {
-    const pmsm_dq reference = period->reference;
     const pmsm_dq zero = {PMSM_C(0.0), PMSM_C(0.0)};
-    period->reference = zero;
-    pmsm_current_demand(period);
-    period->reference = reference;
-    row->m_dd = (pmsm_real)period->params->current_K_p_d_v_per_a;
+    const pmsm_dq K_p = period->magnetics->K_p; /* the governor does not run with a bias loop */
+    const pmsm_dq u = demand(period, K_p, zero);
+    row->m_dd = K_p.d;
     row->m_dq = PMSM_C(0.0);
     row->m_qd = PMSM_C(0.0);
-    row->m_qq = (pmsm_real)period->params->current_K_p_q_v_per_a;
-    row->c_d = period->u.d;
-    row->c_q = period->u.q;
+    row->m_qq = K_p.q;
+    row->c_d = u.d;
+    row->c_q = u.q;
     row->V = period->V_max;
 }
 
 pmsm_dq pmsm_model_voltage(const pmsm_period *period, pmsm_dq i)
 {
-    const pmsm_params *params = period->params;
     pmsm_dq u;
-    u.d = period->R_s * i.d - period->omega_e * (pmsm_real)params->motor_L_q_app_h * i.q;
+    u.d = period->R_s * i.d - period->omega_e * period->magnetics->L_q_app * i.q;
     u.q = period->R_s * i.q +
-          period->omega_e * ((pmsm_real)params->motor_L_d_app_h * i.d + (pmsm_real)params->motor_psi_f_wb);
+          period->omega_e * (period->magnetics->L_d_app * i.d + period->magnetics->psi_f);
     return u;
 }
 
@@ -123,8 +123,8 @@ pmsm_dq pmsm_lost_voltage(const pmsm_period *period, pmsm_dq *inductive)
     const pmsm_real rate = PMSM_C(1.0) / state->derived.T_s;
     const pmsm_real slope_d = (period->i.d - state->current_before.d) * rate;
     const pmsm_real slope_q = (period->i.q - state->current_before.q) * rate;
-    inductive->d = (pmsm_real)params->motor_L_d_h * slope_d;
-    inductive->q = (pmsm_real)params->motor_L_q_h * slope_q;
+    inductive->d = period->magnetics->L_d * slope_d;
+    inductive->q = period->magnetics->L_q * slope_q;
     const pmsm_dq lost = {u.d - model.d - inductive->d, u.q - model.q - inductive->q};
     return lost;
 }
@@ -175,12 +175,11 @@ void pmsm_current_integrate(pmsm_period *period)
  * integrated with the resistance drop at the mean current, then seen from the rotor turned by omega_e T_s. */
 pmsm_dq pmsm_predict_current(pmsm_period *period)
 {
-    const pmsm_params *params = period->params;
     const pmsm_real T_s = period->state->derived.T_s;
     const pmsm_ab committed = {period->state->voltage_committed.d, period->state->voltage_committed.q};
     const pmsm_dq u = pmsm_park(committed, period->sine, period->cosine);
-    const pmsm_dq psi = {(pmsm_real)params->motor_L_d_app_h * period->i.d + (pmsm_real)params->motor_psi_f_wb,
-                         (pmsm_real)params->motor_L_q_app_h * period->i.q};
+    const pmsm_dq psi = {period->magnetics->L_d_app * period->i.d + period->magnetics->psi_f,
+                         period->magnetics->L_q_app * period->i.q};
     const pmsm_real drop = PMSM_C(0.5) * T_s * period->R_s;
     pmsm_turn_half(period);
     const pmsm_real half = period->sine_half;
@@ -191,8 +190,8 @@ pmsm_dq pmsm_predict_current(pmsm_period *period)
                            psi.q + T_s * (u.q - lost.q) - drop * period->i.q};
     const pmsm_dq turned = pmsm_park(fixed, sine, cosine);
     /* half of the drop belongs to the new current itself: i = i_k + L^-1 (turned - drop i - psi) solved for i */
-    const pmsm_real L_d = (pmsm_real)params->motor_L_d_h;
-    const pmsm_real L_q = (pmsm_real)params->motor_L_q_h;
+    const pmsm_real L_d = period->magnetics->L_d;
+    const pmsm_real L_q = period->magnetics->L_q;
     pmsm_dq next;
     next.d = (L_d * period->i.d + (turned.d - psi.d)) / (L_d + drop);
     next.q = (L_q * period->i.q + (turned.q - psi.q)) / (L_q + drop);

@@ -1,5 +1,6 @@
 /* SPDX-License-Identifier: MIT */
 /* Constants of the active parameter set. */
+#include "pmsm_image.h"
 #include "pmsm_period.h"
 
 /* Biquad of (s^2 + 2 z_n w s + w^2)/(s^2 + 2 z_d w s + w^2), bilinear with the notch frequency kept in place. */
@@ -23,6 +24,27 @@ static void prepare_notch(pmsm_derived *derived, const pmsm_params *params)
     derived->notch_a2 = (PMSM_C(1.0) - denominator + k * k) * scale;
 }
 
+static void prepare_magnetics(pmsm_derived *derived, const pmsm_params *params)
+{
+    const pmsm_magnetics nominal = {
+        (pmsm_real)params->motor_L_d_h, (pmsm_real)params->motor_L_q_h, (pmsm_real)params->motor_L_d_app_h,
+        (pmsm_real)params->motor_L_q_app_h, (pmsm_real)params->motor_psi_f_wb,
+        {(pmsm_real)params->current_K_p_d_v_per_a, (pmsm_real)params->current_K_p_q_v_per_a}};
+    derived->nominal = nominal;
+    /* the polar laws know one inductance */
+    derived->saturates = (params->saturation_n_d > 0u && params->polar_mode == PMSM_POLAR_OFF) ? 1u : 0u;
+    if (derived->saturates != 0u) {
+        derived->saturation_word =
+            pmsm_lut_words(params) - params->saturation_n_d * params->saturation_n_q * PMSM_SATURATION_VALUES;
+        const pmsm_real span = (pmsm_real)params->saturation_i_d_max_a - (pmsm_real)params->saturation_i_d_min_a;
+        derived->nodes_per_ampere.d = (pmsm_real)(params->saturation_n_d - 1u) / span;
+        derived->nodes_per_ampere.q =
+            (pmsm_real)(params->saturation_n_q - 1u) / (pmsm_real)params->saturation_i_q_max_a;
+        derived->gain_per_L.d = nominal.K_p.d / nominal.L_d;
+        derived->gain_per_L.q = nominal.K_p.q / nominal.L_q;
+    }
+}
+
 void pmsm_prepare(pmsm_state *state, const pmsm_params *params)
 {
     pmsm_derived *derived = &state->derived;
@@ -40,5 +62,6 @@ void pmsm_prepare(pmsm_state *state, const pmsm_params *params)
     const pmsm_real step = PMSM_C(2.0) * PMSM_PI * (pmsm_real)params->speed_filter_hz * derived->T_s;
     derived->speed_filter = step / (PMSM_C(1.0) + step);
     prepare_notch(derived, params);
+    prepare_magnetics(derived, params);
     state->prepared = 1u;
 }

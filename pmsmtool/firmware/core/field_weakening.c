@@ -36,8 +36,8 @@ static pmsm_row voltage_row(const pmsm_period *period)
     const pmsm_params *p = period->params;
     const pmsm_real omega = period->omega_e;
     const pmsm_real R = (p->field_weakening_mode == PMSM_FW_ACCELERATED) ? period->R_s : PMSM_C(0.0);
-    pmsm_row row = {R, -omega * (pmsm_real)p->motor_L_q_app_h, omega * (pmsm_real)p->motor_L_d_app_h, R,
-                    PMSM_C(0.0), omega * (pmsm_real)p->motor_psi_f_wb,
+    pmsm_row row = {R, -omega * period->magnetics->L_q_app, omega * period->magnetics->L_d_app, R,
+                    PMSM_C(0.0), omega * period->magnetics->psi_f,
                     (PMSM_C(1.0) - (pmsm_real)p->field_weakening_margin) * period->V_max};
     if (p->field_weakening_mode != PMSM_FW_UNCOMPENSATED) { /* through the voltage that holds the present current */
         const pmsm_dq hold = pmsm_hold_voltage(period, period->i);
@@ -63,8 +63,8 @@ static problem state_problem(const pmsm_period *period, pmsm_real tau)
         (pmsm_real)p->field_weakening_h2,
         i_d_lm,
         tau,
-        period->state->derived.torque_per_flux * (pmsm_real)p->motor_psi_f_wb,
-        period->state->derived.torque_per_flux * ((pmsm_real)p->motor_L_d_app_h - (pmsm_real)p->motor_L_q_app_h),
+        period->state->derived.torque_per_flux * period->magnetics->psi_f,
+        period->state->derived.torque_per_flux * (period->magnetics->L_d_app - period->magnetics->L_q_app),
         0u,
         0u,
         0u};

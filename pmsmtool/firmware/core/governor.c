@@ -73,15 +73,14 @@ static pmsm_dq pass(pmsm_period *period, const pmsm_governor_rows *rows, uint32_
                     uint32_t *binding)
 {
     pmsm_state *state = period->state;
-    const pmsm_params *p = period->params;
     const uint32_t landing = state->landing;
     state->landing = 0u;
     state->time_to_go = PMSM_C(0.0);
     if (landing == 0u || off_model != 0u) {
         return r;
     }
-    const pmsm_dq v = {land(period->i_model.d, r.d, (pmsm_real)p->motor_L_d_h, rows->row[0].m_dd, state->derived.T_s),
-                       land(period->i_model.q, r.q, (pmsm_real)p->motor_L_q_h, rows->row[0].m_qq, state->derived.T_s)};
+    const pmsm_dq v = {land(period->i_model.d, r.d, period->magnetics->L_d, rows->row[0].m_dd, state->derived.T_s),
+                       land(period->i_model.q, r.q, period->magnetics->L_q, rows->row[0].m_qq, state->derived.T_s)};
     *binding = PMSM_BINDING_MINIMUM_TIME;
     return v;
 }

@@ -30,11 +30,11 @@ static void set_steady_row(const pmsm_period *period, pmsm_dq offset, pmsm_row *
 {
     const pmsm_params *params = period->params;
     row->m_dd = period->R_s;
-    row->m_dq = -period->omega_e * (pmsm_real)params->motor_L_q_app_h;
-    row->m_qd = period->omega_e * (pmsm_real)params->motor_L_d_app_h;
+    row->m_dq = -period->omega_e * period->magnetics->L_q_app;
+    row->m_qd = period->omega_e * period->magnetics->L_d_app;
     row->m_qq = period->R_s;
     row->c_d = offset.d;
-    row->c_q = offset.q + period->omega_e * (pmsm_real)params->motor_psi_f_wb;
+    row->c_q = offset.q + period->omega_e * period->magnetics->psi_f;
     row->V = (PMSM_C(1.0) - (pmsm_real)params->governor_eps) * period->V_max;
 }
 
@@ -50,10 +50,9 @@ typedef struct {
     pmsm_real X_d, X_q, emf; /* ohm, ohm, V */
 } prediction;
 
-static axis_model axis(pmsm_real T_s, pmsm_real R, float L, float K_p, float K_i, pmsm_real i, pmsm_real x)
+static axis_model axis(pmsm_real T_s, pmsm_real R, pmsm_real L, pmsm_real K_p, float K_i, pmsm_real i, pmsm_real x)
 {
-    const axis_model a = {(pmsm_real)K_p, T_s * (pmsm_real)K_i, T_s / (pmsm_real)L, R, i, x, PMSM_C(0.0),
-                          PMSM_C(0.0)};
+    const axis_model a = {K_p, T_s * (pmsm_real)K_i, T_s / L, R, i, x, PMSM_C(0.0), PMSM_C(0.0)};
     return a;
 }
 
@@ -62,14 +61,13 @@ static prediction begin_prediction(const pmsm_period *period)
     const pmsm_params *p = period->params;
     const pmsm_state *state = period->state;
     const pmsm_real T_s = state->derived.T_s;
+    const pmsm_magnetics *m = period->magnetics;
     const prediction s = {
-        axis(T_s, period->R_s, p->motor_L_d_h, p->current_K_p_d_v_per_a, p->current_K_i_d_v_per_as,
-             period->i_model.d, state->integrator.d),
-        axis(T_s, period->R_s, p->motor_L_q_h, p->current_K_p_q_v_per_a, p->current_K_i_q_v_per_as,
-             period->i_model.q, state->integrator.q),
-        period->omega_e * (pmsm_real)p->motor_L_d_app_h,
-        period->omega_e * (pmsm_real)p->motor_L_q_app_h,
-        period->omega_e * (pmsm_real)p->motor_psi_f_wb};
+        axis(T_s, period->R_s, m->L_d, m->K_p.d, p->current_K_i_d_v_per_as, period->i_model.d, state->integrator.d),
+        axis(T_s, period->R_s, m->L_q, m->K_p.q, p->current_K_i_q_v_per_as, period->i_model.q, state->integrator.q),
+        period->omega_e * m->L_d_app,
+        period->omega_e * m->L_q_app,
+        period->omega_e * m->psi_f};
     return s;
 }
 

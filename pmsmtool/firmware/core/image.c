@@ -3,6 +3,10 @@
 #include "pmsm_image.h"
 #include "pmsm_modes.h"
 
+#define PMSM_FLUX_MOST 100.0F         /* Wb */
+#define PMSM_INDUCTANCE_LEAST 1e-7F   /* H */
+#define PMSM_INDUCTANCE_MOST 10.0F    /* H */
+
 static uint32_t word_at(const uint8_t *image, uint32_t word)
 {
     const uint8_t *p = image + 4u * word;
@@ -62,7 +66,12 @@ uint32_t pmsm_params_check(const pmsm_params *params)
     return k;
 }
 
-uint32_t pmsm_lut_words(const pmsm_params *params)
+static uint32_t saturation_words(const pmsm_params *params)
+{
+    return params->saturation_n_d * params->saturation_n_q * PMSM_SATURATION_VALUES;
+}
+
+static uint32_t look_up_words(const pmsm_params *params)
 {
     if (params->lut_format == PMSM_LUT_NONE) {
         return 0u;
@@ -70,6 +79,11 @@ uint32_t pmsm_lut_words(const pmsm_params *params)
     const uint32_t cells = params->lut_n_x * params->lut_n_y * params->lut_n_z;
     const uint32_t table = (params->lut_format == PMSM_LUT_BINARY32) ? cells : (cells + 1u) / 2u;
     return params->lut_n_x + params->lut_n_y + params->lut_n_z + 2u * table;
+}
+
+uint32_t pmsm_lut_words(const pmsm_params *params)
+{
+    return look_up_words(params) + saturation_words(params);
 }
 
 /* Finite and strictly increasing; a NaN or an infinite end fails one of the comparisons. */
@@ -90,16 +104,41 @@ static uint32_t axis_increases(const uint8_t *image, uint32_t first, uint32_t co
     return (last <= largest) ? 1u : 0u;
 }
 
+/* Fluxes of a machine, and inductances that a gain can follow. */
+static uint32_t check_saturation(const uint8_t *image, const pmsm_params *params)
+{
+    if (params->saturation_n_d == 0u && params->saturation_n_q == 0u) {
+        return PMSM_IMAGE_OK;
+    }
+    if (params->saturation_n_d < 2u || params->saturation_n_q < 2u) {
+        return PMSM_IMAGE_LUT_SIZE;
+    }
+    if (!(params->saturation_i_d_max_a > params->saturation_i_d_min_a) || !(params->saturation_i_q_max_a > 0.0F)) {
+        return PMSM_IMAGE_LUT_AXIS;
+    }
+    const uint32_t first = PMSM_PARAMS_WORDS + look_up_words(params);
+    for (uint32_t k = 0u; k < saturation_words(params); k++) {
+        const float value = float_at(image, first + k);
+        const float least = (k % PMSM_SATURATION_VALUES == 0u) ? -PMSM_FLUX_MOST : PMSM_INDUCTANCE_LEAST;
+        const float most = (k % PMSM_SATURATION_VALUES == 0u) ? PMSM_FLUX_MOST : PMSM_INDUCTANCE_MOST;
+        if (!(value >= least && value <= most)) {
+            return PMSM_IMAGE_RANGE;
+        }
+    }
+    return PMSM_IMAGE_OK;
+}
+
 static uint32_t check_lut(const uint8_t *image, uint32_t size, const pmsm_params *params)
 {
     const uint32_t words = pmsm_lut_words(params);
-    if (size != 4u * (PMSM_PARAMS_WORDS + words)) {
+    if (size != 4u * (PMSM_PARAMS_WORDS + words) || words > PMSM_PARAMS_LUT_WORDS_MAX) {
         return PMSM_IMAGE_LUT_SIZE;
     }
-    if (params->lut_format == PMSM_LUT_NONE) {
-        return PMSM_IMAGE_OK;
+    const uint32_t saturation = check_saturation(image, params);
+    if (saturation != PMSM_IMAGE_OK || params->lut_format == PMSM_LUT_NONE) {
+        return saturation;
     }
-    if (words > PMSM_PARAMS_LUT_WORDS_MAX || params->lut_n_x < 2u || params->lut_n_y < 2u || params->lut_n_z < 1u) {
+    if (params->lut_n_x < 2u || params->lut_n_y < 2u || params->lut_n_z < 1u) {
         return PMSM_IMAGE_LUT_SIZE;
     }
     const uint32_t x = PMSM_PARAMS_WORDS;

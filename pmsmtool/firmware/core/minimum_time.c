@@ -93,10 +93,9 @@ static enum pmsm_transfer find_time(const transfer *t, pmsm_real least, pmsm_rea
     return (*T * pmsm_abs(t->omega) <= LONGEST_ANGLE) ? PMSM_TRANSFER_SOUGHT : PMSM_TRANSFER_NONE;
 }
 
-static pmsm_dq flux(const pmsm_params *params, pmsm_dq i)
+static pmsm_dq flux(const pmsm_magnetics *m, pmsm_dq i)
 {
-    const pmsm_dq psi = {(pmsm_real)params->motor_psi_f_wb + (pmsm_real)params->motor_L_d_app_h * i.d,
-                         (pmsm_real)params->motor_L_q_app_h * i.q};
+    const pmsm_dq psi = {m->psi_f + m->L_d_app * i.d, m->L_q_app * i.q};
     return psi;
 }
 
@@ -109,8 +108,8 @@ static uint32_t keep_current(const pmsm_period *period, pmsm_dq offset, pmsm_dq 
     const pmsm_params *params = period->params;
     const pmsm_dq i = period->i_model;
     const pmsm_dq model = pmsm_model_voltage(period, i);
-    const pmsm_real per_d = period->state->derived.T_s / (pmsm_real)params->motor_L_d_h;
-    const pmsm_real per_q = period->state->derived.T_s / (pmsm_real)params->motor_L_q_h;
+    const pmsm_real per_d = period->state->derived.T_s / period->magnetics->L_d;
+    const pmsm_real per_q = period->state->derived.T_s / period->magnetics->L_q;
     const pmsm_dq free = {i.d - per_d * (model.d + offset.d), i.q - per_q * (model.q + offset.q)}; /* at zero voltage */
     const pmsm_real limit = (pmsm_real)params->governor_I_transient_apk;
     const pmsm_real now = pmsm_square(i);
@@ -169,7 +168,7 @@ enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, p
     const pmsm_dq i = period->i_model;
     const pmsm_real half = PMSM_C(0.5);
     const pmsm_real R = period->R_s;
-    const transfer t = {flux(period->params, i), flux(period->params, target),
+    const transfer t = {flux(period->magnetics, i), flux(period->magnetics, target),
                         {half * (R * i.d + offset.d), half * (R * i.q + offset.q)},
                         {half * (R * target.d + offset.d), half * (R * target.q + offset.q)},
                         period->omega_e, period->V_max};

@@ -92,6 +92,13 @@ typedef struct {
     uint32_t gates;                   /* 1: switch, 0: all transistors off */
 } pmsm_output;
 
+typedef struct {             /* the machine at a current: psi = (psi_f + L_d_app i_d, L_q_app i_q) */
+    pmsm_real L_d, L_q;      /* H, incremental */
+    pmsm_real L_d_app, L_q_app; /* H, apparent */
+    pmsm_real psi_f;         /* Wb */
+    pmsm_dq K_p;             /* V/A, in proportion to L_d and L_q */
+} pmsm_magnetics;
+
 typedef struct {             /* constants of the active set, computed in the first period after pmsm_init() */
     pmsm_real T_s;           /* s */
     pmsm_real pole_pairs;
@@ -100,6 +107,11 @@ typedef struct {             /* constants of the active set, computed in the fir
     pmsm_real speed_period;  /* s */
     pmsm_real speed_filter;  /* weight of a new sample */
     pmsm_real notch_b0, notch_b1, notch_b2, notch_a2; /* a1 = b1; b0 = 0: no notch */
+    pmsm_magnetics nominal;  /* of the parameters */
+    uint32_t saturates;      /* 1: there is a saturation table, and a law that follows it */
+    pmsm_dq nodes_per_ampere; /* 1/A, along its axes */
+    pmsm_dq gain_per_L;      /* V/(A H) */
+    uint32_t saturation_word; /* where its nodes begin, behind the words of the look-up */
 } pmsm_derived;
 
 typedef struct {             /* per-axis controller memory and whatever the modes need */
@@ -140,6 +152,7 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_real U_dc_before;   /* V, of the last good period */
     uint32_t prepared;       /* 0 fresh from pmsm_init(), 1 derived is valid, 2 derived is stale */
     pmsm_derived derived;
+    pmsm_magnetics local;    /* at the present current, with a saturation table */
 } pmsm_state;
 
 /* Clear the memory (all zero, kappa 1, binding 255); call at start-up and after another parameter set. */
@@ -153,7 +166,8 @@ PMSM_EXPORT void pmsm_reset_fault(pmsm_state *state);
 
 /* One PWM period. A period whose inputs are no usable numbers (NaN but for T_winding, where it says that there is no
  * sensor; infinite; larger than any drive's) holds the last voltage and changes nothing else; a second one running is
- * a latched fault. lut points to the words behind pmsm_params in the image, may be NULL if lut_format is 0. */
+ * a latched fault. lut points to the words behind pmsm_params in the image, may be NULL if
+ * lut_format and saturation_n_d are 0. */
 PMSM_EXPORT void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut,
                            const pmsm_measurement *measurement, const pmsm_reference *reference,
                            pmsm_output *output);

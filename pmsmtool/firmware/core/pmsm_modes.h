@@ -53,6 +53,9 @@ enum pmsm_fw_mode {
 enum pmsm_lut_format { PMSM_LUT_NONE = 0, PMSM_LUT_BINARY32 = 1, PMSM_LUT_INT16 = 2 };
 enum pmsm_lut_axis { PMSM_LUT_SPEED_RPM = 0, PMSM_LUT_FLUX_LIMIT = 1 };
 
+/* Words of a node of the saturation table. */
+#define PMSM_SATURATION_VALUES 4u
+
 enum pmsm_polar_mode {
     PMSM_POLAR_OFF = 0,
     PMSM_POLAR_CONVENTIONAL = 1,

@@ -10,8 +10,8 @@ extern "C" {
 #endif
 
 #define PMSM_PARAMS_SCHEMA_VERSION 1u
-#define PMSM_PARAMS_SIGNATURE 0xEFF2C7ACu /* CRC-32 of name:type:dim:unit:scale in struct order */
-#define PMSM_PARAMS_WORDS 85u
+#define PMSM_PARAMS_SIGNATURE 0xB87E4473u /* CRC-32 of name:type:dim:unit:scale in struct order */
+#define PMSM_PARAMS_WORDS 90u
 #define PMSM_PARAMS_LUT_WORDS_MAX 8192u
 #define PMSM_K_MAX_NOT_DETERMINED 255u
 
@@ -95,6 +95,11 @@ typedef struct pmsm_params {
     uint32_t lut_n_y;                        /* nodes of the speed or flux axis */
     uint32_t lut_n_z;                        /* nodes of the U_dc axis, 1 when there is none */
     float    lut_lsb_a;                      /* [A] current of one int16 step */
+    uint32_t saturation_n_d;                 /* nodes along i_d, 0 without saturation */
+    uint32_t saturation_n_q;                 /* nodes along i_q, from 0 on */
+    float    saturation_i_d_min_a;           /* [A] first node along i_d */
+    float    saturation_i_d_max_a;           /* [A] last node along i_d */
+    float    saturation_i_q_max_a;           /* [A] last node along i_q */
     uint32_t polar_mode;                     /* 0 off, 1 conventional, 2 proposed, 3 linear range, 4 linear as
                                                 printed, 5 regularised, 6 unified */
     uint32_t polar_options;                  /* bit0 P and D on the measurement, bit1 no anti-windup, bit2 predict

@@ -77,6 +77,11 @@ const pmsm_param_limit pmsm_param_limits[PMSM_PARAMS_WORDS] = {
     {0.0F, 255.0F, 1u}, /* lut.n_y */
     {0.0F, 16.0F, 1u}, /* lut.n_z */
     {0.0F, 100.0F, 0u}, /* lut.lsb_a */
+    {0.0F, 32.0F, 1u}, /* saturation.n_d */
+    {0.0F, 32.0F, 1u}, /* saturation.n_q */
+    {-100000.0F, 0.0F, 0u}, /* saturation.i_d_min_a */
+    {0.0F, 100000.0F, 0u}, /* saturation.i_d_max_a */
+    {0.0F, 100000.0F, 0u}, /* saturation.i_q_max_a */
     {0.0F, 6.0F, 1u}, /* polar.mode */
     {0.0F, 15.0F, 1u}, /* polar.options */
     {0.100000001F, 1.20000005F, 0u}, /* polar.V_a_max_ratio */

@@ -15,6 +15,7 @@
 typedef struct {
     const pmsm_params *params;
     const uint32_t *lut;
+    const pmsm_magnetics *magnetics; /* the parameters' own, or of the table at the present current */
     const pmsm_reference *request;
     pmsm_state *state;
     pmsm_real omega_e;         /* rad/s */
@@ -38,13 +39,16 @@ typedef struct {
 /* derived.c */
 void pmsm_prepare(pmsm_state *state, const pmsm_params *params);
 
+/* saturation.c: period->magnetics at a current, from the table of the parameter set */
+void pmsm_saturate(pmsm_period *period, pmsm_dq i);
+
 /* reference.c: protection, torque and speed to a current request */
 void pmsm_update_i2t(pmsm_period *period);
 pmsm_real pmsm_current_limit(const pmsm_period *period);
 pmsm_real pmsm_speed_control(pmsm_period *period);
 pmsm_dq pmsm_torque_to_current(pmsm_period *period, pmsm_real tau);
 pmsm_dq pmsm_limit_current(pmsm_period *period, pmsm_dq i);
-pmsm_real pmsm_torque(const pmsm_params *params, pmsm_dq i);
+pmsm_real pmsm_torque(const pmsm_params *params, const pmsm_magnetics *magnetics, pmsm_dq i);
 
 /* field_weakening.c: currents of a torque by optimisation, every N_fw periods; sets the flag of an empty set */
 pmsm_dq pmsm_field_weakening(pmsm_period *period, pmsm_real tau);
@@ -56,7 +60,7 @@ pmsm_dq pmsm_lookup(pmsm_period *period, pmsm_real tau);
 uint32_t pmsm_uses_predictor(const pmsm_params *params);
 void pmsm_current_demand(pmsm_period *period);
 void pmsm_current_integrate(pmsm_period *period);
-void pmsm_current_row(pmsm_period *period, pmsm_row *row); /* demand as a function of the reference */
+void pmsm_current_row(const pmsm_period *period, pmsm_row *row); /* demand as a function of the reference */
 pmsm_dq pmsm_model_voltage(const pmsm_period *period, pmsm_dq i); /* steady state, nominal flux */
 pmsm_dq pmsm_hold_voltage(const pmsm_period *period, pmsm_dq i); /* what the controller gives without an error */
 static inline void pmsm_turn_half(pmsm_period *period) /* once per period */

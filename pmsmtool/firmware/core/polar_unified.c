@@ -175,7 +175,7 @@ void pmsm_polar_unified(pmsm_period *period, const polar_plant *p)
         }
     }
     if (o.weakened != 0u) { /* the speed loop's anti-windup and the record see what the voltage left */
-        period->state->tau_granted = pmsm_torque(params, o.i);
+        period->state->tau_granted = pmsm_torque(params, period->magnetics, o.i);
         period->reference = o.i;
     }
     pmsm_polar_map(period, v, (pmsm_real)params->polar_eps_ratio * p->V);

@@ -4,10 +4,10 @@
 
 #include <stddef.h>
 
-pmsm_real pmsm_torque(const pmsm_params *params, pmsm_dq i)
+pmsm_real pmsm_torque(const pmsm_params *params, const pmsm_magnetics *m, pmsm_dq i)
 {
-    const pmsm_real psi_d = (pmsm_real)params->motor_psi_f_wb + (pmsm_real)params->motor_L_d_app_h * i.d;
-    const pmsm_real psi_q = (pmsm_real)params->motor_L_q_app_h * i.q;
+    const pmsm_real psi_d = m->psi_f + m->L_d_app * i.d;
+    const pmsm_real psi_q = m->L_q_app * i.q;
     return PMSM_C(1.5) * (pmsm_real)params->motor_pole_pairs * (psi_d * i.q - psi_q * i.d);
 }
 
@@ -137,7 +137,7 @@ pmsm_dq pmsm_torque_to_current(pmsm_period *period, pmsm_real tau)
         period->flags |= (uint32_t)PMSM_FLAG_CURRENT_LIMITED;
     }
     i = pmsm_limit_current(period, i);
-    period->state->tau_granted = pmsm_torque(params, i);
+    period->state->tau_granted = pmsm_torque(params, &period->state->derived.nominal, i);
     return i;
 }
 

@@ -2,6 +2,8 @@
 /* One PWM period. */
 #include "pmsm_period.h"
 
+#include <stddef.h>
+
 #define BANDWIDTH_LEAST PMSM_C(1e-3) /* rad/s, of the bias loop */
 #define LINK_LEAST PMSM_C(1e-3)      /* V; duty ratios divide by it */
 #define SHORT_ENDS PMSM_C(0.9)       /* of the speed at which a short circuit began */
@@ -114,10 +116,20 @@ static pmsm_dq current_request(pmsm_period *period)
     return pmsm_torque_to_current(period, tau);
 }
 
+/* A bias loop has the gains that its experiment expects. */
+static void follow_saturation(pmsm_period *period, pmsm_dq i)
+{
+    if (period->state->derived.saturates != 0u && period->lut != NULL &&
+        period->request->bias_bandwidth <= PMSM_C(0.0)) {
+        pmsm_saturate(period, i);
+    }
+}
+
 static void field_oriented(pmsm_period *period, pmsm_output *output)
 {
     if (pmsm_uses_predictor(period->params) != 0u) {
         period->i_model = pmsm_predict_current(period);
+        follow_saturation(period, period->i_model);
     }
     if (period->params->governor_mode == PMSM_GOVERNOR_OFF || pmsm_govern(period) == 0u) {
         pmsm_current_demand(period);
@@ -136,6 +148,7 @@ static void polar(pmsm_period *period, pmsm_output *output)
 static void control(pmsm_period *period, pmsm_output *output)
 {
     pmsm_live *live = &period->state->live;
+    follow_saturation(period, period->i);
     const pmsm_dq request = current_request(period);
     live->i_d_req = request.d;
     live->i_q_req = request.q;
@@ -232,7 +245,7 @@ static void publish(pmsm_period *period, const pmsm_measurement *m)
     live->u_q_lim = period->u_realised.q + period->u_compensation.q;
     live->theta_e = pmsm_wrap(m->theta_e);
     live->omega_e = m->omega_e;
-    live->tau = pmsm_torque(period->params, period->i);
+    live->tau = pmsm_torque(period->params, period->magnetics, period->i);
     live->flags = period->flags;
 }
 
@@ -258,6 +271,7 @@ void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut
     }
     period.params = params;
     period.lut = lut;
+    period.magnetics = &state->derived.nominal;
     period.request = reference;
     period.state = state;
     period.reference = zero;

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """The drive's parameter set: active values, a staging copy, and the commands between them (objects 0x2000, 0x2001).
 
-While a set is staged, writes to the parameters, the look-up DOMAINs and the image go to the staging copy and are read
+While a set is staged, writes to the parameters, the tables' DOMAINs and the image go to the staging copy and are read
 back from there; nothing acts until the set was validated (ranges, look-up table, CRC-32 against the expected one) and
 activated as a whole. Without staging a parameter may be written directly while the power stage is off, a live gain
-always; the look-up table and its descriptor change by staging only, because a half-written table has no meaning.
+always; tables and their descriptors change by staging only, because a half-written table has no meaning.
 """
 
 from __future__ import annotations
@@ -26,11 +26,14 @@ from pmsmtool.firmware.image import (
     to_binary32,
     unpack_image,
 )
-from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, LUT_CAPACITY_WORDS, Parameter
+from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, LUT_CAPACITY_WORDS, SATURATION_VALUES, Parameter
+from pmsmtool.params.parameter_set import SATURATION
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 
 LUT_PARTS = ("lut.axis_x", "lut.axis_y", "lut.axis_z", "lut.table_i_d", "lut.table_i_q")
-"""Keys of the DOMAIN objects, in the order of the image."""
+"""Keys of the look-up DOMAIN objects."""
+PARTS = (*LUT_PARTS, SATURATION)
+"""Keys of all table DOMAINs, in the order of the image."""
 _MAX_LUT_BYTES = 4 * LUT_CAPACITY_WORDS
 _WORD = struct.Struct("<I")
 _REAL = struct.Struct("<f")
@@ -67,7 +70,7 @@ class ParameterImage:
     @classmethod
     def of_values(cls, values: Mapping[str, float]) -> ParameterImage:
         """Return the image of factory defaults, changed by ``values`` (catalogue names, SI)."""
-        image = cls(bytes(SCALAR_BYTES), dict.fromkeys(LUT_PARTS, b""))
+        image = cls(bytes(SCALAR_BYTES), dict.fromkeys(PARTS, b""))
         for row in CATALOGUE:
             image.set(row.name, values.get(row.name, row.default))
         return image
@@ -75,12 +78,12 @@ class ParameterImage:
     @classmethod
     def of_bytes(cls, image: bytes) -> ParameterImage:
         """Return the image of packed bytes whose size is not checked yet; surplus stays in the last part."""
-        made = cls(image[:SCALAR_BYTES], dict.fromkeys(LUT_PARTS, b""))
+        made = cls(image[:SCALAR_BYTES], dict.fromkeys(PARTS, b""))
         position = SCALAR_BYTES
         for key, (_, padded) in made.part_sizes().items():
             made.parts[key] = image[position : position + padded]
             position += padded
-        made.parts[LUT_PARTS[-1]] += image[position:]
+        made.parts[PARTS[-1]] += image[position:]
         return made
 
     def copy(self) -> ParameterImage:
@@ -113,19 +116,19 @@ class ParameterImage:
     def part_sizes(self) -> dict[str, tuple[int, int]]:
         """Return (bytes, bytes padded to words) that the descriptor announces for each part."""
         kind = int(self.get("lut.format"))
+        nodes = 4 * SATURATION_VALUES * int(self.get("saturation.n_d") * self.get("saturation.n_q"))
         if kind == LUT_FORMAT_NONE:
-            return dict.fromkeys(LUT_PARTS, (0, 0))
+            return {**dict.fromkeys(LUT_PARTS, (0, 0)), SATURATION: (nodes, nodes)}
         counts = [int(self.get(f"lut.n_{axis}")) for axis in "xyz"]
         table = math.prod(counts) * (4 if kind == LUT_FORMAT_BINARY32 else 2)
-        sizes = [4 * count for count in counts] + [table, table]
-        return {key: (size, -(-size // 4) * 4) for key, size in zip(LUT_PARTS, sizes, strict=True)}
+        sizes = [4 * count for count in counts] + [table, table, nodes]
+        return {key: (size, -(-size // 4) * 4) for key, size in zip(PARTS, sizes, strict=True)}
 
     def pack(self) -> bytes:
         """Return the packed image; parts of a wrong length go in as they are, for validation to find."""
-        if int(self.get("lut.format")) == LUT_FORMAT_NONE:
-            return bytes(self.words)
         sizes = self.part_sizes()
-        return bytes(self.words) + b"".join(self.parts[key].ljust(sizes[key][1], b"\0") for key in LUT_PARTS)
+        used = (key for key in PARTS if sizes[key][1])
+        return bytes(self.words) + b"".join(self.parts[key].ljust(sizes[key][1], b"\0") for key in used)
 
     def first_offender(self) -> tuple[str, ImageStatus] | None:
         """Return key and reason of the first thing wrong with the set, None when the core would take it."""
@@ -143,14 +146,16 @@ class ParameterImage:
         return None
 
     def _lut_offender(self) -> tuple[str, ImageStatus] | None:
+        sizes = self.part_sizes()
+        if len(self.parts[SATURATION]) != sizes[SATURATION][0] != 0:
+            return SATURATION, ImageStatus.LUT_SIZE
         if int(self.get("lut.format")) == LUT_FORMAT_NONE:
             return None
         for axis, fewest in (("x", 2), ("y", 2), ("z", 1)):
             if self.get(f"lut.n_{axis}") < fewest:
                 return f"lut.n_{axis}", ImageStatus.LUT_SIZE
-        sizes = self.part_sizes()
         for key, (size, padded) in sizes.items():
-            if len(self.parts[key]) not in (size, padded):
+            if key in LUT_PARTS and len(self.parts[key]) not in (size, padded):
                 return key, ImageStatus.LUT_SIZE
         if sum(padded for _, padded in sizes.values()) > _MAX_LUT_BYTES:
             return "lut.table_i_q", ImageStatus.LUT_SIZE
@@ -162,7 +167,7 @@ class ParameterImage:
 
 
 class ParameterSet:
-    """Objects 0x2000, 0x2001, 0x2042 to 0x2046 and every parameter of the catalogue.
+    """Objects 0x2000, 0x2001, 0x2042 to 0x2046, 0x2049 and every parameter of the catalogue.
 
     Parameters
     ----------
@@ -205,7 +210,7 @@ class ParameterSet:
             entry = entries[row.name]
             entry.source = self._parameter_source(row, entry.size)
             entry.sink = self._parameter_sink(row)
-        for key in LUT_PARTS:
+        for key in PARTS:
             entries[key].source = self._part_source(key)
             entries[key].sink = self._part_sink(key)
         entries["parameter_set.image"].source = lambda: self._shown().pack()
@@ -233,7 +238,7 @@ class ParameterSet:
                 self.staging.set_wire(row, data)
                 self._restage()
                 return
-            if row.name.startswith("lut.") or (self._energised() and not row.live):
+            if row.name.startswith(("lut.", "saturation.")) or (self._energised() and not row.live):
                 raise Refused(AbortCode.DEVICE_STATE)
             self.active.set_wire(row, data)
             self.state = SetState.NONE
