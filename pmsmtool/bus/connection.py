@@ -202,10 +202,6 @@ class Connection:
             message.timestamp = self._stamp()
             self._write(message)
 
-    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Send one frame under canopen's name for it, so that its LSS and NMT classes can be used."""
-        self.send(can_id, bytes(data))
-
     # ---- receiving ------------------------------------------------------------------------------
 
     def subscribe(self, cob_id: int, callback: Callback) -> None:
