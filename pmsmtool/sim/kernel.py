@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pmsmtool import native
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.flux_map_cells import FluxMapStruct
-from pmsmtool.params.catalogue import CATALOGUE, LUT_CAPACITY_WORDS
+from pmsmtool.params.catalogue import CATALOGUE
 
 Array = NDArray[np.float64]
 
@@ -405,10 +405,6 @@ class Simulation:
     def floats_at(self, part: Part, count: int) -> Any:
         """Return a writable view of a part's binary32 values."""
         return (_f32 * count).from_address(self.part(part))
-
-    def lut_words(self) -> Any:
-        """Return the drive's look-up words."""
-        return (_u32 * LUT_CAPACITY_WORDS).from_address(self.part(Part.LUT))
 
     def schedule(self, target: Target, t_s: Sequence[float] | Array, value: Sequence[float] | Array) -> None:
         """Let a target follow a piecewise linear function; two nodes at one time make a step.

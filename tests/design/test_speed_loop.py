@@ -22,6 +22,7 @@ from pmsmtool.design.loops.speed_loop import (
     symmetric_ratio,
 )
 from pmsmtool.errors import DesignInfeasible
+from tests.design.test_current_loop import scaled
 
 R, L_Q, T_S, J, B = 0.137, 2.1e-3, 1.0 / 12e3, 0.05, 0.01
 ALPHA = 4000.0
@@ -87,7 +88,7 @@ def test_symmetric_optimum_meets_its_phase_margin(wanted_deg: float) -> None:
     # One lag T_sum stands for six small ones.
     assert found.phase_margin_deg == pytest.approx(wanted_deg, abs=2.5)
     assert found.crossover_rad_s == pytest.approx(gains.omega_c, rel=0.06)
-    limit = speed_loop(gains, path()).scaled(found.gain_margin)
+    limit = scaled(speed_loop(gains, path()), found.gain_margin)
     assert np.abs(limit.closed_loop_poles()).max() == pytest.approx(1.0, abs=1e-7)
 
 

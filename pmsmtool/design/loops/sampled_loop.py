@@ -50,14 +50,6 @@ class SampledLoop:
         z = np.exp(1j * np.asarray(omega, dtype=np.float64) * self.T_s)
         return np.asarray(_horner(self.num, z) / _horner(self.den, z), dtype=np.complex128)
 
-    def scaled(self, gain: float) -> SampledLoop:
-        """Return the loop with its gain multiplied."""
-        return SampledLoop(tuple(gain * b for b in self.num), self.den, self.T_s, self.delay_s)
-
-    def delayed(self, samples: int) -> SampledLoop:
-        """Return the loop with whole samples of extra delay."""
-        return SampledLoop(self.num, self.den + (0.0,) * samples, self.T_s, self.delay_s + samples * self.T_s)
-
     def closed_loop_poles(self) -> NDArray[np.complex128]:
         """Return the roots of den + num."""
         return np.asarray(np.roots(np.polyadd(self.den, self.num)), dtype=np.complex128)
