@@ -134,11 +134,11 @@ def examine(connection: Connection, bitrate: int | None, *, listen_s: float = LI
 
 
 def find_bitrate(
-    interface: str | None, channel: str | None, rates: Sequence[int] = BITRATES, *, listen_s: float = LISTEN_S
+    interface: str | None, channel: str | None, *, listen_s: float = LISTEN_S
 ) -> dict[int, tuple[int, int]]:
     """Open the bus at each rate, only listening where the adapter can, and count (frames, error frames)."""
     found = {}
-    for rate in rates:
+    for rate in BITRATES:
         try:
             with connect(interface, channel, rate) as connection:
                 with contextlib.suppress(Exception):  # most adapters cannot be told after opening

@@ -115,7 +115,6 @@ def frame_bits(
     return bits + 8 * len(payload) + stuffed + CRC_BITS + TRAILER_BITS
 
 
-def unstuffed_bits(length: int, *, extended: bool = False) -> int:
-    """Return the length (bits) of a frame with ``length`` data bytes without any stuff bit."""
-    header = _EXTENDED_HEADER_BITS if extended else _STANDARD_HEADER_BITS
-    return header + 8 * length + CRC_BITS + TRAILER_BITS
+def unstuffed_bits(length: int) -> int:
+    """Return the length (bits) of a frame with an 11-bit identifier and ``length`` data bytes without any stuff bit."""
+    return _STANDARD_HEADER_BITS + 8 * length + CRC_BITS + TRAILER_BITS

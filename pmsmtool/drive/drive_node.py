@@ -96,9 +96,9 @@ class DriveNode:
         """Return the whole number in an object."""
         return int(self.get(item))
 
-    def put(self, item: DriveObject, value: float, *, retry: Retry = Retry.READ_BACK) -> None:
-        """Write a number; see :class:`Retry` for what happens when the answer is lost."""
-        self.write_bytes(item.index, item.sub, item.encode(value), retry=retry)
+    def put(self, item: DriveObject, value: float) -> None:
+        """Write a number; where the answer is lost it is read back."""
+        self.write_bytes(item.index, item.sub, item.encode(value))
 
     def command(self, item: DriveObject, value: int, *, retry: Retry = Retry.REPEAT) -> None:
         """Write a command: nothing a restore would have to bring back."""

@@ -39,12 +39,9 @@ class Heartbeat:
         Node that is asked for its state by remote frames (node guarding) instead of being sent heartbeats.
     """
 
-    def __init__(
-        self, connection: Connection, *, period_s: float = PERIOD_S, is_watched: Callable[[], bool] = lambda: True
-    ) -> None:
+    def __init__(self, connection: Connection, *, is_watched: Callable[[], bool] = lambda: True) -> None:
         self._connection = connection
         self._is_watched = is_watched
-        self._period_s = period_s
         self._ticker: Ticker | None = None
         self._last_s = 0.0
         self._longest_s = 0.0
@@ -66,7 +63,7 @@ class Heartbeat:
             self._last_s, self._longest_s = self._connection.clock.now(), 0.0
             self._send()
             self._failed = False
-            self._ticker = self._connection.clock.every(self._period_s, self._beat)
+            self._ticker = self._connection.clock.every(PERIOD_S, self._beat)
 
     def resume(self) -> None:
         """Make sure that the drive is watching: start when stopped, send one at once when the last failed or is late.
@@ -81,7 +78,7 @@ class Heartbeat:
         """
         if self._ticker is None:
             self.start()
-        elif self._failed or self._connection.clock.now() - self._last_s > LATE_PERIODS * self._period_s:
+        elif self._failed or self._connection.clock.now() - self._last_s > LATE_PERIODS * PERIOD_S:
             self._send()
             self._failed = False
 

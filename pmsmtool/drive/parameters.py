@@ -199,12 +199,12 @@ class DriveParameters:
                 self.node.command(objects.SET_COMMAND, SetCommand.DISCARD)
             raise
 
-    def write_live(self, new: Mapping[str, bytes], *, progress: Progress = _no_progress) -> None:
+    def write_live(self, new: Mapping[str, bytes]) -> None:
         """Write single parameters that act at once (live gains of an enabled drive), and read them back."""
         if self.node.before_write is not None:
             for name in new:
                 self.node.before_write(*self.map.address(name))
-        self._write_all(new, progress)
+        self._write_all(new, _no_progress)
 
     def _write_all(self, new: Mapping[str, bytes], progress: Progress) -> None:
         refused = []

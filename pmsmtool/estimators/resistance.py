@@ -169,7 +169,6 @@ def estimate_resistance(
     *,
     tolerance: SensorTolerance | None = None,
     copper: Copper | None = None,
-    half_width_limit: float = HALF_WIDTH_LIMIT,
 ) -> ResistanceResult:
     """Loop resistance from DC levels.
 
@@ -185,8 +184,6 @@ def estimate_resistance(
         Declared sensor tolerances.
     copper : Copper
         Temperature coefficient and reference.
-    half_width_limit : float
-        Relative 95 % half width above which the result is refused.
 
     Raises
     ------
@@ -235,7 +232,7 @@ def estimate_resistance(
     hardness = abs(V_dead) / (R_w * peak)
     std = math.sqrt(float(variance)) * (HARD_FACTOR if hardness > HARD_RATIO else 1.0)
     std = math.hypot(std, DRIFT_SECOND_ORDER * abs(drift) * R_w, tolerance.voltage_scale_std * R_w)
-    _check_result(R_w, std, half_width_limit)
+    _check_result(R_w, std)
     R_measured = Estimate(
         value=R_w,
         std=std,
@@ -416,12 +413,12 @@ def _check_drift(drift: float) -> None:
         )
 
 
-def _check_result(R: float, std: float, half_width_limit: float) -> None:
-    if not R > 0.0 or COVERAGE_FACTOR * std > half_width_limit * R:
+def _check_result(R: float, std: float) -> None:
+    if not R > 0.0 or COVERAGE_FACTOR * std > HALF_WIDTH_LIMIT * R:
         raise refuse(
             "E_NOT_IDENTIFIABLE",
             f"R_s and V_dead cannot be separated: R = {R:.4g} +- {COVERAGE_FACTOR * std:.2g} ohm (95 %), "
-            f"limit {100 * half_width_limit:g} %",
+            f"limit {100 * HALF_WIDTH_LIMIT:g} %",
             stage=STAGE,
             hint="allow a higher peak current (--i-max)",
         )

@@ -104,9 +104,9 @@ def _there_and_back(up: Sequence[float]) -> tuple[float, ...]:
     return (*up[::2], *reversed(up[1::2]))
 
 
-def record_zero_current(drive: Drive, samples: int = NOISE_SAMPLES) -> Trace:
+def record_zero_current(drive: Drive) -> Trace:
     """Record both axis currents of a drive that is off, in a fixed frame."""
-    return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "flags"), samples))
+    return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "flags"), NOISE_SAMPLES))
 
 
 def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace:

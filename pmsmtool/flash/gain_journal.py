@@ -31,12 +31,10 @@ class GainJournal:
         Of the drive.
     entries : sequence of Entry
         What every object holds now; their ``new`` is None.
-    root : Path, optional
-        Instead of the user's data folder.
     """
 
-    def __init__(self, identity: Identity, entries: Sequence[Entry], root: Path | None = None) -> None:
-        self.path = path_of(identity, root)
+    def __init__(self, identity: Identity, entries: Sequence[Entry]) -> None:
+        self.path = path_of(identity)
         self._snapshot = Snapshot("journal", "open", identity, 0, CONTENT, tuple(entries))
 
     def begin(self) -> None:
@@ -70,18 +68,17 @@ class GainJournal:
         self.path.unlink(missing_ok=True)
 
 
-def path_of(identity: Identity, root: Path | None = None) -> Path:
+def path_of(identity: Identity) -> Path:
     """Return where a drive's journal of changed gains stands."""
-    return JournalFolder(identity, root).path.with_name(FILE)
+    return JournalFolder(identity).path.with_name(FILE)
 
 
-def any_left(root: Path | None = None) -> bool:
+def any_left() -> bool:
     """Whether a measurement of any drive ended without its end; looks at the disk alone."""
-    folder = root or user_folder() / "journals"
-    return any(folder.glob(f"*/{FILE}"))
+    return any((user_folder() / "journals").glob(f"*/{FILE}"))
 
 
-def restore_left(node: DriveNode, identity: Identity, root: Path | None = None) -> int:
+def restore_left(node: DriveNode, identity: Identity) -> int:
     """Bring back the gains that an ended measurement left changed; return how many objects were written.
 
     Raises
@@ -91,7 +88,7 @@ def restore_left(node: DriveNode, identity: Identity, root: Path | None = None) 
     VerifyMismatch
         An object does not hold its old value again.
     """
-    path = path_of(identity, root)
+    path = path_of(identity)
     if not path.exists():
         return 0
     snapshot = read_snapshot(path)

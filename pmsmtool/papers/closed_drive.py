@@ -39,12 +39,12 @@ def source() -> MachineFile:
     return with_simulation(load_machine_file(PROFILE), {"thermal_on": False})
 
 
-def design(request: TuneRequest, speed_rpm: float = SPEED_RPM) -> tuple[Design, Guarantee]:
+def design(request: TuneRequest) -> tuple[Design, Guarantee]:
     """Return the design for the standard-tier node; its current bandwidth is what its maker's tool has set up."""
     file = source()
     bandwidth = SET_UP_BANDWIDTH / file.inverter.T_s / (2.0 * np.pi)
     offers = frozenset(load_family(STANDARD).cells)
-    return tune_closed(file, request, ClosedDrive(STANDARD, offers, bandwidth, RISE_S, speed_rpm, ACCELERATION))
+    return tune_closed(file, request, ClosedDrive(STANDARD, offers, bandwidth, RISE_S, SPEED_RPM, ACCELERATION))
 
 
 def closed_drive(seed: int) -> Reproduction:

@@ -27,8 +27,8 @@ def break_points(low: float, high: float, count: int, exponent: float) -> Array:
     return np.where(shape < 0.0, -shape * low, shape * high)
 
 
-def basis(breaks: Array, x: Array, derivative: int = 0, degree: int = DEGREE) -> Array:
-    """Return the clamped B-splines (or their derivative), shape (n, len(breaks) + degree - 1).
+def basis(breaks: Array, x: Array, derivative: int = 0) -> Array:
+    """Return the clamped B-splines (or their derivative), shape (n, len(breaks) + DEGREE - 1).
 
     Parameters
     ----------
@@ -38,11 +38,9 @@ def basis(breaks: Array, x: Array, derivative: int = 0, degree: int = DEGREE) ->
         Arguments within the break points.
     derivative : int
         Order of the derivative.
-    degree : int
-        Polynomial degree.
     """
-    knots = np.concatenate([np.full(degree, breaks[0]), breaks, np.full(degree, breaks[-1])])
-    return _basis(knots, x, degree, derivative)
+    knots = np.concatenate([np.full(DEGREE, breaks[0]), breaks, np.full(DEGREE, breaks[-1])])
+    return _basis(knots, x, DEGREE, derivative)
 
 
 def _basis(knots: Array, x: Array, degree: int, derivative: int) -> Array:

@@ -372,10 +372,10 @@ def _solve(
     return x, unit**2 * (P @ (inverse * np.outer(scale, scale)) @ P.T)
 
 
-def disc(i: Array, points: int = DISC_POINTS) -> tuple[Array, Array]:
+def disc(i: Array) -> tuple[Array, Array]:
     """Return i_d, i_q of a grid over the disc that the data fill (A), i_q of both signs."""
     radius = 0.95 * min(float(np.max(np.abs(i[0]))), float(np.max(np.abs(i[1]))))
-    axis = np.linspace(-radius, radius, points)
+    axis = np.linspace(-radius, radius, DISC_POINTS)
     i_d, i_q = (grid.ravel() for grid in np.meshgrid(axis, axis, indexing="ij"))
     keep = (np.hypot(i_d, i_q) <= radius) & (i_d >= np.min(i[0])) & (i_d <= np.max(i[0]))
     return i_d[keep], i_q[keep]

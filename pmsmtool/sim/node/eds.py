@@ -22,9 +22,9 @@ _MANDATORY = (0x1000, 0x1001, 0x1018)
 _BAUD_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 
 
-def eds_text(rows: Sequence[ObjectRow] | None = None) -> str:
-    """Return the data sheet of the given rows, of the drive's own by default."""
-    rows = object_rows() if rows is None else rows
+def eds_text() -> str:
+    """Return the data sheet of the simulated drive."""
+    rows = object_rows()
     return "\n".join([*_file_info(), *_device_info(rows), *_object_lists(rows), *_objects(rows)]) + "\n"
 
 
