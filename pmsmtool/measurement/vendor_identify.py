@@ -184,7 +184,6 @@ def _judged(
     source: str,
 ) -> Stage:
     ended = Acceptance("the drive's own steps that ended without an error", str(len(answers)), str(len(answers)), True)
-    criteria = [ended]
     table = None if made.machine is None else made.machine.machine
     given = [
         {"name": key, "value": getattr(table, key), "unit": MEASURABLE[key].unit, "source": source}
@@ -193,10 +192,10 @@ def _judged(
     summary = ", ".join(f"{name} {format_quantity(e.value, e.unit)}" for name, e in values.items())
     return Stage(
         "identify",
-        "pass" if all(line.ok for line in criteria) else "fail",
+        "pass",  # a step that fails ends the run
         0.0,
         values=[*(vendor_facts(name, estimate) for name, estimate in values.items()), *given],
-        acceptance=criteria,
+        acceptance=[ended],
         fallbacks=[f"{', '.join(values)}: {NO_INTERVAL}", *notes, *made.notes],
         summary=f"{summary} (the drive's own)" + (f"; {source}: {', '.join(made.given)}" if made.given else ""),
     )
@@ -224,7 +223,7 @@ def chain_stage(
     """
     asked = replace(request, quantities=vendor_quantities(found))
     own = vendor_stage(run, drive, found, asked, allow_motion, say, known=known)
-    if own.status != "pass" or not can_measure(drive, found, None if known is None else known[0]):
+    if not can_measure(drive, found, None if known is None else known[0]):
         return own
     reason = _wrong_set_up(drive, own)
     if reason:
