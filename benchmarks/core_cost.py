@@ -76,6 +76,8 @@ STEPS_BUDGET = int(re.findall(r"#define PMSM_PROJECTION_STEPS (\d+)u", _HEADER)[
 """Newton steps of a period in binary32."""
 STEP_LEAST = 90
 """Cycles that every Newton step takes at least (checked)."""
+STACK_MOST, STACK_STATES, PAINT = 0x4000, 400, b"\xa5"
+"""Bytes of stack that are looked at, random states for it, and what they hold before."""
 V_DC = 210.0
 STATE_SIZE = 22
 """Numbers that describe an adversarial state."""
@@ -269,6 +271,23 @@ def measure(emulator: cortex_m.Emulator, inputs: Callable[[Target, Law], Cost]) 
     return {name: inputs(Target(emulator, law.values), law) for name, law in laws().items()}
 
 
+def stack_bytes(emulator: cortex_m.Emulator) -> dict[str, int]:
+    """Deepest byte of the stack that a period of every law has written: nominal run and random states."""
+    top = cortex_m.STACK_TOP - cortex_m.ARGUMENTS
+    found = {}
+    for name, law in laws().items():
+        target = Target(emulator, law.values)
+        rng = np.random.default_rng(1)
+        emulator.write(top - STACK_MOST, PAINT * STACK_MOST)
+        nominal(target, law)
+        for x in rng.uniform(size=(STACK_STATES, STATE_SIZE)):
+            set_state(target, law, x)
+            target.step()
+        left = emulator.read(top - STACK_MOST, STACK_MOST)
+        found[name] = len(left.lstrip(PAINT))
+    return found
+
+
 def replay(emulator: cortex_m.Emulator, worst: dict[str, Cost]) -> dict[str, int]:
     """Instructions of every law on the worst input that was found on the M4F."""
     out = {}
@@ -406,6 +425,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
     parser.add_argument("--markdown", type=Path, help="write the table here")
     parser.add_argument("--m4f-only", action="store_true", help="leave Cortex-M3 and M7 out")
+    parser.add_argument("--stack", action="store_true", help="print the bytes of stack of every law, nothing else")
     options = parser.parse_args()
     absent = cortex_m.missing()
     if absent:
@@ -414,6 +434,9 @@ def main() -> int:
     sources = sorted(HEADER_FOLDER.glob("*.c"))
     with tempfile.TemporaryDirectory() as folder:
         emulator, compiler = cortex_m.emulator("Cortex-M4F", sources, "pmsm_step", Path(folder))
+        if options.stack:
+            print(*(f"{name}: {size}" for name, size in stack_bytes(emulator).items()), sep="\n")
+            return 0
         kinds: tuple[Callable[[Target, Law], Cost], ...] = (nominal, adversarial)
         found = {kind.__name__: measure(emulator, kind) for kind in kinds}
         table = {name: {kind: costs[name] for kind, costs in found.items()} for name in laws()}

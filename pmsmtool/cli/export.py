@@ -153,12 +153,14 @@ def header_command(design: Path, prefix: str, out: Output) -> str:
     help="Folder to write into; made when it is not there.",
 )
 @click.option("--fixed-point", is_flag=True, help="Add the reference governor in Q4.27, for parts without an FPU.")
+@click.option("--all-laws", is_flag=True, help="Keep laws that DESIGN does not use: for two motors, or later sets.")
 @text_options
-def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, out: Output) -> None:
-    """Write the parameters and the control core as C99 sources.
+def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, all_laws: bool, out: Output) -> None:
+    """Write the parameters and the control core as C99 sources, with a README.md.
 
-    The core is what the simulated drive runs, byte for byte; the compiler flags it is checked with stand at the top of
-    the configuration, and which values it does not read: those of sampling, encoder and trips are for your application.
+    The core is what the simulated drive runs, less the laws that DESIGN does not use. README.md says how to build and
+    call it, what a period costs, and what to do at a fault. Values that the core does not read, those of sampling,
+    encoder and trips, are for your application.
     """
     from pmsmtool.cli.output_file import make_folder
     from pmsmtool.commissioning.export import image_of
@@ -166,7 +168,7 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, out: O
     from pmsmtool.firmware.export_c import c_files, not_read_by_core
 
     wanted = load_parameters(design)
-    files = c_files(image_of(wanted), prefix=prefix, design_id=wanted.content_hash())
+    files = c_files(image_of(wanted), prefix=prefix, design_id=wanted.content_hash(), all_laws=all_laws)
     if fixed_point:
         from pmsmtool.firmware.export_q import q_files
 
@@ -175,6 +177,10 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, out: O
     for name, text in files.items():
         write_file(folder / name, text)
     out.note(f"wrote {len(files)} files to {folder}")
+    others = sorted({path.name for path in folder.glob("*.[ch]")} - set(files))
+    if others:
+        few = ", ".join(others[:SHOWN]) + (", ..." if len(others) > SHOWN else "")
+        out.warn(f"{folder}: {len(others)} C files there are not of this export: {few}")
     unread = ", ".join(not_read_by_core())
     out.note(f"for your application, not read by these files: {unread}")
 

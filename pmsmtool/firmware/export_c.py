@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """A parameter set as C: a const instance of ``pmsm_params`` with its look-up words, and the core that runs it.
 
-The generated files are the ones the simulated drive runs (``firmware/core``, copied byte for byte) plus
-``<prefix>_cfg.h``, ``<prefix>_cfg.c`` and ``<prefix>_cfg.json`` with the same content, and ``<prefix>_main.c``, an
-example that is compiled only on request. Two motors in one program use two prefixes. The text depends on the set only:
-no date, no path.
+The core is the one the simulated drive runs (``firmware/core``): every file named ``pmsm_...``, so that none meets one
+of the application, and laws that the set does not use left out (``firmware/laws``). Beside it ``<prefix>_cfg.h``,
+``<prefix>_cfg.c`` and ``<prefix>_cfg.json`` with the same content, ``<prefix>_main.c``, an example that is compiled
+only on request, and ``README.md``. Two motors in one program use two prefixes. The text depends on the set only: no
+date, no path.
 """
 
 from __future__ import annotations
@@ -13,16 +14,23 @@ import json
 import re
 import struct
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib import resources
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.export_example import example_source
+from pmsmtool.firmware.export_readme import readme_text
 from pmsmtool.firmware.image import LUT_FORMAT_BINARY32, crc32, pack_image, saturation_words, unpack_image
+from pmsmtool.firmware.laws import LAWS, Law, files_left_out, laws_in_use, with_laws
 from pmsmtool.firmware.params_header import SPDX, c_float, commented
 from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, layout_signature
 
+README, MEMORY = "README.md", "pmsm_memory.c"
+CORE_PREFIX = "pmsm_"
+"""In front of every file and function of the core, whatever the prefix of the configuration."""
+
+_INCLUDE = re.compile(r'^#include "(\w+\.h)"', re.MULTILINE)
 _PREFIX = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,30}\Z")
 _WORD = re.compile(r"\w+")
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
@@ -36,7 +44,7 @@ FLAGS = (
 """Flags the generated code is checked with; contraction off keeps its bits equal to the simulator's."""
 
 
-def c_files(image: bytes, *, prefix: str = "pmsm", design_id: str = "") -> dict[str, str]:
+def c_files(image: bytes, *, prefix: str = "pmsm", design_id: str = "", all_laws: bool = False) -> dict[str, str]:
     """Return file name -> text of the configuration and of the core.
 
     Parameters
@@ -47,6 +55,8 @@ def c_files(image: bytes, *, prefix: str = "pmsm", design_id: str = "") -> dict[
         C identifier in front of every generated name.
     design_id : str
         Content hash of the design the set came from; printed, not interpreted.
+    all_laws : bool
+        Keep the laws that the set does not use: for sets that come later, or two motors on one core.
 
     Raises
     ------
@@ -55,13 +65,16 @@ def c_files(image: bytes, *, prefix: str = "pmsm", design_id: str = "") -> dict[
     """
     _check_prefix(prefix)
     values, lut = unpack_image(image)
-    return {
+    laws = LAWS if all_laws else laws_in_use(values)
+    files = {
         f"{prefix}_cfg.h": _header(prefix, image, lut, design_id),
-        f"{prefix}_cfg.c": _source(prefix, values, lut),
+        f"{prefix}_cfg.c": _source(prefix, values, lut, laws),
         f"{prefix}_cfg.json": _json(values, image, design_id),
         f"{prefix}_main.c": example_source(prefix),
-        **dict(core_files()),
+        **dict(core_files(laws)),
+        MEMORY: resources.files("pmsmtool.firmware").joinpath("freestanding", MEMORY).read_text(encoding="ascii"),
     }
+    return {**files, README: readme_text(values, prefix, image_bytes=len(image), laws=laws, flags=FLAGS)}
 
 
 def header_file(image: bytes, *, prefix: str = "pmsm", design_id: str = "") -> str:
@@ -69,7 +82,7 @@ def header_file(image: bytes, *, prefix: str = "pmsm", design_id: str = "") -> s
     _check_prefix(prefix)
     values, lut = unpack_image(image)
     head = _header(prefix, image, lut, design_id)
-    instance = _instance(prefix, values, lut, "static const")
+    instance = _instance(prefix, values, lut, "static const", LAWS)
     declaration = f"extern const {prefix}_cfg_type {prefix}_cfg;\n"
     return head.replace(declaration, instance)
 
@@ -82,21 +95,33 @@ def _check_prefix(prefix: str) -> None:
         )
 
 
-def core_files() -> Iterator[tuple[str, str]]:
-    """Yield (name, text) of every file of the control core, in name order."""
+def core_files(laws: Iterable[Law] = LAWS) -> Iterator[tuple[str, str]]:
+    """Yield (name, text) of the files of the control core with these laws, in name order.
+
+    Names without the core's own prefix get it, in ``#include`` lines, too; nothing else of the text changes but the
+    switches of laws that are left out.
+    """
+    laws = tuple(laws)
     folder = resources.files("pmsmtool.firmware").joinpath("core")
-    for entry in sorted(folder.iterdir(), key=lambda item: item.name):
-        if entry.name.endswith((".c", ".h")):
-            yield entry.name, entry.read_text(encoding="ascii")
+    names = sorted(entry.name for entry in folder.iterdir() if entry.name.endswith((".c", ".h")))
+    for name in sorted(set(names) - files_left_out(laws), key=_core_name):
+        text = with_laws(name, folder.joinpath(name).read_text(encoding="ascii"), laws)
+        yield _core_name(name), _INCLUDE.sub(lambda found: f'#include "{_core_name(found[1])}"', text)
+
+
+def _core_name(name: str) -> str:
+    return name if name.startswith(CORE_PREFIX) else CORE_PREFIX + name
 
 
 @cache
-def not_read_by_core() -> tuple[str, ...]:
-    """Return the parameters that no source of the core reads: the drive's application around it does.
+def not_read_by_core(laws: tuple[Law, ...] = LAWS) -> tuple[str, ...]:
+    """Return the parameters that no source of the core with these laws reads.
+
+    With all laws it is the drive's application around the core that does.
 
     Computed from the sources: a declaration and the table of bounds read nothing, nor does a comment.
     """
-    code = "".join(_COMMENT.sub("", text) for name, text in core_files() if not name.startswith("pmsm_params"))
+    code = "".join(_COMMENT.sub("", text) for name, text in core_files(laws) if not name.startswith("pmsm_params"))
     read = set(_WORD.findall(code))
     return tuple(row.name for row in CATALOGUE if row.c_name not in read)
 
@@ -157,21 +182,22 @@ extern const {prefix}_cfg_type {prefix}_cfg;
 """
 
 
-def _source(prefix: str, values: Mapping[str, float], lut: bytes) -> str:
+def _source(prefix: str, values: Mapping[str, float], lut: bytes, laws: tuple[Law, ...]) -> str:
     return (
         f'{SPDX}\n/* {prefix}_cfg.c: generated by pmsmtool export, do not edit. */\n#include "{prefix}_cfg.h"\n\n'
-        + _instance(prefix, values, lut, "const")
+        + _instance(prefix, values, lut, "const", laws)
     )
 
 
-def _instance(prefix: str, values: Mapping[str, float], lut: bytes, storage: str) -> str:
+def _instance(prefix: str, values: Mapping[str, float], lut: bytes, storage: str, laws: tuple[Law, ...]) -> str:
+    remarks = dict.fromkeys(not_read_by_core(laws), "; of a law that is left out")
+    remarks |= dict.fromkeys(not_read_by_core(), f"; {_OF_THE_APPLICATION}")
     fields = []
     for row in CATALOGUE:
         value = values[row.name]
         literal = f"{int(value)}u" if row.is_integer else c_float(value)
         unit = "" if row.unit == "1" else f"[{row.unit}] "
-        remark = f"; {_OF_THE_APPLICATION}" if row.name in not_read_by_core() else ""
-        fields.append(commented(f"        .{row.c_name} = {literal},", unit + row.meaning + remark))
+        fields.append(commented(f"        .{row.c_name} = {literal},", unit + row.meaning + remarks.get(row.name, "")))
     tables = _lut_initialiser(values, lut)
     body = "    .params = {\n" + "\n".join(fields) + "\n    }" + (",\n" + tables if tables else "") + "\n"
     return f"{storage} {prefix}_cfg_type {prefix}_cfg = {{\n{body}}};\n"

@@ -107,7 +107,7 @@ def periods(loop: Loop, mode: int) -> Iterator[Any]:
 
 def export(folder: Path, values: dict[str, float], lut: bytes) -> list[Path]:
     """Write the exported files; return the sources."""
-    for name, text in c_files(pack_image(values, lut), prefix="motor").items():
+    for name, text in c_files(pack_image(values, lut), prefix="motor", all_laws=True).items():
         (folder / name).write_text(text)
     return sorted(folder.glob("*.c"))
 

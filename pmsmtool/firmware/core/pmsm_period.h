@@ -8,6 +8,7 @@
 #define PMSM_PERIOD_H
 
 #include "pmsm_core.h"
+#include "pmsm_laws.h"
 #include "pmsm_math.h"
 #include "pmsm_modes.h"
 #include "pmsm_projection.h"

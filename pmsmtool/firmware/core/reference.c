@@ -126,10 +126,12 @@ pmsm_dq pmsm_torque_to_current(pmsm_period *period, pmsm_real tau)
     const uint32_t mode = params->field_weakening_mode;
     if (mode == PMSM_FW_LUT && params->lut_format != PMSM_LUT_NONE && period->lut != NULL) {
         i = lookup_within_limit(period, tau);
-    } else if (mode == PMSM_FW_OFF || mode == PMSM_FW_LUT) {
-        i = direct_current(period, tau);
-    } else {
+#if PMSM_LAW_FIELD_WEAKENING
+    } else if (mode != PMSM_FW_OFF && mode != PMSM_FW_LUT) {
         i = pmsm_field_weakening(period, tau);
+#endif
+    } else {
+        i = direct_current(period, tau);
     }
     const pmsm_real i_d_min = (pmsm_real)params->field_weakening_i_d_min_a;
     if (i.d < i_d_min) {

@@ -131,19 +131,26 @@ static void field_oriented(pmsm_period *period, pmsm_output *output)
         period->i_model = pmsm_predict_current(period);
         follow_saturation(period, period->i_model);
     }
-    if (period->params->governor_mode == PMSM_GOVERNOR_OFF || pmsm_govern(period) == 0u) {
+#if PMSM_LAW_GOVERNOR
+    const uint32_t governed = (period->params->governor_mode != PMSM_GOVERNOR_OFF) ? pmsm_govern(period) : 0u;
+#else
+    const uint32_t governed = 0u;
+#endif
+    if (governed == 0u) {
         pmsm_current_demand(period);
     }
     pmsm_modulate(period, output);
     pmsm_current_integrate(period);
 }
 
+#if PMSM_LAW_POLAR
 static void polar(pmsm_period *period, pmsm_output *output)
 {
     pmsm_polar_demand(period);
     pmsm_modulate(period, output);
     pmsm_polar_settle(period);
 }
+#endif
 
 static void control(pmsm_period *period, pmsm_output *output)
 {
@@ -153,11 +160,15 @@ static void control(pmsm_period *period, pmsm_output *output)
     live->i_d_req = request.d;
     live->i_q_req = request.q;
     period->reference = request;
+#if PMSM_LAW_POLAR
     if (period->params->polar_mode != PMSM_POLAR_OFF && period->request->bias_bandwidth <= PMSM_C(0.0)) {
         polar(period, output);
     } else {
         field_oriented(period, output);
     }
+#else
+    field_oriented(period, output);
+#endif
     period->state->reference_held = period->reference;
 }
 

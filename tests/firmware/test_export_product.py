@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: MIT
+"""An exported folder as a product: its page, only the laws in use, and no need of a C library."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.firmware.export_c import FLAGS, c_files, not_read_by_core
+from pmsmtool.firmware.export_readme import CYCLES, STACK, counted_law, structure_bytes
+from pmsmtool.firmware.image import pack_image
+from pmsmtool.firmware.laws import LAWS, laws_in_use
+from pmsmtool.params.catalogue import CATALOGUE
+
+COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+needs_linux_compiler = pytest.mark.skipif(
+    COMPILER is None or not sys.platform.startswith("linux"), reason="no C compiler that links ELF on this machine"
+)
+OFF = {"governor.mode": 0, "field_weakening.mode": 1, "polar.mode": 0}
+ALONE = {law.name: OFF | {law.mode: law.last_without + 1} for law in LAWS} | {"none": OFF}
+
+CHECK = r"""
+#include "pmsm_core.h"
+#include "pmsm_image.h"
+typedef char state_check[(sizeof(pmsm_state) == %(state)uu) ? 1 : -1];
+typedef char measurement_check[(sizeof(pmsm_measurement) == %(measurement)uu) ? 1 : -1];
+typedef char reference_check[(sizeof(pmsm_reference) == %(reference)uu) ? 1 : -1];
+typedef char output_check[(sizeof(pmsm_output) == %(output)uu) ? 1 : -1];
+"""
+
+
+def values(changes: Mapping[str, float]) -> dict[str, float]:
+    return {row.name: row.default for row in CATALOGUE} | changes
+
+
+def exported(changes: Mapping[str, float], *, all_laws: bool = False, prefix: str = "left") -> dict[str, str]:
+    return c_files(pack_image(values(changes)), prefix=prefix, all_laws=all_laws)
+
+
+def included(files: Mapping[str, str]) -> set[str]:
+    return {name for text in files.values() for name in re.findall(r'^#include "(.+)"', text, re.MULTILINE)}
+
+
+@pytest.mark.parametrize("law", ALONE)
+def test_only_the_laws_in_use_are_written(law: str) -> None:
+    files = exported(ALONE[law])
+    assert included(files) <= set(files), "every header that is included is there"
+    assert {name.split("_")[0] for name in files} == {"left", "pmsm", "README.md"}
+    kept = {one.name for one in laws_in_use(values(ALONE[law]))}
+    assert kept == {law} - {"none"}
+    for one in LAWS:
+        source = "pmsm_" + one.sources[0]
+        assert (source in files) is (one.name in kept)
+        assert f"#define {one.macro} {int(one.name in kept)}" in files["pmsm_laws.h"]
+    assert set(files) < set(exported(ALONE[law], all_laws=True))
+
+
+@needs_linux_compiler
+@pytest.mark.parametrize(
+    ("law", "optimised"), [("none", "-O0"), ("polar control", "-O1"), ("reference governor", "-O2")]
+)
+def test_it_links_without_a_c_library(law: str, optimised: str, tmp_path: Path) -> None:
+    """As its page says; every function called is in the folder, so nothing is missing when all must be resolved."""
+    files = exported(ALONE[law]) | {"check.c": CHECK % structure_bytes()}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    sources = sorted(path.name for path in tmp_path.glob("*.c"))
+    page = files["README.md"]
+    assert all(flag in page for flag in ("-ffreestanding", "-DPMSM_NO_C_LIBRARY", FLAGS))
+    command = [COMPILER, *FLAGS.split(), optimised, "-ffreestanding", "-DPMSM_NO_C_LIBRARY", "-fPIC", "-nostdlib"]
+    link = ["-shared", "-Wl,-z,defs", "-Wl,-Bsymbolic", "-o", "core.so"]
+    done = subprocess.run([*command, *link, *sources], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@needs_linux_compiler
+def test_a_set_for_a_law_that_was_left_out_is_refused(tmp_path: Path) -> None:
+    """The image check of a core without polar control takes its own set, and no polar one."""
+    (tmp_path / "main.c").write_text(
+        '#include "left_cfg.h"\n#include "right_cfg.h"\n#include "pmsm_image.h"\nint main(void)\n{\n'
+        "    return (int)(pmsm_image_check_content((const uint8_t *)&left_cfg, LEFT_CFG_BYTES) * 16u +\n"
+        "                 pmsm_image_check_content((const uint8_t *)&right_cfg, RIGHT_CFG_BYTES));\n}\n"
+    )
+    left = exported(ALONE["none"])
+    right = {k: text for k, text in exported(ALONE["polar control"], prefix="right").items() if k.startswith("right")}
+    for name, text in (left | right).items():
+        (tmp_path / name).write_text(text)
+    sources = sorted(path.name for path in tmp_path.glob("*.c"))
+    assert COMPILER is not None
+    subprocess.run([COMPILER, "-std=c99", "-fno-math-errno", "-o", "check", *sources], cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "check"], check=False).returncode == 5, "PMSM_IMAGE_OK, PMSM_IMAGE_RANGE"
+
+
+def test_what_the_kept_laws_do_not_read_is_said() -> None:
+    source = " ".join(exported(ALONE["none"])["left_cfg.c"].split())
+    for row in CATALOGUE:
+        comment = source.split(f".{row.c_name} = ")[1].split("*/")[0]
+        dead = row.name in not_read_by_core(()) and row.name not in not_read_by_core()
+        assert ("of a law that is left out" in comment) is dead, row.name
+    assert {"polar.gamma", "governor.eps"} <= set(not_read_by_core(())) - set(not_read_by_core())
+
+
+def test_the_page_states_the_numbers_that_were_measured() -> None:
+    table = (Path(__file__).resolve().parents[2] / "benchmarks" / "core_cost.md").read_text(encoding="ascii")
+    for law, cycles in CYCLES.items():
+        cells = next(line for line in table.splitlines() if line.startswith(f"| {law} |")).split("|")
+        counted = [int(cell.split("(")[1].split(")")[0]) for cell in cells[2:6]]
+        assert (counted[0], counted[1], counted[3]) == cycles, law
+    assert STACK.keys() == CYCLES.keys()
+
+
+@pytest.mark.parametrize(
+    ("changes", "law"),
+    [
+        ({"governor.mode": 0, "current.options": 7}, "PI"),
+        ({"governor.mode": 0, "current.options": 23}, "PI, predictor"),
+        ({"governor.mode": 2}, "line search"),
+        ({"governor.mode": 1}, "exact, 12 rows"),
+        ({"governor.mode": 3, "governor.options": 2, "field_weakening.mode": 1}, "best, delay"),
+        ({"governor.mode": 3, "governor.options": 0, "field_weakening.mode": 3}, "best + accelerated FW"),
+        ({"polar.mode": 2}, "polar, proposed"),
+        ({"polar.mode": 5}, "polar, regularised"),
+        ({"polar.mode": 6}, "polar, unified"),
+    ],
+)
+def test_the_page_takes_the_counted_law_of_the_set(changes: dict[str, float], law: str) -> None:
+    assert counted_law(values(changes)) == law
+    page = exported(changes)["README.md"]
+    assert f"`{law}`" in " ".join(page.split()) and f"{CYCLES[law][2]} at worst" in " ".join(page.split())
+    assert f"most found | {STACK[law]} |" in page and f"each motor | {structure_bytes()['state']} |" in page
+    assert "{" not in page and "@" not in page and max(map(len, page.splitlines())) <= 130
