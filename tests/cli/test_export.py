@@ -22,7 +22,6 @@ from pmsmtool.commissioning.export import concise_dcf, csv_text, image_of
 from pmsmtool.commissioning.parameter_source import load_parameters
 from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design
 from pmsmtool.design.tune import tune
-from pmsmtool.drive_maps.dcf import read_concise
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap, reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map
 from pmsmtool.errors import ConfigError
@@ -31,6 +30,7 @@ from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.resources import data_folder
+from tests.concise_dcf import read_concise
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 

@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.random_drives import draw_around
 from pmsmtool.commissioning.export import image_of
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
@@ -25,7 +26,6 @@ from pmsmtool.papers.governed_drive import IDEAL
 from pmsmtool.params.parameter_set import SATURATION, ParameterSet, parse_parameter_set
 from pmsmtool.sim.closed_loop import simulate
 from pmsmtool.sim.kernel import Application
-from pmsmtool.sim.random_drives import draw_around
 from pmsmtool.sim.scenarios import Scenario
 
 STEP_S = 0.05

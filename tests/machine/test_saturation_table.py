@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pmsmtool.machine.analytic_saturation import saturated_pmsyrm_map
+from benchmarks.analytic_saturation import saturated_pmsyrm_map
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.saturation_table import saturation_table
 
