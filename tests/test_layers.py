@@ -358,10 +358,6 @@ def test_rules_allow(module: str, source: str) -> None:
     assert faults(module, source) == []
 
 
-TESTED_AGAINST = {"canopen"}
-"""Declared, and not imported by the product: the other side of the wire in the tests."""
-
-
 def test_every_third_party_import_is_declared_and_the_reverse() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     requirements = [*project["dependencies"], *itertools.chain(*project["optional-dependencies"].values())]
@@ -376,4 +372,4 @@ def test_every_third_party_import_is_declared_and_the_reverse() -> None:
                 assert top in declared, f"{path.name}:{found.line} imports {top}"
                 used.add(top)
     runtime = {re.match(r"[A-Za-z0-9-]+", text)[0].lower() for text in project["dependencies"]}  # type: ignore[index]
-    assert {imported_as.get(name, name) for name in runtime} - used == TESTED_AGAINST
+    assert {imported_as.get(name, name) for name in runtime} <= used
