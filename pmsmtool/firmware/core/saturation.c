@@ -24,7 +24,7 @@ static pmsm_real value_at(const uint32_t *words, uint32_t k)
 /* Left node and what is left of x, in nodes. */
 static uint32_t left_node(pmsm_real x, uint32_t count, pmsm_real *rest)
 {
-    uint32_t k = (uint32_t)x;
+    uint32_t k = (x >= PMSM_C(0.0)) ? (uint32_t)x : 0u; /* NaN from a destroyed memory stays on the table */
     k = (k > count - 2u) ? count - 2u : k;
     *rest = x - (pmsm_real)k;
     return k;
