@@ -288,9 +288,9 @@ def test_a_shaft_that_slows_down_in_a_window_costs_nothing(lost: float) -> None:
     assert found.std > 0.02 * lag_s * lost / 0.05 * PSI
 
 
-def test_windows_driven_at_a_higher_speed_are_no_fastest_pair() -> None:
+def test_windows_driven_at_a_higher_speed_are_no_fastest_pair(population: Population) -> None:
     """A light shaft with friction had them; repeated without their i_q, they showed a magnet 3.5 % weaker."""
-    speeds = Population(11).speeds(0)
+    speeds = population.speeds(0)
     k = fastest_pair(speeds)[0]
     driven = {"i_d_a": 0.0, "i_q_a": 4.0, "omega_e_rad_s": 1.2 * speeds["omega_e_rad_s"][k]}
     rows = {
@@ -301,8 +301,7 @@ def test_windows_driven_at_a_higher_speed_are_no_fastest_pair() -> None:
 
 
 @pytest.mark.parametrize("T_after_c", [math.nan, 24.0, 40.0])
-def test_a_magnet_that_lost_flux_is_told_from_a_warmer_one(T_after_c: float) -> None:
-    population = Population(11)
+def test_a_magnet_that_lost_flux_is_told_from_a_warmer_one(T_after_c: float, population: Population) -> None:
     before = population.speeds(0)
     before = Trace(before.t_s, {**before.signals, "T_magnet_c": np.full_like(before.t_s, 24.0)}, before.units)
     flux = population.estimate(0)

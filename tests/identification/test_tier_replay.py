@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -66,11 +67,31 @@ def told(stage: Stage) -> str:
     return json.dumps([list(stage.values), stage.summary, stage.status, list(stage.fallbacks)])
 
 
-@pytest.mark.parametrize(("options", "quantities"), [("&tier=recorder", ("R", "psi", "L")), ("&drive=cia402", ASKED)])
-def test_a_run_with_a_machine_file_gives_the_same_bytes(
-    options: str, quantities: tuple[str, ...], tmp_path: Path
-) -> None:
-    run, stage = measured(options, tmp_path, quantities, load_machine_file(PROFILE))
+@pytest.fixture(scope="module")
+def recorded_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Stage]:
+    """A run of the recorder tier with a machine file."""
+    folder = tmp_path_factory.mktemp("recorded")
+    run, stage = measured("&tier=recorder", folder, ("R", "psi", "L"), load_machine_file(PROFILE))
+    return run.path, stage
+
+
+@pytest.fixture
+def recorded(recorded_once: tuple[Path, Stage], tmp_path: Path) -> tuple[RunDirectory, Stage]:
+    """A copy of it."""
+    shutil.copytree(recorded_once[0], tmp_path / "run")
+    return RunDirectory(tmp_path / "run"), recorded_once[1]
+
+
+def test_a_run_of_the_recorder_tier_gives_the_same_bytes(recorded: tuple[RunDirectory, Stage]) -> None:
+    assert_replayed(*recorded)
+
+
+def test_a_run_of_the_standard_tier_gives_the_same_bytes(tmp_path: Path) -> None:
+    assert_replayed(*measured("&drive=cia402", tmp_path, ASKED, load_machine_file(PROFILE)))
+
+
+def assert_replayed(run: RunDirectory, stage: Stage) -> None:
+    """Replay a run with a machine file, with its own and with other tolerances."""
     before = {name: (run.path / name).read_bytes() for name in (MACHINE, "run.json", FACTS)}
     again = replay(run)
     assert told(again) == told(stage) and "psi_f_wb" in told(stage)
@@ -117,9 +138,9 @@ def test_what_the_flux_linkage_needs_is_a_speed_in_numbers() -> None:
     assert "given flux linkage" not in below_voltage(facts, 0.5, 0.0)
 
 
-def test_an_instrument_scales_what_a_recorder_told(tmp_path: Path) -> None:
+def test_an_instrument_scales_what_a_recorder_told(recorded: tuple[RunDirectory, Stage]) -> None:
     """Voltage and current as the instruments have them: psi goes with the voltage, R and L_q with their ratio."""
-    run, stage = measured("&tier=recorder", tmp_path, ("R", "psi", "L"), load_machine_file(PROFILE))
+    run, stage = recorded
     plain = {row["name"]: row for row in stage.values}
     again = replay(run, None, ["V_dc=560V:554.4V:0.5V", "I=5Apk:5.05Apk:0.1%"])
     scaled = {row["name"]: row for row in again.values}
