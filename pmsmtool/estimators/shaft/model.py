@@ -7,7 +7,7 @@ Sigma = s_theta^2 I + s_T^2 G G', G_kj = (k - j - 1/2) T^2/J for j < k (docs/ide
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,10 @@ SHAFT = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """A trace in blocks: positions (n + 1,), mean torques (n,), period; deviations of positions (n + 1,) and torque."""
+    """A trace in blocks: positions (n + 1,), mean torques (n,), period; deviations of positions (n + 1,) and torque.
+
+    ``square`` is that of the speed in every block, with its sign (rad2/s2), shape (n,).
+    """
 
     theta: Array
     torque: Array
@@ -32,12 +35,11 @@ class Run:
     torque_std: float
     coasting: bool
     disturbances: Disturbances = NONE
+    square: Array = field(init=False)
 
-    @property
-    def square(self) -> Array:
-        """Square of the speed in every block, with its sign (rad2/s2), shape (n,)."""
+    def __post_init__(self) -> None:
         speed = np.diff(self.theta) / self.T
-        return np.asarray(speed * np.abs(speed))
+        object.__setattr__(self, "square", speed * np.abs(speed))
 
 
 def fastest(runs: Sequence[Run]) -> float:
@@ -81,16 +83,20 @@ class Problem:
         """Parameters before the traces' own."""
         return SHAFT + int(self.drag) + int(self.runs[0].disturbances.torque.shape[1])
 
-    def of_run(self, k: int, x: Array) -> Array:
-        """Whitened residual of one trace."""
+    def _off(self, k: int, x: Array) -> Array:
+        """Residual of one trace's positions (rad)."""
         run, first = self.runs[k], self.shared + 2 * k
-        own = np.append(x[:SHAFT], x[first : first + 2])
+        own = x[[*range(SHAFT), first, first + 1]]
         torque = run.torque - x[SHAFT] * run.square if self.drag else run.torque
         shown = run.theta
         if self.shared > self.sizes.start:
             torque = torque + run.disturbances.torque @ x[self.sizes]
             shown = shown - run.disturbances.position @ x[self.sizes]
-        return np.asarray(self.factors[k] @ (positions(torque, run.T, own) - shown))
+        return positions(torque, run.T, own) - shown
+
+    def of_run(self, k: int, x: Array) -> Array:
+        """Whitened residual of one trace."""
+        return np.asarray(self.factors[k] @ self._off(k, x))
 
     def residual(self, x: Array) -> Array:
         """Whitened residual of the traces, one after the other, and of the disturbances, shape (n,)."""
@@ -101,21 +107,21 @@ class Problem:
         blocks = []
         for k, run in enumerate(self.runs):
             block = np.zeros((len(run.theta), len(x)))
-            here, first = self.of_run(k, x), self.sizes.start
+            here, first = self._off(k, x), self.sizes.start
             if self.shared > first:
-                block[:, self.sizes] = self.factors[k] @ run.disturbances.position
+                block[:, self.sizes] = run.disturbances.position
             turning = [first + int(column) for column in np.nonzero(np.any(run.disturbances.torque, axis=0))[0]]
             for column in turning:
                 plus = x.copy()
                 plus[column] += self.step[column]
-                block[:, column] = (self.of_run(k, plus) - here) / (plus[column] - x[column])
+                block[:, column] = (self._off(k, plus) - here) / (plus[column] - x[column])
             for column in (*range(first), self.shared + 2 * k, self.shared + 2 * k + 1):
                 plus, minus = x.copy(), x.copy()
                 plus[column] += self.step[column]
                 minus[column] -= self.step[column]
-                change = self.of_run(k, plus) - self.of_run(k, minus)
+                change = self._off(k, plus) - self._off(k, minus)
                 block[:, column] = change / (plus[column] - minus[column])
-            blocks.append(block)
+            blocks.append(self.factors[k] @ block)  # one product of matrices instead of one per column and side
         return np.concatenate([*blocks, np.eye(len(x))[self.sizes]])
 
 

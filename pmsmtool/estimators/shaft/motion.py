@@ -59,14 +59,16 @@ def _turning(torque: Array, T: float, omega: float, shaft: tuple[float, float, f
     n = len(torque) if abs(x) * len(torque) <= DECAY_MOST else max(1, int(DECAY_MOST / abs(x)))
     if abs(x) > DECAY_MOST:
         return np.empty(0), omega
-    k = np.arange(n + 1, dtype=np.float64)
     gone = 1.0 if x == 0.0 else -math.expm1(-x) / x
     later = 0.5 - x / 6.0 + x * x / 24.0 - x**3 / 120.0 if abs(x) < SERIES_BELOW else (1.0 - gone) / x
     rate = (torque[:n] - tau_c * sign) / J
-    speed = np.exp(-x * k) * (omega + np.append(0.0, np.cumsum(rate * T * gone * np.exp(x * k[1:]))))
-    turned = np.nonzero(speed[1:] * sign <= 0.0)[0]
+    grown = np.exp(x * np.arange(1.0, n + 1.0))
+    speed = np.empty(n + 1)
+    speed[0] = omega
+    speed[1:] = (omega + np.cumsum(rate * (T * gone) * grown)) / grown
+    turned = np.flatnonzero(speed[1:] * sign <= 0.0)
     n = int(turned[0]) if len(turned) else n
-    ways = np.cumsum(speed[:n] * T * gone + rate[:n] * T * T * later)
+    ways = np.cumsum(speed[:n] * (T * gone) + rate[:n] * (T * T * later))
     return np.asarray(ways), float(speed[n])
 
 
