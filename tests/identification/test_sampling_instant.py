@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Sampling instant and sensor lag that nobody told: R, L and psi_f of a whole identification over CANopen."""
+"""Sampling instant and sensor lag that nobody told: R, L and psi_f of a whole identification over CANopen.
+
+A drive that samples in time is in ``tests/measurement/test_speed_run.py``.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -63,19 +66,6 @@ def test_psi_f_is_wrong_for_samples_taken_to_be_in_time() -> None:
         traces, evaluation.resistance, nameplate.inverter.T_s, nameplate.machine.alpha_psi_per_k, SensorTolerance()
     )
     assert plain.psi_f.value / truth["psi_f_wb"] - 1.0 + share > 2e-3
-
-
-def test_a_drive_that_samples_in_time_is_not_warned_of() -> None:
-    drive = drawn("", 40012, "ideal")
-    traces, nameplate, _ = measured(drive)
-    evaluation = evaluated(traces, nameplate)
-    assert timing_warnings(evaluation.shown) == []
-    instant = timing_estimates(evaluation.inductance, evaluation.shown, SensorTolerance())["sampling_instant_s"]
-    assert abs(instant.value) < 2.0 * instant.std
-    assert evaluation.inductance is not None and evaluation.resistance is not None
-    latency = evaluation.resistance.R_measured.value * SensorTolerance().encoder_latency_s
-    gains = SensorTolerance().impedance * evaluation.inductance.L_d.value
-    assert evaluation.inductance.L_d.systematic == pytest.approx((gains**2 + latency**2) ** 0.5, rel=1e-3)
 
 
 AGE_S = 9.2e-6

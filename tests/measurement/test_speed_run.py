@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from benchmarks.identification_coverage import drawn, evaluated, measured, truth_of
-from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
 from pmsmtool.experiments.speed_run import SETTLE_MOST_S, SETTLE_S, SteadyLoop, steady_loop
+from pmsmtool.identification.sampling import timing_estimates, timing_warnings
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.speeds import run_d_current
@@ -84,6 +85,15 @@ def test_a_q_current_that_settles_slowly_does_not_stop_the_shaft() -> None:
     psi = evaluation.estimates()["psi_f_wb"]
     assert float(np.max(np.abs(speeds["i_d_a"]))) > 1.9 * ripple_of(drive)
     assert abs(psi.value / truth["psi_f_wb"] - 1.0) < PSI_LIMIT
+    # it samples in time: nothing is warned of, and what an old angle would do to L is in its tolerance
+    assert timing_warnings(evaluation.shown) == []
+    instant = timing_estimates(evaluation.inductance, evaluation.shown, SensorTolerance())["sampling_instant_s"]
+    assert abs(instant.value) < 2.0 * instant.std
+    assert evaluation.inductance is not None and evaluation.resistance is not None
+    latency = evaluation.resistance.R_measured.value * SensorTolerance().encoder_latency_s
+    gains = SensorTolerance().impedance * evaluation.inductance.L_d.value
+    expected = math.hypot(gains, latency)
+    assert evaluation.inductance.L_d.systematic == pytest.approx(expected, rel=5e-3)  # measured 3.3e-3, by the R at T
 
 
 def ripple_of(drive: MachineFile) -> float:
