@@ -25,7 +25,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -191,18 +191,24 @@ def prove(truth: MachineFile, design: Design, kind: str, *, log: Callable[[str],
         return proving.prove_stage(run, drive, design, proving.ProofRequest(), lambda lines: None, log)
 
 
-@dataclass(slots=True)
-class Shared:
-    """Predictions by design: a drive is proven twice from one."""
+KEPT = 6
+"""Predictions that are kept."""
 
-    last: tuple[str, Prediction] | None = None
+
+class Shared:
+    """The last predictions by design and conditions: a drive is proven twice and more from one."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, Prediction] = {}
 
     def predict(self, design: Design, conditions: Any, plan: Any, **asked: Any) -> Prediction:
         """Return the prediction, made once."""
         key = f"{design.content_hash()} {conditions} {asked}"
-        if self.last is None or self.last[0] != key:
-            self.last = (key, predict_proof(design, conditions, plan, **asked))
-        return self.last[1]
+        if key not in self.known:
+            while len(self.known) >= KEPT:
+                del self.known[next(iter(self.known))]
+            self.known[key] = predict_proof(design, conditions, plan, **asked)
+        return self.known[key]
 
 
 def one_drive(
