@@ -474,7 +474,7 @@ def test_a_limit_that_does_not_act_is_kept_with_the_run(tmp_path: Path, monkeypa
     )
     with opened("torque", tmp_path) as rig:
         assert isinstance(rig.drive, TorqueDrive)
-        facts = push_by_torque(rig.drive, ENVELOPE, lambda name, trace: None)
+        facts = push_by_torque(rig.drive, ENVELOPE, lambda name, trace: None, lambda text: None)
     assert facts.limit.startswith("the drive does not keep its own current limit")
     assert parse_facts(dump_facts(facts), where="run").limit == facts.limit
 

@@ -146,7 +146,7 @@ def failing(
             patch.setattr(GuardedDrive, "begin", begin)
             patch.setattr(connection, "wait", until_then)
             try:
-                push_by_torque(drive, Envelope(7.2, SPEED_MAX), lambda name, trace: None)
+                push_by_torque(drive, Envelope(7.2, SPEED_MAX), lambda name, trace: None, lambda text: None)
             except Over:
                 pass
             except Exception:  # the bus is cut: what is left of the tool cannot confirm its stop

@@ -124,7 +124,8 @@ def test_a_rotor_of_little_friction_stays_on_the_first_vector(tmp_path: Path) ->
     kept: list[str] = []
     traces: dict[str, Trace] = {}
     with standard(drive, tmp_path) as (opened, envelope):
-        turn_both_ways(opened, envelope, lambda name, trace: (kept.append(name), traces.update({name: trace}))[0])
+        keep = lambda name, trace: (kept.append(name), traces.update({name: trace}))[0]  # noqa: E731
+        turn_both_ways(opened, envelope, keep, lambda text: None)
     assert kept == ["rotation_forward", "rotation_backward"]  # no second try
     assert offset_error_deg(drive, traces) < 0.5  # measured: 0.02 deg; 2 deg are asked for
 
@@ -140,8 +141,8 @@ def test_dead_time_that_drives_the_swing_is_left_by_a_slower_turn(
     with standard(drive, tmp_path) as (opened, envelope):
         monkeypatch.setattr(tier_identify, "TURNS", ((large, fast_s),))
         with pytest.raises(IdentificationError, match="E_ROTOR_MOVED"):
-            turn_both_ways(opened, envelope, traces.__setitem__)
+            turn_both_ways(opened, envelope, traces.__setitem__, lambda text: None)
     with standard(drive, tmp_path) as (opened, envelope):
         monkeypatch.setattr(tier_identify, "TURNS", ((large, slow_s),))
-        turn_both_ways(opened, envelope, traces.__setitem__)
+        turn_both_ways(opened, envelope, traces.__setitem__, lambda text: None)
     assert offset_error_deg(drive, traces) < 0.5  # measured: 0.01 deg
