@@ -12,16 +12,16 @@ from pmsmtool.firmware.core_binding import CORE_HEADERS, HEADER_FOLDER, parse_st
 from pmsmtool.firmware.laws import LAWS, Law
 
 CYCLES = {
-    "PI": (1579, 1600, 1666),
-    "PI, predictor": (1871, 1889, 1955),
-    "line search": (2604, 2707, 2813),
-    "exact, 12 rows": (4266, 5519, 7805),
-    "best": (3313, 5284, 6816),
-    "best, delay": (3508, 5369, 7148),
-    "best + accelerated FW": (3542, 10732, 13029),
-    "polar, proposed": (2616, 2660, 2695),
-    "polar, regularised": (2341, 2362, 2428),
-    "polar, unified": (2709, 2730, 3728),
+    "PI": (1587, 1608, 1674),
+    "PI, predictor": (1887, 1905, 1971),
+    "line search": (2582, 2685, 2791),
+    "exact, 12 rows": (4239, 5495, 7781),
+    "best": (3288, 5258, 6791),
+    "best, delay": (3491, 5351, 7130),
+    "best + accelerated FW": (3517, 10710, 13008),
+    "polar, proposed": (2624, 2668, 2703),
+    "polar, regularised": (2350, 2371, 2437),
+    "polar, unified": (2721, 2742, 3742),
 }
 """Model cycles of a whole period on a Cortex-M4F: mean and worst of a nominal run, worst of the adversarial search.
 

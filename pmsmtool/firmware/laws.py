@@ -96,5 +96,7 @@ def with_laws(name: str, text: str, laws: Iterable[Law]) -> str:
 
 def _replaced(text: str, old: str, new: str, where: str) -> str:
     if not old or text.count(old) != 1:
-        raise ConfigError(f"does not hold {old or 'the bound'!r} once", where=f"core file {where}")
+        raise ConfigError(
+            f"does not hold {old or 'the bound'!r} once", where=f"core file {where}", hint="reinstall pmsmtool"
+        )
     return text.replace(old, new)

@@ -312,7 +312,7 @@ def test_a_gross_deviation_ends_the_proof_before_more_is_asked(design: Design) -
 def test_a_drive_that_holds_another_set_is_refused(design: Design) -> None:
     with flashed(design) as drive:
         drive.write({"current.K_p_d_v_per_a": 0.9 * design["current.K_p_d_v_per_a"]})
-        with pytest.raises(VerifyMismatch, match=r"1 of 90 objects differ") as caught:
+        with pytest.raises(VerifyMismatch, match=r"1 of \d+ objects differ") as caught:
             prove(drive, design)
         assert "flash-params" in str(caught.value) and "K_p_d" in str(caught.value)
         assert not list(Path("runs").glob("*/prove"))

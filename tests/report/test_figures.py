@@ -69,7 +69,7 @@ def test_the_fitted_response_is_measured_plus_residual(canvases: list[Any]) -> N
     current = np.sin(np.arange(n))
     residual = np.random.default_rng(1).standard_normal(n - SKIP_SAMPLES)
     timing = Timing(1.0, 1e-3, -3.0, 1.0, 1.0, 1e-3, 0.0, 0.0)
-    fit = AxisFit(1e-3, 1e-6, 1e-6, (1e-3,), 0.1, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, n, (residual,), (), 1.0, timing)
+    fit = AxisFit(1e-3, 1e-6, 1e-6, (1e-3,), 0.1, 1.0, 0.0, 0.0, 1.0, n, (residual,), (), 1.0, timing)
     shots = {axis: trace({f"i_{axis}_a": current}, half_period=6) for axis in "dq"}
     figures.inductance_figure(shots, {"d": fit, "q": fit}, sigma)
     drawn = lines(canvases[0])
