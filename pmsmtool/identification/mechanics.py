@@ -104,6 +104,7 @@ def mechanics_of(
         direction=direction,
         tolerance=tolerance,
         tilt_std=math.hypot(TILT_FLOOR, tilt),
+        pole_pairs=pole_pairs,
         elastic=elastic,
     )
 

@@ -46,6 +46,8 @@ class RoughShaft:
         Torque per q current (N m/A).
     step_rad : float
         Step of the encoder (rad).
+    pole_pairs : int
+        Of the machine.
     """
 
     J: float
@@ -53,6 +55,7 @@ class RoughShaft:
     tau_c: float
     torque_per_a: float
     step_rad: float
+    pole_pairs: int = 1
 
 
 def rough_friction(speeds: Trace, J: float, torque_per_a: float, pole_pairs: int) -> tuple[float, float]:
@@ -113,7 +116,9 @@ def predict_mechanics(shaft: RoughShaft, plan: PushPlan, sigma_a: float, scale_s
     if speed == 0.0:
         return {}
     extent = Extent(speed, shaft.torque_per_a * plan.i_q_a, TILT_FLOOR)
-    runs = [replace(run, disturbances=disturbances(run.theta, run.torque, run.T, extent)) for run in runs]
+    runs = [
+        replace(run, disturbances=disturbances(run.theta, run.torque, run.T, extent, shaft.pole_pairs)) for run in runs
+    ]
     scale = sizes_of(runs)
     states = [v for run in runs for v in _state(run)]
     x = np.array([math.log(shaft.J), shaft.B, shaft.tau_c, *np.zeros(len(scale) - SHAFT - len(states)), *states])

@@ -138,7 +138,7 @@ def forecast_of(
     step = encoder_step([traces[name]["theta_M_rad"] for name in ("push_0", "push_1")])
     U_dc_v = float(traces["speeds"].meta["U_dc_v"])
     return ShaftForecast(
-        RoughShaft(J, B, tau_c, per_a, step),
+        RoughShaft(J, B, tau_c, per_a, step, pole_pairs),
         noise.sigma_a,
         torque_doubt(flux),
         resistance.R_measured.value,

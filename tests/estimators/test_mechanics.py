@@ -282,6 +282,55 @@ def braked(rng: np.random.Generator, tilt: float = 0.0, friction: float = 0.0, e
     return traces
 
 
+def short(rng: np.random.Generator, cogging: float, sensors: float) -> tuple[list[Trace], tuple[float, ...]]:
+    """Pushes of a fifth of a turn and half a turn of coasting: too little to see cogging of 180 periods per turn.
+
+    Cogging is a torque (N m), ``sensors`` the share of the current by which they are off, by offset and by gain.
+    """
+
+    def shown_too_little(current: float, theta: float) -> float:
+        of_gain = sensors * current * math.cos(20.0 * theta + 0.5)
+        return (current != 0.0) * (5.0 * sensors * math.cos(10.0 * theta) + of_gain)
+
+    truth, step, per_a = (1.06e-3, 2.4e-3, 0.031), 2.0 * math.pi / 2**15, 0.315
+    traces, omega = [], 0.0
+    for current, period, rows in ((5.0, 3e-5, 1430), (0.0, 6e-4, 800), (-5.0, 3e-5, 1430), (0.0, 6e-4, 800)):
+        if current == 0.0:
+            omega *= 0.3
+        else:
+            omega = 0.0
+        theta, shown, h = 0.7 + rng.uniform(), [], period / 4
+        for _ in range(rows):
+            shown.append(theta)
+            for _ in range(4):
+                driving = per_a * (current + shown_too_little(current, theta)) + cogging * math.cos(180.0 * theta)
+                if omega == 0.0 and abs(driving) <= truth[2]:
+                    break
+                sign = math.copysign(1.0, omega if omega != 0.0 else driving)
+                after = omega + h * (driving - truth[1] * omega - truth[2] * sign) / truth[0]
+                after = 0.0 if after * omega < 0.0 else after
+                theta, omega = theta + 0.5 * h * (omega + after), after
+        signals = {
+            "i_d_a": np.zeros(rows),
+            "i_q_a": current + SIGMA * rng.standard_normal(rows) * (current != 0.0),
+            "theta_M_rad": step * np.round(np.array(shown) / step),
+            "flagged": np.zeros(rows),
+        }
+        meta = {"coasting": current == 0.0}
+        traces.append(Trace(period * np.arange(rows, dtype=np.float64), signals, dict.fromkeys(signals, "1"), meta))
+    return traces, truth
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize(("cogging", "sensors"), [(0.11, 6e-3), (0.0, 6e-3), (0.0, 0.0)])
+def test_a_short_way_over_fine_cogging_and_with_wrong_sensors_keeps_the_inertia(cogging: float, sensors: float) -> None:
+    traces, truth = short(np.random.default_rng(4), cogging, sensors)
+    found = estimate_mechanics(traces, lambda i_d, i_q: 0.315 * i_q, 0.315, SIGMA, 0.0, pole_pairs=10)
+    for value, true in zip((found.J, found.B, found.tau_c), truth, strict=True):
+        assert abs(value.value - true) < 3.0 * value.std
+    assert found.J.std < 0.03 * found.J.value
+
+
 @pytest.mark.parametrize("effect", [{"tilt": 3e-3}, {"friction": 0.15}, {"encoder": 6e-3}, {}])
 def test_what_repeats_with_the_angle_or_grows_with_the_speed_is_no_friction(effect: dict[str, float]) -> None:
     """Before: tau_c 11 deviations (8 %) off with friction over the angle, B 25 (20 %) by the encoder, 3 by the tilt."""

@@ -20,7 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.angle_harmonics import AngleHarmonics, angle_harmonics
+from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.angle_harmonics import LEAST_SPEED, AngleHarmonics, angle_harmonics
 from pmsmtool.estimators.estimate import (
     CHI2_WARN,
     SensorTolerance,
@@ -146,6 +147,7 @@ def estimate_mechanics(
     direction: int = 1,
     tolerance: SensorTolerance | None = None,
     tilt_std: float = TILT_FLOOR,
+    pole_pairs: int = 1,
     elastic: bool = False,
 ) -> MechanicsResult:
     """Estimate inertia and friction.
@@ -169,6 +171,8 @@ def estimate_mechanics(
         Declared sensor tolerances.
     tilt_std : float
         Relative standard deviation of the pushes' torque at their fastest speed, less at others.
+    pole_pairs : int
+        Of the machine: the current sensors' errors turn with the electrical angle.
     elastic : bool
         Count any deviation of the torque as noise: the caller has another method to compare the inertia with.
 
@@ -187,21 +191,27 @@ def estimate_mechanics(
     step = encoder_step([run["theta_M_rad"] for run in runs])
     harmonics = angle_harmonics([(run.t_s, direction * run["theta_M_rad"]) for run in runs if run.meta["coasting"]])
 
-    def blocks_of(J_kgm2: float) -> list[Run]:
-        found = [_blocks(run, torque, torque_per_a, sigma_a, direction, step, harmonics, J_kgm2) for run in runs]
-        extent = Extent(fastest([run for _, run in found]), largest_torque([run for _, run in found]), tilt_std)
-        return [replace(run, disturbances=disturbances(theta, run.torque, run.T, extent)) for theta, run in found]
+    def fitted(runs: Sequence[Trace]) -> Fitted:
+        def blocks_of(J_kgm2: float) -> list[Run]:
+            found = [_blocks(run, torque, torque_per_a, sigma_a, direction, step, harmonics, J_kgm2) for run in runs]
+            extent = Extent(fastest([run for _, run in found]), largest_torque([run for _, run in found]), tilt_std)
+            return [
+                replace(run, disturbances=disturbances(theta, run.torque, run.T, extent, pole_pairs))
+                for theta, run in found
+            ]
 
-    blocks = blocks_of(0.0)
-    start = _start(blocks)
-    if harmonics.acceleration_rad_s2:
-        for _ in range(COGGING_FITS - 1):  # the torque over the angle is known as an acceleration
-            found = _fit(blocks_of(math.exp(start[0])), start, elastic)[0].x
-            start = np.delete(found, range(SHAFT, len(found) - 2 * len(runs)))
-        blocks = blocks_of(math.exp(start[0]))
-    with_drag, chi2, noisy = _fit(blocks, start, elastic)
-    before, noise = _noise(blocks), _noise(noisy)
-    unexplained = any(noise[kind] > UNEXPLAINED * max(before[kind], COASTING_FLOOR) for kind in noise)
+        blocks = blocks_of(0.0)
+        start = _start(blocks)
+        if harmonics.acceleration_rad_s2:
+            for _ in range(COGGING_FITS - 1):  # the torque over the angle is known as an acceleration
+                found = _fit(blocks_of(math.exp(start[0])), start, elastic)[0].x
+                start = np.delete(found, range(SHAFT, len(found) - 2 * len(runs)))
+            blocks = blocks_of(math.exp(start[0]))
+        return blocks, *_fit(blocks, start, elastic)
+
+    blocks, with_drag, chi2, noisy = _explained(fitted, runs)
+    noise = _noise(noisy)
+    unexplained = _unexplained(blocks, noisy)
     without = _minimum(noisy, np.delete(with_drag.x, SHAFT), sizes_of(blocks))
     bound, condition = information_bound(without.jacobian)
     condition_gate(condition, "B and tau_c", STAGE)
@@ -240,6 +250,49 @@ def estimate_mechanics(
     ripple = max(noise.values())
     J_found, B_found, tau_found = estimates
     return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, condition, unexplained, harmonics, drag)
+
+
+Fitted = tuple[Sequence[Run], Fit, float, Sequence[Run]]
+"""Blocks, fit with drag, its reduced chi-square, and the blocks with the torque's noise that it took."""
+
+
+def _explained(fitted: Callable[[Sequence[Trace]], Fitted], runs: Sequence[Trace]) -> Fitted:
+    """Return the fit to the traces, or to what of them is fast where that needs less noise of the torque.
+
+    Near standstill cogging that is too fine to be seen holds the rotor, or lets it go late.
+    """
+    try:
+        whole = fitted(runs)
+    except IdentificationError as refused:
+        try:
+            return fitted([_fast(run) for run in runs])
+        except IdentificationError:
+            raise refused from None
+    if not _unexplained(whole[0], whole[3]):
+        return whole
+    try:
+        fast = fitted([_fast(run) for run in runs])
+    except IdentificationError:
+        return whole
+    return fast if max(_noise(fast[3]).values()) < max(_noise(whole[3]).values()) else whole
+
+
+def _unexplained(blocks: Sequence[Run], noisy: Sequence[Run]) -> bool:
+    """Whether the torque's noise grew so much in a fit that the intervals are notably wider."""
+    before, noise = _noise(blocks), _noise(noisy)
+    return any(noise[kind] > UNEXPLAINED * max(before[kind], COASTING_FLOOR) for kind in noise)
+
+
+def _fast(run: Trace) -> Trace:
+    """Return the longest part of a trace above a share of its fastest speed."""
+    theta = run["theta_M_rad"]
+    count = max(2, len(theta) // 40)
+    speed = np.abs(theta[count:] - theta[:-count])
+    fast = np.concatenate([[False], speed >= LEAST_SPEED * np.max(speed), [False]])
+    starts, ends = np.flatnonzero(np.diff(fast)).reshape(-1, 2).T
+    longest = int(np.argmax(ends - starts))
+    part = slice(int(starts[longest]), int(ends[longest]) + count)
+    return replace(run, t_s=run.t_s[part], signals={name: values[part] for name, values in run.signals.items()})
 
 
 def _window(run: Trace) -> Trace:
