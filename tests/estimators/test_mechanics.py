@@ -299,10 +299,10 @@ def short(rng: np.random.Generator, cogging: float, sensors: float) -> tuple[lis
             omega *= 0.3
         else:
             omega = 0.0
-        theta, shown, h = 0.7 + rng.uniform(), [], period / 4
+        theta, shown, h = 0.7 + rng.uniform(), [], period / 16
         for _ in range(rows):
             shown.append(theta)
-            for _ in range(4):
+            for _ in range(16):
                 driving = per_a * (current + shown_too_little(current, theta)) + cogging * math.cos(180.0 * theta)
                 if omega == 0.0 and abs(driving) <= truth[2]:
                     break

@@ -63,7 +63,7 @@ def errors(found: FluxMap, known: np.ndarray, L: dict[str, np.ndarray], truth: F
 
 @pytest.mark.chain
 def test_a_free_rotor_gives_a_map_that_a_replay_repeats(tmp_path: Path) -> None:
-    """Unasked: the machine saturates. What design and proof make of a map: ``tests/proof/test_saturating_machine.py``."""
+    """Unasked: the machine saturates. Design and proof of a map: ``tests/proof/test_saturating_machine.py``."""
     with Connection(PmsmSimBus(f"{PROFILE}?nv=:memory:")) as connection:
         drive = CanopenDrive(connection, 1)
         record = new_record(["test"], drive={}, bus={}, versions={}, operator="nobody")

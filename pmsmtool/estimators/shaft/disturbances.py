@@ -9,8 +9,8 @@ tau_c instead of moving them:
   coasting takes that for B;
 - friction over the angle, once and twice per turn: it changes its sign with the speed;
 - torque over the angle, once and twice per turn: unbalance, tolerances of the stator;
-- torque of the pushes over the electrical angle: an offset of a current sensor shows a q current that is not there once
-  per electrical turn, a gain one in proportion to the current twice. A push of few electrical turns takes it for inertia;
+- torque of the pushes over the electrical angle: an offset of a current sensor shows a q current that is not there
+  once per electrical turn, a gain one in proportion to the current twice; a push of few turns takes it for inertia;
 - the encoder's error, once and twice per turn.
 
 The angles are those of a smooth course: with the encoder's own, an error of the encoder would take its rounding along,
