@@ -70,6 +70,8 @@ WARMING_S, WARMING_TOLERANCE = (0.3, 120.0), 0.02
 """Time constants of a winding that warms by its own losses (s), and how finely one is sought (of its logarithm)."""
 WARMING_GAIN = 10.0
 """Fall of chi-square for which that counts instead of a line of time: one shape more, at three standard deviations."""
+SENSED_K = 1.0
+"""Change of the winding's sensor (K) from which on it may be the shape; its noise is none."""
 LATE = 0.75
 """Middle of a level's window, of the level: its first half settles."""
 DRIFT_LIMIT = 0.15
@@ -201,11 +203,10 @@ def estimate_resistance(
     R_0 = two_point_slope(i, v)
     _check_levels(levels, i, peak, R_0, noise)
     noise_v = MEAN_NOISE_FACTOR * R_0 * noise.sigma_a / math.sqrt(samples)
-    warmth = _warmth(levels.t_s, i, v, peak, math.hypot(noise_v, MODEL_FLOOR * R_0 * peak))
-    sigma_v = _level_sigma(warmth, i, v, peak, R_0, noise_v)
-
     T = levels["T_winding_c"]
     known_T = bool(np.all(np.isfinite(T)))
+    warmth = _warmth(levels.t_s, T, i, v, peak, math.hypot(noise_v, MODEL_FLOOR * R_0 * peak))
+    sigma_v = _level_sigma(warmth, i, v, peak, R_0, noise_v)
     T_w = float(np.sum(T * i**2) / np.sum(i**2)) if known_T else math.nan
     share = _copper_share(copper, R_0)
     R_w, v_w = R_0, v
@@ -257,8 +258,11 @@ def estimate_resistance(
     )
 
 
-def _warmth(t: Vector, i: Vector, v: Vector, peak: float, sigma_v: float) -> Vector:
-    """Return how the winding warms from level to level: with time, or where that does not fit, by its own losses."""
+def _warmth(t: Vector, T: Vector, i: Vector, v: Vector, peak: float, sigma_v: float) -> Vector:
+    """Return how the winding warms from level to level: with time, or where that does not fit, by its losses or sensor.
+
+    What a sensor shows is a shape, too: of the loop only the copper warms, and how much of it that is, is not known.
+    """
     from scipy.optimize import minimize_scalar
 
     def misfit(warmth: Vector) -> float:
@@ -268,7 +272,11 @@ def _warmth(t: Vector, i: Vector, v: Vector, peak: float, sigma_v: float) -> Vec
         lambda log_tau: misfit(_heated(t, i, peak, math.exp(log_tau))),
         bounds=(math.log(WARMING_S[0]), math.log(WARMING_S[1])), method="bounded", options={"xatol": WARMING_TOLERANCE},
     )  # fmt: skip
-    return _heated(t, i, peak, math.exp(found.x)) if found.fun < misfit(t) - WARMING_GAIN else t
+    shapes = [_heated(t, i, peak, math.exp(found.x))]
+    if np.all(np.isfinite(T)) and np.ptp(T) > SENSED_K:
+        shapes.append(T)
+    best = min(shapes, key=misfit)
+    return best if misfit(best) < misfit(t) - WARMING_GAIN else t
 
 
 def _heated(t: Vector, i: Vector, peak: float, tau_s: float) -> Vector:

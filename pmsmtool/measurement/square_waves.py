@@ -103,7 +103,12 @@ class SquareStage:
                 shot = square_injection.inject_square(self.drive, plan, axis, half_period, amplitude)
                 self.keep(f"square_{axis}_{half_period}", shot)
             found = square_injection.ripple_of(shot, axis)
-            rough.append(amplitude * plan.half_periods[-1] * self.drive.period_s / found)
+            last = plan.half_periods[-1]
+            rough.append(amplitude * last * self.drive.period_s / found)
+            slow = square_injection.slow_half_period(plan, self.drive.period_s, rough[-1] / resistance.R_measured.value)
+            if slow:
+                shot = square_injection.inject_square(self.drive, plan, axis, slow, amplitude * last / slow)
+                self.keep(f"square_{axis}_{slow}", shot)
         self.drive.command_current(0.0, 0.0, fixed_angle_rad=plan.angle_rad)
         return rough[0], rough[1]
 

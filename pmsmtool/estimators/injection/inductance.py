@@ -63,6 +63,9 @@ EDGE_STD = 0.05
 EDDY_STD = 5e-3
 """Relative standard deviation of L beside eddy currents, whose branch has one time constant (8 % of iron loss: 0.0 to
 0.3 % off; an eddy branch of 10 %: 0.1 %)."""
+EDDY_MISFIT_STD = 0.02
+"""More of it per root of the reduced chi-square beyond 1: iron loss of 5.6 % beside eddy currents of 6.8 %, which are
+two branches, left 1.13 and 1.69 of it, and L_d, L_q 1.4 and 2.5 % off."""
 MINIMUM_PERIODS = 20
 """Full periods of the square wave below which a shot is not an excitation."""
 CURVE_POINTS = 256
@@ -219,7 +222,7 @@ def estimate_inductances(
                 MODEL_FLOOR * values[axis],
                 tolerance.voltage_scale_std * values[axis],
                 _commutation_std(shots[axis]),
-                EDDY_STD * values[axis] * ("eddy" in fits[axis].effects),
+                _eddy_std(fits[axis]) * values[axis],
             ),
             systematic=math.hypot(
                 tolerance.impedance * values[axis], R_ohm * tolerance.encoder_latency_s * (instant is not None)
@@ -283,6 +286,13 @@ def _fitted(
                 break
             shots[axis] = found
     return fits
+
+
+def _eddy_std(fit: AxisFit) -> float:
+    """Relative standard deviation beside eddy currents: more, where a residual shows that one branch is not all."""
+    if "eddy" not in fit.effects:
+        return 0.0
+    return EDDY_STD + EDDY_MISFIT_STD * math.sqrt(max(0.0, fit.chi2 - 1.0))
 
 
 def _contradicted(fits: Mapping[str, AxisFit], instant: ShownInstant) -> bool:
