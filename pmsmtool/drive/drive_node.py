@@ -349,7 +349,7 @@ def identity_number(sdo: SdoChannel, sub: int) -> int:
     try:
         return int.from_bytes(sdo.read(objects.IDENTITY, sub, size=4), "little")
     except SdoAbort as abort:
-        if sub > 1 and abort.code in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX):
+        if sub > 1 and abort.code in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY):
             return 0
         raise
 

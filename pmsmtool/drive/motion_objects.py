@@ -41,6 +41,9 @@ DEGREE = 0x41
 """Numerator of an SI unit of position (CiA 303-2); others count increments."""
 RATED_RMS = 1e-3 * math.sqrt(2.0)
 """A peak per count of 0x6075, taken as mA rms: the larger of the two readings."""
+LEAST_UNITS = 24
+"""Fewest units of position per turn: one within the 50 ms between two looks at the speed is 5 rad/s then. Files of
+makers say 1 where nothing was set up."""
 NO_RATED = "its rated current (0x6075, or the maker's own object in a map that names this drive)"
 NO_COUNTS = "how many increments its encoder has per turn (0x608F, or the maker's own object in a map)"
 OVER_SPEED_TRIP, TRIP_RATIO = "protection.n_trip_rpm", 1.5
@@ -246,8 +249,20 @@ def position_units(node: DriveNode) -> float:
     Raises
     ------
     NotAvailable
-        Nothing tells, or a gear (0x6091) stands between and nothing says in which units.
+        Nothing tells, a gear (0x6091) stands between and nothing says in which units, or a turn has too few of them.
     """
+    units = _position_units(node)
+    if not abs(units) >= LEAST_UNITS:
+        raise NotAvailable(
+            f"a turn of the motor has {abs(units):.4g} units of position, {LEAST_UNITS} are needed to see its speed",
+            where=f"node {node.node}, 0x608F or 0x6092",
+            likely="the encoder's resolution or the feed was never set",
+            hint="set it with the maker's software",
+        )
+    return units
+
+
+def _position_units(node: DriveNode) -> float:
     sign = -1.0 if int(held(node, POLARITY) or 0) & POSITION_TURNED else 1.0
     gear = max(1.0, held(node, GEAR_MOTOR) or 1.0) / max(1.0, held(node, GEAR_SHAFT) or 1.0)
     unit = int(held(node, POSITION_UNIT) or 0)

@@ -40,6 +40,7 @@ from pmsmtool.units import RAD_S_PER_MRPM
 COMMUTATION_ANGLE = DriveObject(0x60EA, 0, "H")
 ANGLE_COUNTS = 1 << 16
 """Counts of 0x60EA per electrical turn."""
+RESISTANCE = "motor.R_s_ohm"
 POLL_PERIOD_S = 1e-3
 """Live values are polled about this often: process data of a CAN bus do not come faster."""
 SPARE_ROWS = 8
@@ -92,9 +93,10 @@ class StandardDrive(CanopenDrive):
         """
         if name == "motor.pole_pairs":
             return 1.0
-        if name in self.node.map.cells:
+        cell = self.node.map.cells.get(name)
+        if cell is not None and (name != RESISTANCE or self.node.has(cell.index, cell.sub)):
             return super().read(name)
-        if name == "motor.R_s_ohm":
+        if name == RESISTANCE:
             return 0.0
         raise NotAvailable(f"the drive has no object for {name}", where=f"node {self.node.node}")
 

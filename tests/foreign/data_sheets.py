@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-TYPES = {"I8": 2, "I16": 3, "I32": 4, "U8": 5, "U16": 6, "U32": 7, "U64": 0x1B}
+TYPES = {"I8": 2, "I16": 3, "I32": 4, "U8": 5, "U16": 6, "U32": 7, "VSTR": 9, "U64": 0x1B}
 Row = tuple[int, int, str, str, str]
 """Index, sub-index, type, access, stored value."""
 

@@ -107,7 +107,7 @@ class ForeignDrive:
             if law is not None and law.set_up is not None:
                 low, high = _bounds(row)
                 entry.value = entry.encode(min(max(law.set_up, low), high))  # no more than the drive can give
-            if (index, sub) in SERIALS:
+            if (index, sub) in SERIALS and entry.code is not None:
                 entry.value = entry.encode(serial)
             dictionary.show(entry)
         dictionary.find(0x6502, 0).value = self._modes_word(dictionary)

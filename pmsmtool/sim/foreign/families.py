@@ -177,7 +177,7 @@ def laws_of(objects: MakersObjects, motor: SetUp) -> dict[tuple[int, int], Law]:
         per_rps, speed = family.speed_per_rps, family.speed_source
     laws = {(law.index, law.sub): law for law in standard_laws(objects, motor, per_turn, per_rps, speed)}
     laws |= {(law.index, law.sub): law for law in family.laws(objects, motor)}
-    return {address: law for address, law in laws.items() if address in objects.rows}
+    return {at: law for at, law in laws.items() if at in objects.rows and objects.rows[at].data_type.letter}
 
 
 def modes_of(objects: MakersObjects) -> tuple[int, ...]:

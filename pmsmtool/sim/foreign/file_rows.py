@@ -34,8 +34,9 @@ MAPPINGS = frozenset((*range(0x1600, 0x1800), *range(0x1A00, 0x1C00)))
 CONSUMER_LIMIT = 0x7FFFFF
 """Largest entry of 0x1016: a node id above 16 bits of time (CiA 301); files with 65535 leave no room for the node."""
 
-NODE_ID = 1
-"""Of the drive that the file describes, where a value depends on it."""
+NODE_ID, LAST_NODE_ID = 1, 127
+"""Of the drive that the file describes, where a value depends on it; the largest one."""
+LARGEST_BINARY32 = 3.4e38
 
 MANDATORY: tuple[tuple[int, int, str, str, str], ...] = (
     (0x1000, 0, "U32", "const", "0x00020192"),
@@ -83,9 +84,7 @@ class MakersObjects:
     def stored(self, index: int, sub: int = 0) -> int:
         """Return the whole number that the file says an object holds; 0 where it says none."""
         row = self.rows.get((index, sub))
-        if row is None or not row.data_type.letter or row.data_type.is_float:
-            return 0
-        return int(row.default_number(1))
+        return 0 if row is None or not row.data_type.is_integer else int(row.default_number(NODE_ID))
 
     def has(self, *addresses: tuple[int, int]) -> bool:
         """Whether all the objects are there."""
@@ -203,13 +202,13 @@ def _value(text: str, kind: str) -> str:
         return "0" if code.is_float else ""  # blank: the file does not say
     try:
         if code.is_float:
-            return str(float(text))
+            return str(float(text)) if abs(float(text)) <= LARGEST_BINARY32 else "0"
         value = parse_integer(text, NODE_ID)
     except ValueError:
         return "0"
-    if "$NODEID" in text.upper():
-        return f"$NODEID+{value - 1:#x}"
     bits = 8 * code.size
+    if "$NODEID" in text.upper() and NODE_ID <= value and value + LAST_NODE_ID < 1 << bits - code.is_signed:
+        return f"$NODEID+{value - NODE_ID:#x}"
     value %= 1 << bits
     return str(value - (1 << bits) if kind.startswith("I") and value >> bits - 1 else value)
 
@@ -226,8 +225,13 @@ def _completed(
                 found[index, sub] = _row(index, sub, "mandatory", kind, access, value, None, None)
                 assumed.append(f"0x{index:04X}:{sub:02X} {why}")
 
+    for index, sub, kind, _, value in MANDATORY:
+        row = found.get((index, sub))
+        if row is not None and not row.data_type.is_integer:
+            found[index, sub] = replace(row, type=kind, default=value, low=None, high=None)
+            assumed.append(f"0x{index:04X}:{sub:02X} is {kind}, which the file's type is not")
     add(MANDATORY, "mandatory")
-    announced = int(found[0x6502, 0].default or "0", 0)
+    announced = int(found[0x6502, 0].default_number(NODE_ID))
     for mode, items in BY_MODE.items():
         if announced >> mode - 1 & 1:
             add(items, f"mandatory in mode {mode}")

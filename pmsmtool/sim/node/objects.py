@@ -54,17 +54,18 @@ class ObjectRow:
 
     def default_number(self, node: int) -> float:
         """Return the default as a number, ``$NODEID`` replaced."""
+        return float(self.default) if self.data_type.is_float else float(self._whole(node))
+
+    def _whole(self, node: int) -> int:
         text = self.default.removeprefix("$NODEID+")
-        number = float(text) if self.data_type.is_float else float(int(text or "0", 0))
-        return number + (node if text != self.default else 0)
+        return int(text or "0", 0) + (node if text != self.default else 0)
 
     def default_bytes(self, node: int) -> bytes:
         """Return the default as it travels, little endian."""
         kind = self.data_type
         if not kind.letter:
             return self.default.encode("ascii")
-        number = self.default_number(node)
-        return struct.pack("<" + kind.letter, number if kind.is_float else int(number))
+        return struct.pack("<" + kind.letter, float(self.default) if kind.is_float else self._whole(node))
 
 
 def _bound(text: str) -> float | None:

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""EDS files that nobody has seen: objects missing or changed, odd texts. No command ends in a traceback."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+import pytest
+
+from benchmarks.eds_nodes import entries_of, faults_of, mutated, text_of
+from pmsmtool.cli.main import run
+from pmsmtool.machine.profile import machine_path
+from pmsmtool.sim.foreign.file_rows import read_makers_objects
+from pmsmtool.sim.node.dictionary import Entry
+from tests.cli.conftest import Tool
+from tests.foreign.data_sheets import Row, copley, epos4, faulhaber, write_eds
+from tests.simulated_bus import settle
+
+SEEDS = 8
+
+
+@pytest.fixture
+def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Tool:
+    settle(tmp_path, monkeypatch)
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        code = run(arguments)
+        return code, *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    settle(tmp_path, monkeypatch)
+    makers = (epos4, copley, faulhaber)
+    return [str(write_eds(tmp_path / f"{rows.__name__}.eds", rows())) for rows in makers]
+
+
+@pytest.mark.chain
+def test_caps_names_what_is_missing_and_never_breaks(sources: list[str]) -> None:
+    for seed in range(SEEDS):
+        _, codes, wrong = faults_of(seed, sources, 0, None)
+        assert not wrong and codes, (seed, wrong)
+
+
+@pytest.mark.parametrize(
+    ("row", "value"),
+    [
+        ((0x6075, 0, "U8", "rw", "$NODEID+0x180"), 0x81),  # what a type cannot hold wraps
+        ((0x6075, 0, "U32", "rw", "$NODEID+0x180"), 0x181),
+        ((0x2000, 0, "U64", "rw", "0xFFFFFFFFFFFFFFFF"), 2**64 - 1),
+        ((0x2000, 0, "I8", "rw", "-1"), -1),
+        ((0x2000, 0, "U16", "rw", "abc"), 0),
+    ],
+)
+def test_a_stored_value_that_its_type_cannot_hold_is_cut(tmp_path: Path, row: Row, value: int) -> None:
+    objects = read_makers_objects(str(write_eds(tmp_path / "x.eds", [*epos4(), row])))
+    entry = Entry(objects.rows[row[0], row[1]], 1)
+    assert entry.integer() == value or int.from_bytes(entry.value, "little") == value
+
+
+def test_a_mandatory_object_that_is_no_number_is_the_standards(tmp_path: Path) -> None:
+    rows = [row for row in epos4() if row[0] != 0x6502] + [(0x6502, 0, "VSTR", "ro", "modes")]
+    objects = read_makers_objects(str(write_eds(tmp_path / "x.eds", rows)))
+    assert objects.rows[0x6502, 0].type == "U32" and objects.stored(0x6502) == 0
+    assert any(line.startswith("0x6502:00 is U32") for line in objects.assumed)
+
+
+def test_files_differ_and_follow_from_their_seed(sources: list[str]) -> None:
+    entries = entries_of(sources[0])
+    texts = [text_of(mutated(entries, random.Random(seed)), random.Random(seed)) for seed in (1, 1, 2)]
+    assert texts[0] == texts[1] != texts[2]
+
+
+@pytest.mark.chain
+def test_a_row_of_the_map_that_this_drive_lacks_is_no_wiring(tool: Tool) -> None:
+    """Copley's winding resistance is missing in some firmware; the shaft is checked without it."""
+    write_eds(Path("x.eds"), [row for row in copley() if row[:2] != (0x6410, 7)])
+    profile = str(machine_path("interior-2k2"))
+    code, out, _ = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes", "check", profile, "--json")
+    rows = {row["looked_at"]: row["verdict"] for row in json.loads(out)["findings"]}
+    assert code == 10 and rows["shaft"] == rows["encoder sign"] == "ok"
+
+
+def test_a_position_too_coarse_for_a_speed_moves_nothing(tool: Tool) -> None:
+    rows = [*(row for row in faulhaber() if row[0] != 0x608F), (0x608F, 1, "U32", "ro", "5")]
+    write_eds(Path("x.eds"), rows)
+    code, out, _ = tool("caps", "--eds", "x.eds", "--json")
+    ways = {(row["quantity"], row["method"]): row for row in json.loads(out)["quantities"]}
+    assert code == 0 and "position" in str(ways["mechanics", "standard"]["needs"])
