@@ -33,6 +33,11 @@ WIRED: dict[str, tuple[dict[str, object], str]] = {
     "shaft held": ({"rotor": "locked"}, "shaft"),
     "sensor gain": ({"sensor_gain_b": 1.25}, "current sensors"),
     "half the voltage": ({"U_dc_v": 0.5}, "supply"),
+    "leads touch": ({"drive_fault": "phases_shorted"}, "phases"),
+    "supply in limit": ({"drive_fault": "supply_limit"}, "supply"),
+    "torque safely off": ({"drive_fault": "safe_torque_off"}, "safe torque off"),
+    "encoder signal": ({"drive_fault": "encoder_signal"}, "encoder counts"),
+    "encoder stuck": ({"drive_fault": "encoder_stuck"}, "shaft"),
 }
 """What is done to the drive, and the row that it belongs to."""
 FILED = {

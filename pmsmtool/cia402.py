@@ -154,6 +154,8 @@ ERROR_TEXTS: dict[int, str] = {
 
 
 ERROR_CAUSES: dict[int, str] = {
+    0x2320: "two motor leads touch each other or earth, or the output stage is damaged",
+    0x7305: "the encoder's cable or supply; its index is missing; another encoder than is set",
     0x2350: "more current, or for longer, than the winding can carry",
     0x3210: "the shaft was braked and nothing takes its energy: no chopper, or a supply that cannot sink",
     0x3220: "the supply is in current limit, or weaker than the drive needs",

@@ -12,12 +12,22 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Drive
-from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded
+from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, SdoAbort
 from pmsmtool.estimators.noise import estimate_noise
 from pmsmtool.estimators.phase_check import check_phases
 from pmsmtool.experiments import standstill
 from pmsmtool.experiments.first_turn import lead_half_a_turn
-from pmsmtool.identification.wiring import NOT_SEEN, OK, WRONG, Finding, judge_sensors, judge_supply, judge_turn
+from pmsmtool.identification.wiring import (
+    NOT_SEEN,
+    OK,
+    TURNED_BY,
+    WRONG,
+    Finding,
+    judge_fault,
+    judge_sensors,
+    judge_supply,
+    judge_turn,
+)
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import COMPENSATION, starting_gains
@@ -41,9 +51,9 @@ ABOUT = {"E_CURRENT_SENSOR": "current sensors", "E_SNR": "current sensors"}
 """What a refusal of the phase check is about, where that is not the phases."""
 ALL = ("supply", "phases", "current sensors", "shaft", "pole pairs", "encoder sign")
 ORDER = (
-    "supply", "limit switches", "current sensors", "phases", "shaft", "encoder counts", "pole pairs", "encoder sign",
+    "safe torque off", "supply", "limit switches", "current sensors", "phases", "shaft", "encoder counts", "pole pairs",
+    "encoder sign",
 )  # fmt: skip
-TURNED_BY = "a load that turns the shaft; wrong counts per turn or pole pairs"
 DIGITAL_INPUTS = DriveObject(0x60FD, 0, "I")
 INPUTS = {0: "negative limit switch", 1: "positive limit switch", 3: "interlock"}
 """Bits of 0x60FD (CiA 402-2, digital inputs)."""
@@ -93,9 +103,19 @@ def check_wiring(
     try:
         with guarded(drive, envelope, first=starting_gains(limits), say=say) as guard:
             _look(guard, stated, envelope.i_max_apk / HEADROOM, rest_v, against, found, say)
-    except (DriveFault, LimitExceeded) as error:  # the guard has stopped the machine
+    except SdoAbort:
+        raise  # a refused object is no wiring
+    except DriveFault as error:  # the guard has stopped the machine
+        found = with_fault(found, error)
+    except LimitExceeded as error:
         found.append(Finding("shaft", WRONG, error.what, error.likely or TURNED_BY))
     return _ordered(found)
+
+
+def with_fault(rows: list[Finding], error: DriveFault) -> list[Finding]:
+    """Return the rows with that of the fault in place of what was seen of it before."""
+    row = judge_fault(error.what, error.likely)
+    return [*(each for each in rows if each.looked_at != row.looked_at), row]
 
 
 def _ordered(found: list[Finding]) -> list[Finding]:

@@ -8,7 +8,6 @@ commutates by itself is pushed by torque. Currents of single phases, and so the 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -20,23 +19,24 @@ from pmsmtool.commissioning.first_check import (
     SPEED_RAD_S,
     SPEED_SHARE,
     TRAVEL_RAD,
-    TURNED_BY,
     look_at_inputs,
+    with_fault,
 )
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive.tier_drives import TorqueDrive, pushing_drive
-from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, NotAvailable
+from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, NotAvailable, SdoAbort
 from pmsmtool.experiments.first_push import push_forth_and_back
 from pmsmtool.experiments.first_turn import lead_half_a_turn
-from pmsmtool.experiments.vector_turn import lead_onto_vector
+from pmsmtool.experiments.vector_turn import TURN_RAD, lead_onto_vector
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.identification.wiring import (
     COUNT_FACTORS,
     NOT_CHECKED,
     OK,
+    TURNED_BY,
     WRONG,
     Finding,
     judge_current,
@@ -57,9 +57,6 @@ UNSEEN = {
     "pole pairs": "the drive cannot turn a current vector: it has no commutation angle (0x60EA)",
     "encoder sign": "what is wrong comes first",
 }
-FAULT_BY = "safe torque off or the enable input open, no DC link; a limit switch; then " + TURNED_BY
-VOLTAGE_FAULT = re.compile(r"fault 0x3[0-9a-fA-F]{3}\b")
-"""Error codes of the class voltage (CiA 301, 7.2.8)."""
 RUNS_OFF_BY = "an open or shorted phase, or gains of the current loop that do not fit the motor"
 POLE_PAIRS = "motor.pole_pairs"
 
@@ -124,20 +121,25 @@ def check_below_full(
                 if turns:
                     say("shaft: half a turn forward and back by a turned vector")
                     pole_pairs = round(stated.machine.pole_pairs)
-                    lead_onto_vector(guard, i_a, 0.0)
+                    # a rotor half a turn off it may still stand there by friction: the turn to 0 takes it along
+                    lead_onto_vector(guard, i_a, TURN_RAD)
                     link = () if rest_v is None else ("U_dc_v",)
-                    turn = lead_half_a_turn(guard, i_a, pole_pairs, 0.0, signals=("theta_m_rad", "i_q_a", *link))
+                    turn = lead_half_a_turn(guard, i_a, pole_pairs, TURN_RAD, signals=("theta_m_rad", "i_q_a", *link))
                     judged = [*judge_current(turn, i_a), *judge_turn(turn, pole_pairs, counts_against=False)]
                 else:
                     say(f"shaft: torque pulses up to {i_a:.3g} A, forth and back")
-                    judged = judge_push(push_forth_and_back(guard, i_a, 0.5 * envelope.speed_max_rad_s))
+                    speed_rad_s = 0.5 * envelope.speed_max_rad_s
+                    turn = push_forth_and_back(guard, i_a, speed_rad_s, link=rest_v is not None)
+                    judged = judge_push(turn)
+                if rest_v is not None:
+                    judged.append(judge_supply(rest_v, turn, stated.inverter.U_dc_v))
             rows = [row for row in rows if row.looked_at not in {each.looked_at for each in judged}] + judged
         except IdentificationError as error:
             rows.append(Finding("shaft", WRONG, error.what, error.likely + "; an open phase; the encoder's sign"))
+        except SdoAbort:
+            raise  # a refused object is no wiring
         except DriveFault as error:  # the guard has stopped the machine
-            about = "supply" if VOLTAGE_FAULT.search(error.what) else "shaft"
-            rows = [row for row in rows if row.looked_at != about]
-            rows.append(Finding(about, WRONG, error.what, error.likely or FAULT_BY))
+            rows = with_fault(rows, error)
         except LimitExceeded as error:
             about, likely = ("phases", RUNS_OFF_BY) if error.what.startswith("current ") else ("shaft", TURNED_BY)
             rows.append(Finding(about, WRONG, error.what, likely))

@@ -26,7 +26,7 @@ LEAST_NET = 0.3
 """Of the current, what accelerates at least: friction is known roughly."""
 
 
-def push_forth_and_back(drive: Drive, i_a: float, speed_rad_s: float) -> Trace:
+def push_forth_and_back(drive: Drive, i_a: float, speed_rad_s: float, *, link: bool = False) -> Trace:
     """Push with a torque current one way, brake it, and the other way; one row per push.
 
     Parameters
@@ -37,11 +37,13 @@ def push_forth_and_back(drive: Drive, i_a: float, speed_rad_s: float) -> Trace:
         Current (A peak).
     speed_rad_s : float
         Mechanical speed that a push is to stay below.
+    link : bool
+        Whether the drive shows its DC link.
 
     Returns
     -------
     Trace
-        ``i_command_a``, ``i_q_a`` at the end of the push (A peak), ``way_rad`` until then.
+        ``i_command_a``, ``i_q_a`` at the end of the push (A peak), ``way_rad`` until then, ``U_dc_v`` where shown.
 
     Raises
     ------
@@ -53,7 +55,7 @@ def push_forth_and_back(drive: Drive, i_a: float, speed_rad_s: float) -> Trace:
     except IdentificationError as error:
         if error.reason != "E_EXCITATION":
             raise
-        return _held(drive, i_a, error)
+        return _held(drive, i_a, error, link)
     fastest = min(FASTEST_RAD_S, speed_rad_s)
     most = answer.friction_a + fastest / (SHORTEST_S * answer.per_ampere)
     i_a = min(i_a, most)
@@ -64,13 +66,17 @@ def push_forth_and_back(drive: Drive, i_a: float, speed_rad_s: float) -> Trace:
         before = drive.live("theta_m_rad")
         drive.command_current(0.0, current)
         drive.wait(seconds)
-        shown, way = drive.live("i_q_a"), drive.live("theta_m_rad") - before
+        row = {"i_command_a": current, **_shown(drive, link), "way_rad": drive.live("theta_m_rad") - before}
         drive.command_current(0.0, -current)
         drive.wait(seconds)
         drive.command_current(0.0, 0.0)
         drive.wait(2.0 * seconds)
-        rows.append({"i_command_a": current, "i_q_a": shown, "way_rad": way})
+        rows.append(row)
     return table(rows, [4.0 * seconds * k for k in range(len(rows))])
+
+
+def _shown(drive: Drive, link: bool) -> dict[str, float]:
+    return {name: drive.live(name) for name in ("i_q_a", *(("U_dc_v",) if link else ()))}
 
 
 def _answered(way_rad: float, seconds: float) -> bool:
@@ -83,13 +89,13 @@ def _answered(way_rad: float, seconds: float) -> bool:
     return way_rad > ANSWER_RAD
 
 
-def _held(drive: Drive, i_a: float, error: IdentificationError) -> Trace:
+def _held(drive: Drive, i_a: float, error: IdentificationError, link: bool) -> Trace:
     """Return what is shown of the current where the shaft stands still, or raise: it flows, so the shaft is held."""
     rows = []
     for current in (i_a, -i_a):
         drive.command_current(0.0, current)
         drive.wait(HELD_S)
-        rows.append({"i_command_a": current, "i_q_a": drive.live("i_q_a"), "way_rad": 0.0})
+        rows.append({"i_command_a": current, **_shown(drive, link), "way_rad": 0.0})
     drive.command_current(0.0, 0.0)
     if all(row["i_q_a"] / row["i_command_a"] > CURRENT_FLOWS for row in rows):
         raise error

@@ -42,6 +42,10 @@ from pmsmtool.sim.simulated_machine import (
 STOP, ARM, START = 0, 1, 2
 """Commands of excitation, recorder (START: force) and averages (ARM: start) in ``drive.h``."""
 
+TRIPS = {"phases_shorted": 0x2320, "encoder_signal": 0x7305}
+"""Error codes of wiring that fails with the first current (CiA 402-2, 0x603F)."""
+LIMITED = 0.6
+"""DC link of a supply in current limit, of its voltage without a current."""
 IDEAL_ENCODER_COUNTS = 1 << 24
 """Counts per turn that a drive with an ideal encoder (``encoder_bits = 0``) claims."""
 
@@ -71,6 +75,9 @@ class KernelCore:
         self._records_compensation = records_compensation(machine_file)
         self._image = image_of(machine_file, default_set())
         self._averaged: Sequence[Signal] = ()
+        self._fault = settings.text("drive_fault")
+        self.torque_safely_off = self._fault == "safe_torque_off"
+        self._link_v = settings.number("U_dc_v")
         self.simulation = Simulation(setup, self._image, keep)
         self.simulation.library.pmsm_sim_watch(self.simulation.sim, 1)
         self._parameters_changed()
@@ -118,6 +125,15 @@ class KernelCore:
         self.simulation.fixed_angle.value = command.fixed_angle_rad
         self.simulation.word(Part.QUICK_STOP).value = int(command.quick_stop)
         self.simulation.word(Part.ENABLED).value = int(command.mode != ControlMode.OFF)
+        self._fail(command)
+
+    def _fail(self, command: Command) -> None:
+        """Let the wiring fail with the first current, and the link fall while one is asked for."""
+        asked = bool(command.i_d_a or command.i_q_a or command.torque_nm or command.omega_m_rad_s)
+        if asked and self._fault in TRIPS:
+            self.simulation.word(Part.TRIP).value = TRIPS[self._fault]
+        if self._fault == "supply_limit":
+            self.simulation.library.pmsm_sim_set_U_dc(self.simulation.sim, (LIMITED if asked else 1.0) * self._link_v)
 
     # ---- time --------------------------------------------------------------------------------------------
 

@@ -32,6 +32,10 @@ DRIVE_FAULTS = {
     "not_connected": "no phase is connected to the machine",
     "unbalanced": "a bad joint: phase a has half of R_s more",
     "encoder_stuck": "the encoder keeps its first reading",
+    "encoder_signal": "the encoder's signals are not there: fault 0x7305 with the first current",
+    "phases_shorted": "two leads of the motor touch each other: fault 0x2320 with the first current",
+    "safe_torque_off": "safe torque off is open: the drive does not leave SWITCH ON DISABLED",
+    "supply_limit": "the supply is in current limit: the link falls to 60 % with the first current",
 }
 """Values of ``drive_fault`` and what they mean."""
 UNBALANCE_SHARE = 0.5

@@ -40,6 +40,9 @@ def checked(tool: Tool, extra: str) -> tuple[int, dict[str, tuple[str, str]], st
         ("U_dc_v = 300.0", "supply"),
         ("encoder_bits = 15", "encoder counts"),
         ("load_nm = 4.0", "shaft"),
+        ('drive_fault = "phases_shorted"', "phases"),
+        ('drive_fault = "safe_torque_off"', "safe torque off"),
+        ('drive_fault = "supply_limit"', "supply"),
     ],
 )
 def test_the_first_wrong_row_is_what_was_done(extra: str, wrong: str, tool: Tool) -> None:
@@ -47,7 +50,7 @@ def test_the_first_wrong_row_is_what_was_done(extra: str, wrong: str, tool: Tool
     assert [name for name, (verdict, _) in rows.items() if verdict == "WRONG"][:1] == ([wrong] if wrong else []), rows
     assert code == (1 if wrong else 0)
     assert "duration  at most 15 s" in told and "travel    450 deg" in told
-    assert ("voltage off, drive restored" in told) == (wrong != "supply")
+    assert ("voltage off, drive restored" in told) == (extra != "U_dc_v = 300.0")
 
 
 def test_nothing_moves_without_consent(tool: Tool) -> None:

@@ -38,6 +38,7 @@ class SimpleCore:
     """Implements the DriveCore protocol in plain Python."""
 
     encoder_counts = 4096
+    torque_safely_off = False
 
     def __init__(self) -> None:
         self.image = b""

@@ -122,7 +122,15 @@ class Averages:
 
 
 class DriveCore(Protocol):
-    """The drive's application at control-period rate, with the machine behind it."""
+    """The drive's application at control-period rate, with the machine behind it.
+
+    Attributes
+    ----------
+    torque_safely_off : bool
+        Whether the input for safe torque off is open.
+    """
+
+    torque_safely_off: bool
 
     @property
     def period_ns(self) -> int:

@@ -206,6 +206,8 @@ class PowerDrive:
 
     def _command(self, word: int) -> None:
         state = self.state
+        if self._plant.core.torque_safely_off:
+            return  # it stays in SWITCH ON DISABLED
         if not word & Control.ENABLE_VOLTAGE:
             if state is not State.SWITCH_ON_DISABLED:
                 self._to(State.SWITCH_ON_DISABLED)
