@@ -19,6 +19,11 @@ def plain(text: str) -> str:
     return "".join(c if c.isprintable() or c in _KEPT else _shown(c) for c in text)
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun: ``1 object``, ``2 objects``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def one_line(text: str, longest: int | None = None) -> str:
     """Return a text as :func:`plain` does, on one line, and cut to ``longest`` letters."""
     if longest is not None and len(text) > longest:

@@ -79,7 +79,7 @@ def write_trace(trace: Trace, path: Path) -> None:
 
 
 @next_step(NEXT_STEP)
-def read_trace(path: Path) -> Trace:
+def read_trace(path: str | Path) -> Trace:
     """Read a trace by suffix.
 
     Raises
@@ -87,6 +87,7 @@ def read_trace(path: Path) -> Trace:
     ConfigError
         Missing, truncated, not numeric, without time base or units, or time does not increase.
     """
+    path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".npz":
         return _from_arrays(read_npz(path), str(path))

@@ -30,8 +30,8 @@ TRACE_HINT = "name a file in a folder that can be written and has room"
 SEND_PATIENCE_S = 0.5
 """A full transmit queue is waited for this long; a bus where nobody acknowledges stays full."""
 
-_POLL_S = 0.2
-"""The reader thread looks this often whether it shall end."""
+_POLL_S = 0.05
+"""The reader thread looks this often whether it shall end: half of it is what closing a bus waits."""
 _SEND_PAUSE_S = 0.001
 _RESOLUTION_S = 1e-9  # of the virtual clock; less than that never passes
 _SPIN_LIMIT = 200
@@ -301,7 +301,7 @@ class Connection:
                 f"`pmsmtool info -n {node}`, or reset the node",
             )
         if others:
-            return f"only node(s) {', '.join(map(str, others))} were heard: wrong node id?", "`pmsmtool scan`"
+            return f"only others were heard, node {', '.join(map(str, others))}: wrong node id?", "`pmsmtool scan`"
         if self.error_frames:
             return "only error frames were heard: wrong bit rate, or a bus without termination", "`pmsmtool doctor`"
         return (

@@ -19,7 +19,7 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.frame_time import frame_bits
 from pmsmtool.bus.scan import FoundNode, find_nodes
 from pmsmtool.bus.sdo import SdoChannel
-from pmsmtool.errors import BusError, PmsmtoolError, SdoAbort
+from pmsmtool.errors import BusError, DriveTimeout, PmsmtoolError, SdoAbort
 
 BITRATES = (1_000_000, 800_000, 500_000, 250_000, 125_000, 100_000, 50_000, 20_000, 10_000)
 """Rates of CiA 301, section 5.3, and 100 kbit/s."""
@@ -123,8 +123,8 @@ def examine(connection: Connection, bitrate: int | None, *, listen_s: float = LI
     try:
         nodes = tuple(find_nodes(connection))
         answering = [entry.node for entry in nodes if entry.device_type is not None]
-        timed = [_timing(node, *_round_trip(connection, node)) for node in answering[:NODES_TIMED]]
-        findings += [_answered(connection, nodes, answering), *timed]
+        findings.append(_answered(connection, nodes, answering))
+        findings += [_timing(connection, node) for node in answering[:NODES_TIMED]]
     except BusError as error:
         findings.append(("FAIL", f"{error.what}; likely: {error.likely}"))
     state = _state(connection.bus)
@@ -182,29 +182,40 @@ def _heard(frames: int, error_frames: int, load: float | None) -> tuple[str, str
 
 def _answered(connection: Connection, nodes: Sequence[FoundNode], answering: Sequence[int]) -> tuple[str, str]:
     if answering:
-        return "PASS", f"node(s) {', '.join(map(str, answering))} answer"
+        return "PASS", f"answers from: node {', '.join(map(str, answering))}"
     if nodes:
-        return "FAIL", f"node(s) {', '.join(str(n.node) for n in nodes)} are heard but answer no SDO: stopped by NMT?"
+        return "FAIL", f"heard, but no answer to an SDO: node {', '.join(str(n.node) for n in nodes)}: stopped by NMT?"
     return "FAIL", f"no node answers; likely: {connection.explain_silence(0)[0]}"
 
 
-def _timing(node: int, median_s: float, slow_s: float) -> tuple[str, str]:
-    text = f"node {node}: round trip {1e3 * median_s:.3g} ms median, {1e3 * slow_s:.3g} ms at 95 %"
-    return ("WARN" if slow_s > 0.05 else "PASS"), text
-
-
-def _round_trip(connection: Connection, node: int) -> tuple[float, float]:
+def _timing(connection: Connection, node: int) -> tuple[str, str]:
+    """Return how fast a node answers; FAIL where it leaves requests unanswered, each of them sent once."""
     channel = SdoChannel(connection, node)
     times = []
+    lost = 0
     try:
         for _ in range(ROUND_TRIPS):
             started = connection.clock.now()
-            with contextlib.suppress(SdoAbort):
-                channel.read(0x1000, 0)
+            try:
+                channel.upload(0x1000, 0, tries=1)
+            except SdoAbort:
+                pass
+            except DriveTimeout:
+                lost += 1
+                if lost >= ROUND_TRIPS // 5:
+                    break
+                continue
             times.append(connection.clock.now() - started)
     finally:
         channel.close()
-    return statistics.median(times), sorted(times)[int(0.95 * len(times))]
+    if lost:
+        return "FAIL", (
+            f"node {node}: {lost} of {lost + len(times)} requests without an answer: frames get lost; {TERMINATION}; "
+            "a loose plug; an overloaded gateway"
+        )
+    median_s, slow_s = statistics.median(times), sorted(times)[int(0.95 * len(times))]
+    text = f"node {node}: round trip {1e3 * median_s:.3g} ms median, {1e3 * slow_s:.3g} ms at 95 %"
+    return ("WARN" if slow_s > 0.05 else "PASS"), text
 
 
 def _state(bus: Any) -> str:

@@ -254,7 +254,7 @@ class SdoChannel:
                 return frame
             now = self.connection.clock.now()
             if frame is None or now > deadline:  # whoever floods the channel does not prolong the wait
-                raise TransferLost(f"no answer to {what} within {attempt.timeout_s:g} s")
+                raise TransferLost(f"no answer to {what} within {attempt.timeout_s:.2g} s")
             attempt.discarded += 1
 
     def raise_if_abort_of(self, attempt: Attempt, frame: bytes) -> None:
@@ -410,7 +410,7 @@ class SdoChannel:
         for left in reversed(range(TRIES)):
             self.send(barrier.head(0x40) + b"\0\0\0\0")
             try:
-                self.await_answer(barrier, lambda f: f[0] & 0xE0 == 0x40 and barrier.owns(f), "the barrier read")
+                self.await_answer(barrier, lambda f: f[0] & 0xE0 == 0x40 and barrier.owns(f), "the next read")
                 break
             except SdoAbort:
                 break  # also an answer, to this very request
@@ -492,7 +492,9 @@ class SdoChannel:
     def _failure(self, attempt: Attempt, lost: TransferLost, tries: int) -> PmsmtoolError:
         self.retries += tries - 1
         where = self._where(attempt)
-        what = lost.what if tries == 1 else f"{lost.what} ({tries} tries: {'; '.join(attempt.notes)})"
+        alike = all(note == f"try {k}: {lost.what}" for k, note in enumerate(attempt.notes, 1))
+        told = f"{tries} tries" if alike else f"{tries} tries: {'; '.join(attempt.notes)}"
+        what = lost.what if tries == 1 else f"{lost.what} ({told})"
         if lost.code == AbortCode.TIMED_OUT:
             likely, hint = self.connection.explain_silence(self.node)
             return DriveTimeout(what, where=where, likely=likely, hint=hint)

@@ -89,7 +89,7 @@ def _conclude(out: Output, found: list[Finding]) -> None:
         )
     unseen = [finding.looked_at for finding in found if finding.verdict in (NOT_SEEN, NOT_CHECKED)]
     if any(name in unseen for name in ("phases", "shaft", "pole pairs")):
-        raise Partial(f"not judged: {', '.join(unseen)}", hint="correct what the table names, and check again")
+        raise Partial(f"not judged: {', '.join(unseen)}", hint="this drive does not show them; look at them yourself")
 
 
 def _below_full(bus: BusOptions, map_file: Path | None) -> Capabilities | None:

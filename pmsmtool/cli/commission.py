@@ -22,7 +22,6 @@ from pmsmtool.cli.progress import StageProgress
 if TYPE_CHECKING:
     from pmsmtool.drive.canopen_drive import CanopenDrive
     from pmsmtool.drive_maps.drive_map import DriveMap
-    from pmsmtool.errors import Partial
     from pmsmtool.measurement.capabilities import Capabilities
     from pmsmtool.report.verdict import Verdict
     from pmsmtool.run_directory import RunDirectory
@@ -291,19 +290,16 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
         raise
     write_report(run)
     found = _show(run, out, begun)
-    if found.kind == "partial":
-        raise _partial(found, run)
+    from pmsmtool.errors import ExitCode
+
+    if found.kind == "partial":  # the verdict is the last line: nothing is said after it
+        raise click.exceptions.Exit(int(ExitCode.PARTIAL))
 
 
-def _partial(found: Verdict, run: RunDirectory) -> Partial:
-    """Return the error of a run that is good as far as it went."""
-    from pmsmtool.errors import Partial
-
-    return Partial(
-        f"{found.lines[0].split(',')[0]}; the reasons are printed above",
-        where=str(run.path),
-        hint="`pmsmtool caps` lists what this drive can measure; --require STAGE makes a missing stage exit 1",
-    )
+_TO_GO_ON = {
+    "partial": ("try: `pmsmtool caps` lists what this drive can measure; --require STAGE makes a missing stage exit 1",)
+}
+"""Next step by the kind of verdict."""
 
 
 def _next_step(run: RunDirectory, error: BaseException) -> str:
@@ -341,9 +337,10 @@ def _show(run: RunDirectory, out: Output, begun: float, *, ended: bool = False) 
         "values": [] if identified is None else list(identified.values),
         "comparison": [] if identified is None else list(identified.comparison),
     }
-    lines = [found.headline, *(f"  - {line}" for line in found.details), f"report: {run.path / 'report.html'}"]
+    report = f"report: {run.path / 'report.html'}"
+    lines = [*(f"  - {line}" for line in found.details), *_TO_GO_ON.get(found.kind, ()), report, found.headline]
     if ended and not out.json:
-        for line in (found.headline, lines[-1]):
+        for line in (report, found.headline.splitlines()[0]):
             out.note(line)
     else:
         out.result("commission", data, lines)

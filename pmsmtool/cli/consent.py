@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """The two consents: the motion envelope before anything moves, the list of differences before anything is written.
 
-Each is asked on its own. ``--yes`` answers them on a simulated bus; on a real one only together with ``--i-max``,
-``--speed-max``, ``--shaft`` and the serial number of the very drive that answered, so that a line from a script's
-history cannot move another machine; a drive that shows none is not moved or written by it at all. Where nobody can be
-asked, nothing is done (exit code 7).
+Each is asked on its own. ``--yes`` answers them on a simulated bus; on a real one only together with the serial number
+of the very drive that answered, so that a line from a script's history cannot move another machine, and for a motion
+with ``--i-max``, ``--speed-max`` and ``--shaft``; a drive that shows no serial number is not moved or written by it at
+all. Where nobody can be asked, nothing is done (exit code 7).
 """
 
 from __future__ import annotations
@@ -48,14 +48,10 @@ def person_present() -> bool:
     return sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()
 
 
-def missing_for_yes(options: MotionOptions) -> list[str]:
-    """Return the options ``--yes`` still needs on a real bus."""
-    needed = {
-        "--i-max": options.i_max_apk,
-        "--speed-max": options.speed_max_rad_s,
-        "--shaft": options.shaft,
-        "--serial": options.serial,
-    }
+def missing_for_yes(options: MotionOptions, subject: Subject = "motion") -> list[str]:
+    """Return the options ``--yes`` still needs on a real bus; what only writes needs no limits of a motion."""
+    limits = {"--i-max": options.i_max_apk, "--speed-max": options.speed_max_rad_s, "--shaft": options.shaft}
+    needed = {**(limits if subject == "motion" else {}), "--serial": options.serial}
     return [name for name, value in needed.items() if value is None]
 
 
@@ -126,17 +122,17 @@ def _ask(
             likely="another drive answers on this node",
             hint="check channel and node; `pmsmtool info` shows the drive",
         )
-    missing = missing_for_yes(options)
+    missing = missing_for_yes(options, subject)
     if not serial:
         missing.append("a drive that shows its serial number")
     if options.yes and (simulated or not missing):
         return Consent(subject, "--yes", text)
     if options.yes:
-        out.warn(f"--yes alone moves and writes only a simulated drive; missing here: {', '.join(missing)}")
+        out.warn(f"--yes alone answers only for a simulated drive; missing here: {', '.join(missing)}")
     if not person_present():
         raise Declined(
             f"no terminal to ask for consent to {_NAMES[subject]}: nothing was done",
-            likely="standard input or standard error is not a terminal: give --yes with limits, or run interactively",
+            likely="standard input or standard error is not a terminal",
             hint="--yes" if simulated or not missing else _lacking(missing, serial),
         )
     try:
@@ -154,7 +150,7 @@ def _ask(
 def _lacking(missing: list[str], serial: int) -> str:
     if not serial:
         return "run it in a terminal: this drive shows no serial number; without one --yes is not possible"
-    return f"--yes {' '.join(f'{name} ...' for name in missing)}"
+    return f"run it in a terminal, or give --yes {' '.join(f'{name} ...' for name in missing)}"
 
 
 _NAMES: dict[Subject, str] = {"motion": "move the machine", "writing": "write to the drive"}

@@ -16,6 +16,7 @@ from pmsmtool.cli.options import FILE, SIMULATED_INTERFACE, BusOptions
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import BusError, ConfigError
 from pmsmtool.files import read_text
+from pmsmtool.plain_text import counted
 
 if TYPE_CHECKING:
     from pmsmtool.bus.connection import Connection
@@ -220,7 +221,8 @@ def _restore_gains(connection: Connection, node_id: int) -> None:
     finally:
         node.close()
     if count:
-        click.echo(f"node {node_id}: {count} gain(s) restored that an interrupted `map learn` left changed", err=True)
+        gains = counted(count, "gain")
+        click.echo(f"node {node_id}: {gains} restored that an interrupted `map learn` left changed", err=True)
 
 
 def choose_node(connection: Connection, node: int | None) -> int:

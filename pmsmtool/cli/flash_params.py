@@ -9,7 +9,7 @@ import click
 
 from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map
 from pmsmtool.cli.fleet import NodeList, flash_fleet
-from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, output_options, write_options
+from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output
 
 
@@ -20,12 +20,17 @@ from pmsmtool.cli.output import Output
         "pmsmtool -n 5 flash-params design.toml --dry-run",
         "pmsmtool -n 5 flash-params params.toml --check     # exit code 1 when the drive differs",
         "pmsmtool -i socketcan -c can0 flash-params params.toml --nodes 1-6",
+        "pmsmtool -i socketcan -c can0 flash-params RUN_DIR --nodes 2-6 --yes --serials serials.txt",
     ),
 )
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--dry-run", is_flag=True, help="Show what would change and stop.")
 @click.option("--check", is_flag=True, help="As --dry-run; exit code 1 when something would change.")
 @click.option("--nodes", type=NodeList(), metavar="LIST", help="Several drives of the bus, e.g. 1-3,7.")
+@click.option("--serials", type=FILE, help="With --nodes and --yes, without a prompt: a file with a line NODE "
+              "SERIAL per drive.")  # fmt: skip
+@click.option("--canary", type=click.Path(file_okay=False, path_type=Path), metavar="RUN_DIR", help="Run of a drive "
+              "of this kind that passed `prove` with this set; needed by --serials.  [default: SOURCE]")  # fmt: skip
 @click.option("--no-store", is_flag=True, help="Let it act until the next reset only.")
 @map_option
 @bus_options
@@ -40,6 +45,8 @@ def flash_params_command(
     check: bool,
     no_store: bool,
     nodes: tuple[int, ...] | None,
+    serials: Path | None,
+    canary: Path | None,
     map_file: Path | None,
 ) -> None:
     """Write a parameter set, a design, a DCF or a run's parameters to the drive and store it.
@@ -54,9 +61,12 @@ def flash_params_command(
 
     drive_map = read_map(map_file)
     wanted = load_parameters(source, drive_map)
+    if nodes is None and (serials or canary):
+        raise click.UsageError("--serials and --canary go with --nodes")
     if nodes is not None:
         flash_fleet(
-            nodes, wanted, drive_map, bus, motion, out, store=not no_store, dry_run=dry_run, check=check
+            nodes, wanted, drive_map, bus, motion, out, store=not no_store, dry_run=dry_run, check=check,
+            serials=serials, canary=canary or (source if source.is_dir() else None),
         )  # fmt: skip
         return
     with set_named() as jobs, open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pmsmtool.cli.options import BusOptions, MotionOptions
 from pmsmtool.cli.output import Output
+from pmsmtool.plain_text import counted
 
 if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
@@ -45,7 +46,7 @@ def carry_out(
             out.result(command, {"identity": identity, **plan_facts(plan)}, plan.lines())
             if check and plan.changes:
                 raise CheckFailed(
-                    f"{len(plan.changes)} object(s) differ",
+                    f"the drive differs in {counted(len(plan.changes), 'object')}",
                     where=f"node {node.node}",
                     hint="run without --check to write them",
                 )
@@ -108,7 +109,7 @@ def told(outcome: Outcome, node: DriveNode) -> str:
     """Return the outcome of a download in one line."""
     kept = "stored" if outcome.stored else "active until the next reset"
     crc = "" if outcome.crc is None else f", CRC-32 {outcome.crc:#010x}"
-    retries = f", {outcome.retries} transfer(s) repeated" if outcome.retries else ""
+    retries = f", {counted(outcome.retries, 'transfer')} repeated" if outcome.retries else ""
     return f"node {node.node}  {outcome.written} written, {outcome.equal} held already, {kept}{crc}{retries}"
 
 

@@ -13,6 +13,8 @@ from pmsmtool.cli.options import NODE, BusOptions, MotionOptions
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.flash.download import Download, Outcome
     from pmsmtool.params.parameter_set import ParameterSet
@@ -49,8 +51,14 @@ def flash_fleet(
     store: bool,
     dry_run: bool,
     check: bool,
+    serials: Path | None = None,
+    canary: Path | None = None,
 ) -> None:
-    """Plan for every node, ask once, write one after the other; a failure on one does not spare the others."""
+    """Plan for every node, ask once, write one after the other.
+
+    With a person at the terminal a failure on one does not spare the others. With ``serials`` nobody is asked: the
+    checks of ``flash.unattended`` take the place of the person, and the first failure ends it.
+    """
     from pmsmtool.cli.flash_session import checked_identity, plan_facts
     from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
@@ -60,6 +68,7 @@ def flash_fleet(
     from pmsmtool.flash.restore import marks_of, plan_download
 
     _refuse_serial(motion)
+    alone = _Unattended(serials, canary, wanted, drive_map) if serials is not None else None
     with set_named() as jobs, contextlib.ExitStack() as notes, bus.connect() as connection:
         for node_id in nodes:
             claim(connection, node_id)
@@ -72,9 +81,7 @@ def flash_fleet(
             marks = marks_of(plan.content, datetime.datetime.now())
             jobs.append(Download(node, identity, plan, marks, folder, say=_prefixed(out, node_id)))
         plans = {str(job.node.node): plan_facts(job.plan) for job in jobs}
-        lines = [
-            line for job in jobs for line in (f"node {job.node.node}, serial {job.identity.serial}:", *job.plan.lines())
-        ]
+        lines = _grouped(jobs)
         if dry_run or check:
             out.result("flash-params", {"nodes": plans}, lines)
             different = sum(bool(job.plan.changes) for job in jobs)
@@ -87,9 +94,11 @@ def flash_fleet(
         for job in jobs:
             job.admit()
         due = [job for job in jobs if job.has_work(store=store)]
-        if due:
+        if alone is not None:
+            alone.check(jobs, due, motion, out, lines)
+        elif due:
             _ask(lines, due, bus, motion, out, store=store)
-        results = [_run(job, store=store) for job in jobs]
+        results = _results(jobs, store=store, to_the_end=alone is None)
     rows = [_row(job, result) for job, result in zip(jobs, results, strict=True)]
     heads = ("node", "serial", "result", "written", "held already", "CRC-32", "repeated")
     facts = [dict(zip(heads, row, strict=True)) for row in rows]
@@ -97,6 +106,63 @@ def flash_fleet(
     failures = [result for result in results if isinstance(result, PmsmtoolError)]
     if failures:
         raise failures[0]
+
+
+def _grouped(jobs: list[Download]) -> list[str]:
+    """Return the lists of differences; drives with the same list share it."""
+    lists: dict[tuple[str, ...], list[Download]] = {}
+    for job in jobs:
+        lists.setdefault(tuple(job.plan.lines()), []).append(job)
+    return [
+        line
+        for text, of in lists.items()
+        for line in (", ".join(f"node {job.node.node} (serial {job.identity.serial})" for job in of) + ":", *text)
+    ]
+
+
+def _results(jobs: list[Download], *, store: bool, to_the_end: bool) -> list[Outcome | Exception | None]:
+    """Run the downloads; None for one that was not begun after a failure."""
+    results: list[Outcome | Exception | None] = []
+    for job in jobs:
+        stopped = not to_the_end and any(isinstance(result, Exception) for result in results)
+        results.append(None if stopped else _run(job, store=store))
+    return results
+
+
+class _Unattended:
+    """What stands in for the person: the list of serial numbers, and a canary on which the set was proven."""
+
+    def __init__(self, serials: Path, canary: Path | None, wanted: ParameterSet, drive_map: DriveMap) -> None:
+        from pmsmtool.commissioning.parameter_source import load_parameters
+        from pmsmtool.errors import ConfigError
+        from pmsmtool.flash.unattended import check_canary, read_serials
+        from pmsmtool.run_directory import RunDirectory
+
+        if canary is None:
+            raise ConfigError(
+                "--serials needs the run of a drive on which this set was proven",
+                hint="name a run directory as SOURCE, or give --canary RUN_DIR",
+            )
+        self._serials = read_serials(serials)
+        self._record = RunDirectory(canary).read()
+        proven = load_parameters(canary, drive_map)
+        check_canary(self._record, same_set=proven.content_hash() == wanted.content_hash(), where=str(canary))
+
+    def check(
+        self, jobs: list[Download], due: list[Download], motion: MotionOptions, out: Output, lines: list[str]
+    ) -> None:
+        """Refuse what no person allowed; show the lists of differences."""
+        from pmsmtool.errors import Declined
+        from pmsmtool.flash.unattended import STILL_S, check_drives, wait_still
+
+        for line in lines:
+            out.note(line)
+        check_drives([job.identity for job in jobs], self._serials, self._record.drive)
+        if not motion.yes:
+            raise Declined("--serials without --yes: nothing was done", hint="add --yes to write these drives")
+        if due:
+            out.note(f"{len(jobs)} drives must be off and stand still for {STILL_S:g} s")
+            wait_still([job.node for job in jobs])
 
 
 def _ask(
@@ -113,7 +179,10 @@ def _refuse_serial(motion: MotionOptions) -> None:
     from pmsmtool.errors import ConfigError
 
     if motion.serial is not None:
-        raise ConfigError("--serial names one drive", where="--nodes", hint="a fleet is confirmed at the prompt")
+        raise ConfigError(
+            "--serial names one drive", where="--nodes",
+            hint="answer the prompt, or list all drives: --yes --serials FILE",
+        )  # fmt: skip
 
 
 def _run(job: Download, *, store: bool) -> Outcome | Exception:
@@ -127,8 +196,10 @@ def _run(job: Download, *, store: bool) -> Outcome | Exception:
         return error
 
 
-def _row(job: Download, result: Outcome | Exception) -> tuple[Any, ...]:
+def _row(job: Download, result: Outcome | Exception | None) -> tuple[Any, ...]:
     node, serial = job.node.node, job.identity.serial
+    if result is None:
+        return node, serial, "NOT BEGUN", "-", "-", "-", "-"
     if isinstance(result, Exception):
         return node, serial, f"FAIL {getattr(result, 'what', result)}".splitlines()[0], "-", "-", "-", "-"
     crc = "-" if result.crc is None else f"{result.crc:#010x}"

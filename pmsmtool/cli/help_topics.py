@@ -38,10 +38,10 @@ Nothing moves and nothing is written without your consent; the two are asked one
   motion   before the first current the envelope is printed: largest current, energy, speed, travel, duration, and
            what the shaft may do (--shaft, --load, --brake).
   writing  before the first write the list of differences is printed: name, old, new, unit.
---yes answers them on a simulated drive. On a real bus it needs --i-max, --speed-max, --shaft and --serial as well, and
-the serial number must be that of the drive that answers. A drive that shows no serial number is moved and written by
-a person at a terminal only. --yes cannot be set by an environment variable. Without a terminal and without a valid
---yes nothing is done: exit 7.
+--yes answers them on a simulated drive. On a real bus it needs --serial as well, and --i-max, --speed-max and --shaft
+where the machine moves. The serial number must be that of the drive that answers. A drive that shows no serial number
+is moved and written by a person at a terminal only. --yes cannot be set by an environment variable. Without a terminal
+and without a valid --yes nothing is done: exit 7.
 
 A command that moved the machine always ends in the same way: voltage off, zero current, parameters restored, and the
 stop confirmed from the statusword. If the drive does not confirm it, the exit code is 8 whatever else went wrong: use

@@ -187,7 +187,8 @@ def _yes_parameter(auto: bool) -> Option:
         "--yes",
         is_flag=True,
         allow_from_autoenv=False,  # consent is typed, never inherited from a shell's environment
-        help="Answer the prompts; on a real bus only with --i-max, --speed-max, --shaft and --serial.",
+        help="Answer the prompts; on a real bus only with --serial, and where the machine moves with --i-max, "
+        "--speed-max and --shaft.",
     )
 
 

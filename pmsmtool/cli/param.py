@@ -31,6 +31,7 @@ from pmsmtool.cli.options import (
     write_options,
 )
 from pmsmtool.cli.output import Output, table
+from pmsmtool.plain_text import counted
 
 if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
@@ -184,7 +185,7 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
     equal = [name for name in first.values if name in second.values and first.values[name] == second.values[name]]
     facts = {"old": old, "new": new, "differences": differences, "equal": equal, "not_written": lacking}
     out.result("param-diff", facts, lambda: table(heads, rows))
-    out.note(f"{len(differences)} difference(s) among what both hold")
+    out.note(f"{counted(len(differences), 'difference')} among what both hold")
     for name, why in lacking.items():
         (out.note if name in drive_map.left_out else out.detail)(f"not compared, not written: {name}: {why}")
     unnamed = len(lacking.keys() - drive_map.left_out.keys())
@@ -192,7 +193,7 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
         out.note(f"not compared, not written: {unnamed} entries that the map has no row for (-v names them)")
     if check and differences:
         raise CheckFailed(
-            f"{len(differences)} parameter(s) differ",
+            f"{counted(len(differences), 'difference')} found",
             where=f"{old} and {new}",
             hint="the table above names them; `pmsmtool flash-params` writes a set",
         )
@@ -375,5 +376,5 @@ def _difference_cells(difference: Difference) -> tuple[str, ...]:
 
     change = "" if math.isnan(difference.relative) else f"{100.0 * difference.relative:+.3g} %"
     if difference.cells:
-        change = f"{difference.cells} cell(s), the first shown"
+        change = f"{counted(difference.cells, 'cell')}, the first shown"
     return difference.name, text(difference.old), text(difference.new), difference.unit, change

@@ -24,6 +24,7 @@ from pmsmtool.firmware.image import crc32, pack_image
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
 from pmsmtool.params.diff import table_unit
 from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.plain_text import counted
 from pmsmtool.resources import data_folder
 
 CSV_HEAD = ("name", "value", "unit", "held", "object", "type", "bytes", "meaning", "not written because")
@@ -91,7 +92,7 @@ def dcf_file(
     wrong = contradictions(drive_map, types_of(parse_eds(base, where)), rows)
     if wrong:
         raise ConfigError(
-            f"the file contradicts {len(wrong)} row(s) of the map {drive_map.name!r}",
+            f"the file contradicts {counted(len(wrong), 'row')} of the map {drive_map.name!r}",
             where=where, violations=wrong, likely="the file belongs to another drive or firmware",
             hint="give the EDS of the drive that the map is for, or its map with --map; nothing was written",
         )  # fmt: skip

@@ -26,7 +26,7 @@ _DCF_SUFFIXES = (".dcf", ".eds")
 
 
 @next_step(NEXT_STEP)
-def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterSet:
+def load_parameters(path: str | Path, drive_map: DriveMap | None = None) -> ParameterSet:
     """Return the parameter set that a file or a run directory holds.
 
     Parameters
@@ -43,7 +43,7 @@ def load_parameters(path: Path, drive_map: DriveMap | None = None) -> ParameterS
     ConfigError
         It cannot be read, is none of these, or what is wrong with it.
     """
-    path = _file(path)
+    path = _file(Path(path))
     if path.suffix.lower() in _DCF_SUFFIXES:
         return _from_dcf(path, drive_map or reference_map())
     if path.suffix.lower() == ".npz":

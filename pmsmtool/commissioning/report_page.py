@@ -56,7 +56,7 @@ CHAINS = ("commission", "fleet")
 NOTHING_COMPARED = "What the drive holds and how it behaves: neither was compared with the design."
 
 
-def report_page(path: Path) -> str:
+def report_page(path: str | Path) -> str:
     """Return the report of a run as one self-contained HTML page.
 
     Raises
@@ -64,7 +64,7 @@ def report_page(path: Path) -> str:
     ConfigError
         There is no run in the folder, or one of its files is damaged.
     """
-    run = RunDirectory(path)
+    run = RunDirectory(Path(path))
     record = run.read()
     drawn = [
         *_identification_figures(run, record),

@@ -150,8 +150,9 @@ def achieved(loop: LoopMargins) -> str:
 
 
 @next_step(NEXT_STEP)
-def load_design(path: Path) -> Design:
+def load_design(path: str | Path) -> Design:
     """Read ``design.toml``; raises ``ConfigError`` naming the file and everything that is wrong."""
+    path = Path(path)
     return parse_design(read_text(path, hint="`pmsmtool tune MACHINE -o design.toml`"), where=str(path))
 
 

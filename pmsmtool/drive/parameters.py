@@ -21,6 +21,7 @@ from pmsmtool.errors import BusError, DriveFault, DriveTimeout, NotAvailable, Sd
 from pmsmtool.firmware.image import ImageStatus, crc32, pack_image, unpack_image
 from pmsmtool.params.catalogue import SCHEMA_VERSION, layout_signature
 from pmsmtool.params.parameter_set import LUT_NAMES, SATURATION, TABLE_NAMES
+from pmsmtool.plain_text import counted
 
 Progress = Callable[[int, int], None]
 """Called with objects done and objects in all."""
@@ -217,7 +218,7 @@ class DriveParameters:
             progress(count, total)
         if refused:
             raise DriveFault(
-                "\n  - ".join([f"the drive refused {len(refused)} of {len(new)} value(s)", *refused]),
+                "\n  - ".join([f"the drive refused {len(refused)} of {counted(len(new), 'value')}", *refused]),
                 where=f"node {self.node.node}",
                 hint="`pmsmtool param help NAME` shows the limits",
             )

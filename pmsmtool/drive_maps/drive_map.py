@@ -26,6 +26,7 @@ from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import SATURATION, TABLE_NAMES, ParameterSet
+from pmsmtool.plain_text import counted
 
 _ADDRESS = re.compile(r"0x([0-9A-F]{4}):([0-9A-F]{2})(?: |\Z)")
 Rounding = Literal["nearest", "down", "up"]
@@ -308,7 +309,8 @@ class DriveMap:
                 except ConfigError as error:
                     wrong.append(f"{error.where}: {error.what}")
         if wrong:
-            raise ConfigError(f"{len(wrong)} value(s) do not fit the drive", where=self.name, violations=wrong)
+            refused = counted(len(wrong), "value")
+            raise ConfigError(f"the drive cannot hold {refused}", where=self.name, violations=wrong)
         for name, table in wanted.tables.items():
             if name in self.tables:
                 encoded[name] = encode_table(name, table, wanted.values)

@@ -28,6 +28,7 @@ from pmsmtool.params.catalogue import (
     Parameter,
     layout_signature,
 )
+from pmsmtool.plain_text import counted
 
 LUT_FORMAT_NONE, LUT_FORMAT_BINARY32, LUT_FORMAT_INT16 = 0, 1, 2
 LUT_INT16_NO_POINT = -32768
@@ -107,7 +108,7 @@ def _check_names(values: Mapping[str, float]) -> None:
 def _check_ranges(values: Mapping[str, float]) -> None:
     wrong = [text for row in CATALOGUE if (text := _violation(row, values[row.name])) is not None]
     if wrong:
-        raise ImageRefused(ImageStatus.RANGE, f"{len(wrong)} value(s) out of range", violations=tuple(wrong))
+        raise ImageRefused(ImageStatus.RANGE, f"{counted(len(wrong), 'value')} out of range", violations=tuple(wrong))
 
 
 def lut_size_words(values: Mapping[str, float]) -> int:

@@ -35,6 +35,7 @@ from pmsmtool.flash.map_gate import check_map, remember_map
 from pmsmtool.flash.plan import Change, Plan, differences
 from pmsmtool.flash.whole_drive import WholeDrive, parameters_of
 from pmsmtool.params.catalogue import layout_signature
+from pmsmtool.plain_text import counted
 
 CONSUMERS_MAX = 8
 """Entries of 0x1016 that are read; drives have one to four."""
@@ -300,7 +301,7 @@ class Download:
         self.phase = Phase.STAGING
         changes = self.plan.changes
         if changes:
-            self._say(f"writing and reading back {len(changes)} object(s)")
+            self._say(f"writing and reading back {counted(len(changes), 'object')}")
             self._parameters.replace({change.name: change.new for change in changes}, progress=self._progress)
         self.phase = Phase.ACTIVE
         expected = self._parameters.crc_active if self.node.map.staging else None

@@ -22,6 +22,7 @@ from pmsmtool.flash.whole_drive import parameters_of
 from pmsmtool.params.catalogue import BY_NAME, layout_signature
 from pmsmtool.params.diff import table_unit
 from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.plain_text import counted
 
 CONFIGURATION_EPOCH = datetime.date(1984, 1, 1)
 """Day 0 of object 0x1020:01 (CiA 301, section 7.5.2.21)."""
@@ -69,7 +70,7 @@ def _refuse_contradictions(node: DriveNode, names: Sequence[str]) -> None:
     wrong = contradictions(node, names)
     if wrong:
         raise ConfigError(
-            f"the drive contradicts {len(wrong)} row(s) of the map {node.map.name!r}",
+            f"the drive contradicts {counted(len(wrong), 'row')} of the map {node.map.name!r}",
             where=f"node {node.node}", violations=[f"{node.map.row_text(name)}: {why}" for name, why in wrong.items()],
             likely="another firmware than the map's sources describe",
             hint="correct the rows in a copy of the map, and give it with --map; nothing was written",

@@ -54,6 +54,10 @@ SUPPLY_LEVELS = "supply_levels"
 NO_VOLTAGE = "needs injection, or a recorder of voltages at loop rate"
 NO_POLE_PAIRS = "needs the pole pairs: mode 11, an object in the drive's map, or a machine file"
 NO_LINK = "needs the DC link (0x6079) or the machine's voltage"
+TOO_WIDE = "E_NOT_IDENTIFIABLE"
+"""Refusal of ratios whose interval is too wide: the flux linkage beside them stands, and the chain goes on."""
+LIGHT_SHAFT = "a bare shaft with little inertia: the torque that is safe if the tool fails hardly exceeds friction"
+ADD_INERTIA = "couple an inertia to the shaft and say --shaft coupled, or allow more current (--i-max)"
 UNDECIDED = "no source says whether this drive's amperes are peak or rms: the interval holds for both"
 Voltage = Literal["machine", "link", ""]
 
@@ -210,10 +214,19 @@ def _by_torque(
 ) -> tuple[dict[str, Estimate], dict[str, str]]:
     pushes = [trace for name, trace in traces.items() if name.startswith("torque_push")]
     pole_pairs = facts.pole_pairs
-    estimates = estimate_ratios(pushes, pole_pairs=pole_pairs or 1, tolerance=tolerance)
+    missing = {"R_s_ohm": NO_POWER, "L_d_h, L_q_h": NO_VOLTAGE}
+    estimates: dict[str, Estimate] = {}
+    too_wide: IdentificationError | None = None
+    try:
+        estimates = estimate_ratios(pushes, pole_pairs=pole_pairs or 1, tolerance=tolerance)
+    except IdentificationError as error:
+        if error.reason != TOO_WIDE:
+            raise
+        what = error.what.removeprefix(f"{TOO_WIDE}: ")
+        too_wide = IdentificationError(TOO_WIDE, what, where=error.where, likely=LIGHT_SHAFT, hint=ADD_INERTIA)
+        missing["J_per_psi"] = f"{error.what} (likely {LIGHT_SHAFT})"
     if facts.current_undecided:
         estimates = {name: either_reading(estimate) for name, estimate in estimates.items()}
-    missing = {"R_s_ohm": NO_POWER, "L_d_h, L_q_h": NO_VOLTAGE}
     if not pole_pairs:
         return over_torque_constant(estimates), {**missing, "psi_f_wb": NO_POLE_PAIRS}
     utilisation = UTILISATION if inverter is None else inverter.voltage_utilisation
@@ -234,6 +247,8 @@ def _by_torque(
             missing["psi_f_wb"] = below_voltage(facts, utilisation, psi_f_wb) if facts.voltage else NO_LINK
     except IdentificationError as error:
         missing["psi_f_wb"] = error.what
+    if too_wide is not None and not estimates:
+        raise too_wide
     return estimates, missing
 
 

@@ -66,12 +66,19 @@ def judged(
     )
     had = [STEP[name] for name, told in TOLD_BY.items() if set(told) & set(estimates)]
     lacking = {
-        STEP[name]: IdentificationError(NOT_TOLD, why, hint="state it in MACHINE, or allow more current and speed")
+        STEP[name]: _refusal(why)
         for name, told in TOLD_BY.items()
         for keys, why in missing.items()
         if told[0] in keys.split(", ") and not set(told) & set(estimates)
     }
     return Judgement(acceptance, verdicts_of([name for name in asked if name in TOLD_BY], lacking, had, acceptance))
+
+
+def _refusal(why: str) -> IdentificationError:
+    """Return the error of a quantity that is missing; a reason that has its name keeps it."""
+    name, _, text = why.partition(": ")
+    reason, what = (name, text) if name.startswith("E_") else (NOT_TOLD, why)
+    return IdentificationError(reason, what, hint="state it in MACHINE, or allow more current and speed")
 
 
 def stage_of(

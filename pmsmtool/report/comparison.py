@@ -29,8 +29,15 @@ def unchecked(rows: Iterable[Mapping[str, Any]]) -> dict[str, str]:
 def headline(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[str]]:
     """Return what a verdict says of recorded rows: accepted contradictions first, what was not checked last."""
     first = [f"CONTRADICTION ACCEPTED: {row['text']}" for row in rows if row["verdict"] == "accepted"]
-    left = [f"{SHORT.get(name, name)}: {source}, NOT CHECKED" for name, source in unchecked(rows).items()]
-    return first, ["; ".join(left)] if left else []
+    by_source: dict[str, list[str]] = {}
+    for name, source in unchecked(rows).items():
+        by_source.setdefault(source, []).append(SHORT.get(name, name))
+    return first, [not_checked(names, source) for source, names in by_source.items()]
+
+
+def not_checked(names: Iterable[str], source: str) -> str:
+    """Return that values were taken from a source and not measured."""
+    return f"NOT CHECKED ({source}): {', '.join(names)}"
 
 
 def table_cells(rows: Iterable[Mapping[str, Any]]) -> list[tuple[str, str, str, str, str, str]]:

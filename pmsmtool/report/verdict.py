@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pmsmtool.errors import ExitCode
-from pmsmtool.report.comparison import headline, unchecked
+from pmsmtool.report.comparison import headline, not_checked, unchecked
 
 COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
 """Stages of a full commissioning."""
@@ -161,12 +161,12 @@ def _unchecked(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> 
         if "source" in value and "std" not in value and not (value["source"] == AS_GIVEN and value["name"] in compared):
             bare.setdefault(str(value["source"]), []).append(str(value["name"]))
     sources = {VENDOR: "the drive's own measurement, without an interval", AS_GIVEN: "data sheet"}
-    lines = [f"{', '.join(names)}: {sources.get(source, source)}, NOT CHECKED" for source, names in bare.items()]
+    lines = [not_checked(names, sources.get(source, source)) for source, names in bare.items()]
     identified = next((stage for stage in latest if stage["name"] == "identify" and stage["status"] in RAN), None)
     if len(complete) > 1 and identified is not None:
         known = {str(value["name"]) for value in values if "std" in value or "source" in value} | told
         absent = [name for name in NEEDED if name not in known and RATIOS.get(name) not in known]
-        lines += [f"{', '.join(absent)}: not measured in this run, NOT CHECKED"] if absent else []
+        lines += [not_checked(absent, "not measured in this run")] if absent else []
     if len(complete) > 1:
         lines += [str(line) for stage in latest for line in stage.get("not_checked", ())]
     return list(dict.fromkeys(lines))

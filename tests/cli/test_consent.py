@@ -84,7 +84,9 @@ def test_consent_declined(
 def test_declined_message_names_what_yes_still_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(Declined) as caught:
         answer(MotionOptions(yes=True, shaft="free"), monkeypatch)
-    assert caught.value.hint == "--yes --i-max ... --speed-max ... --serial ..."
+    assert caught.value.hint == "run it in a terminal, or give --yes --i-max ... --speed-max ... --serial ..."
+    only_serial = MotionOptions(yes=True, serial=77)
+    assert consent.missing_for_yes(only_serial, "writing") == [] and len(consent.missing_for_yes(only_serial)) == 3
 
 
 TRIES = 30

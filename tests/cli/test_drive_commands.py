@@ -341,6 +341,14 @@ def test_fleet_gets_the_same_set_and_one_table(tool: Tool, wanted: str, tmp_path
     assert len(list((tmp_path / "home" / "journals").iterdir())) == 3
 
 
+def test_an_unattended_fleet_needs_a_proven_set_and_its_serial_numbers(tool: Tool, wanted: str) -> None:
+    Path("serials.txt").write_text("1 22001\n", encoding="utf-8")
+    given = ("flash-params", wanted, "--nodes", "1", "--yes", "--serials", "serials.txt")
+    code, _, err = tool(*given)
+    assert code == 2 and "--canary RUN_DIR" in err
+    assert tool("flash-params", wanted, "--yes", "--serials", "serials.txt")[0] == 2, "it is about several nodes"
+
+
 def test_fleet_with_one_bad_drive_serves_the_others(tool: Tool, wanted: str, tmp_path: Path) -> None:
     (tmp_path / "faults.toml").write_text('[[refuse]]\nobject = "0x1010:01"\ncode = 0x08000020\ncount = 1\n')
     fleet = "interior-2k2?nodes=2&nv=fleet.nv&faults=faults.toml"
@@ -410,7 +418,7 @@ def test_stop_that_reaches_no_drive_is_exit_8(
     [
         (("info",), "no-such-profile", 2, "no profile"),
         (("info",), "interior-2k2?sed=1", 2, "did you mean seed"),
-        (("-n", "77", "info"), "interior-2k2?nv=:memory:", 3, "only node(s) 1 were heard"),
+        (("-n", "77", "info"), "interior-2k2?nv=:memory:", 3, "only others were heard, node 1"),
         (("-b", "250000", "-n", "1", "info"), "interior-2k2?nv=:memory:&bitrate=500000", 3, "only error frames"),
         (("-b", "250000", "scan"), "interior-2k2?nv=:memory:&bitrate=500000", 3, "wrong bit rate"),
         (("--trace-can", "bus.xyz", "scan"), "interior-2k2?nv=:memory:", 2, ".asc"),

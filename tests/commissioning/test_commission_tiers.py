@@ -29,7 +29,7 @@ from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
-from pmsmtool.errors import ConfigError, Contradiction, NotAvailable, Partial
+from pmsmtool.errors import ConfigError, Contradiction, ExitCode, NotAvailable
 from pmsmtool.identification.replay import REPLAYED
 from pmsmtool.identification.tier_evaluate import replay
 from pmsmtool.machine.machine_file import load_machine_file
@@ -98,7 +98,7 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert (found_verdict.word, found_verdict.kind) == ("PARTIAL", "partial") and found_verdict.simulated
     assert found_verdict.headline.startswith("SIMULATED DRIVE, PARTIAL: 3 of 7 stages ran")
     unchecked = ("pole pairs", "R", "L_d", "L_q", "psi", "J")
-    assert all(f"{name}: data sheet, NOT CHECKED" in found_verdict.headline for name in unchecked)
+    assert f"NOT CHECKED (data sheet): {', '.join(unchecked)}" in found_verdict.headline
     limits = [line for line in run.read().stage("tune").fallbacks if line.startswith(LIMITS)]  # type: ignore[union-attr]
     assert limits == [f"{LIMITS}: not available: {why_no_limits(found.drive_map, None)}"] and SLOPE in limits[0]
     return run.path
@@ -179,7 +179,7 @@ def test_one_pair_of_gains_is_the_smaller_of_both_axes(tmp_path: Path) -> None:
     assert machine.machine.J_kgm2 == pytest.approx(truth.J_kgm2, rel=0.06)
     assert machine.machine.R_s_ohm == truth.R_s_ohm and "R_s_ohm" not in machine.estimates
     assert "as given: pole_pairs, R_s_ohm" in str(machine.provenance["source"])
-    assert "pole pairs: data sheet, NOT CHECKED; R: data sheet, NOT CHECKED" in verdict(run.path).headline
+    assert "NOT CHECKED (data sheet): pole pairs, R, " in verdict(run.path).headline
     page = report_page(run.path)
     assert "<strong>SIMULATED DRIVE, PARTIAL: 6 of 7 stages ran" in page
     assert page.count("<td>as given</td>") == 4
@@ -264,7 +264,7 @@ def test_recorder_tier_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Pat
     assert {str(value["name"]).split(":")[0] for value in proof.values if "where" in value} == {"speed_step"}
     found_verdict = verdict(run.path)
     assert found_verdict.word == "PARTIAL" and found_verdict.lines[0].startswith("7 of 7 stages ran")
-    assert f"pole pairs: {SET_UP}, NOT CHECKED; L_d: {SET_UP}, NOT CHECKED" in found_verdict.headline
+    assert f"NOT CHECKED ({SET_UP}): pole pairs, L_d" in found_verdict.headline
     assert "data sheet" not in found_verdict.headline
     assert report_page(run.path).count("<td>{}</td>".format(SET_UP.replace("'", "&#39;"))) == 3
     given = next(value for value in run.read().stage("identify").values if value["name"] == "L_d_h")  # type: ignore[union-attr]
@@ -345,7 +345,7 @@ def test_the_plan_of_a_drive_that_takes_nothing_promises_no_loop(
     monkeypatch.chdir(tmp_path)
     bus = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=faulhaber"]
     outcome = CliRunner().invoke(cli, [*bus, "commission", str(PROFILE), "--yes"])
-    assert isinstance(outcome.exception, Partial), "what it can give: a table for reading"
+    assert outcome.exit_code == ExitCode.PARTIAL, "what it can give: a table for reading"
     plan = outcome.stderr.splitlines()
     assert "lut: with values as given; the drive has no object for the table" in plan
     assert any(line.startswith("tune, margins: not available: needs the gains of the current loops") for line in plan)
@@ -365,7 +365,7 @@ def test_what_a_drive_lacks_is_said_before_a_consent_and_leads_on(
     assert "pmsmtool machine new" in error.hint and "pmsmtool commission MACHINE" in error.hint
     # and that is the step that works
     outcome = CliRunner().invoke(cli, [*bus, "commission", str(PROFILE), "--yes", "--json"])
-    assert isinstance(outcome.exception, Partial) and json.loads(outcome.stdout)["verdict"] == "PARTIAL"
+    assert outcome.exit_code == ExitCode.PARTIAL and json.loads(outcome.stdout)["verdict"] == "PARTIAL"
     stages = {stage["name"]: stage for stage in json.loads(outcome.stdout)["stages"]}
     assert stages["tune"]["status"] == "not available" and "the map 'elmo' has no object" in stages["tune"]["note"]
     assert all(stage["note"] for stage in stages.values() if stage["status"] == "not available")

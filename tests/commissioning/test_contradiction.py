@@ -233,10 +233,10 @@ def test_an_unknown_name_is_no_quantity() -> None:
 def test_what_is_not_checked_is_in_the_headline_and_no_plain_pass() -> None:
     rows = [row.facts() for row in compare(TRUTH, {}, [v for v in measured() if v["name"] != "R_s_ohm"])]
     assert unchecked(rows) == {"R_s_ohm": "data sheet", "encoder_counts": "data sheet"}
-    assert headline(rows) == ([], ["R: data sheet, NOT CHECKED; encoder counts: data sheet, NOT CHECKED"])
+    assert headline(rows) == ([], ["NOT CHECKED (data sheet): R, encoder counts"])
     stage = {"name": "identify", "status": "pass", "comparison": rows}
     found_verdict = verdict_of({"stages": [stage]}, ("identify",))
-    assert found_verdict.word == "PARTIAL" and "R: data sheet, NOT CHECKED" in found_verdict.headline
+    assert found_verdict.word == "PARTIAL" and "NOT CHECKED (data sheet): R" in found_verdict.headline
 
 
 def test_gains_that_follow_from_it_are_marked() -> None:

@@ -7,6 +7,9 @@ import math
 
 import pytest
 
+from pmsmtool.errors import IdentificationError
+from pmsmtool.identification import tier_evaluate
+from pmsmtool.identification.tier_evaluate import TierFacts, tier_result
 from pmsmtool.identification.tier_machine import tier_machine
 from pmsmtool.identification.tier_verdict import Judgement, judged, stage_of
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
@@ -47,6 +50,26 @@ def test_no_percentage_refuses_what_the_design_can_bear(known: MachineFile) -> N
     assert judgement.verdicts.accepted == ASKED and judgement.verdicts.status == "pass"
     margins = {name: line.measured for name, line in judgement.acceptance.items()}
     assert "voltage headroom" in margins["L_q_app_h"] and "speed phase margin" in margins["J_per_psi"]
+
+
+def test_an_inertia_that_is_too_wide_leaves_the_flux_linkage(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bare rotor of 24 g cm2 behind an EPOS4: J/psi within 13 %, limit 10 %, ended the whole identification."""
+
+    def too_wide(*args: object, **options: object) -> dict[str, Estimate]:
+        raise IdentificationError("E_NOT_IDENTIFIABLE", "J/psi is wide")
+
+    def flux(*args: object, **options: object) -> Estimate:
+        return Estimate(0.005, 0.0, 1e-4, "Wb")
+
+    monkeypatch.setattr(tier_evaluate, "estimate_ratios", too_wide)
+    with pytest.raises(IdentificationError, match="E_NOT_IDENTIFIABLE") as caught:
+        tier_result({}, TierFacts("standard", pole_pairs=7, pushed=True))
+    assert "bare shaft" in caught.value.likely and "--shaft coupled" in caught.value.hint
+    monkeypatch.setattr(tier_evaluate, "flux_by_undriven_voltage", flux)
+    result = tier_result({}, TierFacts("standard", pole_pairs=7, pushed=True, voltage="machine"))
+    assert set(result.estimates) == {"psi_f_wb"} and result.missing["J_per_psi"].startswith("E_NOT_IDENTIFIABLE: J/psi")
+    refused = judged(result.estimates, result.missing, ("mechanics",), None).verdicts.refused["mechanics"]
+    assert refused.startswith("E_NOT_IDENTIFIABLE"), "the reason stands once"
 
 
 def test_a_useless_value_is_refused_alone_and_the_others_are_kept(known: MachineFile) -> None:
