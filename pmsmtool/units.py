@@ -89,6 +89,8 @@ _UNITS: tuple[Unit, ...] = (
     Unit("rpm", "angular speed", ("r/min", "1/min", "min-1"), True, factor=RAD_S_PER_RPM),
     Unit("rad/s2", "angular acceleration", ("rad/s^2",)),
     Unit("rpm/s", "angular acceleration", factor=RAD_S_PER_RPM),
+    Unit("rad/s3", "angular jerk"),
+    Unit("rpm/s2", "angular jerk", factor=RAD_S_PER_RPM),
     Unit("N m", "torque", ("Nm", "N*m"), True),
     Unit("N m/s", "torque slope"),
     Unit("kg m2", "inertia", ("kgm2", "kg m^2", "kg*m^2", "kg m²", "kgm²")),
@@ -114,6 +116,8 @@ _UNITS: tuple[Unit, ...] = (
     Unit("V/(A s)", "gain V/(A s)"),
     Unit("N m s/rad", "gain N m s/rad"),
     Unit("N m/rad", "gain N m/rad"),
+    Unit("N m/(rad s)", "gain N m/(rad s)"),
+    Unit("N m/A", "torque constant", (), True),
     Unit("1/(N m)2", "weight 1/(N m)2"),
     Unit("1/A2", "weight 1/A2"),
 )

@@ -42,6 +42,7 @@ FLOORS: dict[str, int] = {
     "estimators": 5,
     "design": 5,
     "firmware": 5,
+    "axis": 6,
     "drive_maps": 6,
     "drive": 7,
     "sim": 7,
@@ -58,7 +59,7 @@ FLOORS: dict[str, int] = {
 SAME_ROOM = {"trace_file": "trace", "__main__": "cli"}
 PURE = frozenset(
     {
-        *("machine", "params", "estimators", "design", "firmware", "drive_maps", "identification"),
+        *("machine", "params", "estimators", "design", "firmware", "axis", "drive_maps", "identification"),
         *("report", "trace", "units"),
     }
 )

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
     from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
+    from pmsmtool.params.parameter_set import ParameterSet
 
 
 @click.command(
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
         "pmsmtool tune interior-2k2 -o design.toml --bandwidth-hz 600 --phase-margin-deg 55",
         "pmsmtool tune machine.toml -o design.toml --speed-bandwidth-hz 12 --notch-hz 180",
         "pmsmtool tune machine.toml -o design.toml --map my-drive.toml --drive-bandwidth-hz 95",
+        "pmsmtool tune machine.toml -o axis.toml --axis --map epos4",
     ),
 )
 @click.argument("machine")
@@ -85,6 +87,13 @@ if TYPE_CHECKING:
     default="auto",
     help="auto: a table for a saturated machine, else the accelerated optimisation.",
 )
+@click.option("--axis", is_flag=True, help="Design speed and position loops of the axis with its load; the parameter "
+              "set then holds nothing else.")  # fmt: skip
+@click.option("--axis-phase-margin-deg", type=float, default=45.0, metavar="DEG", help="Least phase margin of both "
+              "loops over the tolerance box.")  # fmt: skip
+@click.option("--axis-peak-db", type=float, default=6.0, metavar="DB", help="Largest |S| of both loops over it.")
+@click.option("--loop-rate-hz", type=float, metavar="HZ", help="Rate of the drive's speed and position loops.  "
+              "[default: as its map says]")  # fmt: skip
 @map_option
 @click.option("--drive-bandwidth-hz", type=float, metavar="HZ", help="Current bandwidth of a drive with fixed "
               "firmware (--map).")  # fmt: skip
@@ -106,11 +115,20 @@ def tune_command(
     its voltage demand stays within the limit. Guarantee and cost are printed. The map must have objects for slope and
     limit; cia402 and copley have them. Loops are checked with the rounded gains of the drive, or with gains of the
     bandwidth in --drive-bandwidth-hz.
+
+    With --axis: gains, feed-forward and notch of the speed and position loops in the structure of the drive, with the
+    least phase margin and the largest |S| over the tolerance box (inertia, torque, resonance), and a jerk-limited move.
+    Exit code 10 when the drive has no object of known unit for a gain: the table says its value all the same.
     """
     from pmsmtool.design.design_file import design_text
     from pmsmtool.machine.machine_file import load_machine_file
 
     drive_map = read_map(map_file)
+    axis = {name: asked.pop(name) for name in _AXIS}
+    if asked.pop("axis"):
+        _axis(load_machine_file(machine), drive_map, asked, axis, path, params_path or _params_path(path), out)
+        return
+    _refuse_without_axis(axis)
     design = _design(load_machine_file(machine), drive_map, asked)
     params = design.parameter_set()
     params_path = _params_path(path) if params_path is None else params_path
@@ -130,6 +148,87 @@ def tune_command(
     for note in design.notes:
         out.note(note)
     out.note(f"wrote {path}, {params_path}")
+
+
+_AXIS = ("axis_phase_margin_deg", "axis_peak_db", "loop_rate_hz")
+
+
+def _refuse_without_axis(axis: dict[str, Any]) -> None:
+    if axis["loop_rate_hz"] is not None:
+        raise ConfigError("--loop-rate-hz: for the loops of --axis", hint="add --axis")
+
+
+def _axis(
+    source: MachineFile, drive_map: DriveMap, asked: dict[str, Any], axis: dict[str, Any],
+    path: Path, params_path: Path, out: Output,
+) -> None:  # fmt: skip
+    from pmsmtool.axis.design import AxisRequest
+    from pmsmtool.commissioning.axis_design import axis_parameters, design_axis, not_offered
+    from pmsmtool.design.design_file import design_text
+    from pmsmtool.design.tune_request import TuneRequest
+    from pmsmtool.errors import Partial
+
+    for name in _LIMITS:
+        asked.pop(name)
+    bandwidth_hz, filter_hz = asked.pop("drive_bandwidth_hz"), None if drive_map.staging else asked["speed_filter_hz"]
+    if bandwidth_hz is not None:
+        asked["bandwidth_hz"] = bandwidth_hz
+    request = AxisRequest(axis["axis_phase_margin_deg"], axis["axis_peak_db"], axis["loop_rate_hz"], filter_hz)
+    design = design_axis(source, TuneRequest(**asked), request, drive_map)
+    params = axis_parameters(design)
+    write_file(path, design_text(design))
+    write_file(params_path, params.to_toml())
+    lacking = {} if drive_map.staging else not_offered(drive_map)
+    facts = {name: fact for name, fact in design.facts.items() if name.startswith("axis_")}
+    loops = {name: loop for name, loop in design.loops.items() if name.startswith("axis_")}
+    data = {
+        "machine": design.name, "design": path, "params": params_path, "content": params.content_hash(),
+        "drive": drive_map.name, "values": {name: design[name] for name in params.values}, "loops": loops,
+        "facts": facts, "not_written": lacking, "notes": design.notes,
+    }  # fmt: skip
+    out.result("tune.axis", data, lambda: _axis_lines(design, params, drive_map))
+    for note in design.notes:
+        out.note(note)
+    out.note(f"wrote {path}, {params_path}")
+    if lacking:
+        raise Partial(
+            f"the drive has no object of known unit for {', '.join(lacking)}",
+            hint="`pmsmtool map learn` finds out what a gain of the speed loop counts",
+        )
+
+
+def _axis_lines(design: Design, params: ParameterSet, drive_map: DriveMap) -> Iterator[str]:
+    from pmsmtool.axis.design import POSITION_LOOP, SPEED_LOOP
+    from pmsmtool.params.catalogue import BY_NAME
+
+    def counts(name: str) -> str:
+        cell = drive_map.cells.get(name)
+        if cell is None or not drive_map.writes(name, params.values):
+            return "-"
+        return f"0x{cell.index:04X}:{cell.sub:02X}"
+
+    rows = [
+        (name, f"{value:.6g}", BY_NAME[name].unit, counts(name), design.values[name].method)
+        for name, value in params.values.items()
+    ]
+    yield from table(("parameter", "value", "unit", "object", "method"), rows)
+    yield ""
+    box = ("phase_least_deg", "S_peak_db", "T_peak_db")
+    yield from table(
+        ("loop", "phase deg", "gain dB", "delay us", "bandwidth Hz", "least phase", "|S| dB", "|T| dB"),
+        [
+            (
+                name, f"{loop.phase_margin_deg:.1f}", f"{loop.gain_margin_db:.1f}", f"{1e6 * loop.delay_margin_s:.0f}",
+                f"{loop.bandwidth_rad_s / (2.0 * math.pi):.4g}",
+                *(f"{float(design.facts[f'{name}_{key}']):.1f}" for key in box),
+            )
+            for name in (SPEED_LOOP, POSITION_LOOP)
+            for loop in (design.loops[name],)
+        ],
+    )  # fmt: skip
+    yield ""
+    facts = {name: fact for name, fact in design.facts.items() if name.startswith("axis_") and "_at" not in name}
+    yield from table(("axis", "value"), [(name, _fact(value)) for name, value in facts.items()])
 
 
 def _design(source: MachineFile, drive_map: DriveMap, asked: dict[str, Any]) -> Design:

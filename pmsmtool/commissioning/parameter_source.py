@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from pmsmtool.commissioning.axis_design import axis_parameters
 from pmsmtool.design import design_file
 from pmsmtool.design.design_file import parse_design
 from pmsmtool.design.loops.open_loops import SMALLER, smaller_gains
@@ -54,7 +55,10 @@ def load_parameters(path: str | Path, drive_map: DriveMap | None = None) -> Para
     text = read_text(path)
     schema = parse_toml(text, where=str(path)).get("schema")
     if schema == design_file.SCHEMA:
-        return _for_drive(parse_design(text, where=str(path)).parameter_set(), drive_map)
+        design = parse_design(text, where=str(path))
+        if design.request.get("axis"):  # the rest of the drive stays as it is
+            return axis_parameters(design)
+        return _for_drive(design.parameter_set(), drive_map)
     if schema == parameter_set.SCHEMA:
         return _for_drive(parse_parameter_set(text, str(path)), drive_map)
     raise ConfigError(

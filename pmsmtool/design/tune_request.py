@@ -132,6 +132,11 @@ _KEYS: tuple[Key, ...] = (
         for item in fields(TuneRequest)
     ),
     Key("request", "drive", "text", "", 0, 0, None, "drive map the design is for"),
+    Key("request", "axis", "bool", "", 0, 1, None, "whether speed and position loops are those of the axis"),
+    Key("request", "axis_phase_margin_deg", "float", "deg", 0, 90, None, "least phase margin of both loops"),
+    Key("request", "axis_peak_db", "float", "dB", 0, 60, None, "largest |S| of both loops"),
+    Key("request", "axis_speed_filter_hz", "float", "Hz", 1e-3, 1e6, None, "the drive's filter on the speed"),
+    Key("request", "loop_rate_hz", "float", "Hz", 1e-3, 1e6, None, "rate of the drive's speed and position loops"),
     Key("request", "drive_bandwidth_hz", "float", "Hz", 1e-3, 1e6, None, "bandwidth of that drive's current loops"),
 )
 

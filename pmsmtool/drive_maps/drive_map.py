@@ -24,13 +24,13 @@ from pmsmtool.drive_maps.vendor_tuning import VendorTuning
 from pmsmtool.drive_maps.wire_units import as_peak
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.params.catalogue import CATALOGUE, TORQUE_PER_AMPERE
 from pmsmtool.params.parameter_set import SATURATION, TABLE_NAMES, ParameterSet
 from pmsmtool.plain_text import counted
 
 _ADDRESS = re.compile(r"0x([0-9A-F]{4}):([0-9A-F]{2})(?: |\Z)")
 Rounding = Literal["nearest", "down", "up"]
-Form = Literal["value", "time", "rate", "relative", "torque constant"]
+Form = Literal["value", "time", "rate", "relative", "torque constant", "current"]
 Injecting = Literal["none", "current", "voltage"]
 
 LETTERS: dict[str, str] = {
@@ -39,6 +39,8 @@ LETTERS: dict[str, str] = {
 }
 """CiA 301 types a value may have on the wire, with their ``struct`` letters."""
 
+IN_AMPERES = "kept in amperes: `pmsmtool tune --axis` designs it with the torque of an ampere"
+"""Why a gain is not written that needs the torque per ampere beside it."""
 REFERENCE_VENDOR = 0x706D736D
 REFERENCE_PRODUCT = 0x00000001
 REFERENCE_TABLES = {
@@ -76,7 +78,8 @@ class Cell:
         ``value``; ``time``: the drive keeps gain / value (an integral time T_n = K_p / K_i); ``rate``: value / gain
         (an integral rate K_i / K_p, a torque slope / rated torque); ``relative``: value / gain of the same unit (a
         torque / rated torque); ``torque constant``: 1.5 p psi_f instead of the flux linkage (``gain`` is the number of
-        pole pairs).
+        pole pairs); ``current``: value / gain, a torque per something kept as a current (``gain`` is the torque per
+        ampere).
     source : str
         Key of ``DriveMap.sources`` that confirms the object.
     """
@@ -159,7 +162,7 @@ class Cell:
         if self.form == "value":
             return kept
         other = self._other(values)
-        if self.form in ("rate", "relative"):
+        if self.form in ("rate", "relative", "current"):
             return kept * other
         if self.form == "torque constant":
             return kept / torque_per_ampere(other, 1.0) if other else math.inf
@@ -303,7 +306,7 @@ class DriveMap:
         encoded: dict[str, bytes] = {}
         wrong: list[str] = []
         for name, value in wanted.values.items():
-            if name in self.cells:
+            if name in self.cells and self.writes(name, wanted.values):
                 try:
                     encoded[name] = self.cells[name].encode(value, wanted.values)
                 except ConfigError as error:
@@ -317,15 +320,29 @@ class DriveMap:
         return encoded
 
     @next_step("compare type and size in the drive's map with its manual")
-    def decode(self, found: Mapping[str, bytes]) -> ParameterSet:
-        """Return the set that a drive's bytes mean."""
-        values: dict[str, float] = {}
+    def decode(self, found: Mapping[str, bytes], given: Mapping[str, float] | None = None) -> ParameterSet:
+        """Return the set that a drive's bytes mean.
+
+        ``given`` has values that the drive has no object for and others are counted by. Gains in amperes are left out
+        where neither says the torque of an ampere.
+        """
+        values: dict[str, float] = dict(given or {})
         # Gains first: an integral time is decoded with its gain.
         for cell in sorted(self.cells.values(), key=lambda cell: bool(cell.gain)):
-            if cell.name in found:
+            if cell.name in found and not (cell.gain not in values and self._rests_on_torque(cell)):
                 values[cell.name] = cell.decode(found[cell.name], values)
         tables = {n: decode_table(n, found[n], values) for n in TABLE_NAMES if found.get(n)}
         return ParameterSet(values, tables, name=self.name)
+
+    def writes(self, name: str, values: Mapping[str, float]) -> bool:
+        """Whether a value with a row is written: never the torque per ampere, and what rests on it only with it."""
+        return name != TORQUE_PER_AMPERE and (
+            TORQUE_PER_AMPERE in values or not self._rests_on_torque(self.cells[name])
+        )
+
+    def _rests_on_torque(self, cell: Cell) -> bool:
+        """Whether a value is counted by the torque per ampere, itself or through its gain."""
+        return cell.form == "current" or (cell.gain in self.cells and self.cells[cell.gain].form == "current")
 
     def missing(self, wanted: ParameterSet) -> tuple[str, ...]:
         """Return the entries of a set that this drive has no object for."""
@@ -333,7 +350,8 @@ class DriveMap:
 
     def quantised(self, wanted: ParameterSet) -> ParameterSet:
         """Return what the drive will really hold of a set."""
-        return self.decode(self.encode(wanted))
+        given = {name: wanted.values[name] for name in (TORQUE_PER_AMPERE,) if name in wanted.values}
+        return self.decode(self.encode(wanted), given)
 
     def address(self, name: str) -> tuple[int, int]:
         """Return index and sub-index of an entry."""
@@ -355,8 +373,13 @@ class DriveMap:
 
     def not_written(self, names: Iterable[str]) -> dict[str, str]:
         """Return the entries of a set that the map has no object for, and why."""
+        names = list(names)
         lacking = (name for name in names if name not in self.cells and name not in self.tables)
-        return {name: self.left_out.get(name, f"the map {self.name!r} has no row for it") for name in lacking}
+        missing = {name: self.left_out.get(name, f"the map {self.name!r} has no row for it") for name in lacking}
+        if TORQUE_PER_AMPERE in names:
+            return missing
+        amperes = (name for name in names if name in self.cells and self._rests_on_torque(self.cells[name]))
+        return missing | dict.fromkeys(amperes, IN_AMPERES)
 
     @property
     def scales(self) -> bool:

@@ -48,12 +48,18 @@ FACTOR_AGREES = 1e-6
 COMMANDS = frozenset({0x6040, 0x6060, 0x6071, 0x607A, 0x60B1, 0x60B2, 0x60FF})
 """Objects whose writing moves the machine: never a parameter."""
 POLE_PAIRS = "motor.pole_pairs"
+_GAINS = {"torque constant": POLE_PAIRS, "current": "reference.K_t_nm_per_a"}
+"""Other value of a form that needs always the same one."""
 _HEAD = ("schema", "name", "vendor", "product", "more_products", "staging")
 _TABLES = (IDENTITY, "capabilities", "objects", "signals", MOTION, RECORDER, "tables", "left_out", "sources", TABLE)
 _CELL_KEYS = ("index", "sub", "type", "factor", "offset", "unit", "rounding", "form", "gain", "source")
 _TEXT_KEYS = ("type", "unit", "form", "rounding", "gain", "source")
 _SIGNAL_KEYS = ("index", "sub", "type", "unit", "source")
 _FORM_UNIT: dict[str, str] = {"time": "s", "rate": "1/s", "relative": "1", "torque constant": "N m/A"}
+_IN_AMPERES = {
+    "N m s/rad": "A s/rad", "N m/rad": "A/rad", "N m/(rad s)": "A/(rad s)", "kg m2": "A s2/rad",
+}  # fmt: skip
+"""Units of gains whose output is a torque, as a drive keeps them that takes a current for it."""
 _RECORDED = {name: dimension for name, dimension in SIGNALS.items() if not name.startswith("target_")}
 _CHOICES = {"recorder": get_args(Recording), "injection": get_args(Injecting)}
 
@@ -122,6 +128,8 @@ def _unit_factor(cell: Cell) -> float | None:
 
 
 def _expected_unit(parameter: Parameter, form: str) -> str:
+    if form == "current":
+        return _IN_AMPERES.get(parameter.unit, parameter.unit)
     return _FORM_UNIT.get(form, parameter.unit)
 
 
@@ -197,7 +205,7 @@ def _parse_tables(document: Mapping[str, Any], complain: Callable[[tuple[str, ..
         taken[cell.index, cell.sub] = name
         cells[name] = cell
     for name, cell in cells.items():
-        if cell.gain and cell.gain not in table("objects"):
+        if cell.gain and cell.gain not in table("objects") and cell.form != "current":
             about("objects", name)("gain", f"its form needs {cell.gain}, which this map does not hold")
     live = table("signals").items()
     capabilities = _parse_capabilities(table("capabilities"), complain)
@@ -261,7 +269,7 @@ def _parse_cell(
         tell("rounding", f"rounding {row['rounding']!r} is none of {', '.join(get_args(Rounding))}")
     elif row["type"] == "REAL32" and row.get("rounding", "nearest") != "nearest":
         tell("rounding", "a REAL32 is not rounded to counts")
-    gain = row.get("gain", POLE_PAIRS if form == "torque constant" else "")
+    gain = row.get("gain", _GAINS.get(form, ""))
     if gain and gain not in BY_NAME:
         tell("gain", f"gain {gain!r} is not in the parameter catalogue")
     if form in ("time", "rate", "relative") and not gain:

@@ -59,6 +59,8 @@ class MeasuredRow:
         """Say how a published row contradicts what was measured; empty where it agrees."""
         if (published.index, published.sub) != (self.index, self.sub):
             return ""
+        if published.form == "current":
+            return ""  # counts of amperes: the drive's torque per ampere stands between
         if published.form != self.form:
             return f"{self.name}: the map says form {published.form!r}, measured is {self.form!r}"
         miss = math.log(self.scale / published.factor) if published.factor > 0.0 else math.inf

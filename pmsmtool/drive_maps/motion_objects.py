@@ -22,6 +22,7 @@ DIMENSIONS: Mapping[str, str] = {
     "target_speed": "angular speed",
     "speed_limit": "angular speed",
     "counts_per_turn": "ratio",
+    "loop_period": "time",
 }
 """Rows the table may have, and what each counts."""
 UNDECIDED = " peak-or-rms"

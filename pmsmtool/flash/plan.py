@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive_maps.drive_map import DriveMap, address_in
 from pmsmtool.errors import ConfigError
-from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.params.catalogue import BY_NAME, MIDDLE_KIND, TORQUE_PER_AMPERE
 from pmsmtool.params.diff import table_unit
 from pmsmtool.params.parameter_set import ParameterSet
 
 QUANTISATION_SHOWN = 1e-6
 """Relative rounding from which the value the drive holds is shown beside the one asked for (binary32: 6e-8)."""
+
+KIND_LEAST = 0.72
+"""Smallest ratio of a drive's torque per ampere to the middle of peak and rms (0.84 and 1.19 of it), with 15 % for the
+difference of a data sheet to the machine that was measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,9 +161,10 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
             hint="`pmsmtool param help NAME` shows the bounds of a parameter",
             violations=violations,
         )
+    wanted, given = _with_own_torque(drive_map, wanted, found)
     encoded = drive_map.encode(wanted)
-    held = drive_map.decode(encoded).values
-    before = drive_map.decode({name: data for name, data in found.items() if name in drive_map.cells}).values
+    held = drive_map.decode(encoded, given).values
+    before = drive_map.decode({name: data for name, data in found.items() if name in drive_map.cells}, given).values
     entries = []
     for name, new in encoded.items():
         index, sub = drive_map.address(name)
@@ -168,7 +173,37 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
         unit = BY_NAME[name].unit if scalar else table_unit(name)
         entries.append(Change(name, index, sub, found[name], new, *values, unit))
     lacking = drive_map.not_written([*wanted.values, *wanted.tables])
+    lacking = {name: why for name, why in lacking.items() if name not in given}
     return Plan(tuple(entries), lacking, wanted.content_hash(), drive_map.left_out)
+
+
+def _with_own_torque(
+    drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, bytes]
+) -> tuple[ParameterSet, dict[str, float]]:
+    """Return the set with the torque per ampere that the drive itself holds, where gains are counted by it.
+
+    Raises
+    ------
+    ConfigError
+        It is neither that of an ampere peak nor rms of the machine that was designed for.
+    """
+    expected = wanted.values.get(TORQUE_PER_AMPERE)
+    if expected is None:
+        return wanted, {}
+    cell = drive_map.cells.get(TORQUE_PER_AMPERE)
+    if cell is None:
+        return wanted, {TORQUE_PER_AMPERE: expected}
+    own = cell.decode(found[TORQUE_PER_AMPERE], {})
+    if not KIND_LEAST < own / expected < 1.0 / KIND_LEAST:
+        raise ConfigError(
+            f"the drive holds {own:.4g} N m/A, the machine has {expected / MIDDLE_KIND:.4g} per ampere peak and "
+            f"{expected * MIDDLE_KIND:.4g} per ampere rms",
+            where=f"{TORQUE_PER_AMPERE} -> 0x{cell.index:04X}:{cell.sub:02X}",
+            likely="the drive is set up for another motor: its gains in amperes would give another torque",
+            hint="enter the motor's torque constant with the maker's software, or correct psi_f_wb in the machine file",
+        )  # fmt: skip
+    values = {**wanted.values, TORQUE_PER_AMPERE: own}
+    return replace(wanted, values=values), {TORQUE_PER_AMPERE: own}
 
 
 def names_to_read(drive_map: DriveMap, wanted: ParameterSet) -> tuple[str, ...]:

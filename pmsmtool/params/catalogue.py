@@ -411,9 +411,50 @@ CLOSED_DRIVE: tuple[Parameter, ...] = tuple(
             False,
             "slope limit of the torque set-point",
         ),
+        ("reference.K_t_nm_per_a", 0x2023, 1, _F32, "N m/A", 1, 1e-6, 1e4, False, "torque per ampere as a drive counts it"),
+        ("reference.profile_speed_rpm", 0x6081, 0, _F32, "rpm", 1000, 0, 1e6, False, "speed of a move"),
+        (
+            "reference.profile_acceleration_rpm_per_s",
+            0x6083,
+            0,
+            _F32,
+            "rpm/s",
+            1e4,
+            0,
+            1e9,
+            False,
+            "acceleration of a move",
+        ),
+        (
+            "reference.profile_deceleration_rpm_per_s",
+            0x6084,
+            0,
+            _F32,
+            "rpm/s",
+            1e4,
+            0,
+            1e9,
+            False,
+            "deceleration of a move",
+        ),
+        ("reference.profile_jerk_rpm_per_s2", 0x60A4, 1, _F32, "rpm/s2", 1e6, 0, 1e12, False, "jerk of a move"),
+        ("speed.inertia_ff_kgm2", 0x2023, 2, _F32, "kg m2", 0, 0, 1e4, True, "torque per acceleration of the speed reference"),
+        ("speed.friction_ff_nms_per_rad", 0x2023, 3, _F32, "N m s/rad", 0, 0, 1e4, True, "torque per speed of its reference"),
+        ("position.K_p_per_s", 0x2022, 1, _F32, "1/s", 0, 0, 1e5, True, "speed reference per position error"),
+        ("position.velocity_ff", 0x2022, 2, _F32, "1", 1, 0, 2, True, "share of the move's speed added to it"),
+        ("position.inertia_ff_kgm2", 0x2022, 3, _F32, "kg m2", 0, 0, 1e4, True, "torque per acceleration of a move"),
+        ("position.friction_ff_nms_per_rad", 0x2022, 4, _F32, "N m s/rad", 0, 0, 1e4, True, "torque per speed of a move"),
+        ("position.pid_p_nm_per_rad", 0x2022, 5, _F32, "N m/rad", 0, 0, 1e8, True, "torque per position error"),
+        ("position.pid_i_nm_per_rads", 0x2022, 6, _F32, "N m/(rad s)", 0, 0, 1e10, True, "torque per integral of it"),
+        ("position.pid_d_nms_per_rad", 0x2022, 7, _F32, "N m s/rad", 0, 0, 1e6, True, "torque per derivative of it"),
     )
 )
-"""What limits a drive whose control cannot be changed; objects of CiA 402. Not in the reference drive's image."""
+"""What other makers' drives have besides: limits of CiA 402, speed and position loops. Not in the reference drive's image."""
+
+TORQUE_PER_AMPERE = "reference.K_t_nm_per_a"
+"""What gains in amperes rest on: compared with what a drive holds, never written."""
+MIDDLE_KIND = 2.0**0.25
+"""Torque per ampere of unknown kind over that per ampere peak: the geometric mean of peak and rms, 19 % from both."""
 
 EVERY: tuple[Parameter, ...] = (*CATALOGUE, *CLOSED_DRIVE)
 """Everything a parameter set may hold, in its order."""

@@ -151,7 +151,7 @@ def pole_placement(J: float, B: float, omega_n: float, zeta: float) -> SpeedGain
 def speed_loop(gains: SpeedGains, path: SpeedPath) -> SampledLoop:
     """Return the loop at the controller's period, broken at the torque."""
     T = path.T_speed
-    parts = (_torque_path(path.current), _mechanics(path), _speed_estimate(path), _feedback_filter(path))
+    parts = (torque_path(path.current), _mechanics(path), speed_estimate(path), feedback_filter(path))
     num, den = _rational(_lift(_series(*parts), path.decimation))
     for factor_num, factor_den in (
         ((gains.K_p, gains.K_i * T - gains.K_p), (1.0, -1.0)),
@@ -178,9 +178,9 @@ def notch_coefficients(notch: Notch, T: float) -> tuple[tuple[float, ...], tuple
     return num, den
 
 
-def _torque_path(current: SampledLoop) -> System:
+def torque_path(current: SampledLoop) -> System:
     """Closed current loop, reference to current, from the loop transfer function: L / (1 + L)."""
-    return _companion(np.asarray(current.num), np.asarray(np.polyadd(current.den, current.num), dtype=np.float64))
+    return companion(np.asarray(current.num), np.asarray(np.polyadd(current.den, current.num), dtype=np.float64))
 
 
 def _mechanics(path: SpeedPath) -> System:
@@ -189,10 +189,10 @@ def _mechanics(path: SpeedPath) -> System:
     y = path.B * T / path.J
     a = math.exp(-y)
     b = T / path.J * (1.0 if y == 0.0 else -math.expm1(-y) / y)
-    return _companion(np.array([0.5 * b, 0.5 * b]), np.array([1.0, -a]))
+    return companion(np.array([0.5 * b, 0.5 * b]), np.array([1.0, -a]))
 
 
-def _speed_estimate(path: SpeedPath) -> System:
+def speed_estimate(path: SpeedPath) -> System:
     """Tracking filter on the sampled position with a double pole at z0 = exp(-w_n T); output w^ after its update.
 
     e = th - (th^ + T w^), th^ += T w^ + (1 - z0^2) e, w^ += (1 - z0)^2 / T e. The position rises over a period by the
@@ -206,13 +206,14 @@ def _speed_estimate(path: SpeedPath) -> System:
     return A, A @ half_step + half_step, np.array([0.0, 1.0]), float(half_step[1])
 
 
-def _feedback_filter(path: SpeedPath) -> System:
+def feedback_filter(path: SpeedPath) -> System:
+    """First-order filter behind the speed estimate, backward Euler as in ``firmware/core``."""
     x = 2.0 * math.pi * path.filter_hz * path.current.T_s
     share = x / (1.0 + x)
-    return _companion(np.array([share, 0.0]), np.array([1.0, share - 1.0]))
+    return companion(np.array([share, 0.0]), np.array([1.0, share - 1.0]))
 
 
-def _companion(num: Array, den: Array) -> System:
+def companion(num: Array, den: Array) -> System:
     """Return a controllable realisation of num / den."""
     num = np.concatenate((np.zeros(den.size - num.size), num)) / den[0]
     den = den / den[0]

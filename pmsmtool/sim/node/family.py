@@ -18,7 +18,7 @@ from pmsmtool.data_types import SHORT
 from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, SignalCell
 from pmsmtool.drive_maps.wire_units import WireUnit, wire_unit
 from pmsmtool.errors import ConfigError
-from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.params.catalogue import BY_NAME, TORQUE_PER_AMPERE
 from pmsmtool.sim.node import own_identification
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.monitor import Monitor
@@ -255,9 +255,18 @@ class _Parameters:
 
     def _counted(self, cell: Cell, shown: Entry) -> bytes:
         """Return the factory's value as this family would keep it, cut to what its type holds."""
-        values = {name: self._dictionary[name].number() for name in (cell.name, cell.gain) if name}
+        values = {name: self._number(name) for name in (cell.name, cell.gain) if name}
         counts = cell.counts(values[cell.name], values)
         return shown.encode(counts if math.isfinite(counts) else math.copysign(1e30, counts))
+
+    def _number(self, name: str) -> float:
+        """Return a value of the drive behind (SI); what that has no object for is as its maker's tool leaves it."""
+        if name in self._dictionary.by_key:
+            return self._dictionary[name].number()
+        if name == TORQUE_PER_AMPERE:  # amperes are peak here, as everywhere behind
+            poles, flux = (self._dictionary[f"motor.{key}"].number() for key in ("pole_pairs", "psi_f_wb"))
+            return 1.5 * poles * flux
+        return BY_NAME[name].default
 
     def _sink(self, cell: Cell) -> Callable[[bytes], None]:
         def write(data: bytes) -> None:
@@ -277,7 +286,7 @@ class _Parameters:
             return
 
     def _act(self, cell: Cell, data: bytes) -> None:
-        values = {cell.gain: self._dictionary[cell.gain].number()} if cell.gain else {}
+        values = {cell.gain: self._number(cell.gain)} if cell.gain else {}
         try:
             value = cell.decode(data, values)
         except ConfigError as error:
@@ -286,6 +295,8 @@ class _Parameters:
             raise Refused(AbortCode.VALUE)
         others = [name for name in ONE_FOR_BOTH_AXES.get(cell.name, ()) if name not in self._map.cells]
         for name in (cell.name, *others):
+            if name not in self._dictionary.by_key:
+                continue  # kept for the family, without effect on the drive behind
             inner = self._dictionary[name]
             self._dictionary.write(inner, inner.encode(value))
 

@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: MIT
+"""From a design to the design of its axis: speed and position gains, feed-forward, notch, and the move to follow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from pmsmtool.axis.loops import AxisGains, AxisPath
+from pmsmtool.axis.mechanics import Mechanics, mechanics_of
+from pmsmtool.axis.reference import Profile, jerk_limited
+from pmsmtool.axis.search import Box, Case, Judged, Limits, stiffest
+from pmsmtool.design.design_file import Design, DesignValue, Scalar
+from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop
+from pmsmtool.design.loops.sampled_loop import SampledLoop
+from pmsmtool.design.ratings import ratings
+from pmsmtool.design.tolerance import NORMAL_95, tolerance_box
+from pmsmtool.errors import ConfigError, DesignInfeasible
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.params.catalogue import MIDDLE_KIND, TORQUE_PER_AMPERE
+from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
+
+CASCADE = ("position.K_p_per_s", "position.velocity_ff", "position.inertia_ff_kgm2")
+PID = (
+    "position.pid_p_nm_per_rad", "position.pid_i_nm_per_rads", "position.pid_d_nms_per_rad",
+    "position.friction_ff_nms_per_rad",
+)  # fmt: skip
+SPEED = ("speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad")
+SPEED_FORWARD = ("speed.inertia_ff_kgm2", "speed.friction_ff_nms_per_rad")
+NOTCH = ("speed.notch_hz", "speed.notch_zeta_num", "speed.notch_zeta_den")
+PROFILE = (
+    "reference.profile_speed_rpm", "reference.profile_acceleration_rpm_per_s",
+    "reference.profile_deceleration_rpm_per_s", "reference.profile_jerk_rpm_per_s2",
+)  # fmt: skip
+AXIS_ROWS = frozenset((TORQUE_PER_AMPERE, *CASCADE, *PID, *SPEED, *SPEED_FORWARD, *NOTCH, *PROFILE))
+"""What the design of an axis decides, and what is written into a drive for it."""
+SPEED_LOOP, POSITION_LOOP = "axis_speed", "axis_position"
+
+ASSUMED_RATE_HZ = 1000.0
+"""Rate of the loops of a drive that says none."""
+OWN_TORQUE = 0.2
+"""Half width (relative) of a torque per ampere that the drive holds or that is taken from psi_f without knowing whether
+the drive's amperes are peak, rms or block: the middle of peak and rms is 19 % from both."""
+RESONANCE = 0.03
+"""Half width (relative) of a resonance without a standard deviation."""
+DAMPING_SHARE = 0.5
+"""Smallest damping looked at, of the one measured."""
+SPEED_SHARE = 0.8
+"""Speed of a move, of the largest speed that has its torque."""
+TORQUE_SHARE = 0.6
+"""Torque of the acceleration, of the largest one beyond friction: the rest is for the loops."""
+RAMP = 4.0
+"""Ramp of the acceleration on a rigid shaft, in time constants J / K_p of the speed loop: torque follows to 2 %."""
+
+
+@dataclass(frozen=True, slots=True)
+class AxisRequest:
+    """What is asked of an axis.
+
+    Attributes
+    ----------
+    phase_margin_deg, peak_db : float
+        Least phase margin (degree) and largest |S| (dB) of both loops over the tolerance box.
+    loop_rate_hz : float or None
+        Rate of the drive's speed and position loops (Hz); None: as its map says, else 1 kHz.
+    speed_filter_hz : float or None
+        Its filter on the speed (Hz); None: as the design says for a reference drive, none for others.
+    """
+
+    phase_margin_deg: float = 45.0
+    peak_db: float = 6.0
+    loop_rate_hz: float | None = None
+    speed_filter_hz: float | None = None
+
+    def __post_init__(self) -> None:
+        wrong = []
+        if not 20.0 <= self.phase_margin_deg <= 75.0:
+            wrong.append(f"axis_phase_margin_deg = {self.phase_margin_deg!r} is not between 20 and 75 degree")
+        if not 2.0 <= self.peak_db <= 12.0:
+            wrong.append(f"axis_peak_db = {self.peak_db!r} is not between 2 and 12 dB")
+        for name in ("loop_rate_hz", "speed_filter_hz"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                wrong.append(f"{name} = {value!r} is not a positive number")
+        if wrong:
+            raise ConfigError(
+                "the request cannot be used", where="tune --axis", hint="ask within these bounds", violations=wrong
+            )
+
+    def table(self) -> dict[str, Scalar]:
+        """Return what was asked, as the design file keeps it."""
+        asked: dict[str, Scalar] = {
+            "axis": True, "axis_phase_margin_deg": self.phase_margin_deg, "axis_peak_db": self.peak_db,
+        }  # fmt: skip
+        given = {"loop_rate_hz": self.loop_rate_hz, "axis_speed_filter_hz": self.speed_filter_hz}
+        return asked | {name: value for name, value in given.items() if value is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class AxisDrive:
+    """What of a drive decides its axis.
+
+    Attributes
+    ----------
+    name : str
+        Of its map.
+    offers : frozenset of str
+        Catalogue names it has objects for.
+    own_core : bool
+        Whether it runs the control of this program: rate, speed estimate and filter are then those of the design.
+    period_s : float or None
+        Period of its loops as its map says (s).
+    amperes : bool
+        Whether its gains are in amperes.
+    """
+
+    name: str
+    offers: frozenset[str]
+    own_core: bool
+    period_s: float | None = None
+    amperes: bool = False
+
+    @property
+    def pid(self) -> bool:
+        """Whether one controller of the position gives the torque."""
+        return PID[0] in self.offers
+
+
+@dataclass(frozen=True, slots=True)
+class AxisDesign:
+    """A design with its axis, and what judges other gains for it: those a drive holds after rounding."""
+
+    design: Design
+    box: Box
+    speed: AxisGains
+    position: AxisGains
+
+    def with_held(self, held: Mapping[str, float]) -> Design:
+        """Return the design with values as a drive holds them, by catalogue name, judged by the loops these make."""
+        values = {name: replace(self.design.values[name], value=value) for name, value in held.items()}
+        speed, position = self.speed, self.position
+        if SPEED[0] in held and SPEED[1] in held:
+            speed = replace(speed, K_p=held[SPEED[0]], K_i=held[SPEED[1]], K_v=held.get(CASCADE[0], speed.K_v))
+        if PID[0] in held:
+            position = from_pid(held[PID[0]], held[PID[1]], held[PID[2]], position)
+        elif self.box.path.structure == "cascade":
+            position = speed
+        return _judged(self.design, values, self.box, speed, position)
+
+
+def from_pid(K_P: float, K_I: float, K_D: float, like: AxisGains) -> AxisGains:
+    """Return the cascade of a PID: K_v is the root of K_D K_v^2 - K_P K_v + K_I that is nearer to another's."""
+    apart = math.sqrt(max(K_P * K_P - 4.0 * K_D * K_I, 0.0))
+    K_v = min(((K_P + sign * apart) / (2.0 * K_D) for sign in (1.0, -1.0)), key=lambda root: abs(root - like.K_v))
+    return replace(like, K_p=K_D, K_i=K_P - K_D * K_v, K_v=K_v)
+
+
+def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDesign:
+    """Return a design whose speed and position loops are those of its axis.
+
+    Parameters
+    ----------
+    design : Design
+        As ``tune`` makes it: its current loop is part of the path.
+
+    Raises
+    ------
+    ConfigError
+        The machine has no inertia.
+    DesignInfeasible
+        No gains keep the margins over the tolerance box.
+    """
+    source = design.machine
+    shaft = mechanics_of(source)
+    path, notes = axis_path(design, request, drive, shaft)
+    box = Box(path, cases(source, drive.amperes))
+    limits, notch = Limits(request.phase_margin_deg, request.peak_db), NOTCH[0] in drive.offers
+    if drive.pid:  # the controller of the speed acts in velocity modes alone
+        speed = stiffest(box, limits, notch=notch, loops=("speed",))
+        position = stiffest(box, limits, notch=notch, loops=("position",))
+    else:
+        speed = position = stiffest(box, limits, notch=notch)
+    profile = profile_of(design, shaft, position, path.T)
+    if PROFILE[3] not in drive.offers and PROFILE[0] in drive.offers:
+        notes = (*notes, "no object for the jerk (0x60A4): moves are trapezoids")
+    how = f"stiffest with {request.phase_margin_deg:g} deg and |S| below {request.peak_db:g} dB over the tolerance box"
+    asked: dict[str, Scalar] = {**design.request, **request.table()}
+    if not drive.own_core:
+        asked["drive"] = drive.name
+    facts: dict[str, Scalar] = {
+        **{name: fact for name, fact in design.facts.items() if name != "speed_crossover_rad_s"},
+        "axis_structure": path.structure,
+        "axis_loop_period_s": path.T,
+        "axis_load_ratio": shaft.load_ratio,
+        "axis_speed_rad_s": profile.speed,
+        "axis_acceleration_rad_s2": profile.acceleration,
+        "axis_jerk_rad_s3": profile.jerk,
+    }
+    # the loop of the speed alone is judged as part of the axis
+    kept = {name: replace(value, loop="") if value.loop == "speed" else value for name, value in design.values.items()}
+    base = replace(
+        design, request=asked, facts=facts, values=kept, notes=(*design.notes, *notes),
+        loops={name: loop for name, loop in design.loops.items() if name != "speed"},
+    )  # fmt: skip
+    values = axis_values(source, speed, position, profile, drive, how)
+    return AxisDesign(_judged(base, values, box, speed, position), box, speed, position)
+
+
+def _judged(
+    design: Design, values: Mapping[str, DesignValue], box: Box, speed: AxisGains, position: AxisGains
+) -> Design:
+    """Return a design with values of its axis, judged by the loops that the gains make."""
+    loops, facts = dict(design.loops), dict(design.facts)
+    facts |= {
+        "axis_K_p_nms_per_rad": position.K_p,
+        "axis_K_i_nm_per_rad": position.K_i,
+        "axis_K_v_per_s": position.K_v,
+        "axis_stiffness_nm_per_rads": position.K_i * position.K_v,
+    }
+    for name, found in ((SPEED_LOOP, box.judged(speed, "speed")), (POSITION_LOOP, box.judged(position, "position"))):
+        loops[name] = found.nominal.loop
+        facts |= _facts(name, found)
+    return replace(design, values={**design.values, **values}, loops=loops, facts=facts)
+
+
+def _facts(name: str, found: Judged) -> dict[str, Scalar]:
+    return {
+        f"{name}_phase_least_deg": found.phase_deg,
+        f"{name}_phase_least_at": str(found.phase_case),
+        f"{name}_S_peak_db": found.S_db,
+        f"{name}_S_peak_at": str(found.S_case),
+        f"{name}_T_peak_db": found.T_db,
+    }
+
+
+def axis_path(
+    design: Design, request: AxisRequest, drive: AxisDrive, shaft: Mechanics
+) -> tuple[AxisPath, tuple[str, ...]]:
+    """Return what lies between torque and angle on this drive, and what was assumed."""
+    current = _current(design)
+    if drive.own_core:
+        return AxisPath(
+            shaft, current, int(design["speed.decimation"]), pll_rad_s=design["encoder.pll_bandwidth_rad_s"],
+            filter_hz=design["speed.filter_hz"],
+        ), ()  # fmt: skip
+    notes = []
+    period = 1.0 / request.loop_rate_hz if request.loop_rate_hz else drive.period_s
+    if period is None:
+        period = 1.0 / ASSUMED_RATE_HZ
+        notes.append(
+            f"the map {drive.name!r} does not say the rate of the loops: {ASSUMED_RATE_HZ:g} Hz assumed; "
+            "--loop-rate-hz gives it"
+        )
+    decimation = max(1, round(period / current.T_s))
+    if abs(decimation * current.T_s / period - 1.0) > 0.02:
+        # the loops run on their own clock: take the control period that fits a whole number of times
+        current = replace(current, T_s=period / decimation)
+    notes.append("the torque of a sample is taken to act one period of the loops later, besides the current loop")
+    structure = "pid" if drive.pid else "cascade"
+    return AxisPath(shaft, current, decimation, 1, structure, filter_hz=request.speed_filter_hz or 0.0), tuple(notes)  # type: ignore[arg-type]
+
+
+def _current(design: Design) -> SampledLoop:
+    machine, inverter = design.machine.machine, design.machine.inverter
+    plant = AxisPlant(machine.R_s_ohm, machine.L_q_h, inverter.T_s, inverter.delay_periods)
+    gains = CurrentGains(
+        design["current.K_p_q_v_per_a"], design["current.K_i_q_v_per_as"],
+        float(design.facts["current_bandwidth_rad_s"]), Method.IMC,
+    )  # fmt: skip
+    return axis_loop(gains, plant, plant if design.request.get("predictor") else None)
+
+
+def cases(source: MachineFile, amperes: bool) -> tuple[Case, ...]:
+    """Return the corners of the tolerance box that decide the loops: torque over inertia, resonance and damping."""
+    factors = tolerance_box(source).factors
+    inertia = factors["J_kgm2"].half_width
+    torque = OWN_TORQUE if amperes else factors["psi_f_wb"].half_width if "psi_f_wb" in factors else 0.0
+    ends = ((1.0 - torque) / (1.0 + inertia), (1.0 + torque) / (1.0 - min(inertia, 0.8)))
+    f_r = source.machine.resonance_hz
+    if f_r is None:
+        return tuple(Case(end) for end in ends)
+    doubt = RESONANCE
+    if "resonance_hz" in source.std:
+        doubt = (NORMAL_95 * source.std["resonance_hz"] + source.systematic.get("resonance_hz", 0.0)) / f_r
+    shifts = (1.0 - doubt, 1.0 + doubt)
+    return tuple(Case(end, shift, DAMPING_SHARE) for end in ends for shift in shifts)
+
+
+def profile_of(design: Design, shaft: Mechanics, gains: AxisGains, T: float) -> Profile:
+    """Return the limits of a move that torque and voltage allow, and that leaves the load at rest."""
+    source = design.machine
+    margin = float(design.request["voltage_margin"])
+    rated = ratings(source, (1.0 - margin) * source.inverter.V_max_v)
+    top_rpm = min(rated.n_max_rpm, rated.base_speed_rpm) if rated.base_speed_rpm > 0.0 else rated.n_max_rpm
+    speed = SPEED_SHARE * rad_s_from_rpm(top_rpm)
+    friction = (source.machine.tau_c_nm or 0.0) + shaft.B * speed
+    torque = TORQUE_SHARE * (rated.tau_max_nm - friction)
+    if torque <= 0.0:
+        raise DesignInfeasible(
+            f"friction takes the whole torque, {rated.tau_max_nm:.4g} N m, at {top_rpm:.4g} rpm",
+            where="machine.B_nms, machine.tau_c_nm", hint="correct the friction, or the largest speed",
+        )  # fmt: skip
+    ramp = 1.0 / shaft.antiresonance_hz if shaft.elastic else RAMP * shaft.J / gains.K_p
+    return jerk_limited(speed, torque / shaft.J, math.ceil(ramp / T) * T)
+
+
+def axis_values(
+    source: MachineFile, speed: AxisGains, position: AxisGains, profile: Profile, drive: AxisDrive, how: str
+) -> dict[str, DesignValue]:
+    """Return the values of an axis by catalogue name; those of other makers' drives as far as this one has objects."""
+    machine = source.machine
+    J, B = machine.J_kgm2 or 0.0, machine.B_nms or 0.0
+    K_P, K_I, K_D = position.pid
+    notch = "at the resonance" if position.notch.hz else "off: not needed, or the drive has none"
+    profile_how = f"{SPEED_SHARE:g} of the largest speed, {TORQUE_SHARE:g} of the torque beyond friction"
+    found = {
+        SPEED[0]: DesignValue(speed.K_p, how, SPEED_LOOP),
+        SPEED[1]: DesignValue(speed.K_i, how, SPEED_LOOP),
+        SPEED_FORWARD[0]: DesignValue(J, "inertia"),
+        SPEED_FORWARD[1]: DesignValue(B, "viscous friction"),
+        NOTCH[0]: DesignValue(position.notch.hz, notch),
+        NOTCH[1]: DesignValue(position.notch.zeta_num, notch),
+        NOTCH[2]: DesignValue(position.notch.zeta_den, notch),
+        CASCADE[0]: DesignValue(position.K_v, how, POSITION_LOOP),
+        CASCADE[1]: DesignValue(1.0, "the whole speed of the reference"),
+        CASCADE[2]: DesignValue(J, "inertia"),
+        PID[0]: DesignValue(K_P, how, POSITION_LOOP),
+        PID[1]: DesignValue(K_I, how, POSITION_LOOP),
+        PID[2]: DesignValue(K_D, how, POSITION_LOOP),
+        PID[3]: DesignValue(B, "viscous friction"),
+        PROFILE[0]: DesignValue(rpm_from_rad_s(profile.speed), profile_how),
+        PROFILE[1]: DesignValue(rpm_from_rad_s(profile.acceleration), profile_how),
+        PROFILE[2]: DesignValue(rpm_from_rad_s(profile.acceleration), profile_how),
+        PROFILE[3]: DesignValue(
+            rpm_from_rad_s(profile.jerk), "a ramp of one period of the load's own swing, or of 4 J / K_p"
+        ),
+    }
+    values = {name: value for name, value in found.items() if name in drive.offers or name in (*SPEED, *NOTCH)}
+    if drive.amperes:
+        K_t = MIDDLE_KIND * torque_per_ampere(machine.pole_pairs, machine.psi_f_wb)
+        how = "1.5 p psi_f per ampere, between peak and rms: compared, never written"
+        values[TORQUE_PER_AMPERE] = DesignValue(K_t, how)
+    return values

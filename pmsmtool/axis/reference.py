@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: MIT
+"""The move that an axis follows: speed, acceleration and jerk limited, point to point.
+
+With jerk j and acceleration a the torque rises over t_j = a / j. A load behind an elastic shaft is at rest again after
+each of these ramps when t_j is a whole number of its own periods 1 / f_a: the acceleration is then a rectangle averaged
+over one period of the swing (N. C. Singer, W. P. Seering, J. Dyn. Sys. Meas. Control 112 (1990) 76).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """Limits of a move: speed (rad/s), acceleration (rad/s2), jerk (rad/s3; infinity: none)."""
+
+    speed: float
+    acceleration: float
+    jerk: float = math.inf
+
+    def __post_init__(self) -> None:
+        wrong = [name for name in ("speed", "acceleration", "jerk") if not getattr(self, name) > 0.0]
+        if wrong:
+            raise ConfigError(
+                "a move needs positive limits", where="profile", hint="give a positive number", violations=wrong
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """One move from rest to rest.
+
+    Attributes
+    ----------
+    distance : float
+        Angle (rad), signed.
+    t_jerk, t_acceleration, t_speed : float
+        Times (s): of one ramp of the acceleration, from the first ramp's begin to the second's, and from the begin of
+        the acceleration to that of the braking.
+    """
+
+    distance: float
+    t_jerk: float
+    t_acceleration: float
+    t_speed: float
+
+    @property
+    def duration_s(self) -> float:
+        """Time of the whole move (s)."""
+        return self.t_jerk + self.t_acceleration + self.t_speed
+
+    @property
+    def peak_speed(self) -> float:
+        """Largest speed (rad/s)."""
+        return abs(self.distance) / self.t_speed if self.t_speed else 0.0
+
+    @property
+    def peak_acceleration(self) -> float:
+        """Largest acceleration (rad/s2)."""
+        return self.peak_speed / self.t_acceleration if self.t_acceleration else 0.0
+
+    def at(self, t_s: Array) -> tuple[Array, Array, Array]:
+        """Return angle (rad), speed and acceleration at times from the begin of the move (s)."""
+        if not self.distance:
+            zero = np.zeros_like(np.asarray(t_s, dtype=np.float64))
+            return zero, zero, zero
+        # a step, averaged over t_speed, t_acceleration and t_jerk: every derivative is a signed sum of shifted powers
+        signs, shifts = [1.0], [0.0]
+        scale = self.distance
+        for width in (self.t_speed, self.t_acceleration, self.t_jerk):
+            if width > 0.0:
+                signs, shifts = signs + [-s for s in signs], shifts + [at + width for at in shifts]
+                scale /= width
+        order = len(signs).bit_length() - 1
+        age = np.maximum(np.asarray(t_s, dtype=np.float64)[:, None] - np.array(shifts), 0.0)
+
+        def derivative(n: int) -> Array:
+            power = order - n
+            if power < 0:
+                return np.zeros(age.shape[0])
+            shape = (age > 0.0) * 1.0 if power == 0 else age**power / math.factorial(power)
+            return np.asarray(scale * (shape @ np.array(signs)), dtype=np.float64)
+
+        angle = np.where(np.asarray(t_s) >= self.duration_s, self.distance, derivative(0))
+        return angle, derivative(1), derivative(2)
+
+
+def plan(distance: float, profile: Profile) -> Move:
+    """Return the fastest move within limits.
+
+    The three times of a move limited in jerk, acceleration and speed: L = v t_v, v = a t_a, a = j t_j with
+    t_j <= t_a <= t_v; a limit that a short move does not reach is not used up.
+    """
+    length = abs(distance)
+    if not length:
+        return Move(0.0, 0.0, 0.0, 0.0)
+    v, a, j = profile.speed, profile.acceleration, profile.jerk
+    # without reaching a limit: t_v >= t_a >= t_j, each the least that the limits and the order allow
+    t_j = min(a / j, math.sqrt(v / j), (length / (2.0 * j)) ** (1.0 / 3.0) if math.isfinite(j) else 0.0)
+    a = min(a, j * t_j) if t_j else a
+    # v = a t_a, length = v (t_a + t_j) at least
+    t_a = min(v / a, 0.5 * (-t_j + math.sqrt(t_j * t_j + 4.0 * length / a)))
+    v = a * t_a
+    t_v = length / v
+    return Move(distance, t_j, t_a, t_v)
+
+
+def jerk_limited(speed: float, acceleration: float, ramp_s: float) -> Profile:
+    """Return the profile whose acceleration rises within a time (s)."""
+    return Profile(speed, acceleration, acceleration / ramp_s if ramp_s else math.inf)

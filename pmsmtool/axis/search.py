@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: MIT
+"""Gains of an axis: the stiffest control whose margins hold over the whole tolerance box.
+
+Maximised is K_i K_v, the integral gain from position error to torque: its inverse is the integral of the position error
+after a step of load torque. Constraints are least phase margin and largest |S|, of the speed loop alone and of both
+loops together. Source of the principle: K. J. Astrom, H. Panagopoulos, T. Hagglund, Automatica 34 (1998) 585.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.axis.loops import AxisGains, AxisPath, Lifted, Loop, closed_loop_poles, lifted, open_loop
+from pmsmtool.axis.robustness import AxisMargins, axis_margins, gain_crossings, grid
+from pmsmtool.design.loops.speed_loop import Notch
+from pmsmtool.errors import DesignInfeasible
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+LOOPS: tuple[Loop, ...] = ("speed", "position")
+
+INTEGRAL_RATIOS = (3.0, 4.0, 6.0, 9.0, 14.0)
+POSITION_RATIOS = (3.0, 4.0, 6.0, 9.0, 14.0)
+"""Ratios tried: crossover K_p / J over K_i / K_p, and over K_v."""
+NOTCH_WIDTHS = (0.25, 0.5, 1.0)
+"""Denominator dampings of the notch tried."""
+NOTCH_DEPTH = 0.1
+"""Numerator over denominator damping: 20 dB at the centre."""
+NOTCH_RATE = 0.4
+"""Largest frequency of a notch times the period of the loops: half of the rate is the end."""
+SLOWEST = 1e-4
+"""A crossover is looked for down to this share of 1 / lag."""
+STEPS = 44
+HALVINGS = 8
+BACK = 0.98
+"""Step by which a crossover is taken back where the exact margins are just below those of the grid."""
+BACKS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One corner of the box: a factor of the torque over the inertia, and of the resonance and its damping."""
+
+    gain: float = 1.0
+    frequency: float = 1.0
+    damping: float = 1.0
+
+    def __str__(self) -> str:
+        return f"gain x {self.gain:.3g}, resonance x {self.frequency:.3g}, its damping x {self.damping:.3g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Least phase margin (degree) and largest |S| (dB)."""
+
+    phase_deg: float = 45.0
+    S_db: float = 6.0
+
+    def holds(self, found: AxisMargins) -> bool:
+        """Whether a loop is stable and keeps both."""
+        loop = found.loop
+        return loop.stable and loop.phase_margin_deg >= self.phase_deg and found.S_peak_db <= self.S_db
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Margins of one loop: with the nominal shaft, and the least of each over the box with the case it belongs to."""
+
+    nominal: AxisMargins
+    phase_deg: float
+    phase_case: Case
+    S_db: float
+    S_case: Case
+    T_db: float
+
+
+class Box:
+    """The path of an axis at every corner of its tolerance box.
+
+    Parameters
+    ----------
+    path : AxisPath
+        With the nominal shaft.
+    cases : sequence of Case
+        Corners; the nominal one is looked at besides.
+    """
+
+    def __init__(self, path: AxisPath, cases: Sequence[Case]) -> None:
+        self.path = path
+        self.cases = (Case(), *cases)
+        shafts = {(case.frequency, case.damping): None for case in self.cases}
+        self._plants = {
+            key: lifted(replace(path, shaft=path.shaft.scaled(1.0, *key))) for key in shafts
+        }  # fmt: skip
+        self._seen: dict[tuple[float, float], tuple[Array, Complex]] = {}
+        for key, plant in self._plants.items():
+            omega = grid(plant)
+            self._seen[key] = omega, plant.at(omega)
+
+    def may_hold(self, gains: AxisGains, limits: Limits, loops: Sequence[Loop] = LOOPS) -> bool:
+        """Whether loops keep the limits on the grid, at every corner, and are stable."""
+        sensitivity = 10.0 ** (-limits.S_db / 20.0)
+        least = math.radians(limits.phase_deg)
+        for (frequency, damping), (omega, seen) in self._seen.items():
+            plant = self._plants[frequency, damping]
+            for loop in loops:
+                values = open_loop(plant, self.path, gains, loop, omega, seen)
+                for case in self.cases:
+                    if (case.frequency, case.damping) != (frequency, damping):
+                        continue
+                    scaled = values * case.gain
+                    if float(np.min(np.abs(1.0 + scaled))) < sensitivity:
+                        return False
+                    at, angle = gain_crossings(scaled)
+                    if not at.size or float(np.min(np.abs(angle))) < least:
+                        return False
+        return all(
+            bool(np.all(np.abs(closed_loop_poles(self._scaled(case), self.path, gains, loop)) < 1.0))
+            for case in self.cases
+            for loop in loops
+        )
+
+    def _scaled(self, case: Case) -> Lifted:
+        plant = self._plants[case.frequency, case.damping]
+        return replace(plant, b=plant.b * case.gain, d=plant.d * case.gain)
+
+    def judged(self, gains: AxisGains, loop: Loop) -> Judged:
+        """Return the margins of a loop over the box."""
+        found = {case: axis_margins(self._scaled(case), self.path, gains, loop) for case in self.cases}
+        phase = min(found, key=lambda case: _phase(found[case]))
+        peak = max(found, key=lambda case: found[case].S_peak_db)
+        most = max(one.T_peak_db for one in found.values())
+        return Judged(found[Case()], _phase(found[phase]), phase, found[peak].S_peak_db, peak, most)
+
+    def holds(self, gains: AxisGains, limits: Limits, loops: Sequence[Loop] = LOOPS) -> bool:
+        """Whether loops are stable and keep the limits at every corner, exactly."""
+        return all(
+            limits.holds(axis_margins(self._scaled(case), self.path, gains, loop))
+            for case in self.cases
+            for loop in loops
+        )
+
+
+def _phase(found: AxisMargins) -> float:
+    return found.loop.phase_margin_deg if found.loop.stable else -math.inf
+
+
+def _notches(path: AxisPath, allowed: bool) -> Iterator[Notch]:
+    yield Notch()
+    if allowed and path.shaft.elastic and path.shaft.resonance_hz * path.T < NOTCH_RATE:
+        for width in NOTCH_WIDTHS:
+            yield Notch(path.shaft.resonance_hz, NOTCH_DEPTH * width, width)
+
+
+def stiffest(box: Box, limits: Limits, *, notch: bool = True, loops: Sequence[Loop] = LOOPS) -> AxisGains:
+    """Return the gains with the largest K_i K_v that keep the limits over the box.
+
+    Parameters
+    ----------
+    notch : bool
+        Whether the drive has a notch to set.
+    loops : sequence of str
+        Those that these gains decide; of ``speed`` alone K_v is not looked at.
+
+    Raises
+    ------
+    DesignInfeasible
+        None does.
+    """
+    path = box.path
+    positions = POSITION_RATIOS if "position" in loops else POSITION_RATIOS[:1]
+    best: AxisGains | None = None
+    for shape in sorted(
+        itertools.product(INTEGRAL_RATIOS, positions, _notches(path, notch)), key=lambda one: one[0] * one[1]
+    ):
+        floor = 0.0 if best is None else _least(best, path, shape)
+        found = _fastest(box, limits, shape, floor, loops)
+        if found is not None:
+            best = found
+    if best is None:
+        raise DesignInfeasible(
+            f"no gains have {limits.phase_deg:g} degree and |S| below {limits.S_db:g} dB over the tolerance box",
+            where="axis",
+            likely=f"the loops see and act too late ({1e3 * path.lag_s:.3g} ms) for this resonance and its interval",
+            hint="ask for smaller margins, or give the drive's own rate and filter",
+        )
+    return best
+
+
+Shape = tuple[float, float, Notch]
+
+
+def _gains(path: AxisPath, shape: Shape, omega_c: float) -> AxisGains:
+    integral, position, notch = shape
+    K_p = path.shaft.J * omega_c
+    return AxisGains(K_p, K_p * omega_c / integral, omega_c / position, notch)
+
+
+def _least(best: AxisGains, path: AxisPath, shape: Shape) -> float:
+    """Return the crossover from which a shape is stiffer than the best so far."""
+    return float((best.K_i * best.K_v / path.shaft.J * shape[0] * shape[1]) ** (1.0 / 3.0))
+
+
+def _fastest(box: Box, limits: Limits, shape: Shape, floor: float, loops: Sequence[Loop]) -> AxisGains | None:
+    """Return the gains of a shape with the largest crossover above ``floor``, None where none keeps the limits."""
+    path = box.path
+    top = 1.0 / path.lag_s
+    tried = [omega for omega in np.geomspace(1.0, SLOWEST, STEPS) * top if omega > floor]
+    for k, omega in enumerate(tried):
+        if not box.may_hold(_gains(path, shape, float(omega)), limits, loops):
+            continue
+        low, high = float(omega), float(tried[k - 1]) if k else float(omega)
+        for _ in range(HALVINGS):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if box.may_hold(_gains(path, shape, middle), limits, loops) else (low, middle)
+        for _ in range(BACKS):
+            if low <= floor:
+                return None
+            gains = _gains(path, shape, low)
+            if box.holds(gains, limits, loops):
+                return gains
+            low *= BACK
+        return None
+    return None

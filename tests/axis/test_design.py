@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: MIT
+"""The design of an axis: margins over the box, for machines that were not looked at, in the drive's own numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pmsmtool.axis.design import PID, AxisGains, AxisRequest, axis_path, from_pid, with_axis
+from pmsmtool.axis.loops import lifted
+from pmsmtool.axis.mechanics import mechanics_of
+from pmsmtool.axis.robustness import axis_margins
+from pmsmtool.axis.search import Box, Limits, stiffest
+from pmsmtool.commissioning.axis_design import axis_drive, axis_parameters, design_axis, not_offered
+from pmsmtool.design.design_file import Design, design_text, parse_design
+from pmsmtool.design.loops.speed_loop import Notch
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive_maps.shipped_maps import load_family
+from pmsmtool.errors import ConfigError, DesignInfeasible
+from pmsmtool.flash.plan import make_plan, names_to_read
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.params.catalogue import MIDDLE_KIND, TORQUE_PER_AMPERE
+
+ASKED = AxisRequest()
+SLACK_DEG, SLACK_DB = 0.3, 0.1
+"""Random machines inside the box may lie between its corners; measured 0.0 degree and 0.0 dB beyond."""
+
+
+def machine(f_a: float = 0.0, f_r: float = 0.0, zeta: float = 0.02) -> MachineFile:
+    source = load_machine_file("interior-2k2")
+    if not f_r:
+        return source
+    shaft = replace(source.machine, antiresonance_hz=f_a, resonance_hz=f_r, resonance_zeta=zeta)
+    return replace(source, machine=shaft)
+
+
+@cache
+def designed(family: str, f_a: float, f_r: float) -> Design:
+    return design_axis(machine(f_a, f_r), TuneRequest(), ASKED, load_family(family))
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize(
+    ("family", "f_a", "f_r"), [("pmsmsim", 45.0, 200.0), ("epos4", 300.0, 800.0), ("cia402", 90.0, 130.0)]
+)
+def test_random_machines_of_the_box_keep_what_was_asked(family: str, f_a: float, f_r: float) -> None:
+    made = designed(family, f_a, f_r)
+    drive = axis_drive(load_family(family))
+    path, _ = axis_path(made, ASKED, drive, mechanics_of(made.machine))
+    notch = Notch(made["speed.notch_hz"], made["speed.notch_zeta_num"], made["speed.notch_zeta_den"])
+    K_p, K_i, K_v = (float(made.facts[f"axis_{key}"]) for key in ("K_p_nms_per_rad", "K_i_nm_per_rad", "K_v_per_s"))
+    speed = AxisGains(made["speed.K_p_nms_per_rad"], made["speed.K_i_nm_per_rad"], 0.0, notch)
+    rng = np.random.default_rng(4)
+    for _ in range(8):
+        inertia = 1.0 + 1.96 * 0.05 * rng.uniform(-1.0, 1.0)
+        shaft = path.shaft.scaled(inertia, 1.0 + 0.03 * rng.uniform(-1.0, 1.0), rng.uniform(0.5, 2.0))
+        other = replace(path, shaft=shaft)
+        for found in (
+            axis_margins(lifted(other), other, speed, "speed"),
+            axis_margins(lifted(other), other, AxisGains(K_p, K_i, K_v, notch), "position"),
+        ):
+            assert found.loop.stable
+            assert found.loop.phase_margin_deg >= 45.0 - SLACK_DEG and found.S_peak_db <= 6.0 + SLACK_DB
+
+
+def test_the_stiffest_gains_touch_a_limit() -> None:
+    facts = designed("epos4", 0.0, 0.0).facts
+    worst = min(float(facts[f"axis_{loop}_phase_least_deg"]) for loop in ("speed", "position"))
+    peak = max(float(facts[f"axis_{loop}_S_peak_db"]) for loop in ("speed", "position"))
+    assert 45.0 <= worst < 45.5 or 5.7 < peak <= 6.0
+
+
+def test_a_design_of_the_axis_is_read_back_and_gives_its_own_rows_only() -> None:
+    made = designed("epos4", 0.0, 0.0)
+    again = parse_design(design_text(made))
+    assert design_text(again) == design_text(made)
+    assert axis_parameters(again).values == axis_parameters(made).values
+    assert "current.K_p_q_v_per_a" not in axis_parameters(made).values
+
+
+def test_counts_follow_the_torque_per_ampere_that_the_drive_holds() -> None:
+    """Twice the torque per ampere halves the counts: the torque stays."""
+    drive_map, made = load_family("epos4"), designed("epos4", 0.0, 0.0)
+    wanted = axis_parameters(made)
+    peak = wanted.values[TORQUE_PER_AMPERE] / MIDDLE_KIND
+    counts = []
+    for K_t in (peak, 2.0**0.5 * peak):
+        found = {name: bytes(drive_map.cells[name].size) for name in names_to_read(drive_map, wanted)}
+        found[TORQUE_PER_AMPERE] = round(1e6 * K_t).to_bytes(4, "little")
+        plan = make_plan(drive_map, wanted, found)
+        assert TORQUE_PER_AMPERE not in [change.name for change in plan.entries]
+        proportional = next(change for change in plan.entries if change.name == PID[0])
+        assert proportional.held == pytest.approx(wanted.values[PID[0]], rel=1e-6)
+        counts.append(int.from_bytes(proportional.new, "little"))
+    assert counts[0] == pytest.approx(2.0**0.5 * counts[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.2])
+def test_a_drive_set_up_for_another_motor_is_refused(factor: float) -> None:
+    drive_map, wanted = load_family("epos4"), axis_parameters(designed("epos4", 0.0, 0.0))
+    found = {name: bytes(drive_map.cells[name].size) for name in names_to_read(drive_map, wanted)}
+    found[TORQUE_PER_AMPERE] = round(1e6 * factor * wanted.values[TORQUE_PER_AMPERE]).to_bytes(4, "little")
+    with pytest.raises(ConfigError, match="0x3001:05"):
+        make_plan(drive_map, wanted, found)
+
+
+def test_a_whole_design_leaves_gains_in_amperes_alone() -> None:
+    drive_map, whole = load_family("epos4"), tune(machine()).parameter_set()
+    assert not [name for name in drive_map.encode(whole) if name.startswith(("speed.", "position."))]
+    assert "tune --axis" in drive_map.not_written(whole.values)["speed.K_p_nms_per_rad"]
+
+
+def test_a_gain_of_unknown_unit_is_named() -> None:
+    assert "no unit" in not_offered(load_family("faulhaber"))["speed.K_p_nms_per_rad"]
+
+
+def test_from_pid_finds_the_cascade_again() -> None:
+    gains = AxisGains(0.7, 9.0, 21.0)
+    again = from_pid(*gains.pid, gains)
+    assert (again.K_p, again.K_i, again.K_v) == pytest.approx((0.7, 9.0, 21.0))
+
+
+def test_what_cannot_be_designed_is_refused() -> None:
+    source = machine()
+    drive = axis_drive(load_family("cia402"))
+    with pytest.raises(ConfigError, match="inertia"):
+        with_axis(tune(replace(source, machine=replace(source.machine, J_kgm2=None))), ASKED, drive)
+    alone = replace(source, machine=replace(source.machine, resonance_hz=100.0))
+    with pytest.raises(ConfigError, match="antiresonance"):
+        with_axis(tune(alone), ASKED, drive)
+    path, _ = axis_path(tune(source), ASKED, drive, mechanics_of(source))
+    with pytest.raises(DesignInfeasible, match="no gains have 120 degree"):
+        stiffest(Box(path, ()), Limits(120.0, 6.0))

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: MIT
+"""`tune --axis` from the command line, and its gains in a simulated EPOS4: written, read back, and compared again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.cli.conftest import Tool
+
+DRIVE = ("--map", "epos4", "--sim", "interior-2k2?drive=epos4&nv=axis.nv")
+
+
+@pytest.mark.chain
+def test_gains_of_the_axis_reach_the_drive(tool: Tool, tmp_path: Path) -> None:
+    code, printed, _ = tool("tune", "interior-2k2", "-o", "axis.toml", "--axis", "--map", "epos4", "--json")
+    assert code == 0
+    made = json.loads(printed)
+    assert made["schema"] == "pmsmtool.tune.axis/1" and made["not_written"] == {}
+    assert made["loops"]["axis_position"]["phase_margin_deg"] >= 45.0
+    assert made["facts"]["axis_position_S_peak_db"] <= 6.0
+    assert "current.K_p_q_v_per_a" not in made["values"]
+    for source in ("axis.toml", "axis.params.toml"):
+        code, _, said = tool("flash-params", source, *DRIVE, "--yes")
+        assert code == 0, said
+        # the second file is the first one's set: nothing is left to write
+        assert ("12 of 12 objects change" in said) is (source == "axis.toml")
+    assert tool("verify", "axis.params.toml", *DRIVE)[0] == 0
+
+
+def test_a_drive_without_units_gets_a_table_and_exit_code_10(tool: Tool) -> None:
+    code, printed, said = tool("tune", "interior-2k2", "-o", "axis.toml", "--axis", "--map", "faulhaber")
+    assert code == 10 and "axis_K_v_per_s" in printed
+    assert "0x2331:01 or 0x60F9:01" in said and "map learn" in said
+
+
+def test_a_rate_without_the_axis_is_refused(tool: Tool) -> None:
+    code, _, said = tool("tune", "interior-2k2", "-o", "design.toml", "--loop-rate-hz", "1000")
+    assert code == 2 and "--axis" in said
