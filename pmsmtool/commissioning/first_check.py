@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 
 from pmsmtool.commissioning.compared_stage import held_values
@@ -20,10 +21,8 @@ from pmsmtool.experiments.first_turn import lead_half_a_turn
 from pmsmtool.identification.wiring import (
     NOT_SEEN,
     OK,
-    TURNED_BY,
     WRONG,
     Finding,
-    judge_fault,
     judge_sensors,
     judge_supply,
     judge_turn,
@@ -54,6 +53,15 @@ ORDER = (
     "safe torque off", "supply", "limit switches", "current sensors", "phases", "shaft", "encoder counts", "pole pairs",
     "encoder sign",
 )  # fmt: skip
+TURNED_BY = "a load that turns the shaft; wrong counts per turn or pole pairs"
+FAULTS = (
+    ("does not enable", "safe torque off", "safe torque off or the enable input open; no DC link"),
+    ("0x2", "phases", "two motor leads touch each other or earth; gains of the current loop that do not fit the motor"),
+    ("0x3", "supply", "the supply is off, too weak, or in current limit"),
+    ("0x73", "encoder counts", "the encoder's cable or supply, or another encoder than is set"),
+)
+"""What a fault of the drive is about, by its text: error codes by their class (CiA 301, 7.2.8; CiA 402-2, 0x603F)."""
+CODE = re.compile(r"\b(?:fault|emergency) (0x[0-9a-f]{4})")
 DIGITAL_INPUTS = DriveObject(0x60FD, 0, "I")
 INPUTS = {0: "negative limit switch", 1: "positive limit switch", 3: "interlock"}
 """Bits of 0x60FD (CiA 402-2, digital inputs)."""
@@ -114,8 +122,21 @@ def check_wiring(
 
 def with_fault(rows: list[Finding], error: DriveFault) -> list[Finding]:
     """Return the rows with that of the fault in place of what was seen of it before."""
-    row = judge_fault(error.what, error.likely)
+    row = fault_row(error.what, error.likely)
     return [*(each for each in rows if each.looked_at != row.looked_at), row]
+
+
+def fault_row(what: str, likely: str) -> Finding:
+    """Return the row of a fault that ended the check; ``what`` as the drive's error says it.
+
+    A fault that names nothing is the shaft's: it turned where it was not to.
+    """
+    code = CODE.search(what)
+    known = code[1] if code else what
+    for mark, about, usual in FAULTS:
+        if known.startswith(mark) if code else mark in known:
+            return Finding(about, WRONG, what, likely or usual)
+    return Finding("shaft", WRONG, what, likely or "a limit switch; " + TURNED_BY)
 
 
 def _ordered(found: list[Finding]) -> list[Finding]:

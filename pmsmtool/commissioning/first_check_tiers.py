@@ -19,6 +19,7 @@ from pmsmtool.commissioning.first_check import (
     SPEED_RAD_S,
     SPEED_SHARE,
     TRAVEL_RAD,
+    TURNED_BY,
     look_at_inputs,
     with_fault,
 )
@@ -36,7 +37,6 @@ from pmsmtool.identification.wiring import (
     COUNT_FACTORS,
     NOT_CHECKED,
     OK,
-    TURNED_BY,
     WRONG,
     Finding,
     judge_current,

@@ -9,7 +9,6 @@ it: four counts per line, and poles given for pole pairs.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,15 +37,6 @@ rms makes 0.71, and a slow current loop is not at its end.)"""
 NOT_LED = "the vector does not lead the rotor"
 HELD_BY = "brake shut, or the shaft is held; an encoder that does not count; friction above this torque"
 SLIPS_BY = "friction, cogging or a load beyond this torque; a brake that is half open"
-TURNED_BY = "a load that turns the shaft; wrong counts per turn or pole pairs"
-FAULTS = (
-    ("does not enable", "safe torque off", "safe torque off or the enable input open; no DC link"),
-    ("0x2", "phases", "two motor leads touch each other or earth; gains of the current loop that do not fit the motor"),
-    ("0x3", "supply", "the supply is off, too weak, or in current limit"),
-    ("0x73", "encoder counts", "the encoder's cable or supply, or another encoder than is set"),
-)
-"""What a fault of the drive is about, by its text: error codes by their class (CiA 301, 7.2.8; CiA 402-2, 0x603F)."""
-CODE = re.compile(r"\b(?:fault|emergency) (0x[0-9a-f]{4})")
 SIGN_BY = "two motor leads swapped, or the encoder's tracks; identify finds the sign by itself and sets it"
 
 
@@ -180,19 +170,6 @@ def judge_push(pushes: Trace) -> list[Finding]:
         seen = "the position falls under positive torque"
         return [*found, Finding("encoder sign", WRONG, seen, "the polarity of the position (0x607E), or " + SIGN_BY)]
     return [*found, Finding("encoder sign", OK, "the position grows under positive torque")]
-
-
-def judge_fault(what: str, likely: str) -> Finding:
-    """Return the row of a fault that ended the check; ``what`` as the drive's error says it.
-
-    A fault that names nothing is the shaft's: it turned where it was not to.
-    """
-    code = CODE.search(what)
-    known = code[1] if code else what
-    for mark, about, usual in FAULTS:
-        if known.startswith(mark) if code else mark in known:
-            return Finding(about, WRONG, what, likely or usual)
-    return Finding("shaft", WRONG, what, likely or "a limit switch; " + TURNED_BY)
 
 
 def judge_sensors(vectors: Trace) -> Finding:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from pmsmtool.commissioning.first_check import fault_row
+from pmsmtool.identification.wiring import WRONG
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from tests.cli.conftest import Tool
@@ -56,3 +58,19 @@ def test_the_first_wrong_row_is_what_was_done(extra: str, wrong: str, tool: Tool
 def test_nothing_moves_without_consent(tool: Tool) -> None:
     code, out, told = tool("-i", "pmsmsim", "-c", STATED, "check")
     assert code == 7 and not out and "current   at most 1.216 Apk" in told
+
+
+@pytest.mark.parametrize(
+    ("what", "about"),
+    [
+        ("the drive is in fault 0x2320: current, device output side", "phases"),
+        ("emergency 0x3220 (DC-link under-voltage), register 0x04", "supply"),
+        ("the drive is in fault 0x7305: encoder fault", "encoder counts"),
+        ("the drive stays in SWITCH ON DISABLED and does not enable", "safe torque off"),
+        ("the drive is in fault 0x8611: following error", "shaft"),
+    ],
+)
+def test_a_fault_is_about_what_its_class_says(what: str, about: str) -> None:
+    row = fault_row(what, "")
+    assert (row.looked_at, row.verdict) == (about, WRONG) and row.shown == what and row.likely
+    assert fault_row(what, "a cause").likely == "a cause"

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pmsmtool.identification.wiring import NOT_SEEN, OK, WRONG, judge_fault, judge_sensors, judge_supply, judge_turn
+from pmsmtool.identification.wiring import NOT_SEEN, OK, WRONG, judge_sensors, judge_supply, judge_turn
 from pmsmtool.trace import Trace
 
 
@@ -84,19 +84,3 @@ def test_a_sensor_of_another_gain_is_seen_and_an_offset_is_not(gain: float, offs
     signals = {"i_a_a": phases[0] + offset, "i_b_a": gain * phases[1], "i_c_a": phases[2], "i_d_a": np.ones(3)}
     trace = Trace(np.arange(3.0), signals, dict.fromkeys(signals, "A"), {})
     assert judge_sensors(trace).verdict == verdict
-
-
-@pytest.mark.parametrize(
-    ("what", "about"),
-    [
-        ("the drive is in fault 0x2320: current, device output side", "phases"),
-        ("emergency 0x3220 (DC-link under-voltage), register 0x04", "supply"),
-        ("the drive is in fault 0x7305: encoder fault", "encoder counts"),
-        ("the drive stays in SWITCH ON DISABLED and does not enable", "safe torque off"),
-        ("the drive is in fault 0x8611: following error", "shaft"),
-    ],
-)
-def test_a_fault_is_about_what_its_class_says(what: str, about: str) -> None:
-    row = judge_fault(what, "")
-    assert (row.looked_at, row.verdict) == (about, WRONG) and row.shown == what and row.likely
-    assert judge_fault(what, "a cause").likely == "a cause"
