@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Proof of the dead-man: the drive stops by itself when the tool dies.
 
-Nothing moves before this was shown: the consumer heartbeat time 0x1016 is set, or node guarding (0x100C, 0x100D) where
-there is none; abort connection option 0x6007 and quick stop option 0x605A are set to remove the voltage where the drive
-has them and takes that (a ramp runs a speed loop which nobody has proven yet), the drive is enabled at zero current,
-the tool's heartbeat is stopped, and the voltage must be off within the declared time: by the state, as bit 4 of the
-statusword shows the supply, not the power stage (CiA 402-2).
+Nothing moves before this was shown: the consumer heartbeat time 0x1016 is set, node guarding (0x100C, 0x100D) where
+there is none, or the time within which a PDO is expected (0x1400:05) where that is missing, too; abort connection
+option 0x6007 and quick stop option 0x605A are set to remove the voltage where the drive has them and takes that (a ramp
+runs a speed loop which nobody has proven yet), the drive is enabled at zero current, the tool's heartbeat is stopped,
+and the voltage must be off within the declared time: by the state, as bit 4 of the statusword shows the supply, not the
+power stage (CiA 402-2).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pmsmtool.cia402 import AbortConnection, FaultReaction, QuickStop, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
+from pmsmtool.drive.expected_pdo import expect_pdo
 from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat
 from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import SafetyRefusal, SdoAbort
@@ -59,7 +61,7 @@ class DeadManProof:
     left_for : State
         State the drive went to.
     by : str
-        What stopped: the tool's ``heartbeat``, or its ``node guarding``.
+        What stopped: the tool's ``heartbeat``, its ``node guarding``, or its ``process data``.
     """
 
     declared_s: float
@@ -90,8 +92,11 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
         The drive has no supervision, ignores it, or reacts too late; or the computer is too busy to show it.
     """
     node = drive.node
-    if not _set_consumer(drive):
-        _set_guarding(drive, heartbeat)
+    if not (_set_consumer(drive) or _set_guarding(drive, heartbeat) or _set_process_data(drive, heartbeat)):
+        raise _refused(
+            "the drive has neither a consumer heartbeat (0x1016) nor node guarding (0x100C, 0x100D), and expects no "
+            "process data (0x1400:05): it would not notice that the tool died", drive,
+        )  # fmt: skip
     abort_option = _abort_option(drive)
     quick_stop = set_quick_stop(node, QuickStop.DISABLE)
     if abort_option in (None, AbortConnection.FAULT):
@@ -153,8 +158,7 @@ def _stop_and_measure(
         stalled += max(0.0, passed - before - ROUND_S)
         off = is_safe(state)
         if state is not None and off and passed <= declared:
-            by = "heartbeat" if heartbeat.guarded_node is None else "node guarding"
-            return DeadManProof(declared, passed, abort_option, quick_stop, state, by)
+            return DeadManProof(declared, passed, abort_option, quick_stop, state, heartbeat.kind)
         if off or asked > declared:
             if not off:
                 drive.quick_stop()
@@ -193,8 +197,8 @@ def _set_consumer(drive: CanopenDrive) -> bool:
     return True
 
 
-def _set_guarding(drive: CanopenDrive, heartbeat: Heartbeat) -> None:
-    """Make the drive watch the tool's remote frames (node guarding, CiA 301, 7.2.8.2.2.1).
+def _set_guarding(drive: CanopenDrive, heartbeat: Heartbeat) -> bool:
+    """Make the drive watch the tool's remote frames (node guarding, CiA 301, 7.2.8.2.2.1); False where it cannot.
 
     It is active only without a heartbeat of the drive (0x1017 = 0), in the NMT state operational, and after one remote
     frame was answered: so the adapter must be able to send them.
@@ -203,11 +207,8 @@ def _set_guarding(drive: CanopenDrive, heartbeat: Heartbeat) -> None:
     try:
         node.put(objects.LIFE_TIME_FACTOR, 1e-3 * CONSUMER_MS / PERIOD_S)
         node.put(objects.GUARD_TIME_MS, 1e3 * PERIOD_S)
-    except SdoAbort as abort:
-        raise _refused(
-            "the drive has neither a consumer heartbeat (0x1016) nor node guarding (0x100C, 0x100D): it would not "
-            "notice that the tool died", drive,
-        ) from abort  # fmt: skip
+    except SdoAbort:
+        return False
     with contextlib.suppress(SdoAbort):
         if node.get(objects.PRODUCER_HEARTBEAT_MS):
             node.put(objects.PRODUCER_HEARTBEAT_MS, 0)
@@ -219,12 +220,27 @@ def _set_guarding(drive: CanopenDrive, heartbeat: Heartbeat) -> None:
             "the drive has no consumer heartbeat (0x1016), and does not answer the remote frames of node guarding",
             drive, likely="the adapter sends no remote frames, or the drive's guarding is switched off",
         )  # fmt: skip
+    _start(node)
+    heartbeat.guarded_node = node.node
+    return True
+
+
+def _set_process_data(drive: CanopenDrive, heartbeat: Heartbeat) -> bool:
+    """Make the drive expect an empty PDO of the tool's; False where it cannot."""
+    heartbeat.expected_pdo = expect_pdo(drive.node, CONSUMER_MS)
+    if heartbeat.expected_pdo is None:
+        return False
+    _start(drive.node)
+    return True
+
+
+def _start(node: DriveNode) -> None:
+    """Bring the node to the NMT state operational; it is back in pre-operational when it is closed, if it was there."""
     before = node.supervision.nmt_state
     if before is not NmtState.OPERATIONAL:
         send_nmt(node.connection, NmtCommand.START, node.node)
-        if before is NmtState.PRE_OPERATIONAL:
+        if before is not NmtState.STOPPED:
             node.before_close.append(lambda: send_nmt(node.connection, NmtCommand.PRE_OPERATIONAL, node.node))
-    heartbeat.guarded_node = node.node
 
 
 def set_quick_stop(node: DriveNode, option: int) -> int | None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The tool's own heartbeat, or its remote frames of node guarding: the drive stops when they stay away.
+"""The tool's own heartbeat, its remote frames of node guarding or its empty PDO: the drive stops when they stay away.
 
 It runs on the bus clock as a job of its own (a thread on a real bus), so that its period does not depend on what the
 main thread does. It is sent only while somebody watches the machine: a tool that is killed stops the machine, and so
@@ -14,6 +14,7 @@ from types import TracebackType
 from pmsmtool.bus.clock import Ticker
 from pmsmtool.bus.connection import SEND_PATIENCE_S, Connection
 from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE, NmtState
+from pmsmtool.drive.expected_pdo import DUMMY
 from pmsmtool.errors import BusError
 
 PERIOD_S = 0.05
@@ -37,6 +38,8 @@ class Heartbeat:
     ----------
     guarded_node : int or None
         Node that is asked for its state by remote frames (node guarding) instead of being sent heartbeats.
+    expected_pdo : int or None
+        COB-ID of an empty PDO (``expected_pdo.py``) that is sent instead.
     """
 
     def __init__(self, connection: Connection, *, is_watched: Callable[[], bool] = lambda: True) -> None:
@@ -47,6 +50,14 @@ class Heartbeat:
         self._longest_s = 0.0
         self._failed = False
         self.guarded_node: int | None = None
+        self.expected_pdo: int | None = None
+
+    @property
+    def kind(self) -> str:
+        """What is sent, by its name."""
+        if self.expected_pdo is not None:
+            return "process data"
+        return "heartbeat" if self.guarded_node is None else "node guarding"
 
     def __enter__(self) -> Heartbeat:
         self.start()
@@ -83,7 +94,9 @@ class Heartbeat:
             self._failed = False
 
     def _send(self, patience_s: float = SEND_PATIENCE_S) -> None:
-        if self.guarded_node is None:
+        if self.expected_pdo is not None:
+            self._connection.send(self.expected_pdo, DUMMY, patience_s=patience_s)
+        elif self.guarded_node is None:
             data = bytes((NmtState.OPERATIONAL,))
             self._connection.send(HEARTBEAT_ID + TOOL_NODE, data, patience_s=patience_s)
         else:

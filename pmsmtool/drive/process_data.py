@@ -100,13 +100,13 @@ def live_values(
         if state is not NmtState.OPERATIONAL:
             send_nmt(node.connection, NmtCommand.PRE_OPERATIONAL, node.node)
         brought_back = True
-        _bring_back(node, before)
+        bring_pdos_back(node, before)
 
     lost: BusError | None = None
     node.before_close.append(bring_back)  # a signal between two bytecodes of a `with` statement calls no exit
     try:
         for number, cob_id, group in zip(BORROWED, cob_ids, groups, strict=False):
-            before += _contents(node, number)
+            before += pdo_contents(node, 0x1800 + number - 1, 0x1A00 + number - 1)
             _map(node, number, cob_id, [objects[name] for name in group], period_s)
             live.expect(cob_id, group)
             node.connection.subscribe(cob_id, live.take)
@@ -151,9 +151,8 @@ def _groups(names: Sequence[str], objects: Mapping[str, DriveObject]) -> list[li
     return groups
 
 
-def _contents(node: DriveNode, number: int) -> list[tuple[int, int, bytes]]:
+def pdo_contents(node: DriveNode, communication: int, mapping: int) -> list[tuple[int, int, bytes]]:
     """Return what a PDO is, in the order in which it can be written back: off, empty, mapping, count, on."""
-    communication, mapping = 0x1800 + number - 1, 0x1A00 + number - 1
     count = node.sdo.read(mapping, 0, size=1)
     entries = [(mapping, sub, node.sdo.read(mapping, sub, size=4)) for sub in range(1, max(count[0], 2) + 1)]
     cob_id = node.sdo.read(communication, 1, size=4)
@@ -183,7 +182,8 @@ def _map(node: DriveNode, number: int, cob_id: int, items: Sequence[DriveObject]
     write(communication, 1, (cob_id | _NO_RTR).to_bytes(4, "little"))
 
 
-def _bring_back(node: DriveNode, before: list[tuple[int, int, bytes]]) -> None:
+def bring_pdos_back(node: DriveNode, before: list[tuple[int, int, bytes]]) -> None:
+    """Write the contents of PDOs; an object that is refused does not keep the others from it."""
     refused: SdoAbort | None = None
     for index, sub, data in before:
         try:

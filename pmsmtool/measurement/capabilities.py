@@ -15,6 +15,7 @@ from typing import TypeVar
 
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.expected_pdo import expects_pdos
 from pmsmtool.drive.mapped_recorder_drive import records_pushes
 from pmsmtool.drive.motion_objects import (
     NO_RATED,
@@ -65,7 +66,7 @@ FEATURES: Mapping[str, str] = {
     "abort option": "abort connection option (0x6007)",
     "quick stop": "quick stop option (0x605A)",
     "limits": "its own current and speed limit (0x6073, 0x6075, 0x6080)",
-    "supervision": "consumer heartbeat (0x1016), or node guarding (0x100C, 0x100D)",
+    "supervision": "consumer heartbeat (0x1016), or node guarding (0x100C, 0x100D), or an expected PDO (0x1400:05)",
     "rated current": NO_RATED,
     "set-points": "current set-points for d and q",
     "excitation": "voltage or current injection",
@@ -371,7 +372,7 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     rated = None if drive_map.staging else _told(lambda: rated_apk(node))
     if not drive_map.staging:
         has |= _motion(node, rated)
-        has["supervision"] = has["heartbeat"] or (node.has(0x100C, 0) and node.has(0x100D, 0))
+        has["supervision"] = has["heartbeat"] or (node.has(0x100C, 0) and node.has(0x100D, 0)) or expects_pdos(node)
     else:  # only then these objects are what the reference drive has there
         torque = bool(modes & (_bit(Mode.PROFILE_TORQUE) | _bit(Mode.CYCLIC_TORQUE))) and node.has(0x6071, 0)
         has |= {

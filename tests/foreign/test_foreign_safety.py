@@ -28,7 +28,7 @@ from pmsmtool.errors import DriveFault, LimitExceeded, NotAvailable, SafetyRefus
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.node.node import Node
 from pmsmtool.sim.node.session import Session
-from tests.foreign.data_sheets import GUARDING, HEARTBEAT, Row, copley, epos4, faulhaber, write_eds
+from tests.foreign.data_sheets import EXPECTED_PDO, GUARDING, HEARTBEAT, Row, copley, epos4, faulhaber, write_eds
 
 ENVELOPE = Envelope(i_max_apk=3.0, speed_max_rad_s=100.0)
 DECLARED_S = 1e-3 * CONSUMER_MS + REACTION_S
@@ -87,34 +87,48 @@ def test_node_guarding_is_proven_where_there_is_no_heartbeat(tmp_path: Path) -> 
         assert [key for key, data in rig.memory().items() if data != before[key]] == []
 
 
-def test_guarding_that_ends_takes_the_voltage_away(tmp_path: Path) -> None:
-    with opened(tmp_path, copley()) as rig:
-        with pytest.raises(DriveFault), guarded(rig.drive, ENVELOPE) as guard:
-            guard.enable()
-            guard.wait(2.0 * WATCH_S)
-            guard._heartbeat.stop()
-            began = rig.drive.node.connection.clock.now()
-            guard.wait(5.0)
-        assert rig.off_since is not None and 0.0 < rig.off_since - began <= DECLARED_S
+FIXED_PDO: tuple[Row, ...] = ((0x1400, 2, "U8", "rw", "255"), (0x1400, 5, "U16", "rw", "100"))
+"""A receive PDO that is expected, but carries what it carries."""
 
 
-PDO_TIME_OUT: tuple[Row, ...] = ((0x1400, 2, "U8", "rw", "255"), (0x1400, 5, "U16", "rw", "100"))
-"""A receive PDO that is missed after 100 ms: CiA 301 lets that be a message, and nothing else."""
+def unwatched(*more: Row) -> tuple[Row, ...]:
+    """Vendor 0xAB without node guarding."""
+    return (*(row for row in copley() if row not in GUARDING), *more)
 
 
-@pytest.mark.parametrize("more", [(), PDO_TIME_OUT])
+@pytest.mark.parametrize("more", [(), FIXED_PDO])
 def test_a_drive_without_any_supervision_is_refused(tmp_path: Path, more: tuple[Row, ...]) -> None:
-    rows = (*(row for row in copley() if row not in GUARDING), *more)
-    with opened(tmp_path, rows) as rig:
+    with opened(tmp_path, unwatched(*more)) as rig:
         with pytest.raises(SafetyRefusal, match="neither a consumer heartbeat"), guarded(rig.drive, ENVELOPE):
             pass
         assert not rig.was_on
 
 
-def test_guarding_that_only_reports_is_refused(tmp_path: Path) -> None:
-    with opened(tmp_path, copley()) as rig:
+@pytest.mark.parametrize("by", ["heartbeat", "node guarding", "process data"])
+def test_a_supervision_that_ends_takes_the_voltage_away(tmp_path: Path, by: str) -> None:
+    """An expected PDO is the last choice; it is borrowed, carries nothing, and is what it was afterwards."""
+    rows = {"heartbeat": epos4(), "node guarding": copley(), "process data": unwatched(*EXPECTED_PDO)}
+    with opened(tmp_path, rows[by]) as rig:
+        before = rig.memory()
+        with pytest.raises(DriveFault), guarded(rig.drive, ENVELOPE) as guard:
+            assert guard.proof is not None and guard.proof.by == by and guard.proof.measured_s <= DECLARED_S
+            guard.enable()
+            guard.command_current(0.0, 1.0)
+            guard.wait(5.0 * WATCH_S)
+            assert rig.session.power.state is State.OPERATION_ENABLED
+            guard._heartbeat.stop()
+            began = rig.drive.node.connection.clock.now()
+            guard.wait(5.0)
+        assert rig.off_since is not None and 0.0 < rig.off_since - began <= DECLARED_S
+        rig.drive.close()
+        assert [key for key, data in rig.memory().items() if data != before[key]] == []
+
+
+@pytest.mark.parametrize("more", [GUARDING, EXPECTED_PDO])
+def test_a_supervision_that_only_reports_is_refused(tmp_path: Path, more: tuple[Row, ...]) -> None:
+    with opened(tmp_path, unwatched(*more)) as rig:
         power = rig.session.power
-        power.connection_lost = lambda node: power._emergency.raise_error(0x8130)  # type: ignore[method-assign]
+        power.connection_lost = lambda node, code=0: power._emergency.raise_error(0x8130)  # type: ignore[method-assign]
         with pytest.raises(SafetyRefusal, match="still enabled 350 ms after"), guarded(rig.drive, ENVELOPE):
             pass
         assert not power.state.energised

@@ -190,7 +190,8 @@ def _row(
     if low is not None and high is not None and not low < high and access == "rw":
         low = high = None if low == high == 0 else low  # both 0: the file's way to say nothing
     kept = access == "rw" and index not in NOT_KEPT
-    return ObjectRow(index, sub, "", name, kind, access, "T", "", _value(value, kind), low, high, kept)
+    mapped = "R" if access in ("rw", "wo") else "T"  # the files' own word for it is often missing
+    return ObjectRow(index, sub, "", name, kind, access, mapped, "", _value(value, kind), low, high, kept)
 
 
 def _value(text: str, kind: str) -> str:

@@ -9,11 +9,17 @@ from dataclasses import dataclass, field
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import Timer
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.schedule import Schedule
 
 COUNT = 4
 MAX_OBJECTS = 8
 TOO_SHORT = 0x8210
+EVENT_TIMER = 5
+"""Sub-index of the time within which a receive PDO is expected; the reference drive's have none."""
+DUMMY_BYTE = 0x0005_0008
+DUMMY_ROW = ObjectRow(5, 0, "", "dummy UNSIGNED8", "U8", "wo", "R", "", "", None, None, False)
+"""What is received and thrown away (CiA 301, 7.5.2.36)."""
 _OFF = 1 << 31
 _SYNC_TYPES = range(1, 241)
 _EVENT_TYPES = (254, 255)
@@ -34,6 +40,7 @@ class _Pdo:
     waiting: bytes | None = None
     event: Timer | None = None
     deferred: Timer | None = None
+    late: bool = False
 
 
 class ProcessData:
@@ -49,6 +56,8 @@ class ProcessData:
         Reports an emergency code.
     lateness : iterator of float
         How late each PDO is sent (s).
+    missed, regained : callable
+        Called when a receive PDO that is expected stays away; when it comes again.
     """
 
     def __init__(
@@ -59,6 +68,8 @@ class ProcessData:
         send: Callable[[int, bytes], None],
         fault: Callable[[int], None],
         lateness: Iterator[float],
+        missed: Callable[[], None],
+        regained: Callable[[], None],
     ) -> None:
         self._dictionary = dictionary
         self._schedule = schedule
@@ -66,6 +77,7 @@ class ProcessData:
         self._send = send
         self._fault = fault
         self._lateness = lateness
+        self._missed, self._regained = missed, regained
         self.receive_ids: dict[int, _Pdo] = {}
         self._rpdos = [_Pdo(f"rpdo{number + 1}") for number in range(COUNT)]
         self._tpdos = [_Pdo(f"tpdo{number + 1}") for number in range(COUNT)]
@@ -130,6 +142,8 @@ class ProcessData:
         return sink
 
     def _mapped(self, pdo: _Pdo, word: int) -> Entry:
+        if pdo.name.startswith("rpdo") and word == DUMMY_BYTE:
+            return Entry(DUMMY_ROW, 0)
         entry = self._dictionary.find(word >> 16, word >> 8 & 0xFF)
         row = entry.row
         direction = "R" if pdo.name.startswith("rpdo") else "T"
@@ -179,6 +193,7 @@ class ProcessData:
         pdo = self.receive_ids.get(can_id)
         if pdo is None or not self._operational():
             return pdo is not None
+        self._expect_next(pdo)
         length = sum(entry.size for entry in pdo.entries)
         if len(data) < length:
             self._fault(TOO_SHORT)
@@ -187,6 +202,29 @@ class ProcessData:
         else:
             self._take(pdo, data)
         return True
+
+    def _expect_next(self, pdo: _Pdo) -> None:
+        """Watch for the next one from now on (CiA 301, 7.5.2.35: event timer of a receive PDO)."""
+        if pdo.late:
+            pdo.late = False
+            self._regained()
+        if pdo.event is not None:
+            pdo.event.cancel()
+        within_ns = self._expected_ns(pdo)
+        pdo.event = self._schedule.at(self._schedule.now_ns + within_ns, lambda: self._miss(pdo)) if within_ns else None
+
+    def _expected_ns(self, pdo: _Pdo) -> int:
+        try:
+            timer = self._dictionary.find(0x1400 + self._rpdos.index(pdo), EVENT_TIMER)
+        except Refused:
+            return 0
+        return timer.integer() * _MS_NS
+
+    def _miss(self, pdo: _Pdo) -> None:
+        pdo.event = None
+        if self._operational() and self._expected_ns(pdo):
+            pdo.late = True
+            self._missed()
 
     def _take(self, pdo: _Pdo, data: bytes) -> None:
         position = 0

@@ -22,7 +22,7 @@ from pmsmtool.sim.node.schedule import Schedule
 from pmsmtool.sim.signals import Signal
 from pmsmtool.units import RAD_S_PER_MRPM
 
-HEARTBEAT_LOST = 0x8130
+HEARTBEAT_LOST, PDO_MISSED = 0x8130, 0x8250
 CONNECTION_ENDED = 0x8100
 STANDSTILL_SHARE = 0.002
 """Share of n_max below which the machine counts as standing."""
@@ -296,19 +296,19 @@ class PowerDrive:
             else:
                 self.fail(code)
 
-    def connection_lost(self, node: int) -> None:
-        """React to a lost heartbeat as object 0x6007 says."""
+    def connection_lost(self, node: int, code: int = HEARTBEAT_LOST) -> None:
+        """React to a lost heartbeat, or to a PDO that stays away, as object 0x6007 says."""
         self._plant.look()
         if self._abort_connection() is AbortConnection.FAULT:
-            self.fail(HEARTBEAT_LOST, bytes((node,)), ramp=True)
+            self.fail(code, bytes((node,)), ramp=True)
             return
-        self._emergency.raise_error(HEARTBEAT_LOST, bytes((node,)))
+        self._emergency.raise_error(code, bytes((node,)))
         self._leave_operation()
 
-    def connection_regained(self) -> None:
-        """All heartbeats that were lost are back; a fault they caused stays until it is reset."""
+    def connection_regained(self, code: int = HEARTBEAT_LOST) -> None:
+        """What was lost is back; a fault it caused stays until it is reset."""
         if self.state not in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-            self._emergency.clear(HEARTBEAT_LOST)
+            self._emergency.clear(code)
 
     def connection_ended(self) -> None:
         """React to an NMT stop or a reset of the communication as object 0x6007 says (CiA 402-2)."""

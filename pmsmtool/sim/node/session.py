@@ -19,7 +19,7 @@ from pmsmtool.sim.node.lss import ANSWER_ID, REQUEST_ID, LssSlave
 from pmsmtool.sim.node.measurement import Measurement
 from pmsmtool.sim.node.parameter_set import ParameterImage, ParameterSet
 from pmsmtool.sim.node.pdo import ProcessData
-from pmsmtool.sim.node.power_drive import Plant, PowerDrive
+from pmsmtool.sim.node.power_drive import PDO_MISSED, Plant, PowerDrive
 from pmsmtool.sim.node.schedule import Schedule
 from pmsmtool.sim.node.sdo_server import SdoServer
 from pmsmtool.sim.node.store import Group, Store, Stored
@@ -124,7 +124,8 @@ class Session:
         )
         self.pdo = ProcessData(
             self.dictionary, schedule, self._is_operational, hardware.send, self.emergency.raise_error,
-            hardware.pdo_lateness,
+            hardware.pdo_lateness, lambda: self.power.connection_lost(0, PDO_MISSED),
+            lambda: self.power.connection_regained(PDO_MISSED),
         )  # fmt: skip
         self.guarding = None if hardware.face is None else hardware.face.guarding(self)
         self.lss = self._make_lss()
