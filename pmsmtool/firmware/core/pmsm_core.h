@@ -114,6 +114,24 @@ typedef struct {             /* constants of the active set, computed in the fir
     uint32_t saturation_word; /* where its nodes begin, behind the words of the look-up */
 } pmsm_derived;
 
+typedef struct {             /* memory of a PID controller */
+    pmsm_real integral;
+    pmsm_real low;           /* low-passed input of its derivative part */
+    pmsm_real last;          /* its last input */
+} pmsm_polar_pid;
+
+typedef struct {             /* memory of the polar-coordinate laws */
+    pmsm_real delta;         /* rad, phase of the last period */
+    pmsm_real amplitude;     /* V, signed, of the last period */
+    pmsm_polar_pid phase_pid;     /* rad, A, A: laws 1 and 2 */
+    pmsm_polar_pid amplitude_pid; /* V, A, A: law 2 */
+    pmsm_dq integrator;      /* V, of the regularised law; rad and V of the linear ones */
+    pmsm_dq shortfall;       /* V, what overmodulation keeps back, in the unified law */
+    pmsm_real weight;        /* of one period in the observer, in the unified law */
+    uint32_t started;        /* 1: the memory belongs to the running control */
+    uint32_t linear;         /* 1: the regularised law stands in for the phase law */
+} pmsm_polar_state;
+
 typedef struct {             /* per-axis controller memory and whatever the modes need */
     pmsm_dq integrator;      /* V */
     pmsm_dq voltage_committed; /* V, stator frame: computed in the last period, acting now (delay 1.5) */
@@ -127,7 +145,7 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_dq fw_reference;    /* A */
     uint32_t fw_count;       /* periods since the last optimisation */
     uint32_t speed_count;
-    pmsm_real polar[12];     /* memory of the polar-coordinate laws, see polar.h */
+    pmsm_polar_state polar;
     pmsm_real tau_speed;     /* N m, last output of the speed controller */
     pmsm_live live;
     /* private to the core */

@@ -57,7 +57,7 @@ static uint32_t may_integrate(const pmsm_period *period, pmsm_real x, pmsm_real 
 
 static void linear_range(pmsm_period *period, const polar_plant *p)
 {
-    pmsm_real *memory = period->state->polar;
+    pmsm_polar_state *memory = &period->state->polar;
     const pmsm_params *params = period->params;
     const pmsm_real gamma = (pmsm_real)params->polar_gamma;
     const pmsm_real tau = (pmsm_real)params->polar_tau_s;
@@ -66,29 +66,29 @@ static void linear_range(pmsm_period *period, const polar_plant *p)
     const pmsm_dq psi = {p->L * i.d + p->psi, p->L * i.q};
     pmsm_real sine;
     pmsm_real cosine;
-    pmsm_sincos(pmsm_clamp(memory[POLAR_DELTA], -LINEAR_PHASE_SCHEDULE, LINEAR_PHASE_SCHEDULE), &sine, &cosine);
+    pmsm_sincos(pmsm_clamp(memory->delta, -LINEAR_PHASE_SCHEDULE, LINEAR_PHASE_SCHEDULE), &sine, &cosine);
 
     const cdm_gains q = cdm(gamma, tau, p->L, p->R); /* (28), (29) */
     const pmsm_real V_raw =
-        p->omega * PMSM_SQRT(pmsm_square(psi)) + (q.K_p * e.q + memory[POLAR_X_Q]) / cosine;
+        p->omega * PMSM_SQRT(pmsm_square(psi)) + (q.K_p * e.q + memory->integrator.q) / cosine;
     const pmsm_real V_a = pmsm_clamp(V_raw, -p->V, p->V);
-    memory[POLAR_X_Q] += (may_integrate(period, V_raw, p->V) != 0u) ? q.K_i * p->T_s * e.q : PMSM_C(0.0);
+    memory->integrator.q += (may_integrate(period, V_raw, p->V) != 0u) ? q.K_i * p->T_s * e.q : PMSM_C(0.0);
 
     const pmsm_real V_o = away_from_zero(V_a, SMALLEST_SHARE * p->V);
     const pmsm_real grip = pmsm_abs(V_o * cosine);
     const pmsm_real slow = SLOW_SHARE * p->V;
     const cdm_gains d = cdm(gamma, (grip < slow) ? tau * slow / grip : tau, p->L, p->R); /* (30), (31), (37) */
     const pmsm_real raw =
-        decoupling_phase(period, p, i) - (d.K_p * e.d / (V_o * cosine)) + memory[POLAR_X_D];
+        decoupling_phase(period, p, i) - (d.K_p * e.d / (V_o * cosine)) + memory->integrator.d;
     const pmsm_real delta = pmsm_clamp(raw, -LINEAR_PHASE_LIMIT, LINEAR_PHASE_LIMIT);
-    memory[POLAR_X_D] -= (may_integrate(period, raw, LINEAR_PHASE_LIMIT) != 0u)
+    memory->integrator.d -= (may_integrate(period, raw, LINEAR_PHASE_LIMIT) != 0u)
                              ? d.K_i * p->T_s * e.d / (V_o * cosine)
                              : PMSM_C(0.0);
     pmsm_sincos(delta, &sine, &cosine);
     period->u.d = -V_a * sine;
     period->u.q = V_a * cosine;
-    memory[POLAR_DELTA] = delta;
-    memory[POLAR_AMPLITUDE] = V_a;
+    memory->delta = delta;
+    memory->amplitude = V_a;
 }
 
 /* --- law 5: dq law, regularised polar map ---------------------------------------------------------------------- */
@@ -97,8 +97,8 @@ static void linear_range(pmsm_period *period, const polar_plant *p)
  * that direction. */
 void pmsm_polar_map(pmsm_period *period, pmsm_dq v, pmsm_real eps)
 {
-    pmsm_real *memory = period->state->polar;
-    pmsm_real delta = memory[POLAR_DELTA];
+    pmsm_polar_state *memory = &period->state->polar;
+    pmsm_real delta = memory->delta;
     pmsm_real sine;
     pmsm_real cosine;
     pmsm_sincos(delta, &sine, &cosine);
@@ -118,8 +118,8 @@ void pmsm_polar_map(pmsm_period *period, pmsm_dq v, pmsm_real eps)
     const pmsm_real V_a = cosine * v.q - sine * v.d;
     period->u.d = -V_a * sine;
     period->u.q = V_a * cosine;
-    memory[POLAR_DELTA] = delta;
-    memory[POLAR_AMPLITUDE] = V_a;
+    memory->delta = delta;
+    memory->amplitude = V_a;
 }
 
 typedef struct {
@@ -149,26 +149,26 @@ static pmsm_dq regularised_base(const pmsm_period *period, const axis_gains *gai
 
 static void regularised(pmsm_period *period, const polar_plant *p)
 {
-    pmsm_real *memory = period->state->polar;
+    pmsm_polar_state *memory = &period->state->polar;
     const axis_gains gains = regularised_gains(period);
     const pmsm_dq base = regularised_base(period, &gains);
-    const pmsm_dq v = {base.d + memory[POLAR_X_D], base.q + memory[POLAR_X_Q]};
+    const pmsm_dq v = {base.d + memory->integrator.d, base.q + memory->integrator.q};
     pmsm_polar_map(period, v, (pmsm_real)period->params->polar_eps_ratio * p->V);
 }
 
 /* Integrators of law 5: the error, and the voltage that was realised instead of the one the law asked for. */
 static void regularised_settle(pmsm_period *period, pmsm_real T_s)
 {
-    pmsm_real *memory = period->state->polar;
+    pmsm_polar_state *memory = &period->state->polar;
     const axis_gains gains = regularised_gains(period);
     const pmsm_dq base = regularised_base(period, &gains);
-    const pmsm_dq cut = {period->u_realised.d - (base.d + memory[POLAR_X_D]),
-                         period->u_realised.q - (base.q + memory[POLAR_X_Q])};
+    const pmsm_dq cut = {period->u_realised.d - (base.d + memory->integrator.d),
+                         period->u_realised.q - (base.q + memory->integrator.q)};
     const pmsm_dq e = {period->reference.d - period->i.d, period->reference.q - period->i.q};
     const pmsm_real back_d = (gains.d.K_p > PMSM_C(0.0)) ? cut.d / gains.d.K_p : PMSM_C(0.0);
     const pmsm_real back_q = (gains.q.K_p > PMSM_C(0.0)) ? cut.q / gains.q.K_p : PMSM_C(0.0);
-    memory[POLAR_X_D] += gains.d.K_i * T_s * (e.d + back_d);
-    memory[POLAR_X_Q] += gains.q.K_i * T_s * (e.q + back_q);
+    memory->integrator.d += gains.d.K_i * T_s * (e.d + back_d);
+    memory->integrator.q += gains.q.K_i * T_s * (e.q + back_q);
 }
 
 /* --- selection --------------------------------------------------------------------------------------------------- */
@@ -206,47 +206,47 @@ static pmsm_dq holding_voltage(const pmsm_period *period, pmsm_dq i)
  * from the voltage that holds the present current. */
 static uint32_t use_linear_law(pmsm_period *period, const polar_plant *p)
 {
-    pmsm_real *memory = period->state->polar;
+    pmsm_polar_state *memory = &period->state->polar;
     const axis_gains gains = regularised_gains(period);
     const pmsm_dq base = regularised_base(period, &gains);
     pmsm_observe_disturbance(period, pmsm_filter_weight((pmsm_real)period->params->polar_omega_dob_rad_s * p->T_s));
     const uint32_t fits = (pmsm_square(holding_voltage(period, period->reference)) <= p->V * p->V) ? 1u : 0u;
-    if (memory[POLAR_LINEAR] > PMSM_C(0.0)) {
-        const pmsm_dq v = {base.d + memory[POLAR_X_D], base.q + memory[POLAR_X_Q]};
+    if (memory->linear != 0u) {
+        const pmsm_dq v = {base.d + memory->integrator.d, base.q + memory->integrator.q};
         if (fits != 0u || pmsm_square(v) <= p->V * p->V) {
             return 1u;
         }
         pmsm_polar_phase_start(period, p, holding_voltage(period, period->i_model));
-        memory[POLAR_LINEAR] = PMSM_C(0.0);
+        memory->linear = 0u;
         return 0u;
     }
     if (fits == 0u || period->i_model.d < period->reference.d) {
         return 0u;
     }
     const pmsm_dq v = holding_voltage(period, period->i_model);
-    memory[POLAR_X_D] = v.d - base.d;
-    memory[POLAR_X_Q] = v.q - base.q;
-    memory[POLAR_DELTA] = pmsm_arctan(-v.d, v.q);
-    memory[POLAR_LINEAR] = PMSM_C(1.0);
+    memory->integrator.d = v.d - base.d;
+    memory->integrator.q = v.q - base.q;
+    memory->delta = pmsm_arctan(-v.d, v.q);
+    memory->linear = 1u;
     return 1u;
 }
 
 static void start(pmsm_period *period, const polar_plant *p)
 {
-    pmsm_real *memory = period->state->polar;
+    pmsm_polar_state *memory = &period->state->polar;
     const axis_gains gains = regularised_gains(period);
     const pmsm_dq base = regularised_base(period, &gains);
     const pmsm_dq v = pmsm_model_voltage(period, period->i_model);
     const uint32_t mode = period->params->polar_mode;
-    memory[POLAR_STARTED] = PMSM_C(1.0);
-    memory[POLAR_LINEAR] = PMSM_C(1.0);
+    memory->started = 1u;
+    memory->linear = 1u;
     if (is_phase_law(mode) != 0u) {
         pmsm_polar_phase_start(period, p, v);
     }
     if (mode == PMSM_POLAR_REGULARISED || (period->params->polar_options & PMSM_POLAR_LINEAR_RANGE) != 0u) {
-        memory[POLAR_X_D] = v.d - base.d;
-        memory[POLAR_X_Q] = v.q - base.q;
-        memory[POLAR_DELTA] = pmsm_arctan(-v.d, v.q);
+        memory->integrator.d = v.d - base.d;
+        memory->integrator.q = v.q - base.q;
+        memory->delta = pmsm_arctan(-v.d, v.q);
     }
 }
 
@@ -260,7 +260,7 @@ void pmsm_polar_demand(pmsm_period *period)
     if ((period->params->polar_options & PMSM_POLAR_PREDICT) != 0u && period->params->inverter_delay_periods >= 1.0F) {
         period->i_model = pmsm_predict_current(period);
     }
-    if (period->state->polar[POLAR_STARTED] <= PMSM_C(0.0)) {
+    if (period->state->polar.started == 0u) {
         start(period, &p);
     }
     if (mode == PMSM_POLAR_UNIFIED) {
@@ -281,7 +281,7 @@ void pmsm_polar_settle(pmsm_period *period)
 {
     const pmsm_params *params = period->params;
     const uint32_t switched = ((params->polar_options & PMSM_POLAR_LINEAR_RANGE) != 0u &&
-                               period->state->polar[POLAR_LINEAR] > PMSM_C(0.0)) ? 1u : 0u;
+                               period->state->polar.linear != 0u) ? 1u : 0u;
     if (params->polar_mode == PMSM_POLAR_REGULARISED || (is_phase_law(params->polar_mode) & switched) != 0u) {
         regularised_settle(period, period->state->derived.T_s);
     } else if (params->polar_mode == PMSM_POLAR_UNIFIED) {

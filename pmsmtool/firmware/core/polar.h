@@ -5,25 +5,6 @@
 
 #include "pmsm_period.h"
 
-/* Members of pmsm_state.polar. */
-enum pmsm_polar_memory {
-    POLAR_DELTA = 0,      /* rad, phase of the last period */
-    POLAR_AMPLITUDE = 1,  /* V, signed amplitude of the last period */
-    POLAR_I_PHASE = 2,    /* rad, integrator of the phase controller */
-    POLAR_D_PHASE = 3,    /* A, low-passed input of its derivative part, and the last input */
-    POLAR_SHORT_D = 2,    /* V, what overmodulation keeps back, in the unified law */
-    POLAR_SHORT_Q = 3,    /* V */
-    POLAR_WEIGHT = 4,     /* of one period in the observer, in the unified law */
-    POLAR_I_AMPLITUDE = 4,/* V */
-    POLAR_D_AMPLITUDE = 5,/* A */
-    POLAR_X_D = 6,        /* V, integrators of the regularised law */
-    POLAR_X_Q = 7,        /* V */
-    POLAR_STARTED = 8,    /* 1: the memory belongs to the running control */
-    POLAR_LINEAR = 9,     /* 1: the regularised law stands in for the phase law */
-    POLAR_LAST_PHASE = 10,    /* A */
-    POLAR_LAST_AMPLITUDE = 11 /* A */
-};
-
 typedef struct {
     pmsm_real R, L, psi;  /* ohm, H (mean of the axes), Wb */
     pmsm_real alpha;      /* R/L */

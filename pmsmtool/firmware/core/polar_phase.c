@@ -85,31 +85,24 @@ static pid place(const polar_plant *p, pmsm_real sigma, pmsm_real n1, pmsm_real 
  * output), keep gain changes bumpless. */
 typedef struct {
     pmsm_real output;
-    pmsm_real integral, low, last; /* memory if this step is kept */
+    pmsm_polar_pid memory; /* if this step is kept */
 } pid_step;
 
-static pid_step advance(const pid *C, pmsm_real T_s, const pid_step *memory, pmsm_real e, pmsm_real x)
+static pid_step advance(const pid *C, pmsm_real T_s, const pmsm_polar_pid *memory, pmsm_real e, pmsm_real x)
 {
     const pmsm_real width = C->a * T_s;
     const pmsm_real half = PMSM_C(0.5) * C->K_i * T_s * e;
     pid_step step;
-    step.low = ((PMSM_C(2.0) - width) * memory->low + width * (x + memory->last)) / (PMSM_C(2.0) + width);
-    step.output = C->K_p * x + (memory->integral + half) + C->K_d * C->a * (x - step.low);
-    step.integral = memory->integral + PMSM_C(2.0) * half;
-    step.last = x;
+    step.memory.low = ((PMSM_C(2.0) - width) * memory->low + width * (x + memory->last)) / (PMSM_C(2.0) + width);
+    step.output = C->K_p * x + (memory->integral + half) + C->K_d * C->a * (x - step.memory.low);
+    step.memory.integral = memory->integral + PMSM_C(2.0) * half;
+    step.memory.last = x;
     return step;
 }
 
 static uint32_t option(const pmsm_period *period, uint32_t bit)
 {
     return ((period->params->polar_options & bit) != 0u) ? 1u : 0u;
-}
-
-static pid_step recall(const pmsm_period *period, uint32_t integral, uint32_t low, uint32_t last)
-{
-    const pmsm_real *memory = period->state->polar;
-    const pid_step step = {PMSM_C(0.0), memory[integral], memory[low], memory[last]};
-    return step;
 }
 
 /* A step is kept unless the output is at its limit: the memory (integral and derivative filter) is then frozen, but the
@@ -126,7 +119,7 @@ static pmsm_real set_point_share(const pmsm_period *period)
 
 static pmsm_real phase_step(pmsm_period *period, const polar_plant *p, pmsm_dq i, pmsm_dq target, pmsm_real V_a)
 {
-    pmsm_real *memory = period->state->polar;
+    pmsm_polar_state *memory = &period->state->polar;
     const equilibrium eq = find_equilibrium(p, target.q, V_a);
     const pmsm_real scale = V_a / p->L;
     const pmsm_real n1 = -scale * eq.sine;
@@ -134,32 +127,26 @@ static pmsm_real phase_step(pmsm_period *period, const polar_plant *p, pmsm_dq i
     const pid C = place(p, (pmsm_real)period->params->polar_sigma_phase_rad_s, n1, n0);
     const pmsm_real e = target.q - i.q;
     const pmsm_real x = set_point_share(period) * target.q - i.q;
-    const pid_step before = recall(period, POLAR_I_PHASE, POLAR_D_PHASE, POLAR_LAST_PHASE);
-    const pid_step step = advance(&C, p->T_s, &before, e, x);
+    const pid_step step = advance(&C, p->T_s, &memory->phase_pid, e, x);
     const pmsm_real delta = pmsm_clamp(step.output, -PHASE_LIMIT, PHASE_LIMIT);
     if (is_kept(period, step.output, delta) != 0u) {
-        memory[POLAR_I_PHASE] = step.integral;
-        memory[POLAR_D_PHASE] = step.low;
-        memory[POLAR_LAST_PHASE] = step.last;
+        memory->phase_pid = step.memory;
     }
     return delta;
 }
 
 static pmsm_real amplitude_step(pmsm_period *period, const polar_plant *p, pmsm_dq i, pmsm_dq target, pmsm_real V_a)
 {
-    pmsm_real *memory = period->state->polar;
+    pmsm_polar_state *memory = &period->state->polar;
     const equilibrium eq = find_equilibrium(p, target.q, V_a);
     const pmsm_real n1 = -eq.sine / p->L;
     const pmsm_real n0 = (p->omega * eq.cosine - p->alpha * eq.sine) / p->L;
     const pid C = place(p, (pmsm_real)period->params->polar_sigma_amplitude_rad_s, n1, n0);
     const pmsm_real e = target.d - i.d;
-    const pid_step before = recall(period, POLAR_I_AMPLITUDE, POLAR_D_AMPLITUDE, POLAR_LAST_AMPLITUDE);
-    const pid_step step = advance(&C, p->T_s, &before, e, e);
+    const pid_step step = advance(&C, p->T_s, &memory->amplitude_pid, e, e);
     const pmsm_real limited = pmsm_clamp(step.output, PMSM_C(0.0), p->V);
     if (is_kept(period, step.output, limited) != 0u) {
-        memory[POLAR_I_AMPLITUDE] = step.integral;
-        memory[POLAR_D_AMPLITUDE] = step.low;
-        memory[POLAR_LAST_AMPLITUDE] = step.last;
+        memory->amplitude_pid = step.memory;
     }
     return limited;
 }
@@ -167,22 +154,22 @@ static pmsm_real amplitude_step(pmsm_period *period, const polar_plant *p, pmsm_
 /* Memory for a start without a jump from a voltage. */
 void pmsm_polar_phase_start(pmsm_period *period, const polar_plant *plant, pmsm_dq v)
 {
-    pmsm_real *memory = period->state->polar;
+    pmsm_polar_state *memory = &period->state->polar;
     const pmsm_real mirror = (period->omega_e < PMSM_C(0.0)) ? PMSM_C(-1.0) : PMSM_C(1.0);
     const pmsm_real size = PMSM_SQRT(pmsm_square(v));
-    memory[POLAR_DELTA] = pmsm_arctan(-v.d, mirror * v.q);
-    memory[POLAR_AMPLITUDE] = (size < plant->V) ? size : plant->V;
-    memory[POLAR_I_PHASE] = memory[POLAR_DELTA];
-    memory[POLAR_I_AMPLITUDE] = memory[POLAR_AMPLITUDE];
-    memory[POLAR_D_PHASE] = mirror * (set_point_share(period) * period->reference.q - period->i.q);
-    memory[POLAR_LAST_PHASE] = memory[POLAR_D_PHASE];
-    memory[POLAR_D_AMPLITUDE] = PMSM_C(0.0); /* a weakened current drives the amplitude into its limit at once */
-    memory[POLAR_LAST_AMPLITUDE] = PMSM_C(0.0);
+    memory->delta = pmsm_arctan(-v.d, mirror * v.q);
+    memory->amplitude = (size < plant->V) ? size : plant->V;
+    memory->phase_pid.integral = memory->delta;
+    memory->amplitude_pid.integral = memory->amplitude;
+    memory->phase_pid.low = mirror * (set_point_share(period) * period->reference.q - period->i.q);
+    memory->phase_pid.last = memory->phase_pid.low;
+    memory->amplitude_pid.low = PMSM_C(0.0); /* a weakened current drives the amplitude into its limit at once */
+    memory->amplitude_pid.last = PMSM_C(0.0);
 }
 
 void pmsm_polar_phase(pmsm_period *period, const polar_plant *plant)
 {
-    pmsm_real *memory = period->state->polar;
+    pmsm_polar_state *memory = &period->state->polar;
     const pmsm_real mirror = (period->omega_e < PMSM_C(0.0)) ? PMSM_C(-1.0) : PMSM_C(1.0);
     const pmsm_dq i = {period->i_model.d, mirror * period->i_model.q};
     const pmsm_dq target = {period->reference.d, within_reach(plant, mirror * period->reference.q)};
@@ -191,7 +178,7 @@ void pmsm_polar_phase(pmsm_period *period, const polar_plant *plant)
     pmsm_real V_schedule = plant->V;
     if (period->params->polar_mode == PMSM_POLAR_PROPOSED) {
         const pmsm_real floor_V = SMALLEST_SHARE * plant->V;
-        V_schedule = (memory[POLAR_AMPLITUDE] > floor_V) ? memory[POLAR_AMPLITUDE] : floor_V;
+        V_schedule = (memory->amplitude > floor_V) ? memory->amplitude : floor_V;
         V_a = amplitude_step(period, &scheduled, i, target, V_schedule);
     }
     const pmsm_real delta = phase_step(period, &scheduled, i, target, V_schedule);
@@ -200,6 +187,6 @@ void pmsm_polar_phase(pmsm_period *period, const polar_plant *plant)
     pmsm_sincos(delta, &sine, &cosine);
     period->u.d = -V_a * sine;
     period->u.q = mirror * V_a * cosine;
-    memory[POLAR_DELTA] = delta;
-    memory[POLAR_AMPLITUDE] = V_a;
+    memory->delta = delta;
+    memory->amplitude = V_a;
 }

@@ -30,8 +30,8 @@ static pmsm_dq steady_voltage(const pmsm_period *period, pmsm_dq i)
 {
     const pmsm_state *state = period->state;
     pmsm_dq v = pmsm_model_voltage(period, i);
-    v.d += state->disturbance.d + state->polar[POLAR_SHORT_D];
-    v.q += state->disturbance.q + state->polar[POLAR_SHORT_Q];
+    v.d += state->disturbance.d + state->polar.shortfall.d;
+    v.q += state->disturbance.q + state->polar.shortfall.q;
     return v;
 }
 
@@ -152,9 +152,9 @@ static operating_point find_point(pmsm_period *period, pmsm_real V)
 void pmsm_polar_unified(pmsm_period *period, const polar_plant *p)
 {
     const pmsm_params *params = period->params;
-    pmsm_real *memory = period->state->polar;
-    memory[POLAR_WEIGHT] = pmsm_filter_weight((pmsm_real)params->polar_omega_dob_rad_s * p->T_s);
-    pmsm_observe_disturbance(period, memory[POLAR_WEIGHT]);
+    pmsm_polar_state *memory = &period->state->polar;
+    memory->weight = pmsm_filter_weight((pmsm_real)params->polar_omega_dob_rad_s * p->T_s);
+    pmsm_observe_disturbance(period, memory->weight);
     const pmsm_real V_ref = (pmsm_real)params->polar_V_ref_ratio * period->V_max;
     const operating_point o = find_point(period, (V_ref < p->V) ? V_ref : p->V);
     const pmsm_real L_d = (pmsm_real)params->motor_L_d_h;
@@ -185,7 +185,7 @@ void pmsm_polar_unified(pmsm_period *period, const polar_plant *p)
  * equilibrium needs; what the circle cuts off, in a step, is not. */
 void pmsm_polar_unified_settle(pmsm_period *period)
 {
-    pmsm_real *memory = period->state->polar;
+    pmsm_polar_state *memory = &period->state->polar;
     pmsm_dq cut = {PMSM_C(0.0), PMSM_C(0.0)};
     if ((period->flags & (uint32_t)PMSM_FLAG_DUTY_CLIPPED) != 0u) {
         const pmsm_real size = PMSM_SQRT(pmsm_square(period->u));
@@ -193,6 +193,6 @@ void pmsm_polar_unified_settle(pmsm_period *period)
         cut.d = share * period->u.d - period->u_realised.d;
         cut.q = share * period->u.q - period->u_realised.q;
     }
-    memory[POLAR_SHORT_D] += memory[POLAR_WEIGHT] * (cut.d - memory[POLAR_SHORT_D]);
-    memory[POLAR_SHORT_Q] += memory[POLAR_WEIGHT] * (cut.q - memory[POLAR_SHORT_Q]);
+    memory->shortfall.d += memory->weight * (cut.d - memory->shortfall.d);
+    memory->shortfall.q += memory->weight * (cut.q - memory->shortfall.q);
 }

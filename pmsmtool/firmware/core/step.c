@@ -27,6 +27,7 @@ void pmsm_parameters_changed(pmsm_state *state)
 static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
 {
     const pmsm_dq zero = {PMSM_C(0.0), PMSM_C(0.0)};
+    const pmsm_polar_state no_polar = {0};
     state->integrator = zero;
     state->voltage_committed = zero;
     state->voltage_before = zero;
@@ -50,9 +51,7 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->fw_tau = PMSM_C(0.0);
     state->fw_empty = 0u;
     state->speed_count = 0u;
-    for (uint32_t k = 0u; k < 12u; k++) {
-        state->polar[k] = PMSM_C(0.0);
-    }
+    state->polar = no_polar;
 }
 
 #define INPUT_MOST PMSM_C(1e7) /* A, V, N m, rad/s, K: far above every drive's, far below what overflows */
