@@ -156,16 +156,16 @@ def header_command(design: Path, prefix: str, out: Output) -> str:
 @click.option("--all-laws", is_flag=True, help="Keep laws that DESIGN does not use: for two motors, or later sets.")
 @text_options
 def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, all_laws: bool, out: Output) -> None:
-    """Write the parameters and the control core as C99 sources, with a README.md.
+    """Write the parameters, the control core and an application around it as C99 sources, with a README.md.
 
-    The core is what the simulated drive runs, less the laws that DESIGN does not use. README.md says how to build and
-    call it, what a period costs, and what to do at a fault. Values that the core does not read, those of sampling,
-    encoder and trips, are for your application.
+    They are what the simulated drive runs, less the laws that DESIGN does not use. README.md says how to build and
+    call them, what a period costs, and what to do at a fault. The application (speed estimate, trips, quick stop,
+    excitation, recorder) is optional. Values that neither reads are for your program; they are listed.
     """
     from pmsmtool.cli.output_file import make_folder
     from pmsmtool.commissioning.export import image_of
     from pmsmtool.commissioning.parameter_source import load_parameters
-    from pmsmtool.firmware.export_c import c_files, not_read_by_core
+    from pmsmtool.firmware.export_c import c_files, not_read
 
     wanted = load_parameters(design)
     files = c_files(image_of(wanted), prefix=prefix, design_id=wanted.content_hash(), all_laws=all_laws)
@@ -181,8 +181,7 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, all_la
     if others:
         few = ", ".join(others[:SHOWN]) + (", ..." if len(others) > SHOWN else "")
         out.warn(f"{folder}: {len(others)} C files there are not of this export: {few}")
-    unread = ", ".join(not_read_by_core())
-    out.note(f"for your application, not read by these files: {unread}")
+    out.note(f"for your program, not read by these files: {', '.join(not_read())}")
 
 
 @export_command.command("csv", epilog=examples("pmsmtool export csv design.toml -o parameters.csv"))

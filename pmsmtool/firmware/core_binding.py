@@ -20,6 +20,7 @@ from pmsmtool.firmware.image import pack_image, unpack_image
 from pmsmtool.native import load
 
 HEADER_FOLDER = Path(__file__).parent / "core"
+APPLICATION_HEADER = Path(__file__).parent / "application" / "pmsm_application.h"
 CORE_HEADERS = ("pmsm_types.h", "pmsm_params.h", "pmsm_core.h", "pmsm_projection.h")
 
 CType = Any
@@ -42,8 +43,11 @@ _DECLARATOR = re.compile(r"(\w+)\s*(?:\[\s*(\w+)\s*\])?$")
 def _fields(body: str, types: Mapping[str, CType], sizes: Mapping[str, int]) -> list[tuple[str, CType]]:
     fields: list[tuple[str, CType]] = []
     for declaration in filter(None, (part.strip() for part in body.split(";"))):
-        kind, rest = declaration.split(None, 1)
+        kind, rest = declaration.removeprefix("const ").split(None, 1)
         for declarator in rest.split(","):
+            if declarator.strip().startswith("*"):
+                fields.append((declarator.strip()[1:], types["*"]))
+                continue
             match = _DECLARATOR.match(declarator.strip())
             if match is None:
                 raise PmsmtoolError(f"member {declarator.strip()!r} is not understood", where="C header")
@@ -56,18 +60,22 @@ def _fields(body: str, types: Mapping[str, CType], sizes: Mapping[str, int]) -> 
     return fields
 
 
-def parse_structs(text: str, known: Mapping[str, CType] | None = None, *, double: bool = False) -> dict[str, CType]:
+def parse_structs(
+    text: str, known: Mapping[str, CType] | None = None, *, double: bool = False, pointer: CType = ctypes.c_void_p
+) -> dict[str, CType]:
     """Return a ctypes Structure for every ``typedef struct {...} name;`` of C header text.
 
     Parameters
     ----------
     text : str
         One header, or several in the order of their dependence. Members are scalars of fixed width, ``pmsm_real``,
-        earlier structures, or arrays of them with a literal or ``#define``d length.
+        earlier structures, arrays of them with a literal or ``#define``d length, or pointers.
     known : mapping, optional
         Types the text refers to but does not define.
     double : bool
         Whether ``pmsm_real`` is double (``PMSM_REAL_DOUBLE``).
+    pointer : ctypes type
+        What stands for a pointer: this computer's, or ``c_uint32`` for the layout on a 32-bit processor.
 
     Returns
     -------
@@ -77,6 +85,7 @@ def parse_structs(text: str, known: Mapping[str, CType] | None = None, *, double
     sizes = {name: int(value, 0) for name, value in _MACRO.findall(text)}
     types: dict[str, CType] = {**_SCALARS, **(known or {})}
     types["pmsm_real"] = ctypes.c_double if double else ctypes.c_float
+    types["*"] = pointer
     for body, name in _STRUCT.findall(_COMMENT.sub(" ", text)):
         types[name] = type(name, (ctypes.Structure,), {"_fields_": _fields(body, types, sizes)})
     return types

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A parameter set as C: a const instance of ``pmsm_params`` with its look-up words, and the core that runs it.
 
-The core is the one the simulated drive runs (``firmware/core``): every file named ``pmsm_...``, so that none meets one
-of the application, and laws that the set does not use left out (``firmware/laws``). Beside it ``<prefix>_cfg.h``,
+Core and application are those the simulated drive runs (``firmware/core``, ``firmware/application``): every file named
+``pmsm_...``, so that none meets one of your program, and laws that the set does not use left out (``firmware/laws``).
+The application's files are optional. Beside them ``<prefix>_cfg.h``,
 ``<prefix>_cfg.c`` and ``<prefix>_cfg.json`` with the same content, ``<prefix>_main.c``, an example that is compiled
 only on request, and ``README.md``. Two motors in one program use two prefixes. The text depends on the set only: no
 date, no path.
@@ -35,8 +36,8 @@ _PREFIX = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,30}\Z")
 _WORD = re.compile(r"\w+")
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 _WORDS_PER_LINE = 6
-_OF_THE_APPLICATION = "for the drive's application, not read by this code"
-"""What sampling, encoder, trips and the store of a drive need, and the control core does not."""
+_BY_APPLICATION = "read by the application alone"
+_BY_NONE = "for your program, not read by this code"
 
 FLAGS = (
     "-std=c99 -Wall -Wextra -Wdouble-promotion -Wfloat-conversion -Wshadow -Werror -ffp-contract=off -fno-math-errno"
@@ -72,6 +73,7 @@ def c_files(image: bytes, *, prefix: str = "pmsm", design_id: str = "", all_laws
         f"{prefix}_cfg.json": _json(values, image, design_id),
         f"{prefix}_main.c": example_source(prefix),
         **dict(core_files(laws)),
+        **dict(application_files()),
         MEMORY: resources.files("pmsmtool.firmware").joinpath("freestanding", MEMORY).read_text(encoding="ascii"),
     }
     return {**files, README: readme_text(values, prefix, image_bytes=len(image), laws=laws, flags=FLAGS)}
@@ -102,11 +104,25 @@ def core_files(laws: Iterable[Law] = LAWS) -> Iterator[tuple[str, str]]:
     switches of laws that are left out.
     """
     laws = tuple(laws)
-    folder = resources.files("pmsmtool.firmware").joinpath("core")
-    names = sorted(entry.name for entry in folder.iterdir() if entry.name.endswith((".c", ".h")))
-    for name in sorted(set(names) - files_left_out(laws), key=_core_name):
-        text = with_laws(name, folder.joinpath(name).read_text(encoding="ascii"), laws)
-        yield _core_name(name), _INCLUDE.sub(lambda found: f'#include "{_core_name(found[1])}"', text)
+    sources = _sources("core")
+    for name in sorted(set(sources) - files_left_out(laws), key=_core_name):
+        yield _core_name(name), _with_core_names(with_laws(name, sources[name], laws))
+
+
+def application_files() -> Iterator[tuple[str, str]]:
+    """Yield (name, text) of the files of the application around the core, named as the core's are."""
+    for name, text in _sources("application").items():
+        yield _core_name(name), _with_core_names(text)
+
+
+def _sources(folder: str) -> dict[str, str]:
+    place = resources.files("pmsmtool.firmware").joinpath(folder)
+    names = sorted(entry.name for entry in place.iterdir() if entry.name.endswith((".c", ".h")))
+    return {name: place.joinpath(name).read_text(encoding="ascii") for name in names}
+
+
+def _with_core_names(text: str) -> str:
+    return _INCLUDE.sub(lambda found: f'#include "{_core_name(found[1])}"', text)
 
 
 def _core_name(name: str) -> str:
@@ -117,13 +133,26 @@ def _core_name(name: str) -> str:
 def not_read_by_core(laws: tuple[Law, ...] = LAWS) -> tuple[str, ...]:
     """Return the parameters that no source of the core with these laws reads.
 
-    With all laws it is the drive's application around the core that does.
-
     Computed from the sources: a declaration and the table of bounds read nothing, nor does a comment.
     """
-    code = "".join(_COMMENT.sub("", text) for name, text in core_files(laws) if not name.startswith("pmsm_params"))
+    return _not_named_in(core_files(laws))
+
+
+@cache
+def not_read() -> tuple[str, ...]:
+    """Return the parameters that neither the core, with all laws, nor the application reads."""
+    return _not_named_in((*core_files(), *application_files()))
+
+
+def _not_named_in(files: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    code = "".join(_COMMENT.sub("", text) for name, text in files if not name.startswith("pmsm_params"))
     read = set(_WORD.findall(code))
     return tuple(row.name for row in CATALOGUE if row.c_name not in read)
+
+
+def _readers() -> dict[str, str]:
+    """Return what is to be said of the parameters that the core does not read, with any law."""
+    return dict.fromkeys(not_read_by_core(), _BY_APPLICATION) | dict.fromkeys(not_read(), _BY_NONE)
 
 
 def _banner(prefix: str, name: str, design_id: str) -> str:
@@ -132,10 +161,13 @@ def _banner(prefix: str, name: str, design_id: str) -> str:
         f" * design {design_id or 'not named'}, schema {SCHEMA_VERSION}\n"
         f" * checked with\n *     {FLAGS}\n"
         " * gnu99 contracts by default: without -ffp-contract=off the bits differ from the simulator's.\n"
-        f" * {_OF_THE_APPLICATION}:\n"
-        f"{textwrap.fill(', '.join(not_read_by_core()), 118, initial_indent=' *     ', subsequent_indent=' *     ')}\n"
-        " */\n"
+        f"{_listed(_BY_APPLICATION)}{_listed(_BY_NONE)} */\n"
     )
+
+
+def _listed(reader: str) -> str:
+    names = ", ".join(name for name, known in _readers().items() if known == reader)
+    return f" * {reader}:\n{textwrap.fill(names, 118, initial_indent=' *     ', subsequent_indent=' *     ')}\n"
 
 
 def _header(prefix: str, image: bytes, lut: bytes, design_id: str) -> str:
@@ -191,7 +223,7 @@ def _source(prefix: str, values: Mapping[str, float], lut: bytes, laws: tuple[La
 
 def _instance(prefix: str, values: Mapping[str, float], lut: bytes, storage: str, laws: tuple[Law, ...]) -> str:
     remarks = dict.fromkeys(not_read_by_core(laws), "; of a law that is left out")
-    remarks |= dict.fromkeys(not_read_by_core(), f"; {_OF_THE_APPLICATION}")
+    remarks |= {name: f"; {reader}" for name, reader in _readers().items()}
     fields = []
     for row in CATALOGUE:
         value = values[row.name]
@@ -267,6 +299,7 @@ def _json(values: Mapping[str, float], image: bytes, design_id: str) -> str:
         "design": design_id,
         "values": dict(values),
         "not_read_by_core": not_read_by_core(),
+        "not_read": not_read(),
         "lut_words": image[4 * len(CATALOGUE) :].hex(),
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"

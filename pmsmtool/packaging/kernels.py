@@ -32,15 +32,16 @@ class Kernel:
 
 
 _CORE = "firmware/core/*.c"
+_APPLICATION = "firmware/application/*.c"
 
 KERNELS: tuple[Kernel, ...] = (
     Kernel("pmsm_core", (_CORE,)),
     Kernel("pmsm_core_f64", (_CORE,), ("PMSM_REAL_DOUBLE",)),
-    Kernel("pmsm_sim", ("sim/*.c", "machine/*.c", _CORE)),
+    Kernel("pmsm_sim", ("sim/*.c", "machine/*.c", _APPLICATION, _CORE)),
     Kernel("pmsm_design", ("design/lookup/*.c", "machine/*.c")),
 )
 
-INCLUDE_FOLDERS: tuple[str, ...] = ("firmware/core", "machine", "sim", "design/lookup")
+INCLUDE_FOLDERS: tuple[str, ...] = ("firmware/core", "firmware/application", "machine", "sim", "design/lookup")
 """Searched for quoted includes only, so that no header here can hide one of the C library."""
 
 HEADERS: tuple[str, ...] = tuple(f"{folder}/*.h" for folder in INCLUDE_FOLDERS)

@@ -7,6 +7,8 @@
 
 #include "elementary.h"
 
+#define ANGLE_MOST 1e9 /* rad, mechanical: a year at 300 rpm; the encoder fails beyond */
+
 /* ---- what a caller sees of the structs ---------------------------------------------------------------- */
 
 uint32_t pmsm_sim_layout(uint32_t what)
@@ -33,18 +35,19 @@ void *pmsm_sim_part(pmsm_drive *drive, uint32_t part)
     switch (part) {
     case PMSM_PART_PARAMS: return &drive->params;
     case PMSM_PART_LUT: return drive->lut;
-    case PMSM_PART_REFERENCE: return &drive->reference;
-    case PMSM_PART_EXCITATION: return &drive->excitation;
-    case PMSM_PART_RECORDER: return &drive->recorder;
-    case PMSM_PART_AVERAGE: return &drive->average;
+    case PMSM_PART_REFERENCE: return &drive->application.reference;
+    case PMSM_PART_EXCITATION: return &drive->application.excitation;
+    case PMSM_PART_RECORDER: return &drive->application.recorder;
+    case PMSM_PART_AVERAGE: return &drive->application.average;
     case PMSM_PART_BUFFER: return drive->buffer;
     case PMSM_PART_TRACE: return drive->trace;
-    case PMSM_PART_ENABLED: return &drive->enabled;
-    case PMSM_PART_QUICK_STOP: return &drive->quick_stop;
-    case PMSM_PART_TRIP: return &drive->trip;
-    case PMSM_PART_FIXED_ANGLE: return &drive->fixed_angle;
-    case PMSM_PART_RECORDER_WRITE: return &drive->recorder_write;
-    case PMSM_PART_LIVE: return &drive->control.live;
+    case PMSM_PART_ENABLED: return &drive->application.enabled;
+    case PMSM_PART_QUICK_STOP: return &drive->application.quick_stop;
+    case PMSM_PART_TRIP: return &drive->application.trip;
+    case PMSM_PART_FIXED_ANGLE: return &drive->application.fixed_angle;
+    case PMSM_PART_RECORDER_WRITE: return &drive->application.recording.write;
+    case PMSM_PART_LIVE: return &drive->application.control.live;
+    case PMSM_PART_APPLICATION: return &drive->application;
     default: return NULL;
     }
 }
@@ -72,7 +75,7 @@ static void apply_schedules(pmsm_sim *sim, double t, double T_s)
 {
     /* a node a rounding error behind t_k belongs to period k */
     const double now = t + 1e-6 * T_s;
-    pmsm_reference *reference = &sim->drive->reference;
+    pmsm_reference *reference = &sim->drive->application.reference;
     apply_reference(sim, PMSM_TARGET_I_D, now, &reference->i_d_ref);
     apply_reference(sim, PMSM_TARGET_I_Q, now, &reference->i_q_ref);
     apply_reference(sim, PMSM_TARGET_TORQUE, now, &reference->tau_ref);
@@ -136,6 +139,18 @@ static double encoder(pmsm_sim *sim)
     return sim->encoder_held;
 }
 
+/* An unwrapped angle (rad) as the encoder's counters show it. */
+static void read_encoder(double theta_M, pmsm_sensors *sensors)
+{
+    const double parts = theta_M * (4294967296.0 / PMSM_REAL64_TWO_PI);
+    sensors->encoder_failed = pmsm_real64_abs(theta_M) <= ANGLE_MOST ? 0u : 1u;
+    if (sensors->encoder_failed)
+        return;
+    const uint64_t counted = (uint64_t)(int64_t)(parts < 0.0 ? parts - 0.5 : parts + 0.5);
+    sensors->turns = (int32_t)(uint32_t)(counted >> 32);
+    sensors->angle = (uint32_t)counted;
+}
+
 static void sample(pmsm_sim *sim, const pmsm_output *acting, double T_s, double theta_M, pmsm_sensors *sensors)
 {
     const pmsm_sensor_setup *setup = &sim->setup.sensors;
@@ -155,17 +170,19 @@ static void sample(pmsm_sim *sim, const pmsm_output *acting, double T_s, double 
     sensors->U_dc = (float)(setup->U_dc_gain * sim->U_dc);
     sensors->T_winding = (float)(setup->T_lag > 0.0 ? sim->T_winding_shown : sim->plant.T_winding);
     sensors->T_magnet = (float)sim->plant.T_magnet;
-    sensors->theta_M = theta_M;
+    read_encoder(theta_M, sensors);
 }
 
-/* ---- the application ------------------------------------------------------------------------------------------ */
+/* ---- the core alone ------------------------------------------------------------------------------------------- */
 
-/* Electrical angle in [-pi, pi] as the core wants it, and the exact speed. */
-static void run_core(pmsm_sim *sim, const pmsm_sensors *sensors, pmsm_output *output)
+/* What the papers assume: the exact angle and speed, no trips. The application would feed the core its estimate, which
+ * starts late and is rounded: no second one stands here, only what it is left out for. */
+static void run_core(pmsm_sim *sim, double theta_M, const pmsm_sensors *sensors, pmsm_output *output)
 {
-    pmsm_drive *drive = sim->drive;
+    const pmsm_drive *drive = sim->drive;
+    pmsm_application *app = &sim->drive->application;
     const double direction = drive->params.encoder_reversed ? -1.0 : 1.0;
-    const double theta = direction * (double)drive->params.motor_pole_pairs * sensors->theta_M
+    const double theta = direction * (double)drive->params.motor_pole_pairs * theta_M
                          - (double)drive->params.encoder_offset_rad;
     const double turns = theta * (1.0 / PMSM_REAL64_TWO_PI);
     const double whole = (double)(int64_t)(turns < 0.0 ? turns - 0.5 : turns + 0.5);
@@ -178,8 +195,8 @@ static void run_core(pmsm_sim *sim, const pmsm_sensors *sensors, pmsm_output *ou
         (pmsm_real)sensors->U_dc,
         (pmsm_real)sensors->T_winding,
     };
-    drive->sensors = *sensors;
-    pmsm_step(&drive->control, &drive->params, drive->lut, &m, &drive->reference, output);
+    app->sensors = *sensors;
+    pmsm_step(&app->control, &drive->params, drive->lut, &m, &app->reference, output);
 }
 
 /* ---- record ----------------------------------------------------------------------------------------------------- */
@@ -225,14 +242,15 @@ static double truth(const pmsm_sim *sim, uint32_t signal)
         return sim->inverter.elapsed > 0.0 ? sim->inverter.volt_seconds_alpha / sim->inverter.elapsed : 0.0;
     case PMSM_TRUTH_U_BETA_MEAN:
         return sim->inverter.elapsed > 0.0 ? sim->inverter.volt_seconds_beta / sim->inverter.elapsed : 0.0;
-    case PMSM_TRUTH_TRIP: return (double)sim->drive->trip;
+    case PMSM_TRUTH_TRIP: return (double)sim->drive->application.trip;
     default: return 0.0;
     }
 }
 
 double pmsm_sim_signal(const pmsm_sim *sim, uint32_t signal)
 {
-    return signal < (uint32_t)PMSM_TRUTH_T ? (double)pmsm_drive_signal(sim->drive, signal) : truth(sim, signal);
+    return signal < (uint32_t)PMSM_TRUTH_T ? (double)pmsm_application_signal(&sim->drive->application, signal)
+                                           : truth(sim, signal);
 }
 
 static void write_row(pmsm_sim *sim)
@@ -273,10 +291,10 @@ static void run_period(pmsm_sim *sim)
         done = shift;
     }
     sample(sim, &acting, T_s, theta_M, &sensors);
-    if (sim->setup.application == PMSM_APPLICATION_CORE)
-        run_core(sim, &sensors, &sim->output);
+    if (sim->setup.application == PMSM_RUNS_CORE)
+        run_core(sim, theta_M, &sensors, &sim->output);
     else
-        pmsm_drive_period(sim->drive, &sensors, &sim->output);
+        pmsm_application_period(&sim->drive->application, &sensors, &sim->output);
     if (sim->record_rows)
         write_row(sim);
 
@@ -313,8 +331,8 @@ static void run_period(pmsm_sim *sim)
 
 static uint32_t has_news(pmsm_sim *sim)
 {
-    const pmsm_drive *drive = sim->drive;
-    const uint32_t now[4] = {drive->trip, drive->excitation.state, drive->recorder.state, drive->average.state};
+    const pmsm_application *app = &sim->drive->application;
+    const uint32_t now[4] = {app->trip, app->excitation.state, app->recorder.state, app->average.state};
     const uint32_t changed = memcmp(now, sim->seen, sizeof now) != 0;
     memcpy(sim->seen, now, sizeof now);
     return changed;
@@ -352,13 +370,13 @@ void pmsm_sim_start(pmsm_sim *sim, pmsm_drive *drive, const pmsm_sim_setup *setu
     sim->U_dc = setup->U_dc;
     pmsm_random_seed(&sim->random, setup->seed);
     sim->ideal = (uint32_t)pmsm_sensor_is_ideal(&setup->sensors);
-    if (setup->application == PMSM_APPLICATION_CORE) { /* as if it had run at zero voltage before */
+    if (setup->application == PMSM_RUNS_CORE) { /* as if it had run at zero voltage before */
         const pmsm_output zero = {(pmsm_real)0.5, (pmsm_real)0.5, (pmsm_real)0.5, (pmsm_real)0, (pmsm_real)0, 1u};
         for (uint32_t j = 0; j < PMSM_DELAY_MAX; j++)
             sim->pending[j] = zero;
     }
-    drive->pll_omega = (setup->sensors.encoder_reversed != drive->params.encoder_reversed ? -1.0 : 1.0)
-                       * sim->plant.state.omega_M;
+    drive->application.speed.omega = (float)(
+        (setup->sensors.encoder_reversed != drive->params.encoder_reversed ? -1.0 : 1.0) * sim->plant.state.omega_M);
 }
 
 void pmsm_sim_watch(pmsm_sim *sim, uint32_t watch)

@@ -19,9 +19,9 @@
 #define PMSM_DELAY_MAX 3u      /* whole periods of computation delay */
 #define PMSM_RECORD_SIGNALS 64u
 
-enum pmsm_application {
-    PMSM_APPLICATION_DRIVE = 0, /* the drive's whole firmware: speed estimate, trips, excitation, recorder */
-    PMSM_APPLICATION_CORE = 1   /* pmsm_step() alone, with the exact speed; starts out of zero voltage, gates released */
+enum pmsm_runs {
+    PMSM_RUNS_APPLICATION = 0, /* the drive's whole firmware: speed estimate, trips, excitation, recorder */
+    PMSM_RUNS_CORE = 1   /* pmsm_step() alone, with the exact speed; starts out of zero voltage, gates released */
 };
 
 /* Piecewise linear functions of time; two nodes at one time make a step. */
@@ -71,7 +71,7 @@ typedef struct {               /* everything that is fixed during a run */
     double sampling_shift;     /* s, positive: late; late needs a whole period of delay */
     uint64_t seed;
     uint32_t delay;            /* whole periods of computation delay, 0 or 1 (or more) */
-    uint32_t application;      /* enum pmsm_application */
+    uint32_t application;      /* enum pmsm_runs */
     uint32_t T_s_ns;           /* PWM period; 0: as the drive's parameter says */
 } pmsm_sim_setup;
 
@@ -116,7 +116,7 @@ PMSM_EXPORT uint32_t pmsm_sim_layout(uint32_t what);
 enum pmsm_part {
     PMSM_PART_PARAMS = 0, PMSM_PART_LUT, PMSM_PART_REFERENCE, PMSM_PART_EXCITATION, PMSM_PART_RECORDER,
     PMSM_PART_AVERAGE, PMSM_PART_BUFFER, PMSM_PART_TRACE, PMSM_PART_ENABLED, PMSM_PART_QUICK_STOP,
-    PMSM_PART_TRIP, PMSM_PART_FIXED_ANGLE, PMSM_PART_RECORDER_WRITE, PMSM_PART_LIVE
+    PMSM_PART_TRIP, PMSM_PART_FIXED_ANGLE, PMSM_PART_RECORDER_WRITE, PMSM_PART_LIVE, PMSM_PART_APPLICATION
 };
 PMSM_EXPORT void *pmsm_sim_part(pmsm_drive *drive, uint32_t part);
 

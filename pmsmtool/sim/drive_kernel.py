@@ -40,7 +40,7 @@ from pmsmtool.sim.simulated_machine import (
 )
 
 STOP, ARM, START = 0, 1, 2
-"""Commands of excitation, recorder (START: force) and averages (ARM: start) in ``drive.h``."""
+"""Commands of excitation, recorder (START: force) and averages (ARM: start) in ``pmsm_application.h``."""
 
 TRIPS = {"phases_shorted": 0x2320, "encoder_signal": 0x7305}
 """Error codes of wiring that fails with the first current (CiA 402-2, 0x603F)."""
@@ -143,7 +143,7 @@ class KernelCore:
 
     def signal(self, signal: Signal) -> float:
         """Return a signal as it would be recorded now."""
-        return float(self.simulation.library.pmsm_drive_signal(self.simulation.drive, int(signal)))
+        return float(self.simulation.library.pmsm_application_signal(self.simulation.application, int(signal)))
 
     def trip(self) -> int:
         """Return the latched trip code, 0 when there is none."""
@@ -151,7 +151,7 @@ class KernelCore:
 
     def reset_fault(self) -> None:
         """Clear the trip latch."""
-        self.simulation.library.pmsm_drive_reset_fault(self.simulation.drive)
+        self.simulation.library.pmsm_application_reset_fault(self.simulation.application)
 
     # ---- excitation ----------------------------------------------------------------------------------------
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The simulation kernel ``pmsm_sim`` through ctypes: mirrored structs, declared functions, owned memory.
 
-Field names and their meaning are those of ``closed_loop.h``, ``plant.h``, ``inverter.h``, ``sensors.h``, ``drive.h``;
-every mirrored struct is checked against the library's size when it is loaded.
+Field names and their meaning are those of ``closed_loop.h``, ``plant.h``, ``inverter.h``, ``sensors.h`` and
+``pmsm_application.h``; every mirrored struct is checked against the library's size when it is loaded.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ class Average(ctypes.Structure):
 
 
 class Application(IntEnum):
-    """Who runs between the samples and the duty ratios (``enum pmsm_application``)."""
+    """Who runs between the samples and the duty ratios (``enum pmsm_runs``)."""
 
     DRIVE = 0
     CORE = 1
@@ -255,6 +255,7 @@ class Part(IntEnum):
     FIXED_ANGLE = 11
     RECORDER_WRITE = 12
     LIVE = 13
+    APPLICATION = 14
 
 
 _LAYOUT_SIM, _LAYOUT_DRIVE = 0, 1
@@ -310,8 +311,8 @@ def library() -> Any:
         ("pmsm_sim_normal", (_u64, _u64, data), None),
         ("pmsm_drive_init", (data,), None),
         ("pmsm_drive_load", (data, ctypes.c_char_p, _u32), _u32),
-        ("pmsm_drive_reset_fault", (data,), None),
-        ("pmsm_drive_signal", (data, _u32), _f32),
+        ("pmsm_application_reset_fault", (data,), None),
+        ("pmsm_application_signal", (data, _u32), _f32),
     )
     for name, arguments, result in declarations:
         function = getattr(lib, name)
@@ -347,6 +348,7 @@ class Simulation:
         self._sim_memory = (_f64 * (self.library.pmsm_sim_layout(_LAYOUT_SIM) // 8 + 1))()
         self.drive = ctypes.addressof(self._drive_memory)
         self.sim = ctypes.addressof(self._sim_memory)
+        self.application = self.part(Part.APPLICATION)
         self.library.pmsm_drive_init(self.drive)
         self.load(image)
         self.library.pmsm_sim_start(self.sim, self.drive, ctypes.byref(setup))

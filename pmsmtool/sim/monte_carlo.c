@@ -36,7 +36,7 @@ static uint64_t whole_doubles(uint64_t bytes)
 static void look(const pmsm_sim *sim, uint64_t period, pmsm_drive_run *r)
 {
     const pmsm_plant_state *state = &sim->plant.state;
-    const uint32_t flags = sim->drive->control.live.flags;
+    const uint32_t flags = sim->drive->application.control.live.flags;
     const double square = state->i_d * state->i_d + state->i_q * state->i_q;
     const double alpha = (double)sim->output.u_alpha, beta = (double)sim->output.u_beta;
     const double voltage = sim->U_dc > 0.0 ? (alpha * alpha + beta * beta) / (sim->U_dc * sim->U_dc) : 0.0;
@@ -53,7 +53,7 @@ static void look(const pmsm_sim *sim, uint64_t period, pmsm_drive_run *r)
     r->limited += (flags & PMSM_FLAG_VOLTAGE_LIMITED) != 0u;
     r->governed += (flags & PMSM_FLAG_GOVERNOR_ACTIVE) != 0u;
     r->infeasible += (flags & (PMSM_FLAG_GOVERNOR_FALLBACK | PMSM_FLAG_FW_EMPTY)) != 0u;
-    if (sim->drive->trip && r->trip_period > period)
+    if (sim->drive->application.trip && r->trip_period > period)
         r->trip_period = period;
 }
 
@@ -83,7 +83,7 @@ static void run_drive(const worker *by, uint32_t k)
         r.torque /= (double)all->periods;
     }
     r.outside = pmsm_sim_outside_count(by->sim);
-    r.trip = by->drive->trip;
+    r.trip = by->drive->application.trip;
     all->result[k] = r;
 }
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The numbers by which the simulated drive and its plant name their signals (``drive.h``, ``closed_loop.h``)."""
+"""The numbers of the signals of drive and plant (``pmsm_application.h``, ``closed_loop.h``)."""
 
 from __future__ import annotations
 

@@ -18,7 +18,8 @@ from pmsmtool.params.catalogue import CATALOGUE
 from tests.firmware.linear_plant import LinearPlant
 
 DEFAULTS = {row.name: row.default for row in CATALOGUE}
-SIM_FOLDER = Path(__file__).resolve().parents[2] / "pmsmtool" / "sim"
+PACKAGE = Path(__file__).resolve().parents[2] / "pmsmtool"
+HEADERS = (PACKAGE / "firmware" / "application" / "pmsm_application.h", PACKAGE / "sim" / "drive.h")
 STOP, ARM, START = 0, 1, 2
 IDLE, ARMED, RUNNING, DONE, ABORTED = range(5)
 (NONE, STEP, SINE, CHIRP, PRBS, BUFFER, SQUARE, DC, HYSTERESIS) = range(9)
@@ -54,17 +55,26 @@ SIGNALS = (
 S = {name: k for k, name in enumerate(SIGNALS)}
 
 
+def read_encoder(sensors: Any, theta_M: float) -> None:
+    """Fill in an unwrapped angle (rad); what is no number is a failed encoder."""
+    sensors.encoder_failed = int(not math.isfinite(theta_M))
+    if not sensors.encoder_failed:
+        parts = round(theta_M / (2 * math.pi) * 2**32)
+        sensors.turns, sensors.angle = parts >> 32, parts & 0xFFFFFFFF
+
+
 class Bench:
     """A drive application with a linear machine at an imposed or free speed."""
 
     def __init__(self, omega_M: float = 0.0, inertia: float = 0.0, **changes: float) -> None:
         self.values = DEFAULTS | {k.replace("__", "."): v for k, v in changes.items()}
         self.library = load("pmsm_sim")
-        self.library.pmsm_drive_signal.restype = ctypes.c_float
-        self.types = parse_structs((SIM_FOLDER / "drive.h").read_text(encoding="ascii"), core().types)
-        self.drive: Any = self.types["pmsm_drive"]()
+        self.library.pmsm_application_signal.restype = ctypes.c_float
+        self.types = parse_structs("".join(path.read_text(encoding="ascii") for path in HEADERS), core().types)
+        self.memory: Any = self.types["pmsm_drive"]()
+        self.drive: Any = self.memory.application
         self.output = core().make("pmsm_output")
-        self.library.pmsm_drive_init(ctypes.byref(self.drive))
+        self.library.pmsm_drive_init(ctypes.byref(self.memory))
         self.load()
         v = self.values
         self.p = int(v["motor.pole_pairs"])
@@ -77,7 +87,7 @@ class Bench:
             omega=self.p * omega_M,
         )
         self.inertia, self.omega_M, self.theta_M, self.U_dc = inertia, omega_M, 0.0, 210.0
-        self.drive.pll_omega = omega_M
+        self.drive.speed.omega = omega_M
         self.drive.enabled = 1
         self.drive.reference.mode = MODE_CURRENT
         self.sensors = self.types["pmsm_sensors"](T_winding=20.0, T_magnet=21.0)
@@ -85,7 +95,7 @@ class Bench:
     def load(self, **changes: float) -> None:
         self.values |= {k.replace("__", "."): v for k, v in changes.items()}
         image = pack_image(self.values)
-        assert self.library.pmsm_drive_load(ctypes.byref(self.drive), image, len(image)) == 0
+        assert self.library.pmsm_drive_load(ctypes.byref(self.memory), image, len(image)) == 0
 
     def run(self, periods: int = 1) -> None:
         for _ in range(periods):
@@ -94,8 +104,9 @@ class Bench:
     def period(self) -> None:
         sensors, plant = self.sensors, self.plant
         sensors.i_a, sensors.i_b, sensors.i_c = plant.phases()
-        sensors.U_dc, sensors.theta_M = self.U_dc, self.theta_M
-        self.library.pmsm_drive_period(ctypes.byref(self.drive), ctypes.byref(sensors), ctypes.byref(self.output))
+        sensors.U_dc = self.U_dc
+        read_encoder(sensors, self.theta_M)
+        self.library.pmsm_application_period(ctypes.byref(self.drive), ctypes.byref(sensors), ctypes.byref(self.output))
         gates = self.output.gates
         if gates:
             plant.advance(self.output.u_alpha, self.output.u_beta)
@@ -110,7 +121,7 @@ class Bench:
         self.theta_M += self.omega_M * plant.T_s
 
     def signal(self, name: str) -> float:
-        return float(self.library.pmsm_drive_signal(ctypes.byref(self.drive), S[name]))
+        return float(self.library.pmsm_application_signal(ctypes.byref(self.drive), S[name]))
 
     def excite(self, command: int = START, **members: float) -> None:
         for name, value in members.items():
@@ -129,7 +140,7 @@ class Bench:
     def recording(self) -> np.ndarray:
         r = self.drive.recorder
         count = sum(1 for k in range(8) if r.channel[k])
-        return np.frombuffer(bytes(self.drive.trace)[: 4 * count * r.stored], dtype="<f4").reshape(r.stored, count)
+        return np.frombuffer(bytes(self.memory.trace)[: 4 * count * r.stored], dtype="<f4").reshape(r.stored, count)
 
 
 def test_the_python_mirror_has_the_size_of_the_c_struct() -> None:
@@ -138,7 +149,7 @@ def test_the_python_mirror_has_the_size_of_the_c_struct() -> None:
 
 
 def test_signal_names_are_those_of_the_header() -> None:
-    text = (SIM_FOLDER / "drive.h").read_text(encoding="ascii")
+    text = HEADERS[0].read_text(encoding="ascii")
     names = text.split("PMSM_SIGNAL_NONE = 0,")[1].split("PMSM_SIGNAL_COUNT")[0]
     found = [part.strip() for part in names.replace("/*", ",/*").split(",") if part.strip().startswith("PMSM_SIGNAL_")]
     assert ["NONE", *(name.removeprefix("PMSM_SIGNAL_") for name in found)] == [*SIGNALS]
@@ -148,15 +159,15 @@ def test_signal_names_are_those_of_the_header() -> None:
 def test_speed_and_angle_follow_the_encoder_without_a_lag(speed: float) -> None:
     bench = Bench(speed, encoder__offset_rad=0.3, protection__n_trip_rpm=20000.0)
     bench.drive.enabled = 0
-    bench.drive.pll_omega = 0.9 * speed
+    bench.drive.speed.omega = 0.9 * speed
     bench.theta_M = 5000.0
     bench.run(600)
-    assert bench.drive.pll_omega == pytest.approx(speed, rel=1e-6, abs=1e-8)
+    assert bench.drive.speed.omega == pytest.approx(speed, rel=1e-6, abs=1e-8)
     expected = math.remainder(bench.p * (bench.theta_M - speed * bench.plant.T_s) - 0.3, 2 * math.pi)
     assert math.remainder(bench.signal("THETA_E") - expected, 2 * math.pi) == pytest.approx(0, abs=1e-6)
     bench.load(encoder__reversed=1)
     bench.run(900)
-    assert bench.drive.pll_omega == pytest.approx(-speed, rel=1e-4, abs=1e-8)
+    assert bench.drive.speed.omega == pytest.approx(-speed, rel=1e-4, abs=1e-8)
 
 
 @pytest.mark.parametrize("bandwidth", [600.0, 1e5])
@@ -176,7 +187,7 @@ def test_no_parameter_makes_the_speed_estimate_jump(speed: float, bandwidth: flo
         bench.load(**change)
         for _ in range(20):
             bench.run()
-            assert bench.drive.pll_omega == pytest.approx(sign * speed, rel=1e-6, abs=1e-6)
+            assert bench.drive.speed.omega == pytest.approx(sign * speed, rel=1e-6, abs=1e-6)
     assert bench.drive.trip == 0
 
 
@@ -188,8 +199,8 @@ def test_the_speed_estimate_survives_a_gap_of_the_encoder() -> None:
     bench.run(2)
     bench.theta_M = seen + 50.0
     bench.run()
-    assert bench.drive.trip == 0x5530 and bench.drive.pll_omega == pytest.approx(65.0)
-    bench.library.pmsm_drive_reset_fault(ctypes.byref(bench.drive))
+    assert bench.drive.trip == 0x5530 and bench.drive.speed.omega == pytest.approx(65.0)
+    bench.library.pmsm_application_reset_fault(ctypes.byref(bench.drive))
     bench.run(20)
     assert bench.drive.trip == 0
 
@@ -223,7 +234,7 @@ def test_window_average_and_its_spread() -> None:
 )
 def test_shapes(shape: int, expected: Any) -> None:
     bench = Bench()
-    bench.drive.buffer[0], bench.drive.buffer[1], bench.drive.buffer[2] = 1.0, -2.0, 0.5
+    bench.memory.buffer[0], bench.memory.buffer[1], bench.memory.buffer[2] = 1.0, -2.0, 0.5
     bench.excite(
         shape=shape, point=U_Q, amplitude=3.0, f0=250.0, f1=900.0, duration=0.02, hold_periods=6, buffer_samples=3
     )
@@ -239,7 +250,7 @@ def test_shapes(shape: int, expected: Any) -> None:
 
 def test_buffer_without_a_duration_runs_once() -> None:
     bench = Bench()
-    bench.drive.buffer[0] = 2.0
+    bench.memory.buffer[0] = 2.0
     bench.excite(shape=BUFFER, point=U_D, buffer_samples=5, hold_periods=2)
     bench.run(9)
     assert bench.drive.excitation.state == RUNNING
@@ -412,7 +423,7 @@ def test_fault_trigger_records_the_trip() -> None:
         (0x3220, "U_dc", 19.0),
         (0x4310, "T_winding", 156.0),
         (0x5530, "i_a", math.nan),
-        (0x5530, "theta_M", math.inf),
+        (0x5530, "encoder_failed", 1),
     ],
 )
 def test_trips_latch_and_remove_the_gates(code: int, member: str, value: float) -> None:
@@ -424,15 +435,15 @@ def test_trips_latch_and_remove_the_gates(code: int, member: str, value: float) 
     setattr(sensors, member, value)
 
     def call(s: Any) -> None:
-        bench.library.pmsm_drive_period(ctypes.byref(bench.drive), ctypes.byref(s), ctypes.byref(bench.output))
+        bench.library.pmsm_application_period(ctypes.byref(bench.drive), ctypes.byref(s), ctypes.byref(bench.output))
 
-    no_sample = not math.isfinite(value)
+    no_sample = code == 0x5530
     call(sensors)
     if no_sample:  # one is held
         assert (bench.drive.trip, bench.output.gates) == (0, 1)
         call(sensors)
     assert (bench.drive.trip, bench.output.gates) == (code, 0)
-    bench.library.pmsm_drive_reset_fault(ctypes.byref(bench.drive))
+    bench.library.pmsm_application_reset_fault(ctypes.byref(bench.drive))
     call(sensors)
     if no_sample:
         call(sensors)
@@ -440,7 +451,7 @@ def test_trips_latch_and_remove_the_gates(code: int, member: str, value: float) 
     healthy = bench.types["pmsm_sensors"](T_winding=20.0, U_dc=210.0)
     call(healthy)
     assert (bench.drive.trip, bench.output.gates) == (code, 0)
-    bench.library.pmsm_drive_reset_fault(ctypes.byref(bench.drive))
+    bench.library.pmsm_application_reset_fault(ctypes.byref(bench.drive))
     call(healthy)
     assert (bench.drive.trip, bench.output.gates) == (0, 1)
 
@@ -470,10 +481,10 @@ def test_quick_stop_ramps_the_current_and_then_takes_the_gates() -> None:
     bench.run(70)
     assert abs(bench.signal("I_D")) < 0.3
     bench.run(1300)
-    assert (bench.drive.quick_stop_state, bench.output.gates) == (2, 0)
+    assert (bench.drive.stopping.state, bench.output.gates) == (2, 0)
     bench.drive.quick_stop = 0
     bench.run(2)
-    assert (bench.drive.quick_stop_state, bench.output.gates) == (0, 1)
+    assert (bench.drive.stopping.state, bench.output.gates) == (0, 1)
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
@@ -491,7 +502,7 @@ def test_quick_stop_brakes_a_turning_machine(direction: float, known_inertia: fl
     bench.run(50)
     bench.drive.quick_stop = 1
     periods = 0
-    while bench.drive.quick_stop_state != 2 and periods < 6000:
+    while bench.drive.stopping.state != 2 and periods < 6000:
         bench.run(1)
         periods += 1
         assert bench.omega_M * direction > -3.0
@@ -512,6 +523,6 @@ def test_live_parameters_keep_the_controller_memory() -> None:
     assert bench.plant.i[1] == pytest.approx(6.0, abs=0.01)
     image = bytearray(pack_image(bench.values))
     image[0] = 0
-    before = bytes(bench.drive.params)
-    assert bench.library.pmsm_drive_load(ctypes.byref(bench.drive), bytes(image), len(image)) == 5
-    assert bytes(bench.drive.params) == before
+    before = bytes(bench.memory.params)
+    assert bench.library.pmsm_drive_load(ctypes.byref(bench.memory), bytes(image), len(image)) == 5
+    assert bytes(bench.memory.params) == before

@@ -14,7 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.export_c import FLAGS, c_files, core_files, header_file, image_of_json, not_read_by_core
+from pmsmtool.firmware.export_c import (
+    FLAGS,
+    application_files,
+    c_files,
+    core_files,
+    header_file,
+    image_of_json,
+    not_read,
+    not_read_by_core,
+)
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.firmware.params_header import c_float
 from pmsmtool.params.catalogue import CATALOGUE
@@ -129,14 +138,15 @@ def test_a_literal_reads_back_to_the_same_bits(value: float) -> None:
 
 @pytest.mark.chain
 @needs_compiler
-def test_what_the_core_does_not_read_is_said_and_is_what_a_compiler_does_not_miss(tmp_path: Path) -> None:
-    """Without the members that are named, the core compiles; without the others, the compiler misses every one."""
-    unread = set(not_read_by_core())
-    assert {"encoder.pll_bandwidth_rad_s", "encoder.offset_rad", "protection.i_trip_apk"} <= unread
-    assert not {"current.K_p_d_v_per_a", "motor.psi_f_wb", "governor.k_max"} & unread
+def test_what_no_file_reads_is_said_and_is_what_a_compiler_does_not_miss(tmp_path: Path) -> None:
+    """Without the members that are named, the files compile; without the others, the compiler misses every one."""
+    unread = set(not_read())
+    by_application = {"encoder.pll_bandwidth_rad_s", "encoder.offset_rad", "protection.i_trip_apk"}
+    assert by_application <= set(not_read_by_core()) - unread
+    assert not {"current.K_p_d_v_per_a", "motor.psi_f_wb", "governor.k_max"} & set(not_read_by_core())
 
     def missed(gone: set[str]) -> str:
-        for name, text in core_files():
+        for name, text in (*core_files(), *application_files()):
             if name == "pmsm_params.h":
                 for row in CATALOGUE:
                     if row.name in gone:
@@ -154,11 +164,14 @@ def test_what_the_core_does_not_read_is_said_and_is_what_a_compiler_does_not_mis
 
 def test_the_export_says_of_every_value_whether_its_code_reads_it() -> None:
     files = c_files(pack_image(_values()))
-    said = "not read by this code"
     source = " ".join(files["pmsm_cfg.c"].split())
-    for row in CATALOGUE:
-        comment = source.split(f".{row.c_name} = ")[1].split("*/")[0]
-        assert (said in comment) is (row.name in not_read_by_core()), row.name
-        listed = files["pmsm_cfg.h"].split("#ifndef")[0].split(said)[1]
-        assert (row.name in listed.replace(",", " ").split()) is (row.name in not_read_by_core())
-    assert json.loads(files["pmsm_cfg.json"])["not_read_by_core"] == list(not_read_by_core())
+    by_application = set(not_read_by_core()) - set(not_read())
+    assert by_application and not_read()
+    for said, names in (("read by the application alone", by_application), ("not read by this code", set(not_read()))):
+        listed = files["pmsm_cfg.h"].split("#ifndef")[0].split(said)[1].split(" * for")[0]
+        for row in CATALOGUE:
+            comment = source.split(f".{row.c_name} = ")[1].split("*/")[0]
+            assert (said in comment) is (row.name in names), row.name
+            assert (row.name in listed.replace(",", " ").split()) is (row.name in names)
+    content = json.loads(files["pmsm_cfg.json"])
+    assert (content["not_read_by_core"], content["not_read"]) == (list(not_read_by_core()), list(not_read()))

@@ -32,6 +32,9 @@ typedef char state_check[(sizeof(pmsm_state) == %(state)uu) ? 1 : -1];
 typedef char measurement_check[(sizeof(pmsm_measurement) == %(measurement)uu) ? 1 : -1];
 typedef char reference_check[(sizeof(pmsm_reference) == %(reference)uu) ? 1 : -1];
 typedef char output_check[(sizeof(pmsm_output) == %(output)uu) ? 1 : -1];
+#include "pmsm_application.h"
+typedef char sensors_check[(sizeof(pmsm_sensors) == %(sensors)uu) ? 1 : -1];
+typedef char application_check[(sizeof(pmsm_application) - 4u * (sizeof(void *) - 4u) == %(application)uu) ? 1 : -1];
 """
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the CANopen node needs from the simulated drive's application (``pmsmtool/sim/drive.h``).
+"""What the CANopen node needs from the simulated drive's application (``pmsm_application.h``).
 
 The node decides when something may happen and speaks CANopen; everything that happens every control period (control
 core, excitation, recorder, window averages, trips, plant) lies behind this protocol. Between two calls of

@@ -1,0 +1,173 @@
+/* SPDX-License-Identifier: MIT */
+/* The application around the control core, at PWM rate: speed estimate, trips, quick stop, excitation, recorder, window
+ * averages. The simulated drive runs these files; in a drive of your own they are optional.
+ *
+ * binary32 and integers, no allocation, no C library. Whoever asks (a bus, a user interface) reads and writes the
+ * members between two periods.
+ */
+#ifndef PMSM_APPLICATION_H
+#define PMSM_APPLICATION_H
+
+#include "pmsm_core.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#ifdef PMSM_REAL_DOUBLE
+#error "the application is single precision: build it with the core in single precision"
+#endif
+
+#define PMSM_TRACE_CHANNELS 8u
+
+/* Signals a trace channel, a trigger or a window average can name. */
+enum pmsm_signal {
+    PMSM_SIGNAL_NONE = 0,
+    PMSM_SIGNAL_I_D, PMSM_SIGNAL_I_Q, PMSM_SIGNAL_I_D_REQ, PMSM_SIGNAL_I_Q_REQ,
+    PMSM_SIGNAL_I_D_REF, PMSM_SIGNAL_I_Q_REF, PMSM_SIGNAL_U_D, PMSM_SIGNAL_U_Q,
+    PMSM_SIGNAL_U_D_LIM, PMSM_SIGNAL_U_Q_LIM, PMSM_SIGNAL_THETA_E, PMSM_SIGNAL_OMEGA_E,
+    PMSM_SIGNAL_TAU, PMSM_SIGNAL_KAPPA, PMSM_SIGNAL_BINDING, PMSM_SIGNAL_ITERATIONS, PMSM_SIGNAL_FLAGS,
+    PMSM_SIGNAL_I_A, PMSM_SIGNAL_I_B, PMSM_SIGNAL_I_C, PMSM_SIGNAL_U_DC,
+    PMSM_SIGNAL_T_WINDING, PMSM_SIGNAL_T_MAGNET, PMSM_SIGNAL_THETA_M, /* mechanical, unwrapped, rad */
+    PMSM_SIGNAL_COUNT
+};
+
+typedef struct {                 /* what the sensors deliver at the sampling instant */
+    float i_a, i_b, i_c;         /* A */
+    float U_dc;                  /* V */
+    float T_winding, T_magnet;   /* degC, NaN without a sensor; nothing but the recorder reads T_magnet */
+    int32_t turns;               /* whole mechanical turns of the encoder; may wrap */
+    uint32_t angle;              /* 2^-32 mechanical turns */
+    uint32_t encoder_failed;     /* 1: turns and angle are no reading */
+    uint32_t adc_clipped;        /* 1: a sample stood at full scale */
+} pmsm_sensors;
+
+enum pmsm_shape {                /* object 0x2050:01 */
+    PMSM_SHAPE_NONE = 0, PMSM_SHAPE_STEP, PMSM_SHAPE_SINE, PMSM_SHAPE_CHIRP, PMSM_SHAPE_PRBS,
+    PMSM_SHAPE_BUFFER, PMSM_SHAPE_SQUARE, PMSM_SHAPE_DC, PMSM_SHAPE_HYSTERESIS
+};
+
+enum pmsm_injection { PMSM_INJECT_U_D = 0, PMSM_INJECT_U_Q, PMSM_INJECT_I_D, PMSM_INJECT_I_Q, PMSM_INJECT_SPEED };
+
+/* A command that has been carried out; 0 stop, 1 arm (or start an average), 2 start (or force) are new ones. */
+#define PMSM_COMMAND_TAKEN 0xFFFFFFFFu
+
+typedef struct {                 /* object 0x2050 */
+    uint32_t shape, point, hold_periods;
+    float amplitude, amplitude_q, bias_d, bias_q, bias_bandwidth;
+    float f0, f1, duration;
+    float fixed_angle;           /* NaN: follow the rotor */
+    float i_limit_d, i_limit_q, i_centre_d;
+    float abort_current, abort_speed;
+    uint32_t command;            /* 0 stop, 1 arm, 2 start */
+    uint32_t state;              /* 0 idle, 1 armed, 2 running, 3 done, 4 aborted */
+    uint32_t buffer_samples;
+} pmsm_excitation;
+
+typedef struct {                 /* object 0x2060..0x2062 */
+    uint32_t decimation, depth, pretrigger, trigger, trigger_signal;
+    float trigger_level;
+    uint32_t command;            /* 0 stop, 1 arm, 2 force */
+    uint32_t state;              /* 0 idle, 1 armed, 2 triggered, 3 complete */
+    uint32_t stored, trigger_position;
+    uint32_t channel[PMSM_TRACE_CHANNELS]; /* enum pmsm_signal */
+} pmsm_recorder;
+
+typedef struct {                 /* object 0x2063: means over a window, taken in the drive */
+    uint32_t periods;            /* window length; writing a command 1 starts it */
+    uint32_t command, state;     /* state 0 idle, 1 running, 2 complete */
+    uint32_t signal[PMSM_TRACE_CHANNELS];
+    float mean[PMSM_TRACE_CHANNELS];
+    float std[PMSM_TRACE_CHANNELS];
+} pmsm_average;
+
+/* Trips; object 0x603F carries the code. The latch clears with pmsm_application_reset_fault(). */
+enum pmsm_trip {
+    PMSM_TRIP_NONE = 0, PMSM_TRIP_OVERCURRENT = 0x2310, PMSM_TRIP_OVERVOLTAGE = 0x3210,
+    PMSM_TRIP_UNDERVOLTAGE = 0x3220, PMSM_TRIP_OVERTEMPERATURE = 0x4310, PMSM_TRIP_OVERSPEED = 0x8480,
+    PMSM_TRIP_INTERNAL = 0x5530
+};
+
+typedef struct {                 /* speed estimate */
+    float omega;                 /* rad/s, mechanical, along the phase order */
+    float lag;                   /* rad, by which the estimated angle is behind the encoder */
+    float keep, beta;            /* gains, from the active parameters: share of an error that stays; 1/s */
+    float T_s;                   /* s */
+    uint32_t angle;              /* last reading */
+    uint32_t follows;            /* 0: the next reading starts the estimate's angle, without a jump */
+    uint32_t reversed;           /* direction that lag and omega were estimated with */
+    uint32_t offset;             /* electrical angle of the encoder's zero, 2^-32 turns */
+} pmsm_speed_estimate;
+
+typedef struct {                 /* memory of a running excitation */
+    uint64_t phase, step, curvature; /* 2^-64 turns: angle of the sine, its increment, the increment's increment */
+    uint64_t elapsed_ns;
+    uint64_t duration_ns;
+    float f0, f1, duration;      /* that step and curvature were computed from */
+    uint32_t sample, prbs, sign_d, sign_q;
+    uint32_t active;             /* 1 in a period with a wave */
+    uint32_t started;            /* 1 in the period in which an excitation started */
+} pmsm_wave;
+
+typedef struct {                 /* memory of the recorder */
+    uint32_t count, write, filled, after;
+    float trigger_last;
+    uint32_t trigger_primed;
+    uint32_t trip_last;
+    int32_t turns;               /* taken off PMSM_SIGNAL_THETA_M so that binary32 resolves it */
+} pmsm_recorder_memory;
+
+typedef struct {                 /* memory of the window averages: sums with their rounding remainders (Kahan) */
+    uint32_t count;
+    float first[PMSM_TRACE_CHANNELS];
+    float sum[PMSM_TRACE_CHANNELS], sum_carry[PMSM_TRACE_CHANNELS];
+    float square[PMSM_TRACE_CHANNELS], square_carry[PMSM_TRACE_CHANNELS];
+} pmsm_average_memory;
+
+typedef struct {                 /* memory of a quick stop */
+    uint32_t state;              /* 0 inactive, 1 stopping, 2 stopped */
+    float share;                 /* of the first reference that is left, 1 -> 0 */
+    pmsm_reference start;        /* reference when the quick stop came */
+} pmsm_quick_stop;
+
+typedef struct pmsm_application {
+    const pmsm_params *params;          /* active set */
+    const uint32_t *lut;                /* its table words, NULL without */
+    uint8_t *trace;                     /* of the recorder: sample-interleaved little-endian binary32 */
+    const float *buffer;                /* of the excitation's buffer shape */
+    uint32_t trace_bytes, buffer_length; /* 0: none */
+    pmsm_state control;
+    pmsm_reference reference;           /* what is asked for */
+    pmsm_excitation excitation;
+    pmsm_recorder recorder;
+    pmsm_average average;
+    pmsm_sensors sensors;               /* as sampled in the last period */
+    uint32_t enabled;                   /* 1: operation enabled, 0: gates off */
+    uint32_t quick_stop;                /* 1: ramp the current reference to zero and brake */
+    uint32_t trip;                      /* enum pmsm_trip, latched */
+    float fixed_angle;                  /* NaN: frame follows the rotor; else frozen electrical angle */
+    pmsm_reference applied;             /* reference of the last period, excitation included */
+    float applied_angle;                /* rad, fixed frame angle of the last period, NaN when it followed the rotor */
+    /* private memory */
+    pmsm_speed_estimate speed;
+    pmsm_wave wave;
+    pmsm_recorder_memory recording;
+    pmsm_average_memory averaging;
+    pmsm_quick_stop stopping;
+} pmsm_application;
+
+/* Clear everything and take a parameter set, which stays where it is. Afterwards set trace and buffer, if there are. */
+PMSM_EXPORT void pmsm_application_init(pmsm_application *app, const pmsm_params *params, const uint32_t *lut);
+/* Parameters in RAM changed: keep the memory, renew what was derived from them. */
+PMSM_EXPORT void pmsm_application_parameters_changed(pmsm_application *app);
+PMSM_EXPORT void pmsm_application_reset_fault(pmsm_application *app);
+/* One PWM period: sensors in, duty ratios out. */
+PMSM_EXPORT void pmsm_application_period(pmsm_application *app, const pmsm_sensors *sensors, pmsm_output *output);
+/* Value of a signal as it would be recorded now. */
+PMSM_EXPORT float pmsm_application_signal(const pmsm_application *app, uint32_t signal);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif
