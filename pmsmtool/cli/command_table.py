@@ -59,6 +59,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("check", "pmsmtool.cli.check:check_command", Section.MOVE, "Look for wrong wiring at a first power-on."),
     Row("map", "pmsmtool.cli.map:map_group", Section.MOVE, "Find out what a drive's gains count."),
     Row("jog", "pmsmtool.cli.jog:jog_command", Section.MOVE, "Move shortly, within limits."),
+    Row("move", "pmsmtool.cli.move:move_command", Section.MOVE, "Move there and back, and see how it follows."),
     Row("prove", "pmsmtool.cli.prove:prove_command", Section.MOVE, "Show that the machine does what was designed."),
     Row("param", "pmsmtool.cli.param:param_command", Section.WRITE, "Read, write, compare parameters."),
     Row("flash-params", "pmsmtool.cli.flash_params:flash_params_command", Section.WRITE, "Write and store a set."),

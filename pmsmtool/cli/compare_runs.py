@@ -35,10 +35,16 @@ def diff_command(first: Path, second: Path, check: bool, out: Output) -> None:
 
     Runs of one drive share its sensors, so only what scatters counts; of two drives the whole interval does. Resistance
     and flux linkage are compared at their reference temperature, with what the way there leaves open.
+
+    Of two runs of `pmsmtool move`: following error, settling and current of the same move, number by number. The exit
+    code with --check is then 1 where the second one follows worse.
     """
     from pmsmtool.errors import CheckFailed
     from pmsmtool.identification.compared_runs import differences, same_drive, told
 
+    if _moved(first, second):
+        _diff_of_moves(first, second, check, out)
+        return
     (record, file), (other_record, other) = _read(first), _read(second)
     same = same_drive(record.drive, other_record.drive)
     rows = differences(file.estimates, other.estimates, same_sensors=same, machine=file.machine)
@@ -54,6 +60,47 @@ def diff_command(first: Path, second: Path, check: bool, out: Output) -> None:
             f"{', '.join(changed)}: not the same in both runs", where=str(second),
             likely="the machine, its temperature or its wiring changed between the runs",
             hint="`pmsmtool report RUN` shows what each run saw",
+        )  # fmt: skip
+
+
+MOVE = "move"
+SAME_WAY = 0.01
+"""Ways of two moves that are the same (relative)."""
+WORSE = 1.02
+"""Following error, over the first one's, from which the second move is worse: whole counts of the encoder differ."""
+
+
+def _moved(first: Path, second: Path) -> bool:
+    """Whether both runs are of a move."""
+    from pmsmtool.run_directory import RunDirectory
+
+    return all(RunDirectory(path).read().stage(MOVE) is not None for path in (first, second))
+
+
+def _diff_of_moves(first: Path, second: Path, check: bool, out: Output) -> None:
+    from pmsmtool.axis.move import compared_moves, move_result
+    from pmsmtool.cli.move import TRACE, shown
+    from pmsmtool.errors import CheckFailed, ConfigError
+    from pmsmtool.trace_file import read_trace
+
+    before, after = (move_result(read_trace(path / TRACE)) for path in (first, second))
+    if abs(after.way_rad - before.way_rad) > SAME_WAY * before.way_rad:
+        raise ConfigError(
+            f"the moves are of {shown(before.way_rad, 'rad')} and {shown(after.way_rad, 'rad')}", where=str(second),
+            hint="compare the same move: the same --by, --speed and --acceleration",
+        )  # fmt: skip
+    rows = compared_moves(before, after)
+    cells = [
+        (row.name, shown(row.first, row.unit), shown(row.second, row.unit), f"{row.ratio:.3g}" if row.first else "-")
+        for row in rows
+    ]
+    data = [{**_facts(row), "ratio": row.ratio if row.first else None} for row in rows]
+    out.result("diff", {"moves": data}, table(("move", "first", "second", "second / first"), cells))
+    worse = [row.name for row in rows if row.name in ("error_peak_rad", "error_rms_rad") and row.ratio > WORSE]
+    if check and worse:
+        raise CheckFailed(
+            f"{', '.join(worse)}: the second move follows worse", where=str(second),
+            likely="the new gains do not fit this load", hint="`pmsmtool restore` brings the old gains back",
         )  # fmt: skip
 
 

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     epilog=examples(
         "pmsmtool tune machine.toml -o design.toml",
         "pmsmtool tune interior-2k2 -o design.toml --bandwidth-hz 600 --phase-margin-deg 55",
-        "pmsmtool tune machine.toml -o design.toml --speed-bandwidth-hz 12 --notch-hz 180",
         "pmsmtool tune machine.toml -o design.toml --map my-drive.toml --drive-bandwidth-hz 95",
         "pmsmtool tune machine.toml -o axis.toml --axis --map epos4",
     ),

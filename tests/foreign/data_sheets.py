@@ -46,6 +46,9 @@ def epos4(modes: int = 0x225, product: int = 0x65510000) -> tuple[Row, ...]:
         (0x605A, 0, "I16", "rw", "6"), (0x605E, 0, "I16", "rw", "2"), (0x606C, 0, "I32", "ro", "0"),
         (0x6076, 0, "U32", "rw", "0"), (0x6080, 0, "U32", "rw", "50000"), (0x60A9, 0, "U32", "rw", "0x00B44700"),
         (0x60FF, 0, "I32", "rw", "0"), (0x6502, 0, "U32", "ro", hex(modes)),
+        *((0x30A1, sub, "U32", "rw", "0") for sub in range(1, 6)),
+        *((0x30A2, sub, "U32", "rw", "0") for sub in range(1, 5)),
+        *((index, 0, "U32", "rw", "10000") for index in (0x6081, 0x6083, 0x6084)),
     )  # fmt: skip
 
 

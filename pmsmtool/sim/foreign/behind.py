@@ -16,13 +16,17 @@ if TYPE_CHECKING:
     from pmsmtool.machine.machine_file import MachineFile
 
 INNER_MODES = {3: Mode.PROFILE_VELOCITY, 4: Mode.PROFILE_TORQUE, 9: Mode.CYCLIC_VELOCITY, 10: Mode.CYCLIC_TORQUE}
-"""Modes that move the simulated machine; the others (profiles of position, homing) are taken and hold no current."""
+"""Modes that move the simulated machine by themselves; the others, but those of position, are taken without current."""
 RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 """Not the tool's: a mistake in its units must not agree with itself here."""
 POSITION_BITS = 32
 NO_SLOPE = 10_000_000.0
 SPEED_RAD_S, SPEED_INTEGRAL = 60.0, 0.25
 """Bandwidth of the speed loop as a set-up tool leaves it, and its integral rate as a share of it."""
+STORED_RATIO = 4.0
+"""Crossover of the speed over the position gain and over the integral rate, as a maker's tool leaves them."""
+POSITION_MODES = (1, 8)
+"""Modes in which ``position.PositionLoop`` commands the torque."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +89,25 @@ def set_up_of(machine_file: MachineFile) -> SetUp:
 
 
 @dataclass(slots=True)
+class PositionGains:
+    """Gains, torque at the motor; ``pid`` of the position where set, else a cascade."""
+
+    K_p: float
+    K_i: float
+    K_v: float
+    pid: list[float] | None = None
+    inertia_ff: float = 0.0
+    friction_ff: float = 0.0
+
+
+def stored_gains(J_kgm2: float) -> PositionGains:
+    """Return what a maker's tool leaves: calm, without feed-forward."""
+    K_p, rate = SPEED_RAD_S * J_kgm2, SPEED_RAD_S / STORED_RATIO
+    K_i = K_p * rate
+    return PositionGains(K_p, K_i, rate, [K_p * rate + K_i, K_i * rate, K_p])
+
+
+@dataclass(slots=True)
 class Behind:
     """The machine and the application that the objects show and command.
 
@@ -94,6 +117,10 @@ class Behind:
         Of the session.
     set_up : SetUp
         The motor.
+    velocity_ff : float
+        Share of a move's speed that a cascade adds to its speed reference.
+    position_gains : PositionGains
+        Of the position modes.
     largest_step : float
         Largest change of a torque command while energised in a cyclic mode, share of the rated torque; for tests.
     """
@@ -103,8 +130,13 @@ class Behind:
     power: PowerDrive
     set_up: SetUp
     largest_step: float = 0.0
+    velocity_ff: float = 0.0
+    position_gains: PositionGains = field(init=False)
     _torque_nm: float = field(default=0.0, init=False)
     _slope: float = field(default=0.0, init=False)
+
+    def __post_init__(self) -> None:
+        self.position_gains = stored_gains(self.set_up.J_kgm2)
 
     # ---- what is shown --------------------------------------------------------------------------
 
@@ -145,7 +177,10 @@ class Behind:
 
     def command_mode(self, mode: int) -> None:
         """Choose the mode that acts; a cyclic torque has no slope of the drive's (CiA 402-2, mode 10)."""
-        self._write("cia402.mode", INNER_MODES.get(mode, Mode.NONE))
+        inner = Mode.CYCLIC_TORQUE if mode in POSITION_MODES else INNER_MODES.get(mode, Mode.NONE)
+        self._write("cia402.mode", inner)
+        if mode in POSITION_MODES:
+            self.push(0.0)
         self.torque_slope(self._slope)
 
     def command_torque(self, torque_nm: float) -> None:
@@ -154,6 +189,11 @@ class Behind:
         if self.power.state.energised and self.dictionary["cia402.mode"].integer() == Mode.CYCLIC_TORQUE:
             self.largest_step = max(self.largest_step, step)
         self._torque_nm = torque_nm
+        rated_nm = self.dictionary["cia402.rated_torque"].number() / 1000.0
+        self._write("cia402.target_torque", 1000.0 * torque_nm / rated_nm)
+
+    def push(self, torque_nm: float) -> None:
+        """Take a torque of the drive's own position loop (N m)."""
         rated_nm = self.dictionary["cia402.rated_torque"].number() / 1000.0
         self._write("cia402.target_torque", 1000.0 * torque_nm / rated_nm)
 

@@ -15,12 +15,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.sim.foreign.behind import Behind, SetUp
+from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
-from pmsmtool.sim.foreign.families import family_of, laws_of, modes_of
+from pmsmtool.sim.foreign.families import family_of, laws_of, modes_of, units_of
 from pmsmtool.sim.foreign.file_rows import MakersObjects
 from pmsmtool.sim.foreign.guarding import NodeGuarding
 from pmsmtool.sim.foreign.laws import Law
+from pmsmtool.sim.foreign.position import PositionLoop
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.node.objects import ObjectRow
@@ -39,6 +40,8 @@ HELD = (0x6072, 0x6073, 0x6087)
 """Limits whose stored value acts from the start."""
 REVISION = 3
 """Sub-index of the identity object that the file gives; vendor and product it may leave blank."""
+PID_MARKS = {(0x30A1, 3)}
+"""Gain of the derivative, by which one controller of the position is known."""
 SERIALS = ((0x1018, 4), (0x2100, 1), (0x6510, 1))
 """Where makers keep the serial number (EPOS4: 0x2100:01, Copley: 0x6510:01)."""
 
@@ -128,12 +131,19 @@ class ForeignDrive:
             if self.objects.has((index, sub)):
                 _pass_on(dictionary, dictionary.find(index, sub), entry)
         behind.tune_speed_loop()
+        if not PID_MARKS & set(self.laws):
+            behind.position_gains.pid = None  # a position gain on the speed controller (assumed)
         for law in self.laws.values():
             _obey(law, dictionary.find(law.index, law.sub), behind)
         if self.gains is not None:
             behind.sample_speed(self.gains.filter_hz, self.gains.decimation)
             behind.speed_current_loops(self.gains.current_bandwidth / SET_UP_BANDWIDTH)
         self._hook_modes(dictionary, behind)
+        if any(mode in POSITION_MODES for mode in modes_of(self.objects)):
+            per_turn, per_rps, _ = units_of(self.objects, self._set_up)
+            period_s = family_of(self.objects).loop_s
+            loop = PositionLoop(behind, dictionary, power, schedule, per_turn, per_rps, period_s)
+            loop.hook(lambda: dictionary.find(0x6060, 0).integer())
 
     def _hook_modes(self, dictionary: Dictionary, behind: Behind) -> None:
         mode, display = dictionary.find(0x6060, 0), dictionary.find(0x6061, 0)

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from pmsmtool.sim.foreign.behind import Behind, SetUp
+from pmsmtool.sim.foreign.behind import Behind, SetUp, stored_gains
 from pmsmtool.sim.foreign.file_rows import MakersObjects
 from pmsmtool.sim.foreign.laws import ASSUMED, Law, position_units, speed_units, standard_laws
 
@@ -44,6 +44,8 @@ class Family:
         Where that is stated.
     per_turn : int
         Units of position per turn where the maker fixes them; 0: the encoder's counts.
+    loop_s : float
+        Period of its position loop (s; ``assumed`` where it is a millisecond).
     """
 
     name: str
@@ -55,6 +57,7 @@ class Family:
     speed_per_rps: float | None = None
     speed_source: str = ""
     per_turn: int = 0
+    loop_s: float = 1e-3
 
 
 def _current(index: int, sub: int, per_apk: float, source: str) -> Law:
@@ -68,6 +71,39 @@ def _limit(index: int, sub: int, per_apk: float, apk: float, source: str) -> Law
     return Law(index, sub, source, set_up=per_apk * apk, act=act)
 
 
+Counted = tuple[int, int, float]
+"""Index and sub-index of a gain, and the amperes (peak) of one count."""
+
+
+def _position_pid(P: Counted, integral: Counted, D: Counted, motor: SetUp) -> Iterator[Law]:
+    """Gains of the position in amperes, as its maker's tool leaves them."""
+    pid = stored_gains(motor.J_kgm2).pid or [0.0, 0.0, 0.0]
+
+    def taking(place: int, ampere: float) -> Callable[[Behind, float], None]:
+        def act(behind: Behind, counts: float) -> None:
+            if behind.position_gains.pid is not None:
+                behind.position_gains.pid[place] = ampere * counts * motor.torque_constant
+
+        return act
+
+    for place, (index, sub, ampere) in enumerate((P, integral, D)):
+        counts = pid[place] / (ampere * motor.torque_constant)
+        yield Law(index, sub, "current per angle", set_up=counts, act=taking(place, ampere))
+
+
+def _forward(friction: Counted, inertia: Counted, motor: SetUp) -> Iterator[Law]:
+    """Feed-forward of speed and acceleration as currents."""
+
+    def of_speed(behind: Behind, counts: float) -> None:
+        behind.position_gains.friction_ff = friction[2] * counts * motor.torque_constant
+
+    def of_acceleration(behind: Behind, counts: float) -> None:
+        behind.position_gains.inertia_ff = inertia[2] * counts * motor.torque_constant
+
+    yield Law(*friction[:2], "current per speed", set_up=0.0, act=of_speed)
+    yield Law(*inertia[:2], "current per acceleration", set_up=0.0, act=of_acceleration)
+
+
 def _epos4(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     """Nominal current x torque constant is the rated torque, in uN m (a published DCF holds exactly that)."""
     rated_ma, constant = round(1000.0 * motor.i_nom_apk), round(1e6 * motor.torque_constant)
@@ -77,6 +113,8 @@ def _epos4(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     yield Law(0x3001, 5, "uN m/A", set_up=constant)
     yield Law(0x3010, 1, "pulses, four counts each", set_up=motor.counts / 4.0)
     yield Law(0x6076, 0, "uN m", set_up=rated_ma * constant / 1000.0)
+    yield from _position_pid((0x30A1, 1, 1e-6), (0x30A1, 2, 1e-6), (0x30A1, 3, 1e-6), motor)
+    yield from _forward((0x30A1, 4, 1e-6), (0x30A1, 5, 1e-6), motor)
     for sub in (1, 2):
         yield _current(0x30D1, sub, 1000.0, PEAK_ASSUMED)
     yield Law(0x30D0, 0, PEAK_ASSUMED, show=lambda behind: 1000.0 * behind.i_q_a())
@@ -144,7 +182,7 @@ def _none(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
 
 
 FAMILIES: Sequence[Family] = (
-    Family("EPOS4", ((0x3001, 5), (0x30A0, 1)), _epos4, (0xFB, 0x61500000), 0x0000_0225),
+    Family("EPOS4", ((0x3001, 5), (0x30A0, 1)), _epos4, (0xFB, 0x61500000), 0x0000_0225, loop_s=4e-4),
     Family(
         "EPOS2", ((0x2030, 0), (0x6410, 5), (0x60F6, 1)), _epos2, (0xFB, 0x63220000), 0x0000_0065, (-3, -2, -1),
         60.0, "rpm: its largest profile velocity is 25000",
@@ -166,8 +204,8 @@ def family_of(objects: MakersObjects) -> Family:
     return next((family for family in FAMILIES if objects.has(*family.marks)), OTHER)
 
 
-def laws_of(objects: MakersObjects, motor: SetUp) -> dict[tuple[int, int], Law]:
-    """Return the law of every object that has one and that the file has; the maker's before the standard's."""
+def units_of(objects: MakersObjects, motor: SetUp) -> tuple[float, float, str]:
+    """Return units of position per turn, of speed per turn per second, and where the latter is stated."""
     family = family_of(objects)
     per_turn = family.per_turn or position_units(objects, motor.counts)
     per_rps, speed = speed_units(objects, per_turn)
@@ -175,6 +213,13 @@ def laws_of(objects: MakersObjects, motor: SetUp) -> dict[tuple[int, int], Law]:
         per_rps, speed = 10.0 * per_turn, "0.1 counts per second (CML)"
     if family.speed_per_rps is not None:
         per_rps, speed = family.speed_per_rps, family.speed_source
+    return per_turn, per_rps, speed
+
+
+def laws_of(objects: MakersObjects, motor: SetUp) -> dict[tuple[int, int], Law]:
+    """Return the law of every object that has one and that the file has; the maker's before the standard's."""
+    family = family_of(objects)
+    per_turn, per_rps, speed = units_of(objects, motor)
     laws = {(law.index, law.sub): law for law in standard_laws(objects, motor, per_turn, per_rps, speed)}
     laws |= {(law.index, law.sub): law for law in family.laws(objects, motor)}
     return {at: law for at, law in laws.items() if at in objects.rows and objects.rows[at].data_type.letter}

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""What a recorded move says: following error, settling, and the current it took."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.errors import IdentificationError
+from pmsmtool.trace import Trace
+
+Array = NDArray[np.float64]
+
+WINDOW = 0.01
+"""Window in which the error of a move has settled, of its way."""
+RESTING = 1e-4
+"""Largest change of the demand between samples at which it rests, of the way."""
+LEAST_SAMPLES = 50
+
+
+@dataclass(frozen=True, slots=True)
+class MoveResult:
+    """One move there and back.
+
+    Attributes
+    ----------
+    way_rad : float
+        Angle of the move (rad).
+    error_peak_rad, error_rms_rad : float
+        Largest following error, and its root mean square while the demand moves (rad).
+    settling_s : float
+        Longest time from the end of a demand until the error stays inside 1 % of the way (s).
+    error_end_rad : float
+        Largest error left at the end of the record or of a rest (rad).
+    current_peak_a, current_rms_a : float
+        Of the current while the demand moves, without what flowed at rest before (A).
+    moving_s : float
+        Time in which the demand moved (s).
+    samples : int
+        Rows.
+    """
+
+    way_rad: float
+    error_peak_rad: float
+    error_rms_rad: float
+    settling_s: float
+    error_end_rad: float
+    current_peak_a: float
+    current_rms_a: float
+    moving_s: float
+    samples: int
+
+
+UNITS = {
+    "way_rad": "rad", "error_peak_rad": "rad", "error_rms_rad": "rad", "settling_s": "s", "error_end_rad": "rad",
+    "current_peak_a": "A", "current_rms_a": "A", "moving_s": "s", "samples": "1",
+}  # fmt: skip
+
+
+def move_result(trace: Trace) -> MoveResult:
+    """Return what a move says.
+
+    Parameters
+    ----------
+    trace : Trace
+        As ``experiments.move.record_move`` leaves it.
+
+    Raises
+    ------
+    IdentificationError
+        Too few samples, or the demand did not move.
+    """
+    way = abs(float(trace.meta["way_rad"]))
+    t, demand, error = trace.t_s, trace["theta_ref_rad"], trace["theta_ref_rad"] - trace["theta_m_rad"]
+    moving = np.abs(np.diff(demand, prepend=demand[:1])) > RESTING * way
+    if t.size < LEAST_SAMPLES or not moving.any():
+        raise IdentificationError(
+            "E_EXCITATION", f"{t.size} samples, in {int(moving.sum())} of which the demand moved",
+            likely="the bus is busy, or the drive did not take the set-point",
+            hint="leave the bus to this program, then run the command again",
+        )  # fmt: skip
+    first = int(np.argmax(moving))
+    rest = float(np.median(trace["i_q_a"][:first])) if first else 0.0
+    current = trace["i_q_a"][moving] - rest
+    # a demand that rests for a sample within a move (whole counts) has not ended
+    stops = np.flatnonzero(moving[:-1] & ~moving[1:]) + 1
+    ends = [int(k) for k in stops if not moving[k : k + LEAST_SAMPLES].any()]
+    spans = [(k, next((int(m) for m in np.flatnonzero(moving[k:]) + k), t.size)) for k in ends]
+    return MoveResult(
+        way_rad=way,
+        error_peak_rad=float(np.max(np.abs(error[first:]))),
+        error_rms_rad=float(np.sqrt(np.mean(error[moving] ** 2))),
+        settling_s=max((_settled(t[k:m], error[k:m], WINDOW * way) for k, m in spans), default=0.0),
+        error_end_rad=max((float(np.mean(np.abs(error[max(k, m - 20) : m]))) for k, m in spans), default=0.0),
+        current_peak_a=float(np.max(np.abs(current))),
+        current_rms_a=float(np.sqrt(np.mean(current**2))),
+        moving_s=float(np.sum(np.diff(t, append=t[-1:])[moving])),
+        samples=int(t.size),
+    )
+
+
+def _settled(t: Array, error: Array, window: float) -> float:
+    outside = np.flatnonzero(np.abs(error) > window)
+    return float(t[outside[-1]] - t[0]) if outside.size else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class MoveDifference:
+    """One number of two moves; ``ratio`` is second over first, NaN where the first is 0."""
+
+    name: str
+    unit: str
+    first: float
+    second: float
+
+    @property
+    def ratio(self) -> float:
+        """Second over first."""
+        return self.second / self.first if self.first else float("nan")
+
+
+def compared_moves(first: MoveResult, second: MoveResult) -> list[MoveDifference]:
+    """Return two moves number by number."""
+    return [
+        MoveDifference(name, unit, float(getattr(first, name)), float(getattr(second, name)))
+        for name, unit in UNITS.items()
+    ]

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: MIT
+"""``pmsmtool move``: a move by the drive's own position loop, there and back, and how well it followed."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pmsmtool.cli.drive_access import claimed_node, map_option, read_map
+from pmsmtool.cli.options import (
+    DURATION,
+    FILE,
+    SPEED,
+    BusOptions,
+    MotionOptions,
+    Quantity,
+    bus_options,
+    examples,
+    motion_options,
+    output_options,
+)
+from pmsmtool.cli.output import Output, table
+
+if TYPE_CHECKING:
+    from pmsmtool.axis.move import MoveResult
+    from pmsmtool.drive.position_drive import PositionDrive
+    from pmsmtool.run_directory import RunDirectory
+
+TRAVEL_MARGIN, SPEED_MARGIN = 1.25, 1.5
+"""Limits over what is asked for: an overshoot by a badly damped loop is seen, and more ends the move."""
+ERROR_SHARE = 0.5
+"""Following error at which the voltage is removed, of the way."""
+DURATION_S = 45.0
+FOLDER = click.Path(file_okay=False, path_type=Path)
+TRACE = "traces/move.npz"
+SHOWN = {"rad": (math.degrees, "deg"), "s": (lambda value: 1e3 * value, "ms")}
+
+
+@click.command(
+    "move",
+    epilog=examples(
+        "pmsmtool -n 5 move --by 90deg --map epos4 --shaft coupled",
+        "pmsmtool -n 5 move --by 0.4rad --design axis.toml --map epos4",
+        "pmsmtool -n 5 move --by 90deg --speed 200rpm --acceleration 400 --map epos4",
+    ),
+)
+@click.option("--by", "way_rad", type=Quantity("angle"), required=True, metavar="ANGLE", help="Way of the shaft there "
+              "and back, e.g. 90deg.")  # fmt: skip
+@click.option("--design", type=FILE, metavar="FILE", help="Take the limits of the move from this design of the axis.")
+@click.option("--speed", "speed_rad_s", type=SPEED, help="Speed of the move.  [default: as the drive holds it]")
+@click.option("--acceleration", type=float, metavar="RAD/S2", help="Acceleration of the move.  [default: as the drive "
+              "holds it]")  # fmt: skip
+@click.option("--settle", "settle_s", type=DURATION, default="0.5s", help="How long to look on after the demand ended.")
+@click.option(
+    "--runs",
+    type=FOLDER,
+    default=Path("runs"),
+    metavar="DIR",
+    help="Where run directories are made.",
+)
+@map_option
+@bus_options
+@motion_options
+@output_options
+def move_command(
+    bus: BusOptions, motion: MotionOptions, out: Output, way_rad: float, design: Path | None, speed_rad_s: float | None,
+    acceleration: float | None, settle_s: float, runs: Path, map_file: Path | None,
+) -> None:  # fmt: skip
+    """Move the shaft by an angle and back with the position loop that the drive holds, and record how it followed.
+
+    The drive runs the move itself (profile position mode) and shows its demand, so that following error, settling and
+    current are those of its own loop. Nothing of the drive is changed for longer than the move. Do it before and after
+    `flash-params`, then `pmsmtool diff RUN RUN` compares both: the same move with the stored and with the new gains.
+    """
+    from pmsmtool.axis.move import UNITS, move_result
+    from pmsmtool.cli.consent import ask_motion
+    from pmsmtool.drive.envelope import Envelope
+    from pmsmtool.drive.guard import guarded
+    from pmsmtool.drive.position_drive import PositionDrive
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.experiments.move import record_move
+    from pmsmtool.flash.map_gate import check_motion
+    from pmsmtool.run_directory import Stage
+    from pmsmtool.trace_file import trace_npz
+    from pmsmtool.units import rad_s_from_rpm
+
+    if not way_rad:
+        raise ConfigError("--by 0 moves nothing", hint="give a way, e.g. --by 90deg")
+    drive_map = read_map(map_file)
+    profile = _profile(design, speed_rad_s, acceleration)
+    with bus.connect() as connection:
+        drive = PositionDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
+        check_motion(drive.node.map, drive.identity)
+        lent = _lent(drive, profile)
+        speed = lent.get(_SPEED) or _held(drive, _SPEED)
+        speed_max = motion.speed_max_rad_s or (SPEED_MARGIN * rad_s_from_rpm(speed) if speed else None)
+        if speed_max is None:
+            raise ConfigError(
+                "the speed of the drive's own move is not known: its map has no row for it",
+                hint="give --speed-max",
+            )  # fmt: skip
+        envelope = Envelope(
+            i_max_apk=motion.i_max_apk or drive.current_allowed_apk, speed_max_rad_s=speed_max, duration_s=DURATION_S,
+            travel_rad=TRAVEL_MARGIN * abs(way_rad), shaft=motion.shaft or "free", load=motion.load, brake=motion.brake,
+        )  # fmt: skip
+        envelope.refuse_gravity()
+        drive.error_limit_rad = ERROR_SHARE * abs(way_rad)
+        lines = [
+            *envelope.lines(),
+            f"the shaft moves by {math.degrees(way_rad):.4g} deg and back with the drive's own position loop",
+            f"voltage off at a following error of {math.degrees(drive.error_limit_rad):.3g} deg",
+            *(f"lent: {name} {value:.5g} {_unit(name)}" for name, value in lent.items()),
+            "nothing is stored in the drive; every changed object is restored",
+        ]  # fmt: skip
+        ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
+        run = _run(runs, drive, bus)
+        with guarded(drive, envelope, say=out.note) as guard:
+            guard.write(lent)
+            began = connection.clock.now()
+            trace = record_move(guard, drive, way_rad, settle_s)
+            seconds = connection.clock.now() - began
+        drive.close()
+    run.save(TRACE, trace_npz(trace))
+    found = move_result(trace)
+    values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]
+    peak = math.degrees(found.error_peak_rad)
+    run.add(
+        Stage(
+            "move", "pass", seconds, values=values, files={TRACE: ""},
+            summary=f"following error at most {peak:.4g} deg, settled in {1e3 * found.settling_s:.3g} ms",
+        )
+    )  # fmt: skip
+    out.result("move", {"run": run.path, "move": asdict(found), "lent": lent}, lambda: _lines(found))
+    out.note(f"run: {run.path}")
+
+
+_SPEED, _UP, _DOWN, _JERK = (
+    "reference.profile_speed_rpm", "reference.profile_acceleration_rpm_per_s",
+    "reference.profile_deceleration_rpm_per_s", "reference.profile_jerk_rpm_per_s2",
+)  # fmt: skip
+
+
+def _unit(name: str) -> str:
+    from pmsmtool.params.catalogue import BY_NAME
+
+    return BY_NAME[name].unit
+
+
+def _profile(design: Path | None, speed_rad_s: float | None, acceleration: float | None) -> dict[str, float]:
+    """Return the limits that are asked for, by catalogue name."""
+    from pmsmtool.design.design_file import load_design
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.units import rpm_from_rad_s
+
+    asked: dict[str, float | None] = {"speed": speed_rad_s, "acceleration": acceleration, "jerk": None}
+    if design is not None:
+        facts = load_design(design).facts
+        if "axis_speed_rad_s" not in facts:
+            raise ConfigError("not a design of an axis", where=str(design), hint="`pmsmtool tune --axis` makes one")
+        keys = {"speed": "axis_speed_rad_s", "acceleration": "axis_acceleration_rad_s2", "jerk": "axis_jerk_rad_s3"}
+        asked = {name: value or float(facts[keys[name]]) for name, value in asked.items()}
+    rows = {"speed": (_SPEED,), "acceleration": (_UP, _DOWN), "jerk": (_JERK,)}
+    return {
+        row: rpm_from_rad_s(value) for name, value in asked.items() if value is not None for row in rows[name]
+    }  # fmt: skip
+
+
+def _lent(drive: PositionDrive, profile: dict[str, float]) -> dict[str, float]:
+    """Return what of a profile this drive can be lent; refuses what was asked for and has no row."""
+    from pmsmtool.errors import NotAvailable
+
+    cells = drive.node.map.cells
+    lacking = [name for name in profile if name not in cells and name != _JERK]
+    if lacking:
+        raise NotAvailable(
+            f"the map {drive.node.map.name!r} has no row for {', '.join(lacking)}", where=f"node {drive.node.node}",
+            hint="leave --design, --speed and --acceleration out: the drive then moves as it is set up",
+        )  # fmt: skip
+    return {name: value for name, value in profile.items() if name in cells}
+
+
+def _held(drive: PositionDrive, name: str) -> float | None:
+    return drive.read(name) if name in drive.node.map.cells else None
+
+
+def _run(runs: Path, drive: PositionDrive, bus: BusOptions) -> RunDirectory:
+    from pmsmtool import __version__
+    from pmsmtool.run_directory import RunDirectory, new_record
+
+    record = new_record(
+        ["pmsmtool", *sys.argv[1:]], drive=asdict(drive.identity),
+        bus={"interface": bus.interface, "channel": bus.channel, "node": drive.identity.node},
+        versions={"pmsmtool": __version__},
+    )  # fmt: skip
+    return RunDirectory.create(runs, drive.identity.serial, record)
+
+
+def shown(value: float, unit: str) -> str:
+    """Return a number of a move as people read it."""
+    change, text = SHOWN.get(unit, (lambda same: same, "" if unit == "1" else unit))
+    return f"{change(value):.4g} {text}".strip()
+
+
+def _lines(found: MoveResult) -> list[str]:
+    from pmsmtool.axis.move import UNITS
+
+    rows = [(name, shown(float(getattr(found, name)), unit)) for name, unit in UNITS.items()]
+    return table(("move", "value"), rows)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: MIT
+"""A drive of another maker in profile position mode: it runs its own move, and shows demand, position and current.
+
+Demand (0x6062) and position (0x6064) come in one sample: their difference is the drive's own following error, without
+any delay of the bus. The position loop is the drive's own: every stop removes the voltage.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import AbstractContextManager
+
+import numpy as np
+
+from pmsmtool.bus.connection import Connection
+from pmsmtool.cia402 import Command
+from pmsmtool.drive import objects
+from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits, held
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.process_data import LiveValues, live_values
+from pmsmtool.drive.standard_drive import POLL_PERIOD_S
+from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.errors import DriveTimeout, LimitExceeded, NotAvailable, SdoAbort
+from pmsmtool.trace import Trace
+
+TARGET_POSITION = DriveObject(0x607A, 0, "i")
+POSITION_DEMAND = DriveObject(0x6062, 0, "i")
+PROFILE_POSITION = 1
+"""Mode of operation (CiA 402-2)."""
+NEW_SET_POINT, ACKNOWLEDGED = 0x0010, 0x1000
+"""Bits of controlword and statusword in profile position mode (CiA 402-2, 11.4)."""
+ACKNOWLEDGE_S = 0.5
+SHOWN = ("position", "demand", "current")
+WHOLE = 2.0**32
+
+
+class PositionDrive(TorqueDrive):
+    """A drive that follows a position by its own loop, from where it stands.
+
+    Attributes
+    ----------
+    error_limit_rad : float
+        Following error at which the voltage is removed.
+    current_allowed_apk : float
+        Rated current, or the drive's own limit where that is smaller (A peak).
+    sends : bool
+        Whether the drive sends its samples by itself (process data); else they are asked for one by one.
+
+    Raises
+    ------
+    NotAvailable
+        The drive has no profile position mode, or does not show its demand.
+    """
+
+    def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
+        super().__init__(connection, node_id, drive_map=drive_map)
+        modes = int(held(self.node, objects.SUPPORTED_MODES) or 0)
+        lacking = [
+            what
+            for what, has in (
+                ("profile position mode (bit 0 of 0x6502)", modes & 1),
+                ("a target position (0x607A)", held(self.node, TARGET_POSITION) is not None),
+                ("its position demand (0x6062)", held(self.node, POSITION_DEMAND) is not None),
+            )
+            if not has
+        ]
+        if lacking:
+            raise NotAvailable(
+                f"the drive lacks {', '.join(lacking)}", where=f"node {node_id}",
+                hint="`pmsmtool caps` lists what this drive can measure",
+            )  # fmt: skip
+        self.error_limit_rad = math.inf
+        kept = allowed(self.node, current_limits(self.node, self._rated_apk))
+        self.current_allowed_apk = self._rated_apk if kept is None else min(self._rated_apk, kept[1])
+        self.sends = True
+        self._sending: AbstractContextManager[LiveValues] | None = None
+        self._taken: list[tuple[float, float, float, float]] = []
+        self._recording = False
+        self._start_counts = 0.0
+
+    # ---- motion ---------------------------------------------------------------------------------
+
+    def enable(self) -> None:
+        """Bring the drive to operation enabled in its position mode, at the place where the shaft stands."""
+        self._start_counts = self.node.get(POSITION)
+        self.node.put(TARGET_POSITION, self._start_counts)
+        self._set_mode(PROFILE_POSITION)
+        self.may_be_energised = True
+        self.node.enable()
+
+    def move_to(self, angle_rad: float) -> None:
+        """Start a move to an angle from where the shaft stood when it was enabled.
+
+        Raises
+        ------
+        DriveTimeout
+            The drive does not take the set-point.
+        """
+        counts = self._start_counts + angle_rad / (2.0 * math.pi) * self.counts_per_turn
+        self.node.put(TARGET_POSITION, (round(counts) + WHOLE / 2) % WHOLE - WHOLE / 2)
+        self.node.command(objects.CONTROLWORD, Command.ENABLE_OPERATION | NEW_SET_POINT)
+        until = self.node.connection.clock.now() + ACKNOWLEDGE_S
+        while not self.node.whole(objects.STATUSWORD) & ACKNOWLEDGED:
+            if self.node.connection.clock.now() > until:
+                raise DriveTimeout(
+                    f"the drive does not acknowledge a set-point within {ACKNOWLEDGE_S:g} s",
+                    where=f"node {self.node.node}, 0x6041 bit 12",
+                    likely="the drive expects homing first, or the target is beyond its software limits (0x607D)",
+                    hint="home it, or widen the limits with the maker's software",
+                )  # fmt: skip
+        self.node.command(objects.CONTROLWORD, Command.ENABLE_OPERATION)
+
+    def demanded_rad(self) -> float:
+        """Return the demand as the drive shows it now, from where the shaft stood when it was enabled."""
+        return self._angle(self.node.get(POSITION_DEMAND) - self._start_counts)
+
+    def _angle(self, counts: float) -> float:
+        return 2.0 * math.pi * (counts - round(counts / WHOLE) * WHOLE) / self.counts_per_turn
+
+    # ---- records --------------------------------------------------------------------------------
+
+    def begin_samples(self) -> None:
+        """Note demand, position and current every millisecond from now on; asked for where they cannot be sent."""
+        self._taken, self._recording = [], True
+        items = {"position": POSITION, "demand": POSITION_DEMAND, "current": self._current.item}
+        sending = live_values(self.node, SHOWN, POLL_PERIOD_S, items)
+        try:
+            live = sending.__enter__()
+        except (NotAvailable, SdoAbort):  # fixed process data
+            self.sends = False
+            return
+        self._sending = sending
+        live.on_set = lambda stamp_s: self._take(stamp_s, *(live.values[name] for name in SHOWN))
+
+    def end_samples(self) -> Trace:
+        """Bring the drive's process data back; return what was noted: angles from the start (rad), current (A)."""
+        self._recording = False
+        sending, self._sending = self._sending, None
+        if sending is not None:
+            sending.__exit__(None, None, None)
+        table = np.array(self._taken, dtype=np.float64).reshape(len(self._taken), 4)
+        first = table[0, 0] if len(table) else 0.0
+        units = {"theta_m_rad": "rad", "theta_ref_rad": "rad", "i_q_a": "A"}
+        signals = dict(zip(units, table[:, 1:].T, strict=True))
+        return Trace(table[:, 0] - first, signals, units, {"polled": not self.sends})
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass; asks for samples where the drive does not send them, and watches the following error."""
+        clock = self.node.connection.clock
+        end = clock.now() + seconds
+        while self._recording and not self.sends and clock.now() < end:
+            now = clock.now()
+            self._take(now, *(self.node.get(item) for item in (POSITION, POSITION_DEMAND, self._current.item)))
+        super().wait(max(0.0, end - clock.now()))
+        if self._taken and self._recording:
+            error = abs(self._taken[-1][2] - self._taken[-1][1])
+            if error > self.error_limit_rad:
+                raise LimitExceeded(
+                    "following error", error, self.error_limit_rad, "rad", where=f"node {self.node.node}",
+                    likely="the position loop oscillates or saturates, or the shaft is blocked",
+                    hint="the voltage is off; ask for a slower move, or look at the gains",
+                )  # fmt: skip
+
+    def _take(self, t_s: float, position: float, demand: float, current: float) -> None:
+        angles = (self._angle(counts - self._start_counts) for counts in (position, demand))
+        self._taken.append((t_s, *angles, current * self._current.per_count))  # type: ignore[arg-type]

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""One move there and back by the drive's own position loop: what it demands, where the shaft is, and the current."""
+
+from __future__ import annotations
+
+from pmsmtool.drive.guard import GuardedDrive
+from pmsmtool.drive.position_drive import PositionDrive
+from pmsmtool.errors import DriveTimeout
+from pmsmtool.trace import Trace
+
+HOLD_S = 0.2
+"""The shaft is held before the move: what is seen then is noise."""
+LONGEST_S = 20.0
+ARRIVED = 1e-3
+"""The demand has arrived when it is this near to its end, of the way."""
+
+
+def record_move(guard: GuardedDrive, drive: PositionDrive, way_rad: float, settle_s: float) -> Trace:
+    """Move by an angle and back, each time waiting until the demand has arrived and ``settle_s`` longer; stop.
+
+    Returns
+    -------
+    Trace
+        ``theta_m_rad``, ``theta_ref_rad`` (from the start), ``i_q_a``; ``meta``: ``way_rad``.
+
+    Raises
+    ------
+    DriveTimeout
+        The demand does not arrive.
+    LimitExceeded
+        Current, speed, travel or following error; the voltage is off.
+    """
+    guard.enable()
+    drive.begin_samples()
+    try:
+        guard.wait(HOLD_S)
+        for target in (way_rad, 0.0):
+            drive.move_to(target)
+            _arrive(guard, drive, target, way_rad)
+            guard.wait(settle_s)
+    finally:
+        guard.stop()
+        trace = drive.end_samples()
+    return Trace(trace.t_s, trace.signals, trace.units, {**trace.meta, "way_rad": way_rad})
+
+
+def _arrive(guard: GuardedDrive, drive: PositionDrive, target: float, way: float) -> None:
+    clock = drive.node.connection.clock
+    until = clock.now() + LONGEST_S
+    while abs(drive.demanded_rad() - target) > ARRIVED * abs(way):
+        if clock.now() > until:
+            raise DriveTimeout(
+                f"the demand is {drive.demanded_rad():.4g} rad after {LONGEST_S:g} s, not {target:.4g} rad",
+                where=f"node {drive.node.node}, 0x6062",
+                likely="a profile that is too slow, a software limit (0x607D), or an interlock of the drive",
+                hint="ask for a shorter way, or give --speed and --acceleration",
+            )  # fmt: skip
+        guard.wait(0.02)

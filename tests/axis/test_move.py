@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: MIT
+"""What a recorded move says, from records whose numbers are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pmsmtool.axis.move import compared_moves, move_result
+from pmsmtool.axis.reference import Profile, plan
+from pmsmtool.errors import IdentificationError
+from pmsmtool.trace import Trace
+
+WAY = 1.5
+
+
+def record(late_s: float, rest_a: float = 0.3) -> Trace:
+    """A shaft that follows its demand late by a fixed time, there and back, at 1 kHz; 2 A per 100 rad/s2."""
+    t = np.arange(0.0, 2.0, 1e-3)
+    move = plan(WAY, Profile(8.0, 120.0))
+
+    def path(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        there, _, up = move.at(at - 0.2)
+        back, _, down = move.at(at - 1.1)
+        return there - back, up - down
+
+    (demand, acceleration), (angle, _) = path(t), path(t - late_s)
+    signals = {"theta_ref_rad": demand, "theta_m_rad": angle, "i_q_a": rest_a + 0.02 * acceleration}
+    return Trace(t, signals, {"theta_ref_rad": "rad", "theta_m_rad": "rad", "i_q_a": "A"}, {"way_rad": WAY})
+
+
+def test_a_shaft_that_follows_late_has_the_error_of_its_speed() -> None:
+    found = move_result(record(5e-3))
+    assert found.error_peak_rad == pytest.approx(8.0 * 5e-3, rel=1e-6)  # at constant speed
+    assert found.current_peak_a == pytest.approx(2.4, rel=1e-6)  # 120 rad/s2, the current at rest taken off
+    assert found.moving_s == pytest.approx(2.0 * plan(WAY, Profile(8.0, 120.0)).duration_s, abs=0.02)
+    assert found.error_end_rad < 1e-5  # the last samples of a rest see the next move begin
+
+
+def test_settling_is_the_last_time_outside_one_percent_of_the_way() -> None:
+    """At the end of a braking ramp the late shaft is 60 t^2 rad short: outside 15 mrad until 16 ms before it rests."""
+    found = move_result(record(40e-3))
+    assert found.settling_s == pytest.approx(40e-3 - np.sqrt(0.015 / 60.0), abs=3e-3)
+
+
+def test_two_moves_number_by_number() -> None:
+    rows = {row.name: row for row in compared_moves(move_result(record(8e-3)), move_result(record(2e-3)))}
+    assert rows["error_peak_rad"].ratio == pytest.approx(0.25, rel=1e-6)
+    assert rows["way_rad"].ratio == 1.0
+
+
+def test_a_demand_that_does_not_move_is_refused() -> None:
+    trace = record(5e-3)
+    still = {**trace.signals, "theta_ref_rad": np.zeros(trace.t_s.size)}
+    with pytest.raises(IdentificationError, match="demand moved"):
+        move_result(Trace(trace.t_s, still, trace.units, trace.meta))

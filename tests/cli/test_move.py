@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: MIT
+"""`move`, `tune --axis`, `flash-params` and `diff` one after the other, on a simulated node with EPOS4's objects."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.cli.conftest import Tool
+from tests.foreign.data_sheets import Row, epos4, write_eds
+
+POSITION: tuple[Row, ...] = (
+    (0x1010, 1, "U32", "rw", "1"), (0x6062, 0, "I32", "ro", "0"), (0x607A, 0, "I32", "rw", "0"),
+)  # fmt: skip
+ASKED = ("--by", "60deg", "--speed", "300rpm", "--acceleration", "300", "--settle", "0.2s", "--map", "epos4",
+         "--yes", "--json")  # fmt: skip
+MOST = 0.5
+"""Following error with the new gains over that with the stored ones; measured 0.08."""
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Sequence[str]:
+    eds = write_eds(tmp_path / "axis.eds", (*epos4(), *POSITION))
+    return ("--sim", f"interior-2k2?eds={eds}&nv={tmp_path / 'axis.nv'}")
+
+
+@pytest.mark.chain
+def test_the_same_move_with_stored_and_with_new_gains(tool: Tool, drive: Sequence[str]) -> None:
+    code, printed, said = tool("move", *ASKED, *drive)
+    assert code == 0, said
+    assert "every changed object is restored" in said and "voltage off, drive restored" in said
+    before = json.loads(printed)
+    assert tool("tune", "interior-2k2", "-o", "axis.toml", "--axis", "--map", "epos4")[0] == 0
+    code, _, said = tool("flash-params", "axis.toml", "--map", "epos4", *drive, "--yes")
+    assert code == 0, said
+    code, printed, said = tool("move", *ASKED, *drive)
+    assert code == 0, said
+    after = json.loads(printed)
+    assert after["move"]["error_peak_rad"] < MOST * before["move"]["error_peak_rad"]
+    code, printed, _ = tool("diff", before["run"], after["run"], "--check", "--json")
+    rows = {row["name"]: row for row in json.loads(printed)["moves"]}
+    assert code == 0 and rows["error_peak_rad"]["ratio"] < MOST
+    assert tool("diff", after["run"], before["run"], "--check")[0] == 1  # the other way round it got worse
+
+
+@pytest.mark.chain
+def test_a_move_beyond_its_limits_ends_with_the_voltage_off(tool: Tool, drive: Sequence[str]) -> None:
+    code, _, said = tool("move", *ASKED, *drive, "--speed-max", "60rpm")
+    assert code == 5 and "speed" in said and "voltage off, drive restored" in said
+
+
+def test_a_drive_without_position_mode_is_named(tool: Tool, tmp_path: Path) -> None:
+    eds = write_eds(tmp_path / "torque.eds", epos4(modes=0x220))
+    code, _, said = tool("move", *ASKED, "--sim", f"interior-2k2?eds={eds}&nv=:memory:")
+    assert code == 9 and "profile position mode" in said and "0x6062" in said
+
+
+def test_a_move_of_no_way_is_refused(tool: Tool, drive: Sequence[str]) -> None:
+    assert tool("move", "--by", "0deg", *drive, "--yes")[0] == 2
