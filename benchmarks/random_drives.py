@@ -25,6 +25,7 @@ from pmsmtool.machine.parameters import (
     MachineParameters,
 )
 from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.units import rpm_from_rad_s
 
 Block = Literal["ideal", "timing", "gains"]
@@ -212,12 +213,18 @@ def _with_truth(
 
 
 def data_sheet(drive: MachineFile, seed: int) -> MachineFile:
-    """Return what a right data sheet states of a drive: its ratings, and its machine within :data:`CATALOGUE_SHARE`."""
+    """Return what a right data sheet states of a drive: its ratings, and its machine within :data:`CATALOGUE_SHARE`.
+
+    The resistance is that of the winding alone, as a catalogue's; bridge and cable are not the motor's.
+    """
     rng = np.random.default_rng([20260117, seed])
     values = {
         key: (getattr(drive.machine, key) or 0.0) * (1.0 + share * rng.uniform(-1.0, 1.0))
         for key, share in CATALOGUE_SHARE.items()
     }
+    settings = settings_of(drive)
+    values["R_s_ohm"] *= 1.0 - device_slope_ohm(settings) / settings.number("R_s_ohm")
+    values["R_winding_ohm"] = values["R_s_ohm"]
     machine = replace(drive.machine, alpha_psi_tolerance_per_k=MAGNET_TOLERANCE_PER_K, **values)  # type: ignore[arg-type]
     return replace(drive, machine=machine, simulation={})
 

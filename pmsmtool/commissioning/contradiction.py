@@ -329,7 +329,8 @@ def _allowed(
         low, high = (1.0 - over) / (1.0 + under), (1.0 + over) / (1.0 - under)
     if name == "R_s_ohm":
         devices = 0.0
-        if name not in file.std and machine.R_winding_ohm is None:
+        winding_alone = machine.R_winding_ohm == machine.R_s_ohm
+        if winding_alone or (name not in file.std and machine.R_winding_ohm is None):
             devices = high * DEVICE_SHARE / (1.0 - DEVICE_SHARE)
             text = f"{text}, devices and cable up to {100.0 * DEVICE_SHARE:g} % of the loop"
         if not T_known:

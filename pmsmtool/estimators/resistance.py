@@ -33,8 +33,9 @@ from pmsmtool.estimators.inverter_error import InverterCurve, curve_from_levels
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.machine.parameters import Estimate, MachineParameters
-from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, UNKNOWN_T_RANGE_C
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, UNKNOWN_T_RANGE_C, WINDING_TOLERANCE
 from pmsmtool.trace import Trace
 
 STAGE = "resistance"
@@ -102,17 +103,24 @@ class Copper:
     alpha_per_k : float
         Temperature coefficient of the copper part (1/K).
     R_winding_ohm : float or None
-        The copper part of the loop at ``T_ref_c``, where a meter gave it (ohm).
+        The copper part of the loop at ``T_ref_c``, where a meter or a data sheet gave it (ohm).
+    winding_half_ohm : float
+        Its 95 % half width (ohm).
     """
 
     T_ref_c: float = 20.0
     alpha_per_k: float = COPPER_ALPHA_PER_K
     R_winding_ohm: float | None = None
+    winding_half_ohm: float = 0.0
 
 
-def copper_of(machine: MachineParameters) -> Copper:
-    """Return what a machine file says of the winding."""
-    return Copper(machine.T_ref_c, machine.alpha_R_per_k, machine.R_winding_ohm)
+def copper_of(file: MachineFile) -> Copper:
+    """Return what a machine file says of the winding; without a deviation it has a data sheet's tolerance."""
+    machine, name = file.machine, "R_winding_ohm"
+    winding = machine.R_winding_ohm or 0.0
+    half = COVERAGE_FACTOR * file.std[name] + file.systematic.get(name, 0.0) if name in file.std else math.nan
+    stated = half if math.isfinite(half) else WINDING_TOLERANCE * winding
+    return Copper(machine.T_ref_c, machine.alpha_R_per_k, machine.R_winding_ohm, stated)
 
 
 @dataclass(frozen=True, slots=True)
@@ -449,7 +457,7 @@ def normalised(measured: Estimate, copper: Copper, tolerance: SensorTolerance) -
         )
     rise = copper.alpha_per_k * (measured.T_c - copper.T_ref_c)
     value = _at_reference_ohm(measured.value, copper, measured.T_c)
-    unknown = tolerance.device_share_max if copper.R_winding_ohm is None else 0.0
+    unknown = tolerance.device_share_max if copper.R_winding_ohm is None else copper.winding_half_ohm / value
     scale = value / measured.value
     systematic = math.hypot(measured.systematic * scale, unknown * abs(rise) * value)
     systematic = math.hypot(systematic, copper.alpha_per_k * tolerance.temperature_k * value)
@@ -469,7 +477,8 @@ def normalised(measured: Estimate, copper: Copper, tolerance: SensorTolerance) -
 def _at_reference_ohm(R_ohm: float, copper: Copper, T_c: float) -> float:
     """Return a loop resistance of a winding at ``T_c`` as it is at the reference temperature (ohm)."""
     rise = copper.alpha_per_k * (T_c - copper.T_ref_c)
-    return R_ohm / (1.0 + rise) if copper.R_winding_ohm is None else R_ohm - copper.R_winding_ohm * rise
+    all_copper = R_ohm / (1.0 + rise)
+    return R_ohm - min(copper.R_winding_ohm or math.inf, all_copper) * rise
 
 
 def at_the_test(estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:

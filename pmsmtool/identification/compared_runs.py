@@ -11,7 +11,7 @@ from typing import Any
 
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, statistical_half_width, total_half_width
 from pmsmtool.machine.parameters import Estimate, MachineParameters
-from pmsmtool.machine.temperature import UNKNOWN_T_RANGE_C, magnet_tolerance_per_k
+from pmsmtool.machine.temperature import UNKNOWN_T_RANGE_C, WINDING_TOLERANCE, magnet_tolerance_per_k
 from pmsmtool.units import format_quantity
 
 LEAST_SERIES = 5
@@ -102,7 +102,9 @@ def thermal_half_width(name: str, first: Estimate, second: Estimate, machine: Ma
     sensors = SensorTolerance()
     if name == "R_s_ohm":
         alpha = machine.alpha_R_per_k
-        per_k = alpha * sensors.device_share_max if machine.R_winding_ohm is None else 0.0
+        winding = machine.R_winding_ohm
+        unknown = sensors.device_share_max if winding is None else WINDING_TOLERANCE * winding / abs(first.value)
+        per_k = alpha * unknown
     elif name == "psi_f_wb":
         alpha, per_k = machine.alpha_psi_per_k, magnet_tolerance_per_k(machine)
     else:

@@ -137,7 +137,7 @@ def _evaluation(question: _Question) -> Evaluation:
     return evaluate(
         stored_traces(run),
         nameplate.inverter.T_s,
-        copper=copper_of(nameplate.machine),
+        copper=copper_of(nameplate),
         alpha_psi_per_k=nameplate.machine.alpha_psi_per_k,
         U_dc_v=nameplate.inverter.U_dc_v,
         tolerance=replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(nameplate.machine)),

@@ -325,7 +325,7 @@ def evaluated_stage(
         machine = known.machine
         tolerance = replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(machine))
         result = tier_result(
-            traces, facts, tolerance, known.inverter, machine.psi_f_wb, copper_of(machine),
+            traces, facts, tolerance, known.inverter, machine.psi_f_wb, copper_of(known),
             machine.alpha_psi_per_k,
         )  # fmt: skip
     if {"psi", "mechanics"} & set(request.quantities) and facts.kind == "standard" and not facts.pushed:

@@ -375,6 +375,7 @@ def machine_from_datasheet(sheet: Datasheet) -> DatasheetResult:
     machine = MachineParameters(
         pole_pairs=sheet.pole_pairs,
         R_s_ohm=R_s,
+        R_winding_ohm=R_s,
         L_d_h=L_d,
         L_q_h=L_q,
         psi_f_wb=psi_f,
@@ -389,6 +390,7 @@ def machine_from_datasheet(sheet: Datasheet) -> DatasheetResult:
     inverter = InverterParameters(U_dc_v=sheet.U_dc_v, f_s_hz=sheet.f_s_hz, dead_time_s=sheet.dead_time_s)
     warnings.extend(_plausibility(machine, inverter))
     std = {key: estimate.std for key, estimate in estimates.items()}
+    std["R_winding_ohm"] = std["R_s_ohm"]  # what is measured at the motor's terminals is copper: no bridge, no cable
     simulation, assumed = simulation_of(machine, sheet.encoder_bits)
     steps += [Conversion("[simulation]", "assumed", line, "for a rehearsal alone") for line in assumed]
     machine_file = MachineFile(

@@ -22,6 +22,8 @@ MAGNET_ALPHA_PER_K = -0.0012
 """Temperature coefficient of the flux linkage where no machine file says it: sintered NdFeB, -0.11 to -0.12 %/K."""
 ASSUMED_MAGNET_PER_K = 0.0009
 """95 % half width of that assumption: from samarium-cobalt, -0.03 %/K, to ferrite, -0.2 %/K."""
+WINDING_TOLERANCE = 0.10
+"""Relative 95 % half width of a winding's resistance that a file states without a deviation: a data sheet's."""
 UNKNOWN_T_RANGE_C = (5.0, 90.0)
 """Winding and magnets of a machine whose temperature nothing tells (degC)."""
 

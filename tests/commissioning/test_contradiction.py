@@ -90,6 +90,11 @@ def test_the_limit_is_the_joint_interval(name: str, share: float, sign: float) -
     # the measured loop may be above a data sheet's winding by what bridge and cable have
     assert wrong(outside) == ([] if name == "R_s_ohm" and sign > 0.0 else [name])
     assert wrong(compare(TRUTH, {}, measured(R_s_ohm=1.65 * TRUTH.machine.R_s_ohm))) == ["R_s_ohm"]
+    # so it may where a meter read the winding alone, as `machine new` writes it
+    R = TRUTH.machine.R_s_ohm
+    for winding, contradicted in ((R, []), (0.9 * R, ["R_s_ohm"])):
+        meter = replace(TRUTH, machine=replace(TRUTH.machine, R_winding_ohm=winding), std={"R_s_ohm": 0.005 * R})
+        assert wrong(compare(meter, {}, measured(R_s_ohm=1.3 * R))) == contradicted
 
 
 def test_its_own_deviations_outrank_the_catalogue() -> None:
@@ -104,7 +109,7 @@ def test_an_unknown_temperature_widens_what_copper_and_magnets_allow() -> None:
     """At 90 degC R is 27.5 % up and psi 8.4 % down; with a known one the value is at T_ref and that is no excuse."""
     machine = TRUTH.machine
     hot = {"R_s_ohm": 1.1 * 1.275 * machine.R_s_ohm, "psi_f_wb": 0.9 * 0.918 * machine.psi_f_wb}
-    bare = replace(TRUTH, machine=replace(machine, R_winding_ohm=machine.R_s_ohm))
+    bare = replace(TRUTH, machine=replace(machine, R_winding_ohm=0.9 * machine.R_s_ohm))
     for name, number in hot.items():
         assert not wrong(compare(bare, {}, [value(name, number, T_c=None)]))
         assert wrong(compare(bare, {}, [value(name, number, T_c=20.0)])) == [name]

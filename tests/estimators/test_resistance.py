@@ -132,6 +132,13 @@ def test_only_the_copper_part_is_normalised() -> None:
     R = all_copper.R_measured.value
     assert all_copper.R_s.value == pytest.approx(R / (1.0 + ALPHA * 50.0), rel=1e-9)
     assert half.R_s.value == pytest.approx(R - 0.5 * d.R[0] * ALPHA * 50.0, rel=1e-6)
+    # a copper part known to 10 % leaves that of its correction; one that is above the loop is the loop
+    stated = Copper(R_winding_ohm=0.5 * d.R[0], winding_half_ohm=0.05 * d.R[0])
+    doubted = estimate_resistance(hot, noise_of(d, 0), copper=stated).R_s
+    correction = 0.05 * d.R[0] * ALPHA * 50.0
+    assert doubted.systematic == pytest.approx(math.hypot(half.R_s.systematic, correction), rel=1e-6)
+    above = estimate_resistance(hot, noise_of(d, 0), copper=Copper(R_winding_ohm=2.0 * d.R[0]))
+    assert above.R_s.value == pytest.approx(all_copper.R_s.value)
     # not knowing the split widens the total interval by up to 30 % of the correction
     assert total_half_width(all_copper.R_s) > total_half_width(half.R_s) + 0.01 * R
 

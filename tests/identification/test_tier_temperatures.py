@@ -70,7 +70,7 @@ def test_a_machine_takes_the_values_once_and_inertia_by_the_flux_of_the_run(
 ) -> None:
     """J/psi was measured with warm magnets: with the flux at the reference temperature J would be 5 % too large."""
     known = load_machine_file(machine_path("interior-2k2"))
-    assert copper_of(known.machine) == Copper(known.machine.T_ref_c, known.machine.alpha_R_per_k)
+    assert copper_of(known) == Copper(known.machine.T_ref_c, known.machine.alpha_R_per_k)
     made = tier_machine(known, warm.estimates, "as given").machine
     assert made is not None and made.machine.J_kgm2 is not None
     assert made.machine.R_s_ohm == warm.estimates["R_s_ohm"].value

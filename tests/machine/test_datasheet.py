@@ -158,6 +158,8 @@ def test_deviations_follow_the_source(source):
     result = machine_from_datasheet(sheet(sources={"R": source}, J_kgm2=1e-3))
     machine_file = result.machine_file
     assert machine_file.std["R_s_ohm"] == pytest.approx(R * TOLERANCE[source]["R"] / math.sqrt(3))
+    assert machine_file.machine.R_winding_ohm == machine_file.machine.R_s_ohm, "the motor's terminals: no bridge"
+    assert machine_file.std["R_winding_ohm"] == machine_file.std["R_s_ohm"]
     assert machine_file.std["L_d_h"] == pytest.approx(L * TOLERANCE["datasheet"]["L"] / math.sqrt(3))
     assert machine_file.estimates["R_s_ohm"].source == source
     assert machine_file.estimates["J_kgm2"].value == 1e-3
