@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.drive_access import map_option, read_map, rehearsal_bus
-from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
+from pmsmtool.cli.options import (
+    FILE,
+    BusOptions,
+    MotionOptions,
+    bus_options,
+    examples,
+    motion_options,
+    output_options,
+    overspeed_option,
+)
 from pmsmtool.cli.output import Output
 from pmsmtool.cli.progress import StageProgress
 
@@ -59,6 +68,7 @@ LIMITS = ("current", "speed")
     default="lookup",
     help="Where the drive's current references come from: the table, or an optimisation in the drive.",
 )
+@overspeed_option
 @click.option("--drive-bandwidth-hz", type=click.FloatRange(0.0, min_open=True), metavar="HZ", help="Current "
               "bandwidth of a drive with fixed firmware; its limits are then designed.")  # fmt: skip
 @click.option("--require", multiple=True, type=click.Choice(STAGES), metavar="STAGE", help="A stage without which the "

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.options import FILE, Quantity, examples, output_options
+from pmsmtool.cli.options import FILE, Quantity, examples, output_options, overspeed_option
 from pmsmtool.cli.output import Output, table
 from pmsmtool.cli.output_file import save_figure
 from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
     from pmsmtool.design.lookup.design import LookupDesign
+    from pmsmtool.machine.uncontrolled_generation import Protection
 
 _TEMPERATURE = Quantity("temperature")
 
@@ -51,6 +52,7 @@ _TEMPERATURE = Quantity("temperature")
 @click.option("--voltage-margin", type=float, metavar="RATIO", help="Share of V_max kept.  [default: the design's]")
 @click.option("--iron-loss", type=FILE, help="Iron-loss map (.npz): least total loss instead of least copper loss.")
 @click.option("--plot", "plot_path", type=FILE, help="Figure to write (.svg, .png, .pdf).")
+@overspeed_option
 @output_options
 def lut_command(
     source: str,
@@ -58,6 +60,7 @@ def lut_command(
     voltage_margin: float | None,
     iron_loss: Path | None,
     plot_path: Path | None,
+    overspeed_protection: Protection | None,
     out: Output,
     **asked: Any,
 ) -> None:
@@ -79,7 +82,9 @@ def lut_command(
     file = Path(source) / "design.toml"
     if not file.is_file():
         file = machine_path(source)
-    machine, rated, margin = _limits(file, voltage_margin)
+    machine, rated, margin, protection = _limits(file, voltage_margin)
+    protection = overspeed_protection or protection
+    values = rating_values(machine, rated, protection)
     if iron_loss is None and machine.machine.iron_loss_map is not None:
         iron_loss = file.parent / machine.machine.iron_loss_map
     loss_map = None if iron_loss is None else load_iron_loss_map(iron_loss)
@@ -95,7 +100,7 @@ def lut_command(
         save_figure(lookup_figure(made.table, lines), plot_path)
         written.append(plot_path)
     notes = list(made.notes)
-    if at_a_fault := reaction_of(machine, rated, rating_values(machine, rated)).note:
+    if at_a_fault := reaction_of(machine, rated, values, protection).note:
         notes.append(at_a_fault)
     out.result("lut", {"files": written, "notes": notes, **facts, **_counts(made)}, lambda: _lines(made))
     for note in (*notes, *(check_flux_map(machine.flux_map).complaints if machine.flux_map else ())):
@@ -103,7 +108,7 @@ def lut_command(
     out.note(f"wrote {', '.join(map(str, written))}")
 
 
-def _limits(file: Path, voltage_margin: float | None) -> tuple[Any, Any, float]:
+def _limits(file: Path, voltage_margin: float | None) -> tuple[Any, Any, float, Any]:
     from pmsmtool.design.design_file import load_machine_or_design
     from pmsmtool.design.ratings import ratings
     from pmsmtool.design.tune_request import TuneRequest
@@ -111,7 +116,8 @@ def _limits(file: Path, voltage_margin: float | None) -> tuple[Any, Any, float]:
     machine, design = load_machine_or_design(file)
     if voltage_margin is None:
         voltage_margin = TuneRequest().voltage_margin if design is None else design["field_weakening.margin"]
-    return machine, ratings(machine, (1.0 - voltage_margin) * machine.inverter.V_max_v), voltage_margin
+    rated = ratings(machine, (1.0 - voltage_margin) * machine.inverter.V_max_v)
+    return machine, rated, voltage_margin, None if design is None else design.request.get("overspeed_protection")
 
 
 def _counts(made: LookupDesign) -> dict[str, Any]:

@@ -329,6 +329,16 @@ def _output(ctx: click.Context, verbose: int, quiet: bool, json_output: bool) ->
     return Output(json_output or bool(above.get("json_output")), verbosity)
 
 
+def overspeed_option(function: Function) -> Function:
+    """Add ``--overspeed-protection``: what holds the DC link at a fault above uncontrolled generation."""
+    return click.option(
+        "--overspeed-protection",
+        type=click.Choice(["chopper", "short-circuit"]),
+        help="What holds the DC link at a fault above the speed of uncontrolled generation: a brake chopper that you "
+        "state, or shorted windings.  [default: short-circuit where the magnet stands it]",
+    )(function)
+
+
 @contextmanager
 def options_named(fields: Mapping[str, str] | None = None) -> Iterator[None]:
     """Name the options a person typed, where a request refuses the fields they fill in (``eps = 2`` -> ``--eps 2``).

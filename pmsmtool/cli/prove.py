@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.drive_access import map_option, open_drive, read_map
-from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
+from pmsmtool.cli.options import (
+    BusOptions,
+    MotionOptions,
+    bus_options,
+    examples,
+    motion_options,
+    output_options,
+    overspeed_option,
+)
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
@@ -31,6 +39,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
 @click.option("--machines", type=click.IntRange(32, 2000), default=96, help="Machines drawn for the prediction.")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the draw.")
+@overspeed_option
 @map_option
 @bus_options
 @motion_options
@@ -43,6 +52,7 @@ def prove_command(
     runs: Path,
     machines: int,
     seed: int,
+    overspeed_protection: str | None,
     map_file: Path | None,
 ) -> None:
     """Predict the response of a flashed DESIGN, run it on the machine, compare; exit code 1 outside the 95 % band.
@@ -52,18 +62,28 @@ def prove_command(
 
     The band follows from the intervals of the machine in the design. It is printed with its SHA-256 before the first
     step. The steps: speed, current in two sizes and both signs, a governed unreachable reference, entry into field
-    weakening.
+    weakening. Above the speed of uncontrolled generation they go only where a fault shorts the windings, or a brake
+    chopper is stated.
     """
-    from dataclasses import asdict
+    from dataclasses import asdict, replace
 
     from pmsmtool.cli.consent import Consent, ask_motion
     from pmsmtool.commissioning.commission import begin_run, write_report
     from pmsmtool.design.design_file import design_text, load_design
+    from pmsmtool.errors import ConfigError
     from pmsmtool.proof.stage import ProofRequest, not_proven, prove_stage
     from pmsmtool.run_directory import RunDirectory
 
     path = design / "design.toml" if design.is_dir() else design
     made = load_design(path)
+    if overspeed_protection == "short-circuit" and not made["protection.n_short_circuit_rpm"]:
+        raise ConfigError(
+            "--overspeed-protection short-circuit: a fault of this design removes the gates",
+            where=str(path),
+            hint="pmsmtool tune --overspeed-protection short-circuit, flash that design, then prove it",
+        )
+    if overspeed_protection is not None:
+        made = replace(made, request={**made.request, "overspeed_protection": overspeed_protection})
     asked = ProofRequest(
         motion.i_max_apk, motion.speed_max_rad_s, motion.shaft or "free", motion.load, motion.brake, machines, seed
     )

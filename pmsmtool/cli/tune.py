@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.drive_access import map_option, read_map
-from pmsmtool.cli.options import FILE, examples, options_named, output_options
+from pmsmtool.cli.options import FILE, examples, options_named, output_options, overspeed_option
 from pmsmtool.cli.output import Output, table
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import write_file
@@ -93,6 +93,7 @@ if TYPE_CHECKING:
 @click.option("--axis-peak-db", type=float, default=6.0, metavar="DB", help="Largest |S| of both loops over it.")
 @click.option("--loop-rate-hz", type=float, metavar="HZ", help="Rate of the drive's speed and position loops.  "
               "[default: as its map says]")  # fmt: skip
+@overspeed_option
 @map_option
 @click.option("--drive-bandwidth-hz", type=float, metavar="HZ", help="Current bandwidth of a drive with fixed "
               "firmware (--map).")  # fmt: skip

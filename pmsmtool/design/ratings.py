@@ -20,7 +20,7 @@ from pmsmtool.machine.dead_time import dead_time_compensation
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import loop_coefficient_per_k
-from pmsmtool.machine.uncontrolled_generation import FaultReaction, fault_reaction
+from pmsmtool.machine.uncontrolled_generation import FaultReaction, Protection, fault_reaction
 from pmsmtool.params.catalogue import BY_NAME
 
 TRIP_CURRENT_RATIO = 1.5
@@ -159,9 +159,16 @@ def base_speed_rpm(source: MachineFile, I_apk: float, i_d_min_a: float, V_limit_
     return omega / machine.pole_pairs * RPM
 
 
-def rating_values(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
-    """Return the catalogue values of motor, inverter, protection and encoder."""
-    return {**_motor(source, rated), **_inverter(source), **_protection(source, rated), **_encoder(source)}
+def rating_values(source: MachineFile, rated: Ratings, protection: Protection | None = None) -> dict[str, DesignValue]:
+    """Return the catalogue values of motor, inverter, protection and encoder; ``protection`` is that at over-speed.
+
+    Raises
+    ------
+    DesignInfeasible
+        As :func:`~pmsmtool.machine.uncontrolled_generation.fault_reaction`.
+    """
+    protected = _protection(source, rated, protection)
+    return {**_motor(source, rated), **_inverter(source), **protected, **_encoder(source)}
 
 
 def _motor(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
@@ -206,7 +213,7 @@ def _inverter(source: MachineFile) -> dict[str, DesignValue]:
     }
 
 
-def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
+def _protection(source: MachineFile, rated: Ratings, protection: Protection | None) -> dict[str, DesignValue]:
     limits, U_dc = source.limits, source.inverter.U_dc_v
     low, high = U_DC_RANGE
     highest = BY_NAME["protection.U_dc_max_v"].maximum
@@ -227,7 +234,7 @@ def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
         "protection.I_cont_apk": DesignValue(rated.I_cont_apk, rated.methods["I_cont"]),
         "governor.I_transient_apk": DesignValue(rated.I_max_apk, "I_max"),
     }
-    reaction = reaction_of(source, rated, found)
+    reaction = reaction_of(source, rated, found, protection)
     return found | {"protection.n_short_circuit_rpm": DesignValue(reaction.short_from_rpm, reaction.how)}
 
 
@@ -242,10 +249,12 @@ def sag_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict[str
     return facts
 
 
-def reaction_of(source: MachineFile, rated: Ratings, values: Mapping[str, DesignValue]) -> FaultReaction:
+def reaction_of(
+    source: MachineFile, rated: Ratings, values: Mapping[str, DesignValue], protection: Protection | None = None
+) -> FaultReaction:
     """Return what a fault does to the inverter, by the limits among the values."""
     U_max, n_trip = (float(values[f"protection.{name}"].value) for name in ("U_dc_max_v", "n_trip_rpm"))
-    return fault_reaction(source.machine, source.inverter.U_dc_v, U_max, n_trip, rated.i_d_min_a)
+    return fault_reaction(source.machine, source.inverter.U_dc_v, U_max, n_trip, rated.i_d_min_a, protection)
 
 
 def _encoder(source: MachineFile) -> dict[str, DesignValue]:

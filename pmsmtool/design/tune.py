@@ -73,14 +73,15 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
     ConfigError
         The machine file lacks what no rule can supply.
     DesignInfeasible
-        The margins asked for cannot be met with the bandwidth asked for, or a value leaves the drive's range.
+        The margins asked for cannot be met with the bandwidth asked for, or a value leaves the drive's range; or
+        nothing holds the DC link at a fault at rated speed.
     """
     request = TuneRequest() if request is None else request
     V_limit = (1.0 - request.voltage_margin) * source.inverter.V_max_v
     rated = ratings(source, V_limit)
     values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}
-    values |= rating_values(source, rated)
-    reaction = reaction_of(source, rated, values)
+    values |= rating_values(source, rated, request.overspeed_protection)
+    reaction = reaction_of(source, rated, values, request.overspeed_protection)
     told = (reaction.note,) if reaction.note else ()
     generation = {} if math.isinf(reaction.generation_rpm) else {"generation_rpm": reaction.generation_rpm}
     choice = choose_current(source, request, rated.I_max_apk)

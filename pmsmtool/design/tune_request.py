@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, get_args
 
 from pmsmtool.design.design_file import Scalar
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING_MODES
@@ -16,6 +16,7 @@ from pmsmtool.design.loops.speed_loop import SpeedMethod
 from pmsmtool.design.polar_laws import LAWS as POLAR_LAWS
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.key import Key, KeyKind, check_table
+from pmsmtool.machine.uncontrolled_generation import Protection
 
 CONTROLLERS = ("pi", "polar")
 
@@ -65,6 +66,9 @@ class TuneRequest:
         Mode of field weakening (``field_weakening.MODES``), or ``auto``: a look-up table for a machine with a flux map,
         the accelerated optimisation for a constant one; for a polar law the table where it knows more than the law
         (``polar_values.weakening_mode``).
+    overspeed_protection : str or None
+        What holds the DC link at a fault above the speed of uncontrolled generation: ``chopper`` (a person states it)
+        or ``short-circuit``; None: a short circuit where the magnet stands it, else nothing, and the design says so.
     """
 
     controller: str = "pi"
@@ -89,6 +93,7 @@ class TuneRequest:
     governor: str = "best"
     eps: float | None = None
     field_weakening: str = "auto"
+    overspeed_protection: Protection | None = None
 
     def __post_init__(self) -> None:
         wrong = []
@@ -99,9 +104,10 @@ class TuneRequest:
             "speed_method": tuple(str(one) for one in SpeedMethod),
             "governor": tuple(GOVERNOR_MODES),
             "field_weakening": ("auto", *FIELD_WEAKENING_MODES),
+            "overspeed_protection": get_args(Protection),
         }
         for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
+            if getattr(self, name) not in allowed and (name, getattr(self, name)) != ("overspeed_protection", None):
                 wrong.append(f"{name} is {getattr(self, name)!r}, allowed are {', '.join(allowed)}")
         for name in ("bandwidth_hz", "damping", "speed_bandwidth_hz", "speed_damping", "speed_filter_hz", "pll_rad_s"):
             value = getattr(self, name)
@@ -125,7 +131,7 @@ class TuneRequest:
         return {name: value for name, value in given.items() if value is not None}
 
 
-_KINDS: dict[str, KeyKind] = {"str": "text", "float": "float", "int": "int", "bool": "bool"}
+_KINDS: dict[str, KeyKind] = {"str": "text", "float": "float", "int": "int", "bool": "bool", "Protection": "text"}
 _KEYS: tuple[Key, ...] = (
     *(
         Key("request", item.name, _KINDS[str(item.type).split(" ")[0]], "", -1e9, 1e9, None, "what was asked")

@@ -32,7 +32,8 @@ TORQUE_SHORTFALL = 0.10
 machines -10 %)."""
 STEPS = 5
 """Values over an interval that are evaluated, its ends among them."""
-_BARE = TuneRequest(governor="off", field_weakening="off")
+_BARE = TuneRequest(governor="off", field_weakening="off", overspeed_protection="chopper")
+"""Loops and limits alone; what protects the DC link is tune's question."""
 _COLUMNS = (*PARAMETERS, "encoder_rad", "T_winding_c", "T_magnet_c", "U_dc_v", "operating_point")
 
 

@@ -11,13 +11,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
+from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.units import rpm_from_rad_s
 
 COLD_C = 0.0
 """Temperature (degC) of the strongest magnet that is reckoned with: started up in an unheated hall."""
+
+Protection = Literal["chopper", "short-circuit"]
+"""What keeps the link below its limit at a fault: a brake chopper that a person states, or shorted windings."""
+HINT = "fit a brake chopper and state it (--overspeed-protection chopper), or lower n_max"
 
 
 def generation_rpm(machine: MachineParameters, U_dc_max_v: float) -> float:
@@ -53,7 +59,12 @@ class FaultReaction:
 
 
 def fault_reaction(
-    machine: MachineParameters, U_dc_nom_v: float, U_dc_max_v: float, n_trip_rpm: float, i_d_min_a: float
+    machine: MachineParameters,
+    U_dc_nom_v: float,
+    U_dc_max_v: float,
+    n_trip_rpm: float,
+    i_d_min_a: float,
+    protection: Protection | None = None,
 ) -> FaultReaction:
     """Choose between gates off and, above the speed of uncontrolled generation, a short circuit.
 
@@ -67,19 +78,32 @@ def fault_reaction(
         Largest speed at which a fault can occur (rpm).
     i_d_min_a : float
         Most negative i_d that the magnet stands (A).
+    protection : str, optional
+        What a person states or asks for; None: a short circuit where the magnet stands it.
+
+    Raises
+    ------
+    DesignInfeasible
+        A short circuit is asked for that demagnetises the machine; or nothing protects the link at a fault at the
+        machine's rated speed.
     """
     from_rpm = generation_rpm(machine, U_dc_max_v)
     if n_trip_rpm <= from_rpm:
         return FaultReaction(from_rpm, 0.0, "gates off: the back-EMF stays below U_dc_max at n_trip", "")
+    if protection == "chopper":
+        return FaultReaction(from_rpm, 0.0, "gates off: a brake chopper holds the DC link, as stated", "")
     psi = _cold(machine)
     # the voltage limit at that speed bounds the linkage there: V_max / omega = psi U_nom / U_max
     peak = -psi * (1.0 + U_dc_nom_v / U_dc_max_v) / machine.L_d_decoupling_h
     if peak >= i_d_min_a:
         how = f"short circuit above uncontrolled generation: i_d to {peak:.4g} A at most, {i_d_min_a:.4g} A allowed"
         return FaultReaction(from_rpm, from_rpm, how, "")
-    note = (
+    what = (
         f"a fault above {from_rpm:.4g} rpm charges the DC link over {U_dc_max_v:.4g} V (uncontrolled generation, up to "
         f"n_trip {n_trip_rpm:.4g} rpm), and a short circuit would take i_d to {peak:.4g} A, beyond the "
-        f"{i_d_min_a:.4g} A allowed: fit a brake chopper, or lower n_max"
+        f"{i_d_min_a:.4g} A allowed"
     )
+    if protection is not None or (machine.n_nom_rpm or 0.0) > from_rpm:
+        raise DesignInfeasible(what, where="--overspeed-protection" if protection else "n_nom_rpm", hint=HINT)
+    note = f"{what}: {HINT}"
     return FaultReaction(from_rpm, 0.0, "gates off: a short circuit takes i_d beyond its limit", note)

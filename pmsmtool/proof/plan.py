@@ -253,9 +253,10 @@ class _Sizes:
 
 
 def _generation_rpm(design: Design) -> float:
-    """Speed (rpm) above which a fault charges the DC link; infinity where a fault shorts the windings there."""
-    shorted = design["protection.n_short_circuit_rpm"] > 0.0
-    return math.inf if shorted else float(design.facts.get("generation_rpm", math.inf))
+    """Speed (rpm) above which a fault charges the DC link; infinity where shorted windings or a chopper prevent it."""
+    chopper = design.request.get("overspeed_protection") == "chopper"
+    protected = chopper or design["protection.n_short_circuit_rpm"] > 0.0
+    return math.inf if protected else float(design.facts.get("generation_rpm", math.inf))
 
 
 def _speed_step(s: _Sizes) -> Experiment:
@@ -365,7 +366,7 @@ def _weakening(s: _Sizes) -> Experiment | str:
     if end < WEAKENING_LEAST * corner:
         above = _generation_rpm(s.design)
         bound = s.omega_max >= GENERATION_SHARE * above * RPM * s.p
-        why = f"; above {above:.4g} rpm a fault would charge the DC link" if bound else ""
+        why = f"; above {above:.4g} rpm a fault would charge the DC link (--overspeed-protection)" if bound else ""
         return (
             f"entry into field weakening: it begins at {corner / s.p / RPM:.4g} rpm, "
             f"{end / s.p / RPM:.4g} rpm are within the limits{why}"

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.uncontrolled_generation import COLD_C, fault_reaction, generation_rpm
 from pmsmtool.units import rpm_from_rad_s
@@ -49,5 +51,21 @@ def test_a_magnet_that_does_not_stand_it_keeps_the_gates_off_and_says_so() -> No
     told = fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -56.0)
     assert told.short_from_rpm == 0.0 and "chopper" in told.note and f"{n:.4g} rpm" in told.note
     assert told.generation_rpm == pytest.approx(rpm_from_rad_s(U_MAX / (math.sqrt(3.0) * 4 * PSI_COLD)))
+    stated = fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -56.0, "chopper")
+    assert stated.short_from_rpm == 0.0 and not stated.note and "chopper" in stated.how
+    assert fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -1e3, "chopper").short_from_rpm == 0.0
+    with pytest.raises(DesignInfeasible, match="i_d to .* beyond the -56 A allowed"):
+        fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -56.0, "short-circuit")
     quiet = fault_reaction(MACHINE, U_NOM, U_MAX, 0.99 * n, -56.0)
     assert quiet.short_from_rpm == 0.0 and not quiet.note
+
+
+def test_a_rated_speed_that_nothing_protects_is_refused() -> None:
+    """It got a note in the design, and every run at rated speed was one fault from 1.1 U_dc_max."""
+    n = generation_rpm(MACHINE, U_MAX)
+    rated = replace(MACHINE, n_nom_rpm=1.1 * n)
+    with pytest.raises(DesignInfeasible) as refused:
+        fault_reaction(rated, U_NOM, U_MAX, 1.4 * n, -56.0)
+    assert "--overspeed-protection chopper" in refused.value.hint
+    assert not fault_reaction(rated, U_NOM, U_MAX, 1.4 * n, -56.0, "chopper").note
+    assert fault_reaction(rated, U_NOM, U_MAX, 1.4 * n, -1e3).short_from_rpm == pytest.approx(n)
