@@ -83,6 +83,8 @@ class Conditions:
         The envelope.
     shaft : str
         ``free``, ``locked`` or ``coupled``.
+    U_dc_ripple_v : float
+        Amplitude of the link's ripple (V).
     """
 
     U_dc_v: float
@@ -92,6 +94,7 @@ class Conditions:
     i_max_apk: float
     speed_max_rad_s: float
     shaft: str = "free"
+    U_dc_ripple_v: float = 0.0
 
     def facts(self) -> dict[str, Any]:
         """Return them as JSON; what is not known is None."""

@@ -47,6 +47,10 @@ T_SPREAD_K = 5.0
 T_MAGNET_SPREAD_K = 15.0
 """Half range of the magnets' temperature about the winding's where they have no sensor."""
 U_DC_SPREAD = 0.01
+RIPPLE_LEAST = 0.005
+"""Amplitude of the link's ripple, relative, from which on it is drawn: what less does, :data:`U_DC_SPREAD` covers."""
+RIPPLE_HZ = (100.0, 120.0, 300.0, 360.0)
+"""Its frequency: twice that of the mains behind one phase, six times behind three."""
 DEAD_SPREAD = 0.2
 KNEE_FACTOR = 3.0
 MISMATCH_OF_LEGS = 0.05
@@ -65,8 +69,8 @@ OFFSET_SHARE = 0.001
 MISMATCH = 0.002
 """Standard deviations of sensor offsets (of I_max) and of the phases' gains against each other."""
 SEEN_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
-"""Range of identified eddy currents, drag, cogging and encoder errors, and factor either way of the currents' time
-constant: one branch stands for many, one order for the orders of the cogging."""
+"""Range of identified eddy currents, drag, cogging, encoder errors and ripple of the link, and factor either way of the
+currents' time constant: one branch stands for many, one order for the orders of the cogging."""
 RESONANCE_RANGE, ZETA_FACTOR = (0.98, 1.02), 2.0
 """Range of identified resonance and antiresonance, and factor either way of the damping (found within 0.03 % and 14 %,
 ``tests/measurement/test_frequency_response``; a shaft has more than two masses)."""
@@ -306,6 +310,8 @@ def _simulated(machine: MachineFile, conditions: Conditions) -> MachineFile:
         "T_magnet_c": T_winding if math.isnan(conditions.T_magnet_c) else conditions.T_magnet_c,
         "dead_time_s": min(dead_time, 2e-5),
     }
+    if conditions.U_dc_ripple_v > RIPPLE_LEAST * conditions.U_dc_v:
+        settings["U_dc_ripple_v"] = conditions.U_dc_ripple_v
     if inverter.i_knee_apk:
         settings["i_knee_apk"] = inverter.i_knee_apk
     if conditions.shaft == "locked" or machine.machine.J_kgm2 is None:
@@ -350,6 +356,9 @@ def _draw(
     _draw_elastic_shaft(setup, machine, rng)
     out.B, out.tau_c = _friction(machine, rng)
     setup.T_winding, setup.T_magnet, setup.U_dc = (varied[n] for n in ("T_winding_c", "T_magnet_c", "U_dc_v"))
+    if setup.U_dc_ripple > 0.0:
+        setup.U_dc_ripple *= float(rng.uniform(*SEEN_SHARES))
+        setup.U_dc_ripple_hz = float(rng.choice(RIPPLE_HZ))
     setup.sensors.encoder_offset_e += varied["encoder_rad"]
     setup.sensors.offset[:] = list(rng.normal(0.0, OFFSET_SHARE * I_max, 3))
     known = [machine.conditions.get(f"sensor_gain_{phase}_over_mean", 1.0) for phase in "abc"]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
@@ -51,6 +52,9 @@ FOLDER = "prove"
 PREDICTION = "prediction.npz"
 GROSS = 3.0
 """A response this far outside its band, in half widths, ends the proof: what is demanded next needs what has failed."""
+LINK_READINGS = 200
+"""Readings of the DC link whose mean counts, 0.1 s and more of a rectifier's ripple: with one reading of 2.2 % of it, a
+healthy drive entered field weakening 1.23 half widths of the band late (the mean: within 0.2 %)."""
 SPEED = "omega_e_rad_s"
 ENCODER_INCREMENTS = DriveObject(0x608F, 1, "I")
 _HASH_DIGITS = 12
@@ -236,9 +240,10 @@ def conditions_of(drive: CanopenDrive, envelope: Envelope) -> Conditions:
         except SdoAbort:
             return math.nan
 
+    link = [drive.live("U_dc_v") for _ in range(LINK_READINGS)]
     return Conditions(
-        drive.live("U_dc_v"), live("T_winding_c"), live("T_magnet_c"), counts,
-        envelope.i_max_apk, envelope.speed_max_rad_s, envelope.shaft,
+        statistics.fmean(link), live("T_winding_c"), live("T_magnet_c"), counts,
+        envelope.i_max_apk, envelope.speed_max_rad_s, envelope.shaft, math.sqrt(2.0) * statistics.pstdev(link),
     )  # fmt: skip
 
 

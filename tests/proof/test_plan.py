@@ -183,6 +183,15 @@ def test_the_prediction_has_the_two_masses_that_the_resonance_tells() -> None:
         assert zeta / 2.0 <= damping <= 2.0 * zeta
 
 
+def test_the_prediction_has_the_ripple_that_the_link_shows() -> None:
+    made = design()
+    for ripple_v, drawn in ((12.0, True), (2.0, False)):  # 2 V of 540 V are noise of the readings
+        limits = conditions(made, U_dc_ripple_v=ripple_v)
+        setups = SimulatedDrives(made, limits, plan_proof(made, limits), 24, 0).setups
+        assert all((0.5 * ripple_v <= s.U_dc_ripple <= 1.5 * ripple_v) if drawn else not s.U_dc_ripple for s in setups)
+        assert not drawn or {s.U_dc_ripple_hz for s in setups} == {100.0, 120.0, 300.0, 360.0}
+
+
 def test_a_locked_shaft_leaves_the_current_steps() -> None:
     made = design()
     plan = plan_proof(made, conditions(made, shaft="locked"))
