@@ -23,7 +23,7 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.motion_objects import OVER_SPEED_TRIP, lowered_trip, trips_itself
-from pmsmtool.drive.own_limits import NO_LIMITS, lower_limits, put_current_limit
+from pmsmtool.drive.own_limits import NO_LIMITS, lower_limits, put_limit
 from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, Recording, Shape
 from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import (
@@ -36,7 +36,7 @@ from pmsmtool.errors import (
     StopNotConfirmed,
 )
 from pmsmtool.trace import Trace
-from pmsmtool.units import rpm_from_rad_s
+from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 
 WATCH_S = 0.05
 """The machine is looked at this often while time passes."""
@@ -215,7 +215,12 @@ class GuardedDrive:
 
         None where the drive has no limit that this could lower.
         """
-        return put_current_limit(self._node, self._limits, apk)
+        return put_limit(self._node, self._limits.current, apk, self._limits.most_apk)
+
+    def limit_speed(self, rad_s: float) -> float | None:
+        """Lower the drive's own speed limit (rad/s, mechanical), as :meth:`limit_current`; return what it keeps."""
+        kept = put_limit(self._node, self._limits.speed, rpm_from_rad_s(rad_s), self._limits.most_rpm)
+        return None if kept is None else rad_s_from_rpm(kept)
 
     def change(self, item: objects.DriveObject, data: bytes) -> None:
         """Write a gain that no map knows, while the voltage is off, and read it back; restored when the guard ends.

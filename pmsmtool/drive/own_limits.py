@@ -18,7 +18,7 @@ RATED_RATIO = 30.0
 """Largest current limit over the drive's rated current (0x6075): three times the rated current of a motor ten times as
 large as the one that the drive still holds."""
 LEAST_COUNTS = 4
-"""Steps of its limit below which a drive is not asked to keep a current: they are too coarse."""
+"""Steps of its limit below which a drive is not asked to keep a current or speed: they are too coarse."""
 _ROUNDING = 1e-6
 
 
@@ -29,16 +29,17 @@ class OwnLimits(NamedTuple):
     ----------
     current, speed : Quantity or None
         The objects in use, None where the drive has none.
-    most_apk : float
-        What the current's allows after it was lowered to the envelope (A peak).
+    most_apk, most_rpm : float
+        What they allow after they were lowered to the envelope (A peak, rpm).
     """
 
     current: Quantity | None
     speed: Quantity | None
     most_apk: float
+    most_rpm: float
 
 
-NO_LIMITS = OwnLimits(None, None, math.inf)
+NO_LIMITS = OwnLimits(None, None, math.inf, math.inf)
 
 
 def lower_limits(drive: CanopenDrive, envelope: Envelope) -> OwnLimits:
@@ -69,18 +70,18 @@ def lower_limits(drive: CanopenDrive, envelope: Envelope) -> OwnLimits:
         None if current is None else current[0],
         None if speed is None else speed[0],
         math.inf if current is None else current[1],
+        math.inf if speed is None else speed[1],
     )
 
 
-def put_current_limit(node: DriveNode, limits: OwnLimits, wanted_apk: float) -> float | None:
-    """Let the drive keep a current (A peak), at most what it allows while it is lent; return what it keeps.
+def put_limit(node: DriveNode, limit: Quantity | None, wanted: float, most: float) -> float | None:
+    """Let the drive keep a current (A peak) or a speed (rpm), at most what it allows while it is lent.
 
-    None where it has no such limit, or steps too coarse for it.
+    Returns what it keeps; None where it has no such limit, or steps too coarse for it.
     """
-    limit = limits.current
     if limit is None:
         return None
-    counts = math.floor(min(wanted_apk, limits.most_apk) / limit.per_count + _ROUNDING)
+    counts = math.floor(min(wanted, most) / limit.per_count + _ROUNDING)
     if counts < LEAST_COUNTS:
         return None
     try:

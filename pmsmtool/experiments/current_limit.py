@@ -34,37 +34,42 @@ LEAST_NET = 0.3
 
 @dataclass(frozen=True, slots=True)
 class LimitShown:
-    """Currents (A peak) of one trial: asked for, kept by the limit, seen, and the most with which the limit acts."""
+    """Currents (A peak) or speeds of one trial: asked for, kept by the limit, seen, the most with which it acts."""
 
-    asked_a: float
-    kept_a: float
-    seen_a: float
-    most_a: float
+    asked: float
+    kept: float
+    seen: float
+    most: float
+    quantity: str = "current"
+    unit: str = "A"
 
     @property
     def acts(self) -> bool:
         """Whether no more was seen than the limit allows."""
-        return self.seen_a <= self.most_a
+        return self.seen <= self.most
 
     def __str__(self) -> str:
-        shown = f"asked for {self.asked_a:.3g} A, limit {self.kept_a:.3g} A, the drive gave at most {self.seen_a:.3g} A"
+        asked, kept, seen = (f"{value:.3g} {self.unit}" for value in (self.asked, self.kept, self.seen))
+        shown = f"asked for {asked}, limit {kept}, the drive gave at most {seen}"
         if not self.acts:
-            return f"the drive does not keep its own current limit: {shown}"
-        return f"current limit {'proven' if self.proven else 'not proven'}: {shown}"
+            return f"the drive does not keep its own {self.quantity} limit: {shown}"
+        return f"{self.quantity} limit {'proven' if self.proven else 'not proven'}: {shown}"
 
     @property
     def proven(self) -> bool:
-        """Whether the limit was reached, and no more flowed."""
-        return self.acts and self.seen_a >= LEAST * self.kept_a
+        """Whether the limit was reached, and not more than that."""
+        return self.acts and self.seen >= LEAST * self.kept
 
 
-NOT_SHOWN = "current limit not proven: the drive has none that can be lowered; every command is bounded here"
+def not_shown(quantity: str = "current") -> str:
+    """Return what is said of a limit that could not be tried."""
+    return f"{quantity} limit not proven: the drive has none that can be lowered; every command is bounded here"
 
 
-def unproven(shown: LimitShown | None) -> str:
+def unproven(shown: LimitShown | None, quantity: str = "current") -> str:
     """Return what a report says of a limit that was not proven, empty where it was."""
     if shown is None:
-        return NOT_SHOWN
+        return not_shown(quantity)
     return "" if shown.proven else f"{shown}; every command is bounded here, and this program looks"
 
 
@@ -126,8 +131,9 @@ def require_limit(shown: LimitShown | None) -> None:
     if shown is not None and not shown.acts:
         raise SafetyRefusal(
             str(shown),
-            likely="the limit acts in other modes only, or another object than 0x6073 limits the current",
-            hint="ask the maker which object limits the current; nothing more is moved without it",
+            likely=f"the limit acts in other modes only, or the {shown.quantity} is limited by another object than "
+            + ("0x6080" if shown.quantity == "speed" else "0x6073"),
+            hint=f"ask the maker which object limits the {shown.quantity}; nothing more is moved without it",
         )
 
 

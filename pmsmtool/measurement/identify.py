@@ -202,8 +202,7 @@ def identify_stage(
             run.add(replace(kept, status=status_of(error), note=text_of(error), seconds=clock.now() - start))
         raise
     stage = evaluated_stage(run, nameplate, request)
-    fallbacks = [*stage.fallbacks, unproven] if unproven else stage.fallbacks
-    return replace(stage, seconds=clock.now() - start, fallbacks=fallbacks)
+    return replace(stage, seconds=clock.now() - start, fallbacks=[*stage.fallbacks, *unproven])
 
 
 def _measure(
@@ -213,10 +212,10 @@ def _measure(
     limits: Limits,
     request: IdentifyRequest,
     say: Callable[[str], None],
-) -> str:
+) -> list[str]:
     """Run the experiments inside the guard; traces, predictions and refusals go into the run.
 
-    Returns what a report says of a current limit that was not proven.
+    Returns what a report says of limits that were not proven.
     """
 
     def keep(name: str, trace: Trace) -> None:
@@ -234,7 +233,7 @@ def _measure(
             map_if_saturated=request.map_if_saturated,
         )
         measurement.spent = lambda: (guard.energised_s, guard.energy_j)
-        measurement.limit_current = guard.limit_current
+        measurement.limit_current, measurement.limit_speed = guard.limit_current, guard.limit_speed
         predictions: list[dict[str, Any]] = []
 
         def predicted(prediction: dict[str, Any]) -> None:

@@ -23,9 +23,10 @@ from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
-from pmsmtool.experiments.current_limit import NOT_SHOWN, LimitCurrent, require_limit, show_current_limit, unproven
+from pmsmtool.experiments.current_limit import LimitCurrent, not_shown, require_limit, show_current_limit, unproven
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
+from pmsmtool.experiments.speed_limit import LimitSpeed, show_speed_limit
 from pmsmtool.experiments.vector_turn import RAMP_S
 from pmsmtool.identification.evaluate import flux_of, resistance_of, tolerance_on
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
@@ -113,8 +114,10 @@ class Measurement:
         Current that turns the rotor over, of the test current; more where it did not follow.
     limit_current : callable or None
         Sets the drive's own current limit (A peak) and returns what it keeps; with it the limit is shown to act.
-    unproven : str
-        What a report says of a current limit that could not be shown to act.
+    limit_speed : callable or None
+        The same of the speed limit (rad/s).
+    unproven : list of str
+        What a report says of limits that could not be shown to act.
     predicted : callable or None
         Told every prediction (``identification/run_files``) before the machine moves for it.
     """
@@ -129,9 +132,10 @@ class Measurement:
     map_if_saturated: bool = False
     spent: Callable[[], tuple[float, float]] | None = None
     limit_current: LimitCurrent | None = None
+    limit_speed: LimitSpeed | None = None
     predicted: Callable[[dict[str, Any]], None] | None = None
     turn_share: float = TURN_SHARES[0]
-    unproven: str = ""
+    unproven: list[str] = field(default_factory=list)
     refused: dict[str, IdentificationError] = field(default_factory=dict)
     _kept: dict[str, Trace] = field(default_factory=dict)
     _effort: Effort = ALL
@@ -187,7 +191,9 @@ class Measurement:
         self._tell_spent()
         if inductances is None or "speeds" not in steps:
             return False
-        speeds = SpeedStage(self.drive, self.limits, self._keep_for_later, self.say, self._effort.speeds)
+        speeds = SpeedStage(
+            self.drive, self.limits, self._keep_for_later, self.say, self._effort.speeds, self._speed_limit
+        )
 
         def enough() -> bool:
             try:
@@ -357,10 +363,19 @@ class Measurement:
         if self.limit_current is not None:
             limits, angle = self.limits, standstill.PHASE_ANGLES_RAD[-1]
             shown = show_current_limit(self.drive, self.limit_current, limits.I_nom_apk, limits.i_max_apk, angle)
-            self.say(f"  {shown or NOT_SHOWN}")
+            self.say(f"  {shown or not_shown()}")
             require_limit(shown)
-            self.unproven = unproven(shown)
+            self.unproven += filter(None, [unproven(shown)])
         return found
+
+    def _speed_limit(self, largest_rad_s: float, pole_pairs: int) -> None:
+        """Show that the drive keeps its own speed limit, before the run that relies on it."""
+        if self.limit_speed is not None:
+            shown = show_speed_limit(self.drive, self.limit_speed, largest_rad_s, pole_pairs)
+            self.say(f"  {shown or not_shown('speed')}")
+            require_limit(shown)
+            self.unproven += filter(None, [unproven(shown, "speed")])
+            self.limit_speed = None  # once is enough
 
     def _encoder_counts(self, start_rad: float, end_rad: float) -> None:
         for share in TURN_SHARES:

@@ -81,6 +81,7 @@ class SpeedStage:
     keep: Callable[[str, Trace], None]
     say: Callable[[str], None]
     effort: SpeedEffort = ALL_SPEEDS
+    show_limit: Callable[[float, int], None] = lambda largest_rad_s, pole_pairs: None
 
     def measure(
         self,
@@ -227,6 +228,7 @@ class SpeedStage:
                 "speed.acceleration_rpm_per_s": rpm_from_rad_s(per_ampere * i_run),
             }
         )
+        self.show_limit(largest, pole_pairs)
         self.drive.enable()
         fastest_rpm = rpm_from_rad_s(largest)
         self.say(f"psi_f and fine offset: coasting from up to {fastest_rpm:.0f} rpm, i_d up to {run_i_d:.3g} A")

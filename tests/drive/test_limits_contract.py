@@ -29,24 +29,14 @@ from pmsmtool.drive.heartbeat import PERIOD_S
 from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
 from pmsmtool.drive.port import Drive
 from pmsmtool.drive.recorded_means import RecordedMeans
-from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
+from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveFault, Interrupted, LimitExceeded, PmsmtoolError, SafetyRefusal, StopNotConfirmed
-from pmsmtool.experiments.current_limit import (
-    OVER,
-    LimitShown,
-    require_limit,
-    show_current_limit,
-    show_torque_limit,
-    unproven,
-)
 from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
-from pmsmtool.identification.tier_evaluate import dump_facts, parse_facts
 from pmsmtool.machine.parameters import MachineParameters
-from pmsmtool.measurement.tier_identify import push_by_torque
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.session import Session
@@ -420,63 +410,6 @@ def test_a_limit_that_the_drive_does_not_hold_is_refused(rig: Rig, index: int) -
     with pytest.raises(SafetyRefusal, match=f"0x{index:04X}:00") as caught, guarded(rig.drive, ENVELOPE):
         pass
     assert "holds the limit" in caught.value.what and rig.off_since is None
-
-
-SHOWN = 0.06
-"""What a limit was shown to keep, relative: measured within 0.004 by the current, 0.037 by the way of the shaft."""
-
-
-def shown_limit(rig: Rig, guard: GuardedDrive) -> LimitShown | None:
-    """Along a vector the rotor lies on, or by a push of an aligned rotor."""
-    guard.enable()
-    if not isinstance(rig.drive, TorqueCurrent):
-        return show_current_limit(guard, guard.limit_current, 6.0, ENVELOPE.i_max_apk, 0.0)
-    counts, turns = (rig.session.dictionary.find(0x608F, sub).number() for sub in (1, 2))
-    least = 10.0 * turns / counts * 2.0 * math.pi
-    answer = acceleration_per_ampere(guard, ENVELOPE.i_max_apk, lambda way, seconds: way > least)
-    return show_torque_limit(guard, guard.limit_current, answer, ENVELOPE.i_max_apk)
-
-
-@pytest.mark.parametrize("name", ["full", "recorder", "torque"])
-def test_the_current_limit_is_shown_to_act(name: str, tmp_path: Path) -> None:
-    with opened(name, tmp_path) as rig:
-        before = rig.memory()
-        with guarded(rig.drive, ENVELOPE) as guard:
-            limit = [rig.session.dictionary["cia402.max_current"].number()]
-            shown = shown_limit(rig, guard)
-            assert [rig.session.dictionary["cia402.max_current"].number()] == limit, "the envelope's holds again"
-        assert shown is not None and shown.proven and "limit proven" in str(shown) and not unproven(shown)
-        assert shown.asked_a >= OVER * shown.kept_a * (1.0 - 1e-9)
-        assert shown.seen_a == pytest.approx(shown.kept_a, rel=SHOWN)
-        assert rig.memory() == before
-
-
-@pytest.mark.parametrize("name", ["full", "recorder", "torque"])
-def test_a_current_limit_that_does_not_act_is_told(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The object holds what was written, and the drive gives what is asked for."""
-    monkeypatch.setattr(
-        Session, "_load_core", lambda self: self.hardware.take_parameters(self.parameters.active.copy().pack())
-    )
-    with opened(name, tmp_path) as rig, guarded(rig.drive, ENVELOPE) as guard:
-        shown = shown_limit(rig, guard)
-        assert shown is not None and not shown.acts
-        assert shown.seen_a == pytest.approx(shown.asked_a, rel=SHOWN)
-        assert "every command is bounded here" in unproven(shown), "a line of the report"
-        with pytest.raises(SafetyRefusal, match="does not keep its own current limit"):
-            require_limit(shown)
-
-
-@pytest.mark.chain
-def test_a_limit_that_does_not_act_is_kept_with_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every command is bounded, so the run goes on; its report says it, replayed or not."""
-    monkeypatch.setattr(
-        Session, "_load_core", lambda self: self.hardware.take_parameters(self.parameters.active.copy().pack())
-    )
-    with opened("torque", tmp_path) as rig:
-        assert isinstance(rig.drive, TorqueDrive)
-        facts = push_by_torque(rig.drive, ENVELOPE, lambda name, trace: None, lambda text: None)
-    assert facts.limit.startswith("the drive does not keep its own current limit")
-    assert parse_facts(dump_facts(facts), where="run").limit == facts.limit
 
 
 def test_a_supervision_that_only_reports_is_refused(rig: Rig) -> None:

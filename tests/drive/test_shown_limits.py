@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: MIT
+"""The drive's own limits are shown to act before they are relied on; one that does not act is named."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.drive.guard import GuardedDrive, guarded
+from pmsmtool.drive.standard_drive import TorqueCurrent
+from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.errors import SafetyRefusal
+from pmsmtool.experiments.current_limit import (
+    OVER,
+    LimitShown,
+    require_limit,
+    show_current_limit,
+    show_torque_limit,
+    unproven,
+)
+from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
+from pmsmtool.experiments.speed_limit import show_speed_limit
+from pmsmtool.identification.tier_evaluate import dump_facts, parse_facts
+from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.profile import machine_path
+from pmsmtool.measurement.tier_identify import push_by_torque
+from pmsmtool.sim.node.factory import set_up_values
+from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, PowerDrive
+from pmsmtool.sim.node.session import Session
+from tests.drive.test_limits_contract import ENVELOPE, POLE_PAIRS, Rig, opened
+
+SHOWN = 0.06
+"""What a limit was shown to keep, relative: measured within 0.004 by the current, 0.037 by the way of the shaft."""
+
+
+def shown_limit(rig: Rig, guard: GuardedDrive) -> LimitShown | None:
+    """Along a vector the rotor lies on, or by a push of an aligned rotor."""
+    guard.enable()
+    if not isinstance(rig.drive, TorqueCurrent):
+        return show_current_limit(guard, guard.limit_current, 6.0, ENVELOPE.i_max_apk, 0.0)
+    counts, turns = (rig.session.dictionary.find(0x608F, sub).number() for sub in (1, 2))
+    least = 10.0 * turns / counts * 2.0 * math.pi
+    answer = acceleration_per_ampere(guard, ENVELOPE.i_max_apk, lambda way, seconds: way > least)
+    return show_torque_limit(guard, guard.limit_current, answer, ENVELOPE.i_max_apk)
+
+
+@pytest.mark.parametrize("name", ["full", "recorder", "torque"])
+def test_the_current_limit_is_shown_to_act(name: str, tmp_path: Path) -> None:
+    with opened(name, tmp_path) as rig:
+        before = rig.memory()
+        with guarded(rig.drive, ENVELOPE) as guard:
+            limit = [rig.session.dictionary["cia402.max_current"].number()]
+            shown = shown_limit(rig, guard)
+            assert [rig.session.dictionary["cia402.max_current"].number()] == limit, "the envelope's holds again"
+        assert shown is not None and shown.proven and "limit proven" in str(shown) and not unproven(shown)
+        assert shown.asked >= OVER * shown.kept * (1.0 - 1e-9)
+        assert shown.seen == pytest.approx(shown.kept, rel=SHOWN)
+        assert rig.memory() == before
+
+
+@pytest.mark.parametrize("name", ["full", "recorder", "torque"])
+def test_a_current_limit_that_does_not_act_is_told(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The object holds what was written, and the drive gives what is asked for."""
+    monkeypatch.setattr(
+        Session, "_load_core", lambda self: self.hardware.take_parameters(self.parameters.active.copy().pack())
+    )
+    with opened(name, tmp_path) as rig, guarded(rig.drive, ENVELOPE) as guard:
+        shown = shown_limit(rig, guard)
+        assert shown is not None and not shown.acts
+        assert shown.seen == pytest.approx(shown.asked, rel=SHOWN)
+        assert "every command is bounded here" in unproven(shown), "a line of the report"
+        with pytest.raises(SafetyRefusal, match="does not keep its own current limit"):
+            require_limit(shown)
+
+
+def speed_shown(rig: Rig, guard: GuardedDrive) -> LimitShown | None:
+    machine = load_machine_file(machine_path("interior-2k2"))
+    J = machine.machine.J_kgm2 or 0.0
+    loop = {"K_p_nms_per_rad": 50.0 * J, "K_i_nm_per_rad": 625.0 * J, "tau_max_nm": 3.0}
+    loop["acceleration_rpm_per_s"] = 1500.0
+    guard.write({**set_up_values(machine), **{f"speed.{name}": value for name, value in loop.items()}})
+    return show_speed_limit(guard, guard.limit_speed, ENVELOPE.speed_max_rad_s, POLE_PAIRS)
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("name", ["full", "inject"])
+def test_the_speed_limit_is_shown_to_act(name: str, tmp_path: Path) -> None:
+    """On every class that is commanded a speed; measured within 0.2 %."""
+    with opened(name, tmp_path) as rig:
+        before = rig.memory()
+        with guarded(rig.drive, ENVELOPE) as guard:
+            limit = rig.session.dictionary["cia402.max_speed"].number()
+            shown = speed_shown(rig, guard)
+            assert rig.session.dictionary["cia402.max_speed"].number() == limit, "the envelope's holds again"
+            assert not rig.energised
+        assert shown is not None and shown.proven and "speed limit proven" in str(shown) and not unproven(shown)
+        assert shown.asked == pytest.approx(OVER * shown.kept) and shown.kept <= 0.1 * ENVELOPE.speed_max_rad_s
+        assert shown.seen == pytest.approx(shown.kept, rel=SHOWN)
+        assert rig.memory() == before
+
+
+@pytest.mark.chain
+def test_a_speed_limit_that_does_not_act_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The object holds what was written, and the shaft turns as fast as it is asked to; so a run is refused."""
+    monkeypatch.setattr(
+        Session, "_load_core", lambda self: self.hardware.take_parameters(self.parameters.active.copy().pack())
+    )
+    monkeypatch.setattr(PowerDrive, "_target_speed", lambda self: self._number("target_velocity") * RAD_S_PER_MRPM)
+    with opened("full", tmp_path) as rig, guarded(rig.drive, ENVELOPE) as guard:
+        shown = speed_shown(rig, guard)
+        assert shown is not None and not shown.acts and shown.seen == pytest.approx(shown.asked, rel=SHOWN)
+        with pytest.raises(SafetyRefusal, match="does not keep its own speed limit") as caught:
+            require_limit(shown)
+        assert "0x6080" in caught.value.likely
+
+
+def test_a_drive_without_a_speed_limit_is_told(tmp_path: Path) -> None:
+    with opened("full", tmp_path) as rig, guarded(rig.drive, ENVELOPE) as guard:
+        assert show_speed_limit(guard, lambda rad_s: None, 100.0, POLE_PAIRS) is None
+        assert "speed limit not proven" in unproven(None, "speed")
+
+
+@pytest.mark.chain
+def test_a_limit_that_does_not_act_is_kept_with_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every command is bounded, so the run goes on; its report says it, replayed or not."""
+    monkeypatch.setattr(
+        Session, "_load_core", lambda self: self.hardware.take_parameters(self.parameters.active.copy().pack())
+    )
+    with opened("torque", tmp_path) as rig:
+        assert isinstance(rig.drive, TorqueDrive)
+        facts = push_by_torque(rig.drive, ENVELOPE, lambda name, trace: None, lambda text: None)
+    assert facts.limit.startswith("the drive does not keep its own current limit")
+    assert parse_facts(dump_facts(facts), where="run").limit == facts.limit
