@@ -17,6 +17,7 @@ from pmsmtool.files import write_file
     epilog=examples(
         "pmsmtool report runs/20260101T120000Z-000055f1",
         "pmsmtool report runs/20260101T120000Z-000055f1 --json | jq .verdict",
+        "pmsmtool report --pdf runs/20260101T120000Z-000055f1",
         "pmsmtool report --junit runs/20260101T120000Z-000055f1 -o result.xml",
         "pmsmtool report --anonymous runs/20260101T120000Z-000055f1 -o to-send.json",
     ),
@@ -27,8 +28,9 @@ from pmsmtool.files import write_file
               "no names.  [default: anonymous.json in the run directory]")  # fmt: skip
 @click.option("--junit", is_flag=True, help="Instead of the page JUnit XML for a test system: a case per criterion.  "
               "[default: junit.xml in the run directory]")  # fmt: skip
+@click.option("--pdf", is_flag=True, help="The page as PDF as well, by Chromium, Chrome or Edge; beside the page.")
 @output_options
-def report_command(run: Path, path: Path | None, anonymous: bool, junit: bool, out: Output) -> None:
+def report_command(run: Path, path: Path | None, anonymous: bool, junit: bool, pdf: bool, out: Output) -> None:
     """Write the report of a RUN directory: one self-contained HTML page, verdict first.
 
     Every figure is drawn from the files of the run. The exit code is that of writing the page, not the verdict of the
@@ -37,8 +39,8 @@ def report_command(run: Path, path: Path | None, anonymous: bool, junit: bool, o
     --anonymous makes a file to send to the authors of pmsmtool: no serial number, no name of a person, drive, machine,
     computer or file, no date, no text of the run. Read it before you send it: it is plain text.
     """
-    if anonymous and junit:
-        raise click.UsageError("--anonymous and --junit make two different files: give one of them")
+    if anonymous + junit + pdf > 1:
+        raise click.UsageError("--anonymous, --junit and --pdf make different files: give one of them")
     if anonymous:
         _write_anonymous(run, run / "anonymous.json" if path is None else path, out)
         return
@@ -56,8 +58,13 @@ def report_command(run: Path, path: Path | None, anonymous: bool, junit: bool, o
     else:
         write_file(path, report_page(run))
     data = {"file": path, "verdict": found.word, "simulated": found.simulated, "reasons": found.lines, "ended": ended}
+    if pdf:
+        from pmsmtool.cli.print_page import print_page
+
+        data["pdf"] = path.with_suffix(".pdf")
+        print_page(path, path.with_suffix(".pdf"))
     out.result("report", data, [found.headline, *found.details, *ended])
-    out.note(f"wrote {path}")
+    out.note(f"wrote {path}" + (f" and {path.with_suffix('.pdf')}" if pdf else ""))
 
 
 def _write_anonymous(run: Path, path: Path, out: Output) -> None:

@@ -10,15 +10,21 @@ import contextlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pmsmtool.design.design_file import load_design
+from pmsmtool.design.design_file import Design, load_design
+from pmsmtool.design.loops.current_loop import HOLD_PERIODS
+from pmsmtool.design.loops.margins import margin_problem
 from pmsmtool.design.loops.open_loops import open_loops
-from pmsmtool.errors import IdentificationError
+from pmsmtool.design.loops.vector_margins import current_response, vector_margins
+from pmsmtool.design.minimum_time import TransferProblem, minimum_time
+from pmsmtool.design.prediction import Prediction
+from pmsmtool.errors import DesignInfeasible, IdentificationError
 from pmsmtool.files import read_text
 from pmsmtool.identification.evaluate import Evaluation, evaluate, shots_of
 from pmsmtool.identification.fingerprint import STAGE as FINGERPRINT
@@ -66,12 +72,13 @@ def report_page(path: str | Path) -> str:
     """
     run = RunDirectory(Path(path))
     record = run.read()
+    design = load_design(run.path / "design.toml") if (run.path / "design.toml").is_file() else None
     drawn = [
-        *_identification_figures(run, record),
-        *_design_figures(run.path / "design.toml"),
-        *_margin_figures(record),
-        *_table_figures(run.path / "lut.npz"),
-        *_proof_figures(run, record),
+        *_of_stage("identify", 1.0, _identification_figures(run, record)),
+        *_of_stage("tune", 2.0, _design_figures(design)),
+        *_of_stage("margins", 2.5, _margin_figures(record, design)),
+        *_of_stage("lut", 3.0, _table_figures(run.path / "lut.npz")),
+        *_proof_figures(run, record, design),
     ]
     not_checked = NOT_CHECKED[1:] if record.passed("prove") else NOT_CHECKED
     if not any(record.passed(stage) for stage in ("flash", "verify", "prove")):
@@ -98,6 +105,11 @@ def _complete(record: RunRecord) -> Sequence[str]:
 def how_it_ended(path: Path) -> list[str]:
     """Return how a run ended that did not come to its end; raises ``ConfigError`` when there is none in the folder."""
     return account_lines(RunDirectory(path).read().account)
+
+
+def _of_stage(stage: str, weight: float, drawn: Iterator[Figure]) -> list[Figure]:
+    """Return the figures of a stage; its first one weighs most."""
+    return [replace(figure, stage=stage, weight=weight if k == 0 else 0.0) for k, figure in enumerate(drawn)]
 
 
 def _identification_figures(run: RunDirectory, record: RunRecord) -> Iterator[Figure]:
@@ -151,16 +163,45 @@ def _evaluated(traces: Mapping[str, Trace], period_s: float, *, complete: bool) 
     return None
 
 
-def _design_figures(path: Path) -> Iterator[Figure]:
-    if path.is_file():
-        design = load_design(path)
-        loops = open_loops(design)
-        if loops:
-            yield figures.bode_figure(loops, {name: design.loops[name] for name in loops})
+def _design_figures(design: Design | None) -> Iterator[Figure]:
+    loops = {} if design is None else open_loops(design)
+    if design is not None and loops:
+        found = {name: design.loops[name] for name in loops}
+        yield figures.bode_figure(loops, found)
+        yield figures.nyquist_figure(loops, found)
 
 
-def _margin_figures(record: RunRecord) -> Iterator[Figure]:
+MAP_INDUCTANCE, MAP_PERIODS, MAP_POINTS = (0.4, 1.8), (-0.9, 1.5), 15
+"""Drawn part of the margin map: inductance over that of the design, delay beside it (control periods), points each."""
+
+
+def _margin_map(design: Design) -> Iterator[Figure]:
+    """Draw the phase margin of the q current loop where inductance and delay are not those of the design."""
+    if "current_q" not in design.loops:
+        return
+    problem = margin_problem(design)
+    gains, plant = problem.gains["q"], problem.plants["q"]
+    model = (plant.R, plant.L) if problem.predictor else None
+    factor = np.linspace(*MAP_INDUCTANCE, MAP_POINTS)
+    least = max(HOLD_PERIODS, plant.delay_periods + MAP_PERIODS[0])
+    delay = np.linspace(least, plant.delay_periods + MAP_PERIODS[1], MAP_POINTS)
+    L = plant.L * factor[:, None]
+    R = np.full_like(L, plant.R)
+    rows = []
+    for periods in delay:
+        loop = current_response(gains, R, L, plant.T_s, float(periods), model)
+        rows.append(vector_margins(loop, plant.T_s, gains.K_p / plant.L).phase_deg)
+    yield figures.margin_map_figure(
+        factor, delay, np.array(rows), (1.0, plant.delay_periods),
+        "Phase margin of the q current loop where the inductance or the delay is not that of the design; below 0 deg "
+        "it is unstable.",
+    )  # fmt: skip
+
+
+def _margin_figures(record: RunRecord, design: Design | None) -> Iterator[Figure]:
     stage = record.stage("margins")
+    if stage is not None and design is not None:
+        yield from _margin_map(design)
     for ending, title in (("phase", "Phase margin"), ("gain", "Gain margin")):
         rows = {}
         unit = ""
@@ -193,7 +234,7 @@ def _table_figures(path: Path) -> Iterator[Figure]:
     yield figures.envelope_figure(arrays["largest_speed_rpm"], arrays["largest_torque_nm"], lines, I_max, binding)
 
 
-def _proof_figures(run: RunDirectory, record: RunRecord) -> Iterator[Figure]:
+def _proof_figures(run: RunDirectory, record: RunRecord, design: Design | None) -> Iterator[Figure]:
     """Draw the latest proof: what was committed before the first step, and what was measured, verdict first."""
     stage = record.stage("prove")
     names = [name for name in (stage.files if stage else {}) if name.endswith("/prediction.npz")]
@@ -211,7 +252,44 @@ def _proof_figures(run: RunDirectory, record: RunRecord) -> Iterator[Figure]:
             f"Proof {number}, {verdict}: {text}. Grey: the band predicted and committed before the first step, wider "
             "by the ripple of the record itself."
         )
-        yield figures.proof_figure(prediction, experiment, measured, caption)
+        fastest = None
+        if design is not None and measured and is_current_step(traces[experiment]):
+            fastest = _least_times(prediction, traces[experiment], measured, design)
+            caption += " Dashed: the same currents after the least time that the voltage allows, without the delay."
+        drawn = figures.proof_figure(prediction, experiment, measured, caption, fastest)
+        yield replace(drawn, stage="prove", weight=4.0 + max(shares, default=0.0))
+
+
+STEP_POINTS, STEP_START = 16, 0.05
+"""Points of the line of least times, and from which share of the step on: noise is not followed."""
+
+
+def is_current_step(trace: Trace) -> bool:
+    """Return whether a proof's experiment was one step of the q current."""
+    asked = trace.meta.get("excitation", {})
+    return (asked.get("shape"), asked.get("point")) == ("step", "i_q")
+
+
+def _least_times(
+    prediction: Prediction, trace: Trace, measured: Mapping[str, NDArray[np.float64]], design: Design
+) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]] | None:
+    """Return the least times to currents along a measured step, and these currents."""
+    i_d, i_q = measured["i_d_a"], measured["i_q_a"]
+    machine = design.machine.machine
+    omega = float(np.median(trace["omega_e_rad_s"]))
+    U_dc = float(prediction.facts["conditions"]["U_dc_v"])
+    problem = TransferProblem(
+        machine.R_s_ohm, machine.L_d_h, machine.L_q_h, machine.psi_f_wb, omega,
+        U_dc * design["inverter.voltage_utilisation"],
+    )  # fmt: skip
+    way = np.hypot(i_d - i_d[0], i_q - i_q[0])
+    rows = np.unique(np.linspace(0, len(way) - 1, STEP_POINTS).astype(int))
+    rows = rows[way[rows] > STEP_START * way.max()]
+    try:
+        times = [minimum_time(problem, (0.0, 0.0), (float(i_d[k]), float(i_q[k]))) for k in rows]
+    except DesignInfeasible:
+        return None
+    return np.array([0.0, *times]), {"i_d_a": np.array([0.0, *i_d[rows]]), "i_q_a": np.array([0.0, *i_q[rows]])}
 
 
 def _changes(record: RunRecord) -> Sequence[Change]:

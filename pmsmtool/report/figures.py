@@ -99,9 +99,9 @@ def inductance_figure(shots: Mapping[str, Trace], fits: Mapping[str, AxisFit], s
     sigma_a : float
         Noise of one current sample (A), which whitened the residuals.
     """
-    canvas, panels = _canvas(1, 2)
+    canvas, panels = _canvas(2, 2, height=1.35)
     texts = []
-    for axes, axis in zip(panels, "dq", strict=True):
+    for axes, below, axis in zip(panels[:2], panels[2:], "dq", strict=True):
         shot, fit = shots[axis], fits[axis]
         half = int(shot.meta["half_period"])
         shown = min(2 * half * PERIODS_SHOWN, len(shot) - SKIP_SAMPLES)
@@ -110,8 +110,10 @@ def inductance_figure(shots: Mapping[str, Trace], fits: Mapping[str, AxisFit], s
         predicted = measured + sigma_a * fit.residuals[0][:shown]
         axes.plot(t_ms, predicted, "-", color=_MODEL, label="fitted response")
         axes.plot(t_ms, measured, ".", ms=4.0, color=_MEASURED, label="measured")
-        axes.set(xlabel="time / ms", ylabel=f"i_{axis} / A")
-        axes.set_title(f"{axis} axis, half period {half} samples", loc="left", fontsize=9)
+        axes.set(ylabel=f"i_{axis} / A")
+        axes.set_title(f"{axis}, half period {half}", loc="left", fontsize=9)
+        below.plot(t_ms, 1e3 * sigma_a * fit.residuals[0][:shown], ".", ms=3.0, color=_OTHER)
+        below.set(xlabel="time / ms", ylabel="residual / mA")
         rms = sigma_a * math.sqrt(float(np.mean(fit.residuals[0] ** 2)))
         texts.append(f"{axis}: rms residual {1e3 * rms:.3g} mA over {len(shot)} samples, chi2 {fit.chi2:.3g}")
     panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
@@ -183,6 +185,66 @@ def bode_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMargin
     )
 
 
+NYQUIST_SIZE = 2.0
+"""Half side of the drawn part of the plane."""
+
+
+def nyquist_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMargins]) -> Figure:
+    """Draw the open loops in the complex plane, with -1, the unit circle and the circle of the modulus margin.
+
+    Parameters
+    ----------
+    loops, found : as :func:`bode_figure`
+    """
+    canvas, panels = _canvas(1, len(loops))
+    turn = np.linspace(0.0, 2.0 * math.pi, 181)
+    for axes, (name, loop), colour in zip(panels, loops.items(), _colours(len(loops)), strict=True):
+        crossing = found[name].crossover_rad_s
+        start = 0.02 * crossing if math.isfinite(crossing) else 1e-3 * math.pi / loop.T_s
+        response = loop.at(np.geomspace(start, math.pi / loop.T_s, BODE_POINTS))
+        axes.plot(np.cos(turn), np.sin(turn), "--", lw=0.8, color=_LIMIT)
+        axes.plot(response.real, response.imag, color=colour)
+        least = float(np.min(np.abs(1.0 + response)))
+        axes.plot(-1.0 + least * np.cos(turn), least * np.sin(turn), ":", lw=1.0, color=_MODEL)
+        axes.plot(-1.0, 0.0, "+", ms=9, color=_MODEL)
+        axes.set(xlim=(-NYQUIST_SIZE, 1.0), ylim=(-NYQUIST_SIZE, 1.0), aspect="equal", xlabel="Re L")
+        axes.set_title(f"{name}: {least:.2f} from -1", loc="left", fontsize=9)
+    panels[0].set_ylabel("Im L")
+    return Figure(
+        svg(canvas), "Nyquist curves of the open loops as sampled. Dotted: least distance from -1 (modulus margin); "
+        "dashed: unit circle."
+    )  # fmt: skip
+
+
+def margin_map_figure(
+    inductance: Vector, delay: Vector, phase_deg: NDArray[np.float64], designed: tuple[float, float], caption: str
+) -> Figure:
+    """Draw the phase margin of a current loop over an inductance and a delay that differ from the design.
+
+    Parameters
+    ----------
+    inductance : ndarray, shape (n,)
+        Of the machine over that of the design.
+    delay : ndarray, shape (m,)
+        In control periods.
+    phase_deg : ndarray, shape (m, n)
+        Least phase margin (deg); below 0 unstable.
+    designed : tuple of float
+        What the design assumes.
+    """
+    canvas, (axes,) = _canvas(1, 1)
+    levels = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
+    shown = np.clip(phase_deg, -15.0, 89.0)
+    axes.contourf(inductance, delay, shown, levels=(-15.0, *levels, 90.0), cmap="RdYlGn", alpha=0.75)
+    lines = axes.contour(inductance, delay, shown, levels=levels, colors=_OTHER, linewidths=0.8)
+    axes.clabel(lines, fmt="%g deg", fontsize=8)
+    axes.plot(*designed, "o", ms=6, color=_MEASURED)
+    axes.annotate("designed", designed, xytext=(8, 6), textcoords="offset points", color=_MEASURED)
+    axes.grid(False)
+    axes.set(xlabel="inductance of the machine / designed", ylabel="delay / control periods")
+    return Figure(svg(canvas), caption)
+
+
 def envelope_figure(
     speed_rpm: Vector,
     largest_nm: Vector,
@@ -242,7 +304,13 @@ def band_figure(rows: Mapping[str, tuple[float, float, float, float]], unit: str
 _SIGNAL_LABELS = {"i_d_a": "i_d / A", "i_q_a": "i_q / A", "omega_e_rad_s": "speed / rad/s (el)"}
 
 
-def proof_figure(prediction: Prediction, experiment: str, measured: Mapping[str, Vector], caption: str) -> Figure:
+def proof_figure(
+    prediction: Prediction,
+    experiment: str,
+    measured: Mapping[str, Vector],
+    caption: str,
+    fastest: tuple[Vector, Mapping[str, Vector]] | None = None,
+) -> Figure:
     """Draw the measured response of one experiment over its predicted band.
 
     Parameters
@@ -253,6 +321,8 @@ def proof_figure(prediction: Prediction, experiment: str, measured: Mapping[str,
         One of its experiments.
     measured : mapping of str to ndarray, shape (n,)
         Response by signal; without one only the band is drawn.
+    fastest : tuple of ndarray and mapping, optional
+        Least times (s) to some of the measured values, and these by signal.
     """
     signals = prediction.signals(experiment)
     canvas, panels = _canvas(len(signals), 1, height=0.3 + 0.45 * len(signals), sharex=True)
@@ -265,6 +335,8 @@ def proof_figure(prediction: Prediction, experiment: str, measured: Mapping[str,
             axes.plot(t_ms, measured[signal], color=_MEASURED, label="measured")
             if np.any(outside):
                 axes.plot(t_ms[outside], measured[signal][outside], "x", ms=4, color=_MODEL, label="outside")
+        if fastest is not None and signal in fastest[1]:
+            axes.plot(1e3 * fastest[0], fastest[1][signal], "--", color=_OTHER, label="least time to it")
         axes.set_ylabel(_SIGNAL_LABELS.get(signal, signal))
     panels[0].legend(loc="best")
     panels[-1].set_xlabel("time / ms")

@@ -22,10 +22,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One plot: inline SVG text and its caption."""
+    """One plot: inline SVG text, its caption, the stage whose numbers it explains, and how well it shows the verdict.
+
+    The figure of the largest ``weight`` stands below the verdict.
+    """
 
     svg: str
     caption: str
+    stage: str = ""
+    weight: float = 0.0
+
+
+Cell = tuple[Any, str]
+"""Text of a cell and its class in the page."""
+Table = tuple[Sequence[str], Sequence[Sequence[Cell]]]
+"""Heads and rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,31 +80,113 @@ def render(
     drive = record.get("drive", {})
     name = str(drive.get("name") or "drive")
     found, rows = verdict_of(record, complete), comparison_of(latest)
+    first = max(figures, key=lambda figure: figure.weight, default=None)
+    left = [figure for figure in figures if figure is not first]
+    shown = {stage["name"] for stage in latest}
+    # A later stage may write a file of an earlier one again: the last digest is that of the file.
+    files = sorted({name: digest for stage in latest for name, digest in stage.get("files", {}).items()}.items())
     return template("report.html.j2").render(
         title=f"Commissioning of {name}, serial {int(drive.get('serial', 0)):#010x}",
         subtitle=f"started {record['started_utc']} by {record['operator']}",
         verdict=found,
         ended=list(ended),
-        stages=latest,
-        estimates=[
-            _estimate_row(value)
-            for stage in latest
-            for value in stage.get("values", ())
-            if "std" in value or "source" in value
-        ],
-        comparison=[HEADS, *table_cells(rows)] if rows else [],
-        fallbacks=[f"{stage['name']}: {line}" for stage in latest for line in stage.get("fallbacks", ())],
-        # the table of stages has the note only where there are no criteria
-        notes=[
-            f"{stage['name']}: {stage['note']}" for stage in latest if stage.get("acceptance") and stage.get("note")
-        ],
-        figures=[{"svg": _trusted_svg(figure.svg), "caption": figure.caption} for figure in figures],
-        changes=changes,
+        first=None if first is None else _drawn(first),
+        stages=[_stage(stage, [figure for figure in left if figure.stage == stage["name"]]) for stage in latest],
+        comparison=_comparison(rows) if rows else None,
+        figures=[_drawn(figure) for figure in left if figure.stage not in shown],
+        changes=_changes(changes) if changes else None,
         not_checked=list(not_checked),
-        conditions=list(_conditions(record)),
-        # A later stage may write a file of an earlier one again: the last digest is that of the file.
-        files=sorted({name: digest for stage in latest for name, digest in stage.get("files", {}).items()}.items()),
+        signatures=(_SIGNED, [[(role, ""), *[("", "")] * (len(_SIGNED) - 1)] for role in _ROLES]),
+        conditions=(("condition", "value"), [[(key, ""), (value, "small")] for key, value in _conditions(record)]),
+        files=(("file", "SHA-256"), [[(text, "small") for text in row] for row in files]) if files else None,
     )
+
+
+TITLES = {
+    "identify": "Identification", "tune": "Control design", "lut": "Table of current references", "margins": "Margins",
+    "flash": "Download", "verify": "What the drive holds", "prove": "Proof on the machine",
+}  # fmt: skip
+"""Headings by stage."""
+_SIGNED = ("role", "name", "date", "signature")
+_ROLES = ("commissioned by", "checked by", "released by")
+_STATUS = {"pass": "pass", "partial": "partial", "not available": "partial"}
+"""Class in the page by the status of a stage; others failed."""
+_VERDICTS = {"contradicts": "fail", "accepted": "partial", "NOT CHECKED": "partial"}
+"""Class in the page by the verdict of a comparison."""
+
+
+def _stage(stage: Mapping[str, Any], figures: Sequence[Figure]) -> dict[str, Any]:
+    """Return what the page shows of a stage: its values, its criteria, and the figures that explain them."""
+    values = [value for value in stage.get("values", ()) if "std" in value or "source" in value]
+    criteria = [
+        [
+            ("PASS" if line["ok"] else "FAIL", "pass" if line["ok"] else "fail"),
+            (line["what"], ""), (line["measured"], ""), (line["limit"], "limit"),
+        ]
+        for line in stage.get("acceptance", ())
+    ]  # fmt: skip
+    return {
+        "title": TITLES.get(str(stage["name"]), str(stage["name"]).capitalize()),
+        "status": stage["status"],
+        "kind": _STATUS.get(stage["status"], "fail"),
+        "note": stage.get("note", ""),
+        "fallbacks": list(stage.get("fallbacks", ())),
+        "estimates": (_ESTIMATE, [_estimate_row(value) for value in values]) if values else None,
+        "criteria": (("result", "criterion", "measured", "limit"), criteria) if criteria else None,
+        "figures": [_drawn(figure) for figure in figures],
+    }
+
+
+def _comparison(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return the table *data sheet | drive | measured*, with a drawing of the intervals where there are two."""
+    heads = (*HEADS[:-1], "allowed and measured", HEADS[-1])
+    body = [
+        [*((text, "") for text in cells[:-1]), (_intervals(row), ""), (cells[-1], _VERDICTS.get(cells[-1], ""))]
+        for row, cells in zip(rows, table_cells(rows), strict=True)
+    ]
+    used = [k for k in range(len(heads)) if any(row[k][0] for row in body)]
+    return [heads[k] for k in used], [[row[k] for k in used] for row in body]
+
+
+_WIDE, _HIGH, _EDGE = 144.0, 16.0, 0.08
+"""Size of the drawing of two intervals, and its margin on either side, of the width."""
+
+
+def _intervals(row: Mapping[str, Any]) -> Any:
+    """Return what the data sheet allows (grey) and the measured interval (blue, red beside it) as SVG; else nothing."""
+    import markupsafe
+
+    measured, low, high = row.get("measured"), row.get("low"), row.get("high")
+    if measured is None or low is None or high is None or not high > low:
+        return ""
+    half = float(row.get("interval") or 0.0)
+    ends = (float(low), float(high), float(measured) - half, float(measured) + half)
+    span = max(ends) - min(ends)
+
+    def x(value: float) -> float:
+        return _WIDE * (_EDGE + (1.0 - 2.0 * _EDGE) * (value - min(ends)) / span)
+
+    meet = ends[2] <= ends[1] and ends[0] <= ends[3]
+    colour = "#1f5fa8" if meet else "#c2410c"
+    text = "the intervals overlap" if meet else "the intervals do not overlap"
+    return markupsafe.Markup(
+        f'<svg class="interval" viewBox="0 0 {_WIDE:g} {_HIGH:g}" role="img" aria-label="{text}">'
+        f'<rect x="{x(ends[0]):.1f}" y="4" width="{x(ends[1]) - x(ends[0]):.1f}" height="8" fill="#b8c0c8"/>'
+        f'<path d="M{x(ends[2]):.1f} 8H{x(ends[3]):.1f}" stroke="{colour}" stroke-width="2"/>'
+        f'<circle cx="{x(float(measured)):.1f}" cy="8" r="3" fill="{colour}"/></svg>'
+    )
+
+
+def _changes(changes: Sequence[Change]) -> Table:
+    heads = ("parameter", "before", "asked", "held by the drive", "unit")
+    return heads, [
+        [(row.name, ""), (row.old, "number"), (row.asked, "number"), (row.held, "number"), (row.unit, "")]
+        for row in changes
+    ]
+
+
+def _drawn(figure: Figure) -> dict[str, Any]:
+    return {"svg": _trusted_svg(figure.svg), "caption": figure.caption}
 
 
 def template(name: str) -> jinja2.Template:
@@ -107,30 +200,32 @@ def template(name: str) -> jinja2.Template:
     ).get_template(name)
 
 
-def _estimate_row(value: Mapping[str, Any]) -> dict[str, str]:
+_ESTIMATE = (
+    "quantity", "value \u00b1 total 95 %", "statistical (1 \u03c3)", "systematic (95 %)", "at", "method, source",
+)  # fmt: skip
+
+
+def _estimate_row(value: Mapping[str, Any]) -> list[Cell]:
     unit = str(value["unit"])
     method = ", ".join(str(value[key]) for key in ("method", "source") if value.get(key))
     if "std" not in value:
-        told = format_quantity(float(value["value"]), unit)
-        return {
-            "name": str(value["name"]), "value": told, "std": "none", "systematic": "none", "conditions": "",
-            "method": method,
-        }  # fmt: skip
+        only = format_quantity(float(value["value"]), unit)
+        return [(value["name"], ""), (only, "number"), ("none", ""), ("none", ""), ("", ""), (method, "")]
     total = total_interval(float(value["std"]), float(value["systematic"]), float(value.get("coverage_factor", 1.96)))
     conditions = []
     if _finite(value.get("T_c")):
-        conditions.append(f"{value['T_c']:.1f} °C")
+        conditions.append(f"{value['T_c']:.1f} \u00b0C")
     if _finite(value.get("i_d_apk")) or _finite(value.get("i_q_apk")):
         bias = (float(value[key]) if _finite(value.get(key)) else 0.0 for key in ("i_d_apk", "i_q_apk"))
         conditions.append("i_d {:.3g}, i_q {:.3g} A pk".format(*bias))
-    return {
-        "name": str(value["name"]),
-        "value": format_estimate(float(value["value"]), total, unit),
-        "std": format_quantity(float(value["std"]), unit, 2),
-        "systematic": format_quantity(float(value["systematic"]), unit, 2),
-        "conditions": ", ".join(conditions),
-        "method": method,
-    }
+    return [
+        (value["name"], ""),
+        (format_estimate(float(value["value"]), total, unit), "number"),
+        (format_quantity(float(value["std"]), unit, 2), "number"),
+        (format_quantity(float(value["systematic"]), unit, 2), "number"),
+        (", ".join(conditions), ""),
+        (method, ""),
+    ]
 
 
 def total_interval(std: float, systematic: float, coverage_factor: float = 1.96) -> float:

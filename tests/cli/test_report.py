@@ -8,21 +8,28 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
 from pmsmtool.cli.main import run as program
+from pmsmtool.cli.print_page import find_browser, print_page
 from pmsmtool.commissioning import report_page
 from pmsmtool.commissioning.design_stages import lut_stage, tune_stage
+from pmsmtool.design.design_file import load_design
 from pmsmtool.design.lookup.design import LookupRequest
 from pmsmtool.design.loops.open_loops import open_loops
+from pmsmtool.design.loops.sampled_loop import margins
 from pmsmtool.design.tune_request import TuneRequest
-from pmsmtool.errors import IdentificationError
+from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.report.junit import junit_xml
 from pmsmtool.report.verdict import Verdict
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage, new_record
+from pmsmtool.trace import Trace
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +60,7 @@ def test_the_page_needs_nothing_else_and_puts_the_verdict_first(made: Path) -> N
     assert "not run: identify, margins, verify, prove" in page
     assert not re.search(r"<(script|link|iframe|img)\b|@import|url\((?!#)", page)
     assert not re.search(r'(?:src|href)="(?!#)', page)
-    assert page.count("<svg") == 2
+    assert page.count("<svg") == 3, "references, Bode, Nyquist"
     assert "bench &lt;2&gt;" in page
     for text in ("motor.R_s_ohm", "84 of 84", "What was not checked", "Behaviour: the drive", "A. Engineer"):
         assert text in page
@@ -89,7 +96,7 @@ def test_a_run_of_one_stage_is_complete_with_that_stage(name: str, tmp_path: Pat
     run.add(Stage(name, "pass", 1.0, note="worth a note", acceptance=[Acceptance("width", "1 %", "3 %", True)]))
     assert report_page.verdict(run.path) == Verdict("pass", "PASS", (f"{name} alone, 1 criterion, met",))
     page = page_of(run.path)
-    assert "PARTIAL" not in page and f"<li>{name}: worth a note</li>" in page
+    assert "PARTIAL" not in page and "<p>worth a note</p>" in page
     run.add(Stage("tune", "pass", 1.0))
     assert report_page.verdict(run.path).word == "PARTIAL", "somebody went on towards a commissioning"
 
@@ -111,9 +118,6 @@ def test_a_failed_stage_makes_the_verdict(made: Path, tmp_path: Path) -> None:
 
 
 def test_the_loops_drawn_are_those_of_the_design(made: Path) -> None:
-    from pmsmtool.design.design_file import load_design
-    from pmsmtool.design.loops.sampled_loop import margins
-
     design = load_design(made / "design.toml")
     loops = open_loops(design)
     assert set(loops) == {"current_d", "current_q", "speed"}
@@ -228,3 +232,50 @@ def test_junit_has_a_case_per_criterion_and_is_green_only_for_a_pass(made: Path,
         found = ElementTree.fromstring(junit_xml(record, Verdict(kind, "", ("x",))).encode())  # type: ignore[arg-type]
         assert found.find(f"testcase/{inside}") is not None and found.get("failures") == "0"
     assert program(["report", "--junit", "--anonymous", str(folder), "-q"]) == 2
+
+
+def test_the_margin_map_has_the_margin_of_the_design_where_nothing_differs(
+    made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    design = load_design(made / "design.toml")
+    drawn: list[Any] = []
+    monkeypatch.setattr(report_page.figures, "margin_map_figure", lambda *given: drawn.append(given))
+    list(report_page._margin_map(design))
+    factor, delay, phase, designed, _ = drawn[0]
+    at = [float(np.interp(1.0, factor, row)) for row in phase]
+    nominal = design.loops["current_q"].phase_margin_deg
+    assert float(np.interp(designed[1], delay, at)) == pytest.approx(nominal, abs=0.5), "by interpolation: 0.1 seen"
+    assert phase[-1, 0] < phase[0, -1], "a smaller inductance and a longer delay cost margin"
+
+
+def test_the_least_time_to_a_current_at_standstill_is_that_of_a_winding(made: Path) -> None:
+    """t = L/R ln(V / (V - R i)) for constant voltage."""
+    design = load_design(made / "design.toml")
+    machine, i_q = design.machine.machine, np.linspace(0.0, 6.0, 40)
+    trace = Trace(np.arange(40) * 1e-4, {"omega_e_rad_s": np.zeros(40)}, {"omega_e_rad_s": "rad/s"})
+    prediction: Any = SimpleNamespace(facts={"conditions": {"U_dc_v": 540.0}})
+    found = report_page._least_times(prediction, trace, {"i_d_a": 0.0 * i_q, "i_q_a": i_q}, design)
+    assert found is not None
+    V, R = 540.0 * design["inverter.voltage_utilisation"], machine.R_s_ohm
+    expected = machine.L_q_h / R * np.log(V / (V - R * found[1]["i_q_a"]))
+    assert found[0] == pytest.approx(expected, rel=2e-3), "within 2e-4 seen"
+
+
+@pytest.mark.parametrize("browser", ["missing", "silent"])
+def test_a_browser_that_makes_no_pdf_is_named(browser: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    silent = tmp_path / "silent"
+    silent.write_text("#!/bin/sh\n")
+    silent.chmod(0o755)
+    monkeypatch.setenv("PMSMTOOL_BROWSER", str(silent) if browser == "silent" else "no-such-browser")
+    with pytest.raises(ConfigError) as caught:
+        print_page(tmp_path / "report.html", tmp_path / "report.pdf")
+    assert caught.value.hint.endswith("print it: it is laid out for A4 and Letter")
+    assert not (tmp_path / "report.pdf").exists()
+
+
+@pytest.mark.chain
+@pytest.mark.skipif(find_browser() is None, reason="no browser on this computer")
+def test_the_page_as_pdf(made: Path) -> None:
+    assert program(["report", str(made), "--pdf", "-q"]) == 0
+    assert (made / "report.pdf").read_bytes().startswith(b"%PDF-")
+    (made / "report.pdf").unlink()

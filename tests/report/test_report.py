@@ -8,7 +8,7 @@ import math
 
 import pytest
 
-from pmsmtool.report.report import Change, Figure, render, total_interval
+from pmsmtool.report.report import Change, Figure, _intervals, render, total_interval
 from pmsmtool.report.verdict import COMPLETE, NEEDED
 
 
@@ -73,7 +73,8 @@ def test_all_passed_is_pass_and_names_the_value_with_its_interval() -> None:
     assert ">SIMULATED DRIVE, PASS: 7 of 7 stages ran, 7 criteria, all met</strong>" in page
     assert "0.1371" in page and "multi-level DC" in page
     assert "thermal behaviour under load" in page
-    assert page.index("PASS: 7 of 7") < page.index("<h1>") < page.index("Stages"), "the verdict comes first"
+    order = [page.index(text) for text in ("PASS: 7 of 7", "<h1>", "What was not checked", "Identification: ")]
+    assert order == sorted(order), "the verdict comes first"
 
 
 @pytest.mark.parametrize("missing", COMPLETE)
@@ -117,3 +118,31 @@ def test_text_from_outside_is_escaped_and_figures_are_inline() -> None:
 def test_total_interval_adds_in_quadrature() -> None:
     assert total_interval(1.0, 0.0) == pytest.approx(1.96)
     assert total_interval(1.0, 1.96) == pytest.approx(1.96 * math.sqrt(2.0))
+
+
+def test_the_figure_that_shows_the_verdict_best_stands_first_and_the_others_with_their_stage() -> None:
+    drawn = [
+        Figure("<svg>bode</svg>", "loops", stage="tune", weight=2.0),
+        Figure("<svg>step</svg>", "proof", stage="prove", weight=4.3),
+        Figure("<svg>other</svg>", "of no stage that ran", stage="scan"),
+    ]
+    page = render(_record(), figures=drawn)
+    texts = ("<h1>", ">step<", "What was not checked", "Control design: ", ">bode<", "Proof on")
+    order = [page.index(text) for text in texts]
+    assert order == sorted(order) and page.count(">step<") == 1 and ">other<" in page
+
+
+def test_tables_keep_their_heads_in_print_and_their_labels_on_a_phone() -> None:
+    page = render(_record(), changes=[Change("motor.R_s_ohm", "0.2", "0.1", "0.1", "ohm")])
+    assert page.count("<main>") == 1 and page.count("<table>") == page.count("<thead>") >= len(COMPLETE)
+    assert "thead { display: table-header-group; }" in page and 'data-label="limit" class="limit">1 %</td>' in page
+    assert '<td data-label="held by the drive" class="number">0.1</td>' in page
+    for role in ("commissioned by", "checked by", "released by"):
+        assert f'<td data-label="role">{role}</td>' in page
+
+
+@pytest.mark.parametrize(("measured", "meet"), [(1.05, True), (1.19, True), (1.3, False), (0.5, False)])
+def test_two_intervals_are_drawn_and_said_to_overlap_or_not(measured: float, meet: bool) -> None:
+    row = {"measured": measured, "interval": 0.1, "low": 0.9, "high": 1.1}
+    assert ('aria-label="the intervals overlap"' in _intervals(row)) == meet
+    assert _intervals({**row, "low": None}) == "" == _intervals({**row, "measured": None})
