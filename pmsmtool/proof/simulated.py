@@ -61,8 +61,9 @@ FRICTION_SHARE = 0.03
 """Largest Coulomb and viscous friction, of the rated torque, where the machine file gives none."""
 FRICTION_FACTOR = 2.0
 """Factor either way where it gives them."""
-LAG_SHARE = 0.1
-"""Largest lag of the current sensors, of the control period, where it was not identified."""
+LAG_SHARES, LAG_S = (0.1, 0.4), 20e-6
+"""Largest lag of the current sensors where it was not identified: that of amplifier and filter (s), within these shares
+of the control period. With a tenth of it a healthy drive (17 of 44 us) was 1.23 half widths of the delay off."""
 TIMING_COVERAGE = 2.0
 """Half range of identified lag and instant, of their standard deviation."""
 OFFSET_SHARE = 0.001
@@ -435,7 +436,7 @@ def _timing(machine: MachineFile, rng: np.random.Generator, *, late: bool) -> tu
     lag, instant, T_s = machine.inverter.current_lag_s, machine.inverter.sampling_instant_s, machine.inverter.T_s
     where = float(rng.uniform(0.0, 1.0))
     if lag is None or instant is None:
-        return where * LAG_SHARE * T_s, 0.0, 0.0
+        return where * min(max(LAG_S, LAG_SHARES[0] * T_s), LAG_SHARES[1] * T_s), 0.0, 0.0
     stds = [machine.estimates[name].std for name in (LAG, INSTANT) if name in machine.estimates]
     apart = (2.0 * where - 1.0) * TIMING_COVERAGE * math.hypot(*stds)
     shift = max(-T_s, min(T_s, instant - apart))

@@ -19,7 +19,7 @@ from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.proof.plan import RPM, SIGNALS, STEPS, Conditions, plan_proof
-from pmsmtool.proof.simulated import BASE_SPEED, SimulatedDrives
+from pmsmtool.proof.simulated import BASE_SPEED, LAG_SHARES, SimulatedDrives
 from pmsmtool.proof.stage import ProofRequest, envelope_of
 from pmsmtool.resources import data_folder
 
@@ -119,6 +119,11 @@ def test_an_inertia_that_counts_for_nothing_leaves_the_steps_to_the_voltage(J_kg
     assert "unreachable" in [e.name for e in plan.experiments]
 
 
+BEGUN = 0.06
+"""Speed at the beginning of a record beyond what is drawn, relative: a 12-bit encoder 0.01; besides a sensor lag of 0.4
+periods, whose current speeds a light shaft up while it coasts, 0.049."""
+
+
 @pytest.mark.parametrize("psi_f_wb", [0.005, 0.02])
 def test_the_predicted_records_begin_at_their_speed(psi_f_wb: float) -> None:
     """The drawn friction slows a light shaft while the prediction gets ready; a record begins at its speed."""
@@ -129,7 +134,7 @@ def test_the_predicted_records_begin_at_their_speed(psi_f_wb: float) -> None:
         if experiment.name in ("q_steps", "d_steps"):
             once = replace(experiment, rows=experiment.pattern_rows, repeats=1)
             begun = drives.respond(once)[:, SIGNALS.index("omega_e_rad_s"), 0] / (7 * experiment.base_rad_s) - 1.0
-            assert (begun >= BASE_SPEED[0] - 0.03).all() and (begun <= BASE_SPEED[1] + 0.03).all()  # 12-bit encoder
+            assert (begun >= BASE_SPEED[0] - BEGUN).all() and (begun <= BASE_SPEED[1] + BEGUN).all()
 
 
 SETTLED = 0.03
@@ -164,7 +169,11 @@ def test_the_prediction_samples_when_the_identified_sensors_do() -> None:
             assert shifts.any() and ages.any() and not np.any(shifts * ages), "one looks like the other"
             assert lags + shifts + ages == pytest.approx(lag + instant)
         else:
-            assert 0.0 <= lags.min() and lags.max() <= 0.1 * inverter.T_s and not shifts.any()
+            assert (
+                0.0 <= lags.min()
+                and 0.3 * inverter.T_s < lags.max() <= LAG_SHARES[1] * inverter.T_s
+                and not shifts.any()
+            )
 
 
 def test_the_prediction_has_the_two_masses_that_the_resonance_tells() -> None:
