@@ -72,7 +72,7 @@ def build() -> Path:
         NAME,
         (
             *(path.relative_to(PACKAGE).as_posix() for path in kept),
-            *(f"{folder}/*.c" for folder in ("machine", "firmware/core")),
+            *(f"{folder}/*.c" for folder in ("machine", "firmware/application", "firmware/core")),
             f"../{FOLDER.parent.name}/{FOLDER.name}/*.c",
         ),
     )
