@@ -7,6 +7,7 @@ import dataclasses
 import enum
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -65,6 +66,21 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
     return lines
 
 
+_GOOD, _PART, _BAD = "green", "yellow", "red"
+_COLOURS = {
+    "PASS": _GOOD, "PARTIAL": _PART, "NOT AVAILABLE": _PART, "NOT CHECKED": _PART, "WARN": _PART,
+    "FAIL": _BAD, "REFUSED": _BAD, "WRONG": _BAD, "STOP NOT CONFIRMED": _BAD,
+}  # fmt: skip
+_VERDICT = re.compile(rf"\b(?:{'|'.join(_COLOURS)})\b")
+
+
+def coloured(text: str) -> str:
+    """Return a text with its verdicts in colour; click takes colours out where no terminal is, NO_COLOR everywhere."""
+    if os.environ.get("NO_COLOR"):
+        return text
+    return _VERDICT.sub(lambda found: click.style(found[0], fg=_COLOURS[found[0]]), text)
+
+
 def _is_number(text: str) -> bool:
     try:
         float(text)
@@ -106,7 +122,7 @@ class Output:
             self.json_line(command, data)
             return
         for line in text() if callable(text) else text:
-            click.echo(plain(line))
+            click.echo(coloured(plain(line)))
 
     def json_line(self, command: str, data: Mapping[str, Any]) -> None:
         """Print one JSON object on a line of its own (``monitor`` prints many)."""
@@ -138,7 +154,7 @@ class Output:
 
     def _say(self, text: str, label: str = "") -> None:
         self._clear_status()
-        click.echo(label + plain(text), err=True)
+        click.echo(label + coloured(plain(text)), err=True)
 
     def _clear_status(self) -> None:
         if self._status_width:

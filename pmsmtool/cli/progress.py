@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from pmsmtool.cli.output import Output
@@ -13,6 +15,27 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from pmsmtool.run_directory import Stage
+
+
+STEPS: Mapping[str, Sequence[tuple[str, float]]] = {
+    "identify": (
+        ("noise: ", 0.01), ("phases: ", 0.02), ("R and inverter: ", 0.05), ("pairs of phases: ", 0.26),
+        ("pole pairs, direction, offset: ", 0.28), ("L_d, L_q: ", 0.37), ("flux and inertia, first", 0.43),
+        ("psi_f and fine offset: ", 0.47), ("J, B, tau_c: ", 0.63), ("frequency response: ", 0.66),
+        ("J/psi, tau_c/psi: ", 0.3), ("psi: the ", 0.8), ("R, psi, L_q, J: ", 0.3), ("voltage off, ", 0.98),
+    ),
+    "flash": (("writing and reading back ", 0.05), ("storing", 0.3), ("resetting the drive ", 0.6)),
+    "prove": (
+        ("predicting ", 0.02), ("prediction committed", 0.4), ("speed step ", 0.5), ("i_q steps ", 0.6),
+        ("i_d steps ", 0.7), ("i_q step to ", 0.8), ("speed ramp ", 0.85), ("voltage off, ", 0.98),
+    ),
+}  # fmt: skip
+"""How the steps of a stage begin, and the share of the stage's time that has passed when they do: in the README's
+session, whose identification takes 66 s on the drive's clock."""
+LEAST_SHARE = 0.04
+"""Share of a stage from which its remaining time is said: before, what has passed tells nothing."""
+BAR = 20
+"""Width of the bar (characters)."""
 
 
 class StageProgress:
@@ -28,7 +51,7 @@ class StageProgress:
         self._out = out
         self._live: Progress | None = None
         self._task: TaskID | None = None
-        self._head = ""
+        self._head, self._stage, self._began, self._share = "", "", 0.0, 0.0
 
     def skip(self, stage: Stage, number: int, count: int) -> None:
         """Say how a stage ended that was run before."""
@@ -36,7 +59,8 @@ class StageProgress:
 
     def begin(self, name: str, number: int, count: int) -> None:
         """Show the stage while it runs."""
-        self._head = f"[{number}/{count}] {name}"
+        self._head, self._stage, self._share = f"[{number}/{count}] {name}", name, 0.0
+        self._began = time.monotonic()
         self.resume()
 
     def resume(self) -> None:
@@ -44,20 +68,41 @@ class StageProgress:
         if self._out.verbosity < 0 or not sys.stderr.isatty():
             return
         from rich.console import Console
-        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import BarColumn, Progress, TextColumn
+        from rich.table import Column
 
-        columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
-        self._live = Progress(*columns, console=Console(stderr=True), transient=True)
-        self._task = self._live.add_task(self._head, total=None)
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=BAR),
+            TextColumn("{task.fields[share]:>4} {task.fields[left]:<14}", markup=False),
+            TextColumn("{task.fields[action]}", markup=False, table_column=Column(ratio=1, no_wrap=True)),
+        )
+        self._live = Progress(*columns, console=Console(stderr=True), transient=True, expand=True)
+        self._task = self._live.add_task(self._head, total=None, share="", left="", action="")
+        self._show()
         self._live.start()
+
+    def _show(self) -> None:
+        """Draw the share of the stage's time that has passed; a stage without known steps has a bar that runs."""
+        if self._live is None or self._task is None or not self._share:
+            return
+        left = (time.monotonic() - self._began) * (1.0 - self._share) / self._share
+        self._live.update(
+            self._task, total=1.0, completed=self._share, share=f"{100.0 * self._share:.0f} %",
+            left=f"{left // 60:.0f}:{left % 60:02.0f} left" if self._share > LEAST_SHARE else "",
+        )  # fmt: skip
 
     def say(self, text: str) -> None:
         """Show a step inside the stage."""
         text = plain(text)
+        reached = (share for start, share in STEPS.get(self._stage, ()) if text.startswith(start))
+        self._share = next(reached, self._share)
         if self._live is None or self._task is None:
             self._out.detail(f"      {text}")
             return
-        self._live.update(self._task, description=f"{self._head}  {text}")
+        if not text.startswith(" "):  # those are results of a step, not the step
+            self._live.update(self._task, action=text)
+        self._show()
         if self._out.verbosity >= 1:
             self._live.console.print(f"      {text}", markup=False, highlight=False)
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 
 import io
 import sys
+from pathlib import Path
 
 import pytest
 
-from pmsmtool.cli.output import Output
-from pmsmtool.cli.progress import StageProgress
+import pmsmtool
+from pmsmtool.cli.output import Output, coloured
+from pmsmtool.cli.progress import STEPS, StageProgress
 from pmsmtool.run_directory import Stage
 
+ROOT = Path(pmsmtool.__file__).parent
 PASSED = Stage("tune", "pass", 0.0, summary="current loops 637 Hz")
 PASSED_BEFORE = Stage("identify", "pass", 1.0)
 NOT_AVAILABLE = Stage("prove", "not available", 0.0, note="needs a loop")
@@ -69,6 +72,7 @@ def test_a_live_line_on_a_terminal_that_leaves_one_line_per_stage(
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("NO_COLOR", "1")
     told(Output(verbosity=verbosity))
     shown = terminal.getvalue()
     assert "choosing a bandwidth" in shown and "\x1b[2K" in shown, "the live line is drawn and erased"
@@ -86,3 +90,35 @@ def test_text_of_a_drive_is_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
     progress.say("journal: [/tmp/x] [bold]y[/bold]")
     progress.pause()
     assert "[bold]y[/bold]" in terminal.getvalue()
+
+
+def test_the_bar_has_share_remaining_time_and_action(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    now = [100.0]
+    monkeypatch.setattr("pmsmtool.cli.progress.time.monotonic", lambda: now[0])
+    progress = StageProgress(Output())
+    progress.begin("prove", 7, 7)
+    now[0] += 30.0
+    progress.say("i_q steps of +-1 A at 600 rpm")
+    progress.end(PASSED, 7, 7)
+    assert "60 %" in terminal.getvalue() and "0:20 left" in terminal.getvalue()
+    assert "i_q steps of +-1 A" in terminal.getvalue()
+
+
+def test_every_step_of_the_bar_is_said_somewhere() -> None:
+    rooms = ("measurement", "experiments", "drive", "flash", "proof", "identification", "design")
+    said = "".join(path.read_text() for room in rooms for path in (ROOT / room).rglob("*.py"))
+    for steps in STEPS.values():
+        assert [share for _, share in steps if not 0.0 < share < 1.0] == []
+        starts = [start.replace("i_q steps", "i_{axis} steps").replace("i_d s", "i_{axis} s") for start, _ in steps]
+        assert [start for start in starts if f'"{start}' not in said] == []
+
+
+def test_verdicts_have_their_colour_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert coloured("[1/7] lut  PASS  PASSED") == "[1/7] lut  \x1b[32mPASS\x1b[0m  PASSED"
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert coloured("FAIL") == "FAIL"
