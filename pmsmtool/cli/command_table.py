@@ -69,7 +69,7 @@ COMMANDS: tuple[Row, ...] = (
     Row("machine", "pmsmtool.cli.machine:machine_command", Section.COMPUTE, "Make a machine file from a datasheet."),
     Row("tune", "pmsmtool.cli.tune:tune_command", Section.COMPUTE, "Design the control of a machine."),
     Row("diff", "pmsmtool.cli.compare_runs:diff_command", Section.COMPUTE, "Compare two runs with their intervals."),
-    Row("fleet", "pmsmtool.cli.compare_runs:fleet_command", Section.COMPUTE, "Show the statistics of many runs."),
+    Row("fleet", "pmsmtool.cli.fleet_runs:fleet_command", Section.COMPUTE, "Show the statistics of many runs."),
     Row("report", "pmsmtool.cli.report:report_command", Section.COMPUTE, "Write the report of a run."),
     Row("export", "pmsmtool.cli.export:export_command", Section.COMPUTE, "Write a design as DCF, C, CSV."),
     Row("margins", "pmsmtool.cli.margins:margins_command", Section.COMPUTE, "Judge a design over its tolerances."),

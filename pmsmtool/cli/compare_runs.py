@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``pmsmtool diff`` and ``pmsmtool fleet``: two runs compared with their intervals, statistics over many."""
+"""``pmsmtool diff``: two runs compared with their intervals."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ from pmsmtool.cli.output import Output, table
 if TYPE_CHECKING:
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.run_directory import RunRecord
-
-MOST_RUNS = 10_000
-"""Folders that are looked at."""
 
 
 @click.command(
@@ -45,7 +42,7 @@ def diff_command(first: Path, second: Path, check: bool, out: Output) -> None:
     if _moved(first, second):
         _diff_of_moves(first, second, check, out)
         return
-    (record, file), (other_record, other) = _read(first), _read(second)
+    (record, file), (other_record, other) = read_run(first), read_run(second)
     same = same_drive(record.drive, other_record.drive)
     rows = differences(file.estimates, other.estimates, same_sensors=same, machine=file.machine)
     cells = [(*told(row), row.verdict) for row in rows]
@@ -104,48 +101,14 @@ def _diff_of_moves(first: Path, second: Path, check: bool, out: Output) -> None:
         )  # fmt: skip
 
 
-@click.command("fleet", epilog=examples("pmsmtool fleet runs", "pmsmtool fleet runs --json | jq '.quantities[].odd'"))
-@click.argument("folder", type=click.Path(path_type=Path))
-@output_options
-def fleet_command(folder: Path, out: Output) -> None:
-    """Show the statistics of all runs in a folder: medians, spread, and the runs that stand out."""
-    from pmsmtool.errors import ConfigError, PmsmtoolError
-    from pmsmtool.identification.compared_runs import series
-    from pmsmtool.units import format_quantity
-
-    paths = sorted(path.parent for path in folder.glob("*/run.json"))[:MOST_RUNS]
-    runs, unread = [], []
-    for path in paths:
-        try:
-            runs.append((path.name, _read(path)[1].estimates))
-        except PmsmtoolError as error:
-            unread.append(f"{path.name}: {error.what}")
-    if not runs:
-        raise ConfigError(
-            "no run with identified values in here", where=str(folder),
-            hint="give the folder that holds the run directories, usually runs",
-        )  # fmt: skip
-    rows = series(runs)
-    cells = [
-        (
-            row.name, row.runs, format_quantity(row.median, row.unit),
-            "-" if row.spread != row.spread else format_quantity(row.spread, row.unit, 2),
-            f"+-{format_quantity(row.interval, row.unit, 2)}", ", ".join(row.odd) or "-",
-        )
-        for row in rows
-    ]  # fmt: skip
-    heads = ("quantity", "runs", "median", "spread", "interval of one", "stand out")
-    lines = [*table(heads, cells), f"{len(runs)} runs", *(f"left out: {text}" for text in unread)]
-    out.result("fleet", {"runs": len(runs), "left_out": unread, "quantities": [_facts(row) for row in rows]}, lines)
-
-
 def _facts(row: object) -> dict[str, object]:
     from dataclasses import asdict
 
     return asdict(row)  # type: ignore[call-overload,no-any-return]
 
 
-def _read(path: Path) -> tuple[RunRecord, MachineFile]:
+def read_run(path: Path) -> tuple[RunRecord, MachineFile]:
+    """Return the record of a run and the machine it identified; raises ``ConfigError`` where it identified none."""
     from pmsmtool.errors import ConfigError
     from pmsmtool.identification.replay import MACHINE
     from pmsmtool.machine.machine_file import load_machine_file

@@ -21,6 +21,11 @@ ODD = 3.5
 ROBUST = 1.4826
 """Standard deviation over median absolute deviation of a normal distribution."""
 
+MEASURED = ("pmsmtool", "vendor")
+"""Sources of values that a run measured."""
+TREND = 2.576
+"""Standard deviations of the test for a trend: 99 %."""
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:
@@ -150,6 +155,9 @@ class Series:
         Median total 95 % half width of one run.
     odd : tuple of str
         Runs whose value stands out of the others by more than the series' spread and its own interval.
+    drift : float
+        Change from the first run to the last by the median slope, where Mann and Kendall's test sees one at 99 %; NaN
+        where it sees none, which it cannot below 7 runs.
     """
 
     name: str
@@ -159,6 +167,27 @@ class Series:
     spread: float
     interval: float
     odd: tuple[str, ...] = ()
+    drift: float = math.nan
+
+
+def measured(estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Return the estimates that were measured: what a data sheet says of one type is the same in all runs."""
+    return {name: estimate for name, estimate in estimates.items() if estimate.source in MEASURED}
+
+
+def drift(values: Sequence[float]) -> float:
+    """Return the change over a series in order of time, NaN where no trend is seen at 99 %.
+
+    The test of H. B. Mann (Econometrica 13 (1945) 245, doi:10.2307/1907187) and the median slope of P. K. Sen (J. Am.
+    Stat. Assoc. 63 (1968) 1379, doi:10.1080/01621459.1968.10480934).
+    """
+    n = len(values)
+    pairs = [(i, j) for j in range(n) for i in range(j)]
+    rising = sum((values[j] > values[i]) - (values[j] < values[i]) for i, j in pairs)
+    deviation = math.sqrt(n * (n - 1.0) * (2.0 * n + 5.0) / 18.0)
+    if not pairs or abs(rising) - 1.0 <= TREND * deviation:
+        return math.nan
+    return (n - 1.0) * statistics.median((values[j] - values[i]) / (j - i) for i, j in pairs)
 
 
 def series(runs: Iterable[tuple[str, Mapping[str, Estimate]]]) -> list[Series]:
@@ -181,4 +210,4 @@ def _series(name: str, found: Sequence[tuple[str, Estimate]]) -> Series:
             allowed = max(ODD * spread, math.hypot(total_half_width(estimate), interval))
             if abs(estimate.value - median) > allowed:
                 odd.append(run)
-    return Series(name, found[0][1].unit, len(values), median, spread, interval, tuple(odd))
+    return Series(name, found[0][1].unit, len(values), median, spread, interval, tuple(odd), drift(values))

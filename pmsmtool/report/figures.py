@@ -301,6 +301,26 @@ def band_figure(rows: Mapping[str, tuple[float, float, float, float]], unit: str
     return Figure(svg(canvas), caption)
 
 
+def series_figure(
+    name: str, unit: str, numbers: Sequence[int], values: Sequence[float], halves: Sequence[float]
+) -> Figure:
+    """Draw a quantity over the runs it was measured in, each with its total 95 % interval, and the median.
+
+    Parameters
+    ----------
+    numbers : sequence of int
+        Numbers of the runs in order of time.
+    values, halves : sequence of float
+        Values and half widths of their intervals.
+    """
+    canvas, (axes,) = _canvas(1, 1, height=0.6)
+    axes.axhline(float(np.median(values)), color=_LIMIT)
+    axes.errorbar(numbers, values, yerr=halves, fmt="o", ms=4, lw=1.0, color=_MEASURED)
+    axes.set(xlabel="run", ylabel=f"{name} / {unit}")
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    return Figure(svg(canvas), f"{name} over the runs, with the total 95 % interval of each; grey: the median.")
+
+
 _SIGNAL_LABELS = {"i_d_a": "i_d / A", "i_q_a": "i_q / A", "omega_e_rad_s": "speed / rad/s (el)"}
 
 

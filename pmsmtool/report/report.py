@@ -90,10 +90,10 @@ def render(
         subtitle=f"started {record['started_utc']} by {record['operator']}",
         verdict=found,
         ended=list(ended),
-        first=None if first is None else _drawn(first),
+        first=None if first is None else drawn(first),
         stages=[_stage(stage, [figure for figure in left if figure.stage == stage["name"]]) for stage in latest],
         comparison=_comparison(rows) if rows else None,
-        figures=[_drawn(figure) for figure in left if figure.stage not in shown],
+        figures=[drawn(figure) for figure in left if figure.stage not in shown],
         changes=_changes(changes) if changes else None,
         not_checked=list(not_checked),
         signatures=(_SIGNED, [[(role, ""), *[("", "")] * (len(_SIGNED) - 1)] for role in _ROLES]),
@@ -133,7 +133,7 @@ def _stage(stage: Mapping[str, Any], figures: Sequence[Figure]) -> dict[str, Any
         "fallbacks": list(stage.get("fallbacks", ())),
         "estimates": (_ESTIMATE, [_estimate_row(value) for value in values]) if values else None,
         "criteria": (("result", "criterion", "measured", "limit"), criteria) if criteria else None,
-        "figures": [_drawn(figure) for figure in figures],
+        "figures": [drawn(figure) for figure in figures],
     }
 
 
@@ -185,7 +185,8 @@ def _changes(changes: Sequence[Change]) -> Table:
     ]
 
 
-def _drawn(figure: Figure) -> dict[str, Any]:
+def drawn(figure: Figure) -> dict[str, Any]:
+    """Return a figure as the templates take it."""
     return {"svg": _trusted_svg(figure.svg), "caption": figure.caption}
 
 

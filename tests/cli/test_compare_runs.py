@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
 from pmsmtool.errors import CheckFailed, ConfigError
-from pmsmtool.identification.compared_runs import LEAST_SERIES, differences, same_drive, series
+from pmsmtool.identification.compared_runs import LEAST_SERIES, differences, drift, same_drive, series
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
@@ -28,12 +28,14 @@ def moved(estimate: Estimate, share: float) -> Estimate:
     return replace(estimate, value=estimate.value * (1.0 + share))
 
 
-def run_of(folder: Path, name: str, estimates: dict[str, Estimate], serial: int = 5) -> Path:
-    path = folder / name
+def run_of(
+    folder: Path, label: str, estimates: dict[str, Estimate], serial: int = 5, name: str = "interior-2k2"
+) -> Path:
+    path = folder / label
     path.mkdir(parents=True)
     record = RunRecord("2026-01-01T00:00:00Z", "x", ("identify",), {}, {"serial": serial, "vendor": 1}, {})
     run = RunDirectory.create(path, serial, record)
-    machine = replace(load_machine_file(machine_path("interior-2k2")), estimates=estimates)
+    machine = replace(load_machine_file(machine_path("interior-2k2")), estimates=estimates, name=name)
     run.save("machine.toml", dump_machine_file(machine))
     return run.path
 
@@ -115,12 +117,39 @@ def test_a_folder_of_runs_names_the_one_that_stands_out(tmp_path: Path) -> None:
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "run.json").write_text("{")
     found = told("fleet", tmp_path)
-    (row,) = found["quantities"]  # type: ignore[misc]
+    (motor,) = found["motors"]  # type: ignore[misc]
+    (row,) = motor["quantities"]
+    assert (motor["runs"], motor["drives"]) == (6, 6) and motor["name"].endswith(", 3 pole pairs")
     assert row["odd"] == ["run-5"] and row["runs"] == 6 == found["runs"]
     assert row["median"] == pytest.approx(0.5 * 1.0005, rel=1e-4)
     assert len(found["left_out"]) == 1  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="no run"):
         CliRunner().invoke(cli, ["fleet", str(tmp_path / "made")], catch_exceptions=False, standalone_mode=False)
+
+
+def test_two_motors_are_two_tables_and_what_was_stated_is_none_of_them(tmp_path: Path) -> None:
+    stated = replace(PSI, source="datasheet", method="conversion")
+    for k in range(4):
+        path = run_of(tmp_path / "made", f"a{k}", {"R_s_ohm": R, "psi_f_wb": stated})
+        path.rename(tmp_path / f"a-{k}")
+        path = run_of(tmp_path / "made", f"b{k}", {"R_s_ohm": moved(R, 3.0)}, name="other <motor>")
+        path.rename(tmp_path / f"b-{k}")
+    found = told("fleet", tmp_path, "-o", tmp_path / "fleet.html")
+    assert [len(motor["quantities"]) for motor in found["motors"]] == [1, 1]  # type: ignore[attr-defined]
+    page = (tmp_path / "fleet.html").read_text()
+    assert "8 runs, nothing stands out" in page and "other &lt;motor&gt;, 3 pole pairs: 4 runs, 1 drive" in page
+    assert page.count("<figure>") == 2 and "psi_f_wb" not in page
+    told("fleet", tmp_path, "-o", tmp_path / "fleet.csv")
+    rows = (tmp_path / "fleet.csv").read_text().splitlines()
+    assert len(rows) == 1 + 8 and rows[0].startswith("motor,run,started_utc,serial,quantity,value")
+    assert rows[1] == '"interior-2k2, 3 pole pairs",a-0,2026-01-01T00:00:00Z,5,R_s_ohm,0.5,0.00537,ohm,no'
+
+
+def test_a_drift_is_seen_and_scatter_is_none() -> None:
+    scatter = [0.3, -0.2, 0.1, -0.4, 0.2, 0.4, -0.1, -0.3]
+    assert math.isnan(drift(scatter)) and math.isnan(drift([1.0])) and math.isnan(drift([1.0, 2.0, 3.0]))
+    assert drift([0.1 * k + 0.02 * s for k, s in enumerate(scatter)]) == pytest.approx(0.7, abs=0.03)
+    assert drift([-2.0 * k for k in range(8)]) == pytest.approx(-14.0)
 
 
 def test_few_runs_have_no_spread() -> None:
