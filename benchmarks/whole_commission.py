@@ -31,17 +31,21 @@ from typing import Any
 
 from benchmarks import second_plant
 from benchmarks.commissioning import QUANTITIES, commanded, errors_of, prepared
-from benchmarks.random_drives import Block, data_sheet, draw_drive
+from benchmarks.random_drives import Block, data_sheet, draw_drive, true_loop_resistance
 from benchmarks.real_population import draw_real
 from pmsmtool.commissioning.report_page import verdict
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.estimators.resistance import R_MEASURED
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.temperature import resistance_at
 from pmsmtool.params.catalogue import layout_signature
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.node.factory import factory_values, set_up_values
 from pmsmtool.sim.node.memory import FileStorage, Memory
 from pmsmtool.sim.node.parameter_set import ParameterImage
 from pmsmtool.sim.node.store import IMAGE_KEY, SIGNATURE_KEY, encode
+from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 
 BLOCKS: tuple[Block, ...] = ("ideal", "timing", "gains")
 OTHER = 1_000_000
@@ -58,6 +62,12 @@ def fill_memory(path: Path, drive: MachineFile, other: MachineFile) -> None:
     content = {IMAGE_KEY: image.pack(), SIGNATURE_KEY: struct.pack("<I", layout_signature())}
     for _ in Memory(FileStorage(path)).store(encode(content)):
         pass
+
+
+def with_devices(drive: MachineFile) -> MachineParameters:
+    """Return the machine with the loop as the drive sees it, and its copper part."""
+    loop = true_loop_resistance(drive)
+    return replace(drive.machine, R_s_ohm=loop, R_winding_ohm=loop - device_slope_ohm(settings_of(drive)))
 
 
 def commission_real(seed: int) -> dict[str, Any]:
@@ -84,6 +94,10 @@ def commission_one(seed: int, drive: MachineFile | None = None) -> dict[str, Any
             result["refused"] = {name: why for s in stages if s.name == "identify" for name, why in s.refused.items()}
             errors = errors_of(drive, folder)
             found = load_machine_file(folder / "machine.toml").estimates if errors else {}
+            settings = settings_of(drive)
+            if R_MEASURED in found and not settings.flag("thermal_on"):
+                R_true = resistance_at(with_devices(drive), settings.number("T_winding_c"))
+                errors[R_MEASURED] = found[R_MEASURED].value / R_true - 1.0
             result["values"] = {
                 name: (error, total_half_width(found[name]) / found[name].value) for name, error in errors.items()
             }
@@ -110,14 +124,14 @@ def summary(results: Sequence[dict[str, Any]]) -> list[str]:
     count = Counter(map(ended, results))
     lines = [f"{len(results)} drives: " + ", ".join(f"{count[word]} {word}" for word in ("PASS", "PARTIAL", "FAIL"))]
     lines.append(f"gate false alarms: {sum(bool(result['alarms']) for result in results)}")
-    lines.append(f"{'quantity':10} {'values':>6} {'median half width %':>19} {'beyond 1x':>9} {'2x':>4} {'3x':>4}")
-    for name in QUANTITIES:
+    lines.append(f"{'quantity':16} {'values':>6} {'median half width %':>19} {'beyond 1x':>9} {'2x':>4} {'3x':>4}")
+    for name in (R_MEASURED, *QUANTITIES):
         pairs = [result["values"][name] for result in results if name in result["values"]]
         if pairs:
             ratios = [abs(error) / half for error, half in pairs]
             beyond = [sum(ratio > times for ratio in ratios) for times in (1, 2, 3)]
             width = 100.0 * statistics.median(half for _, half in pairs)
-            lines.append(f"{name:10} {len(pairs):6d} {width:19.2f} {beyond[0]:9d} {beyond[1]:4d} {beyond[2]:4d}")
+            lines.append(f"{name:16} {len(pairs):6d} {width:19.2f} {beyond[0]:9d} {beyond[1]:4d} {beyond[2]:4d}")
     for result in sorted(results, key=lambda each: str(each["stage"])):
         if result["code"]:
             lines.append(f"{result['seed']} {ended(result)} exit {result['code']}, {result['stage'] or 'no stage'}:")
