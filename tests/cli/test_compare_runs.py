@@ -74,6 +74,8 @@ def test_the_way_to_the_reference_temperature_counts_on_one_drive_too() -> None:
     R_s, offset, psi = range(3)
     assert verdicts(0.02, 25.0)[R_s] == "differs" and verdicts(0.02, 60.0)[R_s] == "agrees"
     assert verdicts(0.02, 60.0, R_winding_ohm=0.4)[R_s] == "differs", "the copper part is known"
+    assert verdicts(0.012, 60.0, R_winding_ohm=0.4)[R_s] == "agrees", "but within a data sheet's 10 % only"
+    assert verdicts(0.012, 25.0, R_winding_ohm=0.4)[R_s] == "differs", "which counts by what the two are apart"
     assert verdicts(0.05, 60.0)[R_s] == "differs" and verdicts(0.05, math.nan)[R_s] == "agrees"
     assert verdicts(0.02, 60.0)[psi] == "agrees" and verdicts(0.02, 60.0, alpha_psi_per_k=-0.001)[psi] == "differs"
     assert verdicts(0.0, 25.0, -3.142)[offset] == "agrees" and verdicts(0.0, 25.0, -3.1)[offset] == "differs"

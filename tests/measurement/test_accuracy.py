@@ -114,6 +114,7 @@ def test_a_percent_takes_less_machine_time_and_the_truth_is_in_the_intervals(
         assert fact["statistical_95"] <= 0.01
         assert values[key]["systematic"] > 0.0, "the sensors' part stands beside it"
     assert accuracy_line(facts) in err and "; reached" in err
+    assert "current limit proven: " in err and "speed limit proven: " in err
 
     before = (folder / "machine.toml").read_bytes()
     (folder / "machine.toml").unlink()
