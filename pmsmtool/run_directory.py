@@ -273,7 +273,7 @@ def _stage_violations(entry: Any) -> list[str]:
     if wrong:
         return wrong
     if entry["status"] not in get_args(Status):
-        wrong.append(f"status = {entry['status']!r} is none of {', '.join(get_args(Status))}")
+        wrong.append(f"status = {entry['status']!r} is not one of {', '.join(get_args(Status))}")
     for k, line in enumerate(entry.get("acceptance", ())):
         wrong += [f"acceptance[{k}]: {text}" for text in _shape_violations(line, Acceptance)]
     for k, value in enumerate(entry.get("values", ())):

@@ -46,7 +46,7 @@ def test_damaged_files_end_in_our_errors(name):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda body: body["stages"][0].update(status="half done"), "stages[0] status = 'half done' is none of pass"),
+        (lambda body: body["stages"][0].update(status="half done"), "[0] status = 'half done' is not one of pass"),
         (
             lambda body: body["stages"][1]["values"][0].pop("systematic"),
             "stages[1] values[0]: systematic is not",

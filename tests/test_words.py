@@ -25,6 +25,7 @@ COINED = {
     r"promise[ds]?|believe[ds]?|doubts?|claim(s|ed)?": "guarantee, predicted, no personification",
     r"borrowed": "temporarily changed",
     r"(ring|row) recorder": "the maker's name",
+    r"(drives?|maps?) (says?|knows?|thinks?|wants?)": "reports, states",
     r"for its tier|as far as this drive goes": "PARTIAL: n of 7 stages ran",
 }
 """Terms that this project made up, and what is written instead (docs/glossary.md)."""
@@ -47,6 +48,10 @@ NOT_UNDERSTOOD = (
 PATTERN = re.compile(
     rf"(?<![\w.'-])(?:{'|'.join(COINED)})(?![\w'=(-])|{'|'.join(map(re.escape, NOT_UNDERSTOOD))}", re.IGNORECASE
 )
+LONGEST_SENTENCE = 30
+"""Words; most have fewer than 20."""
+NO_SENTENCES = ("firmware", "papers", "sim")
+"""Rooms whose long texts are C, tables and scenario files."""
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "firmware-params/README.md"])
 SOURCES = sorted((ROOT / "pmsmtool").rglob("*.py"))
 
@@ -84,6 +89,19 @@ def test_no_coined_term_stands_in_what_the_program_says(room: str) -> None:
                 assert found(text) == [], path.relative_to(ROOT)
 
 
+def sentences(text: str) -> Iterator[str]:
+    """Parts of a message that are read in one go: up to a full stop, a colon, a semicolon, or a new line of a list."""
+    yield from re.split(r"(?<=[.;:?!])\s+|\n\s*\n|\n  - |  +", text)
+
+
+def test_a_message_has_no_sentence_that_is_too_long_and_no_optional_plural() -> None:
+    for path in SOURCES:
+        if path.relative_to(ROOT / "pmsmtool").parts[0] not in NO_SENTENCES:
+            for text in prose(path.read_text(encoding="utf-8")):
+                long = [part for part in sentences(text) if len(part.split()) > LONGEST_SENTENCE]
+                assert long == [] and not re.search(r"[a-z]\(s\)", text), path.relative_to(ROOT)
+
+
 def test_no_coined_term_stands_in_the_report_s_templates() -> None:
     for path in sorted((ROOT / "pmsmtool/report/templates").iterdir()):
         text = re.sub(r"<script.*?</script>|\{[{%#].*?[}%#]\}", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
@@ -106,4 +124,6 @@ def inner():
     key = "tier"
 '''
     assert [len(found(text)) for text in prose(source)] == [1, 1, 1]
+    assert found("the drive says 5") and found("a map knows it") and not found("the drive map states it")
+    assert list(sentences("One. Two: three; 3.5 A")) == ["One.", "Two:", "three;", "3.5 A"]
     assert found("an hour, a tool, retold, tier=inject, --tell") == []

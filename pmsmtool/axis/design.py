@@ -64,7 +64,7 @@ class AxisRequest:
     phase_margin_deg, peak_db : float
         Least phase margin (degree) and largest |S| (dB) of both loops over the tolerance box.
     loop_rate_hz : float or None
-        Rate of the drive's speed and position loops (Hz); None: as its map says, else 1 kHz.
+        Rate of the drive's speed and position loops (Hz); None: as its map states, else 1 kHz.
     speed_filter_hz : float or None
         Its filter on the speed (Hz); None: as the design says for a reference drive, none for others.
     """
@@ -111,7 +111,7 @@ class AxisDrive:
     own_core : bool
         Whether it runs the control of this program: rate, speed estimate and filter are then those of the design.
     period_s : float or None
-        Period of its loops as its map says (s).
+        Period of its loops as its map states (s).
     amperes : bool
         Whether its gains are in amperes.
     """
@@ -250,7 +250,7 @@ def axis_path(
     if period is None:
         period = 1.0 / ASSUMED_RATE_HZ
         notes.append(
-            f"the map {drive.name!r} does not say the rate of the loops: {ASSUMED_RATE_HZ:g} Hz assumed; "
+            f"the map {drive.name!r} does not state the rate of the loops: {ASSUMED_RATE_HZ:g} Hz assumed; "
             "--loop-rate-hz gives it"
         )
     decimation = max(1, round(period / current.T_s))

@@ -83,7 +83,7 @@ def new_command(path: Path, force: bool, out: Output, **given: Any) -> None:
     """Write a machine file from a datasheet or meter readings.
 
     Line-line or phase, star or delta, rms or peak: every conversion is printed. A torque constant that contradicts the
-    back-EMF constant is flagged (exit code 0; the file says which one was used). The table [simulation] is what
+    back-EMF constant is flagged (exit code 0; the file states which one was used). The table [simulation] is what
     `commission FILE --rehearse FAMILY` and `--eds` need; what is assumed for it is printed.
     """
     from pmsmtool.errors import ConfigError

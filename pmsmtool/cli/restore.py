@@ -90,7 +90,7 @@ def restore_command(
             return
         if not plan.changes and snapshot.state != "open":
             outcome = nothing_written(node, plan)
-            same = "the file says" if snapshot_file is not None else "before its last download"
+            same = "the file states" if snapshot_file is not None else "before its last download"
             text = f"{told(outcome, node)}: already as {same}, nothing was done"
             out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [text])
             if not outcome.stored:

@@ -92,7 +92,7 @@ if TYPE_CHECKING:
               "loops over the tolerance box.")  # fmt: skip
 @click.option("--axis-peak-db", type=float, default=6.0, metavar="DB", help="Largest |S| of both loops over it.")
 @click.option("--loop-rate-hz", type=float, metavar="HZ", help="Rate of the drive's speed and position loops.  "
-              "[default: as its map says]")  # fmt: skip
+              "[default: as its map states]")  # fmt: skip
 @overspeed_option
 @map_option
 @click.option("--drive-bandwidth-hz", type=float, metavar="HZ", help="Current bandwidth of a drive with fixed "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The design of an axis for a drive: as its map says what it has, with the gains it will hold after rounding."""
+"""The design of an axis for a drive: as its map states what it has, with the gains it will hold after rounding."""
 
 from __future__ import annotations
 

@@ -194,8 +194,8 @@ class Guarantee:
         """Return the guarantee as a person reads it."""
         return (
             f"in profile torque mode: voltage demand <= {self.demand_v:.4g} V (limit {self.limit_v:.4g} V of "
-            f"{self.V_max_v:.4g} V) and current <= {self.I_apk + self.deviation_a:.4g} A for every torque set-point "
-            f"within +-{self.tau_nm:.4g} N m, every speed within +-{self.n_rpm:.4g} rpm and every acceleration up to "
+            f"{self.V_max_v:.4g} V) and current <= {self.I_apk + self.deviation_a:.4g} A. This holds for every torque "
+            f"set-point within +-{self.tau_nm:.4g} N m, speed within +-{self.n_rpm:.4g} rpm and acceleration up to "
             f"{self.acceleration_rpm_per_s:.3g} rpm/s, delay and intervals included; no guarantee above "
             f"that speed. Cost: {100.0 * self.torque_loss:.1f} % of the full governor's torque at that speed, "
             f"{100.0 * self.standstill_loss:.1f} % at standstill; {1e3 * self.rise_s:.3g} ms to the torque limit "
@@ -256,7 +256,7 @@ def _as_controlled(design: Design, drive: ClosedDrive) -> Design:
         raise ConfigError(
             f"the gains of {drive.name!r} cannot be written, and its current bandwidth is not known",
             where="drive with fixed firmware",
-            hint="give --drive-bandwidth-hz, as the maker's tool or manual says",
+            hint="give --drive-bandwidth-hz, as in the maker's tool or manual",
         )
     judged = (CURRENT_LOOPS,) if lacking_gains(drive.offers)[SPEED_LOOP] else (CURRENT_LOOPS, SPEED_LOOP)
     return with_gains(design, gains, judged)

@@ -232,7 +232,7 @@ def _read_values(table: Any) -> tuple[dict[str, DesignValue], list[str]]:
             elif not isinstance(number, (int, float)) or isinstance(number, bool):
                 wrong.append(f"{name}: its value is not a number")
             elif entry.get("unit") != row.unit:
-                wrong.append(f"{name}: its unit is {entry.get('unit')!r}, the catalogue says {row.unit!r}")
+                wrong.append(f"{name}: its unit is {entry.get('unit')!r}, the catalogue has {row.unit!r}")
             else:
                 values[name] = DesignValue(float(number), str(entry.get("method", "")), str(entry.get("loop", "")))
     wrong += [f"{row.name}: is missing" for row in CATALOGUE if row.name not in values and not wrong]

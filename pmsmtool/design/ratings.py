@@ -39,7 +39,7 @@ WINDING_LIMIT_C = 155.0
 """Winding temperature limit of insulation class F (IEC 60085)."""
 
 OVERLOAD_S = 10.0
-"""Time I_max may flow where the machine file does not say."""
+"""Time I_max may flow where the machine file states none."""
 
 MAGNET_SHARE = 0.7
 """Share of the magnet's flux linkage that i_d may oppose where no demagnetisation limit is given."""

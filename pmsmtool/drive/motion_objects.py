@@ -142,7 +142,7 @@ def rated_apk(node: DriveNode) -> float:
     found = None if own is None else held(node, own.item)
     if own is None or found is None:
         raise NotAvailable(
-            f"the drive does not say {NO_RATED}", where=f"node {node.node}",
+            f"the drive does not report {NO_RATED}", where=f"node {node.node}",
             hint="`pmsmtool caps` lists what this drive can measure",
         )  # fmt: skip
     return own.per_count * found
@@ -229,7 +229,7 @@ def limited_speed(node: DriveNode) -> LimitedSpeed:
     Raises
     ------
     NotAvailable
-        The drive has no such mode, its map does not say its unit of speed, or it has no current limit.
+        The drive has no such mode, its map does not state its unit of speed, or it has no current limit.
     """
     own, row = _own(node, "target_speed"), node.map.motion.get("target_speed")
     limit = _own(node, "current_limit")  # the one that its map names: what it does in this mode is the maker's matter
@@ -237,7 +237,7 @@ def limited_speed(node: DriveNode) -> LimitedSpeed:
     there = own is not None and limit is not None and None not in (held(node, own.item), held(node, limit.item))
     if own is None or row is None or limit is None or not there or not modes >> row.mode - 1 & 1:
         raise NotAvailable(
-            f"the drive has neither a torque mode nor a velocity mode whose unit its map says (0x6502 = {modes:#x})",
+            f"the drive has neither a torque mode nor a velocity mode whose unit its map states (0x6502 = {modes:#x})",
             where=f"node {node.node}",
         )
     return LimitedSpeed(own, limit, row.mode)
@@ -282,7 +282,7 @@ def _position_units(node: DriveNode) -> float:
         return sign * counts / max(1.0, held(node, MOTOR_TURNS) or 1.0)
     row = node.map.motion.get("counts_per_turn")
     if row is None:
-        raise NotAvailable(f"the drive does not say {NO_COUNTS}", where=f"node {node.node}")
+        raise NotAvailable(f"the drive does not report {NO_COUNTS}", where=f"node {node.node}")
     own = _own(node, "counts_per_turn")
     return sign * (row.number if own is None else own.per_count * node.get(own.item))
 

@@ -22,7 +22,7 @@ SILENCE_S = 1.5
 OWN_S = 0.2
 """What a stop has at least, of a drive that was silent before."""
 RAMP_LIMIT_S = 60.0
-"""No ramp is waited for longer: then the voltage is removed, whatever the drive says about its speed."""
+"""No ramp is waited for longer: then the voltage is removed, whatever the drive reports about its speed."""
 STALLED_S = 1.0
 """A speed that has not fallen for so long does not follow the ramp: the voltage is removed."""
 ANSWERS_S = 8.0

@@ -58,7 +58,7 @@ class VendorDrive(StandardDrive):
         tuning = self.node.map.vendor_tuning
         if tuning is None:
             raise NotAvailable(
-                "the drive's map does not say how its own identification is started",
+                "the drive's map does not state how its own identification is started",
                 where=f"node {node_id}",
                 hint="[vendor_tuning] of the map (firmware-params/README.md)",
             )

@@ -264,9 +264,9 @@ def _parse_cell(
         return None
     form = row.get("form", "time" if "gain" in row else "value")
     if form not in get_args(Form):
-        tell("form", f"form {form!r} is none of {', '.join(get_args(Form))}")
+        tell("form", f"form {form!r} is not one of {', '.join(get_args(Form))}")
     if row.get("rounding", "nearest") not in get_args(Rounding):
-        tell("rounding", f"rounding {row['rounding']!r} is none of {', '.join(get_args(Rounding))}")
+        tell("rounding", f"rounding {row['rounding']!r} is not one of {', '.join(get_args(Rounding))}")
     elif row["type"] == "REAL32" and row.get("rounding", "nearest") != "nearest":
         tell("rounding", "a REAL32 is not rounded to counts")
     gain = row.get("gain", _GAINS.get(form, ""))
@@ -356,7 +356,7 @@ def _check_row(
         return False
     usable = True
     if row.get("type") not in LETTERS:
-        tell("type", f"type {row.get('type')!r} is none of {', '.join(LETTERS)}")
+        tell("type", f"type {row.get('type')!r} is not one of {', '.join(LETTERS)}")
         usable = False
     if not isinstance(row.get("unit"), str) or not row["unit"]:
         tell("unit", 'unit is missing: say what one count is worth, such as "uV/A" or "mA rms"')

@@ -62,7 +62,7 @@ class MeasuredRow:
         if published.form == "current":
             return ""  # counts of amperes: the drive's torque per ampere stands between
         if published.form != self.form:
-            return f"{self.name}: the map says form {published.form!r}, measured is {self.form!r}"
+            return f"{self.name}: the map states form {published.form!r}, measured is {self.form!r}"
         miss = math.log(self.scale / published.factor) if published.factor > 0.0 else math.inf
         if abs(miss) <= self.half_width:
             return ""

@@ -108,7 +108,7 @@ def parse_recorder(
     Parameters
     ----------
     kind : str
-        What the map says of the recorder (``capabilities.recorder``).
+        What the map states of the recorder (``capabilities.recorder``).
     dimensions : mapping of str to str
         Signals there are, with their dimension.
     sources : mapping of str to str
@@ -164,7 +164,7 @@ def _parse_channel(
         if not check_object(row, _KEYS[kind], tell) or not _measures(row["unit"], dimension, tell):
             return None
         if row["type"] not in RING_TYPES:
-            tell("type", f"type {row['type']!r} is none of {', '.join(RING_TYPES)}: a ring is read in words")
+            tell("type", f"type {row['type']!r} is not one of {', '.join(RING_TYPES)}: a ring is read in words")
             return None
         return Channel(row["unit"], 0, row["index"], row["sub"], row["type"], row.get("source", ""))
     if not _usable(row, _KEYS[kind], sources, tell) or not _measures(row["unit"], dimension, tell):

@@ -215,7 +215,7 @@ def parse_vendor_tuning(
     known = isinstance(source, str) and ("source" not in table or source in sources)
     check(known, ("source",), f"source {source!r} is not in [sources]")
     order = table.get("order", "little")
-    check(order in ORDERS, ("order",), f"order {order!r} is none of {', '.join(ORDERS)}")
+    check(order in ORDERS, ("order",), f"order {order!r} is not one of {', '.join(ORDERS)}")
     failures = _parse_codes(table.get("failures", {}), ("failures",), check)
     rows = table.get("steps")
     check(isinstance(rows, dict) and bool(rows), ("steps",), "steps: no table of commands")

@@ -82,7 +82,7 @@ def check_motion(drive_map: DriveMap, identity: Identity) -> None:
 def other_drive(drive_map: DriveMap, vendor: int, product: int, doubt: str = "") -> str:
     """Return how a map and a drive differ, empty when the map names the drive."""
     if drive_map.vendor == UNKNOWN_VENDOR:
-        return f"the map {drive_map.name!r} does not say whose drive it is for (vendor 0)"
+        return f"the map {drive_map.name!r} does not state whose drive it is for (vendor 0)"
     if drive_map.is_for(vendor, product):
         return doubt
     return (

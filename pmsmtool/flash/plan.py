@@ -131,7 +131,7 @@ class Plan:
         return ["not stored", *([f"the encoder's parameters change: {HOMING_LOST}"] if encoder else [])]
 
     def left_out(self) -> list[str]:
-        """Return what of the set is not written: by name where the map says why, the rest as a number."""
+        """Return what of the set is not written: by name where the map states why, the rest as a number."""
         named = [name for name in self.missing if name in self.reasons]
         lines = [f"not written: {name}: {self.reasons[name]}" for name in named]
         others = len(self.missing) - len(named)

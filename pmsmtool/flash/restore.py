@@ -158,7 +158,7 @@ def check_snapshot(drive_map: DriveMap, snapshot: Snapshot, identity: Identity, 
     wrong = [text for entry in snapshot.entries if (text := _strange(drive_map, entry))]
     if wrong:
         raise ConfigError(
-            "the drive's map does not know all objects of the snapshot",
+            "the drive's map lacks objects of the snapshot",
             likely="it was taken through another map",
             hint="give the map that the snapshot was taken through with --map",
             violations=wrong,
@@ -166,7 +166,7 @@ def check_snapshot(drive_map: DriveMap, snapshot: Snapshot, identity: Identity, 
 
 
 def _strange(drive_map: DriveMap, entry: Entry) -> str:
-    """Return what the map says else about an entry's name, object or size; empty when it agrees."""
+    """Return what else the map states about an entry's name, object or size; empty when it agrees."""
     if entry.name in _MARK_NAMES:
         expected = next((index, sub) for name, index, sub in MARKS if name == entry.name)
     elif entry.name in drive_map.cells or entry.name in drive_map.tables:
@@ -177,10 +177,11 @@ def _strange(drive_map: DriveMap, entry: Entry) -> str:
         return f"{entry.name}: is not in the map"
     if (entry.index, entry.sub) != expected:
         return (
-            f"{entry.name}: is 0x{entry.index:04X}:{entry.sub:02X}, the map says 0x{expected[0]:04X}:{expected[1]:02X}"
+            f"{entry.name}: is 0x{entry.index:04X}:{entry.sub:02X}, "
+            f"the map states 0x{expected[0]:04X}:{expected[1]:02X}"
         )
     size = drive_map.cells[entry.name].size if entry.name in drive_map.cells else len(entry.old)
-    return "" if len(entry.old) == size else f"{entry.name}: has {len(entry.old)} bytes, the map says {size}"
+    return "" if len(entry.old) == size else f"{entry.name}: has {len(entry.old)} bytes, the map states {size}"
 
 
 def restore_plan(drive_map: DriveMap, snapshot: Snapshot, found: Mapping[str, bytes]) -> Plan:

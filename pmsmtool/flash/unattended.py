@@ -104,7 +104,7 @@ def check_drives(identities: Sequence[Identity], serials: Mapping[int, int], can
         if listed is None:
             reasons.append(f"node {found.node}: not in the list of serial numbers")
         elif listed != found.serial or not found.serial:
-            reasons.append(f"node {found.node}: serial number {found.serial}, the list says {listed}")
+            reasons.append(f"node {found.node}: serial number {found.serial}, the list has {listed}")
         reasons += [
             f"node {found.node}: {key} {getattr(found, key)}, the canary's is {canary.get(key)}"
             for key in KIND

@@ -73,7 +73,7 @@ def flux_map_of(
 
 
 def map_estimates(result: Evaluation, flux_map: FluxMapResult, traces: Mapping[str, Trace]) -> dict[str, Estimate]:
-    """Return what the map says of the machine, by machine-file key.
+    """Return what the map states of the machine, by machine-file key.
 
     Inductances at the largest torque of the rated current; and psi_f, which the run over speeds measures at d currents
     and extrapolates, at none.

@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 NODES_MAX = 1 << 19
 """Of each of the two tables: 724 x 724, 130 MB of cells."""
 INVERSE_NODES = (129, 129)
-"""Flux nodes of the inverse table unless the map says otherwise: 4 MB of cells, built in 20 ms."""
+"""Flux nodes of the inverse table unless the map states otherwise: 4 MB of cells, built in 20 ms."""
 
 INVERSE_MARGIN = 0.01
 """The inverse table reaches beyond the fluxes of the grid by this share of their range."""

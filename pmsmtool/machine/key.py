@@ -80,7 +80,7 @@ class Key:
         if not isinstance(value, str):
             return None, f"is {_kind(value)}, not text"
         if self.choices and value not in self.choices:
-            return None, f"= {value!r} is none of {', '.join(self.choices)}{did_you_mean(value, self.choices)}"
+            return None, f"= {value!r} is not one of {', '.join(self.choices)}{did_you_mean(value, self.choices)}"
         return value, ""
 
     def _check_floats(self, value: Any) -> tuple[Value | None, str]:

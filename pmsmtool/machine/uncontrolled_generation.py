@@ -100,7 +100,7 @@ def fault_reaction(
         return FaultReaction(from_rpm, from_rpm, how, "")
     what = (
         f"a fault above {from_rpm:.4g} rpm charges the DC link over {U_dc_max_v:.4g} V (uncontrolled generation, up to "
-        f"n_trip {n_trip_rpm:.4g} rpm), and a short circuit would take i_d to {peak:.4g} A, beyond the "
+        f"n_trip {n_trip_rpm:.4g} rpm); a short circuit would take i_d to {peak:.4g} A, beyond the "
         f"{i_d_min_a:.4g} A allowed"
     )
     if protection is not None or (machine.n_nom_rpm or 0.0) > from_rpm:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a drive can give: quantity x method x expected interval x what is missing, decided from map and drive.
 
-The map says what a family can do, the drive itself must confirm it: supported modes (0x6502) and objects that answer.
+The map states what a family can do, the drive itself must confirm it: supported modes (0x6502) and objects that answer.
 Expected intervals are those measured on simulated nodes of the tier (:data:`EXPECTED`); where nothing was measured,
 nothing is said.
 """
@@ -73,7 +73,7 @@ FEATURES: Mapping[str, str] = {
     "averages": "averages inside the drive",
     "recorder": "a recorder of currents and voltages that this program reads",
     "torque mode": "torque mode (0x6502 bit 3 or 9)",
-    "push": "torque mode (0x6502 bit 3 or 9), or a velocity mode whose unit a map says, with a current limit",
+    "push": "torque mode (0x6502 bit 3 or 9), or a velocity mode whose unit a map states, with a current limit",
     "position": "position in increments of a known number per turn (0x6064 with 0x608F, or in a map of its maker)",
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
     "vendor R": "the maker's identification of R, with its result, in a map that names this drive",

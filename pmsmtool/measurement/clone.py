@@ -79,7 +79,7 @@ def clone_drive(node: DriveNode, found: Capabilities, machine_file: MachineFile,
 def drawn_truth(machine_file: MachineFile, draw: int | None) -> dict[str, Value]:
     """Return what the simulated machine really is: the file's values, or a draw around them.
 
-    A quantity without an interval stays what the file says; it must stay positive where it is a size.
+    A quantity without an interval stays what the file states; it must stay positive where it is a size.
     """
     rng = None if draw is None else np.random.default_rng([20260103, draw])
     truth: dict[str, Value] = {"pole_pairs": machine_file.machine.pole_pairs}
@@ -97,7 +97,7 @@ def drawn_truth(machine_file: MachineFile, draw: int | None) -> dict[str, Value]
 
 
 def _noise(machine_file: MachineFile) -> dict[str, Value]:
-    """Return the noise of the clone's current sensors: one step of their converter where the file says none.
+    """Return the noise of the clone's current sensors: one step of their converter where the file states none.
 
     Without noise all samples at rest are equal, and identification of the clone is refused (E_SNR).
     """

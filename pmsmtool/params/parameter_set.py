@@ -136,7 +136,7 @@ def parse_parameter_set(text: str, where: str = "params.toml") -> ParameterSet:
     found = ParameterSet(values=values, tables=tables, provenance=provenance, name=name)
     if content is not None and content != found.content_hash():
         raise ConfigError(
-            f"the content is {found.content_hash()}, the file says {content}",
+            f"the content is {found.content_hash()}, the file states {content}",
             where=f"{where}:content",
             likely="the file was edited or cut",
             hint="delete the line `content` to accept the file as it is",

@@ -69,7 +69,7 @@ UNREACHABLE_LARGEST_RISE = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What the drive says before anything moves, and what it may do.
+    """What the drive reports before anything moves, and what it may do.
 
     Attributes
     ----------

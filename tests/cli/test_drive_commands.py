@@ -300,7 +300,7 @@ def test_a_map_that_is_refused_is_refused_before_the_consent(tool: Tool, wanted:
     channel = "interior-2k2?nv=:memory:&drive=copley"
     Path("nobodys.toml").write_text(dump_drive_map(replace(load_family("copley"), vendor=0)), encoding="utf-8")
     code, _, err = tool(*command, wanted, "--map", "nobodys.toml", channel=channel)
-    assert code == 2 and "does not say whose drive it is for" in err
+    assert code == 2 and "does not state whose drive it is for" in err
     assert "->" not in err and "consent" not in err, "nothing to consent to was shown"
 
 

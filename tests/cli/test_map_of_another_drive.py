@@ -85,7 +85,7 @@ def test_nothing_is_moved_or_written_through_the_map_of_another_drive(
     code, out, err = on(channel, capsys, "--yes", *command, "--map", map_file)
     assert (code, out) == (2, ""), err
     assert "where:" in err and "0x1018" in err and "nothing was moved or written" in err
-    expected = "does not say whose drive it is for" if map_file == "nobody.toml" else "is for vendor"
+    expected = "does not state whose drive it is for" if map_file == "nobody.toml" else "is for vendor"
     assert expected in err
     assert "shaft" not in err, "no consent was asked"
     assert written == []

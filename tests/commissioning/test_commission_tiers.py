@@ -153,7 +153,7 @@ def test_what_a_family_holds_is_shown_before_and_equal_after(
 @pytest.mark.parametrize("family", [name for name in FOREIGN if not load_family(name).vendor])
 def test_nothing_is_moved_through_a_map_that_names_no_drive(family: str, designed: Path, tmp_path: Path) -> None:
     if family != "cia402":
-        refused = pytest.raises(ConfigError, match="does not say whose drive it is for")
+        refused = pytest.raises(ConfigError, match="does not state whose drive it is for")
         with refused, opened(f"&drive={family}", load_family(family)):
             pytest.fail("a drive was opened through the map of nobody's drive")
         return

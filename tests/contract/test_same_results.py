@@ -31,7 +31,7 @@ Answers = list[tuple[str, str]]
 
 
 def answer(peer: Peer, row: ObjectRow, data: bytes | None = None) -> str:
-    """Return what the drive says to a read or a write, as text."""
+    """Return what the drive reports to a read or a write, as text."""
     try:
         if data is None:
             mode = Mode.BLOCK if row.type == "DOMAIN" else Mode.AUTO

@@ -242,7 +242,7 @@ def folder(tmp_path: Path) -> JournalFolder:
 
 
 def test_a_map_without_a_vendor_writes_nothing(folder: JournalFolder) -> None:
-    with pytest.raises(ConfigError, match="does not say whose drive"):
+    with pytest.raises(ConfigError, match="does not state whose drive"):
         check_map(replace(load_family("copley"), vendor=0), Identity(1, 0xAB, 1, 1, 7), folder)
 
 

@@ -44,7 +44,7 @@ def changed(change) -> str:
         (lambda body: body["identity"].pop("name"), "name is missing"),
         (lambda body: body.update(identity=[]), "identity is not a table"),
         (lambda body: body.update(signature=None), "signature is"),
-        (lambda body: body.update(state="half"), "'half' is none of open, done, restored"),
+        (lambda body: body.update(state="half"), "'half' is not one of open, done, restored"),
         (lambda body: body.update(node=1e400), "node = inf is not finite"),
         (lambda body: body.update(entries={}), "holds no entries"),
         (lambda body: body["entries"][0].update(object="0x2010"), "is not of the form 0x2010:02"),
@@ -115,7 +115,7 @@ WRONG = {
     "another product": (of_identity(product=0x77), "product 0x00000077"),
     "another serial": (of_identity(serial=99), "serial number 99"),
     "another layout": (lambda snapshot: replace(snapshot, signature=1), "layout 0x00000001"),
-    "another object": (first_entry(sub=99), "the map says 0x"),
+    "another object": (first_entry(sub=99), "the map states 0x"),
     "another size": (first_entry(old=b"abc"), "has 3 bytes"),
     "another name": (first_entry(name="motor.none"), "is not in the map"),
 }

@@ -43,7 +43,7 @@ def test_drives_are_listed_and_of_the_canary_s_kind() -> None:
     check_drives([SECOND, THIRD], {2: 102, 3: 103, 4: 104}, CANARY)
     for serials, canary, reason in (
         ({2: 102}, CANARY, "node 3: not in the list"),
-        ({2: 102, 3: 999}, CANARY, "node 3: serial number 103, the list says 999"),
+        ({2: 102, 3: 999}, CANARY, "node 3: serial number 103, the list has 999"),
         ({2: 102, 3: 103}, {**CANARY, "software": "1.1"}, "node 2: software 1.0, the canary's is 1.1"),
     ):
         with pytest.raises(SafetyRefusal, match=reason):

@@ -129,7 +129,7 @@ R_s_ohm = 0.1
         "m.toml:14: [inverter] U_dc_v = nan is not finite",
         "m.toml:13: inverter: f_s_hz is missing (sampling and PWM frequency)",
         "m.toml:16: [std] R_s_ohm = -0.1 is below 0 ohm (of loop resistance per phase at T_ref)",
-        "m.toml:26: [simulation] inverter_model = 'switch' is none of averaged, switched; did you mean switched?",
+        "m.toml:26: [simulation] inverter_model = 'switch' is not one of averaged, switched; did you mean switched?",
         "m.toml:22: [estimate.R_s_ohm] unit = 'H' is not 'ohm'",
         "m.toml:23: [estimate] R_s: no key of the machine; did you mean R_s_ohm?",
         "m.toml:11: [machine] I_nom_apk = 30 is above I_max_apk = 20",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which recorder a drive has, by what its map says."""
+"""Which recorder a drive has, by what its map states."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COMMANDED: Mapping[str, type[CommandedRecorder]] = {
     "rows": RowRecorder,
     "rings": RingRecorder,
 }
-"""Makers' recorders by the kind a map says (``drive_maps.recorder_map.Recording``)."""
+"""Makers' recorders by the kind a map states (``drive_maps.recorder_map.Recording``)."""
 
 
 def recorder_of(node: DriveNode, period_s: float) -> Recorder:
@@ -32,7 +32,7 @@ def recorder_of(node: DriveNode, period_s: float) -> Recorder:
     Raises
     ------
     NotAvailable
-        It has none that this program reads, or its map does not say enough of it.
+        It has none that this program reads, or its map does not state enough of it.
     """
     if node.map.staging:
         return Recorder(node, period_s)

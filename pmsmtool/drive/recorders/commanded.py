@@ -37,7 +37,7 @@ class CommandedRecorder(Recorder):
     Raises
     ------
     NotAvailable
-        The drive has no such recorder, or the map does not say enough of it.
+        The drive has no such recorder, or the map does not state enough of it.
 
     Attributes
     ----------

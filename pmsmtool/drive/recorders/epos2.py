@@ -38,7 +38,7 @@ class RingRecorder(CommandedRecorder):
         unit = self._node.map.recorder.period
         if not unit:
             raise NotAvailable(
-                f"the drive map {self._node.map.name!r} does not say what one count of the recorder's period is",
+                f"the drive map {self._node.map.name!r} does not state what one count of the recorder's period is",
                 where=f"node {self._node.node}, 0x2012:00",
                 hint='from the manual of the drive, a row such as `period = { unit = "us" }` in its table [recorder]',
             )

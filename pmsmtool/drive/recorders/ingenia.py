@@ -35,7 +35,7 @@ class MonitorRecorder(CommandedRecorder):
         rate_hz, self._largest = self._get(objects.LOOP_RATE_HZ), self._get(objects.LARGEST_BYTES)
         if rate_hz <= 0:
             raise NotAvailable(
-                f"the drive says its loop runs at {rate_hz} Hz", where=f"node {self._node.node}, 0x2520:00"
+                f"the drive reports its loop runs at {rate_hz} Hz", where=f"node {self._node.node}, 0x2520:00"
             )
         return 1.0 / rate_hz
 
@@ -61,7 +61,7 @@ class MonitorRecorder(CommandedRecorder):
         if said != row_bytes:
             raise VerifyMismatch(
                 "the monitor has not taken the signals", where=f"node {self._node.node}, 0x58E4:00",
-                differences=[f"{row_bytes} bytes per row are mapped, the drive says {said}"],
+                differences=[f"{row_bytes} bytes per row are mapped, the drive reports {said}"],
                 hint="compare the types in the map's [signals] with the drive's manual",
             )  # fmt: skip
         if not self._get(objects.STATUS) & objects.ENABLED_BIT:

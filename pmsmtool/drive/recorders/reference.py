@@ -105,7 +105,7 @@ class Recorder:
         if zlib.crc32(data) != crc:
             raise VerifyMismatch(
                 "the trace is damaged", where=f"node {node.node}, 0x2062:00",
-                differences=[f"CRC-32 {zlib.crc32(data):#010x}, the drive says {crc:#010x}"], hint=MEASURE_AGAIN,
+                differences=[f"CRC-32 {zlib.crc32(data):#010x}, the drive reports {crc:#010x}"], hint=MEASURE_AGAIN,
             )  # fmt: skip
         period_s = 1e-9 * node.whole(objects.TRACE_PERIOD_NS)
         table = np.frombuffer(data, "<f4").reshape(stored, len(signals)).astype(np.float64)
