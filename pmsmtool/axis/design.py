@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 
 from pmsmtool.axis.loops import AxisGains, AxisPath
 from pmsmtool.axis.mechanics import Mechanics, mechanics_of
-from pmsmtool.axis.reference import Profile, jerk_limited
+from pmsmtool.axis.reference import Profile, jerk_limited, plan
 from pmsmtool.axis.search import Box, Case, Judged, Limits, stiffest
+from pmsmtool.axis.tracking import best_share, following_error
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop
 from pmsmtool.design.loops.sampled_loop import SampledLoop
@@ -40,17 +41,22 @@ SPEED_LOOP, POSITION_LOOP = "axis_speed", "axis_position"
 
 ASSUMED_RATE_HZ = 1000.0
 """Rate of the loops of a drive that says none."""
-OWN_TORQUE = 0.2
-"""Half width (relative) of a torque per ampere that the drive holds or that is taken from psi_f without knowing whether
-the drive's amperes are peak, rms or block: the middle of peak and rms is 19 % from both."""
+OWN_TORQUE = 0.1
+"""Half width (relative) of the torque of an ampere that the drive itself holds, whatever its ampere is: as true as a
+data sheet's."""
+UNKNOWN_KIND = 0.2
+"""Of one taken from psi_f, where nothing says if the drive's amperes are peak, rms or block: the middle of peak and rms
+is 19 % from both."""
 RESONANCE = 0.03
 """Half width (relative) of a resonance without a standard deviation."""
 DAMPING_SHARE = 0.5
-"""Smallest damping looked at, of the one measured."""
+"""Smallest damping looked at, of one without a standard deviation."""
 SPEED_SHARE = 0.8
 """Speed of a move, of the largest speed that has its torque."""
 TORQUE_SHARE = 0.6
 """Torque of the acceleration, of the largest one beyond friction: the rest is for the loops."""
+WAY_RAD = math.pi
+"""Way of the move whose following error is predicted, at these limits."""
 RAMP = 4.0
 """Ramp of the acceleration on a rigid shaft, in time constants J / K_p of the speed loop: torque follows to 2 %."""
 
@@ -114,6 +120,8 @@ class AxisDrive:
         Period of its loops as its map states (s).
     amperes : bool
         Whether its gains are in amperes.
+    holds_torque : bool
+        Whether it holds the torque of an ampere itself.
     """
 
     name: str
@@ -121,6 +129,7 @@ class AxisDrive:
     own_core: bool
     period_s: float | None = None
     amperes: bool = False
+    holds_torque: bool = False
 
     @property
     def pid(self) -> bool:
@@ -175,7 +184,7 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
     source = design.machine
     shaft = mechanics_of(source)
     path, notes = axis_path(design, request, drive, shaft)
-    box = Box(path, cases(source, drive.amperes))
+    box = Box(path, cases(source, drive))
     limits, notch = Limits(request.phase_margin_deg, request.peak_db), NOTCH[0] in drive.offers
     if drive.pid:  # the controller of the speed acts in velocity modes alone
         speed = stiffest(box, limits, notch=notch, loops=("speed",))
@@ -204,7 +213,16 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
         design, request=asked, facts=facts, values=kept, notes=(*design.notes, *notes),
         loops={name: loop for name, loop in design.loops.items() if name != "speed"},
     )  # fmt: skip
-    values = axis_values(source, speed, position, profile, drive, how)
+    jerk = profile if drive.own_core or PROFILE[3] in drive.offers else replace(profile, jerk=math.inf)
+    move = plan(WAY_RAD, jerk)
+    share, error = best_share(*following_error(box.plant, path, position, move))
+    predicted: dict[str, Scalar] = {
+        "axis_inertia_ff_share": share,
+        "axis_following_error_rad": error,
+        "axis_friction_error_rad": (source.machine.tau_c_nm or 0.0) / position.pid[0],
+    }
+    base = replace(base, facts={**base.facts, **predicted})
+    values = axis_values(source, speed, position, share, profile, drive, how)
     return AxisDesign(_judged(base, values, box, speed, position), box, speed, position)
 
 
@@ -272,20 +290,29 @@ def _current(design: Design) -> SampledLoop:
     return axis_loop(gains, plant, plant if design.request.get("predictor") else None)
 
 
-def cases(source: MachineFile, amperes: bool) -> tuple[Case, ...]:
+def cases(source: MachineFile, drive: AxisDrive) -> tuple[Case, ...]:
     """Return the corners of the tolerance box that decide the loops: torque over inertia, resonance and damping."""
     factors = tolerance_box(source).factors
     inertia = factors["J_kgm2"].half_width
-    torque = OWN_TORQUE if amperes else factors["psi_f_wb"].half_width if "psi_f_wb" in factors else 0.0
+    torque = factors["psi_f_wb"].half_width if "psi_f_wb" in factors else 0.0
+    if drive.amperes:
+        torque = OWN_TORQUE if drive.holds_torque else UNKNOWN_KIND
     ends = ((1.0 - torque) / (1.0 + inertia), (1.0 + torque) / (1.0 - min(inertia, 0.8)))
     f_r = source.machine.resonance_hz
     if f_r is None:
         return tuple(Case(end) for end in ends)
-    doubt = RESONANCE
-    if "resonance_hz" in source.std:
-        doubt = (NORMAL_95 * source.std["resonance_hz"] + source.systematic.get("resonance_hz", 0.0)) / f_r
+    doubt = _half_width(source, "resonance_hz", f_r, RESONANCE)
+    zeta = source.machine.resonance_zeta
+    least = 1.0 - (_half_width(source, "resonance_zeta", zeta, DAMPING_SHARE) if zeta else DAMPING_SHARE)
     shifts = (1.0 - doubt, 1.0 + doubt)
-    return tuple(Case(end, shift, DAMPING_SHARE) for end in ends for shift in shifts)
+    return tuple(Case(end, shift, max(least, 0.1)) for end in ends for shift in shifts)
+
+
+def _half_width(source: MachineFile, key: str, value: float, otherwise: float) -> float:
+    """Return half of the 95 % interval of a key, relative; ``otherwise`` where the file has no standard deviation."""
+    if key not in source.std:
+        return otherwise
+    return (NORMAL_95 * source.std[key] + source.systematic.get(key, 0.0)) / value
 
 
 def profile_of(design: Design, shaft: Mechanics, gains: AxisGains, T: float) -> Profile:
@@ -307,25 +334,32 @@ def profile_of(design: Design, shaft: Mechanics, gains: AxisGains, T: float) -> 
 
 
 def axis_values(
-    source: MachineFile, speed: AxisGains, position: AxisGains, profile: Profile, drive: AxisDrive, how: str
+    source: MachineFile,
+    speed: AxisGains,
+    position: AxisGains,
+    inertia_share: float,
+    profile: Profile,
+    drive: AxisDrive,
+    how: str,
 ) -> dict[str, DesignValue]:
     """Return the values of an axis by catalogue name; those of other makers' drives as far as this one has objects."""
     machine = source.machine
     J, B = machine.J_kgm2 or 0.0, machine.B_nms or 0.0
     K_P, K_I, K_D = position.pid
+    forward = f"{inertia_share:g} of the inertia: the least predicted following error"
     notch = "at the resonance" if position.notch.hz else "off: not needed, or the drive has none"
     profile_how = f"{SPEED_SHARE:g} of the largest speed, {TORQUE_SHARE:g} of the torque beyond friction"
     found = {
         SPEED[0]: DesignValue(speed.K_p, how, SPEED_LOOP),
         SPEED[1]: DesignValue(speed.K_i, how, SPEED_LOOP),
-        SPEED_FORWARD[0]: DesignValue(J, "inertia"),
+        SPEED_FORWARD[0]: DesignValue(inertia_share * J, forward),
         SPEED_FORWARD[1]: DesignValue(B, "viscous friction"),
         NOTCH[0]: DesignValue(position.notch.hz, notch),
         NOTCH[1]: DesignValue(position.notch.zeta_num, notch),
         NOTCH[2]: DesignValue(position.notch.zeta_den, notch),
         CASCADE[0]: DesignValue(position.K_v, how, POSITION_LOOP),
         CASCADE[1]: DesignValue(1.0, "the whole speed of the reference"),
-        CASCADE[2]: DesignValue(J, "inertia"),
+        CASCADE[2]: DesignValue(inertia_share * J, forward),
         PID[0]: DesignValue(K_P, how, POSITION_LOOP),
         PID[1]: DesignValue(K_I, how, POSITION_LOOP),
         PID[2]: DesignValue(K_D, how, POSITION_LOOP),

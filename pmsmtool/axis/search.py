@@ -126,6 +126,11 @@ class Box:
             for loop in loops
         )
 
+    @property
+    def plant(self) -> Lifted:
+        """The path with the nominal shaft."""
+        return self._plants[1.0, 1.0]
+
     def _scaled(self, case: Case) -> Lifted:
         plant = self._plants[case.frequency, case.damping]
         return replace(plant, b=plant.b * case.gain, d=plant.d * case.gain)

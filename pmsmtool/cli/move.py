@@ -29,7 +29,10 @@ from pmsmtool.cli.output import Output, table
 if TYPE_CHECKING:
     from pmsmtool.axis.move import MoveResult
     from pmsmtool.drive.position_drive import PositionDrive
+    from pmsmtool.machine.machine_file import MachineFile
+    from pmsmtool.machine.parameters import Estimate
     from pmsmtool.run_directory import RunDirectory
+    from pmsmtool.trace import Trace
 
 TRAVEL_MARGIN, SPEED_MARGIN = 1.25, 1.5
 """Limits over what is asked for: an overshoot by a badly damped loop is seen, and more ends the move."""
@@ -55,6 +58,11 @@ SHOWN = {"rad": (math.degrees, "deg"), "s": (lambda value: 1e3 * value, "ms")}
 @click.option("--speed", "speed_rad_s", type=SPEED, help="Speed of the move.  [default: as the drive holds it]")
 @click.option("--acceleration", type=float, metavar="RAD/S2", help="Acceleration of the move.  [default: as the drive "
               "holds it]")  # fmt: skip
+@click.option("--identify", "machine", metavar="MACHINE", help="Find inertia and friction of this machine (a machine "
+              "file) from the moves.")  # fmt: skip
+@click.option("-o", "--output", "path", type=FILE, metavar="FILE", help="Machine file to write with what --identify "
+              "found.  [default: machine.toml of the run]")  # fmt: skip
+@click.option("--times", type=click.IntRange(1, 20), help="Moves there and back.  [default: 1, with --identify 4]")
 @click.option("--settle", "settle_s", type=DURATION, default="0.5s", help="How long to look on after the demand ended.")
 @click.option(
     "--runs",
@@ -69,13 +77,17 @@ SHOWN = {"rad": (math.degrees, "deg"), "s": (lambda value: 1e3 * value, "ms")}
 @output_options
 def move_command(
     bus: BusOptions, motion: MotionOptions, out: Output, way_rad: float, design: Path | None, speed_rad_s: float | None,
-    acceleration: float | None, settle_s: float, runs: Path, map_file: Path | None,
+    acceleration: float | None, machine: str | None, path: Path | None, times: int | None, settle_s: float, runs: Path,
+    map_file: Path | None,
 ) -> None:  # fmt: skip
     """Move the shaft by an angle and back with the position loop that the drive holds, and record how it followed.
 
     The drive runs the move itself (profile position mode) and shows its demand, so that following error, settling and
     current are those of its own loop. Nothing of the drive is changed for longer than the move. Do it before and after
     `flash-params`, then `pmsmtool diff RUN RUN` compares both: the same move with the stored and with the new gains.
+
+    With --identify: inertia and Coulomb friction of MACHINE from the current of the moves, for a drive without a torque
+    mode. They rest on the flux linkage and the pole pairs of MACHINE. Exit code 6 when the moves do not identify them.
     """
     from pmsmtool.axis.move import UNITS, move_result
     from pmsmtool.cli.consent import ask_motion
@@ -85,12 +97,15 @@ def move_command(
     from pmsmtool.errors import ConfigError
     from pmsmtool.experiments.move import record_move
     from pmsmtool.flash.map_gate import check_motion
+    from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.run_directory import Stage
     from pmsmtool.trace_file import trace_npz
     from pmsmtool.units import rad_s_from_rpm
 
     if not way_rad:
         raise ConfigError("--by 0 moves nothing", hint="give a way, e.g. --by 90deg")
+    source = None if machine is None else load_machine_file(machine)
+    times = times or (1 if source is None else IDENTIFY_TIMES)
     drive_map = read_map(map_file)
     profile = _profile(design, speed_rad_s, acceleration)
     with bus.connect() as connection:
@@ -105,14 +120,16 @@ def move_command(
                 hint="give --speed-max",
             )  # fmt: skip
         envelope = Envelope(
-            i_max_apk=motion.i_max_apk or drive.current_allowed_apk, speed_max_rad_s=speed_max, duration_s=DURATION_S,
-            travel_rad=TRAVEL_MARGIN * abs(way_rad), shaft=motion.shaft or "free", load=motion.load, brake=motion.brake,
+            i_max_apk=motion.i_max_apk or drive.current_allowed_apk, speed_max_rad_s=speed_max,
+            duration_s=DURATION_S * times, travel_rad=TRAVEL_MARGIN * abs(way_rad),
+            shaft=motion.shaft or "free", load=motion.load, brake=motion.brake,
         )  # fmt: skip
         envelope.refuse_gravity()
         drive.error_limit_rad = ERROR_SHARE * abs(way_rad)
         lines = [
             *envelope.lines(),
-            f"the shaft moves by {math.degrees(way_rad):.4g} deg and back with the drive's own position loop",
+            f"the shaft moves by {math.degrees(way_rad):.4g} deg and back with the drive's own position loop, {times} "
+            f"time{'s' if times > 1 else ''}",
             f"voltage off at a following error of {math.degrees(drive.error_limit_rad):.3g} deg",
             *(f"lent: {name} {value:.5g} {_unit(name)}" for name, value in lent.items()),
             "nothing is stored in the drive; every changed object is restored",
@@ -122,7 +139,7 @@ def move_command(
         with guarded(drive, envelope, say=out.note) as guard:
             guard.write(lent)
             began = connection.clock.now()
-            trace = record_move(guard, drive, way_rad, settle_s)
+            trace = record_move(guard, drive, way_rad, settle_s, times)
             seconds = connection.clock.now() - began
         drive.close()
     run.save(TRACE, trace_npz(trace))
@@ -135,8 +152,43 @@ def move_command(
             summary=f"following error at most {peak:.4g} deg, settled in {1e3 * found.settling_s:.3g} ms",
         )
     )  # fmt: skip
-    out.result("move", {"run": run.path, "move": asdict(found), "lent": lent}, lambda: _lines(found))
+    told = {} if source is None else _identified(source, trace, drive, run, path, out)
+    data = {"run": run.path, "move": asdict(found), "lent": lent, "identified": told}
+    out.result("move", data, lambda: [*_lines(found), *_told(told)])
     out.note(f"run: {run.path}")
+
+
+IDENTIFY_TIMES = 4
+"""Moves there and back for inertia and friction: sixteen halves."""
+
+
+def _identified(
+    source: MachineFile, trace: Trace, drive: PositionDrive, run: RunDirectory, path: Path | None, out: Output
+) -> dict[str, Estimate]:
+    """Find inertia and friction, write the machine file, and return both."""
+    from pmsmtool.files import write_file
+    from pmsmtool.identification.move_mechanics import move_mechanics
+    from pmsmtool.identification.tier_machine import tier_machine
+    from pmsmtool.machine.machine_file import dump_machine_file
+
+    ratios = move_mechanics(trace, pole_pairs=source.machine.pole_pairs, undecided=drive.current_undecided)
+    made = tier_machine(source, ratios, "as given").machine
+    assert made is not None
+    text = dump_machine_file(made)
+    run.save("machine.toml", text)
+    if path is not None:
+        write_file(path, text)
+        out.note(f"wrote {path}")
+    return {name: made.estimates[name] for name in ("J_kgm2", "tau_c_nm") if name in made.estimates}
+
+
+def _told(found: dict[str, Estimate]) -> list[str]:
+    from pmsmtool.estimators.estimate import total_half_width
+
+    rows = [
+        (name, f"{e.value:.4g}", f"{total_half_width(e):.2g}", e.unit, e.fallback or "-") for name, e in found.items()
+    ]
+    return ["", *table(("identified", "value", "+- 95 %", "unit", "note"), rows)] if rows else []
 
 
 _SPEED, _UP, _DOWN, _JERK = (

@@ -11,6 +11,7 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.params.catalogue import TORQUE_PER_AMPERE
 from pmsmtool.params.parameter_set import ParameterSet
 
 
@@ -20,7 +21,7 @@ def axis_drive(drive_map: DriveMap) -> AxisDrive:
     return AxisDrive(
         drive_map.name, frozenset(drive_map.cells), drive_map.staging,
         period.number if period is not None and period.number else None,
-        any(cell.form == "current" for cell in drive_map.cells.values()),
+        any(cell.form == "current" for cell in drive_map.cells.values()), TORQUE_PER_AMPERE in drive_map.cells,
     )  # fmt: skip
 
 

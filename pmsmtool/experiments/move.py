@@ -15,7 +15,7 @@ ARRIVED = 1e-3
 """The demand has arrived when it is this near to its end, of the way."""
 
 
-def record_move(guard: GuardedDrive, drive: PositionDrive, way_rad: float, settle_s: float) -> Trace:
+def record_move(guard: GuardedDrive, drive: PositionDrive, way_rad: float, settle_s: float, times: int = 1) -> Trace:
     """Move by an angle and back, each time waiting until the demand has arrived and ``settle_s`` longer; stop.
 
     Returns
@@ -34,7 +34,7 @@ def record_move(guard: GuardedDrive, drive: PositionDrive, way_rad: float, settl
     drive.begin_samples()
     try:
         guard.wait(HOLD_S)
-        for target in (way_rad, 0.0):
+        for target in (way_rad, 0.0) * times:
             drive.move_to(target)
             _arrive(guard, drive, target, way_rad)
             guard.wait(settle_s)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from pmsmtool.machine.machine_file import load_machine_file
 from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import Row, epos4, write_eds
 
@@ -17,6 +18,7 @@ POSITION: tuple[Row, ...] = (
 )  # fmt: skip
 ASKED = ("--by", "60deg", "--speed", "300rpm", "--acceleration", "300", "--settle", "0.2s", "--map", "epos4",
          "--yes", "--json")  # fmt: skip
+J = 0.015
 MOST = 0.5
 """Following error with the new gains over that with the stored ones; measured 0.08."""
 
@@ -36,9 +38,12 @@ def test_the_same_move_with_stored_and_with_new_gains(tool: Tool, drive: Sequenc
     assert tool("tune", "interior-2k2", "-o", "axis.toml", "--axis", "--map", "epos4")[0] == 0
     code, _, said = tool("flash-params", "axis.toml", "--map", "epos4", *drive, "--yes")
     assert code == 0, said
-    code, printed, said = tool("move", *ASKED, *drive)
+    code, printed, said = tool("move", *ASKED, *drive, "--identify", "interior-2k2", "--times", "2")
     assert code == 0, said
     after = json.loads(printed)
+    inertia = after["identified"]["J_kgm2"]  # 0.015 kg m2; its interval holds for peak and rms
+    assert abs(inertia["value"] - J) < inertia["systematic"] + 2.0 * inertia["std"] < 0.5 * J
+    assert load_machine_file(after["run"]).machine.J_kgm2 == inertia["value"]
     assert after["move"]["error_peak_rad"] < MOST * before["move"]["error_peak_rad"]
     code, printed, _ = tool("diff", before["run"], after["run"], "--check", "--json")
     rows = {row["name"]: row for row in json.loads(printed)["moves"]}

@@ -48,8 +48,8 @@ class SetUp:
         Encoder counts per turn.
     K_p_v_per_a, K_i_v_per_as : float
         Gains of the current loops.
-    J_kgm2 : float
-        Inertia, for the speed loop.
+    J_kgm2, J_load_kgm2 : float
+        Inertia of the motor, for the speed loop; of the load besides, for the position loop.
     """
 
     pole_pairs: int
@@ -63,6 +63,7 @@ class SetUp:
     K_p_v_per_a: float
     K_i_v_per_as: float
     J_kgm2: float
+    J_load_kgm2: float = 0.0
 
     @property
     def torque_constant(self) -> float:
@@ -84,7 +85,7 @@ def set_up_of(machine_file: MachineFile) -> SetUp:
         values["motor.I_max_apk"], abs(machine_file.machine.torque_nm(0.0, i_nom)) or 1.0, values["motor.n_max_rpm"],
         1 << bits if bits else IDEAL_ENCODER_COUNTS,
         values["current.K_p_q_v_per_a"], values["current.K_i_q_v_per_as"],
-        settings_of(machine_file).number("J_kgm2"),
+        settings_of(machine_file).number("J_kgm2"), settings_of(machine_file).number("J_load_kgm2"),
     )  # fmt: skip
 
 
@@ -136,7 +137,7 @@ class Behind:
     _slope: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
-        self.position_gains = stored_gains(self.set_up.J_kgm2)
+        self.position_gains = stored_gains(self.set_up.J_kgm2 + self.set_up.J_load_kgm2)
 
     # ---- what is shown --------------------------------------------------------------------------
 

@@ -77,7 +77,7 @@ Counted = tuple[int, int, float]
 
 def _position_pid(P: Counted, integral: Counted, D: Counted, motor: SetUp) -> Iterator[Law]:
     """Gains of the position in amperes, as its maker's tool leaves them."""
-    pid = stored_gains(motor.J_kgm2).pid or [0.0, 0.0, 0.0]
+    pid = stored_gains(motor.J_kgm2 + motor.J_load_kgm2).pid or [0.0, 0.0, 0.0]
 
     def taking(place: int, ampere: float) -> Callable[[Behind, float], None]:
         def act(behind: Behind, counts: float) -> None:

@@ -16,6 +16,8 @@ from pmsmtool.sim.foreign.file_rows import MakersObjects
 
 ASSUMED = "assumed"
 STANDARD = "CiA 402-2"
+PROFILE_SHARE, PROFILE_RPS2 = 0.2, 40.0
+"""Speed of a move over the largest one, and its acceleration (turns/s2), where the file leaves them blank."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +113,11 @@ def standard_laws(objects: MakersObjects, set_up: SetUp, per_turn: float, per_rp
     yield Law(0x6064, 0, STANDARD, show=lambda behind: behind.position(turned * per_turn))
     yield Law(0x606C, 0, speed, show=lambda behind: back * per_rps * behind.turns_per_s())
     yield Law(0x60FF, 0, speed, act=lambda behind, n: behind.command_speed(back * n / per_rps))
+    for index, turns in (
+        (0x6081, PROFILE_SHARE * set_up.n_max_rpm / 60.0), (0x6083, PROFILE_RPS2), (0x6084, PROFILE_RPS2),
+    ):  # fmt: skip
+        if objects.stored(index) == 0:
+            yield Law(index, 0, f"{speed}; of a move {ASSUMED}", set_up=per_rps * turns)
     if objects.stored(0x608F, 1) <= 1:
         yield Law(0x608F, 1, STANDARD, set_up=set_up.counts)
         yield Law(0x608F, 2, STANDARD, set_up=1.0)

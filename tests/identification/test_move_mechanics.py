@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: MIT
+"""Inertia and friction from position moves: a shaft whose numbers are known, moved by a loop that saturates nothing."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pmsmtool.axis.reference import Profile, plan
+from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.identification.move_mechanics import halves_of_moves, move_mechanics
+from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.trace import Trace
+
+J, TAU_C, PSI, POLES = 2.4e-3, 0.08, 0.11, 4
+WAY = 2.6
+COUNT = 2.0 * math.pi / 8192
+
+
+def moves(times: int, seed: int, acceleration: float = 150.0) -> Trace:
+    """Moves there and back at 1 kHz: whole counts of the angle, a noisy current, friction that opposes the speed."""
+    rng = np.random.default_rng(seed)
+    move = plan(WAY, Profile(20.0, acceleration, 20_000.0))
+    span = move.duration_s + 0.2
+    t = np.arange(0.0, 2 * times * span + 0.2, 1e-3)
+    angle, speed, rise = (np.zeros_like(t) for _ in range(3))
+    for k in range(2 * times):
+        sign = 1.0 if k % 2 == 0 else -1.0
+        for total, part in zip((angle, speed, rise), move.at(t - 0.2 - k * span), strict=True):
+            total += sign * part
+    torque = J * rise + TAU_C * np.sign(np.where(np.abs(speed) > 1e-9, speed, 0.0))
+    current = torque / torque_per_ampere(POLES, PSI) + rng.normal(0.0, 0.02, t.size)
+    seen = np.round((angle + rng.normal(0.0, 0.2 * COUNT, t.size)) / COUNT) * COUNT
+    signals = {"theta_ref_rad": angle, "theta_m_rad": seen, "i_q_a": current}
+    return Trace(t, signals, {"theta_ref_rad": "rad", "theta_m_rad": "rad", "i_q_a": "A"}, {"way_rad": WAY})
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_intervals_hold_the_truth(seed: int) -> None:
+    found = move_mechanics(moves(4, seed), pole_pairs=POLES, undecided=False)
+    inertia, friction = found["J_per_psi"], found["tau_c_per_psi"]
+    assert abs(inertia.value - J / PSI) < total_half_width(inertia) < 0.05 * J / PSI
+    assert abs(friction.value - TAU_C / PSI) < total_half_width(friction) < 0.3 * TAU_C / PSI
+    assert inertia.method == "regression over position moves"
+
+
+def test_amperes_of_unknown_kind_widen_the_interval_to_both_readings() -> None:
+    """Read as rms, they are sqrt 2 larger than peak ones would be: the interval holds both."""
+    found = move_mechanics(moves(4, 7), pole_pairs=POLES, undecided=True)["J_per_psi"]
+    for truth in (J / PSI, math.sqrt(0.5) * J / PSI):
+        assert abs(found.value - truth) < total_half_width(found)
+
+
+def test_every_move_has_two_halves() -> None:
+    assert len(halves_of_moves(moves(3, 1))) == 12
+
+
+def test_one_move_is_not_enough() -> None:
+    single = moves(1, 1)
+    kept = single.t_s < 0.2 + 0.5 * (single.t_s[-1] - 0.2)
+    first = Trace(single.t_s[kept], {k: v[kept] for k, v in single.signals.items()}, single.units, single.meta)
+    with pytest.raises(IdentificationError, match="E_EXCITATION"):
+        move_mechanics(first, pole_pairs=POLES, undecided=False)
