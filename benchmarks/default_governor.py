@@ -6,14 +6,20 @@ seconds per machine. A third of the machines is saturated (around the profile ``
 saliency of 1.5 to 3, a third less; delay 1.5 periods. Each law drives the project's own plant with ideal sensors and an
 ideal bridge at a constant speed of up to 1.2 of the base speed either way: from one reachable current to another, or to
 one that the voltage does not reach. Settled: within 2 % of the step (1 % of I_max at least) of where the current ends.
+*Voltage binds*: reachable steps in which the law without governor demands more than V_max after the step.
+
+``--noise 0.0018`` adds white noise to the phase currents (of I_max, rms: 0.1 A on 56 A). ``--second-plant`` takes motor
+and bridge of ``benchmarks/second_plant``, which knows no flux map: the saturated third stays on the project's own.
 
 Laws: the default; the same without governor; both with predictor. Settling is compared case by case. Exit code 1: the
-default exceeds ``OVER`` on a machine without saturation, or is slower than ``SLOWER`` on reachable steps.
+default exceeds ``OVER``, is slower than ``SLOWER`` on reachable steps, or settles later than ``LATE_P95_MS`` (95 %) or
+``LATEST_MS`` where the voltage does not reach the reference.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import sys
 from dataclasses import replace
@@ -23,6 +29,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from benchmarks import second_plant
 from benchmarks.random_drives import draw_around, draw_drive
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import ratings
@@ -45,6 +52,8 @@ OVER = 1.05
 """Largest current over I_max."""
 SLOWER = 1.02
 """Upper end of the interval of the paired settling, over that without governor."""
+LATE_P95_MS, LATEST_MS = 12.0, 40.0
+"""Settling on references out of reach."""
 KINDS = ("linear", "salient", "saturated")
 REQUESTS = {
     "default": TuneRequest(),
@@ -109,8 +118,11 @@ class Steps:
 
 def run(
     source: MachineFile, params: ParameterSet, step: tuple[float, tuple[float, float], tuple[float, float]]
-) -> tuple[float, float]:
-    """Return settling (s; the whole time when it does not settle) and largest current over I_max."""
+) -> tuple[float, float, bool]:
+    """Return settling (s; the whole time when it does not settle), largest current (A), and whether V_max was passed.
+
+    The last: the demanded voltage after the step.
+    """
     rpm, start, target = step
     schedule = {
         name: ((0.0, a), (BEFORE_S, a), (BEFORE_S, b))
@@ -126,7 +138,8 @@ def run(
     band = max(BAND * math.dist(before, end), 0.01 * (source.machine.I_max_apk or 1.0))
     off = np.flatnonzero(np.hypot(*(after - end[:, None])) > band)
     settled = (0 if not len(off) else int(off[-1]) + 1) * float(trace.t_s[1] - trace.t_s[0])
-    return settled, float(np.hypot(*after).max())
+    demanded = np.hypot(trace["u_d_v"], trace["u_q_v"])[k:].max()
+    return settled, float(np.hypot(*after).max()), bool(demanded > 1.001 * source.inverter.V_max_v)
 
 
 def ratio(pairs: np.ndarray) -> tuple[float, float, float]:
@@ -144,35 +157,33 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--steps", type=int, default=12)
     parser.add_argument("--kind", choices=KINDS)
+    parser.add_argument("--noise", type=float, default=0.0, metavar="SHARE")
+    parser.add_argument("--second-plant", action="store_true")
     parser.add_argument("--list", action="store_true", help="print every case")
     asked = parser.parse_args()
-    rows: dict[str, list[tuple[str, int, bool, float, float]]] = {law: [] for law in REQUESTS}
+    rows: dict[str, list[tuple[str, int, bool, bool, float, float]]] = {law: [] for law in REQUESTS}
     for k in range(asked.machines):
         kind = asked.kind or KINDS[k % len(KINDS)]
         source = draw(kind, 1000 * asked.seed + k)
         steps = Steps(source, 1000 * asked.seed + k)
         cases = [(reachable, steps.draw(reachable)) for reachable in (True, False) for _ in range(asked.steps)]
-        for law, request in REQUESTS.items():
-            params = tune(source, request).parameter_set()
-            for n, (reachable, step) in enumerate(cases):
-                settled, peak = run(source, params, step)
-                rows[law].append((kind, k, reachable, settled, peak / steps.rated.I_max_apk))
-                if asked.list:
-                    print(
-                        law,
-                        kind,
-                        k,
-                        n,
-                        reachable,
-                        step,
-                        f"{1e3 * settled:.2f} ms",
-                        f"{rows[law][-1][-1]:.3f}",
-                        flush=True,
-                    )
+        noise = {"sensor_noise_apk": asked.noise * steps.rated.I_max_apk}
+        drive = replace(source, simulation={**source.simulation, **noise})
+        sets = {law: tune(source, request).parameter_set() for law, request in REQUESTS.items()}
+        other = asked.second_plant and kind != "saturated"
+        with second_plant.used() if other else contextlib.nullcontext():
+            binds = [run(drive, sets["no governor"], step)[2] for _, step in cases]
+            for law, params in sets.items():
+                for n, (reachable, step) in enumerate(cases):
+                    settled, peak, _ = run(drive, params, step)
+                    rows[law].append((kind, k, reachable, binds[n], settled, peak / steps.rated.I_max_apk))
+                    if asked.list:
+                        print(law, kind, k, n, reachable, step, f"{1e3 * settled:.2f} ms", f"{rows[law][-1][-1]:.3f}")
     failed = False
     for kind in KINDS:
         for reachable in (True, False):
-            chosen = {law: np.array([r[3:] for r in rows[law] if r[0] == kind and r[2] == reachable]) for law in rows}
+            chosen = {law: np.array([r[4:] for r in rows[law] if r[0] == kind and r[2] == reachable]) for law in rows}
+            binding = np.array([r[3] for r in rows["default"] if r[0] == kind and r[2] == reachable])
             if not len(chosen["default"]):
                 continue
             for law, found in chosen.items():
@@ -182,16 +193,20 @@ def main() -> int:
                     f"{np.median(ms):6.2f} p95 {np.percentile(ms, 95):6.2f} max {ms.max():6.2f}; over "
                     f"{OVER:g} I_max {int((found[:, 1] > OVER).sum())} of {len(ms)}, most {found[:, 1].max():.3f}"
                 )
-            failed |= kind != "saturated" and bool((chosen["default"][:, 1] > OVER).any())
-            for law, other in (
+            failed |= bool((chosen["default"][:, 1] > OVER).any())
+            ms = 1e3 * chosen["default"][:, 0]
+            failed |= not reachable and bool(np.percentile(ms, 95) > LATE_P95_MS or ms.max() > LATEST_MS)
+            for law, other_law in (
                 ("default", "no governor"),
                 ("predictor", "predictor, no governor"),
                 ("predictor", "default"),
             ):
-                pairs = np.stack([chosen[law][:, 0], chosen[other][:, 0]], axis=1)
-                mean, low, high = ratio(pairs)
-                print(f"    {law} / {other}: {mean:.3f} ({low:.3f} to {high:.3f})")
-                failed |= reachable and (law, other) == ("default", "no governor") and high > SLOWER
+                pairs = np.stack([chosen[law][:, 0], chosen[other_law][:, 0]], axis=1)
+                text = "{:.3f} ({:.3f} to {:.3f})".format(*ratio(pairs))
+                if reachable and binding.any():
+                    text += "; voltage binds: {:.3f} ({:.3f} to {:.3f})".format(*ratio(pairs[binding]))
+                print(f"    {law} / {other_law}: {text}")
+                failed |= reachable and (law, other_law) == ("default", "no governor") and ratio(pairs)[2] > SLOWER
     return int(failed)
 
 

@@ -76,7 +76,7 @@ def main() -> int:
         designed = tune(source).parameter_set()
         for law, params in (("table", designed), ("no table", without_table(designed))):
             for reachable, case in cases:
-                settled, peak = run(source, params, case)
+                settled, peak, _ = run(source, params, case)
                 found.setdefault((law, reachable), []).append((1e3 * settled, peak / steps.rated.I_max_apk))
         for predictor in (False, True) if asked.hunt else ():
             params = tune(source, TuneRequest(predictor=predictor)).parameter_set()

@@ -53,10 +53,6 @@ SHORT_HORIZON = 10
 ROWS_IN_DRIVE = 64
 """Prediction rows the drive has (``PMSM_GOVERNOR_ROWS``)."""
 
-STEERED_SALIENCY = 1.5
-"""Inductance ratio up to which the flux is steered along the minimum-time direction. On the way it leads i_d far off,
-which is torque where the machine is salient: 2.4 times the final torque was seen on a saturated PM-SyRM."""
-
 EULER_ANGLES = 36
 """Directions of current and voltage over which the prediction error is maximised."""
 
@@ -148,8 +144,7 @@ def design_governor(
     found = horizon(model, omega, V_max, chosen) if predicts else None
     listed = {f"k_max_eps_{e:g}": _fact(horizon(model, omega, V_max, e)) for e in EPS_LISTED if predicts}
     observer = 0.0 if source.flux_map is not None else min(1.0, source.inverter.T_s / OBSERVER_TIME_S)
-    apart = _not_steered(source, predictor)
-    options, how = _options(mode, predictor, apart)
+    options, how = _options(mode, predictor)
     values = {
         "governor.mode": DesignValue(MODES[mode], f"{mode}, as asked for"),
         "governor.k_max": _k_max(found),
@@ -210,31 +205,12 @@ def _k_max(found: Horizon | None) -> DesignValue:
     return DesignValue(min(found.k_max, ROWS_IN_DRIVE - 1), f"redundancy test over all states, eps {found.eps:g}")
 
 
-def _not_steered(source: MachineFile, predictor: bool) -> str:
-    """Return why the flux is not steered along the minimum-time direction; empty when it is."""
-    if source.flux_map is not None or source.machine.saliency > STEERED_SALIENCY:
-        return "on the way the reluctance torque would overshoot"
-    if source.inverter.delay_periods >= 1.0 and not predictor:  # 43 of 80 unreachable steps: up to 1.27 I_max
-        return "without the predictor it passes the current limit during the delay"
-    return ""
-
-
-def _options(mode: str, predictor: bool, apart: str) -> tuple[int, str]:
-    parts: dict[str, tuple[tuple[int, str], ...]] = {
-        "line": ((CURRENT_ROW, "current row"), (PRE_PROJECTION, "pre-projection")),
-        "best": (
-            (CURRENT_ROW, "current row"),
-            (PRE_PROJECTION, "pre-projection"),
-            *(((MINIMUM_TIME, "minimum-time direction"),) if not apart else ()),
-        ),
-    }
-    chosen = parts.get(mode, ())
+def _options(mode: str, predictor: bool) -> tuple[int, str]:
+    row = (CURRENT_ROW, "current row"), (PRE_PROJECTION, "pre-projection")
+    chosen = {"line": row, "best": (*row, (MINIMUM_TIME, "minimum-time direction"))}.get(mode, ())
     bits = sum(bit for bit, _ in chosen) | (PREDICTOR if predictor and mode != "off" else 0)
     names = [name for _, name in chosen] + (["predictor"] if bits & PREDICTOR else [])
-    how = ", ".join(names) or "none"
-    if mode == "best" and apart:
-        how += f"; no minimum-time direction: {apart}"
-    return bits, how
+    return bits, ", ".join(names) or "none"
 
 
 def _notes(mode: str, error: float, eps: float, found: Horizon | None, model: PredictionModel) -> tuple[str, ...]:

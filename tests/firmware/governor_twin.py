@@ -30,6 +30,8 @@ from tests.firmware.projection_twin import (
 EMPTY, STEERED = 254, 250
 EMPTY_MARGIN, HOLD_SHARE, LANDING_REST, ACCURACY, CLOSE_SHARE = f(1.00001), f(0.99), f(0.26), f(1e-2), f(0.95)
 STILL_SHARE, MODEL_SHARE = f(0.2), f(0.1)
+MEAN_WEIGHT, SURE_SHARE, SLOW_GAIN, NEAR_SHARE = f(0.05), f(0.01), f(0.1), f(0.2)
+SHRINK, FORCED = f(0.95), f(1.2)
 TRIALS, INSIDE = 2, f(0.9999995)
 FLAG_FALLBACK = 64
 
@@ -45,6 +47,7 @@ class GovernedTwin(Twin):
     time_to_go: np.float32 = ZERO
     landing: bool = False
     news: list[np.float32] = field(default_factory=lambda: [ZERO, ZERO])
+    mean: list[np.float32] = field(default_factory=lambda: [ZERO, ZERO])
     off_model: bool = False
     u: Vector = (ZERO, ZERO)
     reachable: Vector | None = None
@@ -68,10 +71,13 @@ class GovernedTwin(Twin):
         sine, cosine = sincos(f(-0.5) * self.T_s * self.omega)
         u = park(self.committed, s * cosine + c * sine, c * cosine - s * sine)
         mean = HALF * (self.i[0] + self.before[0]), HALF * (self.i[1] + self.before[1])
-        model, rate, gain = self.model_voltage(mean), ONE / self.T_s, self["governor.observer_gain"]
+        model, rate = self.model_voltage(mean), ONE / self.T_s
         inductive = [self[f"motor.L_{axis}_h"] * ((self.i[k] - self.before[k]) * rate) for k, axis in enumerate("dq")]
         d, before, power = self.disturbance, self.news, self.V_max * self.V_max
         self.news = news = [u[k] - model[k] - inductive[k] - d[k] for k in range(2)]
+        self.mean = [m + MEAN_WEIGHT * (x - m) for m, x in zip(self.mean, news, strict=True)]
+        lasting = square((self.mean[0], self.mean[1])) / (SURE_SHARE * SURE_SHARE * power)
+        gain = self["governor.observer_gain"] * min(max(lasting, SLOW_GAIN), ONE)
         if square((inductive[0], inductive[1])) <= STILL_SHARE * STILL_SHARE * power:
             agreed = [ZERO if a * b <= 0 else (a if abs(a) < abs(b) else b) for a, b in zip(news, before, strict=True)]
             self.disturbance = d[0] + gain * agreed[0], d[1] + gain * agreed[1]
@@ -289,13 +295,17 @@ class GovernedTwin(Twin):
             (self["motor.psi_f_wb"] + self["motor.L_d_app_h"] * x[0], self["motor.L_q_app_h"] * x[1])
             for x in (self.i, target)
         )
+        direct = square((b[0] - a[0], b[1] - a[1]))
+        near = NEAR_SHARE * self.V_max * self.T_s
+        if direct <= near * near:
+            self.time_to_go = ZERO
+            return None, False
         drops = tuple((HALF * (R * x[0] + offset[0]), HALF * (R * x[1] + offset[1])) for x in (self.i, target))
         T, m = self.time_to_go - self.T_s, None
         if T > 0:
             T, m = self.find_time((a, b, drops), T, least)
         elif may_start and not self.is_cornered(offset):
-            direct = f(0.7) * np.sqrt(square((b[0] - a[0], b[1] - a[1]))) / self.V_max
-            T, m = self.find_time((a, b, drops), max(direct, least), least)
+            T, m = self.find_time((a, b, drops), max(f(0.7) * np.sqrt(direct) / self.V_max, least), least)
         else:
             T = ZERO
         self.time_to_go = T if m is None else ZERO
@@ -325,7 +335,7 @@ class GovernedTwin(Twin):
         hold = model[0] + offset[0], model[1] + offset[1]
         free = i[0] - per[0] * hold[0], i[1] - per[1] * hold[1]
         limit, now = self["governor.I_transient_apk"], square(i)
-        bound = now if now > limit * limit else limit * limit
+        bound = max(SHRINK * now, limit * limit) if now <= FORCED * (limit * limit) else now
         step = per[0] * w[0], per[1] * w[1]
         if square((free[0] + step[0], free[1] + step[1])) <= bound:
             return w

@@ -91,6 +91,34 @@ static uint32_t asks_first(const pmsm_params *params)
     return (params->governor_mode == PMSM_GOVERNOR_PAPER || params->governor_mode == PMSM_GOVERNOR_BEST) ? 1u : 0u;
 }
 
+/* The current controllers act on the sampled current, their voltage a period later. */
+static uint32_t acts_late(const pmsm_params *params)
+{
+    return (params->inverter_delay_periods >= 1.0F && pmsm_uses_predictor(params) == 0u) ? 1u : 0u;
+}
+
+/* A voltage that acts late meets another current than the sampled one: the transfer starts from the predicted one. */
+static enum pmsm_transfer steer(pmsm_period *period, const pmsm_governor_rows *rows, pmsm_dq r, pmsm_dq *v)
+{
+    if (acts_late(period->params) == 0u) {
+        return pmsm_minimum_time(period, &rows->row[0], rows->offset, r, rows->may_start, v);
+    }
+    const pmsm_dq sampled = period->i_model;
+    const pmsm_magnetics *magnetics = period->magnetics;
+    const pmsm_magnetics here = *magnetics;
+    period->i_model = pmsm_predict_current(period);
+    if (magnetics == &period->state->local) {
+        pmsm_saturate(period, period->i_model);
+    }
+    const enum pmsm_transfer found =
+        pmsm_minimum_time(period, &rows->row[0], rows->offset, r, rows->may_start, v);
+    if (magnetics == &period->state->local) {
+        period->state->local = here;
+    }
+    period->i_model = sampled;
+    return found;
+}
+
 /* An inadmissible request: along the minimum-time direction where that is asked for and possible, else what the solver
  * of the mode finds. Whether row 0 and the steady state can be met at once is settled first: an empty set changes what
  * the direction may do to the current, and the smallest steady-state voltage is then the answer. So it is where the
@@ -108,9 +136,9 @@ static pmsm_dq restrain(pmsm_period *period, pmsm_governor_rows *rows, pmsm_dq r
     rows->smallest = v;
     *binding = PMSM_BINDING_EMPTY;
     period->flags |= (empty != 0u) ? (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK : 0u;
-    const enum pmsm_transfer transfer = pmsm_minimum_time(period, &rows->row[0], rows->offset, r, rows->may_start, &v);
+    const enum pmsm_transfer transfer = steer(period, rows, r, &v);
     if (transfer == PMSM_TRANSFER_FOUND) {
-        state->landing = 1u;
+        state->landing = (acts_late(period->params) == 0u) ? 1u : 0u; /* what is on its way would be asked for again */
         *binding = PMSM_BINDING_MINIMUM_TIME;
         return v;
     }

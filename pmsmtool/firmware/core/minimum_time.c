@@ -9,6 +9,7 @@
 #include "pmsm_period.h"
 
 #define SHORTEST_PERIODS PMSM_C(3.0) /* a shorter transfer is left to the projection */
+#define NEAR_SHARE PMSM_C(0.2)       /* of V_max T_s: a shorter way may be noise, and is left to the projection */
 #define TRIALS 2u /* then the search goes on in the next period; 2.8 in the mean to start, 1 to follow */
 #define DIRECT_SHARE PMSM_C(0.7)     /* first guess, of the time at standstill */
 #define GROWTH PMSM_C(1.0)           /* of T, where the gap does not close yet */
@@ -16,6 +17,8 @@
 #define LONGEST_ANGLE PMSM_C(100.0)  /* rad */
 #define HOLD_SHARE PMSM_C(0.99)      /* of V_max: a current that needs more is not held at its limit */
 #define CLOSE_SHARE PMSM_C(0.95)     /* of the transient current limit */
+#define SHRINK PMSM_C(0.95)          /* of the square of a current little beyond the limit, in a period */
+#define FORCED PMSM_C(1.2)           /* of the square of the limit: the EMF has driven a current that far beyond */
 #define ACCURACY PMSM_C(1e-2)        /* of V T, before the last step of Newton's method */
 
 typedef struct {
@@ -93,16 +96,10 @@ static enum pmsm_transfer find_time(const transfer *t, pmsm_real least, pmsm_rea
     return (*T * pmsm_abs(t->omega) <= LONGEST_ANGLE) ? PMSM_TRANSFER_SOUGHT : PMSM_TRANSFER_NONE;
 }
 
-static pmsm_dq flux(const pmsm_magnetics *m, pmsm_dq i)
-{
-    const pmsm_dq psi = {m->psi_f + m->L_d_app * i.d, m->L_q_app * i.q};
-    return psi;
-}
-
-/* Does the Euler step under w keep the transient current limit, or not let a current beyond it grow? If not, turn w,
- * keeping its size, just so far that it does: the path slides along the limit with the full voltage, on the side
- * nearer to w. Not while the voltage cannot hold the present current: getting out of there goes first.
- * 0: w would break the limit. */
+/* Does the Euler step under w keep the transient current limit? A current little beyond it (an inductance that is off
+ * has led it there) is led back, one far beyond it must not grow. If not, turn w, keeping its size, just so far that it
+ * does: the path slides along the limit with the full voltage, on the side nearer to w. Not while the voltage cannot
+ * hold the present current: getting out of there goes first. 0: w would break the limit. */
 static uint32_t keep_current(const pmsm_period *period, pmsm_dq offset, pmsm_dq *w)
 {
     const pmsm_params *params = period->params;
@@ -110,16 +107,17 @@ static uint32_t keep_current(const pmsm_period *period, pmsm_dq offset, pmsm_dq 
     const pmsm_dq model = pmsm_model_voltage(period, i);
     const pmsm_real per_d = period->state->derived.T_s / period->magnetics->L_d;
     const pmsm_real per_q = period->state->derived.T_s / period->magnetics->L_q;
-    const pmsm_dq free = {i.d - per_d * (model.d + offset.d), i.q - per_q * (model.q + offset.q)}; /* at zero voltage */
+    const pmsm_dq hold = {model.d + offset.d, model.q + offset.q};
+    const pmsm_dq free = {i.d - per_d * hold.d, i.q - per_q * hold.q}; /* at zero voltage */
     const pmsm_real limit = (pmsm_real)params->governor_I_transient_apk;
+    const pmsm_real most = limit * limit;
     const pmsm_real now = pmsm_square(i);
-    const pmsm_real square = (now > limit * limit) ? now : limit * limit;
+    const pmsm_real square = (now <= FORCED * most) ? ((SHRINK * now > most) ? SHRINK * now : most) : now;
     pmsm_dq step = {per_d * w->d, per_q * w->q};
     const pmsm_dq next = {free.d + step.d, free.q + step.q};
     if (pmsm_square(next) <= square) {
         return 1u;
     }
-    const pmsm_dq hold = {model.d + offset.d, model.q + offset.q};
     if (pmsm_square(hold) > HOLD_SHARE * HOLD_SHARE * period->V_max * period->V_max) {
         return 0u;
     }
@@ -168,18 +166,23 @@ enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, p
     const pmsm_dq i = period->i_model;
     const pmsm_real half = PMSM_C(0.5);
     const pmsm_real R = period->R_s;
-    const transfer t = {flux(period->magnetics, i), flux(period->magnetics, target),
+    const transfer t = {pmsm_flux(period, i), pmsm_flux(period, target),
                         {half * (R * i.d + offset.d), half * (R * i.q + offset.q)},
                         {half * (R * target.d + offset.d), half * (R * target.q + offset.q)},
                         period->omega_e, period->V_max};
     const pmsm_real least = SHORTEST_PERIODS * T_s;
     pmsm_real T = state->time_to_go - T_s;
+    const pmsm_dq way = {t.b.d - t.a.d, t.b.q - t.a.q};
+    const pmsm_real near = NEAR_SHARE * t.V * T_s;
+    if (pmsm_square(way) <= near * near) {
+        state->time_to_go = PMSM_C(0.0);
+        return PMSM_TRANSFER_NONE;
+    }
     pmsm_dq m;
     enum pmsm_transfer found = PMSM_TRANSFER_NONE;
     if (T > PMSM_C(0.0)) {
         found = find_time(&t, least, &T, &m);
     } else if (may_start != 0u && is_cornered(period, offset) == 0u) {
-        const pmsm_dq way = {t.b.d - t.a.d, t.b.q - t.a.q};
         T = DIRECT_SHARE * PMSM_SQRT(pmsm_square(way)) / t.V;
         T = (T > least) ? T : least;
         found = find_time(&t, least, &T, &m);

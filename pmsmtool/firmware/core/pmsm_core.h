@@ -153,6 +153,7 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_dq current_before;  /* A, sampled in the last period */
     pmsm_dq reference_realised; /* A, reference of the last period that its limited voltage stood for */
     pmsm_dq news_before;     /* V, what the last period said beside disturbance */
+    pmsm_dq news_mean;       /* V, its mean over some 20 periods */
     pmsm_real tau_granted;   /* N m, torque of the reference that the limits left */
     pmsm_real time_to_go;    /* s, of the minimum-time transfer in progress, 0 when there is none */
     pmsm_dq reachable;       /* A, a request's projection on steady-state and current row */

@@ -42,6 +42,7 @@ void pmsm_prepare(pmsm_state *state, const pmsm_params *params);
 
 /* saturation.c: period->magnetics at a current, from the table of the parameter set */
 void pmsm_saturate(pmsm_period *period, pmsm_dq i);
+pmsm_dq pmsm_flux(const pmsm_period *period, pmsm_dq i); /* Wb, at any current */
 
 /* reference.c: protection, torque and speed to a current request */
 void pmsm_update_i2t(pmsm_period *period);

@@ -30,11 +30,10 @@ static uint32_t left_node(pmsm_real x, uint32_t count, pmsm_real *rest)
     return k;
 }
 
-void pmsm_saturate(pmsm_period *period, pmsm_dq i)
+static void read_table(const pmsm_period *period, pmsm_dq i, pmsm_magnetics *m)
 {
     const pmsm_params *p = period->params;
     const pmsm_derived *derived = &period->state->derived;
-    pmsm_magnetics *m = &period->state->local;
     const pmsm_real i_d_min = (pmsm_real)p->saturation_i_d_min_a;
     const pmsm_real i_q_max = (pmsm_real)p->saturation_i_q_max_a;
     const pmsm_real size_q = pmsm_abs(i.q);
@@ -61,5 +60,22 @@ void pmsm_saturate(pmsm_period *period, pmsm_dq i)
     m->L_q_app = (size_q > edge.q) ? m->L_q + (found[1] - m->L_q) * edge.q / size_q : found[1];
     m->K_p.d = m->L_d * derived->gain_per_L.d;
     m->K_p.q = m->L_q * derived->gain_per_L.q;
-    period->magnetics = m;
+}
+
+void pmsm_saturate(pmsm_period *period, pmsm_dq i)
+{
+    read_table(period, i, &period->state->local);
+    period->magnetics = &period->state->local;
+}
+
+pmsm_dq pmsm_flux(const pmsm_period *period, pmsm_dq i)
+{
+    const pmsm_magnetics *m = period->magnetics;
+    pmsm_magnetics there;
+    if (m == &period->state->local) {
+        read_table(period, i, &there);
+        m = &there;
+    }
+    const pmsm_dq psi = {m->psi_f + m->L_d_app * i.d, m->L_q_app * i.q};
+    return psi;
 }

@@ -35,6 +35,7 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->reference_realised = zero;
     state->disturbance = zero;
     state->news_before = zero;
+    state->news_mean = zero;
     state->fw_reference = zero;
     state->time_to_go = PMSM_C(0.0);
     state->landing = 0u;
