@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pmsmtool.commissioning.first_check_tiers import judge_kept
 from pmsmtool.identification.wiring import NOT_CHECKED, WRONG, judge_current, judge_push
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
@@ -73,6 +74,16 @@ def test_pushes_are_judged_by_current_way_and_sign() -> None:
     assert pushed((0.9, -0.9), (0.3, 0.2)) == {"shaft": WRONG}
     assert pushed((0.1, -0.1), (0.0, 0.0)) == {"phases": WRONG, "shaft": "not seen"}
     assert pushed((0.71, -0.71), (0.3, -0.2))["shaft"] == "ok", "a reading as peak of what is rms"
+
+
+@pytest.mark.parametrize(
+    ("shares", "kept"),
+    [((0.9, 0.9), True), ((0.71, 0.65), True), ((1.41, 1.3), True), ((0.33, 0.9), False), ((1.6, -0.05), False)],
+)
+def test_a_push_without_its_current_is_about_the_phases(shares: tuple[float, float], kept: bool) -> None:
+    signals = {"i_command_a": np.array([2.0, -2.0]), "i_q_a": np.array([2.0, -2.0]) * shares}
+    found = judge_kept(Trace(np.array([0.0, 1.0]), signals, dict.fromkeys(signals, "A"), {}))
+    assert [row.looked_at for row in found if row.verdict == WRONG] == ([] if kept else ["phases"])
 
 
 def test_a_current_that_breaks_in_at_some_angles_is_an_open_phase() -> None:
