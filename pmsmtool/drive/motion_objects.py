@@ -138,6 +138,9 @@ def rated_apk(node: DriveNode) -> float:
     found = held(node, objects.RATED_CURRENT_MA)
     if found is not None:
         return RATED_RMS * found
+    row = node.map.motion.get("rated_current")
+    if row is not None and row.number:  # no object holds it: its owner wrote it into the map
+        return row.per_count * row.number
     own = _own(node, "rated_current")
     found = None if own is None else held(node, own.item)
     if own is None or found is None:

@@ -25,6 +25,8 @@ DIMENSIONS: Mapping[str, str] = {
     "loop_period": "time",
 }
 """Rows the table may have, and what each counts."""
+FIXED: Mapping[str, str] = {"counts_per_turn": "1", "loop_period": "s", "rated_current": ""}
+"""Rows that may be a number, which the drive's owner knows where no object holds it, and their unit without one."""
 UNDECIDED = " peak-or-rms"
 """End of a unit of current whose kind no source says."""
 _KEYS = ("index", "sub", "type", "unit", "mode", "number", "source")
@@ -86,7 +88,7 @@ def parse_motion(
         if name not in DIMENSIONS:
             tell("", f"no such row; there are {', '.join(DIMENSIONS)}")
         elif isinstance(row, dict) and "number" in row:
-            found = _fixed(row, sources, tell)
+            found = _fixed(name, row, sources, tell)
             good |= {} if found is None else {name: found}
         elif check_object(row, _KEYS, tell):
             found = _object(name, row, tell)
@@ -94,17 +96,29 @@ def parse_motion(
     return good
 
 
-def _fixed(row: Mapping[str, Any], sources: Mapping[str, str], tell: Complain) -> MotionObject | None:
-    number, source = row["number"], row.get("source", "")
+def _fixed(name: str, row: Mapping[str, Any], sources: Mapping[str, str], tell: Complain) -> MotionObject | None:
+    number, source, unit = row["number"], row.get("source", ""), row.get("unit", FIXED.get(name, ""))
     if type(number) not in (int, float) or not 0.0 < number < 2.0**32:
         tell("number", "number must be positive")
     elif source not in sources:
         tell("source", "a fixed number needs a source in [sources]")
-    elif set(row) - {"number", "source"}:
-        tell("", "a fixed number has a source and nothing else")
+    elif set(row) - {"number", "source", "unit"}:
+        tell("", "a fixed number has a source, a unit, and nothing else")
+    elif name not in FIXED:
+        tell("number", f"no fixed number, but an object; a number may be {', '.join(FIXED)}")
+    elif _dimension(unit, tell) == DIMENSIONS[name]:
+        return MotionObject(number=float(number), unit=unit, source=source)
     else:
-        return MotionObject(number=float(number), source=source)
+        tell("unit", f"unit {unit!r}: {DIMENSIONS[name]} expected, of a current peak or rms")
     return None
+
+
+def _dimension(unit: object, tell: Complain) -> str:
+    try:
+        return wire_unit(str(unit)).dimension
+    except ValueError as error:
+        tell("unit", f"unit {unit!r}: {error}")
+        return ""
 
 
 def _object(name: str, row: Mapping[str, Any], tell: Complain) -> MotionObject | None:
@@ -126,11 +140,12 @@ def _object(name: str, row: Mapping[str, Any], tell: Complain) -> MotionObject |
 def dump_motion(rows: Mapping[str, MotionObject]) -> dict[str, dict[str, Any]]:
     """Return the table as a map file holds it."""
 
-    def row(item: MotionObject) -> dict[str, Any]:
+    def row(name: str, item: MotionObject) -> dict[str, Any]:
         if item.number:
-            return {"number": item.number, "source": item.source}
+            unit = {} if item.unit == FIXED[name] else {"unit": item.unit}
+            return {"number": item.number, "source": item.source} | unit
         found: dict[str, Any] = {"index": item.index, "sub": item.sub, "type": item.wire, "unit": item.unit}
         found |= {"mode": item.mode} if item.mode else {}
         return found | ({"source": item.source} if item.source else {})
 
-    return {name: row(item) for name, item in rows.items()}
+    return {name: row(name, item) for name, item in rows.items()}

@@ -20,6 +20,7 @@ product = 7
 current_limit = { index = 0x2001, sub = 1, type = "UNSIGNED32", unit = "mA peak-or-rms", source = "doc" }
 target_current = { index = 0x2002, sub = 0, type = "INTEGER16", unit = "0.01 A peak", mode = -3, source = "doc" }
 counts_per_turn = { number = 524288, source = "doc" }
+rated_current = { number = 4.2, unit = "A rms", source = "doc" }
 
 [sources]
 doc = "manual, p. 3"
@@ -32,6 +33,8 @@ def test_rows_are_read_and_written_back() -> None:
     assert limit.undecided and limit.per_count == pytest.approx(1e-3 * math.sqrt(2.0)), "as if rms"
     assert not target.undecided and target.per_count == pytest.approx(0.01) and target.mode == -3
     assert drive_map.motion["counts_per_turn"].number == 524288 and not drive_map.motion["counts_per_turn"].index
+    rated = drive_map.motion["rated_current"]
+    assert rated.per_count * rated.number == pytest.approx(4.2 * math.sqrt(2.0))
     assert parse_drive_map(dump_drive_map(drive_map)) == drive_map
 
 
@@ -46,6 +49,10 @@ def test_rows_are_read_and_written_back() -> None:
         ("number = 524288", "number = 0", "must be positive"),
         ('number = 524288, source = "doc"', "number = 524288", "needs a source"),
         ("index = 0x2001", "index = 0x1016", "outside 0x2000"),
+        ('"A rms"', '"A"', "peak or rms"),
+        ('unit = "A rms", ', "", "unit"),
+        ('"A rms"', '"A peak-or-rms"', "unit"),
+        ("rated_current =", "speed_limit =", "no fixed number"),
     ],
 )
 def test_mistakes_are_named(old: str, new: str, said: str) -> None:

@@ -7,6 +7,7 @@ The limits of every class of drive stand in ``tests/drive``; here is what differ
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,12 +24,25 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import WATCH_S, guarded
 from pmsmtool.drive.motion_objects import position_units, watched_by_tool
 from pmsmtool.drive.tier_drives import SpeedPushDrive, TorqueDrive, pushing_drive
+from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import family_of, load_family
 from pmsmtool.errors import DriveFault, LimitExceeded, NotAvailable, SafetyRefusal
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.node.node import Node
 from pmsmtool.sim.node.session import Session
-from tests.foreign.data_sheets import EXPECTED_PDO, GUARDING, HEARTBEAT, Row, copley, epos4, faulhaber, write_eds
+from tests.foreign.data_sheets import (
+    COMMON,
+    EXPECTED_PDO,
+    GUARDING,
+    HEARTBEAT,
+    TORQUE,
+    Row,
+    copley,
+    epos4,
+    faulhaber,
+    identity,
+    write_eds,
+)
 
 ENVELOPE = Envelope(i_max_apk=3.0, speed_max_rad_s=100.0)
 DECLARED_S = 1e-3 * CONSUMER_MS + REACTION_S
@@ -325,3 +339,31 @@ def test_heartbeat_stays_the_first_choice(tmp_path: Path) -> None:
     with opened(tmp_path, (*copley(), *HEARTBEAT)) as rig, guarded(rig.drive, ENVELOPE) as guard:
         assert guard.proof is not None and guard.proof.by == "heartbeat"
         assert rig.number(0x100C) == 0
+
+
+def test_what_only_its_owner_knows_moves_a_drive(tmp_path: Path) -> None:
+    """Torque mode and a torque limit in permille, but neither a rated current nor counts per turn: Eyou's drives."""
+    own = (0x6072, 0, "U16", "rw", "1000"), (0x6502, 0, "U32", "ro", "0x8")
+    rows = (*COMMON, *HEARTBEAT, *TORQUE, *identity(0x668, 1), (0x6007, 0, "I16", "rw", "2"), *own)
+    eds = write_eds(tmp_path / "drive.eds", rows)
+    numbers = """
+        [capabilities]
+        torque_mode = true
+        [motion]
+        rated_current = { number = 6.0, unit = "A peak", source = "plate" }
+        counts_per_turn = { number = 131072, source = "plate" }
+        [sources]
+        plate = "name plate"
+        """
+    head = 'schema = "pmsmtool.drive-map/1"\nname = "mine"\nvendor = 0x668\nproduct = 1\n'
+    with connect("pmsmsim", f"interior-2k2?nv=:memory:&eds={eds}") as connection:
+        with pytest.raises(NotAvailable, match="increments"):
+            pushing_drive(connection, 1, load_family("cia402"))
+        drive = pushing_drive(connection, 1, parse_drive_map(head + textwrap.dedent(numbers)))
+        assert drive.rated_apk == pytest.approx(6.0) and drive.counts_per_turn == 131072
+        with guarded(drive, ENVELOPE) as guard:
+            guard.enable()
+            guard.command_current(0.0, 1.0)
+            guard.wait(2.0 * WATCH_S)
+            assert abs(guard.live("omega_e_rad_s")) > 1.0
+        drive.close()
