@@ -85,16 +85,17 @@ def in_python(path: Path, text: str) -> Iterator[Mutation]:
         if found:
             yield Mutation(path, begin + found.start(), symbol, other)
 
+    tree = ast.parse(text)
     hidden = {
         id(inner)
-        for node in ast.walk(ast.parse(text))
+        for node in ast.walk(tree)
         for name in ("annotation", "returns", "decorator_list")
         for part in [getattr(node, name, None)]
         for top in (part if isinstance(part, list) else [part])
         if isinstance(top, ast.AST)
         for inner in ast.walk(top)
     }
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(tree):
         if id(node) in hidden:
             continue
         if isinstance(node, ast.Compare):
