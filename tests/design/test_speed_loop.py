@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
-from pmsmtool.design.loops.sampled_loop import margins
+from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import (
     Notch,
     SpeedGains,
@@ -101,8 +101,16 @@ def test_symmetric_ratio_is_the_textbook_one() -> None:
 
 
 def test_a_crossover_beyond_the_small_time_constants_is_refused() -> None:
-    with pytest.raises(DesignInfeasible, match="crossover"):
+    with pytest.raises(DesignInfeasible, match="crossover") as refused:
         symmetric_optimum(J, 3e-3, 0.9)
+    assert "below 53.1 Hz" in refused.value.hint, "1 / (2 pi 3 ms)"
+
+
+def test_the_bandwidth_is_where_the_closed_loop_has_fallen_by_three_decibels() -> None:
+    """L = k / (z - 1): |k / (z - 1 + k)|^2 = 1/2 at cos(theta) = (1 + (1 - k)^2 - 2 k^2) / (2 (1 - k))."""
+    k, T_s = 0.1, 1e-4
+    theta = math.acos((1.0 + (1.0 - k) ** 2 - 2.0 * k**2) / (2.0 * (1.0 - k)))
+    assert margins(SampledLoop((k,), (1.0, -1.0), T_s)).bandwidth_rad_s == pytest.approx(theta / T_s, rel=1e-6)
 
 
 def test_pole_placement_on_the_stiff_machine() -> None:

@@ -27,6 +27,12 @@ class DriveContract:
         assert drive.identity.vendor == 0x706D736D and drive.identity.serial != 0 and drive.identity.name
         assert 1e-5 < drive.period_s < 1e-3
 
+    def test_a_set_of_another_layout_is_refused(self, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch) -> None:
+        drive.parameters.check_layout()
+        monkeypatch.setattr("pmsmtool.drive.parameters.layout_signature", lambda: 7)
+        with pytest.raises(NotAvailable, match="signature 0x00000007"):
+            drive.parameters.check_layout()
+
     def test_parameters_are_written_and_read_back(self, drive: CanopenDrive) -> None:
         old = drive.read("motor.R_s_ohm")
         drive.write({"motor.R_s_ohm": 0.25, "motor.pole_pairs": 5})
