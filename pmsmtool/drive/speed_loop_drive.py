@@ -18,7 +18,7 @@ import numpy as np
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
-from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits, held
+from pmsmtool.drive.motion_objects import POSITION, TORQUE_PERMILLE, allowed, current_limits, held, rated_current
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S
@@ -88,6 +88,8 @@ class SpeedLoopDrive(TorqueDrive):
         Velocity mode: cyclic (9) where it has one, for it knows no ramp, else 3.
     rad_s_per_count : float
         One count of 0x60FF; until it is measured the largest that occurs.
+    read_as_rms : bool
+        Whether the current that is shown was taken as rms without a source: a share of 0x6075 is, too.
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
 
@@ -113,6 +115,10 @@ class SpeedLoopDrive(TorqueDrive):
         self.commands_bounded_current = allowed(self.node, iter(limits)) is not None
         allows = [limit.per_count * value for limit in limits if (value := held(self.node, limit.item)) is not None]
         self.current_limit_apk = min(allows, default=math.inf)
+        base = rated_current(self.node)
+        of_standard = base is not None and base.item == objects.RATED_CURRENT_MA
+        share = self._current.item in (objects.CURRENT_PERMILLE, TORQUE_PERMILLE)
+        self.read_as_rms = self.current_undecided or (of_standard and share)
         self.oscillation = Oscillation()
         self.sends = True
         self._sending: AbstractContextManager[LiveValues] | None = None

@@ -52,7 +52,7 @@ def shown_currents(file: MachineFile, measured: LearnedLoop, drive: SpeedLoopDri
     psi_std = _relative(file, "psi_f_wb", machine.psi_f_wb, PSI_STD)
     return convention(
         measured.base, rotor_of(file), torque_per_ampere(machine.pole_pairs, machine.psi_f_wb), psi_std,
-        READ_AS_RMS if drive.current_undecided else 1.0,
+        READ_AS_RMS if drive.read_as_rms else 1.0,
     )  # fmt: skip
 
 

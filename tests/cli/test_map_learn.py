@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -102,6 +103,8 @@ def test_learned_gains_are_the_drawn_ones_and_go_into_a_map(bench: Bench, tool: 
     drawn, found = bench.drawn, {row["name"]: row for row in facts["gains"]}
     assert found[GAIN]["scale"] == pytest.approx(drawn.K_p_nms_per_rad, rel=0.12)
     assert found[INTEGRAL]["form"] == drawn.form == "time"
+    per_ampere, kind = facts["currents"]["torque_per_ampere"], math.sqrt(2.0) if drawn.rms else 1.0
+    assert per_ampere == pytest.approx(kind * facts["currents"]["expected_peak"], rel=0.12), "0x6075 may be either"
     assert found[INTEGRAL]["scale"] in (None, pytest.approx(drawn.integral_scale, rel=0.12))
     cells = parse_drive_map((tmp_path / "mine.toml").read_text(encoding="utf-8")).cells
     assert cells[GAIN].source == "measured" and (cells[GAIN].index, cells[GAIN].sub) == drawn.gain
