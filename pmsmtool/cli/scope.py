@@ -70,7 +70,8 @@ def scope_command(
     """Show live signals against time on a page in the browser; nothing is commanded.
 
     SIGNAL is a name of `monitor`, or several with * and ?. The page is at the address that is printed, for browsers on
-    this computer only (127.0.0.1). The simulated drive of this process runs at the pace of the wall clock.
+    this computer only (127.0.0.1). It zooms and moves, has two cursors and a trigger, and writes CSV and PNG. The
+    simulated drive of this process runs at the pace of the wall clock.
     """
     from pmsmtool.cli.live_server import LiveServer, Samples
     from pmsmtool.drive.objects import signal_unit

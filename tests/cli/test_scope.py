@@ -286,11 +286,11 @@ def test_a_late_browser_gets_what_is_kept_in_pieces() -> None:
 # ---- the page ----------------------------------------------------------------------------------------------
 
 BROWSER = r"""
-const vm = require("vm"), [page, stream] = JSON.parse(require("fs").readFileSync(0, "utf8"));
+const vm = require("vm"), [page, stream, acts] = JSON.parse(require("fs").readFileSync(0, "utf8"));
 const ops = [], ids = {}, made = [];
 function element(tag) {
-  const e = {tag, style: {}, kids: [], textContent: "", clientWidth: 900, clientHeight: 208, setAttribute() {},
-    addEventListener() {}, append(...k) { e.kids.push(...k); },
+  const e = {tag, style: {}, kids: [], on: {}, textContent: "", clientWidth: 900, clientHeight: 208, setAttribute() {},
+    addEventListener(n, f) { e.on[n] = f; }, append(...k) { e.kids.push(...k); }, setPointerCapture() {},
     replaceChildren(...k) { e.kids = k; if (k[0].value) e.value = (k.find(o => o.selected) || k[0]).value; },
     getContext: () => new Proxy({}, {get: (t, n) => (...a) => ops.push([n, ...a]), set: () => true})};
   made.push(tag);
@@ -308,8 +308,14 @@ vm.runInNewContext(page.match(/<script>([\s\S]*?)<\/script>/)[1], {
 });
 for (const [name, data] of stream) source.on[name]({data: JSON.stringify(data)});
 frame();
+for (const [id, event, given] of acts || []) {
+  const e = id === "canvas" ? find("panels").kids.find(k => k.tag === "canvas") : find(id);
+  if (event === "value") e.value = given; else e.on[event]({preventDefault() {}, ...given});
+  frame();
+}
 const legends = find("panels").kids.filter(k => k.className === "legend");
 console.log(JSON.stringify({ops, made, state: find("state").firstChild.textContent, closed: source.closed,
+  readout: find("cursor").textContent, times: ops.filter(o => o[0] === "fillText" && / s$/.test(o[1])).map(o => o[1]),
   text: find("state").lastChild.textContent, title: find("title").textContent,
   values: legends.map(l => l.kids.map(s => s.kids[1] + s.kids[2].textContent + s.kids[3]))}));
 """
@@ -336,3 +342,32 @@ def test_the_page_draws_what_it_is_told_and_says_how_it_ended() -> None:
     drawn = [op for op in found["ops"] if op[0] == "lineTo"]
     assert 1000 < len(drawn) < 8000 and all(0.0 <= x <= 900.0 and 0.0 <= y <= 208.0 for _, x, y in drawn)
     assert not {"img", "script"} & set(found["made"])
+
+
+def acted(*acts: tuple[str, str, Any]) -> dict[str, Any]:
+    """What the page shows after acts on it: a saw of 1 s over 20 s, sampled every 10 ms."""
+    rows = [[0.01 * k, (k % 100) / 100.0] for k in range(2001)]
+    head = {"title": "drive", "keep_s": 60.0, "signals": [{"name": "a", "unit": "A"}]}
+    given = json.dumps([template("scope.html.j2").render(), [("head", head), ("samples", rows)], acts])
+    done = subprocess.run(["node", "-e", BROWSER], input=given, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node to run the page's script in")
+def test_cursors_zoom_and_trigger_of_the_page() -> None:
+    """The canvas draws from 64 to 892 px: 20 s of it at first, so 207 px are 5 s."""
+    clicks = [("canvas", kind, {"offsetX": x}) for x in (271, 478) for kind in ("pointerdown", "pointerup")]
+    readout = acted(*clicks)["readout"]
+    assert "A 5.0000 s" in readout and "B 10.0000 s" in readout and "B - A: 5 s   a 0 A" in readout
+    assert "A 5" not in acted(*clicks, ("clear", "click", {}))["readout"]
+    wheel = ("canvas", "wheel", {"offsetX": 478, "deltaY": -1000})
+    assert acted(wheel)["times"][-1] == "11 s", "e^2 of 20 s around 10 s: 8.65 to 11.35 s"
+    dragged = [("canvas", "pointerdown", {"offsetX": 478}), ("canvas", "pointermove", {"offsetX": 271})]
+    assert acted(wheel, *dragged)["times"][-1] == "12 s", "a quarter of 2.7 s later"
+    assert acted(wheel, ("canvas", "dblclick", {}))["times"][-1] == "20 s", "live again"
+    armed = [("span", "value", "2"), ("level", "value", "0.5"), ("edge", "value", "1"), ("source", "value", "1")]
+    assert acted(*armed, ("source", "change", {}))["times"][-1] == "19 s", "the edge at 17.5 s: 17.1 to 19.1 s"
+    falling = acted(*armed[:2], ("edge", "value", "-1"), armed[3], ("edge", "change", {}))["times"]
+    assert falling[-1] == "19.5 s", "the edge at 18 s, with 1.6 s behind it"
