@@ -57,6 +57,9 @@ class Status(IntFlag):
     TARGET_REACHED = 1 << 10
     INTERNAL_LIMIT = 1 << 11
     SPEED_ZERO = 1 << 12
+    SET_POINT_TAKEN = 1 << 12
+    HOMING_ATTAINED = 1 << 12
+    FOLLOWING_ERROR = 1 << 13
 
 
 class Control(IntFlag):
@@ -66,6 +69,9 @@ class Control(IntFlag):
     ENABLE_VOLTAGE = 1 << 1
     QUICK_STOP_OFF = 1 << 2
     ENABLE_OPERATION = 1 << 3
+    NEW_SET_POINT = 1 << 4
+    AT_ONCE = 1 << 5
+    RELATIVE = 1 << 6
     FAULT_RESET = 1 << 7
     HALT = 1 << 8
 
@@ -87,8 +93,12 @@ class Mode(IntEnum):
     IDENTIFICATION = -1
     """Manufacturer mode: current set-point 0x2052 and excitation 0x2050."""
     NONE = 0
+    PROFILE_POSITION = 1
     PROFILE_VELOCITY = 3
     PROFILE_TORQUE = 4
+    HOMING = 6
+    INTERPOLATED_POSITION = 7
+    CYCLIC_POSITION = 8
     CYCLIC_VELOCITY = 9
     CYCLIC_TORQUE = 10
     CYCLIC_TORQUE_ANGLE = 11
@@ -148,6 +158,7 @@ ERROR_TEXTS: dict[int, str] = {
     0x8130: "heartbeat of the master lost",
     0x8210: "PDO not processed: too short",
     0x8480: "over-speed",
+    0x8611: "following error",
     EXCITATION_ABORTED: "excitation left its abort limit",
 }
 """Error codes of object 0x603F and of emergency messages (CiA 301 table 26, CiA 402-2)."""

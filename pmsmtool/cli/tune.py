@@ -270,7 +270,7 @@ def _params_path(design: Path) -> Path:
 
 _SHOWN = (
     "current.K_p_d_v_per_a", "current.K_i_d_v_per_as", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as",
-    "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad", "speed.tau_max_nm",
+    "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad", "speed.tau_max_nm", "position.K_p_per_s",
 )  # fmt: skip
 _SHOWN_LIMITS = (
     "governor.mode", "governor.k_max", "governor.eps", "governor.options", "governor.I_transient_apk",
@@ -279,7 +279,7 @@ _SHOWN_LIMITS = (
     "field_weakening.iterations", "field_weakening.i_d_min_a", "field_weakening.i_d_lm_a",
 )  # fmt: skip
 _SHOWN_CLOSED = (
-    *_SHOWN[4:], "motor.I_max_apk", "reference.tau_rated_nm", "reference.torque_slope_nm_per_s", "motor.n_max_rpm",
+    *_SHOWN[4:7], "motor.I_max_apk", "reference.tau_rated_nm", "reference.torque_slope_nm_per_s", "motor.n_max_rpm",
 )  # fmt: skip
 _SHOWN_POLAR = (
     "polar.mode", "polar.options", "polar.sigma_phase_rad_s", "polar.sigma_amplitude_rad_s", "polar.tau_s",

@@ -24,6 +24,7 @@ from pmsmtool.design.loops.speed_loop import (
     SpeedMethod,
     SpeedPath,
     pole_placement,
+    position_gain,
     small_time_constants,
     speed_loop,
     symmetric_optimum,
@@ -233,7 +234,7 @@ def _design_speed(
     J = source.machine.J_kgm2
     if J is None:
         off = DesignValue(0.0, "off: the inertia J_kgm2 is not known", "")
-        values |= {"speed.K_p_nms_per_rad": off, "speed.K_i_nm_per_rad": off}
+        values |= {"speed.K_p_nms_per_rad": off, "speed.K_i_nm_per_rad": off, "position.K_p_per_s": off}
         return _Part(values, {}, {}, ("speed control is off: the machine file has no inertia J_kgm2", *notes))
     path = SpeedPath(J, source.machine.B_nms or 0.0, current.loop("q"), decimation, pll, filter_hz, notch)
     gains = _speed_gains(request, path, current.alpha)
@@ -254,7 +255,17 @@ def _design_speed(
         "speed.K_i_nm_per_rad": DesignValue(gains.K_i, how, "speed"),
         "speed.acceleration_rpm_per_s": DesignValue(slope, why),
     }
-    return _Part(values, {"speed": found}, {"speed_crossover_rad_s": found.crossover_rad_s}, notes)
+    K_p, crossover = position_gain(gains, path)
+    values |= {
+        "position.K_p_per_s": DesignValue(K_p, f"{crossover / (2.0 * math.pi):.4g} Hz, 60 deg, |S| <= 6 dB at least"),
+        "position.velocity_ff": DesignValue(1.0, "whole: a constant speed leaves no following error"),
+        "position.inertia_ff_kgm2": DesignValue(J, "J"),
+    }
+    facts: dict[str, Scalar] = {
+        "speed_crossover_rad_s": found.crossover_rad_s,
+        "position_crossover_rad_s": crossover,
+    }
+    return _Part(values, {"speed": found}, facts, notes)
 
 
 def _notch(source: MachineFile, request: TuneRequest, T_speed: float) -> tuple[Notch, str, tuple[str, ...]]:

@@ -161,6 +161,7 @@ LIVE: dict[str, DriveObject] = {
     "kappa": DriveObject(0x2070, 0x16, "f"),
     "binding": DriveObject(0x2070, 0x17, "I"),
     "iterations": DriveObject(0x2070, 0x18, "I"),
+    "following_error_rad": DriveObject(0x2070, 0x19, "f"),
 }
 """Live quantities of the reference drive; also what its recorder and its averages take."""
 

@@ -26,6 +26,7 @@ uint32_t pmsm_sim_layout(uint32_t what)
     case PMSM_LAYOUT_RECORDER: return (uint32_t)sizeof(pmsm_recorder);
     case PMSM_LAYOUT_AVERAGE: return (uint32_t)sizeof(pmsm_average);
     case PMSM_LAYOUT_FLUX_MAP: return (uint32_t)sizeof(pmsm_flux_map);
+    case PMSM_LAYOUT_POSITION: return (uint32_t)offsetof(pmsm_position, trajectory);
     default: return 0u;
     }
 }
@@ -48,6 +49,7 @@ void *pmsm_sim_part(pmsm_drive *drive, uint32_t part)
     case PMSM_PART_RECORDER_WRITE: return &drive->application.recording.write;
     case PMSM_PART_LIVE: return &drive->application.control.live;
     case PMSM_PART_APPLICATION: return &drive->application;
+    case PMSM_PART_POSITION: return &drive->application.position;
     default: return NULL;
     }
 }
@@ -171,6 +173,11 @@ static void sample(pmsm_sim *sim, const pmsm_output *acting, double T_s, double 
     sensors->T_winding = (float)(setup->T_lag > 0.0 ? sim->T_winding_shown : sim->plant.T_winding);
     sensors->T_magnet = (float)sim->plant.T_magnet;
     read_encoder(theta_M, sensors);
+    sensors->limits = 0;
+    if (sim->has_switches) {
+        const double shaft = sim->plant.state.theta_M + (double)sim->plant.state.turns * PMSM_REAL64_TWO_PI;
+        sensors->limits = (shaft <= sim->switch_negative ? 1u : 0u) | (shaft >= sim->switch_positive ? 2u : 0u);
+    }
 }
 
 /* ---- the core alone ------------------------------------------------------------------------------------------- */
@@ -332,7 +339,8 @@ static void run_period(pmsm_sim *sim)
 static uint32_t has_news(pmsm_sim *sim)
 {
     const pmsm_application *app = &sim->drive->application;
-    const uint32_t now[4] = {app->trip, app->excitation.state, app->recorder.state, app->average.state};
+    const uint32_t now[5] = {app->trip, app->excitation.state, app->recorder.state, app->average.state,
+                             app->position.flags};
     const uint32_t changed = memcmp(now, sim->seen, sizeof now) != 0;
     memcpy(sim->seen, now, sizeof now);
     return changed;
@@ -441,6 +449,13 @@ void pmsm_sim_set_open(pmsm_sim *sim, uint32_t a, uint32_t b, uint32_t c)
             pmsm_plant_clear_current(&sim->plant, x); /* the arc is shorter than anything resolved here */
         sim->inverter.setup.open[x] = sim->setup.inverter.open[x] = open[x];
     }
+}
+
+void pmsm_sim_set_switches(pmsm_sim *sim, double negative, double positive)
+{
+    sim->switch_negative = negative;
+    sim->switch_positive = positive;
+    sim->has_switches = 1;
 }
 
 void pmsm_sim_set_U_dc(pmsm_sim *sim, double U_dc)

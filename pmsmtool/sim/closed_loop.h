@@ -100,15 +100,17 @@ typedef struct pmsm_sim {
     uint64_t record_rows, record_row;
     uint32_t record_signals, record_decimation, record_count;
     uint32_t record_signal[PMSM_RECORD_SIGNALS];
-    uint32_t watch;            /* 1: return when trip, excitation, recorder or averages changed their state */
-    uint32_t seen[4];
+    uint32_t watch;            /* 1: return when trip, excitation, recorder, averages or position changed their state */
+    uint32_t seen[5];
+    double switch_negative, switch_positive; /* rad, where the limit switches begin, when has_switches */
+    uint32_t has_switches;
 } pmsm_sim;
 
 /* Sizes of the structs a caller mirrors or allocates, in the order of enum pmsm_layout. */
 enum pmsm_layout {
     PMSM_LAYOUT_SIM = 0, PMSM_LAYOUT_DRIVE, PMSM_LAYOUT_SETUP, PMSM_LAYOUT_MACHINE, PMSM_LAYOUT_INVERTER,
     PMSM_LAYOUT_SENSORS, PMSM_LAYOUT_PARAMS, PMSM_LAYOUT_REFERENCE, PMSM_LAYOUT_EXCITATION,
-    PMSM_LAYOUT_RECORDER, PMSM_LAYOUT_AVERAGE, PMSM_LAYOUT_FLUX_MAP
+    PMSM_LAYOUT_RECORDER, PMSM_LAYOUT_AVERAGE, PMSM_LAYOUT_FLUX_MAP, PMSM_LAYOUT_POSITION
 };
 PMSM_EXPORT uint32_t pmsm_sim_layout(uint32_t what);
 
@@ -116,7 +118,8 @@ PMSM_EXPORT uint32_t pmsm_sim_layout(uint32_t what);
 enum pmsm_part {
     PMSM_PART_PARAMS = 0, PMSM_PART_LUT, PMSM_PART_REFERENCE, PMSM_PART_EXCITATION, PMSM_PART_RECORDER,
     PMSM_PART_AVERAGE, PMSM_PART_BUFFER, PMSM_PART_TRACE, PMSM_PART_ENABLED, PMSM_PART_QUICK_STOP,
-    PMSM_PART_TRIP, PMSM_PART_FIXED_ANGLE, PMSM_PART_RECORDER_WRITE, PMSM_PART_LIVE, PMSM_PART_APPLICATION
+    PMSM_PART_TRIP, PMSM_PART_FIXED_ANGLE, PMSM_PART_RECORDER_WRITE, PMSM_PART_LIVE, PMSM_PART_APPLICATION,
+    PMSM_PART_POSITION
 };
 PMSM_EXPORT void *pmsm_sim_part(pmsm_drive *drive, uint32_t part);
 
@@ -141,6 +144,8 @@ PMSM_EXPORT uint64_t pmsm_sim_time_ns(const pmsm_sim *sim);
 PMSM_EXPORT void pmsm_sim_set_load(pmsm_sim *sim, double load);
 PMSM_EXPORT void pmsm_sim_set_rotor(pmsm_sim *sim, uint32_t rotor, double omega_M);
 PMSM_EXPORT void pmsm_sim_set_open(pmsm_sim *sim, uint32_t a, uint32_t b, uint32_t c);
+/* Limit switches at two angles of the shaft (rad, unwrapped). */
+PMSM_EXPORT void pmsm_sim_set_switches(pmsm_sim *sim, double negative, double positive);
 PMSM_EXPORT void pmsm_sim_set_U_dc(pmsm_sim *sim, double U_dc);
 PMSM_EXPORT void pmsm_sim_set_temperatures(pmsm_sim *sim, double T_winding, double T_magnet);
 

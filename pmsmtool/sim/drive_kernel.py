@@ -26,6 +26,9 @@ from pmsmtool.sim.node.drive_core import (
     Command,
     ControlMode,
     ExcitationState,
+    PositionCommand,
+    PositionFlag,
+    PositionState,
     RecorderSetup,
     RecorderState,
     RecorderStatus,
@@ -102,6 +105,7 @@ class KernelCore:
 
     def _parameters_changed(self) -> None:
         """Lay the compensation that is built into the drive over the parameters; no object shows it."""
+        self.simulation.position.asked.increments = self._counts
         params = self.simulation.params
         for name, value in self._compensation.items():
             member = name.replace(".", "_")
@@ -123,6 +127,8 @@ class KernelCore:
         reference.tau_ref, reference.omega_M_ref = command.torque_nm, command.omega_m_rad_s
         reference.u_d_inject = reference.u_q_inject = reference.bias_bandwidth = 0.0
         self.simulation.fixed_angle.value = command.fixed_angle_rad
+        if command.position is not None:
+            self._command_position(command.position)
         self.simulation.word(Part.QUICK_STOP).value = int(command.quick_stop)
         self.simulation.word(Part.ENABLED).value = int(command.mode != ControlMode.OFF)
         self._fail(command)
@@ -134,6 +140,22 @@ class KernelCore:
             self.simulation.word(Part.TRIP).value = TRIPS[self._fault]
         if self._fault == "supply_limit":
             self.simulation.library.pmsm_sim_set_U_dc(self.simulation.sim, (LIMITED if asked else 1.0) * self._link_v)
+
+    def _command_position(self, command: PositionCommand) -> None:
+        asked = self.simulation.position.asked
+        asked.profile, asked.target, asked.set_point = command.profile, command.target, command.set_point
+        asked.interval, asked.velocity, asked.jerk = command.interval_s, command.velocity, command.jerk
+        asked.acceleration, asked.deceleration = command.acceleration, command.deceleration
+        asked.stop_deceleration, asked.halt = command.stop_deceleration, command.halt
+        asked.offset = command.offset
+        asked.minimum, asked.maximum = command.minimum, command.maximum
+        asked.window, asked.window_time = command.window, command.window_time_s
+
+    def position(self) -> PositionState:
+        """Return the state of the position controller."""
+        now = self.simulation.position
+        flags = PositionFlag(now.flags)
+        return PositionState(now.actual, now.reference, now.error, flags, now.limits, now.asked.offset)
 
     # ---- time --------------------------------------------------------------------------------------------
 

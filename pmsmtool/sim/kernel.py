@@ -23,7 +23,7 @@ from pmsmtool.params.catalogue import CATALOGUE
 
 Array = NDArray[np.float64]
 
-_f32, _f64, _u32, _u64 = ctypes.c_float, ctypes.c_double, ctypes.c_uint32, ctypes.c_uint64
+_f32, _f64, _i32, _u32, _u64 = ctypes.c_float, ctypes.c_double, ctypes.c_int32, ctypes.c_uint32, ctypes.c_uint64
 TRACE_CHANNELS = 8
 
 
@@ -209,6 +209,45 @@ class Average(ctypes.Structure):
     )
 
 
+class PositionRequest(ctypes.Structure):
+    """``pmsm_position_request``."""
+
+    _fields_ = (
+        ("increments", _u32),
+        ("offset", _i32),
+        ("profile", _u32),
+        ("target", _i32),
+        ("set_point", _u32),
+        ("interval", _f32),
+        ("velocity", _f32),
+        ("acceleration", _f32),
+        ("deceleration", _f32),
+        ("stop_deceleration", _f32),
+        ("jerk", _f32),
+        ("halt", _u32),
+        ("minimum", _i32),
+        ("maximum", _i32),
+        ("window", _f32),
+        ("window_time", _f32),
+    )
+
+
+class Position(ctypes.Structure):
+    """``pmsm_position``, up to its private memory."""
+
+    _fields_ = (
+        ("asked", PositionRequest),
+        ("actual", _i32),
+        ("reference", _i32),
+        ("reference_part", _f32),
+        ("velocity", _f32),
+        ("acceleration", _f32),
+        ("error", _f32),
+        ("flags", _u32),
+        ("limits", _u32),
+    )
+
+
 class Application(IntEnum):
     """Who runs between the samples and the duty ratios (``enum pmsm_runs``)."""
 
@@ -256,6 +295,7 @@ class Part(IntEnum):
     RECORDER_WRITE = 12
     LIVE = 13
     APPLICATION = 14
+    POSITION = 15
 
 
 _LAYOUT_SIM, _LAYOUT_DRIVE = 0, 1
@@ -270,6 +310,7 @@ _MIRRORED: tuple[tuple[int, type[ctypes.Structure]], ...] = (
     (9, Recorder),
     (10, Average),
     (11, FluxMapStruct),
+    (12, Position),
 )
 
 
@@ -301,6 +342,7 @@ def library() -> Any:
         ("pmsm_sim_set_load", (data, _f64), None),
         ("pmsm_sim_set_rotor", (data, _u32, _f64), None),
         ("pmsm_sim_set_open", (data, _u32, _u32, _u32), None),
+        ("pmsm_sim_set_switches", (data, _f64, _f64), None),
         ("pmsm_sim_set_U_dc", (data, _f64), None),
         ("pmsm_sim_set_temperatures", (data, _f64, _f64), None),
         ("pmsm_sim_outside_count", (data,), _u64),
@@ -390,6 +432,11 @@ class Simulation:
     def average(self) -> Average:
         """The drive's window averages."""
         return Average.from_address(self.part(Part.AVERAGE))
+
+    @property
+    def position(self) -> Position:
+        """The drive's position controller."""
+        return Position.from_address(self.part(Part.POSITION))
 
     def word(self, part: Part) -> Any:
         """Return ENABLED, QUICK_STOP, TRIP or RECORDER_WRITE as an unsigned word with a ``value``."""

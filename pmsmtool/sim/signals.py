@@ -34,6 +34,7 @@ class Signal(IntEnum):
     T_WINDING = 22
     T_MAGNET = 23
     THETA_M = 24
+    FOLLOWING_ERROR = 25
 
 
 class Truth(IntEnum):

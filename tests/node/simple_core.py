@@ -16,6 +16,8 @@ from pmsmtool.sim.node.drive_core import (
     Command,
     ControlMode,
     ExcitationState,
+    PositionFlag,
+    PositionState,
     RecorderSetup,
     RecorderState,
     RecorderStatus,
@@ -49,6 +51,7 @@ class SimpleCore:
         self.restarts = 0
         self.i_d = self.i_q = self.omega = self.theta = self.u_d = self.u_q = 0.0
         self.flags = 0
+        self.position_flags = PositionFlag(0)
         self.driven = False
         self.command_seen = Command()
         self.persistent_trip = 0
@@ -242,6 +245,10 @@ class SimpleCore:
             for column, mean in zip(columns, means, strict=True)
         ]
         return Averages(AverageState.COMPLETE, means, stds)
+
+    def position(self) -> PositionState:
+        count = round(self.theta / (2.0 * math.pi) * self.encoder_counts)
+        return PositionState((count + (1 << 31)) % (1 << 32) - (1 << 31), 0, 0.0, self.position_flags)
 
     def trip(self) -> int:
         return self._trip

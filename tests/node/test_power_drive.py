@@ -231,13 +231,21 @@ def test_set_point_of_the_identification_mode(bench: Bench) -> None:
     assert bench.core.command_seen.i_d_a == 3.0
 
 
-def test_unknown_modes_are_refused(bench: Bench) -> None:
-    for mode in (1, 6, 8):
+def test_unknown_modes_are_refused_and_position_before_it_is_tuned(bench: Bench) -> None:
+    for mode, code in (
+        (2, AbortCode.VALUE),
+        (5, AbortCode.VALUE),
+        (6, AbortCode.DEVICE_STATE),
+        (1, AbortCode.DEVICE_STATE),
+    ):
         with pytest.raises(Aborted) as caught:
             bench.client.put(0x6060, 0, mode, "b")
-        assert caught.value.code == AbortCode.VALUE
+        assert caught.value.code == code
     assert bench.client.number(0x6061, 0, "b") == 0
-    assert int(bench.client.number(0x6502)) == 1 << 2 | 1 << 3 | 1 << 8 | 1 << 9 | 1 << 16
+    supported = {bit for bit in range(32) if int(bench.client.number(0x6502)) >> bit & 1}
+    assert supported == {0, 2, 3, 5, 6, 7, 8, 9, 16}
+    bench.client.put(0x2022, 1, 20.0, "f")
+    bench.client.put(0x6060, 0, 1, "b")
 
 
 def test_a_trip_is_a_fault_with_code_register_and_emergency_at_its_time(bench: Bench) -> None:

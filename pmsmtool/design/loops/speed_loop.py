@@ -161,6 +161,38 @@ def speed_loop(gains: SpeedGains, path: SpeedPath) -> SampledLoop:
     return SampledLoop(tuple(num.tolist()), tuple(den.tolist()), T, path.current.delay_s + 0.5 * T)
 
 
+POSITION_PHASE_DEG, POSITION_MODULUS, POSITION_GAIN = 60.0, 0.5, 2.0
+"""Least phase margin (degree), distance of L from -1 (|S| <= 6 dB) and gain margin of the position loop."""
+_FREQUENCIES = 4000
+_GAIN_STEP = 0.95
+
+
+def position_gain(gains: SpeedGains, path: SpeedPath) -> tuple[float, float]:
+    """Return the largest gain K_p (1/s) of a position controller above the speed loop, and its crossover (rad/s).
+
+    The loop is the speed loop, reference to position of the shaft, closed over K_p every period of the speed
+    controller. It is open-loop stable but for its integrator, so its frequency response decides.
+    """
+    T = path.T_speed
+    omega = np.geomspace(1e-3 * gains.omega_c, 0.999 * math.pi / T, _FREQUENCIES)
+    z = np.exp(1j * omega * T)
+    speed = speed_loop(gains, path).at(omega)
+    integral = companion(np.array([0.5 * path.current.T_s] * 2), np.array([1.0, -1.0]))
+    num, den = _rational(_lift(_series(torque_path(path.current), _mechanics(path), integral), path.decimation))
+    notch_num, notch_den = notch_coefficients(path.notch, T)
+    controller = (gains.K_p + gains.K_i * T / (z - 1.0)) * np.polyval(notch_num, z) / np.polyval(notch_den, z)
+    unit = controller * np.polyval(num, z) / np.polyval(den, z) / (1.0 + speed)
+    lag_deg = -np.degrees(np.unwrap(np.angle(unit)))
+    late = lag_deg >= 180.0 - POSITION_PHASE_DEG
+    K_p = float(1.0 / np.abs(unit[late]).max())
+    past = lag_deg >= 180.0
+    if past.any():
+        K_p = min(K_p, float(1.0 / (POSITION_GAIN * np.abs(unit[past]).max())))
+    while np.abs(1.0 + K_p * unit).min() < POSITION_MODULUS:
+        K_p *= _GAIN_STEP
+    return K_p, float(omega[np.abs(K_p * unit) >= 1.0].max())
+
+
 def notch_coefficients(notch: Notch, T: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return num, den of (s^2 + 2 zeta_num w s + w^2) / (s^2 + 2 zeta_den w s + w^2) by the prewarped bilinear rule."""
     if notch.hz == 0.0:

@@ -59,6 +59,7 @@ void pmsm_application_period(pmsm_application *app, const pmsm_sensors *sensors,
         app->trip = pmsm_find_trip(app);
     }
     pmsm_excite(app, &reference, &angle);
+    pmsm_control_position(app, &reference);
     pmsm_apply_quick_stop(app, &reference, &angle);
     if (app->trip != (uint32_t)PMSM_TRIP_NONE) {
         reference.mode = (uint32_t)PMSM_MODE_FAULT;
@@ -118,6 +119,7 @@ float pmsm_application_signal(const pmsm_application *app, uint32_t signal)
     case PMSM_SIGNAL_T_WINDING: return s->T_winding;
     case PMSM_SIGNAL_T_MAGNET: return s->T_magnet;
     case PMSM_SIGNAL_THETA_M: return mechanical_angle(app);
+    case PMSM_SIGNAL_FOLLOWING_ERROR: return app->position.error * pmsm_increment(app);
     default: return 0.0F;
     }
 }

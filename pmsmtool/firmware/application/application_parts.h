@@ -26,6 +26,39 @@ void pmsm_speed_update(pmsm_speed_estimate *speed, const pmsm_sensors *sensors);
 /* Electrical angle of the rotor by the encoder (rad, within one turn); NaN when it failed. */
 float pmsm_rotor_angle(const pmsm_application *app);
 
+/* trajectory.c: where the reference of a move is; all quantities per step of the speed controller */
+typedef struct {
+    float velocity;              /* increments per step */
+    float acceleration, deceleration; /* increments per step^2 */
+    uint32_t jerk_steps;
+} pmsm_profile;
+void pmsm_trajectory_rest(pmsm_trajectory *trajectory, int32_t position);
+/* One step towards the target, in no direction that the limit switches forbid. Sets the reference. */
+void pmsm_trajectory_step(pmsm_trajectory *trajectory, const pmsm_profile *profile, int32_t target, uint32_t limits,
+                          pmsm_position *position);
+/* 1: a limit switch forbids the direction of a way */
+static inline uint32_t pmsm_is_barred(uint32_t limits, float way)
+{
+    return (((limits & 2u) != 0u && way > 0.0F) || ((limits & 1u) != 0u && way < 0.0F)) ? 1u : 0u;
+}
+
+/* position.c: the speed controller's reference and torque of this period, from the position; before the core's step */
+void pmsm_control_position(pmsm_application *app, pmsm_reference *reference);
+
+/* rad of an increment of the position */
+static inline float pmsm_increment(const pmsm_application *app)
+{
+    const uint32_t increments = app->position.asked.increments;
+    return (increments > 0u) ? 2.0F * PMSM_PI / (float)increments : 0.0F;
+}
+
+/* Difference of two positions, which wrap. */
+static inline float pmsm_way(int32_t to, int32_t from)
+{
+    const uint32_t way = (uint32_t)to - (uint32_t)from;
+    return (way < 0x80000000u) ? (float)way : -(float)(0u - way);
+}
+
 /* protection.c: the trip that the sensors of this period demand, enum pmsm_trip */
 uint32_t pmsm_find_trip(const pmsm_application *app);
 

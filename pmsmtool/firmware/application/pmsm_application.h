@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: MIT */
-/* The application around the control core, at PWM rate: speed estimate, trips, quick stop, excitation, recorder, window
- * averages. The simulated drive runs these files; in a drive of your own they are optional.
+/* The application around the control core, at PWM rate: speed estimate, position control, trips, quick stop,
+ * excitation, recorder, window averages. The simulated drive runs these files; for another drive they are optional.
  *
  * binary32 and integers, no allocation, no C library. Whoever asks (a bus, a user interface) reads and writes the
  * members between two periods.
@@ -29,6 +29,7 @@ enum pmsm_signal {
     PMSM_SIGNAL_TAU, PMSM_SIGNAL_KAPPA, PMSM_SIGNAL_BINDING, PMSM_SIGNAL_ITERATIONS, PMSM_SIGNAL_FLAGS,
     PMSM_SIGNAL_I_A, PMSM_SIGNAL_I_B, PMSM_SIGNAL_I_C, PMSM_SIGNAL_U_DC,
     PMSM_SIGNAL_T_WINDING, PMSM_SIGNAL_T_MAGNET, PMSM_SIGNAL_THETA_M, /* mechanical, unwrapped, rad */
+    PMSM_SIGNAL_FOLLOWING_ERROR, /* rad, mechanical: reference less position */
     PMSM_SIGNAL_COUNT
 };
 
@@ -39,6 +40,7 @@ typedef struct {                 /* what the sensors deliver at the sampling ins
     int32_t turns;               /* whole mechanical turns of the encoder; may wrap */
     uint32_t angle;              /* 2^-32 mechanical turns */
     uint32_t encoder_failed;     /* 1: turns and angle are no reading */
+    uint32_t limits;             /* limit switches that are active: bit 0 negative, bit 1 positive direction */
     uint32_t adc_clipped;        /* 1: a sample stood at full scale */
 } pmsm_sensors;
 
@@ -130,6 +132,66 @@ typedef struct {                 /* memory of a quick stop */
     pmsm_reference start;        /* reference when the quick stop came */
 } pmsm_quick_stop;
 
+/* Steps of the speed controller that a change of the acceleration takes at most: jerk * PMSM_JERK_STEPS * its period is
+ * the largest acceleration of a move. */
+#define PMSM_JERK_STEPS 128u
+
+enum pmsm_position_flag {
+    PMSM_POSITION_MOVING = 1u << 0,      /* the reference has not come to rest at the target */
+    PMSM_POSITION_ERROR = 1u << 1,       /* the following error left its window for its time; the caller decides */
+    PMSM_POSITION_SOFTWARE_LIMIT = 1u << 2, /* a target was cut to minimum or maximum */
+    PMSM_POSITION_SWITCH = 1u << 3,      /* a limit switch stops the way to the target */
+    PMSM_POSITION_SATURATED = 1u << 4    /* the speed reference is at the machine's largest speed */
+};
+
+typedef struct {                 /* position control: what is asked; used with reference.mode PMSM_MODE_POSITION */
+    uint32_t increments;         /* of the position in a mechanical turn, in the encoder's direction */
+    int32_t offset;              /* increments, added to the encoder's count: position = count + offset, modulo 2^32 */
+    uint32_t profile;            /* 1: move to every target by the profile; 0: follow targets, linear between two */
+    int32_t target;              /* increments */
+    uint32_t set_point;          /* another number: target is a new one. Without one the shaft is held where it is */
+    float interval;              /* s from target to target, without a profile */
+    float velocity;              /* increments/s */
+    float acceleration, deceleration; /* increments/s^2 */
+    float stop_deceleration;     /* increments/s^2, at a limit switch */
+    float jerk;                  /* increments/s^3, 0: not limited; twice as much from one ramp to the other, where a
+                                    move is too short for a constant speed between them */
+    uint32_t halt;               /* 1: with a profile, come to rest by the deceleration */
+    int32_t minimum, maximum;    /* increments, of every target; none when minimum >= maximum */
+    float window, window_time;   /* increments, s: following error that is a fault; window 0: none */
+} pmsm_position_request;
+
+typedef struct {                 /* the reference of a move: trapezoid of the speed, averaged over the jerk's time */
+    int32_t planned;             /* increments, where the trapezoid is */
+    float planned_part;          /* increments in [-0.5, 0.5], beside planned */
+    float planned_velocity;      /* increments per step */
+    float moved[PMSM_JERK_STEPS]; /* increments of the last steps, a ring */
+    uint32_t length, next;       /* steps that are averaged; the oldest of them */
+    uint32_t resting;            /* steps since the trapezoid moved, up to length */
+} pmsm_trajectory;
+
+typedef struct {
+    pmsm_position_request asked;
+    int32_t actual;              /* increments */
+    int32_t reference;           /* increments */
+    float reference_part;        /* increments, beside reference */
+    float velocity;              /* increments/s, of the reference */
+    float acceleration;          /* increments/s^2, of the reference */
+    float error;                 /* increments, reference - actual */
+    uint32_t flags;              /* enum pmsm_position_flag */
+    uint32_t limits;             /* limit switches, as the sensors show them */
+    /* private memory */
+    pmsm_trajectory trajectory;
+    int32_t target;              /* increments, taken and within the limits */
+    uint32_t seen;               /* set_point that was taken */
+    uint32_t left;               /* PWM periods to the end of the interval */
+    float step;                  /* increments per PWM period, within the interval */
+    uint32_t stopped;            /* 1: a limit switch ended the following */
+    float outside;               /* s, with the error outside its window */
+    uint32_t running;            /* 1: controlled in the last period */
+    float omega_ref, torque;     /* rad/s, N m: handed to the speed controller until its next step */
+} pmsm_position;
+
 typedef struct pmsm_application {
     const pmsm_params *params;          /* active set */
     const uint32_t *lut;                /* its table words, NULL without */
@@ -141,6 +203,7 @@ typedef struct pmsm_application {
     pmsm_excitation excitation;
     pmsm_recorder recorder;
     pmsm_average average;
+    pmsm_position position;
     pmsm_sensors sensors;               /* as sampled in the last period */
     uint32_t enabled;                   /* 1: operation enabled, 0: gates off */
     uint32_t quick_stop;                /* 1: ramp the current reference to zero and brake */

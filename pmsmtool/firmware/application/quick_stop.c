@@ -46,7 +46,7 @@ static void stop_reference(pmsm_application *app, pmsm_reference *reference)
     reference->tau_ref = stop->start.tau_ref * share;
     stop->share -= app->speed.T_s / QUICK_STOP_RAMP_S;
     uint32_t stopped = (stop->share < -QUICK_STOP_TIMEOUT_S / QUICK_STOP_RAMP_S) ? 1u : 0u;
-    if (stop->start.mode == (uint32_t)PMSM_MODE_SPEED) {
+    if (stop->start.mode == (uint32_t)PMSM_MODE_SPEED || stop->start.mode == (uint32_t)PMSM_MODE_POSITION) {
         reference->mode = (uint32_t)PMSM_MODE_TORQUE;
         reference->tau_ref = brake_torque(app);
         stopped = at_standstill(app);

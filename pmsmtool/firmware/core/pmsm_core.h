@@ -23,7 +23,8 @@ enum pmsm_mode {
     PMSM_MODE_CURRENT = 2, /* i_d_ref, i_q_ref */
     PMSM_MODE_TORQUE = 3,  /* tau_ref through look-up or field weakening */
     PMSM_MODE_SPEED = 4,   /* omega_M_ref through the speed controller */
-    PMSM_MODE_FAULT = 5    /* the fault reaction of the parameters: the application has tripped */
+    PMSM_MODE_FAULT = 5,   /* the fault reaction of the parameters: the application has tripped */
+    PMSM_MODE_POSITION = 6 /* as SPEED, below a position controller: omega_M_ref without slope limit, plus tau_ref */
 };
 
 /* Why pmsm_state.fault stands, until pmsm_reset_fault(). */

@@ -10,8 +10,8 @@ extern "C" {
 #endif
 
 #define PMSM_PARAMS_SCHEMA_VERSION 1u
-#define PMSM_PARAMS_SIGNATURE 0xB87E4473u /* CRC-32 of name:type:dim:unit:scale in struct order */
-#define PMSM_PARAMS_WORDS 90u
+#define PMSM_PARAMS_SIGNATURE 0x2077D183u /* CRC-32 of name:type:dim:unit:scale in struct order */
+#define PMSM_PARAMS_WORDS 93u
 #define PMSM_PARAMS_LUT_WORDS_MAX 8192u
 #define PMSM_K_MAX_NOT_DETERMINED 255u
 
@@ -69,6 +69,9 @@ typedef struct pmsm_params {
     float    speed_notch_zeta_num;           /* notch numerator damping */
     float    speed_notch_zeta_den;           /* notch denominator damping */
     float    speed_acceleration_rpm_per_s;   /* [rpm/s] slope limit of the speed reference */
+    float    position_K_p_per_s;             /* [1/s] speed reference per position error, 0: not tuned */
+    float    position_velocity_ff;           /* share of a move's speed added to it */
+    float    position_inertia_ff_kgm2;       /* [kg m2] torque per acceleration of a move */
     uint32_t governor_mode;                  /* 0 off, 1 paper (exact), 2 line search, 3 best, 4 linearised, 5
                                                 observe */
     uint32_t governor_k_max;                 /* horizon in T_s, 255 not determined */

@@ -53,6 +53,9 @@ const pmsm_param_limit pmsm_param_limits[PMSM_PARAMS_WORDS] = {
     {0.0F, 10.0F, 0u}, /* speed.notch_zeta_num */
     {0.00999999978F, 10.0F, 0u}, /* speed.notch_zeta_den */
     {0.100000001F, 1e+09F, 0u}, /* speed.acceleration_rpm_per_s */
+    {0.0F, 100000.0F, 0u}, /* position.K_p_per_s */
+    {0.0F, 2.0F, 0u}, /* position.velocity_ff */
+    {0.0F, 10000.0F, 0u}, /* position.inertia_ff_kgm2 */
     {0.0F, 5.0F, 1u}, /* governor.mode */
     {0.0F, 255.0F, 1u}, /* governor.k_max */
     {0.0F, 0.5F, 0u}, /* governor.eps */

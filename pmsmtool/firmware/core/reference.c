@@ -172,14 +172,17 @@ static pmsm_real speed_update(pmsm_period *period)
     pmsm_state *state = period->state;
     const pmsm_params *params = period->params;
     const pmsm_real T = state->derived.speed_period;
+    const pmsm_reference *request = period->request;
+    const uint32_t positioned = (request->mode == PMSM_MODE_POSITION) ? 1u : 0u;
     const pmsm_real slope = (pmsm_real)params->speed_acceleration_rpm_per_s / PMSM_RPM * T;
-    state->omega_ref_ramped +=
-        pmsm_clamp(period->request->omega_M_ref - state->omega_ref_ramped, -slope, slope);
+    const pmsm_real change = request->omega_M_ref - state->omega_ref_ramped;
+    state->omega_ref_ramped += (positioned != 0u) ? change : pmsm_clamp(change, -slope, slope);
 
     const pmsm_real K_p = (pmsm_real)params->speed_K_p_nms_per_rad;
     const pmsm_real tau_max = (pmsm_real)params->speed_tau_max_nm;
     const pmsm_real error = state->omega_ref_ramped - state->omega_filtered;
-    const pmsm_real tau = K_p * error + state->speed_integrator;
+    const pmsm_real ahead = (positioned != 0u) ? request->tau_ref : PMSM_C(0.0);
+    const pmsm_real tau = K_p * error + state->speed_integrator + ahead;
     const pmsm_real limited = pmsm_clamp(tau, -tau_max, tau_max);
     const pmsm_real cut = (limited - tau) + torque_cut(state);
     const pmsm_real back = (K_p > PMSM_C(0.0)) ? cut / K_p : PMSM_C(0.0);

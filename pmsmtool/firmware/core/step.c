@@ -68,7 +68,7 @@ static uint32_t is_usable(const pmsm_measurement *m, const pmsm_reference *r, pm
                             pmsm_abs(r->bias_bandwidth);
     const uint32_t tiny = (r->bias_bandwidth > PMSM_C(0.0) && r->bias_bandwidth < BANDWIDTH_LEAST) ? 1u : 0u;
     return (sampled + asked <= INPUT_MOST && pmsm_abs(turn) <= PMSM_PI &&
-            pmsm_abs(m->theta_e) + pmsm_abs(advance) <= PMSM_ANGLE_MAX && r->mode <= (uint32_t)PMSM_MODE_FAULT &&
+            pmsm_abs(m->theta_e) + pmsm_abs(advance) <= PMSM_ANGLE_MAX && r->mode <= (uint32_t)PMSM_MODE_POSITION &&
             tiny == 0u)
                ? 1u
                : 0u;
@@ -112,7 +112,7 @@ static pmsm_dq current_request(pmsm_period *period)
         const pmsm_dq asked = {request->i_d_ref, request->i_q_ref};
         return pmsm_limit_current(period, asked);
     }
-    const pmsm_real tau = (request->mode == PMSM_MODE_SPEED) ? pmsm_speed_control(period) : request->tau_ref;
+    const pmsm_real tau = (request->mode == PMSM_MODE_TORQUE) ? request->tau_ref : pmsm_speed_control(period);
     return pmsm_torque_to_current(period, tau);
 }
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from typing import Protocol
 
 from pmsmtool.drive.port import Excitation
@@ -33,6 +33,17 @@ class ControlMode(IntEnum):
     CURRENT = 2
     TORQUE = 3
     SPEED = 4
+    POSITION = 6
+
+
+class PositionFlag(IntFlag):
+    """``enum pmsm_position_flag``."""
+
+    MOVING = 1 << 0
+    FOLLOWING_ERROR = 1 << 1
+    SOFTWARE_LIMIT = 1 << 2
+    LIMIT_SWITCH = 1 << 3
+    SATURATED = 1 << 4
 
 
 class Trigger(IntEnum):
@@ -74,6 +85,53 @@ class AverageState(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class PositionCommand:
+    """What the position controller shall do (``pmsm_position_request``); encoder counts, and counts over seconds.
+
+    A target counts when ``set_point`` is another number than before. ``profile`` moves to it within velocity,
+    acceleration and jerk (0: not limited); without, it is reached on a straight line after ``interval_s``.
+    """
+
+    target: int = 0
+    set_point: int = 0
+    profile: bool = False
+    offset: int = 0
+    interval_s: float = 0.001
+    velocity: float = 0.0
+    acceleration: float = 0.0
+    deceleration: float = 0.0
+    stop_deceleration: float = 0.0
+    jerk: float = 0.0
+    halt: bool = False
+    minimum: int = 0
+    maximum: int = 0
+    window: float = 0.0
+    window_time_s: float = 0.0
+
+
+def wrapped(count: int) -> int:
+    """Return a count as 32 bits with a sign."""
+    return (count + (1 << 31)) % (1 << 32) - (1 << 31)
+
+
+@dataclass(frozen=True, slots=True)
+class PositionState:
+    """Position now, what it shall be, and their difference (encoder counts); flags, and limit switches."""
+
+    actual: int
+    demand: int
+    error: float
+    flags: PositionFlag
+    limits: int = 0
+    offset: int = 0
+
+    @property
+    def raw(self) -> int:
+        """The encoder's count, without the offset."""
+        return wrapped(self.actual - self.offset)
+
+
+@dataclass(frozen=True, slots=True)
 class Command:
     """References of the running mode; SI, peak, mechanical speed, electrical frame angle.
 
@@ -88,6 +146,7 @@ class Command:
     omega_m_rad_s: float = 0.0
     fixed_angle_rad: float = math.nan
     quick_stop: bool = False
+    position: PositionCommand | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,8 +208,8 @@ class DriveCore(Protocol):
     def run(self, periods: int) -> int:
         """Run at most ``periods`` control periods and return how many ran (at least 1 for ``periods`` >= 1).
 
-        Returns early after the period in which a trip was latched or the state of the excitation, the recorder or the
-        averages changed, so that the node can report it at the right time.
+        Returns early after the period in which a trip was latched or the state of the excitation, the recorder, the
+        averages or the position controller changed, so that the node can report it at the right time.
         """
 
     def command(self, command: Command) -> None:
@@ -158,6 +217,9 @@ class DriveCore(Protocol):
 
     def signal(self, signal: Signal) -> float:
         """Return a signal as it would be recorded now."""
+
+    def position(self) -> PositionState:
+        """Return the state of the position controller."""
 
     def trip(self) -> int:
         """Return the latched trip as CiA 402 error code (0x2310 over-current, ...), 0 when there is none."""

@@ -55,6 +55,7 @@ LIVE_SIGNALS: dict[str, Signal] = {
     "kappa": Signal.KAPPA,
     "binding": Signal.BINDING,
     "iterations": Signal.ITERATIONS,
+    "following_error_rad": Signal.FOLLOWING_ERROR,
 }
 """Live values (key behind ``live.``) and the core's signal behind each."""
 

@@ -17,6 +17,8 @@ from pmsmtool.cia402 import AbortConnection, Control, FaultReaction, Mode, Quick
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore
 from pmsmtool.sim.node.emergency import Emergency
+from pmsmtool.sim.node.position_modes import FOLLOWING_ERROR, PositionModes
+from pmsmtool.sim.node.position_modes import MODES as _POSITION_MODES
 from pmsmtool.sim.node.quick_stop import Stopping
 from pmsmtool.sim.node.schedule import Schedule
 from pmsmtool.sim.signals import Signal
@@ -89,6 +91,15 @@ class PowerDrive:
             parameter=plant.parameter,
             done=self._stopped,
         )
+        self._position = PositionModes(
+            dictionary,
+            plant.core,
+            schedule,
+            look=plant.look,
+            mode=lambda: self.mode,
+            apply=self.apply,
+            torque=lambda: self._signal(Signal.TAU) / self._rated_torque_nm() * 1000.0,
+        )
         self._hook()
 
     # ---- objects -------------------------------------------------------------------------------
@@ -106,7 +117,6 @@ class PowerDrive:
             "error_code": lambda: self._error_code,
             "statusword": self.statusword,
             "mode_display": lambda: self.mode,
-            "position": self._position,
             "velocity": lambda: self.omega_m() / RAD_S_PER_MRPM,
             "torque_demand": lambda: self._torque_demand,
             "torque": lambda: self._signal(Signal.TAU) / self._rated_torque_nm() * 1000.0,
@@ -148,10 +158,6 @@ class PowerDrive:
         milliampere_rms = 1000.0 * math.copysign(math.hypot(i_d, i_q), i_q) / math.sqrt(2.0)
         return 1000.0 * milliampere_rms / self._number("rated_current")
 
-    def _position(self) -> float:
-        count = round(self._signal(Signal.THETA_M) / (2.0 * math.pi) * self._plant.core.encoder_counts)
-        return (count + (1 << 31)) % (1 << 32) - (1 << 31)
-
     def omega_m(self) -> float:
         """Return the mechanical speed the drive sees (rad/s)."""
         return self._signal(Signal.OMEGA_E) / max(1.0, self._plant.parameter("motor.pole_pairs"))
@@ -185,7 +191,7 @@ class PowerDrive:
         if self.mode in _TORQUE_MODES:
             target = self._target_torque()
             return Status.TARGET_REACHED if self._torque_demand == target else Status(0)
-        return Status(0)
+        return self._position.status() if self.mode in _POSITION_MODES else Status(0)
 
     # ---- state machine -------------------------------------------------------------------------
 
@@ -202,9 +208,9 @@ class PowerDrive:
         if rising & Control.FAULT_RESET:
             self._emergency.clear()  # acknowledges what is past and caused no fault
         if self.state is not State.FAULT_REACTION_ACTIVE:
-            self._command(word)
+            self._command(word, rising)
 
-    def _command(self, word: int) -> None:
+    def _command(self, word: int, rising: int) -> None:
         state = self.state
         if self._plant.core.torque_safely_off:
             return  # it stays in SWITCH ON DISABLED
@@ -223,6 +229,7 @@ class PowerDrive:
             if state in (State.READY_TO_SWITCH_ON, State.OPERATION_ENABLED):
                 self._to(State.SWITCHED_ON)
         elif state is State.OPERATION_ENABLED:
+            self._position.controlword(word, rising)
             self.apply()  # the halt bit may have changed
         elif state in (State.READY_TO_SWITCH_ON, State.SWITCHED_ON) or self._may_resume():
             self._to(State.OPERATION_ENABLED)
@@ -240,6 +247,7 @@ class PowerDrive:
             self._stopping.cancel()
         if state is State.OPERATION_ENABLED:
             self._torque_demand = self._torque_filtered = 0.0
+            self._position.begin()
             self.apply()
         elif not state.energised:
             self._plant.core.command(Command())
@@ -296,6 +304,15 @@ class PowerDrive:
             else:
                 self.fail(code)
 
+    def check_position(self) -> None:
+        """Report a following error, else go on to the set-point that waited."""
+        if self.state is not State.OPERATION_ENABLED:
+            return
+        if self._position.failed():
+            self.fail(FOLLOWING_ERROR, ramp=True)
+        else:
+            self._position.attend(self._controlword)
+
     def connection_lost(self, node: int, code: int = HEARTBEAT_LOST) -> None:
         """React to a lost heartbeat, or to a PDO that stays away, as object 0x6007 says."""
         self._plant.look()
@@ -336,17 +353,22 @@ class PowerDrive:
         number = int.from_bytes(data, "little", signed=True)
         if number not in set(Mode):
             raise Refused(AbortCode.VALUE)
+        if number in _POSITION_MODES and self._plant.parameter("position.K_p_per_s") <= 0.0:
+            raise Refused(AbortCode.DEVICE_STATE)  # not tuned
         changed = self._dictionary["cia402.mode"].value != data
         self._dictionary["cia402.mode"].value = data
         if changed and self.state is State.OPERATION_ENABLED:
             self.on_leave()
             self._torque_demand = self._torque_filtered = 0.0
+            self._position.begin()
             self.apply()
 
     def _control_mode(self) -> ControlMode:
         mode = self.mode
         if mode in _SPEED_MODES or (mode is Mode.IDENTIFICATION and self.speed_injection):
             return ControlMode.SPEED
+        if mode in _POSITION_MODES:
+            return ControlMode.POSITION
         return ControlMode.TORQUE if mode in _TORQUE_MODES else ControlMode.CURRENT
 
     def _target_speed(self) -> float:
@@ -372,6 +394,11 @@ class PowerDrive:
             self._step_torque()
         elif control is ControlMode.SPEED:
             self._plant.core.command(Command(control, omega_m_rad_s=self._target_speed()))
+        elif control is ControlMode.POSITION and self._position.released:
+            return
+        elif control is ControlMode.POSITION:
+            halt = bool(self._controlword & Control.HALT)
+            self._plant.core.command(Command(control, position=self._position.command(halt=halt)))
         elif self.mode is Mode.IDENTIFICATION and not self._controlword & Control.HALT:
             i_d, i_q, angle = (
                 self._dictionary[f"set_point.{key}"].number() for key in ("i_d_a", "i_q_a", "fixed_angle_rad")

@@ -77,7 +77,7 @@ class Stopping:
         seconds = _MARGIN_S + _FACTOR * abs(omega) / self._slope_rad_s2()
         self._deadline_ns = self._schedule.now_ns + round(seconds * NS)
         turns = abs(omega) > self._standstill_rad_s()
-        self._brakes = control is ControlMode.SPEED or (control is ControlMode.TORQUE and turns)
+        self._brakes = control in (ControlMode.SPEED, ControlMode.POSITION) or (control is ControlMode.TORQUE and turns)
         is_tuned = self._parameter("speed.K_p_nms_per_rad") > 0.0
         self._ramp_rad_s = omega if self._brakes and is_tuned and option in _RAMPED else None
         if self._brakes:

@@ -391,6 +391,7 @@ class Session:
         self.attending = True
         try:
             self.power.check_trip()  # before the excitation, which a trip aborts, too
+            self.power.check_position()
             self.measurement.attend()
             self.pdo.changed()
         finally:

@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: MIT
+"""The position modes of the node, of CiA 402: profile (1), homing (6), interpolated (7), cyclic synchronous (8).
+
+Unit of every position is the encoder's count, from 0x608F; velocities are counts over seconds. When a mode begins, the
+shaft is held where it is: only a target that is written afterwards moves it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.cia402 import Control, Mode, Status
+from pmsmtool.sim.node.dictionary import Dictionary, Refused
+from pmsmtool.sim.node.drive_core import (
+    Command,
+    ControlMode,
+    DriveCore,
+    PositionCommand,
+    PositionFlag,
+    PositionState,
+    wrapped,
+)
+from pmsmtool.sim.node.homing import METHODS, Homing
+from pmsmtool.sim.node.schedule import Schedule
+
+MODES = (Mode.PROFILE_POSITION, Mode.HOMING, Mode.INTERPOLATED_POSITION, Mode.CYCLIC_POSITION)
+FOLLOWING_ERROR = 0x8611
+"""Error code of a position that left the window of its reference for its time."""
+_OFF = 0xFFFFFFFF
+_CUT = PositionFlag.SOFTWARE_LIMIT | PositionFlag.LIMIT_SWITCH | PositionFlag.SATURATED
+
+
+class PositionModes:
+    """Targets, and what the statusword says of them.
+
+    Parameters
+    ----------
+    core : DriveCore
+        What is moved.
+    look : callable
+        Brings the core to the present instant.
+    mode : callable
+        Returns the mode of operation.
+    apply : callable
+        Gives the references to the core.
+    torque : callable
+        Returns the torque in permille of rated.
+    """
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        core: DriveCore,
+        schedule: Schedule,
+        *,
+        look: Callable[[], None],
+        mode: Callable[[], Mode],
+        apply: Callable[[], None],
+        torque: Callable[[], float],
+    ) -> None:
+        self._dictionary = dictionary
+        self._core = core
+        self._look = look
+        self._mode = mode
+        self._apply = apply
+        self._target = 0
+        self._set_point = 0
+        self._waiting: int | None = None
+        self._taken = False
+        self._offset = 0
+        self._homing_speed = 0.0
+        self._homing = Homing(
+            dictionary,
+            schedule,
+            state=self.state,
+            torque=torque,
+            go=self._search,
+            release=self._release,
+            hold=self._hold,
+        )
+        dictionary["cia402.homing_method"].sink = self._write_method
+        self._hook("target_position", Mode.CYCLIC_POSITION)
+        self._hook("interpolated_position", Mode.INTERPOLATED_POSITION)
+        for key, value in (
+            ("position", lambda state: state.actual),
+            ("position_demand", lambda state: state.demand),
+            ("following_error", lambda state: round(state.error)),
+            ("inputs", lambda state: state.limits),
+        ):
+            self._show(key, value)
+
+    def _hook(self, key: str, mode: Mode) -> None:
+        entry = self._dictionary[f"cia402.{key}"]
+
+        def sink(data: bytes) -> None:
+            entry.value = data
+            if self._mode() is mode:
+                self._go(entry.integer())
+
+        entry.sink = sink
+
+    def _show(self, key: str, value: Callable[[PositionState], int]) -> None:
+        entry = self._dictionary[f"cia402.{key}"]
+        entry.source = lambda: entry.encode(value(self.state()))
+
+    def _number(self, key: str) -> float:
+        return self._dictionary[f"cia402.{key}"].number()
+
+    def state(self) -> PositionState:
+        """Return the state of the position controller now."""
+        self._look()
+        return self._core.position()
+
+    # ---- homing --------------------------------------------------------------------------------
+
+    def _write_method(self, data: bytes) -> None:
+        if int.from_bytes(data, "little", signed=True) not in METHODS:
+            raise Refused(AbortCode.VALUE)
+        self._dictionary["cia402.homing_method"].value = data
+
+    @property
+    def released(self) -> bool:
+        """Whether the position has no controller for the moment in which it gets another zero."""
+        return self._homing.released
+
+    def _search(self, target: int, speed: float) -> None:
+        self._homing_speed = speed
+        self._go(wrapped(target))
+
+    def _release(self, offset: int) -> None:
+        self._offset = wrapped(offset)
+        self._core.command(Command(ControlMode.CURRENT, position=self.command(halt=False)))
+
+    def _hold(self) -> None:
+        self._homing_speed = 0.0
+        self._target = self.state().actual
+        self._apply()
+
+    # ---- targets -------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Forget targets: the shaft is held."""
+        self._waiting, self._taken = None, False
+        self._homing.forget()
+        self._target = self.state().actual
+
+    def controlword(self, word: int, rising: int) -> None:
+        """Take a set-point of mode 1 by its handshake: at once, or after the move that is under way."""
+        if self._mode() is Mode.HOMING:
+            if rising & Control.NEW_SET_POINT:
+                self._homing.start()
+            elif not word & Control.NEW_SET_POINT or word & Control.HALT:
+                self._homing.interrupt()
+        if self._mode() is not Mode.PROFILE_POSITION:
+            return
+        if rising & Control.NEW_SET_POINT:
+            target = int(self._number("target_position"))
+            base = self._target if self._waiting is None else self._waiting
+            target = wrapped(base + target) if word & Control.RELATIVE else target
+            self._taken = True
+            if word & Control.AT_ONCE or not self._moves():
+                self._waiting = None
+                self._go(target)
+            elif self._waiting is None:
+                self._waiting = target
+        elif not word & Control.NEW_SET_POINT and self._waiting is None:
+            self._taken = False
+
+    def attend(self, word: int) -> None:
+        """Start the set-point that waited for the end of a move."""
+        if self._waiting is not None and not self._moves():
+            target, self._waiting = self._waiting, None
+            self._taken = bool(word & Control.NEW_SET_POINT)
+            self._go(target)
+
+    def _moves(self) -> bool:
+        flags = self.state().flags
+        return bool(flags & PositionFlag.MOVING) and not flags & PositionFlag.LIMIT_SWITCH  # which ended it
+
+    def _go(self, target: int) -> None:
+        self._target = target
+        self._set_point += 1
+        self._apply()
+
+    def command(self, *, halt: bool) -> PositionCommand:
+        """Return what the controller shall do."""
+        counts = self._number("encoder_counts")
+        fastest = min(self._number("max_profile_velocity"), self._number("max_speed") / 60.0 * counts)
+        window = self._number("following_window")
+        homing = self._mode() is Mode.HOMING
+        ramps = ("homing_acceleration",) * 2 if homing else ("profile_acceleration", "profile_deceleration")
+        return PositionCommand(
+            target=self._target,
+            set_point=self._set_point,
+            offset=self._offset,
+            profile=homing or self._mode() is Mode.PROFILE_POSITION,
+            interval_s=self._number("interpolation_period") * 10.0 ** self._number("interpolation_exponent"),
+            velocity=min(self._homing_speed if homing else self._number("profile_velocity"), fastest),
+            acceleration=self._number(ramps[0]),
+            deceleration=self._number(ramps[1]),
+            stop_deceleration=self._number("quick_stop_deceleration") / 60.0 * counts,
+            jerk=self._number("profile_jerk"),
+            halt=halt,
+            minimum=0 if homing else int(self._number("minimum_position")),
+            maximum=0 if homing else int(self._number("maximum_position")),
+            window=0.0 if homing or window == _OFF else window,
+            window_time_s=1e-3 * self._number("following_time"),
+        )
+
+    # ---- what is told --------------------------------------------------------------------------
+
+    def status(self) -> Status:
+        """Return the bits of the statusword that belong to the mode."""
+        state, bits = self.state(), Status(0)
+        if state.flags & PositionFlag.FOLLOWING_ERROR:
+            bits |= Status.FOLLOWING_ERROR
+        if state.flags & _CUT:
+            bits |= Status.INTERNAL_LIMIT
+        if self._mode() is Mode.HOMING:
+            return bits | self._homing.status()
+        if self._mode() is not Mode.PROFILE_POSITION:
+            return bits | Status.SET_POINT_TAKEN  # in these modes bit 12: the drive follows the targets
+        if self._taken:
+            bits |= Status.SET_POINT_TAKEN
+        window = self._number("position_window")
+        arrived = not state.flags & PositionFlag.MOVING and self._waiting is None
+        if arrived and (window == _OFF or abs(state.error) <= window):
+            bits |= Status.TARGET_REACHED
+        return bits
+
+    def failed(self) -> bool:
+        """Whether the following error left its window for its time."""
+        return self._mode() in MODES and bool(self._core.position().flags & PositionFlag.FOLLOWING_ERROR)
