@@ -32,6 +32,7 @@ from pmsmtool.commissioning.tier_stages import open_tier_drive
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.errors import Declined, PmsmtoolError, exit_code_of
+from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.capabilities import examine
 from pmsmtool.proof.stage import ProofRequest
@@ -138,6 +139,7 @@ def commission_one(job: tuple[str, str, int, bool]) -> Outcome:
             ends = error == RIGHT and not to_the_end
             chain = Commissioning(
                 run, drive, Agrees(writes=True), BehindTheGate(ends=ends), file,
+                identify=IdentifyRequest(map_if_saturated=True, resonance=True),  # as the command asks
                 prove=ProofRequest(runs=32), capabilities=found,
             )  # fmt: skip
             code, text = 0, ""
