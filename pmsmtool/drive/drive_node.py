@@ -235,16 +235,26 @@ class DriveNode:
             raise self.fault_error()
 
     def fault_error(self) -> DriveFault:
-        """Return the error that tells the drive's fault."""
-        code = self.whole(objects.ERROR_CODE)
+        """Return the error that tells the drive's fault: by 0x603F, else by its last emergency."""
+        code = self._fault_code()
         aborted = code == EXCITATION_ABORTED
         cause = "allow more (--speed-max, --i-max) or ask for less" if aborted else "remove the cause"
+        named = f" {code:#06x}: {error_text(code)}" if code else ", and names no error (0x603F, emergencies)"
         return DriveFault(
-            f"the drive is in fault {code:#06x}: {error_text(code)}",
+            f"the drive is in fault{named}",
             where=f"node {self.node}, 0x603F:00",
             likely="current or speed left the limits of the envelope" if aborted else ERROR_CAUSES.get(code, ""),
             hint=f"{cause}, then `pmsmtool fault reset -n {self.node}`",
         )
+
+    def _fault_code(self) -> int:
+        try:
+            return self.whole(objects.ERROR_CODE)
+        except SdoAbort as abort:
+            if abort.code not in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX):
+                raise
+        self.connection.collect()
+        return next((said.code for said in reversed(self.supervision.emergencies) if said.code), 0)
 
     # ---- reset and store ------------------------------------------------------------------------
 

@@ -367,3 +367,11 @@ def test_what_only_its_owner_knows_moves_a_drive(tmp_path: Path) -> None:
             guard.wait(2.0 * WATCH_S)
             assert abs(guard.live("omega_e_rad_s")) > 1.0
         drive.close()
+
+
+def test_a_fault_without_an_error_code_is_named_by_its_emergency(tmp_path: Path) -> None:
+    """EPOS4's public files have no 0x603F."""
+    with opened(tmp_path, epos4()) as rig:
+        assert not rig.drive.node.has(0x603F, 0)
+        rig.session.power.fail(0x3220)
+        assert "fault 0x3220: DC-link under-voltage" in rig.drive.node.fault_error().what
