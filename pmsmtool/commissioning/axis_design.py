@@ -41,9 +41,34 @@ def design_axis(source: MachineFile, request: TuneRequest, axis: AxisRequest, dr
     lacking = not_offered(drive_map)
     notes = tuple(f"not written: {name}: {why}" for name, why in lacking.items())
     wanted = axis_parameters(made.design)
-    held = drive_map.quantised(wanted).values
+    fitting = dict(wanted.values)
+    for group in GROUPS:
+        fitting |= _slowed(drive_map, group, wanted)
+    cut = [name for name, value in fitting.items() if value < wanted.values[name]]
+    held = drive_map.quantised(replace(wanted, values=fitting)).values
     design = made.with_held({name: value for name, value in held.items() if drive_map.writes(name, wanted.values)})
+    notes += tuple(f"{name}: {wanted.values[name]:.4g} is designed, slower by what its objects hold" for name in cut)
     return replace(design, notes=(*design.notes, *notes))
+
+
+GROUPS = ({SPEED[0]: 1, SPEED[1]: 2}, {PID[0]: 2, PID[1]: 3, PID[2]: 1})
+"""Gains of one controller, and the power of its crossover with which each grows."""
+SIGNED = ("INTEGER8", "INTEGER16", "INTEGER32")
+
+
+def _slowed(drive_map: DriveMap, group: dict[str, int], wanted: ParameterSet) -> dict[str, float]:
+    """Return the gains of a controller, all of it slower where one of them is beyond what its object can hold."""
+    rows = [
+        (drive_map.cells[name], power)
+        for name, power in group.items()
+        if name in drive_map.cells and name in wanted.values and drive_map.writes(name, wanted.values)
+    ]
+    share = 1.0
+    for cell, power in rows:
+        if cell.wire != "REAL32":
+            largest = 2.0 ** (8 * cell.size - (cell.wire in SIGNED)) - 1.0
+            share = min(share, (largest / cell.counts(wanted.values[cell.name], wanted.values)) ** (1.0 / power))
+    return {cell.name: wanted.values[cell.name] * share**power for cell, power in rows}
 
 
 def not_offered(drive_map: DriveMap) -> dict[str, str]:

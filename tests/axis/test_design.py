@@ -74,6 +74,15 @@ def test_the_stiffest_gains_touch_a_limit() -> None:
     assert 45.0 <= worst < 45.5 or 5.7 < peak <= 6.0
 
 
+def test_a_gain_beyond_its_object_is_cut_and_judged_so() -> None:
+    """EPOS2 keeps gains as INTEGER16: K_p of the speed loop would be 35 200 counts."""
+    made = designed("epos2", 0.0, 0.0)
+    assert any("slower by what its objects hold" in note for note in made.notes)
+    assert float(made.facts["axis_speed_phase_least_deg"]) >= 45.0
+    K_t = made[TORQUE_PER_AMPERE]
+    assert made["speed.K_p_nms_per_rad"] == pytest.approx(32_767 * 20e-6 * K_t, rel=1e-4)
+
+
 def test_a_design_of_the_axis_is_read_back_and_gives_its_own_rows_only() -> None:
     made = designed("epos4", 0.0, 0.0)
     again = parse_design(design_text(made))

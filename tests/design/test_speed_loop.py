@@ -141,3 +141,13 @@ def test_a_notch_costs_phase_below_it() -> None:
     gains = symmetric_optimum(J, small_time_constants(path(), ALPHA), 4.0)
     plain, notched = (margins(speed_loop(gains, path(n))) for n in (Notch(), Notch(150.0, 0.05, 0.5)))
     assert notched.phase_margin_deg < plain.phase_margin_deg
+
+
+@pytest.mark.parametrize("slower", [1.0, 10.0, 100.0])
+def test_the_modulus_margin_of_a_slow_loop_is_that_of_a_fine_grid(slower: float) -> None:
+    """Of loops far below their rate the polynomial's roots lie too near 1: 1.0003 was found for 0.797."""
+    ratio = symmetric_ratio(math.radians(60.0))
+    gains = symmetric_optimum(J, slower * small_time_constants(path(), ALPHA), ratio)
+    loop = speed_loop(gains, path())
+    fine = np.geomspace(1e-5, 1.0, 200_001) * math.pi / loop.T_s
+    assert margins(loop).modulus_margin == pytest.approx(np.min(np.abs(1.0 + loop.at(fine))), rel=1e-7)

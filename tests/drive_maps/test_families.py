@@ -28,7 +28,7 @@ from pmsmtool.flash.download import Download
 from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.map_gate import check_map, memory_of, remember_map
 from pmsmtool.flash.restore import plan_download, take_backup
-from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.params.catalogue import CATALOGUE, TORQUE_PER_AMPERE
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.node.family import STANDARD
 
@@ -48,12 +48,8 @@ def opened(family: str, *, nv: str = ":memory:") -> Iterator[DriveNode]:
         yield node
         node.close()
 
+
 PROFILE = ("speed_rpm", "acceleration_rpm_per_s", "deceleration_rpm_per_s", "jerk_rpm_per_s2")
-IN_AMPERES = (
-    "speed.inertia_ff_kgm2", "speed.friction_ff_nms_per_rad", "position.inertia_ff_kgm2",
-    "position.friction_ff_nms_per_rad", "position.pid_p_nm_per_rad", "position.pid_i_nm_per_rads",
-    "position.pid_d_nms_per_rad",
-)  # fmt: skip
 
 
 def random_design(rng: np.random.Generator) -> dict[str, float]:
@@ -64,7 +60,6 @@ def random_design(rng: np.random.Generator) -> dict[str, float]:
 
     current, R_s, L_d = between(1.0, 100.0), between(0.01, 5.0), between(1e-4, 0.02)
     torque = between(0.1, 500.0)
-    K_t = between(0.05, 5.0)
     L_q, alpha = L_d * float(rng.uniform(1.0, 2.2)), between(300.0, 5000.0)
     return {
         "motor.pole_pairs": float(rng.integers(1, 12)),
@@ -86,10 +81,24 @@ def random_design(rng: np.random.Generator) -> dict[str, float]:
         "speed.tau_max_nm": torque,
         "reference.tau_rated_nm": torque / between(0.5, 10.0),
         "reference.torque_slope_nm_per_s": torque * between(0.1, 500.0),
-        "reference.K_t_nm_per_a": K_t,
         **{f"reference.profile_{key}": between(1.0, 1e5) for key in PROFILE},
-        **{name: between(1e-5, 100.0) * K_t for name in IN_AMPERES},
     }
+
+
+K_T = 2.3
+"""Torque of an ampere (N m/A), as the machine's or as the drive holds it."""
+
+
+def in_amperes(drive_map: DriveMap, rng: np.random.Generator) -> dict[str, float]:
+    """Gains that a family keeps in amperes, within its types."""
+    resting = [cell for name, cell in drive_map.cells.items() if not drive_map.writes(name, {})]
+    return {cell.name: cell.factor * K_T * float(rng.uniform(1.0, 3e4)) for cell in resting} | {TORQUE_PER_AMPERE: K_T}
+
+
+def torque_of(design: dict[str, float], drive_map: DriveMap) -> dict[str, float]:
+    """The torque of an ampere, where any gain is kept in amperes."""
+    resting = any(cell.form == "current" for cell in drive_map.cells.values())
+    return {TORQUE_PER_AMPERE: design[TORQUE_PER_AMPERE]} if resting else {}
 
 
 @pytest.mark.chain
@@ -101,14 +110,13 @@ def test_what_is_shown_before_is_what_the_drive_holds(family: str) -> None:
         drive_map, parameters = node.map, DriveParameters(node)
         rounded = 0
         for _ in range(DESIGNS):
-            design = random_design(rng)
-            wanted = ParameterSet({name: design[name] for name in drive_map.cells})
+            design = random_design(rng) | in_amperes(drive_map, rng)
+            wanted = ParameterSet({name: design[name] for name in drive_map.cells} | torque_of(design, drive_map))
             encoded, shown = drive_map.encode(wanted), drive_map.quantised(wanted)
             parameters.replace(encoded)
             found = parameters.read(encoded)
             assert found == encoded
-            given = {name: wanted.values[name] for name in ("reference.K_t_nm_per_a",) if name in wanted.values}
-            assert drive_map.decode(found, given).values == shown.values
+            assert drive_map.decode(found, torque_of(design, drive_map)).values == shown.values
             rounded += shown.values != wanted.values
         whole = set(drive_map.cells) == {"motor.pole_pairs"}
         assert rounded == (0 if whole else DESIGNS)  # every design is rounded by what the family can hold
@@ -117,8 +125,9 @@ def test_what_is_shown_before_is_what_the_drive_holds(family: str) -> None:
 @pytest.mark.parametrize("family", WITH_OWN_OBJECTS)
 def test_the_machine_behind_works_with_what_the_bytes_mean(family: str) -> None:
     with opened(family) as node:
-        design = random_design(np.random.default_rng(3))
-        wanted = ParameterSet({name: design[name] for name in node.map.cells})
+        rng = np.random.default_rng(3)
+        design = random_design(rng) | in_amperes(node.map, rng)
+        wanted = ParameterSet({name: design[name] for name in node.map.cells} | torque_of(design, node.map))
         DriveParameters(node).replace(node.map.encode(wanted))
         held = node.map.quantised(wanted).values
         session = node.connection.bus.line.nodes[0].session  # type: ignore[attr-defined]

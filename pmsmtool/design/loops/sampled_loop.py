@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 _REAL_ROOT = 1e-6
 """Largest |imaginary part| of a root in c taken as real; double roots of degree <= 12 scatter by about 1e-8."""
 
+_MODULUS_GRID, _MODULUS_ROUNDS = 60, 5
+"""Points of the grid for the least |1 + L|, and looks between neighbours: the place is known to 1e-7 of itself then."""
+
 _POLISH_STEPS, _POLISHED = 60, 1e-15
 """Bracketed secant steps of a crossing (8 to 12 seen), and the relative change that ends them."""
 
@@ -202,15 +205,24 @@ def _horner(coefficients: tuple[float, ...], z: NDArray[np.complex128]) -> NDArr
 
 
 def _modulus_margin(loop: SampledLoop) -> float:
-    """Least |1 + L| over the unit circle: the extrema of |D + N|^2 / |D|^2 are roots of a polynomial in c."""
+    """Least |1 + L| over the unit circle: the extrema of |D + N|^2 / |D|^2 are roots of a polynomial in c.
+
+    The roots of a slow loop lie too near 1 to be told apart. So a grid is looked at besides, and the least of both
+    again between its neighbours.
+    """
     above, below = _square(tuple(np.polyadd(loop.den, loop.num))), _square(loop.den)
     derivative = chebyshev.chebsub(
         chebyshev.chebmul(chebyshev.chebder(above), below), chebyshev.chebmul(above, chebyshev.chebder(below))
     )
-    theta = np.append(_real_roots(np.asarray(derivative)), math.pi)
+    theta = np.unique(np.append(_real_roots(np.asarray(derivative)), np.geomspace(1e-4, 1.0, _MODULUS_GRID) * math.pi))
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.abs(1.0 + loop.at(theta / loop.T_s))
-    return float(np.nanmin(distance))
+        for _ in range(_MODULUS_ROUNDS):
+            distance = np.abs(1.0 + loop.at(theta / loop.T_s))
+            least = int(np.nanargmin(distance))
+            low, high = theta[max(least - 1, 0)], theta[min(least + 1, theta.size - 1)]
+            theta = np.append(np.linspace(low, high, _MODULUS_GRID), theta[least])
+            theta.sort()
+        return float(np.nanmin(np.abs(1.0 + loop.at(theta / loop.T_s))))
 
 
 def _bandwidth(loop: SampledLoop) -> float:

@@ -40,7 +40,7 @@ HELD = (0x6072, 0x6073, 0x6087)
 """Limits whose stored value acts from the start."""
 REVISION = 3
 """Sub-index of the identity object that the file gives; vendor and product it may leave blank."""
-PID_MARKS = {(0x30A1, 3)}
+PID_MARKS = {(0x30A1, 3), (0x60FB, 3)}
 """Gain of the derivative, by which one controller of the position is known."""
 SERIALS = ((0x1018, 4), (0x2100, 1), (0x6510, 1))
 """Where makers keep the serial number (EPOS4: 0x2100:01, Copley: 0x6510:01)."""

@@ -137,6 +137,8 @@ def _epos2(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     yield Law(0x2210, 1, "pulses, four counts each", set_up=motor.counts / 4.0)
     yield _current(0x6078, 0, 1000.0, PEAK_ASSUMED)
     yield _current(0x2027, 0, 1000.0, PEAK_ASSUMED)
+    yield from _position_pid((0x60FB, 1, 1e-2), (0x60FB, 2, 78e-3), (0x60FB, 3, 80e-6), motor)
+    yield from _forward((0x60FB, 4, 1e-6), (0x60FB, 5, 1e-6), motor)
 
     def push(behind: Behind, counts: float) -> None:
         behind.command_torque(1e-3 * counts * motor.torque_constant)
