@@ -104,6 +104,8 @@ def test_an_unreachable_reference_is_steered_within_the_current_limit() -> None:
     assert np.flatnonzero(away > 1.0)[-1] * source.inverter.T_s <= 0.010
     salient = tune(load_machine_file(PROFILES / "mtpv-test.toml"))
     assert int(salient["governor.options"]) & MINIMUM_TIME
+    small = replace(source.machine, I_max_apk=0.1 * source.machine.I_max_apk, I_nom_apk=None)
+    assert not int(tune(replace(source, machine=small))["governor.options"]) & MINIMUM_TIME
 
 
 def test_overshoot_of_the_reference_ramps() -> None:
