@@ -67,16 +67,23 @@ def _iron(drive: MachineFile, percent: float) -> Changes:
     return {"iron_loss_ohm": emf / (0.01 * percent * float(drive.machine.I_nom_apk or 1.0)) if percent else 0.0}
 
 
-def _eddy(drive: MachineFile, percent: float) -> Changes:
-    return {"eddy_share": 0.01 * percent, "eddy_time_s": 1e-4}
+def _eddy(drive: MachineFile, percent: float, time_us: float = 100.0) -> Changes:
+    return {"eddy_share": 0.01 * percent, "eddy_time_s": 1e-6 * time_us}
 
 
 def _inertia(drive: MachineFile, factor: float) -> Changes:
     return {"J_kgm2": factor * truth_of(drive, "J_kgm2")}
 
 
-def _ripple(drive: MachineFile, percent: float) -> Changes:
-    return {"U_dc_ripple_v": 0.01 * percent * drive.inverter.U_dc_v, "U_dc_ripple_hz": 300.0}
+def _ripple(drive: MachineFile, percent: float, hz: float = 300.0) -> Changes:
+    return {"U_dc_ripple_v": 0.01 * percent * drive.inverter.U_dc_v, "U_dc_ripple_hz": hz}
+
+
+def _sag(drive: MachineFile, percent: float) -> Changes:
+    """Fall of the link at rated power, through a supply whose resistance the link's capacitor sees after 1 ms."""
+    torque, speed = _rated(drive)
+    power = torque * speed / truth_of(drive, "pole_pairs")
+    return {"U_dc_source_ohm": 0.01 * percent * drive.inverter.U_dc_v**2 / power}
 
 
 def _mismatch(drive: MachineFile, percent: float) -> Changes:
@@ -84,17 +91,64 @@ def _mismatch(drive: MachineFile, percent: float) -> Changes:
     return {"sensor_gain_a": 1.0 + 0.005 * percent, "sensor_gain_b": 1.0 - 0.005 * percent}
 
 
-def _elastic(drive: MachineFile, ratio: float) -> Changes:
-    """As many times the rotor's inertia behind a shaft that resonates at 150 Hz, damped by 2 %."""
-    J, w = truth_of(drive, "J_kgm2"), 2.0 * math.pi * 150.0
+def _cubic(drive: MachineFile, percent: float) -> Changes:
+    return {"sensor_cubic": 0.01 * percent}
+
+
+def _drift(drive: MachineFile, percent: float) -> Changes:
+    """Of the full scale in a minute."""
+    return {"sensor_drift_apk_per_s": 0.01 * percent * truth_of(drive, "adc_full_scale_apk") / 60.0}
+
+
+def _elastic(drive: MachineFile, ratio: float, hz: float = 150.0, damping_percent: float = 2.0) -> Changes:
+    """As many times the rotor's inertia behind a shaft, with its resonance and damping."""
+    J, w = truth_of(drive, "J_kgm2"), 2.0 * math.pi * hz
     if not ratio:
         return {}
     common = J * ratio / (1.0 + ratio)
     return {
         "J_load_kgm2": ratio * J,
         "coupling_stiffness_nm_per_rad": common * w * w,
-        "coupling_damping_nms_per_rad": 2.0 * 0.02 * common * w,
+        "coupling_damping_nms_per_rad": 0.02 * damping_percent * common * w,
     }
+
+
+def _backlash(drive: MachineFile, degrees: float) -> Changes:
+    """Play of the elastic shaft; of one with the rotor's inertia behind it where there is none yet."""
+    shaft = {} if "J_load_kgm2" in drive.simulation else _elastic(drive, 1.0)
+    return {**shaft, "backlash_rad": math.radians(degrees)} if degrees else {}
+
+
+def _stribeck(drive: MachineFile, percent: float) -> Changes:
+    """Friction at rest above the Coulomb torque; 1/e of it is left at half a percent of the rated speed."""
+    return {"stribeck_share": 0.01 * percent, "stribeck_rpm": 0.005 * float(drive.machine.n_nom_rpm or 1.0)}
+
+
+def _uneven_friction(drive: MachineFile, percent: float) -> Changes:
+    return {"friction_once": 0.01 * percent}
+
+
+def _tolerances(drive: MachineFile, percent: float) -> Changes:
+    """Cogging of the rated torque once per slot and per pole, which only tolerances make."""
+    torque, pairs = _rated(drive)[0], round(truth_of(drive, "pole_pairs"))
+    return {
+        "cogging_slot_nm": 0.01 * percent * torque,
+        "cogging_slot_periods": 6 * (2 if pairs < 5 else 3),
+        "cogging_pole_nm": 0.01 * percent * torque,
+        "cogging_pole_periods": 2 * pairs,
+    }
+
+
+def _uneven_R(drive: MachineFile, percent: float) -> Changes:
+    return {"resistance_imbalance": 0.01 * percent}
+
+
+def _uneven_L(drive: MachineFile, percent: float) -> Changes:
+    return {"inductance_imbalance": 0.01 * percent}
+
+
+def _sixth_L(drive: MachineFile, percent: float) -> Changes:
+    return {"inductance_6": 0.01 * percent}
 
 
 def _drag(drive: MachineFile, share: float) -> Changes:
@@ -135,7 +189,7 @@ def _load(drive: MachineFile, percent: float) -> Changes:
     return {"tau_c_nm": truth_of(drive, "tau_c_nm") + 0.01 * percent * _rated(drive)[0]}
 
 
-EFFECTS: Mapping[str, tuple[Callable[[MachineFile, float], Changes], tuple[float, ...]]] = {
+EFFECTS: Mapping[str, tuple[Callable[..., Changes], tuple[float, ...]]] = {
     "none": (lambda drive, level: {}, (0.0,)),
     "cogging %": (_cogging, (1.0, 3.0, 5.0, 10.0)),
     "emf 5th 7th %": (_emf, (1.0, 2.0, 5.0, 10.0)),
@@ -152,6 +206,16 @@ EFFECTS: Mapping[str, tuple[Callable[[MachineFile, float], Changes], tuple[float
     "sensor lag us": (_lag, (1.0, 3.0, 10.0)),
     "encoder age us": (_latency, (2.0, 10.0, 50.0)),
     "friction %": (_load, (5.0, 15.0, 30.0)),
+    "R imbalance %": (_uneven_R, (1.0, 3.0, 6.0)),
+    "L imbalance %": (_uneven_L, (1.0, 3.0, 6.0)),
+    "L 6th %": (_sixth_L, (1.0, 5.0, 10.0)),
+    "cogging tolerances %": (_tolerances, (0.2, 1.0, 2.0)),
+    "Stribeck %": (_stribeck, (20.0, 60.0, 120.0)),
+    "friction once %": (_uneven_friction, (5.0, 20.0, 40.0)),
+    "backlash deg": (_backlash, (0.05, 0.3, 1.0, 2.0)),
+    "sensor cubic %": (_cubic, (0.1, 0.5, 1.0)),
+    "sensor drift %/min": (_drift, (0.1, 0.5, 1.0)),
+    "DC link sag %": (_sag, (2.0, 10.0, 20.0)),
 }
 """Effect -> what it changes in ``[simulation]`` at a level, and the levels; the last one is about twice its range."""
 

@@ -99,12 +99,23 @@ static void apply_schedules(pmsm_sim *sim, double t, double T_s)
 
 static double dc_link(const pmsm_sim *sim, double t)
 {
+    const double U_dc = sim->setup.U_dc - sim->setup.U_dc_source * sim->link_current;
     if (sim->setup.U_dc_ripple == 0.0)
-        return sim->setup.U_dc;
+        return U_dc;
     const double turns = sim->setup.U_dc_ripple_hz * t;
     double s, c;
     pmsm_real64_sincos(PMSM_REAL64_TWO_PI * (turns - (double)(int64_t)turns), &s, &c);
-    return sim->setup.U_dc + sim->setup.U_dc_ripple * s;
+    return U_dc + sim->setup.U_dc_ripple * s;
+}
+
+/* The bridge takes the sum of duty times current from the capacitor, which the supply recharges. */
+static void load_link(pmsm_sim *sim, const pmsm_output *acting, double T_s)
+{
+    const double duty[3] = {(double)acting->duty_a, (double)acting->duty_b, (double)acting->duty_c};
+    double current = 0.0;
+    for (int x = 0; x < 3 && acting->gates; x++)
+        current += duty[x] * pmsm_plant_leg_current(&sim->plant, x);
+    sim->link_current += (current - sim->link_current) * T_s / (sim->setup.U_dc_source_time + T_s);
 }
 
 /* ---- sampling ----------------------------------------------------------------------------------------------- */
@@ -156,6 +167,7 @@ static void read_encoder(double theta_M, pmsm_sensors *sensors)
 static void sample(pmsm_sim *sim, const pmsm_output *acting, double T_s, double theta_M, pmsm_sensors *sensors)
 {
     const pmsm_sensor_setup *setup = &sim->setup.sensors;
+    const double drifted = setup->drift * 1e-9 * (double)sim->t_ns, drift[3] = {drifted, -drifted, 0.0};
     double i[3], seen[3];
     if (sim->has_early)
         memcpy(i, sim->early, sizeof i);
@@ -165,7 +177,7 @@ static void sample(pmsm_sim *sim, const pmsm_output *acting, double T_s, double 
         read_shunts(sim, acting, T_s, i);
     sensors->adc_clipped = 0;
     for (int x = 0; x < 3; x++)
-        seen[x] = sim->ideal ? i[x] : pmsm_sensor_current(setup, &sim->random, x, i[x], &sensors->adc_clipped);
+        seen[x] = sim->ideal ? i[x] : pmsm_sensor_current(setup, &sim->random, x, i[x] + drift[x], &sensors->adc_clipped);
     sensors->i_a = (float)seen[0];
     sensors->i_b = (float)seen[1];
     sensors->i_c = (float)seen[2];
@@ -328,6 +340,8 @@ static void run_period(pmsm_sim *sim)
         done = T_s + shift;
     }
     pmsm_inverter_run(&sim->inverter, &sim->plant, &sim->lag, done, T_s);
+    if (sim->setup.U_dc_source > 0.0)
+        load_link(sim, &acting, T_s);
     if (sim->plant.machine.thermal_capacity > 0.0)
         pmsm_plant_heat(&sim->plant, T_s);
     if (sim->setup.sensors.T_lag > 0.0)

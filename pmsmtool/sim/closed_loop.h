@@ -64,6 +64,7 @@ typedef struct {               /* everything that is fixed during a run */
     pmsm_inverter_setup inverter;
     pmsm_sensor_setup sensors;
     double U_dc, U_dc_ripple, U_dc_ripple_hz;
+    double U_dc_source, U_dc_source_time; /* ohm of the supply, s of its resistance with the link's capacitor */
     double T_winding, T_magnet; /* degC at the start */
     double theta_M, omega_M;   /* at the start */
     double load;               /* N m */
@@ -91,6 +92,7 @@ typedef struct pmsm_sim {
     uint32_t has_early;
     double i_read[3];          /* A, last current a shunt could read */
     double U_dc;               /* V, of this period */
+    double link_current;       /* A, that the supply gives */
     double T_winding_shown;    /* degC, of the lagging sensor */
     double encoder_held;       /* rad, reading of a stuck encoder */
     uint32_t encoder_is_held;

@@ -62,6 +62,16 @@ class Machine(ctypes.Structure):
         ("J_load", _f64),
         ("coupling_stiffness", _f64),
         ("coupling_damping", _f64),
+        ("backlash", _f64),
+        ("stribeck", _f64),
+        ("stribeck_speed", _f64),
+        ("friction_once", _f64),
+        ("cogging_slot", _f64),
+        ("cogging_slot_periods", _f64),
+        ("cogging_pole", _f64),
+        ("cogging_pole_periods", _f64),
+        ("L_6", _f64),
+        ("L_imbalance", _f64),
     )
 
 
@@ -103,6 +113,8 @@ class Sensors(ctypes.Structure):
         ("encoder_twice", _f64),
         ("T_lag", _f64),
         ("blind", _f64),
+        ("cubic", _f64),
+        ("drift", _f64),
     )
 
 
@@ -116,6 +128,8 @@ class Setup(ctypes.Structure):
         ("U_dc", _f64),
         ("U_dc_ripple", _f64),
         ("U_dc_ripple_hz", _f64),
+        ("U_dc_source", _f64),
+        ("U_dc_source_time", _f64),
         ("T_winding", _f64),
         ("T_magnet", _f64),
         ("theta_M", _f64),

@@ -29,19 +29,48 @@ static inline void terminal_voltage(const pmsm_plant *m, const pmsm_supply *supp
 
 /* ---- mechanical side ---------------------------------------------------------------------------- */
 
+static inline double cogging_torque(double amplitude, double periods, double theta_M)
+{
+    double s, c;
+    if (amplitude == 0.0)
+        return 0.0;
+    pmsm_real64_sincos(periods * theta_M, &s, &c);
+    return amplitude * s;
+}
+
+/* Coulomb torque at an angle and a speed; the largest of a speed at rest. */
+static inline double coulomb_torque(const pmsm_machine *k, double theta_M, double omega)
+{
+    double torque = k->tau_c;
+    if (k->friction_once != 0.0) {
+        double s, c;
+        pmsm_real64_sincos(theta_M, &s, &c);
+        torque *= 1.0 + k->friction_once * s;
+    }
+    if (k->stribeck > 0.0) {
+        const double x = omega / k->stribeck_speed;
+        torque *= 1.0 + k->stribeck * pmsm_real64_exp(-x * x);
+    }
+    return torque;
+}
+
 /* Accelerations of rotor and second mass (rad/s2) at speeds omega, omega_load and angle theta_M. */
 static inline void accelerations(const pmsm_plant *m, double torque, double theta_M, double omega, double twist,
                                  double omega_load, double *rotor, double *load)
 {
     const pmsm_machine *k = &m->machine;
-    double net = torque - (k->B + k->drag * pmsm_real64_abs(omega)) * omega - k->tau_c * m->friction_sign;
-    if (k->cogging != 0.0) {
-        double s, c;
-        pmsm_real64_sincos(k->cogging_periods * theta_M, &s, &c);
-        net -= k->cogging * s;
-    }
+    double net = torque - (k->B + k->drag * pmsm_real64_abs(omega)) * omega;
+    if (m->friction_sign != 0.0)
+        net -= m->friction_sign * coulomb_torque(k, theta_M, omega);
+    net -= cogging_torque(k->cogging, k->cogging_periods, theta_M);
+    net -= cogging_torque(k->cogging_slot, k->cogging_slot_periods, theta_M);
+    net -= cogging_torque(k->cogging_pole, k->cogging_pole_periods, theta_M);
     if (k->J_load > 0.0) {
-        const double shaft = k->coupling_stiffness * twist + k->coupling_damping * (omega - omega_load);
+        const double play = 0.5 * k->backlash;
+        const double bent = twist > play ? twist - play : twist < -play ? twist + play : 0.0;
+        const double shaft = play > 0.0 && bent == 0.0
+                                 ? 0.0
+                                 : k->coupling_stiffness * bent + k->coupling_damping * (omega - omega_load);
         *load = (shaft - m->load - k->load_viscous * omega_load) / k->J_load;
         net -= shaft;
     } else {
@@ -309,7 +338,7 @@ static void decide_stick(pmsm_plant *m)
     accelerations(m, m->state.torque, m->state.theta_M, 0.0, m->state.twist, m->state.omega_load, &acceleration,
                   &load_acceleration);
     const double torque = acceleration * m->machine.J;
-    m->state.sticking = pmsm_real64_abs(torque) <= m->machine.tau_c;
+    m->state.sticking = pmsm_real64_abs(torque) <= coulomb_torque(&m->machine, m->state.theta_M, 0.0);
     if (!m->state.sticking)
         m->friction_sign = torque > 0.0 ? 1.0 : -1.0;
 }

@@ -37,6 +37,11 @@ typedef struct {
     double thermal_resistance, thermal_capacity, T_ambient; /* K/W, J/K, degC; capacity 0: T_winding is held */
     uint32_t rotor;                /* enum pmsm_rotor */
     double J_load, coupling_stiffness, coupling_damping; /* second mass behind a shaft; J_load 0: one mass */
+    double backlash;               /* rad, whole play of the shaft */
+    double stribeck, stribeck_speed; /* tau_c (1 + stribeck exp(-(omega/stribeck_speed)^2)); 1, rad/s */
+    double friction_once;          /* tau_c (1 + friction_once sin(theta_M)) */
+    double cogging_slot, cogging_slot_periods, cogging_pole, cogging_pole_periods; /* of tolerances, as cogging */
+    double L_6, L_imbalance;       /* shares: di/dpsi (1 - L_6 cos 6 theta_e), phase a above the mean; not with a map */
 } pmsm_machine;
 
 typedef struct {

@@ -21,6 +21,14 @@ static void find_reluctance(const pmsm_plant *m, const pmsm_point *at, double g[
         g[1] = 0.0;
         g[2] = 0.0;
         g[3] = m->L_q_inverse;
+        if (pmsm_is_uneven(&m->machine)) {
+            double uneven[3], slope[3];
+            pmsm_uneven_reluctance(m, at->c, at->s, uneven, slope);
+            g[0] += uneven[0];
+            g[1] += uneven[1];
+            g[2] += uneven[1];
+            g[3] += uneven[2];
+        }
     }
     if (m->machine.eddy_rate > 0.0) {
         g[0] += m->machine.eddy_d;
@@ -61,6 +69,13 @@ double pmsm_point_hold_voltage(const pmsm_plant *m, const pmsm_point *at, double
     const double n_d = c * pmsm_leg_alpha[x] + s * pmsm_leg_beta[x], n_q = c * pmsm_leg_beta[x] - s * pmsm_leg_alpha[x];
     double di_d = g[0] * d_psi_d + g[1] * d_psi_q - omega_e * at->i_q;
     double di_q = g[2] * d_psi_d + g[3] * d_psi_q + omega_e * at->i_d;
+    if (pmsm_is_uneven(&m->machine)) {
+        double uneven[3], slope[3], psi[2];
+        pmsm_uneven_reluctance(m, c, s, uneven, slope);
+        pmsm_current_flux(m, at, psi);
+        di_d += omega_e * (slope[0] * psi[0] + slope[1] * psi[1]);
+        di_q += omega_e * (slope[1] * psi[0] + slope[2] * psi[1]);
+    }
     if (m->machine.eddy_rate > 0.0) {
         di_d -= m->machine.eddy_d * at->d_chi_d;
         di_q -= m->machine.eddy_q * at->d_chi_q;

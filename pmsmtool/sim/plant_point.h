@@ -35,6 +35,37 @@ static inline int pmsm_has_harmonics(const pmsm_machine *machine)
     return machine->psi_6 != 0.0 || machine->psi_12 != 0.0 || machine->psi_7 != 0.0;
 }
 
+static inline int pmsm_is_uneven(const pmsm_machine *machine)
+{
+    return machine->L_6 != 0.0 || machine->L_imbalance != 0.0;
+}
+
+/* What di/dpsi has beside its mean at angle (c, s), as dd, dq, qq, and its derivative with respect to theta_e. Phase a
+ * with the share e above the mean is e/2 of the mean in alpha and against it in beta. */
+static inline void pmsm_uneven_reluctance(const pmsm_plant *m, double c, double s, double g[3], double dg[3])
+{
+    const double c2 = c * c - s * s, s2 = 2.0 * c * s;
+    const double c3 = c2 * c - s2 * s, s3 = s2 * c + c2 * s;
+    const double c6 = c3 * c3 - s3 * s3, s6 = 2.0 * c3 * s3;
+    const double a = 0.25 * m->machine.L_imbalance * (m->L_d_inverse + m->L_q_inverse), b = m->machine.L_6;
+    g[0] = -a * c2 - b * c6 * m->L_d_inverse;
+    g[1] = a * s2;
+    g[2] = a * c2 - b * c6 * m->L_q_inverse;
+    dg[0] = 2.0 * a * s2 + 6.0 * b * s6 * m->L_d_inverse;
+    dg[1] = 2.0 * a * c2;
+    dg[2] = -2.0 * a * s2 + 6.0 * b * s6 * m->L_q_inverse;
+}
+
+/* Flux of the currents at a point: without magnet and harmonics; not with a map. */
+static inline void pmsm_current_flux(const pmsm_plant *m, const pmsm_point *at, double psi[2])
+{
+    double h[2] = {0.0, 0.0}, dh[2];
+    if (pmsm_has_harmonics(&m->machine))
+        pmsm_magnet_harmonics(m, at->c, at->s, h, dh);
+    psi[0] = at->c * at->psi_alpha + at->s * at->psi_beta - h[0] - m->psi_m;
+    psi[1] = at->c * at->psi_beta - at->s * at->psi_alpha - h[1];
+}
+
 /* Currents of a point from its flux and angle. */
 static inline void pmsm_find_currents(pmsm_plant *m, pmsm_point *at)
 {
@@ -53,6 +84,12 @@ static inline void pmsm_find_currents(pmsm_plant *m, pmsm_point *at)
     } else {
         at->i_d = (psi_d - m->psi_m) * m->L_d_inverse;
         at->i_q = psi_q * m->L_q_inverse;
+        if (pmsm_is_uneven(&m->machine)) {
+            double g[3], dg[3];
+            pmsm_uneven_reluctance(m, c, s, g, dg);
+            at->i_d += g[0] * (psi_d - m->psi_m) + g[1] * psi_q;
+            at->i_q += g[1] * (psi_d - m->psi_m) + g[2] * psi_q;
+        }
     }
     if (m->machine.eddy_rate > 0.0) {
         const double slip_d = psi_d - at->chi_d, slip_q = psi_q - at->chi_q;
@@ -72,6 +109,12 @@ static inline double pmsm_air_gap_torque(const pmsm_plant *m, const pmsm_point *
         double h[2], dh[2];
         pmsm_magnet_harmonics(m, at->c, at->s, h, dh);
         flux_current += at->i_d * dh[0] + at->i_q * dh[1];
+    }
+    if (pmsm_is_uneven(&m->machine)) { /* from the field energy: -psi' (dg/d theta_e) psi' / 2 */
+        double g[3], dg[3], psi[2];
+        pmsm_uneven_reluctance(m, at->c, at->s, g, dg);
+        pmsm_current_flux(m, at, psi);
+        flux_current -= 0.5 * (dg[0] * psi[0] + 2.0 * dg[1] * psi[1]) * psi[0] + 0.5 * dg[2] * psi[1] * psi[1];
     }
     return 1.5 * m->machine.pole_pairs * flux_current;
 }

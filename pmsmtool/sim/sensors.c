@@ -76,6 +76,8 @@ static double nearest(double x)
 double pmsm_sensor_current(const pmsm_sensor_setup *setup, pmsm_random *random, int x, double i, uint32_t *clipped)
 {
     double value = setup->gain[x] * i + setup->offset[x];
+    if (setup->cubic != 0.0 && setup->full_scale > 0.0)
+        value += setup->cubic * i * (i / setup->full_scale) * (i / setup->full_scale);
     if (setup->noise > 0.0)
         value += setup->noise * pmsm_random_normal(random);
     if (!(setup->full_scale > 0.0))

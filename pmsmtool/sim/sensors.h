@@ -24,6 +24,8 @@ typedef struct {
     double encoder_once, encoder_twice; /* rad mechanical: error amplitudes per turn and per half turn */
     double T_lag;                /* s, of the temperature sensor, 0: none */
     double blind;                /* s: shortest low-side pulse a shunt can read, 0: in-phase sensors */
+    double cubic;                /* share of the full scale at full scale: gain i + cubic i^3 / full_scale^2 */
+    double drift;                /* A/s, offset of phase a; that of b drifts against it */
 } pmsm_sensor_setup;
 
 enum pmsm_sensor_fault {
@@ -41,7 +43,7 @@ typedef struct {
 static inline int pmsm_sensor_is_ideal(const pmsm_sensor_setup *s)
 {
     return s->noise == 0.0 && s->full_scale == 0.0 && s->gain[0] == 1.0 && s->gain[1] == 1.0 && s->gain[2] == 1.0
-           && s->offset[0] == 0.0 && s->offset[1] == 0.0 && s->offset[2] == 0.0;
+           && s->offset[0] == 0.0 && s->offset[1] == 0.0 && s->offset[2] == 0.0 && s->drift == 0.0;
 }
 
 void pmsm_random_seed(pmsm_random *random, uint64_t seed);

@@ -158,6 +158,7 @@ def build_setup(
     _timing(setup, machine_file, settings, violations)
     setup.U_dc, setup.load = settings.number("U_dc_v"), settings.number("load_nm")
     setup.U_dc_ripple, setup.U_dc_ripple_hz = settings.number("U_dc_ripple_v"), settings.number("U_dc_ripple_hz")
+    setup.U_dc_source, setup.U_dc_source_time = settings.number("U_dc_source_ohm"), settings.number("U_dc_source_s")
     setup.T_winding, setup.T_magnet = settings.number("T_winding_c"), settings.number("T_magnet_c")
     setup.theta_M = settings.number("theta_M_start_rad")
     driven = setup.machine.rotor == Rotor.DRIVEN and start_rad_s == 0.0
@@ -179,7 +180,8 @@ def device_slope_ohm(settings: Settings) -> float:
 def _machine(out: Any, machine_file: MachineFile, settings: Settings, violations: list[str]) -> object:
     machine = machine_file.machine
     devices = device_slope_ohm(settings)
-    R_phase = settings.number("R_s_ohm") - devices
+    # phase a has 1.5 times the imbalance more in its lead
+    R_phase = settings.number("R_s_ohm") * (1.0 - 0.5 * settings.number("resistance_imbalance")) - devices
     if R_phase <= 0.0:
         violations.append(f"R_s_ohm is the loop and must exceed the devices' share of {devices:g} ohm")
     winding = machine.R_winding_ohm
@@ -187,6 +189,7 @@ def _machine(out: Any, machine_file: MachineFile, settings: Settings, violations
     out.R_copper, out.R_fixed = share * R_phase, (1.0 - share) * R_phase
     out.pole_pairs = settings.whole("pole_pairs")
     out.L_d, out.L_q, out.psi_f = (settings.number(name) for name in ("L_d_h", "L_q_h", "psi_f_wb"))
+    out.L_6, out.L_imbalance = settings.number("inductance_6"), settings.number("inductance_imbalance")
     out.T_ref, out.alpha_R = machine.T_ref_c, machine.alpha_R_per_k
     out.alpha_psi = settings.number("alpha_psi_per_k")
     out.R_iron = settings.number("iron_loss_ohm")
@@ -202,7 +205,8 @@ def _machine(out: Any, machine_file: MachineFile, settings: Settings, violations
     _mechanics(out, settings, violations)
     if machine_file.flux_map is None:
         return None
-    given = [name for name in ("L_d_h", "L_q_h", "psi_f_wb") if name in machine_file.simulation]
+    of_constants = ("L_d_h", "L_q_h", "psi_f_wb", "inductance_6", "inductance_imbalance")
+    given = [name for name in of_constants if name in machine_file.simulation]
     if given:
         violations.append(f"{', '.join(given)}: the flux map is the machine, its inductances and flux are in the map")
     keep = machine_file.flux_map.as_struct()
@@ -218,6 +222,11 @@ def _mechanics(out: Any, settings: Settings, violations: list[str]) -> None:
     out.tau_c, out.load_viscous = settings.number("tau_c_nm"), settings.number("load_viscous_nms")
     out.drag = settings.number("drag_nms2")
     out.cogging, out.cogging_periods = settings.number("cogging_nm"), float(settings.whole("cogging_periods"))
+    for of in ("slot", "pole"):
+        setattr(out, f"cogging_{of}", settings.number(f"cogging_{of}_nm"))
+        setattr(out, f"cogging_{of}_periods", float(settings.whole(f"cogging_{of}_periods")))
+    out.stribeck, out.stribeck_speed = settings.number("stribeck_share"), RPM * settings.number("stribeck_rpm")
+    out.friction_once, out.backlash = settings.number("friction_once"), settings.number("backlash_rad")
     out.J_load = settings.number("J_load_kgm2")
     out.coupling_stiffness = settings.number("coupling_stiffness_nm_per_rad")
     out.coupling_damping = settings.number("coupling_damping_nms_per_rad")
@@ -241,6 +250,7 @@ def _inverter(out: Any, machine_file: MachineFile, settings: Settings, violation
         out.open[:] = [1, 1, 1]
     if fault == "unbalanced":
         out.r_leg[0] = UNBALANCE_SHARE * settings.number("R_s_ohm")
+    out.r_leg[0] += 1.5 * settings.number("resistance_imbalance") * settings.number("R_s_ohm")
     if out.model == MODELS.index("switched") and out.capacitance > 0.0:
         L_min = min(settings.number("L_d_h"), settings.number("L_q_h"))
         least = library().pmsm_inverter_smallest_capacitance(dead + abs(mismatch), L_min)
@@ -263,6 +273,7 @@ def _sensors(out: Any, machine_file: MachineFile, settings: Settings, violations
     out.fault = int(settings.text("drive_fault") == "encoder_stuck")
     out.encoder_latency = settings.number("encoder_latency_s")
     out.encoder_once, out.encoder_twice = settings.number("encoder_once_rad"), settings.number("encoder_twice_rad")
+    out.cubic, out.drift = settings.number("sensor_cubic"), settings.number("sensor_drift_apk_per_s")
     out.T_lag, out.blind = settings.number("T_sensor_lag_s"), settings.number("shunt_blind_s")
 
 

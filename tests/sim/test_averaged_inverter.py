@@ -92,6 +92,58 @@ def test_unequal_legs_and_a_bad_joint():
     assert u.real == pytest.approx((R_S + 2.0 / 3.0 * 0.3) * 10.0, rel=1e-5)
 
 
+def uneven(setup: Setup) -> None:
+    setup.machine.L_6, setup.machine.L_imbalance = 0.05, 0.04
+
+
+def test_uneven_inductances_at_a_standing_rotor():
+    """The slope of a short pulse along alpha, at an angle: the inverse of (1 - L_6 cos 6 theta) and of phase a's."""
+    theta, u, h = 0.2, 10.0, 1e-7
+
+    def change(setup: Setup) -> None:
+        uneven(setup)
+        setup.machine.R_copper, setup.theta_M = 1e-9, theta / POLE_PAIRS
+
+    i = plant_run(open_simulation(change), [u] * 10, h)[-1] * np.exp(1j * theta)
+    mean, half = (0.5 * (1.0 / L_D + sign / L_Q) for sign in (1.0, -1.0))
+    rotor = (1.0 - 0.05 * math.cos(6.0 * theta)) * (mean + half * np.exp(2j * theta))
+    assert i == pytest.approx((rotor - 0.02 * mean) * u * 10 * h, rel=1e-9)
+
+
+def test_uneven_inductances_conserve_energy():
+    """A short-circuited machine without resistance: what the field holds, the shaft has lost."""
+    J = 2e-3
+
+    def change(setup: Setup) -> None:
+        uneven(setup)
+        machine = setup.machine
+        machine.R_copper, machine.rotor, machine.J = 1e-9, Rotor.FREE, J
+        machine.psi_6 = 0.02 * PSI
+        setup.omega_M = 40.0
+
+    simulation = open_simulation(change, mode=VOLTAGE)
+    signals = [Truth.I_D, Truth.I_Q, Truth.PSI_D, Truth.PSI_Q, Truth.THETA_E, Truth.OMEGA_M]
+    i_d, i_q, psi_d, psi_q, theta, omega = record(simulation, signals, 3000)
+    harmonic = 0.02 * PSI * np.exp(-6j * theta)
+    field = 0.75 * ((psi_d - PSI - harmonic.real) * i_d + (psi_q - harmonic.imag) * i_q)
+    energy = 0.5 * J * omega**2 + field
+    assert np.ptp(field) > 0.2 * energy[0]
+    assert np.ptp(energy) < 1e-6 * energy[0]
+
+
+def test_a_loaded_link_falls_by_what_its_supply_drops():
+    """U (U_0 - U)/R_source is the power of the machine, here of its resistance."""
+    R_source, i = 0.5, 20.0
+
+    def change(setup: Setup) -> None:
+        setup.U_dc_source, setup.U_dc_source_time = R_source, 1e-3
+
+    simulation = open_simulation(change)
+    steady_voltage(simulation, i, 0.0)
+    U = float(record(simulation, [Truth.U_DC], 50)[0].mean())
+    assert U * (U_DC - U) / R_source == pytest.approx(1.5 * R_S * i**2, rel=1e-3)
+
+
 def test_steep_error_stays_stable():
     """13 V of dead time behind a knee of 5 mA: the slope alone would be 100 times what one RK4 step can take."""
     change = lossy(TANH)

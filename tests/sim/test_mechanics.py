@@ -97,9 +97,49 @@ def test_reversal_through_standstill_loses_no_time():
     assert np.abs(omega - expected).max() < 1e-9
 
 
-def test_cogging_conserves_energy():
+def test_friction_takes_its_torque_over_the_angle():
+    """J omega^2 / 2 = E_0 - tau_c (theta + f (1 - cos theta)), at speeds where nothing of Stribeck's part is left."""
+    J, tau_c, once = 2e-3, 0.05, 0.3
+    change = free(J=J, tau_c=tau_c, friction_once=once, stribeck=0.5, stribeck_speed=1.0)
+    omega, theta = record(idle(open_simulation(both(change, coasting))), [Truth.OMEGA_M, Truth.THETA_M], 20000)
+    expected = 0.5 * J * 100.0**2 - tau_c * (theta + once * (1.0 - np.cos(theta)))
+    moving = omega > 10.0
+    assert moving.sum() > 1e4
+    assert np.abs(0.5 * J * omega**2 - expected)[moving].max() < 1e-8 * expected[0]  # measured 2e-10
+
+
+def test_stribeck_friction_holds_more_than_it_brakes():
+    """At rest 1.5 tau_c holds; a coasting shaft then passes v_s, where 1 + 0.5/e of it brakes."""
+    J, tau_c, speed = 2e-3, 0.1, 20.0
+    change = free(J=J, tau_c=tau_c, stribeck=0.5, stribeck_speed=speed)
+    simulation = idle(open_simulation(change))
+    simulation.schedule(Target.LOAD, [0.0, 0.1, 0.1, 0.3], [0.0, -0.149, -0.151, -0.151])
+    t, omega = record(simulation, [Truth.T, Truth.OMEGA_M], 1200)
+    assert np.all(omega[t < 0.1] == 0.0) and omega[-1] > 0.0
+    t, omega = record(idle(open_simulation(both(change, coasting))), [Truth.T, Truth.OMEGA_M], 18000)
+    k = int(np.argmax(omega < speed))
+    slope = (omega[k + 1] - omega[k - 1]) / (t[k + 1] - t[k - 1])
+    assert slope == pytest.approx(-tau_c / J * (1.0 + 0.5 * math.exp(-((omega[k] / speed) ** 2))), rel=1e-6)
+
+
+def test_a_shaft_with_play_couples_nothing_inside_it():
+    """The load falls freely through half of the play, then swings on the shaft around its static twist."""
+    J_load, stiffness, play, torque = 5e-3, 400.0, 0.02, 1.0
+    change = free(J=2e-3, J_load=J_load, coupling_stiffness=stiffness, tau_c=50.0, backlash=play)
+    simulation = idle(open_simulation(change))
+    simulation.library.pmsm_sim_set_load(simulation.sim, torque)
+    t, twist = record(simulation, [Truth.T, Truth.TWIST], 2000)
+    free_time = math.sqrt(play * J_load / torque)
+    falling = t < free_time
+    assert np.abs(twist - 0.5 * torque / J_load * t**2)[falling].max() < 1e-12
+    static = torque / stiffness
+    assert twist.max() == pytest.approx(0.5 * play + static + math.sqrt(static**2 + static * play), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["cogging", "cogging_slot", "cogging_pole"])
+def test_cogging_conserves_energy(name):
     J, amplitude, periods = 2e-3, 0.05, 12
-    simulation = idle(open_simulation(both(free(J=J, cogging=amplitude, cogging_periods=periods), coasting)))
+    simulation = idle(open_simulation(both(free(J=J, **{name: amplitude, f"{name}_periods": periods}), coasting)))
     omega, theta = record(simulation, [Truth.OMEGA_M, Truth.THETA_M], 20000)
     energy = 0.5 * J * omega**2 - amplitude / periods * np.cos(periods * theta)
     assert np.ptp(energy) < 1e-8 * energy[0]

@@ -242,6 +242,15 @@ def test_every_drive_fault_can_be_built():
     assert list(setup.inverter.open) == [0, 1, 0]
 
 
+def test_an_imbalance_of_the_resistances_keeps_their_mean():
+    setup, _ = build_setup(with_simulation(machine("interior-2k2"), {"resistance_imbalance": 0.04}))
+    even, _ = build_setup(machine("interior-2k2"))
+    R_mean = even.machine.R_copper + even.machine.R_fixed
+    phases = [setup.machine.R_copper + setup.machine.R_fixed + more for more in setup.inverter.r_leg]
+    assert sum(phases) / 3.0 == pytest.approx(R_mean, rel=1e-12)
+    assert phases[0] / R_mean == pytest.approx(1.04, rel=1e-2)  # of the loop, the switches' share included
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

@@ -53,6 +53,17 @@ def test_gain_and_offset_per_phase():
     assert np.abs(seen - expected).max() < 2e-6  # binary32
 
 
+def test_cubic_error_and_drift():
+    cubic, scale, drift = 0.004, 20.0, 0.5
+    simulation = open_simulation(with_sensors(cubic=cubic, full_scale=scale, drift=drift), mode=VOLTAGE)
+    simulation.reference.u_d_inject = 5.0
+    seen, true = sampled_phases(simulation, 400)
+    t = T_S * np.arange(400)
+    drifted = true + np.array([drift * t, -drift * t, 0.0 * t])
+    assert np.abs(seen - drifted - cubic * scale * (drifted / scale) ** 3).max() < 2e-6  # binary32
+    assert np.abs(seen - true).max() > 0.01
+
+
 def test_grid_and_full_scale():
     bits, full_scale = 10, 8.0
     simulation = open_simulation(with_sensors(adc_bits=bits, full_scale=full_scale), mode=VOLTAGE)
