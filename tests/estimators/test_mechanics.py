@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from benchmarks.mechanics_accuracy import realisation
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.shaft.mechanics import NOTED, RIPPLE_MOST, MechanicsResult, estimate_mechanics
+from pmsmtool.estimators.shaft.mechanics import (
+    NOTED,
+    RIPPLE_MOST,
+    MechanicsResult,
+    estimate_mechanics,
+    require_useful,
+)
+from pmsmtool.estimators.shaft.model import Run
 from pmsmtool.estimators.shaft.motion import positions
 from pmsmtool.experiments.mechanics_run import UNIT_LEAST_S, UNIT_MOST_S, plan_mechanics
 from pmsmtool.trace import Trace
@@ -338,3 +345,13 @@ def test_what_repeats_with_the_angle_or_grows_with_the_speed_is_no_friction(effe
     for value, true in ((found.J, J), (found.B, B), (found.tau_c, 1.2)):
         assert abs(value.value - true) < 3.0 * value.std
     assert found.J.std < 2e-3 * J and found.tau_c.std < 0.01 * 1.2
+
+
+def test_friction_that_may_be_more_than_what_turned_the_shaft_is_none() -> None:
+    """Behind an elastic shaft with fine cogging a fit ran away: tau_c -2.7e5 +- 8e6 N m, B 1e5 +- 3e6 N m s."""
+    n = 20
+    run = Run(0.1 * np.arange(n + 1), np.full(n, 0.5), 1e-3, np.full(n + 1, 1e-4), 0.01, False)  # 0.5 N m, 100 rad/s
+    require_useful([run], 2e-3, 0.2)
+    for B_std, tau_std in ((3e-3, 0.2), (2e-3, 0.3)):
+        with pytest.raises(IdentificationError, match="E_NOT_IDENTIFIABLE"):
+            require_useful([run], B_std, tau_std)

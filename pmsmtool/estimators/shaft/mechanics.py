@@ -24,6 +24,7 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.angle_harmonics import LEAST_SPEED, AngleHarmonics, angle_harmonics
 from pmsmtool.estimators.estimate import (
     CHI2_WARN,
+    COVERAGE_FACTOR,
     SensorTolerance,
     chi2_gate,
     condition_gate,
@@ -230,6 +231,7 @@ def estimate_mechanics(
         deviations.append(widen * math.sqrt((1.0 - share) * parts[0] + share * parts[1] + spread))
     J, B, tau_c = math.exp(values[0]), values[1], values[2]
     stds = (J * deviations[0], deviations[1], deviations[2])
+    require_useful(noisy, stds[1], stds[2])
     drag = None
     if share > 0.5:
         drag = Estimate(float(with_drag.x[SHAFT]), widen * float(of_drag[SHAFT]), 0.0, "N m s2", method=METHOD)
@@ -250,6 +252,18 @@ def estimate_mechanics(
     ripple = max(noise.values())
     J_found, B_found, tau_found = estimates
     return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, condition, unexplained, harmonics, drag)
+
+
+def require_useful(runs: Sequence[Run], B_std: float, tau_std: float) -> None:
+    """Refuse friction that may be more than what turned the shaft: a fit that ran away, and J with it."""
+    doubt, largest = COVERAGE_FACTOR * max(B_std * fastest(runs), tau_std), largest_torque(runs)
+    if doubt > largest:
+        raise refuse(
+            "E_NOT_IDENTIFIABLE",
+            f"friction is known to +-{doubt:.2g} N m, the pulses made {largest:.2g} N m",
+            stage=STAGE,
+            likely=NOISY_TORQUE,
+        )
 
 
 Fitted = tuple[Sequence[Run], Fit, float, Sequence[Run]]
