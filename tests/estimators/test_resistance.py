@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.peer_formulas import single_point_resistance, two_point_resistance
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, total_half_width
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, Verdict, total_half_width
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import (
@@ -233,6 +233,21 @@ def test_refusals(change: Change, reason: str) -> None:
     assert caught.value.reason == reason
     assert caught.value.exit_code == 6
     assert caught.value.hint
+
+
+@pytest.mark.parametrize("seed", [8, 9])
+def test_levels_that_scatter_widen_the_interval_before_they_are_refused(seed: int) -> None:
+    """Ripple on a link that falls under load: 0.07 % of the largest level, chi-square about 6."""
+    rng = np.random.default_rng(seed)
+    d = replace_inverter(draw(1, rng))
+    trace = levels_of(d, 0, rng)
+    v = trace["u_d_v"] + 1e-3 * d.R[0] * d.I_r[0] * np.cos(np.arange(len(trace)) * 1.7)
+    quiet = estimate_resistance(trace, noise_of(d, 0)).R_measured
+    found = estimate_resistance(replace(trace, signals={**trace.signals, "u_d_v": v}), noise_of(d, 0))
+    assert found.R_measured.chi2 > 3.0 and found.verdict is Verdict.WARN
+    error = abs(found.R_measured.value / quiet.value - 1.0)
+    assert error < COVERAGE_FACTOR * found.R_measured.std / quiet.value < 0.01, error
+    assert found.R_measured.std > 2.0 * quiet.std
 
 
 @pytest.mark.parametrize("tau_s", [0.7, 2.0, 4.3, 10.0, 60.0])
