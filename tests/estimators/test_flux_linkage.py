@@ -332,6 +332,6 @@ def test_a_wide_interval_takes_the_driven_windows_along() -> None:
     """A drive whose coasting was 3.1 % off and known to 6.6 %, its driven windows 0.4 % off."""
     coasting = Estimate(0.969, 0.066, 0.03, "Wb", method="coasting")
     found = with_driven(coasting, Estimate(0.996, 0.0016, 0.01, "Wb", method="driven"))
-    assert found.value == pytest.approx(0.9954, abs=2e-4)
-    assert found.std == pytest.approx(DRIVEN_STD, rel=0.02)  # the mean of two is no better than the driven one's doubt
-    assert found.systematic == pytest.approx(0.01, rel=0.05)
+    assert found.value == pytest.approx(0.9947, abs=2e-4)
+    assert found.std == pytest.approx(DRIVEN_STD, rel=0.03)  # the mean of two is no better than the driven one's doubt
+    assert found.systematic == pytest.approx(0.011, rel=0.05)
