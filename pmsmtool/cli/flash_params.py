@@ -19,7 +19,6 @@ from pmsmtool.cli.output import Output
         "pmsmtool -i pmsmsim --yes flash-params params.toml",
         "pmsmtool -n 5 flash-params design.toml --dry-run",
         "pmsmtool -n 5 flash-params params.toml --check     # exit code 1 when the drive differs",
-        "pmsmtool -i socketcan -c can0 flash-params params.toml --nodes 1-6",
         "pmsmtool -i socketcan -c can0 flash-params RUN_DIR --nodes 2-6 --yes --serials serials.txt",
     ),
 )

@@ -16,7 +16,6 @@ from pmsmtool.files import write_file
     "report",
     epilog=examples(
         "pmsmtool report runs/20260101T120000Z-000055f1",
-        "pmsmtool report runs/20260101T120000Z-000055f1 --json | jq .verdict",
         "pmsmtool report --pdf runs/20260101T120000Z-000055f1",
         "pmsmtool report --junit runs/20260101T120000Z-000055f1 -o result.xml",
         "pmsmtool report --anonymous runs/20260101T120000Z-000055f1 -o to-send.json",

@@ -182,7 +182,7 @@ def test_one_pair_of_gains_is_the_smaller_of_both_axes(tmp_path: Path) -> None:
     assert "NOT CHECKED (data sheet): pole pairs, R, " in verdict(run.path).headline
     page = report_page(run.path)
     assert "<strong>SIMULATED DRIVE, PARTIAL: 6 of 7 stages ran" in page
-    assert page.count("<td>as given</td>") == 4
+    assert page.count(">as given</td>") == 4
     drawn = {value["name"]: value for value in run.read().stage("tune").values}  # type: ignore[union-attr]
     assert drawn["current.K_p_q_v_per_a"]["value"] == design["current.K_p_q_v_per_a"]
     assert design.loops["current_q"].phase_margin_deg > design.loops["current_d"].phase_margin_deg + 5.0
@@ -266,7 +266,7 @@ def test_recorder_tier_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Pat
     assert found_verdict.word == "PARTIAL" and found_verdict.lines[0].startswith("7 of 7 stages ran")
     assert f"NOT CHECKED ({SET_UP}): pole pairs, L_d" in found_verdict.headline
     assert "data sheet" not in found_verdict.headline
-    assert report_page(run.path).count("<td>{}</td>".format(SET_UP.replace("'", "&#39;"))) == 3
+    assert report_page(run.path).count(">{}</td>".format(SET_UP.replace("'", "&#39;"))) == 3
     given = next(value for value in run.read().stage("identify").values if value["name"] == "L_d_h")  # type: ignore[union-attr]
     assert given["source"] == SET_UP and "std" not in given
     # the tier does not measure the encoder: its maker's offset must not be overwritten

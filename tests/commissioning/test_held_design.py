@@ -85,7 +85,7 @@ def test_gains_that_do_not_fit_are_refused() -> None:
             **{n: replace(design.values[n], value=1e6) for n in (name, name.replace("_q_", "_d_"))},
         },
     )
-    with pytest.raises(ConfigError, match="do not fit the drive"):
+    with pytest.raises(ConfigError, match="cannot hold 1 value"):
         held_design(large, load_family("epos4"))
 
 

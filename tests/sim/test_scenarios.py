@@ -155,7 +155,7 @@ def test_file_says_what_happens(tmp_path, drive):
         ("decimation = 2", "decimation = 0", "below 1"),
         ("decimation = 2", "decimation = nan", "decimation = nan is not finite"),
         ("decimation = 2", "decimation = 1.5", "is not a whole number"),
-        ('rotor = "free"', 'rotor = "loose"', "none of free, locked, driven"),
+        ('rotor = "free"', 'rotor = "loose"', "not one of free, locked, driven"),
         ("speed_rpm = [[0.0, 300]", "speed_rmp = [[0.0, 300]", "did you mean speed_rpm"),
         ("[0.02, 300], [0.02, 400.0]", "[0.02, 300], [0.01, 400.0]", "the times decrease"),
         ("load_nm = 1.5", "load_nm = []", "has no nodes"),

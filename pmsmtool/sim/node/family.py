@@ -122,7 +122,7 @@ class Face:
         """Put the family's own functions over the running application."""
         kind = RECORDERS.get(self.drive_map.capabilities.recorder)
         if kind is not None:
-            kind(self.drive_map, dictionary, plant, schedule)
+            kind(self.drive_map, dictionary, plant)
         own_identification.attach(self.drive_map, dictionary, plant, power, schedule)
 
     def guarding(self, session: object) -> None:

@@ -16,7 +16,6 @@ from pmsmtool.drive_maps.recorder_map import Address
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.power_drive import Plant
 from pmsmtool.sim.node.recorder_face import SIGNALS, RecorderFace
-from pmsmtool.sim.node.schedule import Schedule
 
 MEMORY_BYTES = 8192
 """Size of the simulated monitor's memory."""
@@ -31,12 +30,12 @@ class Monitor(RecorderFace):
         The family; its signals can be mapped.
     dictionary : Dictionary
         Dressed as the family's.
-    plant, schedule : Plant, Schedule
-        The drive behind, and its clock.
+    plant : Plant
+        The drive behind.
     """
 
-    def __init__(self, drive_map: DriveMap, dictionary: Dictionary, plant: Plant, schedule: Schedule) -> None:
-        super().__init__(dictionary, plant, schedule)
+    def __init__(self, drive_map: DriveMap, dictionary: Dictionary, plant: Plant) -> None:
+        super().__init__(dictionary, plant)
         self._cells = {cell.index: (name, cell) for name, cell in drive_map.signals.items() if name in SIGNALS}
         self._rows = b""
         self._running = False

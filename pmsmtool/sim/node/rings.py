@@ -19,7 +19,6 @@ from pmsmtool.drive_maps.wire_units import wire_unit
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.power_drive import Plant
 from pmsmtool.sim.node.recorder_face import RecorderFace, whole
-from pmsmtool.sim.node.schedule import Schedule
 
 STOOD_AT = 5
 """Where in its ring a variable stands when the trigger comes."""
@@ -39,12 +38,12 @@ class Rings(RecorderFace):
         The family; its channels are the objects that can be recorded.
     dictionary : Dictionary
         Dressed as the family's.
-    plant, schedule : Plant, Schedule
-        The drive behind, and its clock.
+    plant : Plant
+        The drive behind.
     """
 
-    def __init__(self, drive_map: DriveMap, dictionary: Dictionary, plant: Plant, schedule: Schedule) -> None:
-        super().__init__(dictionary, plant, schedule)
+    def __init__(self, drive_map: DriveMap, dictionary: Dictionary, plant: Plant) -> None:
+        super().__init__(dictionary, plant)
         channels = drive_map.recorder.channels
         self._known = {(channel.index, channel.sub): (name, channel) for name, channel in channels.items()}
         self._count_s = wire_unit(drive_map.recorder.period).scale if drive_map.recorder.period else COUNT_S

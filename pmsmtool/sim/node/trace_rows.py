@@ -18,7 +18,6 @@ from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.power_drive import Plant
 from pmsmtool.sim.node.recorder_face import RecorderFace, whole
-from pmsmtool.sim.node.schedule import Schedule
 
 MEMORY_NUMBERS = 2048
 """Size of the simulated trace's memory."""
@@ -34,12 +33,12 @@ class TraceRows(RecorderFace):
         The family; its channels are the variables there are.
     dictionary : Dictionary
         Dressed as the family's.
-    plant, schedule : Plant, Schedule
-        The drive behind, and its clock.
+    plant : Plant
+        The drive behind.
     """
 
-    def __init__(self, drive_map: DriveMap, dictionary: Dictionary, plant: Plant, schedule: Schedule) -> None:
-        super().__init__(dictionary, plant, schedule)
+    def __init__(self, drive_map: DriveMap, dictionary: Dictionary, plant: Plant) -> None:
+        super().__init__(dictionary, plant)
         self._known = {channel.number: (name, channel) for name, channel in drive_map.recorder.channels.items()}
         self._running = False
         self._rows = b""
