@@ -53,7 +53,7 @@ COMMUTATION_ANGLE = 0x60EA
 ANGLE_COUNT_RAD = 2.0 * math.pi / 65536.0
 TIER_HIDES = {"inject": (0x2063, 0x2064), "recorder": (0x2050, 0x2051, 0x2052, 0x2063, 0x2064)}
 """What a reduced reference drive does not have: window averages; the excitation and current set-points too."""
-RECORDERS: Mapping[str, Callable[[DriveMap, Dictionary, Plant, Schedule], object]] = {
+RECORDERS: Mapping[str, Callable[[DriveMap, Dictionary, Plant], object]] = {
     "index": Monitor,
     "rows": TraceRows,
     "rings": Rings,
