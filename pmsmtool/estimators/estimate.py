@@ -26,6 +26,8 @@ CONDITION_LIMIT = 1e6
 """Largest condition number of a column-scaled Jacobian (docs/identification.md, 7)."""
 SINGULAR = 1e-14
 """Ratio of eigenvalues of the scaled normal matrix below which it counts as singular."""
+MEDIAN_TO_STD = 1.4826
+"""Standard deviation over the median of the absolute deviations, of a normal distribution."""
 COVERAGE_FACTOR = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
 SENSOR_GAIN_TOLERANCE = 0.01

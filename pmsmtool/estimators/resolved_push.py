@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.estimate import CONDITION_LIMIT, scaled_covariance
+from pmsmtool.estimators.estimate import CONDITION_LIMIT, MEDIAN_TO_STD, scaled_covariance
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.trace import Trace
 
@@ -244,7 +244,7 @@ def resolve(pushes: Sequence[Blocks]) -> Resolved:
 
 def _above_noise(part: Vector) -> Vector:
     """Return slopes with those that are only noise set to zero."""
-    noise = 1.4826 * float(np.median(np.abs(part - np.median(part))))
+    noise = MEDIAN_TO_STD * float(np.median(np.abs(part - np.median(part))))
     return np.asarray(np.where(np.abs(part) > SLOPE_NOISE * noise, part, 0.0))
 
 
@@ -289,7 +289,7 @@ def _fit(columns: Sequence[Rows], u: Rows, weight: Vector, owner: NDArray[np.int
     for _ in range(ITERATIONS):
         solution = np.linalg.solve(matrix.T @ (matrix * weights[:, None]), matrix.T @ (weights * measured))
         residual = np.abs(measured - matrix @ solution) * np.sqrt(beats)
-        limit = HUBER * 1.4826 * float(np.median(residual))
+        limit = HUBER * MEDIAN_TO_STD * float(np.median(residual))
         weights = beats / np.maximum(1.0, residual / limit) if limit > 0.0 else beats
     without = np.empty((n, TOLD))
     normal, right = _normal(matrix, measured, weights)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.estimators.estimate import MEDIAN_TO_STD
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.tracking_model import (
     STATES,
@@ -195,7 +196,7 @@ def observation_noise(observations: Trace, known: Known) -> tuple[float, float]:
     measured = np.column_stack([observations["u_d_v"], observations["u_q_v"]])
     curvature = np.diff(measured - model, n=2, axis=0)
     largest = float(np.max(np.hypot(*measured.T)))
-    spread = 1.4826 * np.median(np.abs(curvature), axis=0) / math.sqrt(6.0)
+    spread = MEDIAN_TO_STD * np.median(np.abs(curvature), axis=0) / math.sqrt(6.0)
     return tuple(np.maximum(spread, NOISE_FLOOR * largest).tolist())
 
 

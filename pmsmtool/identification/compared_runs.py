@@ -9,7 +9,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, statistical_half_width, total_half_width
+from pmsmtool.estimators.estimate import (
+    COVERAGE_FACTOR,
+    MEDIAN_TO_STD,
+    SensorTolerance,
+    statistical_half_width,
+    total_half_width,
+)
 from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.machine.temperature import UNKNOWN_T_RANGE_C, WINDING_TOLERANCE, magnet_tolerance_per_k
 from pmsmtool.units import format_quantity
@@ -18,8 +24,6 @@ LEAST_SERIES = 5
 """Runs of a quantity from which a median and a spread say something, and an odd one can be named."""
 ODD = 3.5
 """Distance from the median, in robust standard deviations, that makes a value odd (Iglewicz and Hoaglin 1993)."""
-ROBUST = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
 
 MEASURED = ("pmsmtool", "vendor")
 """Sources of values that a run measured."""
@@ -205,7 +209,7 @@ def _series(name: str, found: Sequence[tuple[str, Estimate]]) -> Series:
     median = statistics.median(values)
     spread, odd = math.nan, list[str]()
     if len(values) >= LEAST_SERIES:
-        spread = ROBUST * statistics.median(abs(value - median) for value in values)
+        spread = MEDIAN_TO_STD * statistics.median(abs(value - median) for value in values)
         for run, estimate in found:
             allowed = max(ODD * spread, math.hypot(total_half_width(estimate), interval))
             if abs(estimate.value - median) > allowed:

@@ -35,7 +35,7 @@ from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marq
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.disturbances import NONE, TILT_FLOOR, Extent, disturbances
 from pmsmtool.estimators.shaft.model import SHAFT, Problem, Run, fastest, largest_torque, sizes_of, whitener
-from pmsmtool.estimators.shaft.position import encoder_step, position_std
+from pmsmtool.estimators.shaft.position import encoder_step, position_noise, position_std
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
@@ -340,7 +340,7 @@ def _blocks(
     rows = max(1, (len(run) - 1) // BLOCKS)
     count = (len(run) - 1) // rows
     shown = direction * run["theta_M_rad"]
-    theta_std = position_std(shown[: count * rows + 1 : rows], step)
+    theta_std = np.maximum(position_std(shown[: count * rows + 1 : rows], step), position_noise(shown))
     if run.meta["coasting"]:
         theta = harmonics.shaft(harmonics.without_ripple(run.t_s, shown))[: count * rows + 1]
         return theta, Run(theta[::rows], np.zeros(count), rows * run.period_s, theta_std, 0.0, True)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.estimators.estimate import MEDIAN_TO_STD
 from pmsmtool.estimators.refusals import refuse
 
 Array = NDArray[np.float64]
@@ -38,6 +39,16 @@ def rounding_rad(theta: Array) -> Array:
 def position_std(theta: Array, step_rad: float) -> Array:
     """Return the standard deviation of each position (rad), shape (n,): two uniform roundings, one after the other."""
     return np.asarray(np.hypot(step_rad, rounding_rad(theta)) / math.sqrt(12.0))
+
+
+def position_noise(theta: Array) -> float:
+    """Return the standard deviation of what positions scatter by themselves (rad), theta of shape (n,).
+
+    Third differences of the recorded positions, whose median no jump and no reversal moves: those of independent
+    errors are sqrt(20) of one, those of an encoder's rounding at speed as much, of a slow shaft's none.
+    """
+    differences = np.abs(np.diff(theta, 3))
+    return MEDIAN_TO_STD * float(np.median(differences)) / math.sqrt(20.0) if len(differences) else 0.0
 
 
 def encoder_step(traces: Sequence[Array]) -> float:
