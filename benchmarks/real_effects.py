@@ -176,6 +176,10 @@ def _encoder(drive: MachineFile, degrees: float) -> Changes:
     return {"encoder_once_rad": math.radians(degrees), "encoder_twice_rad": 0.5 * math.radians(degrees)}
 
 
+def _scatter(drive: MachineFile, steps: float) -> Changes:
+    return {"encoder_noise_rad": steps * 2.0 * math.pi / 2 ** truth_of(drive, "encoder_bits")}
+
+
 def _lag(drive: MachineFile, microseconds: float) -> Changes:
     return {"sensor_lag_s": 1e-6 * microseconds}
 
@@ -203,6 +207,7 @@ EFFECTS: Mapping[str, tuple[Callable[..., Changes], tuple[float, ...]]] = {
     "magnet %/K": (_magnet, (0.03, 0.11, 0.2)),
     "heating s": (_heating, (60.0, 10.0, 2.0)),
     "encoder once deg": (_encoder, (0.05, 0.2, 0.5, 1.0)),
+    "encoder noise steps": (_scatter, (0.3, 1.0, 3.0, 6.0)),
     "sensor lag us": (_lag, (1.0, 3.0, 10.0)),
     "encoder age us": (_latency, (2.0, 10.0, 50.0)),
     "friction %": (_load, (5.0, 15.0, 30.0)),

@@ -32,6 +32,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "drag of tau_c": (0.2, 2.0),
     "heating s": (2.0, 60.0),
     "encoder once deg": (0.02, 0.5),
+    "encoder noise steps": (0.3, 3.0),
     "sensor lag us": (1.0, 10.0),
     "encoder age us": (1.0, 50.0),
     "friction %": (0.5, 15.0),

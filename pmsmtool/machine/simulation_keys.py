@@ -79,6 +79,7 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _flag("leads_swapped", "leads b and c exchanged; load and traces follow the drive's phase order"),
     _number("encoder_once_rad", "rad", -0.1, 0.1, 0.0, "encoder error once per turn, amplitude (mechanical)"),
     _number("encoder_twice_rad", "rad", -0.1, 0.1, 0.0, "encoder error twice per turn, amplitude (mechanical)"),
+    _number("encoder_noise_rad", "rad", 0.0, 0.01, 0.0, "encoder noise, white, standard deviation (mechanical)"),
     _number("encoder_latency_s", "s", 0, 1e-3, 0.0, "age of an encoder sample"),
     _number("shunt_blind_s", "s", 0, 1e-4, 0.0, "low-side pulses shorter than this cannot be read, 0 in-phase sensors"),
     # temperatures

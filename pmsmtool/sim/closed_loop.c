@@ -147,7 +147,8 @@ static double encoder(pmsm_sim *sim)
     if (setup->fault == PMSM_SENSOR_ENCODER_STUCK && sim->encoder_is_held)
         return sim->encoder_held;
     const double theta_M = state->theta_M + (double)state->turns * PMSM_REAL64_TWO_PI;
-    sim->encoder_held = pmsm_sensor_angle(setup, theta_M, state->omega_M, sim->plant.machine.pole_pairs);
+    sim->encoder_held =
+        pmsm_sensor_angle(setup, &sim->random, theta_M, state->omega_M, sim->plant.machine.pole_pairs);
     sim->encoder_is_held = 1;
     return sim->encoder_held;
 }

@@ -111,6 +111,7 @@ class Sensors(ctypes.Structure):
         ("encoder_latency", _f64),
         ("encoder_once", _f64),
         ("encoder_twice", _f64),
+        ("encoder_noise", _f64),
         ("T_lag", _f64),
         ("blind", _f64),
         ("cubic", _f64),

@@ -102,7 +102,8 @@ double pmsm_sensor_current(const pmsm_sensor_setup *setup, pmsm_random *random, 
     return code * lsb;
 }
 
-double pmsm_sensor_angle(const pmsm_sensor_setup *setup, double theta_M, double omega_M, double pole_pairs)
+double pmsm_sensor_angle(const pmsm_sensor_setup *setup, pmsm_random *random, double theta_M, double omega_M,
+                         double pole_pairs)
 {
     double theta = theta_M - omega_M * setup->encoder_latency;
     if (setup->encoder_offset_e != 0.0)
@@ -113,6 +114,8 @@ double pmsm_sensor_angle(const pmsm_sensor_setup *setup, double theta_M, double 
         pmsm_real64_sincos(PMSM_REAL64_TWO_PI * turn, &s, &c);
         theta += setup->encoder_once * s + setup->encoder_twice * 2.0 * s * c;
     }
+    if (setup->encoder_noise > 0.0)
+        theta += setup->encoder_noise * pmsm_random_normal(random);
     if (setup->encoder_reversed)
         theta = -theta;
     if (setup->encoder_bits > 0) {

@@ -22,6 +22,7 @@ typedef struct {
     uint32_t fault;              /* enum pmsm_sensor_fault */
     double encoder_latency;      /* s */
     double encoder_once, encoder_twice; /* rad mechanical: error amplitudes per turn and per half turn */
+    double encoder_noise;        /* rad mechanical rms, white, before the grid */
     double T_lag;                /* s, of the temperature sensor, 0: none */
     double blind;                /* s: shortest low-side pulse a shunt can read, 0: in-phase sensors */
     double cubic;                /* share of the full scale at full scale: gain i + cubic i^3 / full_scale^2 */
@@ -56,6 +57,7 @@ double pmsm_random_normal(pmsm_random *random);
 double pmsm_sensor_current(const pmsm_sensor_setup *setup, pmsm_random *random, int x, double i, uint32_t *clipped);
 
 /* Encoder position (rad mechanical, unwrapped) of the rotor at theta_M turning at omega_M. */
-double pmsm_sensor_angle(const pmsm_sensor_setup *setup, double theta_M, double omega_M, double pole_pairs);
+double pmsm_sensor_angle(const pmsm_sensor_setup *setup, pmsm_random *random, double theta_M, double omega_M,
+                         double pole_pairs);
 
 #endif

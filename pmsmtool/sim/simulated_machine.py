@@ -272,6 +272,7 @@ def _sensors(out: Any, machine_file: MachineFile, settings: Settings, violations
     out.encoder_reversed = int(settings.flag("encoder_reversed"))
     out.fault = int(settings.text("drive_fault") == "encoder_stuck")
     out.encoder_latency = settings.number("encoder_latency_s")
+    out.encoder_noise = settings.number("encoder_noise_rad")
     out.encoder_once, out.encoder_twice = settings.number("encoder_once_rad"), settings.number("encoder_twice_rad")
     out.cubic, out.drift = settings.number("sensor_cubic"), settings.number("sensor_drift_apk_per_s")
     out.T_lag, out.blind = settings.number("T_sensor_lag_s"), settings.number("shunt_blind_s")

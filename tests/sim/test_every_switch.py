@@ -86,6 +86,7 @@ SWITCHES: dict[str, tuple[Value, Mapping[str, Value]]] = {
     "leads_swapped": (True, {}),
     "encoder_once_rad": (0.01, {}),
     "encoder_twice_rad": (0.01, {}),
+    "encoder_noise_rad": (0.001, {}),
     "encoder_latency_s": (2e-5, {}),
     "shunt_blind_s": (4e-5, {}),
     "T_winding_c": (120.0, {}),

@@ -175,6 +175,15 @@ def test_encoder_grid_errors_and_latency():
     expected = true - omega * latency + once * np.sin(true) + twice * np.sin(2.0 * true)
     assert np.abs(seen - expected).max() < 2e-5  # binary32 at 12 rad
 
+    def noisy(setup: Setup) -> None:
+        change(setup)
+        setup.sensors.encoder_noise = 1e-3
+
+    scattered = open_simulation(noisy)
+    scattered.run(1)
+    error = record(scattered, [THETA_M], 4000)[0] - seen
+    assert abs(error.mean()) < 5e-5 and error.std() == pytest.approx(1e-3, rel=0.03)  # 0.7 % measured
+
     def coarse(setup: Setup) -> None:
         turning(omega)(setup)
         with_sensors(encoder_bits=bits)(setup)

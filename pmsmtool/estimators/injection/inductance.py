@@ -27,6 +27,7 @@ from pmsmtool.estimators.injection.switching_ripple import LEG_ANGLES
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.shaft.position import position_noise
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
@@ -391,7 +392,9 @@ def _check_rotor(theta_e: Vector, stage: str) -> None:
     moves = np.abs(np.diff(theta_e))
     moves = moves[moves > 1e-9]
     step = float(np.min(moves)) if len(moves) else 0.0
-    span = float(np.ptp(theta_e)) - step
+    # what the encoder scatters is no motion: as far as so many normal numbers reach to both sides
+    scatter = 2.0 * position_noise(theta_e) * math.sqrt(2.0 * math.log(len(theta_e)))
+    span = float(np.ptp(theta_e)) - max(step, scatter)
     if span > ROTOR_LIMIT_RAD:
         raise refuse(
             "E_ROTOR_MOVED",
