@@ -12,16 +12,16 @@ from pmsmtool.firmware.core_binding import APPLICATION_HEADER, CORE_HEADERS, HEA
 from pmsmtool.firmware.laws import LAWS, Law
 
 CYCLES = {
-    "PI": (1585, 1606, 1672),
-    "PI, predictor": (1885, 1903, 1969),
-    "line search": (2579, 2682, 2788),
-    "exact, 12 rows": (4244, 5497, 7783),
-    "best": (3284, 5254, 6787),
-    "best, delay": (3488, 5348, 7127),
-    "best + accelerated FW": (3514, 10707, 13005),
-    "polar, proposed": (2614, 2658, 2693),
-    "polar, regularised": (2342, 2363, 2429),
-    "polar, unified": (2713, 2734, 3730),
+    "PI": (1586, 1607, 1673),
+    "PI, predictor": (1886, 1904, 1970),
+    "line search": (2580, 2683, 2789),
+    "exact, 12 rows": (4245, 5498, 7784),
+    "best": (3410, 5420, 6956),
+    "best, delay": (3639, 5546, 7325),
+    "best + accelerated FW": (3622, 10922, 13201),
+    "polar, proposed": (2615, 2659, 2694),
+    "polar, regularised": (2345, 2366, 2432),
+    "polar, unified": (2716, 2737, 3736),
 }
 """Model cycles of a whole period on a Cortex-M4F: mean and worst of a nominal run, worst of the adversarial search.
 
