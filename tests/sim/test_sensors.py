@@ -264,3 +264,20 @@ def test_bytes_of_the_plant_are_those_of_the_first_platform():
     u = 40.0 * np.exp(1j * np.arange(500) * 0.03)
     digest = hashlib.sha256(np.asarray(plant_run(simulation, u, T_S), dtype="<c16").tobytes()).hexdigest()
     assert digest == "95422e5d061936bd1026534b09ac621e5aa0be9eb5fb08f1cbff32fdfe5523d8"
+
+
+def test_an_angle_just_below_a_whole_turn_is_rounded_as_a_small_number():
+    """An encoder of 17 bits that turns backward from zero: each recorded angle is on its grid within 1.1 roundings."""
+    step = 2.0 * math.pi / 2**17
+
+    def change(setup: Setup) -> None:
+        turning(-30.0)(setup)
+        with_sensors(encoder_bits=17)(setup)
+        setup.application = Application.DRIVE
+
+    simulation = open_simulation(change)
+    simulation.run(1)
+    angle = record(simulation, [THETA_M], 4000)[0]
+    assert angle.min() < -1.0 and angle.max() > -0.01
+    off = np.abs(angle - step * np.round(angle / step)) / np.spacing(np.abs(angle).astype(np.float32))
+    assert off.max() < 1.5
