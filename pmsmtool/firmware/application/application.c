@@ -81,8 +81,8 @@ void pmsm_application_period(pmsm_application *app, const pmsm_sensors *sensors,
     pmsm_take_average(app);
 }
 
-/* Unwrapped angle since the turn that was taken off; the turns' large part is exact (Cody-Waite). The part of a turn has
- * a sign: just below a whole turn it would have the rounding of a turn, where the angle has that of a small number. */
+/* Unwrapped angle since the turn that was taken off; the turns' large part is exact (Cody-Waite). The part of a turn
+ * has a sign: just below a whole turn it would have the rounding of a turn, not that of a small number. */
 static float mechanical_angle(const pmsm_application *app)
 {
     const uint32_t nearest = (uint32_t)app->sensors.turns + ((app->sensors.angle >= 0x80000000u) ? 1u : 0u);
