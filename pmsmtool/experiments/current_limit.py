@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -165,12 +166,16 @@ def _way_of_push(drive: Drive, current_a: float, seconds: float) -> float:
 
 
 def _settled(drive: Drive, kept_a: float) -> float:
-    """Return the current (A peak) once it stands, or after a limit."""
+    """Return the current (A peak) once it stands at or below the limit, else its mean over the second half of the wait.
+
+    A shaft that slips from one cog to the next swings for a while, and its back-EMF moves the current of slow gains by
+    a third about the limit; a limit that does not act leaves the current above it all the time.
+    """
     periods = max(1, round(WINDOW_S / drive.period_s))
-    seen = 0.0
+    seen = [0.0]
     for _ in range(round(ARRIVAL_LIMIT_S / WINDOW_S)):
         means = drive.average(("i_d_a", "i_q_a"), periods)
-        before, seen = seen, math.hypot(means["i_d_a"], means["i_q_a"])
-        if seen >= NEAR * kept_a and abs(seen - before) <= STEADY * kept_a:
-            break
-    return seen
+        seen.append(math.hypot(means["i_d_a"], means["i_q_a"]))
+        if NEAR * kept_a <= seen[-1] <= MOST * kept_a and abs(seen[-1] - seen[-2]) <= STEADY * kept_a:
+            return seen[-1]
+    return statistics.fmean(seen[len(seen) // 2 :])

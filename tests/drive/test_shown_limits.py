@@ -5,13 +5,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import cast
 
 import pytest
 
 from pmsmtool.drive.guard import GuardedDrive, guarded
+from pmsmtool.drive.port import Drive
 from pmsmtool.drive.standard_drive import TorqueCurrent
 from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.errors import SafetyRefusal
+from pmsmtool.experiments import current_limit
 from pmsmtool.experiments.current_limit import (
     OVER,
     LimitShown,
@@ -73,6 +76,31 @@ def test_a_current_limit_that_does_not_act_is_told(name: str, tmp_path: Path, mo
         assert "every command is bounded here" in unproven(shown), "a line of the report"
         with pytest.raises(SafetyRefusal, match="does not keep its own current limit"):
             require_limit(shown)
+
+
+class Swinging:
+    """A shaft that slipped a cog: windows of the current (A) that a simulated drive gave, limited to 2.116 A."""
+
+    period_s = 100e-6
+    windows = (0.870, 1.878, 1.923, 1.755, 1.978, 2.781, 2.767, 2.063, 1.799, 1.856, 1.977, 2.386, 2.468, 2.131)
+    windows += (1.906, 1.991, 2.205, 2.283, 2.147, 2.034, 2.062, 2.162, 2.170, 2.128, 2.106, 2.097, 2.116, 2.122)
+
+    def __init__(self, scale: float) -> None:
+        self._left = [scale * window for window in self.windows]
+
+    def average(self, names: tuple[str, ...], periods: int) -> dict[str, float]:
+        return {"i_d_a": self._left.pop(0), "i_q_a": 0.0}
+
+
+@pytest.mark.parametrize(("scale", "seen"), [(1.0, 2.11), (1.5, 3.18)])
+def test_a_swinging_shaft_hides_no_limit_and_shows_none(
+    scale: float, seen: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first window that stands may be 1.3 times the limit: measured 2.77 A of 2.12 A."""
+    monkeypatch.setattr(current_limit, "ARRIVAL_LIMIT_S", len(Swinging.windows) * current_limit.WINDOW_S)
+    given = current_limit._settled(cast(Drive, Swinging(scale)), 2.116)
+    assert given == pytest.approx(seen, rel=SHOWN)
+    assert LimitShown(3.17, 2.116, given, current_limit.MOST * 2.116).acts == (scale == 1.0)
 
 
 def speed_shown(rig: Rig, guard: GuardedDrive) -> LimitShown | None:
