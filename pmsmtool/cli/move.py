@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import claimed_node, map_option, read_map
+from pmsmtool.cli.drive_access import LOOKING_S, claimed_node, map_option, open_node, read_map
 from pmsmtool.cli.options import (
     DURATION,
     FILE,
@@ -29,6 +29,7 @@ from pmsmtool.cli.output import Output, table
 if TYPE_CHECKING:
     from pmsmtool.axis.move import MoveResult
     from pmsmtool.drive.position_drive import PositionDrive
+    from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.machine.parameters import Estimate
     from pmsmtool.run_directory import RunDirectory
@@ -106,7 +107,7 @@ def move_command(
         raise ConfigError("--by 0 moves nothing", hint="give a way, e.g. --by 90deg")
     source = None if machine is None else load_machine_file(machine)
     times = times or (1 if source is None else IDENTIFY_TIMES)
-    drive_map = read_map(map_file)
+    drive_map = _map_of(bus, map_file)
     profile = _profile(design, speed_rad_s, acceleration)
     with bus.connect() as connection:
         drive = PositionDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
@@ -156,6 +157,16 @@ def move_command(
     data = {"run": run.path, "move": asdict(found), "lent": lent, "identified": told}
     out.result("move", data, lambda: [*_lines(found), *_told(told)])
     out.note(f"run: {run.path}")
+
+
+def _map_of(bus: BusOptions, map_file: Path | None) -> DriveMap:
+    """Return the map that is given, else the one for the drive that answers."""
+    from pmsmtool.measurement.capabilities import choose_map
+
+    if map_file is not None:
+        return read_map(map_file)
+    with open_node(bus, within_s=LOOKING_S) as node:
+        return choose_map(node.identity(), None)
 
 
 IDENTIFY_TIMES = 4

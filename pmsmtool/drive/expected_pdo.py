@@ -10,18 +10,16 @@ a thread that sends it knows nothing of the controlword.
 from __future__ import annotations
 
 import contextlib
-from functools import partial
 
+from pmsmtool.drive.borrowed_pdo import BorrowedPdo
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
-from pmsmtool.drive.process_data import bring_pdos_back, pdo_contents
-from pmsmtool.errors import BusError, SdoAbort
+from pmsmtool.errors import BusError, NotAvailable, SdoAbort
 
 NUMBERS = (4, 3, 2, 1)
 """Receive PDOs in the order in which they are tried: the first ones are what a master uses."""
 DUMMY_BYTE = 0x0005_0008
 DUMMY = b"\0"
-_OFF = 1 << 31
 _AT_ONCE = 255
 
 
@@ -45,17 +43,20 @@ def expect_pdo(node: DriveNode, within_ms: float) -> int | None:
             continue
         communication, mapping = 0x1400 + number - 1, 0x1600 + number - 1
         ours = 0x100 + 0x100 * number + node.node
-        before: list[tuple[int, int, bytes]] = []
-        back = partial(_bring_back, node, before)
+        try:
+            pdo = BorrowedPdo.read(node, communication, mapping, 1)
+        except (SdoAbort, NotAvailable):  # another one may do
+            continue
+
+        def back(pdo: BorrowedPdo = pdo) -> None:
+            """Give the PDO back; a bus that is lost ended the work already, and its own error says more."""
+            with contextlib.suppress(BusError):
+                pdo.bring_back(node)
+
         node.before_close.append(back)
         try:
-            before += pdo_contents(node, communication, mapping)
-            for index, sub, data in (
-                (communication, 1, (ours | _OFF).to_bytes(4, "little")), (mapping, 0, b"\0"),
-                (mapping, 1, DUMMY_BYTE.to_bytes(4, "little")), (mapping, 0, b"\1"),
-                (communication, 2, bytes((_AT_ONCE,))),
-            ):  # fmt: skip
-                node.sdo.download(index, sub, data)
+            pdo.switch_off(node)
+            pdo.change(node, [DUMMY_BYTE], _AT_ONCE)
             node.put(event_timer(number), within_ms)
             node.sdo.download(communication, 1, ours.to_bytes(4, "little"))
         except SdoAbort:  # fixed, or without dummy entries
@@ -64,9 +65,3 @@ def expect_pdo(node: DriveNode, within_ms: float) -> int | None:
             continue
         return ours
     return None
-
-
-def _bring_back(node: DriveNode, before: list[tuple[int, int, bytes]]) -> None:
-    """Give the PDO back; a bus that is lost ended the work already, and its own error says more."""
-    with contextlib.suppress(BusError):
-        bring_pdos_back(node, before)

@@ -2,17 +2,17 @@
 """Live quantities as process data: the drive sends them by itself (TPDOs, CiA 301, section 7.5.2.35 on).
 
 The transmit PDOs 2 to 4 are borrowed: what they were is noted first and brought back at the end, with
-the NMT state. TPDO 1 is left to whoever watches the statusword.
+the NMT state. One that could not be brought back is passed over. TPDO 1 is left to whoever watches the statusword.
 """
 
 from __future__ import annotations
 
-import contextlib
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from pmsmtool.bus.nmt import NmtCommand, NmtState, send_nmt
+from pmsmtool.drive.borrowed_pdo import BorrowedPdo
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.objects import LIVE, DriveObject
@@ -22,7 +22,6 @@ BORROWED = (2, 3, 4)
 """Numbers of the transmit PDOs in use."""
 PDO_BYTES = 8
 EVENT_DRIVEN = 255
-_OFF = 1 << 31
 _NO_RTR = 1 << 30
 _NMT_WAIT_S = 0.05
 
@@ -86,8 +85,8 @@ def live_values(
     """
     groups = _groups(names, objects)
     live = LiveValues(objects)
-    before: list[tuple[int, int, bytes]] = []
-    cob_ids = [0x80 + 0x100 * number + node.node for number in BORROWED[: len(groups)]]
+    before: list[BorrowedPdo] = []
+    cob_ids: list[int] = []
     state = node.supervision.nmt_state
     brought_back = False
 
@@ -100,15 +99,17 @@ def live_values(
         if state is not NmtState.OPERATIONAL:
             send_nmt(node.connection, NmtCommand.PRE_OPERATIONAL, node.node)
         brought_back = True
-        bring_pdos_back(node, before)
+        while before:
+            before.pop().bring_back(node)
 
     lost: BusError | None = None
     node.before_close.append(bring_back)  # a signal between two bytecodes of a `with` statement calls no exit
     try:
-        for number, cob_id, group in zip(BORROWED, cob_ids, groups, strict=False):
-            before += pdo_contents(node, 0x1800 + number - 1, 0x1A00 + number - 1)
-            _map(node, number, cob_id, [objects[name] for name in group], period_s)
+        left = _usable(node, max(len(group) for group in groups), len(groups))
+        for group in groups:
+            cob_id = _lend(node, left, before, [objects[name] for name in group], period_s)
             live.expect(cob_id, group)
+            cob_ids.append(cob_id)
             node.connection.subscribe(cob_id, live.take)
         send_nmt(node.connection, NmtCommand.START, node.node)
         node.connection.wait(_NMT_WAIT_S)
@@ -131,6 +132,60 @@ def live_values(
             raise KeyboardInterrupt
 
 
+def _usable(node: DriveNode, entries: int, wanted: int) -> list[tuple[int, BorrowedPdo]]:
+    """Return the PDOs that can be borrowed by what they hold, with their numbers; writes nothing.
+
+    Raises
+    ------
+    NotAvailable
+        Fewer than wanted; each other one is named with its reason.
+    """
+    found: list[tuple[int, BorrowedPdo]] = []
+    reasons: list[str] = []
+    for number in BORROWED:
+        communication, mapping = 0x1800 + number - 1, 0x1A00 + number - 1
+        try:
+            pdo = BorrowedPdo.read(node, communication, mapping, entries)
+        except (NotAvailable, SdoAbort) as reason:
+            reasons.append(f"0x{mapping:04X}: {reason.what}")
+            continue
+        if pdo.has_event_timer:
+            found.append((number, pdo))
+        else:
+            reasons.append(f"0x{communication:04X}: it has no event timer")
+    if len(found) < wanted:
+        raise NotAvailable(
+            f"the drive cannot send these as process data: {'; '.join(reasons)}",
+            where=f"node {node.node}", hint="leave --pdo out",
+        )  # fmt: skip
+    return found
+
+
+def _lend(
+    node: DriveNode, left: list[tuple[int, BorrowedPdo]], before: list[BorrowedPdo], items: Sequence[DriveObject],
+    period_s: float,
+) -> int:  # fmt: skip
+    """Let the next PDO that can be brought back send the items; return its COB-ID."""
+    while left:
+        number, pdo = left.pop(0)
+        cob_id = 0x80 + 0x100 * number + node.node
+        before.append(pdo)
+        try:
+            pdo.switch_off(node)
+        except SdoAbort:  # it still holds what it refused
+            before.remove(pdo)
+            pdo.bring_back(node)
+            continue
+        pdo.change(node, [item.mapping_word for item in items], EVENT_DRIVEN)
+        node.sdo.download(pdo.communication, 5, round(1000.0 * sent_every_s(period_s)).to_bytes(2, "little"))
+        node.sdo.download(pdo.communication, 1, (cob_id | _NO_RTR).to_bytes(4, "little"))
+        return cob_id
+    raise NotAvailable(
+        "the drive cannot send these as process data: it refuses what its own PDOs hold",
+        where=f"node {node.node}", hint="leave --pdo out",
+    )  # fmt: skip
+
+
 def sent_every_s(period_s: float) -> float:
     """Return the period (s) nearest to the one wanted that an event timer holds, in whole milliseconds."""
     return 1e-3 * min(max(1, round(1000.0 * period_s)), 0xFFFF)
@@ -149,46 +204,3 @@ def _groups(names: Sequence[str], objects: Mapping[str, DriveObject]) -> list[li
             hint="choose fewer with -g, or leave --pdo out",
         )
     return groups
-
-
-def pdo_contents(node: DriveNode, communication: int, mapping: int) -> list[tuple[int, int, bytes]]:
-    """Return what a PDO is, in the order in which it can be written back: off, empty, mapping, count, on."""
-    count = node.sdo.read(mapping, 0, size=1)
-    entries = [(mapping, sub, node.sdo.read(mapping, sub, size=4)) for sub in range(1, max(count[0], 2) + 1)]
-    cob_id = node.sdo.read(communication, 1, size=4)
-    rest = [(communication, 2, node.sdo.read(communication, 2, size=1))]
-    with contextlib.suppress(SdoAbort):
-        rest.append((communication, 5, node.sdo.read(communication, 5, size=2)))
-    return [
-        (communication, 1, _with_off(cob_id)), (mapping, 0, b"\0"), *entries, (mapping, 0, count), *rest,
-        (communication, 1, cob_id),
-    ]  # fmt: skip
-
-
-def _with_off(cob_id: bytes) -> bytes:
-    return (int.from_bytes(cob_id, "little") | _OFF).to_bytes(4, "little")
-
-
-def _map(node: DriveNode, number: int, cob_id: int, items: Sequence[DriveObject], period_s: float) -> None:
-    communication, mapping = 0x1800 + number - 1, 0x1A00 + number - 1
-    write = node.sdo.download
-    write(communication, 1, (cob_id | _OFF | _NO_RTR).to_bytes(4, "little"))
-    write(mapping, 0, b"\0")
-    for sub, item in enumerate(items, 1):
-        write(mapping, sub, item.mapping_word.to_bytes(4, "little"))
-    write(mapping, 0, bytes((len(items),)))
-    write(communication, 2, bytes((EVENT_DRIVEN,)))
-    write(communication, 5, round(1000.0 * sent_every_s(period_s)).to_bytes(2, "little"))
-    write(communication, 1, (cob_id | _NO_RTR).to_bytes(4, "little"))
-
-
-def bring_pdos_back(node: DriveNode, before: list[tuple[int, int, bytes]]) -> None:
-    """Write the contents of PDOs; an object that is refused does not keep the others from it."""
-    refused: SdoAbort | None = None
-    for index, sub, data in before:
-        try:
-            node.sdo.download(index, sub, data)
-        except SdoAbort as abort:  # a drive that refuses one must get the others
-            refused = refused or abort
-    if refused is not None:
-        raise refused

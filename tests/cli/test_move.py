@@ -65,3 +65,8 @@ def test_a_drive_without_position_mode_is_named(tool: Tool, tmp_path: Path) -> N
 
 def test_a_move_of_no_way_is_refused(tool: Tool, drive: Sequence[str]) -> None:
     assert tool("move", "--by", "0deg", *drive, "--yes")[0] == 2
+
+
+def test_without_map_the_drives_identity_chooses_it(tool: Tool, drive: Sequence[str]) -> None:
+    code, _, said = tool("move", "--by", "60deg", *drive)
+    assert code == 7 and "0x608F" not in said  # the map has its increments per turn

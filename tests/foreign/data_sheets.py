@@ -23,7 +23,7 @@ HEARTBEAT: tuple[Row, ...] = ((0x1016, 1, "U32", "rw", "0"),)
 GUARDING: tuple[Row, ...] = ((0x100C, 0, "U16", "rw", "0"), (0x100D, 0, "U8", "rw", "0"))
 EXPECTED_PDO: tuple[Row, ...] = (
     (0x1403, 1, "U32", "rw", "$NODEID+0x80000500"), (0x1403, 2, "U8", "rw", "254"), (0x1403, 5, "U16", "rw", "0"),
-    (0x1603, 0, "U8", "rw", "1"), *((0x1603, sub, "U32", "rw", "0") for sub in range(1, 9)),
+    (0x1603, 0, "U8", "rw", "0"), *((0x1603, sub, "U32", "rw", "0") for sub in range(1, 9)),
 )  # fmt: skip
 """A receive PDO with an event timer: the drive notices that it stays away."""
 TORQUE: tuple[Row, ...] = ((0x6071, 0, "I16", "rw", "0"), (0x6077, 0, "I16", "ro", ""))

@@ -370,8 +370,9 @@ def test_what_only_its_owner_knows_moves_a_drive(tmp_path: Path) -> None:
 
 
 def test_a_fault_without_an_error_code_is_named_by_its_emergency(tmp_path: Path) -> None:
-    """EPOS4's public files have no 0x603F."""
-    with opened(tmp_path, epos4()) as rig:
+    """EPOS4's public files have no 0x603F, and an identifier of the emergency that follows the node id."""
+    with opened(tmp_path, (*epos4(), (0x1014, 0, "U32", "ro", "$NODEID+0x80"))) as rig:
+        assert rig.number(0x1014) == 0x81
         assert not rig.drive.node.has(0x603F, 0)
         rig.session.power.fail(0x3220)
         assert "fault 0x3220: DC-link under-voltage" in rig.drive.node.fault_error().what

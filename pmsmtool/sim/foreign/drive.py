@@ -18,7 +18,7 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.families import family_of, laws_of, modes_of, units_of
-from pmsmtool.sim.foreign.file_rows import MakersObjects
+from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects
 from pmsmtool.sim.foreign.guarding import NodeGuarding
 from pmsmtool.sim.foreign.laws import Law
 from pmsmtool.sim.foreign.position import PositionLoop
@@ -31,13 +31,14 @@ if TYPE_CHECKING:
     from pmsmtool.sim.node.schedule import Schedule
     from pmsmtool.sim.node.session import Session
 
-COMMUNICATION = range(0x1000, 0x1200)
-"""Objects whose stored value the node's own server takes over; those of SDO and PDO keep the server's."""
+COMMUNICATION = frozenset((*range(0x1000, 0x1200), *range(0x1400, 0x1C00)))
+"""Objects whose stored value the node's own server takes over; those of the SDO keep the server's."""
 LAST_COMMUNICATION = 0x2000
 PASSED_ON = (0x603F, 0x6040, 0x6041, 0x6007, 0x605A, 0x605E)
 """State machine and option codes: numbers of the standard, whoever the maker is."""
 HELD = (0x6072, 0x6073, 0x6087)
 """Limits whose stored value acts from the start."""
+PDO_OFF = 1 << 31
 REVISION = 3
 """Sub-index of the identity object that the file gives; vendor and product it may leave blank."""
 PID_MARKS = {(0x30A1, 3), (0x60FB, 3)}
@@ -95,17 +96,20 @@ class ForeignDrive:
         server = {(entry.row.index, entry.row.sub): entry for entry in dictionary}
         for index in {index for index, _ in server}:
             dictionary.hide(index)
+            if index in COMMUNICATION and 0x1400 <= index and index not in MAPPINGS:
+                server[index, 1].put(PDO_OFF)  # one that the file lacks
         serial = dictionary["identity.serial"].integer()
         for (index, sub), row in self.objects.rows.items():
             kept = server.get((index, sub))
             if index < LAST_COMMUNICATION and kept is not None and kept.row.type == row.type:
-                if index in COMMUNICATION and (index != 0x1018 or sub == REVISION) and row.default:
-                    kept.value = row.default_bytes(0)
+                known = row.default or index in MAPPINGS  # a blank entry of a mapping names nothing
+                if index in COMMUNICATION and (index != 0x1018 or sub == REVISION) and known:
+                    kept.value = row.default_bytes(dictionary.node)
                 kept.row = replace(kept.row, stored=row.stored)
                 kept.readable, kept.writable = row.access != "wo", row.access in ("rw", "wo")
                 dictionary.show(kept)
                 continue
-            entry = Entry(row, 0)
+            entry = Entry(row, dictionary.node)
             law = self.laws.get((index, sub))
             if law is not None and law.set_up is not None:
                 low, high = _bounds(row)

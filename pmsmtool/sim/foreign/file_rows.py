@@ -31,6 +31,9 @@ _CODES = {kind.code: _KEPT_AS.get(short, short) for short, kind in BY_SHORT.item
 _ACCESS = {"ro": "ro", "const": "const", "wo": "wo", "rw": "rw", "rwr": "rw", "rww": "rw"}
 MAPPINGS = frozenset((*range(0x1600, 0x1800), *range(0x1A00, 0x1C00)))
 """Mapping of the PDOs: its number of entries is written when it changes (CiA 301, 7.5.2.36 and 7.5.2.38)."""
+FIRST_OBJECT = 0x1000
+"""Below are the data types."""
+_MAPPED_AS = {8: ("U8", "0"), 16: ("U16", "0"), 32: ("U32", "0"), 64: ("U64", "0")}
 CONSUMER_LIMIT = 0x7FFFFF
 """Largest entry of 0x1016: a node id above 16 bits of time (CiA 301); files with 65535 leave no room for the node."""
 
@@ -214,6 +217,26 @@ def _value(text: str, kind: str) -> str:
     return str(value - (1 << bits) if kind.startswith("I") and value >> bits - 1 else value)
 
 
+def _mapped_words(found: Mapping[tuple[int, int], ObjectRow]) -> list[int]:
+    """Return what the mappings of the PDOs name, but dummies: no file has them as objects (CiA 301, 7.5.2.36)."""
+    words = [
+        int(row.default_number(NODE_ID))
+        for (index, sub), row in found.items()
+        if index in MAPPINGS and sub and row.data_type.is_integer
+    ]
+    return [word for word in words if word >> 16 >= FIRST_OBJECT]
+
+
+def _named(found: Mapping[tuple[int, int], ObjectRow], index: int) -> int:
+    """Return how many entries of a PDO's mapping name an object, up to the first that names none."""
+    count = 0
+    while row := found.get((index, count + 1)):
+        if not row.data_type.is_integer or not row.default_number(NODE_ID):
+            break
+        count += 1
+    return count
+
+
 def _completed(
     found: dict[tuple[int, int], ObjectRow],
 ) -> tuple[dict[tuple[int, int], ObjectRow], tuple[str, ...]]:
@@ -236,10 +259,14 @@ def _completed(
     for mode, items in BY_MODE.items():
         if announced >> mode - 1 & 1:
             add(items, f"mandatory in mode {mode}")
+    for word in _mapped_words(found):
+        kind, value = _MAPPED_AS.get(word & 0xFF, ("VSTR", ""))
+        add([(word >> 16, word >> 8 & 0xFF, kind, "ro", value)], "named by the mapping of a PDO")
     for index in sorted({index for index, sub in found if sub}):
         highest = max(sub for at, sub in found if at == index)
-        access = "rw" if index in MAPPINGS else "const"
-        add([(index, 0, "U8", access, str(highest))], "number of entries")
+        if index in MAPPINGS:
+            add([(index, 0, "U8", "rw", str(_named(found, index)))], "number of entries")
+        add([(index, 0, "U8", "const", str(highest))], "number of entries")
     for (index, sub), row in found.items():
         if index == 0x1016 and sub and row.high is not None and row.high < CONSUMER_LIMIT:
             found[index, sub] = replace(row, high=None)

@@ -121,9 +121,12 @@ class Dictionary:
     ----------
     on_change : callable
         Called with the entry after a value that can be stored was changed from outside.
+    node : int
+        Node id that identifiers follow.
     """
 
     def __init__(self, node: int) -> None:
+        self.node = node
         self._entries = {row.index << 8 | row.sub: Entry(row, node) for row in object_rows()}
         self._indices = {row.index for row in object_rows()}
         self.by_key = {entry.row.key: entry for entry in self._entries.values() if entry.row.key}

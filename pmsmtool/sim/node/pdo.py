@@ -32,7 +32,8 @@ class _Pdo:
     """One PDO: its keys' prefix and what it carries now."""
 
     name: str
-    entries: list[Entry] = field(default_factory=list)
+    entries: list[tuple[Entry, int]] = field(default_factory=list)
+    """Objects and their bytes."""
     last: bytes = b""
     free_ns: int = 0
     sent_ns: int = 0
@@ -141,27 +142,30 @@ class ProcessData:
 
         return sink
 
-    def _mapped(self, pdo: _Pdo, word: int) -> Entry:
+    def _mapped(self, pdo: _Pdo, word: int) -> tuple[Entry, int]:
         if pdo.name.startswith("rpdo") and word == DUMMY_BYTE:
-            return Entry(DUMMY_ROW, 0)
+            return Entry(DUMMY_ROW, 0), 1
         entry = self._dictionary.find(word >> 16, word >> 8 & 0xFF)
         row = entry.row
         direction = "R" if pdo.name.startswith("rpdo") else "T"
         # What can be received is mappable for sending too (its value is read back), not the other way round.
         if row.pdo != direction and not (direction == "T" and row.pdo == "R"):
             raise Refused(AbortCode.NOT_MAPPABLE)
-        if word & 0xFF != 8 * entry.size:
+        size = entry.size or (word & 0xFF) // 8  # a maker's object of any length, such as an interpreter's answer
+        if word & 0xFF != 8 * size:
             raise Refused(AbortCode.PDO_LENGTH)
-        return entry
+        return entry, size
 
-    def _collect(self, pdo: _Pdo, count: int) -> list[Entry]:
+    def _collect(self, pdo: _Pdo, count: int) -> list[tuple[Entry, int]]:
+        if count > MAX_OBJECTS:
+            raise Refused(AbortCode.PDO_LENGTH)
         words = [self._number(pdo, f"object_{number + 1}") for number in range(count)]
         entries = [self._mapped(pdo, word) for word in words]
-        if sum(entry.size for entry in entries) > 8:
+        if sum(size for _, size in entries) > 8:
             raise Refused(AbortCode.PDO_LENGTH)
         return entries
 
-    def _mapping(self, pdo: _Pdo) -> list[Entry]:
+    def _mapping(self, pdo: _Pdo) -> list[tuple[Entry, int]]:
         """Return what a PDO carries; nothing when it maps an object this firmware does not have."""
         try:
             return self._collect(pdo, self._number(pdo, "count"))
@@ -194,7 +198,7 @@ class ProcessData:
         if pdo is None or not self._operational():
             return pdo is not None
         self._expect_next(pdo)
-        length = sum(entry.size for entry in pdo.entries)
+        length = sum(size for _, size in pdo.entries)
         if len(data) < length:
             self._fault(TOO_SHORT)
         elif self._number(pdo, "type") in _SYNC_TYPES or self._number(pdo, "type") == 0:
@@ -228,9 +232,9 @@ class ProcessData:
 
     def _take(self, pdo: _Pdo, data: bytes) -> None:
         position = 0
-        for entry in pdo.entries:
-            piece = data[position : position + entry.size]
-            position += entry.size
+        for entry, size in pdo.entries:
+            piece = data[position : position + size]
+            position += size
             try:
                 self._dictionary.write(entry, piece)
             except Refused:
@@ -239,7 +243,7 @@ class ProcessData:
     # ---- transmitted ---------------------------------------------------------------------------
 
     def _content(self, pdo: _Pdo) -> bytes:
-        return b"".join(entry.read() for entry in pdo.entries)
+        return b"".join(entry.read()[:size].ljust(size, b"\0") for entry, size in pdo.entries)
 
     def start(self) -> None:
         """The node has become operational: every event-driven PDO is sent once."""

@@ -324,6 +324,8 @@ class Session:
         self.sdo.reset()
         self.lss = self._make_lss()  # it is waiting again
         fresh = Dictionary(self.hardware.node_id)
+        if self.hardware.face is not None:
+            self.hardware.face.dress(fresh)
         for entry in self.dictionary:
             if entry.row.index in Group.COMMUNICATION.indices and entry.row.stored:
                 entry.value = fresh.find(entry.row.index, entry.row.sub).value
