@@ -23,7 +23,7 @@ import math
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -156,13 +156,13 @@ def _powered(truth: MachineFile, folder: Path) -> Iterator[CanopenDrive]:
 
 
 @contextmanager
-def spoiled(kind: str) -> Iterator[None]:
+def spoiled(kind: str, kinds: Mapping[str, Change] = KINDS) -> Iterator[None]:
     """Let every simulated drive run with a defect that its objects do not show."""
     original = KernelCore._parameters_changed
 
     def changed(self: KernelCore) -> None:
         original(self)
-        KINDS[kind](self.simulation.params)
+        kinds[kind](self.simulation.params)
 
     if kind:
         KernelCore._parameters_changed = changed  # type: ignore[method-assign]
@@ -184,11 +184,19 @@ def prove(truth: MachineFile, design: Design, kind: str, *, log: Callable[[str],
     """Flash a design on a simulated drive, healthy (empty kind) or spoiled, and prove it."""
     if kind == "delay":
         truth = replace(truth, inverter=replace(truth.inverter, delay_periods=truth.inverter.delay_periods + 1.0))
-    with tempfile.TemporaryDirectory() as folder, spoiled(kind), _powered(truth, Path(folder)) as drive:
+    with spoiled(kind):
+        return proven(truth, design, proving.ProofRequest(), log)
+
+
+def proven(
+    truth: MachineFile, design: Design, asked: proving.ProofRequest, log: Callable[[str], None] = lambda text: None
+) -> Stage:
+    """Flash a design on a simulated drive, and prove it."""
+    with tempfile.TemporaryDirectory() as folder, _powered(truth, Path(folder)) as drive:
         flash(drive, design, Path(folder))
         run = RunDirectory(Path(folder))
         run.write(new_record(["prove_verdicts"], drive={}, bus={}, versions={}))
-        return proving.prove_stage(run, drive, design, proving.ProofRequest(), lambda lines: None, log)
+        return proving.prove_stage(run, drive, design, asked, lambda lines: None, log)
 
 
 KEPT = 6
@@ -266,11 +274,11 @@ def main() -> None:
     caught, spoiled_count = sum(good[k] for k in spoiled_kinds), sum(total[k] for k in spoiled_kinds)
     if refused:
         print(f"refused by identify: {refused} of {asked.drives}")
-    print(f"healthy pass: {_interval(good['healthy'], total['healthy'])}")
-    print(f"spoiled caught: {_interval(caught, spoiled_count)}")
+    print(f"healthy pass: {interval(good['healthy'], total['healthy'])}")
+    print(f"spoiled caught: {interval(caught, spoiled_count)}")
 
 
-def _interval(good: int, total: int) -> str:
+def interval(good: int, total: int) -> str:
     """Return a share with its 95 % interval (Clopper and Pearson, DOI 10.1093/biomet/26.4.404)."""
     from scipy.stats import beta
 

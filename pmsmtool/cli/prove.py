@@ -62,8 +62,8 @@ def prove_command(
 
     The band follows from the intervals of the machine in the design. It is printed with its SHA-256 before the first
     step. The steps: speed, current in two sizes and both signs, a governed unreachable reference, entry into field
-    weakening. Above the speed of uncontrolled generation they go only where a fault shorts the windings, or a brake
-    chopper is stated.
+    weakening, a move of the position loop with the speed fed forward and one without. Above the speed of uncontrolled
+    generation they go only where a fault shorts the windings, or a brake chopper is stated.
     """
     from dataclasses import asdict, replace
 

@@ -159,7 +159,7 @@ class Direction:
     """How a derived quantity is made: two sets of runs that differ in nothing but the quantity.
 
     ``high`` and ``low`` are responses of the same machines at the values ``at_high`` and ``at_low``; ``below`` and
-    ``above`` as for :class:`Quantity`.
+    ``above`` as for :class:`Quantity`. ``least_change`` is the least half width, as :data:`LEAST_CHANGE`.
     """
 
     nominal: float
@@ -170,6 +170,7 @@ class Direction:
     at_low: float
     below: str = ""
     above: str = ""
+    least_change: float = LEAST_CHANGE
 
 
 def predict(
@@ -276,7 +277,7 @@ def _quantity(
     direction: Direction, signature: Mapping[tuple[str, str], Array], amplitude: Array, factor: float
 ) -> Quantity:
     middle = direction.nominal + float(np.median(amplitude))
-    half = max(factor * _least_std(amplitude), LEAST_CHANGE * abs(direction.at_high - direction.at_low))
+    half = max(factor * _least_std(amplitude), direction.least_change * abs(direction.at_high - direction.at_low))
     return Quantity(
         direction.nominal, direction.unit, middle - half, middle + half, signature, direction.below, direction.above
     )

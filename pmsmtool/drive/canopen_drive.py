@@ -11,8 +11,9 @@ from pmsmtool.cia402 import Mode, State
 from pmsmtool.drive import objects, stop
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.drive.port import Excitation, Halves, Injection, Recording, Shape
+from pmsmtool.drive.port import Excitation, Halves, Injection, ProfileMove, Recording, Shape
 from pmsmtool.drive.recorders.reference import Recorder
+from pmsmtool.drive.set_point import POSITION_DEMAND, start_move
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError, DriveFault, NotAvailable, SdoAbort
 from pmsmtool.params.catalogue import BY_NAME
@@ -22,6 +23,8 @@ from pmsmtool.units import RAD_S_PER_MRPM
 
 PERIOD = "inverter.T_s_ns"
 """The reference drive counts speed in thousandths of a mechanical revolution per minute."""
+HELD_S = 0.2
+"""The position loop holds the shaft this long before a move that is recorded."""
 
 
 class CanopenDrive:
@@ -209,6 +212,20 @@ class CanopenDrive:
         """
         return self.take(Recording(signals, samples, decimation, excitation, pretrigger), self.wait)
 
+    def record_move(self, signals: Sequence[str], samples: int, decimation: int, move: ProfileMove) -> Trace:
+        """Move by the drive's own position loop; record from the period in which the reference begins to move.
+
+        Raises
+        ------
+        NotAvailable
+            No profile position mode, or more than the recorder holds.
+        DriveFault
+            The drive tripped, as when the following error left its window.
+        DriveTimeout
+            It does not take the set-point, or does not begin to move.
+        """
+        return self.take(Recording(signals, samples, decimation, move=move), self.wait)
+
     def take(self, recording: Recording, wait: Callable[[float], None]) -> Trace:
         """Prepare, begin and finish a record; ``wait`` lets time pass. An excitation ends however this ends.
 
@@ -240,6 +257,9 @@ class CanopenDrive:
 
     def begin_record(self, recording: Recording, wait: Callable[[float], None]) -> None:
         """Start the (prepared) excitation and the recorder, in the order its ``lead_s`` asks for."""
+        if recording.move is not None:
+            self._begin_move(recording, recording.move, wait)
+            return
         excitation, decimation, pretrigger = recording.excitation, recording.decimation, recording.pretrigger
         lead_s = 0.0 if excitation is None else excitation.lead_s
         in_current_mode = excitation is not None and excitation.point is not Injection.SPEED
@@ -255,6 +275,21 @@ class CanopenDrive:
                 self._set_mode(Mode.IDENTIFICATION)
             wait(pretrigger * decimation * self.period_s)
             self.node.command(objects.EXCITATION_COMMAND, 2)
+
+    def _begin_move(self, recording: Recording, move: ProfileMove, wait: Callable[[float], None]) -> None:
+        for item, value in (
+            (objects.PROFILE_VELOCITY, move.velocity),
+            (objects.PROFILE_ACCELERATION, move.acceleration),
+            (objects.PROFILE_DECELERATION, move.acceleration),
+            (objects.PROFILE_JERK, move.jerk),
+        ):
+            self.node.put(item, value)
+        self._set_mode(Mode.PROFILE_POSITION)
+        wait(HELD_S)
+        self.recorder.arm(
+            recording.signals, recording.samples, recording.decimation, 0, at_excitation=False, at_move=True
+        )  # fmt: skip
+        start_move(self.node, self.node.get(POSITION_DEMAND) + move.way)
 
     def finish_record(self, recording: Recording) -> Trace:
         """Wait until the recorder is complete and return its trace, if the drive did not trip meanwhile."""

@@ -24,7 +24,7 @@ from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.motion_objects import OVER_SPEED_TRIP, lowered_trip, trips_itself
 from pmsmtool.drive.own_limits import NO_LIMITS, lower_limits, put_limit
-from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, Recording, Shape
+from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, ProfileMove, Recording, Shape
 from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import (
     BusError,
@@ -319,6 +319,14 @@ class GuardedDrive:
         """Record signals, with an excitation whose abort limits are at most the envelope's."""
         within = None if excitation is None else self._within(excitation)
         return self._drive.take(Recording(signals, samples, decimation, within, pretrigger), self.wait)
+
+    def record_move(self, signals: Sequence[str], samples: int, decimation: int, move: ProfileMove) -> Trace:
+        """Move by the drive's own position loop and record it; the speed of the move is at most the envelope's."""
+        turn = self._node.whole(objects.ENCODER_INCREMENTS)
+        self._check("speed", 2.0 * math.pi * move.velocity / turn, self.envelope.speed_max_rad_s, "rad/s")
+        self._refuse_turning()
+        self._asked_rad_s, self._kept_since_s = 0.0, None
+        return self._drive.take(Recording(signals, samples, decimation, move=move), self.wait)
 
     def wait(self, seconds: float) -> None:
         """Let time pass, looking at the machine in between."""

@@ -96,14 +96,28 @@ class Excitation:
 
 
 @dataclass(frozen=True, slots=True)
+class ProfileMove:
+    """A move from where the shaft stands: its way and its limits in increments, per s, s2 and s3 (0: no jerk limit)."""
+
+    way: int
+    velocity: int
+    acceleration: int
+    jerk: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Recording:
-    """One record: signals every ``decimation`` control periods, from ``pretrigger`` samples before the excitation."""
+    """One record: signals every ``decimation`` control periods, from ``pretrigger`` samples before the excitation.
+
+    With ``move``: from the period in which the reference of that move begins to move.
+    """
 
     signals: Sequence[str]
     samples: int
     decimation: int = 1
     excitation: Excitation | None = None
     pretrigger: int = 0
+    move: ProfileMove | None = None
 
 
 class Halves(NamedTuple):
@@ -160,6 +174,9 @@ class Drive(Protocol):
         pretrigger: int = 0,
     ) -> Trace:
         """Record signals every ``decimation`` periods, starting with the excitation if there is one."""
+
+    def record_move(self, signals: Sequence[str], samples: int, decimation: int, move: ProfileMove) -> Trace:
+        """Move by the drive's own position loop; record from the period in which the reference begins to move."""
 
     def live(self, name: str) -> float:
         """Return one live quantity (``drive.objects.LIVE``) as it is now."""

@@ -13,26 +13,18 @@ from contextlib import AbstractContextManager
 import numpy as np
 
 from pmsmtool.bus.connection import Connection
-from pmsmtool.cia402 import Command
+from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits, held
-from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.process_data import LiveValues, live_values
+from pmsmtool.drive.set_point import POSITION_DEMAND, TARGET_POSITION, WHOLE, start_move
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S
 from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
-from pmsmtool.errors import DriveTimeout, LimitExceeded, NotAvailable, SdoAbort
+from pmsmtool.errors import LimitExceeded, NotAvailable, SdoAbort
 from pmsmtool.trace import Trace
 
-TARGET_POSITION = DriveObject(0x607A, 0, "i")
-POSITION_DEMAND = DriveObject(0x6062, 0, "i")
-PROFILE_POSITION = 1
-"""Mode of operation (CiA 402-2)."""
-NEW_SET_POINT, ACKNOWLEDGED = 0x0010, 0x1000
-"""Bits of controlword and statusword in profile position mode (CiA 402-2, 11.4)."""
-ACKNOWLEDGE_S = 0.5
 SHOWN = ("position", "demand", "current")
-WHOLE = 2.0**32
 
 
 class PositionDrive(TorqueDrive):
@@ -85,7 +77,7 @@ class PositionDrive(TorqueDrive):
         """Bring the drive to operation enabled in its position mode, at the place where the shaft stands."""
         self._start_counts = self.node.get(POSITION)
         self.node.put(TARGET_POSITION, self._start_counts)
-        self._set_mode(PROFILE_POSITION)
+        self._set_mode(Mode.PROFILE_POSITION)
         self.may_be_energised = True
         self.node.enable()
 
@@ -98,18 +90,7 @@ class PositionDrive(TorqueDrive):
             The drive does not take the set-point.
         """
         counts = self._start_counts + angle_rad / (2.0 * math.pi) * self.counts_per_turn
-        self.node.put(TARGET_POSITION, (round(counts) + WHOLE / 2) % WHOLE - WHOLE / 2)
-        self.node.command(objects.CONTROLWORD, Command.ENABLE_OPERATION | NEW_SET_POINT)
-        until = self.node.connection.clock.now() + ACKNOWLEDGE_S
-        while not self.node.whole(objects.STATUSWORD) & ACKNOWLEDGED:
-            if self.node.connection.clock.now() > until:
-                raise DriveTimeout(
-                    f"the drive does not acknowledge a set-point within {ACKNOWLEDGE_S:g} s",
-                    where=f"node {self.node.node}, 0x6041 bit 12",
-                    likely="the drive expects homing first, or the target is beyond its software limits (0x607D)",
-                    hint="home it, or widen the limits with the maker's software",
-                )  # fmt: skip
-        self.node.command(objects.CONTROLWORD, Command.ENABLE_OPERATION)
+        start_move(self.node, counts)
 
     def demanded_rad(self) -> float:
         """Return the demand as the drive shows it now, from where the shaft stood when it was enabled."""

@@ -68,15 +68,16 @@ class RecordedMeans(Recorder):
     _armed: tuple[object, ...] | None = None
 
     def arm(
-        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool
-    ) -> None:
+        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool,
+        at_move: bool = False,
+    ) -> None:  # fmt: skip
         """Set the recorder up and arm it; only arm it where it is set up like this: hundreds of means are alike."""
-        wanted = (tuple(signals), samples, decimation, pretrigger, at_excitation)
+        wanted = (tuple(signals), samples, decimation, pretrigger, at_excitation, at_move)
         if wanted == self._armed:
             self._node.command(objects.TRACE_COMMAND, 1)
             return
         self._armed = None
-        super().arm(signals, samples, decimation, pretrigger, at_excitation=at_excitation)
+        super().arm(signals, samples, decimation, pretrigger, at_excitation=at_excitation, at_move=at_move)
         self._armed = wanted
 
     def forget(self) -> None:

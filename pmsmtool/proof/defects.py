@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from pmsmtool.design.design_file import Design
+from pmsmtool.design.prediction import LEAST_CHANGE
 from pmsmtool.sim.kernel import Params, Setup
 
 Change = Callable[[Setup, Params], None]
@@ -14,10 +15,11 @@ Change = Callable[[Setup, Params], None]
 
 @dataclass(frozen=True, slots=True)
 class Defect:
-    """Something wrong with a drive: what a person reads, and what it changes in the simulated one."""
+    """Something wrong with a drive: what a person reads, what it changes in the simulated one, where that shows."""
 
     text: str
     change: Change
+    moves_only: bool = False
 
 
 def _gain(factor: float) -> Change:
@@ -58,6 +60,33 @@ def _inertia(factor: float) -> Change:
     return change
 
 
+def _position_gain(factor: float) -> Change:
+    def change(setup: Setup, params: Params) -> None:
+        params.position_K_p_per_s *= factor
+
+    return change
+
+
+def _speed_gain(factor: float) -> Change:
+    def change(setup: Setup, params: Params) -> None:
+        params.speed_K_p_nms_per_rad *= factor
+        params.speed_K_i_nm_per_rad *= factor
+
+    return change
+
+
+def _forward_reversed(setup: Setup, params: Params) -> None:
+    params.position_velocity_ff *= -1.0
+
+
+def _inertia_reversed(setup: Setup, params: Params) -> None:
+    params.position_inertia_ff_kgm2 *= -1.0
+
+
+def _late_angle(setup: Setup, params: Params) -> None:
+    setup.sensors.encoder_latency += params.speed_decimation * 1e-9 * params.inverter_T_s_ns
+
+
 WRONG_POLE_PAIRS = "wrong pole pairs"
 """Too many or too few: the shaft falls out of step either way, and where it is then tells nothing of the sign."""
 HELD = 1e3
@@ -85,20 +114,54 @@ DEFECTS: Mapping[str, Defect] = {
     "compensation": Defect("the dead-time compensation does not fit the inverter", _compensation),
     "inertia_high": Defect("more inertia than designed for", _inertia(1.4)),
     "inertia_low": Defect("less inertia than designed for", _inertia(0.7)),
+    "position_gain_low": Defect("the gain of the position loop is lower than designed", _position_gain(0.8), True),
+    "position_gain_high": Defect("the gain of the position loop is higher than designed", _position_gain(1.25), True),
+    "speed_gain_low": Defect("the gain of the speed loop is lower than designed", _speed_gain(0.8), True),
+    "speed_gain_high": Defect("the gain of the speed loop is higher than designed", _speed_gain(1.25), True),
+    "speed_ff": Defect("the speed of a move is fed forward with the wrong sign", _forward_reversed, True),
+    "inertia_ff": Defect("the acceleration of a move is fed forward with the wrong sign", _inertia_reversed, True),
+    "late_angle": Defect("the angle is one period of the speed loop older than designed", _late_angle),
     "held": Defect("something holds the shaft", _inertia(HELD)),
 }
 """What the likely cause is looked for among."""
 
-QUANTITIES = {
-    "loop gain over the designed one": ("gain_high", 1.25, "gain_low", 0.8, 1.0, "1"),
-    "delay beyond the designed one": ("delay", 1.0, "", 0.0, 0.0, "1"),
-    "decoupling over the designed one": ("", 1.0, "decoupling", -1.0, 1.0, "1"),
+AGE_LEAST = 0.3
+"""Least half width of the angle's age, in periods of the speed loop: cogging acts on a move where the shaft stands, and
+the prediction draws one order of it (0.13 to 0.17 of a healthy machine whose cogging is 4 % of the rated torque)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Derived:
+    """A derived quantity.
+
+    Which experiments show it (begin of their names), two sets of runs that differ in it (empty: the healthy drive) with
+    their values, its nominal value, and its least half width over their difference.
+    """
+
+    shown_by: tuple[str, ...]
+    high: str
+    at_high: float
+    low: str
+    at_low: float
+    nominal: float
+    least: float = LEAST_CHANGE
+
+
+STEPS, MOVES = ("q_", "d_"), ("move",)
+QUANTITIES: Mapping[str, Derived] = {
+    "loop gain over the designed one": Derived(STEPS, "gain_high", 1.25, "gain_low", 0.8, 1.0),
+    "delay beyond the designed one": Derived(STEPS, "delay", 1.0, "", 0.0, 0.0),
+    "decoupling over the designed one": Derived(STEPS, "", 1.0, "decoupling", -1.0, 1.0),
+    "position gain over the designed one": Derived(MOVES, "position_gain_high", 1.25, "position_gain_low", 0.8, 1.0),
+    "speed gain over the designed one": Derived(MOVES, "speed_gain_high", 1.25, "speed_gain_low", 0.8, 1.0),
+    "age of the angle beyond the designed one": Derived(MOVES, "late_angle", 1.0, "", 0.0, 0.0, AGE_LEAST),
 }
-"""Derived quantity: the two sets of runs and their values (empty: the healthy drive), nominal value, unit."""
 
 
-def is_possible(defect: str, design: Design) -> bool:
-    """Return whether a drive with this design can have the defect."""
+def is_possible(defect: str, design: Design, *, moves: bool) -> bool:
+    """Return whether a drive with this design can have the defect, and a plan with or without moves may show it."""
+    if DEFECTS[defect].moves_only and not moves:
+        return False
     if defect == "pole_pairs_low":
         return design["motor.pole_pairs"] >= 2
     return defect != "compensation" or design["inverter.deadtime_compensation"] != 0.0

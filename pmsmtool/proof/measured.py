@@ -15,7 +15,7 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.drive.port import Drive, Injection
 from pmsmtool.errors import CheckFailed
 from pmsmtool.experiments.speed_run import reach
-from pmsmtool.proof.plan import RPM, SIGNALS, Conditions, Experiment, ProofPlan
+from pmsmtool.proof.plan import RPM, Conditions, Experiment, ProofPlan
 from pmsmtool.trace import Trace
 
 REACH_S = 4.0
@@ -38,6 +38,7 @@ USED_UP = 0.95
 """Share of the largest voltage at which none is left."""
 SAGGED = 0.95
 """DC link over what it showed at rest, below which it has sagged."""
+VELOCITY_FF = "position.velocity_ff"
 CURRENT_LIMITED = 1 << 2
 """Flag of the drive: the current asked for was cut (``PMSM_FLAG_CURRENT_LIMITED`` of ``pmsm_core.h``)."""
 STANDSTILL_S = 2.0
@@ -114,7 +115,9 @@ def _recorded(
             if reach(drive, omega_e, limit_s=limit_s) >= limit_s:
                 _refuse_other_speed(drive, experiment, omega_e, limit_s, design, conditions)
             drive.wait(experiment.settle_s)
-        trace = drive.record(SIGNALS, experiment.rows, decimation=experiment.decimation,
+        if experiment.move is not None:
+            return _moved(drive, experiment, design)
+        trace = drive.record(experiment.signals, experiment.rows, decimation=experiment.decimation,
                              excitation=experiment.excitation)  # fmt: skip
         off = float(trace["omega_e_rad_s"][0]) / omega_e - 1.0 if omega_e else 0.0
         if KEPT[0] <= off <= KEPT[1]:
@@ -125,6 +128,16 @@ def _recorded(
         f"{experiment.base_rad_s / RPM:.4g} rpm, or {100.0 * KEPT[1]:g} % above",
         likely="the shaft coasts too long while the bus or this computer is slow, or something brakes or drives it",
     )
+
+
+def _moved(drive: Drive, experiment: Experiment, design: Design) -> Trace:
+    """Move with the share of the speed fed forward that the experiment asks for; the design's own is back behind it."""
+    assert experiment.move is not None
+    designed = design[VELOCITY_FF]
+    drive.write({VELOCITY_FF: experiment.velocity_ff * designed})
+    trace = drive.record_move(experiment.signals, experiment.rows, experiment.decimation, experiment.move)
+    drive.write({VELOCITY_FF: designed})
+    return trace
 
 
 def _refuse_other_speed(

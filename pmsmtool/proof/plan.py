@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
-from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Shape
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import RAD_S_PER_RPM
@@ -18,7 +18,9 @@ from pmsmtool.units import RAD_S_PER_RPM
 RPM = RAD_S_PER_RPM
 
 SIGNALS = ("i_d_a", "i_q_a", "omega_e_rad_s", "u_d_lim_v", "u_q_lim_v")
-"""What is recorded of every experiment."""
+"""What is recorded of every experiment but a move."""
+MOVE_SIGNALS = ("following_error_rad", "omega_e_rad_s", "i_q_a")
+"""What is recorded of a move by the position loop, and judged."""
 STEPS = (0.5, 0.0, -0.5, 0.0, 1.0, 0.0, -1.0, 0.0)
 """Current steps of one pattern, over the larger one: two sizes and both signs."""
 SETTLE = 8.0
@@ -66,6 +68,19 @@ UNREACHABLE_LARGEST_RISE = 0.25
 """Rise of the speed while it is asked for, relative: wanted, and largest with the fewest rows and all of the current
 (40 random drives: at most 0.032). Beyond, the speed decides what the voltage lets through, not the governor."""
 
+MOVE_ACCELERATION, MOVE_SPEED_SHARE = 0.4, 0.5
+"""Acceleration of a move, of the design's largest, and its speed, of the largest that is asked for: no limit is to act.
+"""
+MOVE_RISE, MOVE_AT_SPEED, MOVE_SETTLE = 3.0, 3.0, 3.0
+"""Most time to its speed, time at its speed, and time after it, in time constants 1 / K_p of the position loop: the
+following error settles to 5 %."""
+MOVE_RAMP, MOVE_RAMP_STEPS = 2.0, 100.0
+"""Ramp of its acceleration, in time constants of the speed loop, and its most steps (the core has memory for 128)."""
+MOVE_LEAST_INCREMENTS = 1.0
+"""Least speed, in increments per step of the speed loop."""
+MOST_JERK = 4e9
+"""Increments/s3: what 0x60A4 (UNSIGNED32) holds."""
+
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
@@ -108,7 +123,7 @@ class Experiment:
     Attributes
     ----------
     name : str
-        ``speed_step``, ``q_steps``, ``d_steps``, ``unreachable``, ``weakening``.
+        ``speed_step``, ``q_steps``, ``d_steps``, ``unreachable``, ``weakening``, ``move``, ``move_lag``.
     text : str
         What happens, one line.
     base_rad_s : float
@@ -121,12 +136,16 @@ class Experiment:
         The record is this often the same pattern; it is averaged over them.
     judged : tuple of str
         Signals that have a band.
-    scale_a, scale_rad_s : float
-        Scale of its currents (A) and of its electrical speed (rad/s).
+    scale_a, scale_rad_s, scale_rad : float
+        Scale of its currents (A), of its electrical speed (rad/s) and of its following error (rad).
     settle_s : float
         Time at the speed held before, after it is reached (s).
     steady_rows : int
         So many rows at the end are steady: what they shake by is the machine's ripple.
+    move : ProfileMove or None
+        Instead of the excitation: a move by the position loop.
+    velocity_ff : float
+        Of the move's speed, share of what the design feeds forward; the drive is lent it for the record.
     """
 
     name: str
@@ -141,6 +160,18 @@ class Experiment:
     scale_rad_s: float = 1.0
     settle_s: float = 0.0
     steady_rows: int = 0
+    scale_rad: float = 1.0
+    move: ProfileMove | None = None
+    velocity_ff: float = 1.0
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """What is recorded."""
+        return SIGNALS if self.move is None else MOVE_SIGNALS
+
+    def scale(self, signal: str) -> float:
+        """Return the scale of a signal, in its unit."""
+        return {"omega_e_rad_s": self.scale_rad_s, "following_error_rad": self.scale_rad}.get(signal, self.scale_a)
 
     @property
     def pattern_rows(self) -> int:
@@ -189,6 +220,11 @@ def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
                 experiments.append(found)
             else:
                 left_out.append(found)
+    moves = _moves(sizes, conditions.encoder_counts) if turning else "position moves: no speed loop, or a locked shaft"
+    if isinstance(moves, str):
+        left_out.append(moves)
+    else:
+        experiments += moves
     return ProofPlan(tuple(experiments), tuple(left_out))
 
 
@@ -388,3 +424,38 @@ def _weakening(s: _Sizes) -> Experiment | str:
                       judged=("i_d_a", "i_q_a", "omega_e_rad_s"), scale_a=s.I_test, scale_rad_s=end,
                       settle_s=SPEED_SETTLE / s.crossover_rad_s,
                       steady_rows=_steady_rows(s, step / slope, rows, decimation))  # fmt: skip
+
+
+def _moves(s: _Sizes, increments: int) -> tuple[Experiment, ...] | str:
+    """Return a move with the speed fed forward as designed, and its way back without: what K_p alone leaves shows."""
+    K_p, slope = s.design["position.K_p_per_s"], s.design["speed.acceleration_rpm_per_s"] * RPM
+    if K_p <= 0.0:
+        return "position moves: the design has no position controller"
+    if not increments:
+        return "position moves: the drive does not state the increments of a turn (0x608F)"
+    acceleration = MOVE_ACCELERATION * slope * min(1.0, s.i_lim / s.design["motor.I_max_apk"])
+    speed = min(s.omega_steps / s.p, MOVE_SPEED_SHARE * s.omega_max / s.p, MOVE_RISE * acceleration / K_p)
+    step_s = s.T_s * s.design["speed.decimation"]
+    ramp_s = min(max(MOVE_RAMP / s.crossover_rad_s, step_s), MOVE_RAMP_STEPS * step_s)
+    unit = 2.0 * math.pi / increments
+    jerk = min(acceleration / (ramp_s * unit), MOST_JERK)
+    move = ProfileMove(0, round(speed / unit), max(1, round(acceleration / unit)), max(1, round(jerk)))
+    if move.velocity < MOVE_LEAST_INCREMENTS / step_s:
+        return f"position moves: {increments} increments of a turn are too coarse for {speed / RPM:.4g} rpm"
+    rise_s, ramp_s = move.velocity / move.acceleration, move.acceleration / move.jerk
+    at_speed_s = rise_s + ramp_s + MOVE_AT_SPEED / K_p
+    move = replace(move, way=round(move.velocity * at_speed_s))
+    moving_s, settling_s = at_speed_s + rise_s + ramp_s, MOVE_SETTLE / K_p + 0.5 * SPEED_SETTLE / s.crossover_rad_s
+    decimation = max(1, math.ceil((moving_s + settling_s) / (SPEED_ROWS * s.T_s)))
+    steady = max(0, SPEED_ROWS - math.ceil((moving_s + 0.5 * settling_s) / (decimation * s.T_s)))
+    turns = f"{move.way / increments:.4g} turns at {speed / RPM:.4g} rpm"
+    nothing = Excitation(Shape.NONE, Injection.SPEED, 0.0)
+    whole = Experiment(
+        "move", f"move of {turns} by the position loop", 0.0, nothing, SPEED_ROWS, decimation, judged=MOVE_SIGNALS,
+        scale_a=s.I_test, scale_rad_s=s.p * speed, steady_rows=steady, scale_rad=speed / K_p, move=move,
+    )  # fmt: skip
+    back = replace(
+        whole, name="move_lag", text=f"and back, {turns}, without the speed fed forward", velocity_ff=0.0,
+        move=replace(move, way=-move.way),
+    )  # fmt: skip
+    return whole, back

@@ -29,7 +29,8 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import iron_drag
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.proof.defects import DEFECTS, QUANTITIES, Defect, is_possible
-from pmsmtool.proof.plan import SIGNALS, Conditions, Experiment, ProofPlan
+from pmsmtool.proof.plan import Conditions, Experiment, ProofPlan
+from pmsmtool.proof.simulated_move import hold, record_move
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
 from pmsmtool.sim.kernel import Params, Part, Setup, Simulation, library
 from pmsmtool.sim.scenarios import MODES
@@ -120,6 +121,7 @@ class SimulatedDrives:
         self._map = None if flux_map is None else ScalableMap.of(flux_map, machine.machine.psi_f_wb)
         self._image = image_of(machine, _cut(design, conditions))
         self._T_s = design.machine.inverter.T_s
+        self._increments = conditions.encoder_counts
         self._base_speed: list[float] = []
         self._phase: list[int] = []
         self._coasting = np.random.default_rng([seed, 2]).integers(1, COAST_PERIODS + 1, runs).tolist()
@@ -148,8 +150,11 @@ class SimulatedDrives:
         Returns
         -------
         ndarray, shape (runs, signals, pattern rows)
-            Signals of ``plan.SIGNALS``.
+            Signals as the experiment lists them.
         """
+        if experiment.move is not None:
+            count = len(self.setups) if runs is None else runs
+            return np.stack([self._move(k, experiment, defect).T for k in range(count)])
         drives = [self._start(k, experiment, defect) for k in range(len(self.setups) if runs is None else runs)]
         in_speed_mode = experiment.excitation.point is Injection.SPEED
         run_in = COAST_PERIODS
@@ -167,13 +172,18 @@ class SimulatedDrives:
                 lost = (1.0 + self._base_speed[row]) * experiment.base_rad_s - drive.signal(Truth.OMEGA_M)
                 drives[row] = self._start(row, experiment, defect, lost)
                 self._get_ready(drives[row], row, experiment, run_in)
-        wanted = [DRIVE_SIGNALS[name][0] for name in SIGNALS]
+        wanted = [DRIVE_SIGNALS[name][0] for name in experiment.signals]
         for drive in drives:
             _excite(drive, experiment.excitation)
         records = [drive.record(wanted, experiment.rows, experiment.decimation) for drive in drives]
         for drive in drives:
             drive.run(experiment.rows * experiment.decimation)
         return averaged(np.stack(records).transpose(0, 2, 1), experiment)
+
+    def _move(self, row: int, experiment: Experiment, defect: Defect | None) -> Array:
+        drive = self._start(row, experiment, defect)
+        hold(drive, experiment, self._increments, self._T_s, self._phase[row])
+        return record_move(drive, experiment)
 
     def _get_ready(self, drive: Simulation, row: int, experiment: Experiment, run_in: int) -> None:
         """Let the loops settle; before a step at a speed, the current that held it has just been switched off."""
@@ -239,10 +249,14 @@ def predict_proof(
     drives = SimulatedDrives(design, conditions, plan, runs, seed)
     few_runs = max(2, runs * FAULT_RUNS // RUNS)
     healthy = {e.name: drives.respond(e) for e in plan.experiments}
+    few: dict[str, Array] = {name: values[:few_runs] for name, values in healthy.items()}
     wrong = {
-        name: {e.name: drives.respond(e, defect, few_runs) for e in plan.experiments}
+        name: {
+            e.name: few[e.name] if defect.moves_only and e.move is None else drives.respond(e, defect, few_runs)
+            for e in plan.experiments
+        }
         for name, defect in DEFECTS.items()
-        if is_possible(name, design)
+        if is_possible(name, design, moves=any(e.move is not None for e in plan.experiments))
     }
     T_s = design.machine.inverter.T_s
     facts = {
@@ -255,17 +269,20 @@ def predict_proof(
         "runs": runs,
         "seed": seed,
     }
-    few: dict[str, Array] = {name: values[:few_runs] for name, values in healthy.items()}
-    steps = [e for e in plan.experiments if e.repeats > 1 or e.name.endswith("_steps")]
     directions = {}
-    for name, (high, at_high, low, at_low, nominal, unit) in QUANTITIES.items():
-        pair = [_judged(steps, wrong[fault] if fault else few) for fault in (high, low)]
-        below, above = (DEFECTS[fault].text if fault else "" for fault in (low, high))
-        directions[name] = Direction(nominal, unit, pair[0], pair[1], at_high, at_low, below, above)
+    for name, derived in QUANTITIES.items():
+        shown = [e for e in plan.experiments if e.name.startswith(derived.shown_by)]
+        if not shown:
+            continue
+        high, low = (_judged(shown, wrong[fault] if fault else few) for fault in (derived.high, derived.low))
+        below, above = (DEFECTS[fault].text if fault else "" for fault in (derived.low, derived.high))
+        directions[name] = Direction(
+            derived.nominal, "1", high, low, derived.at_high, derived.at_low, below, above, derived.least
+        )  # fmt: skip
     return predict(
         {e.name: np.arange(e.pattern_rows, dtype=np.float64) * (T_s * e.decimation) for e in plan.experiments},
         _judged(plan.experiments, healthy),
-        {(e.name, s): e.scale_rad_s if s == "omega_e_rad_s" else e.scale_a for e in plan.experiments for s in e.judged},
+        {(e.name, s): e.scale(s) for e in plan.experiments for s in e.judged},
         directions=directions,
         faults={name: (DEFECTS[name].text, _judged(plan.experiments, values)) for name, values in wrong.items()},
         facts=facts,
@@ -275,7 +292,7 @@ def predict_proof(
 
 def _judged(experiments: Sequence[Experiment], responses: Mapping[str, Array]) -> Runs:
     return {
-        (e.name, signal): np.ascontiguousarray(responses[e.name][:, SIGNALS.index(signal), :])
+        (e.name, signal): np.ascontiguousarray(responses[e.name][:, e.signals.index(signal), :])
         for e in experiments
         for signal in e.judged
     }

@@ -21,11 +21,11 @@ import numpy as np
 
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.prediction import Array, Prediction
+from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope, largest_acceleration
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.objects import DriveObject
 from pmsmtool.errors import (
     ConfigError,
     DriveFault,
@@ -56,7 +56,8 @@ LINK_READINGS = 200
 """Readings of the DC link whose mean counts, 0.1 s and more of a rectifier's ripple: with one reading of 2.2 % of it, a
 healthy drive entered field weakening 1.23 half widths of the band late (the mean: within 0.2 %)."""
 SPEED = "omega_e_rad_s"
-ENCODER_INCREMENTS = DriveObject(0x608F, 1, "I")
+AT_REST = 0.1
+"""Predicted end of a speed, of its largest, below which the experiment ends at rest: a move."""
 _HASH_DIGITS = 12
 ROUNDING = 1e-6
 """Relative: a rating that went through a drive's units and back is the same rating."""
@@ -232,7 +233,7 @@ def conditions_of(drive: CanopenDrive, envelope: Envelope) -> Conditions:
     """Read what the prediction depends on, with the drive off."""
     counts = 0
     with contextlib.suppress(SdoAbort):
-        counts = drive.node.whole(ENCODER_INCREMENTS)
+        counts = drive.node.whole(objects.ENCODER_INCREMENTS)
 
     def live(name: str) -> float:
         try:
@@ -358,9 +359,9 @@ def _too_slow(prediction: Prediction, measured: Mapping[tuple[str, str], Array])
     """Return which records end below the band of their speed, or have one that says nothing; empty when none does."""
     lines = []
     for (experiment, signal), values in measured.items():
-        if signal != SPEED:
-            continue
         band = prediction.bands[experiment, signal]
+        if signal != SPEED or abs(band.mean[-1]) < AT_REST * float(np.max(np.abs(band.mean))):
+            continue
         low, high = float(band.low[-1]), float(band.high[-1])
         if high - low > 2.0 * WIDEST_BAND * abs(band.mean[-1]):
             ends = f"between {low:.4g} and {high:.4g} rad/s (electrical)"

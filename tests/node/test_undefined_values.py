@@ -25,7 +25,7 @@ DEFINED: dict[str, tuple[int, ...]] = {
     "excitation.shape": tuple(range(9)),
     "excitation.point": tuple(range(5)),
     "excitation.command": (0, 1, 2),
-    "trace.trigger": tuple(range(6)),
+    "trace.trigger": tuple(range(7)),
     "trace.command": (0, 1, 2),
     "average.command": (0, 1),
     "cia402.abort_connection": (0, 1, 2, 3),

@@ -41,9 +41,22 @@ def changed(made: Design, **values: float) -> Design:
 
 def test_everything_the_issue_asks_for_is_there() -> None:
     plan = plan_proof(design(), conditions(design()))
-    assert [e.name for e in plan.experiments] == ["speed_step", "q_steps", "d_steps", "unreachable", "weakening"]
+    names = ["speed_step", "q_steps", "d_steps", "unreachable", "weakening", "move", "move_lag"]
+    assert [e.name for e in plan.experiments] == names
     assert plan.left_out == ()
     assert sorted({abs(share) for share in STEPS if share}) == [0.5, 1.0] and sum(STEPS) == 0.0
+
+
+def test_a_drive_without_what_a_move_needs_is_told() -> None:
+    made = design()
+    for without, why in (
+        (plan_proof(changed(made, position__K_p_per_s=0.0), conditions(made)), "no position controller"),
+        (plan_proof(made, conditions(made, encoder_counts=0)), "increments of a turn"),
+        (plan_proof(made, conditions(made, encoder_counts=4)), "too coarse"),
+        (plan_proof(made, conditions(made, shaft="locked")), "locked shaft"),
+    ):
+        assert not [e for e in without.experiments if e.move is not None]
+        assert any(line.startswith("position moves: ") and why in line for line in without.left_out)
 
 
 @pytest.mark.chain
@@ -56,6 +69,10 @@ def test_nothing_leaves_the_envelope(seed: int) -> None:
     V_max = made.machine.inverter.V_max_v
     for experiment in plan_proof(made, allowed).experiments:
         wave = experiment.excitation
+        if experiment.move is not None:
+            turns_per_s = experiment.move.velocity / allowed.encoder_counts
+            assert 0.0 < 2.0 * math.pi * turns_per_s <= allowed.speed_max_rad_s and experiment.move.way
+            continue
         assert wave.amplitude > 0.0
         if wave.point is Injection.SPEED:
             assert experiment.base_rad_s + wave.amplitude <= allowed.speed_max_rad_s
@@ -223,7 +240,7 @@ def test_without_a_speed_controller_nothing_is_turned() -> None:
 def test_what_the_design_does_not_have_is_left_out(value: dict[str, float], reason: str) -> None:
     made = changed(design(), **value)
     plan = plan_proof(made, conditions(made))
-    assert len(plan.experiments) == 4 and any(reason in line for line in plan.left_out)
+    assert len(plan.experiments) == 6 and any(reason in line for line in plan.left_out)
 
 
 def test_a_speed_limit_below_field_weakening_is_said() -> None:

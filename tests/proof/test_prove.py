@@ -16,6 +16,7 @@ import can
 import numpy as np
 import pytest
 
+from benchmarks.move_verdicts import CHANGES
 from benchmarks.prove_verdicts import KINDS, Shared, flash, spoiled
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import connect
@@ -126,11 +127,11 @@ def test_a_healthy_drive_passes_and_the_prediction_came_first(design: Design) ->
     assert hashlib.sha256((folder / "prediction.npz").read_bytes()).hexdigest() == digest, "the file is as committed"
     prediction, traces = read_proof(folder)
     assert prediction.facts["design"] == design.content_hash()
-    assert list(traces) == ["speed_step", "q_steps", "d_steps", "unreachable", "weakening"]
+    assert list(traces) == ["speed_step", "q_steps", "d_steps", "unreachable", "weakening", "move", "move_lag"]
     again = judge(with_ripple(prediction, traces), responses(traces, prediction))
     assert [line.share for line in again.seen] == [v["value"] for v in stage.values if "where" in v]
     page = report_page(run.path)
-    assert page.count("inside its band") == 5 and "Behaviour: the drive" not in page
+    assert page.count("inside its band") == 7 and "Behaviour: the drive" not in page
 
 
 @pytest.mark.parametrize(
@@ -152,6 +153,18 @@ def test_a_spoiled_drive_is_caught_and_the_cause_named(kind: str, cause: str, de
     assert cause in stage.note
     if kind == "gain_low":
         assert "OUTSIDE its band" in report_page(run.path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "cause"),
+    [("gain_low", "gain of the position loop is lower"), ("speed_ff_sign", "fed forward with the wrong sign")],
+)
+def test_a_spoiled_move_is_caught_and_the_cause_named(kind: str, cause: str, design: Design) -> None:
+    with spoiled(kind, CHANGES), flashed(design) as drive:
+        _, stage = prove(drive, design)
+    assert stage.status == "fail" and cause in stage.note
+    outside = {line.what.split(":")[0] for line in stage.acceptance if not line.ok and ":" in line.what}
+    assert outside <= {"move", "move_lag"}, "the rest of the drive is as designed"
 
 
 IRON_AND_SENSORS = (
@@ -388,7 +401,7 @@ def test_from_the_command_line(design: Design, capsys: pytest.CaptureFixture[str
     found = json.loads(printed.out)
     assert found["schema"] == "pmsmtool.prove/1" and found["verdict"] == "PASS" and found["cause"] == ""
     assert f"prediction committed: {found['prediction']}" in printed.err
-    assert len(found["seen"]) == 15 and all(line["inside"] for line in found["seen"])
+    assert len(found["seen"]) == 24 and all(line["inside"] for line in found["seen"])
     run = RunDirectory(Path(found["run"]))
     assert (run.path / "report.html").is_file() and run.read().passed("prove")
     assert [given["subject"] for given in run.read().consents] == ["motion"]

@@ -92,8 +92,9 @@ class CommandedRecorder(Recorder):
         """Set what the choice of the signals left open, and record."""
 
     def arm(
-        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool
-    ) -> None:
+        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool,
+        at_move: bool = False,
+    ) -> None:  # fmt: skip
         """Choose the signals and record them from now on.
 
         Raises
@@ -103,7 +104,7 @@ class CommandedRecorder(Recorder):
         VerifyMismatch
             The drive has taken something else.
         """
-        self._begin_arming(samples, decimation, pretrigger, at_excitation=at_excitation)
+        self._begin_arming(samples, decimation, pretrigger, at_excitation=at_excitation or at_move)
         largest = self.room(signals)
         if samples > largest:
             raise self._too_much(signals, samples, f"{largest} samples", self.memory)

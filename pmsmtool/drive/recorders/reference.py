@@ -41,7 +41,7 @@ class AverageState(IntEnum):
     COMPLETE = 2
 
 
-_TRIGGER_NOW, _TRIGGER_EXCITATION = 0, 4
+_TRIGGER_NOW, _TRIGGER_EXCITATION, _TRIGGER_MOVE = 0, 4, 6
 
 
 class Recorder:
@@ -64,9 +64,10 @@ class Recorder:
     # ---- traces ---------------------------------------------------------------------------------
 
     def arm(
-        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool
-    ) -> None:
-        """Set the recorder up and arm it.
+        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool,
+        at_move: bool = False,
+    ) -> None:  # fmt: skip
+        """Set the recorder up and arm it: from now on, from an excitation on, or from the begin of a move on.
 
         Raises
         ------
@@ -81,7 +82,8 @@ class Recorder:
         node.put(objects.TRACE_PRETRIGGER, 0)
         node.put(objects.TRACE_DEPTH, samples)
         node.put(objects.TRACE_PRETRIGGER, pretrigger)
-        node.put(objects.TRACE_TRIGGER, _TRIGGER_EXCITATION if at_excitation else _TRIGGER_NOW)
+        trigger = _TRIGGER_MOVE if at_move else _TRIGGER_EXCITATION if at_excitation else _TRIGGER_NOW
+        node.put(objects.TRACE_TRIGGER, trigger)
         node.command(objects.TRACE_COMMAND, 1)
 
     def fetch(self, signals: Sequence[str], decimation: int) -> Trace:
@@ -159,7 +161,7 @@ class Recorder:
 
     def _await(self, item: DriveObject, wanted: int, what: str) -> None:
         where = f"0x{item.index:04X}:{item.sub:02X}"
-        likely = "its trigger never came: the excitation did not start"
+        likely = "its trigger never came: the excitation or the move did not start"
         self._until(lambda: self._node.whole(item) == wanted, what, where, likely=likely)
 
     def _until(

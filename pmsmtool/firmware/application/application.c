@@ -81,12 +81,10 @@ void pmsm_application_period(pmsm_application *app, const pmsm_sensors *sensors,
     pmsm_take_average(app);
 }
 
-/* Unwrapped angle since the turn that was taken off; the turns' large part is exact (Cody-Waite). The part of a turn
- * has a sign: just below a whole turn it would have the rounding of a turn, not that of a small number. */
+/* Unwrapped angle since the turn that was taken off; the turns' large part is exact (Cody-Waite). */
 static float mechanical_angle(const pmsm_application *app)
 {
-    const uint32_t nearest = (uint32_t)app->sensors.turns + ((app->sensors.angle >= 0x80000000u) ? 1u : 0u);
-    const uint32_t turns = nearest - (uint32_t)app->recording.turns;
+    const uint32_t turns = pmsm_nearest_turn(&app->sensors) - app->recording.turns;
     const float n = (turns < 0x80000000u) ? (float)turns : -(float)(0u - turns);
     const float part = pmsm_signed_angle(app->sensors.angle);
     return 4.0F * n * PMSM_PIO2_A + (4.0F * n * PMSM_PIO2_B + (4.0F * n * PMSM_PIO2_C + part));

@@ -20,6 +20,12 @@ static inline float pmsm_signed_angle(uint32_t angle)
     return PMSM_TURN_PART * ((angle < 0x80000000u) ? (float)angle : -(float)(0u - angle));
 }
 
+/* The whole turn of the encoder that is nearest: what is left then has a sign, and the rounding of a small number. */
+static inline uint32_t pmsm_nearest_turn(const pmsm_sensors *sensors)
+{
+    return (uint32_t)sensors->turns + ((sensors->angle >= 0x80000000u) ? 1u : 0u);
+}
+
 /* speed_estimate.c */
 void pmsm_speed_prepare(pmsm_speed_estimate *speed, const pmsm_params *params);
 void pmsm_speed_update(pmsm_speed_estimate *speed, const pmsm_sensors *sensors);

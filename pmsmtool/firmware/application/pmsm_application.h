@@ -116,7 +116,7 @@ typedef struct {                 /* memory of the recorder */
     float trigger_last;
     uint32_t trigger_primed;
     uint32_t trip_last;
-    int32_t turns;               /* taken off PMSM_SIGNAL_THETA_M so that binary32 resolves it */
+    uint32_t turns;              /* taken off PMSM_SIGNAL_THETA_M so that binary32 resolves it */
 } pmsm_recorder_memory;
 
 typedef struct {                 /* memory of the window averages: sums with their rounding remainders (Kahan) */

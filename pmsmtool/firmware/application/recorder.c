@@ -7,7 +7,7 @@
 
 enum { RECORDER_IDLE = 0, RECORDER_ARMED = 1, RECORDER_TRIGGERED = 2, RECORDER_COMPLETE = 3 };
 enum { TRIGGER_NOW = 0, TRIGGER_RISING = 1, TRIGGER_FALLING = 2, TRIGGER_WINDOW = 3, TRIGGER_EXCITATION = 4,
-       TRIGGER_FAULT = 5 };
+       TRIGGER_FAULT = 5, TRIGGER_MOVE = 6 };
 enum { COMMAND_STOP = 0, COMMAND_ARM = 1, COMMAND_FORCE = 2 };
 enum { AVERAGE_IDLE = 0, AVERAGE_RUNNING = 1, AVERAGE_COMPLETE = 2 };
 
@@ -91,7 +91,7 @@ static void arm(pmsm_application *app)
     app->recording.write = 0u;
     app->recording.filled = 0u;
     app->recording.trigger_primed = 0u;
-    app->recording.turns = app->sensors.turns + ((app->sensors.angle >= 0x80000000u) ? 1 : 0);
+    app->recording.turns = pmsm_nearest_turn(&app->sensors);
     recorder->stored = 0u;
     recorder->trigger_position = 0u;
     recorder->state = (ring_rows(app) > 0u) ? RECORDER_ARMED : RECORDER_IDLE;
@@ -118,6 +118,9 @@ static uint32_t is_triggered(pmsm_application *app)
     }
     if (recorder->trigger == TRIGGER_EXCITATION) {
         return app->wave.started;
+    }
+    if (recorder->trigger == TRIGGER_MOVE) {
+        return (app->position.running != 0u && (app->position.flags & (uint32_t)PMSM_POSITION_MOVING) != 0u) ? 1u : 0u;
     }
     if (recorder->trigger == TRIGGER_FAULT) {
         return (app->trip != PMSM_TRIP_NONE && app->recording.trip_last == PMSM_TRIP_NONE) ? 1u : 0u;

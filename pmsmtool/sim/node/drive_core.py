@@ -55,6 +55,7 @@ class Trigger(IntEnum):
     WINDOW = 3
     EXCITATION_START = 4
     FAULT = 5
+    MOVE_START = 6
 
 
 class ExcitationState(IntEnum):
