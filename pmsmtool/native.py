@@ -13,12 +13,21 @@ from pmsmtool.errors import PmsmtoolError
 LIBRARY_FOLDER = Path(__file__).parent / "_native"
 """Where the wheel carries the kernels and where ``build_kernels`` puts them in a checkout."""
 
+PAGE_MODULE = "pmsm_page.wasm"
+"""Core, application and machine as WebAssembly, for the page of a report; beside the kernels."""
+
 _SUFFIX = {"win32": "dll", "darwin": "dylib"}
 
 
 def library_name(kernel: str, platform: str = sys.platform) -> str:
     """Return the file name of a kernel on a platform (spelled as ``sys.platform``)."""
     return f"lib{kernel}.{_SUFFIX.get(platform, 'so')}"
+
+
+def page_module() -> bytes | None:
+    """Return the WebAssembly module of the report's page; None where the build had no ziglang to make it."""
+    path = LIBRARY_FOLDER / PAGE_MODULE
+    return path.read_bytes() if path.is_file() else None
 
 
 @functools.cache

@@ -20,7 +20,8 @@ from typing import Any
 from pmsmtool.packaging import contents, wheel
 from pmsmtool.packaging.build_kernels import build_all
 from pmsmtool.packaging.compiler import Compiler, build_compiler, system_compiler
-from pmsmtool.packaging.targets import local_wheel_tag
+from pmsmtool.packaging.page_module import build_page_module
+from pmsmtool.packaging.targets import here, local_wheel_tag
 
 Settings = Mapping[str, Any] | None
 
@@ -33,11 +34,14 @@ def ziglang_requirement(root: Path) -> str:
 
 
 def get_requires_for_build_wheel(config_settings: Settings = None) -> list[str]:
-    """Require ziglang where no compiler of this machine builds a library that loads."""
+    """Require ziglang where no compiler of this machine builds a library that loads, and for the page of reports.
+
+    A compiler that ``CC`` names is the only one that is taken, and the module of the page is left out with it.
+    """
     compiler, reasons = system_compiler()
-    if compiler is not None:
-        return []
     requirement = ziglang_requirement(Path.cwd())
+    if compiler is not None:
+        return [requirement] if here() is not None and not os.environ.get("CC") else []
     print(f"no C compiler works here ({'; '.join(reasons)}): the build takes {requirement}", file=sys.stderr)
     return [requirement]
 
@@ -81,7 +85,9 @@ def build_editable(
     root = Path.cwd()
     with tempfile.TemporaryDirectory() as scratch:
         _keep_zig_cache_in(scratch)
-        build_all(root / "pmsmtool", root / "pmsmtool" / "_native", build_compiler(), force=True)
+        native = root / "pmsmtool" / "_native"
+        build_all(root / "pmsmtool", native, build_compiler(), force=True)
+        build_page_module(root / "pmsmtool", native, force=True)
         metadata = _metadata(Path(scratch))
         pointer = {"__editable__.pmsmtool.pth": f"{root}\n".encode()}
         return wheel.write_wheel(Path(wheel_directory), metadata, "py3-none-any", pointer).name
@@ -109,6 +115,7 @@ def wheel_for(
     """Build the wheel of one platform from the checkout ``root`` with a compiler for that platform."""
     with tempfile.TemporaryDirectory() as scratch:
         built = build_all(root / "pmsmtool", Path(scratch), compiler, platform=platform, strict=strict)
+        built += build_page_module(root / "pmsmtool", Path(scratch), strict=strict)
         files: dict[str, Path | bytes] = {**contents.package_files(root)}
         files |= {f"pmsmtool/_native/{library.name}": library for library in built}
         return wheel.write_wheel(folder, metadata, f"py3-none-{platform_tag}", files)

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from pmsmtool.native import LIBRARY_FOLDER, library_name
 from pmsmtool.packaging.compiler import Compiler, CompilerError, build_compiler, compile_library
-from pmsmtool.packaging.kernels import HEADERS, KERNELS, Kernel
+from pmsmtool.packaging.kernels import KERNELS, Kernel, is_current
+from pmsmtool.packaging.page_module import SOURCES, build_page_module
 
 PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -36,25 +37,16 @@ def build_all(
             print(f"{kernel.name}: no sources match {', '.join(kernel.sources)}, not built", file=sys.stderr)
             continue
         library = folder / library_name(kernel.name, platform)
-        if force or not _is_current(library, kernel, package):
+        if force or not is_current(library, kernel, package):
             compile_library(compiler, kernel, package, library, platform=platform, strict=strict)
             print(f"{library.name}: compiled by {compiler.name}", file=sys.stderr)
         libraries.append(library)
     return libraries
 
 
-def _is_current(library: Path, kernel: Kernel, package: Path) -> bool:
-    if not library.is_file():
-        return False
-    inputs = [package / source for source in kernel.source_files(package)]
-    inputs += [path for pattern in HEADERS for path in package.glob(pattern)]
-    inputs += Path(__file__).parent.glob("*.py")
-    return library.stat().st_mtime > max(path.stat().st_mtime for path in inputs)
-
-
 def main(argv: list[str] | None = None) -> int:
     """Build into ``pmsmtool/_native``; warnings are errors; one kernel's errors do not keep the others back."""
-    names = [kernel.name for kernel in KERNELS]
+    names = [kernel.name for kernel in (*KERNELS, SOURCES)]
     parser = argparse.ArgumentParser(description="Compile the kernels of this checkout into pmsmtool/_native.")
     parser.add_argument("kernel", nargs="*", help=f"which ones; default all of {', '.join(names)}")
     parser.add_argument("--force", action="store_true", help="compile also what is up to date")
@@ -68,6 +60,8 @@ def main(argv: list[str] | None = None) -> int:
         except CompilerError as error:
             print(error, file=sys.stderr)
             failed = 1
+    if not options.kernel or SOURCES.name in options.kernel:
+        build_page_module(PACKAGE, LIBRARY_FOLDER, force=options.force)
     return failed
 
 

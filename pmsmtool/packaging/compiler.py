@@ -155,7 +155,7 @@ def compile_library(
     with tempfile.TemporaryDirectory(dir=library.parent, prefix=".build-") as scratch:
         # A scratch folder of its own: linkers for Windows leave import libraries and debug files beside the output.
         output = Path(scratch) / library.name
-        _run(
+        run_compiler(
             compiler,
             _arguments(kernel, package, output, platform, strict, compiler.tolerated),
             package,
@@ -182,7 +182,8 @@ def _arguments(
     return [*arguments, *(path.as_posix() for path in kernel.source_files(package)), *libraries, "-o", str(output)]
 
 
-def _run(compiler: Compiler, arguments: list[str], folder: Path, what: str) -> None:
+def run_compiler(compiler: Compiler, arguments: list[str], folder: Path, what: str) -> None:
+    """Run a compiler in ``folder``; raises CompilerError with its messages, ``what`` before them."""
     done = subprocess.run(
         [*compiler.command, *arguments], cwd=folder, capture_output=True, text=True, errors="replace", check=False
     )
@@ -198,7 +199,8 @@ def _probe(compiler: Compiler) -> str:
         output = folder / library_name("probe")
         arguments = ["-shared", *COMPILE_FLAGS, *([] if sys.platform == "win32" else ["-fPIC"])]
         try:
-            _run(compiler, [*arguments, "probe.c", "-lm", "-o", str(output)], folder, "does not build a library")
+            command = [*arguments, "probe.c", "-lm", "-o", str(output)]
+            run_compiler(compiler, command, folder, "does not build a library")
         except (CompilerError, OSError) as error:
             return str(error)
         # In a process of its own: a library that crashes must not take the installation with it.

@@ -22,7 +22,7 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from pmsmtool.native import library_name
+from pmsmtool.native import PAGE_MODULE, library_name
 from pmsmtool.packaging import backend, contents
 from pmsmtool.packaging.build_kernels import PACKAGE
 from pmsmtool.packaging.compiler import CompilerError, zig_compiler
@@ -72,6 +72,7 @@ def wheel_faults(wheel: Path, target: Target, root: Path) -> tuple[list[str], di
     expected = set(contents.package_files(root))
     kernels = [kernel for kernel in KERNELS if kernel.source_files(root / "pmsmtool")]
     expected |= {f"pmsmtool/_native/{library_name(kernel.name, target.platform)}" for kernel in kernels}
+    expected.add(f"pmsmtool/_native/{PAGE_MODULE}")
     symbols: dict[str, frozenset[str]] = {}
     with zipfile.ZipFile(wheel) as archive:
         faults = record_faults(archive)

@@ -19,25 +19,29 @@ class Kernel:
         Globs relative to the package folder. A glob that matches nothing adds nothing.
     defines : tuple of str
         Preprocessor symbols besides :data:`COMMON_DEFINES`.
+    without : tuple of str
+        Sources that are left out.
     """
 
     name: str
     sources: tuple[str, ...]
     defines: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
 
     def source_files(self, package: Path) -> list[Path]:
         """Return the sources relative to ``package``, each once, in a fixed order."""
         found = {path.relative_to(package) for pattern in self.sources for path in package.glob(pattern)}
-        return sorted(found)
+        return sorted(path for path in found if path.as_posix() not in self.without)
 
 
 _CORE = "firmware/core/*.c"
-_APPLICATION = "firmware/application/*.c"
+SIMULATION = ("sim/*.c", "machine/*.c", "firmware/application/*.c", _CORE)
+"""The simulated drive and its machine."""
 
 KERNELS: tuple[Kernel, ...] = (
     Kernel("pmsm_core", (_CORE,)),
     Kernel("pmsm_core_f64", (_CORE,), ("PMSM_REAL_DOUBLE",)),
-    Kernel("pmsm_sim", ("sim/*.c", "machine/*.c", _APPLICATION, _CORE)),
+    Kernel("pmsm_sim", SIMULATION),
     Kernel("pmsm_design", ("design/lookup/*.c", "machine/*.c")),
 )
 
@@ -68,3 +72,13 @@ WARNING_FLAGS: tuple[str, ...] = (
     "-Werror",
 )
 """For development and release builds; ``pip install`` must not fail on a warning a later compiler invents."""
+
+
+def is_current(library: Path, kernel: Kernel, package: Path) -> bool:
+    """Return whether a compiled file is newer than its sources, all headers and the build rules."""
+    if not library.is_file():
+        return False
+    inputs = [package / source for source in kernel.source_files(package)]
+    inputs += [path for pattern in HEADERS for path in package.glob(pattern)]
+    inputs += Path(__file__).parent.glob("*.py")
+    return library.stat().st_mtime > max(path.stat().st_mtime for path in inputs)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pmsmtool.packaging import backend, compiler
+from pmsmtool.packaging import backend, compiler, page_module
+from pmsmtool.packaging.targets import here
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -87,6 +88,24 @@ def test_cc_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found is not None
     assert found.command == (real.command[0], "-O1")
     assert backend.get_requires_for_build_wheel() == []
+
+
+def test_the_page_of_reports_asks_for_ziglang_beside_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    monkeypatch.delenv("CC", raising=False)
+    real_compiler()
+    expected = [] if here() is None else [backend.ziglang_requirement(ROOT)]
+    assert backend.get_requires_for_build_wheel() == backend.get_requires_for_build_editable() == expected
+
+
+def test_without_ziglang_the_page_is_left_out_and_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert page_module.build_page_module(ROOT / "pmsmtool", tmp_path) == []
+    assert "reports do not recompute themselves: ziglang is not installed" in capsys.readouterr().err
+    with pytest.raises(compiler.CompilerError):
+        page_module.build_page_module(ROOT / "pmsmtool", tmp_path, strict=True)
 
 
 def test_cc_that_does_not_work_is_an_error_not_a_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
