@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.commissioning.recomputed_page import loop_margins, recomputed
 from pmsmtool.design.design_file import Design, load_design
 from pmsmtool.design.loops.current_loop import HOLD_PERIODS
 from pmsmtool.design.loops.margins import margin_problem
 from pmsmtool.design.loops.open_loops import open_loops
-from pmsmtool.design.loops.vector_margins import current_response, vector_margins
 from pmsmtool.design.minimum_time import TransferProblem, minimum_time
 from pmsmtool.design.prediction import Prediction
 from pmsmtool.errors import DesignInfeasible, IdentificationError
@@ -85,8 +85,9 @@ def report_page(path: str | Path) -> str:
         not_checked = (NOTHING_COMPARED, *NOT_CHECKED[1:])
     if not is_simulated(asdict(record)) and record.bus.get("interface") in SERVED:
         not_checked = (ANY_DRIVE.format(record.bus["interface"]), *not_checked)
+    again = recomputed(design) if design is not None and "current_q" in design.loops else None
     return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=not_checked,
-                  complete=_complete(record), ended=account_lines(record.account))  # fmt: skip
+                  complete=_complete(record), ended=account_lines(record.account), recomputed=again)  # fmt: skip
 
 
 def verdict(path: Path) -> Verdict:
@@ -180,17 +181,11 @@ def _margin_map(design: Design) -> Iterator[Figure]:
     if "current_q" not in design.loops:
         return
     problem = margin_problem(design)
-    gains, plant = problem.gains["q"], problem.plants["q"]
-    model = (plant.R, plant.L) if problem.predictor else None
+    plant = problem.plants["q"]
     factor = np.linspace(*MAP_INDUCTANCE, MAP_POINTS)
     least = max(HOLD_PERIODS, plant.delay_periods + MAP_PERIODS[0])
     delay = np.linspace(least, plant.delay_periods + MAP_PERIODS[1], MAP_POINTS)
-    L = plant.L * factor[:, None]
-    R = np.full_like(L, plant.R)
-    rows = []
-    for periods in delay:
-        loop = current_response(gains, R, L, plant.T_s, float(periods), model)
-        rows.append(vector_margins(loop, plant.T_s, gains.K_p / plant.L).phase_deg)
+    rows = [loop_margins(problem, "q", factor, float(at - plant.delay_periods)).phase_deg for at in delay]
     yield figures.margin_map_figure(
         factor, delay, np.array(rows), (1.0, plant.delay_periods),
         "Phase margin of the q current loop where the inductance or the delay is not that of the design; below 0 deg "

@@ -58,6 +58,7 @@ def render(
     not_checked: Sequence[str] = (),
     complete: Sequence[str] = COMPLETE,
     ended: Sequence[str] = (),
+    recomputed: Mapping[str, Any] | None = None,
 ) -> str:
     """Return the report as HTML.
 
@@ -75,6 +76,8 @@ def render(
         Stages that a pass needs.
     ended : sequence of str
         How a run ended that did not come to its end.
+    recomputed : mapping, optional
+        Of ``recompute.html.j2``: the step that the page computes again.
     """
     latest = latest_of(record.get("stages", ()))
     drive = record.get("drive", {})
@@ -90,6 +93,7 @@ def render(
         subtitle=f"started {record['started_utc']} by {record['operator']}",
         verdict=found,
         ended=list(ended),
+        recomputed=recomputed,
         first=None if first is None else drawn(first),
         stages=[_stage(stage, [figure for figure in left if figure.stage == stage["name"]]) for stage in latest],
         comparison=_comparison(rows) if rows else None,

@@ -187,7 +187,7 @@ def simulate_many(
     setups = (Setup * n)()
     flux_map = machine_file.flux_map
     scalable = None if flux_map is None else ScalableMap.of(flux_map, machine_file.machine.psi_f_wb)
-    keep = [_vary(setups[k], model.setup, scalable, variation) for k, variation in enumerate(variations)]
+    keep = [vary(setups[k], model.setup, scalable, variation) for k, variation in enumerate(variations)]
     workers = min(max(1, cores() if threads is None else threads), max(1, n), THREADS_MAX)
     memory = np.zeros(workers * lib.pmsm_monte_carlo_memory() // 8)
     names = np.ascontiguousarray(signals, dtype=np.uint32)
@@ -222,7 +222,7 @@ def _runs(result: NDArray[Any], periods: int, T_s: float, record: Array) -> Driv
     )
 
 
-def _vary(out: Setup, nominal: Setup, flux_map: ScalableMap | None, by: Variation) -> object:
+def vary(out: Setup, nominal: Setup, flux_map: ScalableMap | None, by: Variation) -> object:
     """Write one machine over the nominal one; returns what must live as long as the setup."""
     ctypes.memmove(ctypes.byref(out), ctypes.byref(nominal), ctypes.sizeof(Setup))
     machine = out.machine
