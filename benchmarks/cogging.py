@@ -30,7 +30,8 @@ from benchmarks.real_effects import EFFECTS, truth_of
 from benchmarks.real_population import draw_real
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
-from pmsmtool.identification.replay import MACHINE, replay
+from pmsmtool.identification.replay import replay
+from pmsmtool.identification.run_files import MACHINE
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.resources import data_folder

@@ -48,7 +48,7 @@ from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, stati
 from pmsmtool.identification.evaluate import Evaluation, evaluate
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.measurement.identify import envelope_of, nameplate_of
+from pmsmtool.measurement.by_injection import envelope_of, nameplate_of
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of

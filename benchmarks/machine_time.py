@@ -45,7 +45,7 @@ from pmsmtool.identification.accuracy import accuracy_told
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.identification.run_files import PREDICTED
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.measurement.identify import identify
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 
@@ -61,7 +61,7 @@ def identified(drive_file: MachineFile, accuracy: float | None, folder: Path) ->
     with connect("pmsmsim", f"{path}?nv=:memory:") as connection:
         drive = CanopenDrive(connection, 1)
         request = IdentifyRequest(accuracy=accuracy)
-        stage = identify_stage(run, drive, nameplate_of(drive, "random"), request, lambda _: None, lambda _: None)
+        stage = identify(run, drive, request, lambda _: None, lambda _: None)
         drive.close()
     entries = json.loads((run.path / PREDICTED).read_text(encoding="utf-8"))["predictions"]
     return stage, {key: value for entry in entries for key, value in entry["relative_std"].items()}

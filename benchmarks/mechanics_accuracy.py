@@ -40,7 +40,7 @@ from pmsmtool.estimators.shaft.motion import positions
 from pmsmtool.identification.evaluate import evaluate
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import dump_machine_file
-from pmsmtool.measurement.identify import envelope_of, nameplate_of
+from pmsmtool.measurement.by_injection import envelope_of, nameplate_of
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
 from pmsmtool.sim.simulated_machine import settings_of

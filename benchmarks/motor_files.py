@@ -28,13 +28,13 @@ from benchmarks.random_drives import data_sheet, draw_drive
 from pmsmtool.bus.connect import Connection
 from pmsmtool.commissioning.commission import Commissioning, Silent, begin_run
 from pmsmtool.commissioning.report_page import verdict
-from pmsmtool.commissioning.tier_stages import open_tier_drive
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.errors import Declined, PmsmtoolError, exit_code_of
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.capabilities import examine
+from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.proof.stage import ProofRequest
 from pmsmtool.report.comparison import unchecked
 from pmsmtool.run_directory import RunDirectory, Stage
@@ -133,7 +133,7 @@ def commission_one(job: tuple[str, str, int, bool]) -> Outcome:
             node = DriveNode(connection, 1)
             found = examine(node)
             node.close()
-            drive = open_tier_drive(connection, 1, found)
+            drive = open_for_level(connection, 1, found)
             before = _contents(drive)
             run = begin_run(drive, Path("runs"), tier=found.tier)
             ends = error == RIGHT and not to_the_end

@@ -45,7 +45,8 @@ from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.restore import marks_of, plan_download
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
-from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.measurement.by_injection import nameplate_of
+from pmsmtool.measurement.identify import identify
 from pmsmtool.proof import stage as proving
 from pmsmtool.proof.simulated import predict_proof
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
@@ -137,7 +138,7 @@ def identified(truth: MachineFile) -> MachineFile:
     """Return what identification says of a simulated drive; raises what it refuses with."""
     with tempfile.TemporaryDirectory() as folder, _powered(truth, Path(folder)) as drive:
         run = begin_run(drive, Path(folder) / "runs")
-        identify_stage(run, drive, nameplate_of(drive, truth.name), IdentifyRequest(), _silent, _silent)
+        identify(run, drive, IdentifyRequest(), _silent, _silent, known=(nameplate_of(drive, truth.name), "bench"))
         return load_machine_file(run.path / "machine.toml")
 
 

@@ -26,7 +26,8 @@ from benchmarks.commissioning import commanded, prepared
 from benchmarks.random_drives import draw_drive
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
-from pmsmtool.identification.replay import MACHINE, replay
+from pmsmtool.identification.replay import replay
+from pmsmtool.identification.run_files import MACHINE
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.torque import iron_drag

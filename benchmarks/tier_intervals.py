@@ -47,15 +47,16 @@ from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.experiments.supply_levels import ReadSupply, hold_supply_levels
+from pmsmtool.identification.by_pulses import SUPPLY_LEVELS, PulseFacts, PulseResult, pulse_result
 from pmsmtool.identification.evaluate import evaluate
-from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.tier_evaluate import SUPPLY_LEVELS, TierFacts, TierResult, tier_result
+from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters
-from pmsmtool.measurement.identify import envelope_of, nameplate_of
+from pmsmtool.measurement.by_injection import envelope_of, nameplate_of
+from pmsmtool.measurement.by_pulses import HEADROOM, push_by_torque, swing_and_record, turn_both_ways
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
-from pmsmtool.measurement.tier_identify import HEADROOM, Keep, Say, push_by_torque, swing_and_record, turn_both_ways
+from pmsmtool.measurement.task import Keep, Say
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
 
@@ -91,7 +92,7 @@ def truth_of(drive: MachineFile) -> dict[str, float]:
     }
 
 
-def identify(tier: str, drive: MachineFile, path: Path, speed: float, *, given: bool = True) -> TierResult:
+def identify(tier: str, drive: MachineFile, path: Path, speed: float, *, given: bool = True) -> PulseResult:
     """Run one drive; the inverter is known where a machine file is given."""
     machine = drive.machine
     envelope = Envelope(
@@ -113,31 +114,31 @@ def identify(tier: str, drive: MachineFile, path: Path, speed: float, *, given: 
         pole_pairs = round(found.estimates["pole_pairs"].value)
         pushing = TorqueDrive(connection, 1, drive_map=family)
         pushed = told_by(push_by_torque, pushing, envelope, drive.inverter if given else None, pole_pairs=pole_pairs)
-        return TierResult({**found.estimates, **pushed.estimates}, pushed.missing, {})
+        return PulseResult({**found.estimates, **pushed.estimates}, pushed.missing, {})
 
 
 def told_by(
-    experiment: Callable[[Any, Envelope, Keep, Say], TierFacts],
+    experiment: Callable[[Any, Envelope, Keep, Say], PulseFacts],
     drive: CanopenDrive,
     envelope: Envelope,
     inverter: InverterParameters | None = None,
     **known: Any,
-) -> TierResult:
+) -> PulseResult:
     """Return what an experiment on a drive tells; ``known`` replaces what the drive says of itself."""
     traces: dict[str, Trace] = {}
     facts = experiment(drive, envelope, traces.__setitem__, lambda text: None)
-    return tier_result(traces, replace(facts, **known), None, inverter)
+    return pulse_result(traces, replace(facts, **known), None, inverter)
 
 
-def _by_supply(drive: StandardDrive, envelope: Envelope, read: ReadSupply) -> TierResult:
+def _by_supply(drive: StandardDrive, envelope: Envelope, read: ReadSupply) -> PulseResult:
     traces: dict[str, Trace] = {}
     i_a = envelope.i_max_apk / HEADROOM
     traces[SUPPLY_LEVELS] = hold_supply_levels(drive, envelope, i_a, read, lambda text: None)
     drive.close()
-    return tier_result(traces, TierFacts("standard"))
+    return pulse_result(traces, PulseFacts(Method.STANDARD))
 
 
-def _by_injection(drive: RecordingDrive) -> TierResult:
+def _by_injection(drive: RecordingDrive) -> PulseResult:
     traces: dict[str, Trace] = {}
     nameplate, request = nameplate_of(drive, "random"), IdentifyRequest()
     envelope = envelope_of(nameplate, request)
@@ -150,7 +151,7 @@ def _by_injection(drive: RecordingDrive) -> TierResult:
     T_s, T_ref, U_dc = nameplate.inverter.T_s, nameplate.machine.T_ref_c, nameplate.inverter.U_dc_v
     found = evaluate(traces, T_s, T_ref_c=T_ref, U_dc_v=U_dc).whole()
     estimates: dict[str, Estimate] = found.estimates()
-    return TierResult({name: estimates[name] for name in OF_THE_MACHINE}, {}, {})
+    return PulseResult({name: estimates[name] for name in OF_THE_MACHINE}, {}, {})
 
 
 def judged(tier: str, seed: int, speed: float, *, given: bool = True) -> dict[str, Any]:

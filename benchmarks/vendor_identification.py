@@ -25,10 +25,10 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.vendor_tuning import VendorDrive
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.identification.vendor_machine import PHASE_INDUCTANCE, vendor_estimates
+from pmsmtool.identification.by_vendor import PHASE_INDUCTANCE, vendor_estimates
 from pmsmtool.machine.machine_file import dump_machine_file
-from pmsmtool.measurement.tier_identify import HEADROOM
-from pmsmtool.measurement.vendor_identify import identify_vendor
+from pmsmtool.measurement.by_pulses import HEADROOM
+from pmsmtool.measurement.by_vendor import identify_vendor
 
 FAMILY = "synapticon"
 

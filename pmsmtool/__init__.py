@@ -63,6 +63,7 @@ _HOME = {
     "CanopenDrive": "pmsmtool.drive.canopen_drive",
     "Envelope": "pmsmtool.drive.envelope",
     "guarded": "pmsmtool.drive.guard",
+    "identify": "pmsmtool.measurement.identify",
     "commission": "pmsmtool.commissioning.commission",
     "report_page": "pmsmtool.commissioning.report_page",
 }
@@ -92,6 +93,7 @@ __all__ = [
     "CanopenDrive",
     "Envelope",
     "guarded",
+    "identify",
     "commission",
     "report_page",
 ]

@@ -108,11 +108,11 @@ def _check_below_full(
     from pmsmtool.cia402 import HOMING_LOST
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.commissioning.first_check_tiers import check_below_full, envelope_below_full
-    from pmsmtool.commissioning.tier_stages import open_tier_drive
     from pmsmtool.errors import ConfigError, NotAvailable
-    from pmsmtool.identification.request import IdentifyRequest
+    from pmsmtool.identification.request import IdentifyRequest, Method
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.measurement.capabilities import Method, Tier
+    from pmsmtool.measurement.capabilities import Tier
+    from pmsmtool.measurement.identify import open_for_level
 
     if found.tier not in (Tier.STANDARD, Tier.RECORDER):
         missing = found.row("mechanics", Method.STANDARD).missing
@@ -130,7 +130,7 @@ def _check_below_full(
         load=motion.load, brake=motion.brake,
     )  # fmt: skip
     with bus.connect() as connection:
-        drive = open_tier_drive(connection, claimed_node(connection, bus.node), found)
+        drive = open_for_level(connection, claimed_node(connection, bus.node), found)
         envelope = envelope_below_full(drive, found, request, stated)
         envelope.refuse_gravity()
         lines = [
@@ -148,7 +148,7 @@ def _check_below_full(
 def _stated(drive: CanopenDrive, path: Path | None) -> MachineFile:
     """Return what is stated of the machine; of two rated currents the smaller one."""
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.measurement.identify import nameplate_of
+    from pmsmtool.measurement.by_injection import nameplate_of
 
     held = nameplate_of(drive, "held by the drive")
     if path is None:

@@ -166,21 +166,21 @@ def commission_command(
 def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDrive, Capabilities]]:
     """Open the drive with what it has; without a map, the one of its identity is used."""
     from pmsmtool.cli.drive_access import claimed_node
-    from pmsmtool.commissioning.tier_stages import open_tier_drive
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.measurement.capabilities import examine
+    from pmsmtool.measurement.identify import open_for_level
 
     with bus.connect() as connection:
         node = DriveNode(connection, claimed_node(connection, bus.node))
         found = examine(node, given)
         node.close()
-        drive = open_tier_drive(connection, node.node, found)
+        drive = open_for_level(connection, node.node, found)
         yield drive, found
         drive.close()
 
 
 def _kept_nameplate(run: RunDirectory) -> Path | None:
-    from pmsmtool.identification.replay import NAMEPLATE
+    from pmsmtool.identification.run_files import NAMEPLATE
 
     path = run.path / NAMEPLATE
     return path if path.is_file() else None

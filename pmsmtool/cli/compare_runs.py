@@ -110,7 +110,7 @@ def _facts(row: object) -> dict[str, object]:
 def read_run(path: Path) -> tuple[RunRecord, MachineFile]:
     """Return the record of a run and the machine it identified; raises ``ConfigError`` where it identified none."""
     from pmsmtool.errors import ConfigError
-    from pmsmtool.identification.replay import MACHINE
+    from pmsmtool.identification.run_files import MACHINE
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.run_directory import RunDirectory
 

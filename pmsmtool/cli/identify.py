@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pmsmtool.cli.fingerprint import Comparison
     from pmsmtool.experiments.supply_levels import ReadSupply
     from pmsmtool.identification.fingerprint import Earlier
-    from pmsmtool.identification.request import IdentifyRequest
+    from pmsmtool.identification.request import IdentifyRequest, Method
     from pmsmtool.measurement.capabilities import Capabilities
     from pmsmtool.run_directory import RunDirectory, Stage
 
@@ -122,7 +122,7 @@ def identify_command(
     from pmsmtool.errors import NotAvailable
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.identification.calibration import calibrated_tolerance
-    from pmsmtool.identification.request import NEEDS, QUANTITIES, IdentifyRequest
+    from pmsmtool.identification.request import NEEDS, QUANTITIES, IdentifyRequest, Method
 
     declared = None if sensor_tol is None else SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol)
     if replay is not None:
@@ -130,8 +130,8 @@ def identify_command(
             raise click.UsageError("--fingerprint measures; `pmsmtool diff` compares two runs that are there")
         if accuracy is not None:
             raise click.UsageError("--accuracy says how much is measured; with --replay it is that of the run")
-        from pmsmtool.identification.replay import MACHINE, REPLAYED
-        from pmsmtool.identification.tier_evaluate import replay as recompute
+        from pmsmtool.identification.replay import replay as recompute
+        from pmsmtool.identification.run_files import MACHINE, REPLAYED
         from pmsmtool.run_directory import RunDirectory
 
         run = RunDirectory(replay)
@@ -164,25 +164,24 @@ def identify_command(
     request.check()
     everything = not quantities and earlier is None
     found, how, request = _choose(bus, map_file, method, request, everything=everything, supply=supply)
-    if accuracy is not None and how != "inject":
+    if accuracy is not None and how is not Method.INJECT:
         raise NotAvailable(f"the method {how} has no choice of what it collects", hint="leave --accuracy out")
-    if supply and not (how == "standard" and "R" in request.quantities):
+    if supply and not (how is Method.STANDARD and "R" in request.quantities):
         raise NotAvailable(f"the method {how} reads no bench supply", hint="leave --supply out, or ask for R")
-    if how == "inject":
-        run, stage = _measure(bus, motion, out, request, runs, found, earlier)
-    else:
-        run, stage = _measure_without_injection(bus, motion, out, request, runs, found, how, supply=supply)
+    run, stage = _measure(bus, motion, out, request, runs, found, how, earlier, supply=supply)
+    if how is not Method.INJECT:
         _tell_more(found, request, out)
     _show(run, stage, out, None if earlier is None else compare(earlier, run, asked))
 
 
 def _choose(
     bus: BusOptions, map_file: Path | None, method: str, request: IdentifyRequest, *, everything: bool, supply: bool
-) -> tuple[Capabilities, str, IdentifyRequest]:
+) -> tuple[Capabilities, Method, IdentifyRequest]:
     """Ask the drive what it can; return the method, and without a choice of quantities those it gives."""
     from pmsmtool.cli.drive_access import open_node, read_map
     from pmsmtool.flash.map_gate import check_motion
-    from pmsmtool.measurement.capabilities import MEASURING, Method, examine, with_supply
+    from pmsmtool.identification.request import Method
+    from pmsmtool.measurement.capabilities import MEASURING, examine, with_supply
 
     with open_node(bus) as node:
         found = examine(node, None if map_file is None else read_map(map_file))
@@ -194,13 +193,13 @@ def _choose(
         for candidate in MEASURING if wanted is None else (wanted,):
             given = tuple(name for name in request.quantities if found.row(name, candidate).available)
             if given and candidate is not Method.MANUAL:
-                return found, candidate.value, replace(request, quantities=given)
-    return found, found.require(request.quantities, wanted).value, request
+                return found, candidate, replace(request, quantities=given)
+    return found, found.require(request.quantities, wanted), request
 
 
 def _tell_more(found: Capabilities, request: IdentifyRequest, out: Output) -> None:
     """Name what the drive would measure by itself besides."""
-    from pmsmtool.measurement.vendor_identify import vendor_quantities
+    from pmsmtool.measurement.by_vendor import vendor_quantities
 
     more = [name for name in vendor_quantities(found) if name not in request.quantities]
     if more:
@@ -239,14 +238,15 @@ def supply_reader(connection: Connection, node: int, *, simulated: bool) -> Read
     return ask
 
 
-def _measure_without_injection(
+def _measure(
     bus: BusOptions,
     motion: MotionOptions,
     out: Output,
     request: IdentifyRequest,
     runs: Path,
     found: Capabilities,
-    how: str,
+    how: Method,
+    earlier: Earlier | None,
     *,
     supply: bool,
 ) -> tuple[RunDirectory, Stage]:
@@ -255,68 +255,23 @@ def _measure_without_injection(
     from pmsmtool import __version__
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.cli.drive_access import choose_node
-    from pmsmtool.commissioning.tier_stages import open_tier_drive
-    from pmsmtool.measurement.tier_identify import tier_stage
-    from pmsmtool.measurement.vendor_identify import vendor_stage
-    from pmsmtool.run_directory import RunDirectory, new_record
-
-    identity = found.identity
-    with bus.connect() as connection:
-        drive = open_tier_drive(connection, choose_node(connection, bus.node), found)
-        reader = supply_reader(connection, identity.node, simulated=bus.simulated()) if supply else None
-        record = new_record(
-            ["pmsmtool", *sys.argv[1:]],
-            drive=asdict(identity),
-            bus={"interface": bus.interface, "channel": bus.channel, "node": identity.node},
-            versions={"pmsmtool": __version__},
-        )
-        run = RunDirectory.create(runs, identity.serial, record)
-
-        def allow(lines: Any) -> None:
-            given = ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
-            _keep(run, given)
-
-        with _accounted(run, out) as say:
-            if how == "vendor":
-                stage = vendor_stage(run, drive, found, request, allow, say)
-            else:
-                stage = tier_stage(run, drive, found, request, allow, say, read_supply=reader)
-            run.add(stage)
-        drive.close()
-    return run, stage
-
-
-def _measure(
-    bus: BusOptions,
-    motion: MotionOptions,
-    out: Output,
-    request: IdentifyRequest,
-    runs: Path,
-    found: Capabilities,
-    earlier: Earlier | None,
-) -> tuple[RunDirectory, Stage]:
-    from dataclasses import asdict
-
-    from pmsmtool import __version__
-    from pmsmtool.cli.consent import ask_motion
-    from pmsmtool.cli.drive_access import choose_node
-    from pmsmtool.commissioning.tier_stages import open_tier_drive
-    from pmsmtool.measurement.identify import identify_stage, nameplate_of, with_limits_of
+    from pmsmtool.identification.request import Method
+    from pmsmtool.measurement.by_injection import nameplate_of, with_limits_of
+    from pmsmtool.measurement.identify import identify, open_for_level
     from pmsmtool.run_directory import RunDirectory, new_record
 
     with bus.connect() as connection:
-        drive = open_tier_drive(connection, choose_node(connection, bus.node), found)
+        drive = open_for_level(connection, choose_node(connection, bus.node), found)
         identity = drive.identity
-
+        reader = supply_reader(connection, identity.node, simulated=bus.simulated()) if supply else None
+        if earlier is not None and how is Method.INJECT:
+            request = with_limits_of(earlier.request, request, nameplate_of(drive))
         record = new_record(
             ["pmsmtool", *sys.argv[1:]],
             drive=asdict(identity),
             bus={"interface": bus.interface, "channel": bus.channel, "node": identity.node},
             versions={"pmsmtool": __version__},
         )
-        nameplate = nameplate_of(drive, identity.name or f"drive {identity.serial:#010x}")
-        if earlier is not None:
-            request = with_limits_of(earlier.request, request, nameplate)
         run = RunDirectory.create(runs, identity.serial, record)
 
         def allow(lines: Any) -> None:
@@ -324,7 +279,7 @@ def _measure(
             _keep(run, given)
 
         with _accounted(run, out) as say:
-            stage = identify_stage(run, drive, nameplate, request, allow, say)
+            stage = identify(run, drive, request, allow, say, method=how, found=found, read_supply=reader)
             run.add(stage)
         drive.close()
     return run, stage

@@ -178,12 +178,12 @@ def _identified(
 ) -> dict[str, Estimate]:
     """Find inertia and friction, write the machine file, and return both."""
     from pmsmtool.files import write_file
+    from pmsmtool.identification.completed_machine import completed_machine
     from pmsmtool.identification.move_mechanics import move_mechanics
-    from pmsmtool.identification.tier_machine import tier_machine
     from pmsmtool.machine.machine_file import dump_machine_file
 
     ratios = move_mechanics(trace, pole_pairs=source.machine.pole_pairs, undecided=drive.current_undecided)
-    made = tier_machine(source, ratios, "as given").machine
+    made = completed_machine(source, ratios, "as given").machine
     assert made is not None
     text = dump_machine_file(made)
     run.save("machine.toml", text)

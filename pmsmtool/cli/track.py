@@ -115,7 +115,7 @@ def _live(
     from pmsmtool.errors import PmsmtoolError
     from pmsmtool.identification.track import follow, known_of, track_stage
     from pmsmtool.machine.machine_file import dump_machine_file
-    from pmsmtool.measurement.identify import nameplate_of
+    from pmsmtool.measurement.by_injection import nameplate_of
     from pmsmtool.measurement.run_account import accounted
 
     with ExitStack() as bus_open:

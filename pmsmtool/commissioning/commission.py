@@ -20,9 +20,9 @@ from pmsmtool.commissioning.compared_stage import check_accepted, compared, refu
 from pmsmtool.commissioning.contradiction import DATA_SHEET
 from pmsmtool.commissioning.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.commissioning.flash_stages import flash_stage, verify_stage
+from pmsmtool.commissioning.level_stages import LevelStages
 from pmsmtool.commissioning.rated_limits import within_ratings
 from pmsmtool.commissioning.report_page import report_page
-from pmsmtool.commissioning.tier_stages import TierStages
 from pmsmtool.design.design_file import load_design
 from pmsmtool.design.lookup.design import LookupRequest
 from pmsmtool.design.loops.margins import MarginRequest
@@ -44,7 +44,7 @@ from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.identification.verdicts import blocking
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.capabilities import Capabilities, Tier
-from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.measurement.identify import identify
 from pmsmtool.measurement.run_account import RunAccount, status_of, text_of
 from pmsmtool.proof.stage import ProofRequest, not_proven, prove_stage
 from pmsmtool.report.verdict import RAN
@@ -303,11 +303,11 @@ class Commissioning:
         self._settle(Stage(name, "not available", seconds, note=error.what, files=files), number)
 
     @property
-    def tier(self) -> TierStages | None:
+    def tier(self) -> LevelStages | None:
         """The stages of a drive below the full tier; None for one that has everything, safe or (then refused) not."""
         if self.capabilities is None or self.capabilities.tier is Tier.FULL or self.capabilities.unsafe:
             return None
-        return TierStages(self.run, self.drive, self.capabilities, self.nameplate, self.drive_bandwidth_hz)
+        return LevelStages(self.run, self.drive, self.capabilities, self.nameplate, self.drive_bandwidth_hz)
 
     def _say(self, line: str) -> None:
         """Tell a line, and the account of the run what it is about."""
@@ -337,9 +337,11 @@ class Commissioning:
         }
 
     def _identify(self) -> Stage:
-        identity = self.drive.identity
-        known = self.nameplate or nameplate_of(self.drive, identity.name or f"drive {identity.serial:#010x}")
-        stage = identify_stage(self.run, self.drive, known, self.identify, self.person.allow_motion, self._say)
+        known = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
+        stage = identify(
+            self.run, self.drive, self.identify, self.person.allow_motion, self._say,
+            found=self.capabilities, known=known,
+        )  # fmt: skip
         # without a file that a person gave, the drive's own set would stand in: it may be another machine's
         stops = blocking(stage.refused, given=self.nameplate is not None)
         return replace(stage, status="fail") if stops else stage
@@ -466,7 +468,7 @@ def commission(
         What is asked; the defaults of their classes.
     capabilities : Capabilities, optional
         Of a drive below the full tier (``measurement.capabilities.examine``,
-        ``commissioning.tier_stages.open_tier_drive``).
+        ``measurement.identify.open_for_level``).
 
     Raises
     ------

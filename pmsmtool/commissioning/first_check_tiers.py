@@ -32,7 +32,7 @@ from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, NotA
 from pmsmtool.experiments.first_push import push_forth_and_back
 from pmsmtool.experiments.first_turn import lead_half_a_turn
 from pmsmtool.experiments.vector_turn import TURN_RAD, lead_onto_vector
-from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.identification.wiring import (
     COUNT_FACTORS,
     NOT_CHECKED,
@@ -46,9 +46,9 @@ from pmsmtool.identification.wiring import (
     judge_turn,
 )
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.measurement.capabilities import Capabilities, Method
-from pmsmtool.measurement.tier_identify import HEADROOM as TIER_HEADROOM
-from pmsmtool.measurement.tier_identify import tier_envelope
+from pmsmtool.measurement.by_pulses import HEADROOM as PULSES_HEADROOM
+from pmsmtool.measurement.by_pulses import envelope_of
+from pmsmtool.measurement.capabilities import Capabilities
 from pmsmtool.trace import Trace
 
 UNSEEN = {
@@ -74,9 +74,9 @@ def turns_a_vector(found: Capabilities) -> bool:
 def envelope_below_full(
     drive: CanopenDrive, found: Capabilities, request: IdentifyRequest, stated: MachineFile
 ) -> Envelope:
-    """Return what the check may do: a tenth of the rated current, half a turn, 15 s; raises as ``tier_envelope``."""
-    allowed = tier_envelope(drive, replace(request, i_max_apk=None), stated)
-    largest = HEADROOM * CURRENT_SHARE * allowed.i_max_apk / TIER_HEADROOM
+    """Return what the check may do: a tenth of the rated current, half a turn, 15 s; raises as ``envelope_of``."""
+    allowed = envelope_of(drive, replace(request, i_max_apk=None), stated)
+    largest = HEADROOM * CURRENT_SHARE * allowed.i_max_apk / PULSES_HEADROOM
     return replace(
         allowed,
         i_max_apk=largest if request.i_max_apk is None else min(request.i_max_apk, largest),
@@ -94,7 +94,7 @@ def check_below_full(
     Parameters
     ----------
     drive : CanopenDrive
-        As ``open_tier_drive`` gives it.
+        As ``identify.open_for_level`` gives it.
     found : Capabilities
         What it has.
     stated : MachineFile

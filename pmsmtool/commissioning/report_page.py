@@ -26,10 +26,11 @@ from pmsmtool.design.minimum_time import TransferProblem, minimum_time
 from pmsmtool.design.prediction import Prediction
 from pmsmtool.errors import DesignInfeasible, IdentificationError
 from pmsmtool.files import read_text
+from pmsmtool.identification.by_injection import evaluation_of
 from pmsmtool.identification.evaluate import Evaluation, evaluate, shots_of
 from pmsmtool.identification.fingerprint import STAGE as FINGERPRINT
-from pmsmtool.identification.replay import NAMEPLATE, evaluation_of, stored_traces
 from pmsmtool.identification.request import REQUEST, parse_request
+from pmsmtool.identification.run_files import NAMEPLATE, stored_traces
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.run_account import account_lines
 from pmsmtool.npz_file import read_npz

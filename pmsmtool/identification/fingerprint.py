@@ -11,11 +11,11 @@ from typing import Any
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
 from pmsmtool.files import read_text
+from pmsmtool.identification.by_pulses import FACTS, read_facts
+from pmsmtool.identification.by_vendor import ANSWERS
 from pmsmtool.identification.compared_runs import Difference, differences, same_drive, told
-from pmsmtool.identification.replay import MACHINE
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, parse_request
-from pmsmtool.identification.tier_evaluate import FACTS, parse_facts
-from pmsmtool.identification.vendor_machine import ANSWERS
+from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method, parse_request
+from pmsmtool.identification.run_files import MACHINE
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.run_directory import Acceptance, RunDirectory, RunRecord, Stage
@@ -48,7 +48,7 @@ class Earlier:
     ----------
     run : str
         Name of its directory.
-    level : str
+    level : Method
         How it measured, as ``identify --method`` names it.
     drive : mapping
         Identity of its drive.
@@ -61,7 +61,7 @@ class Earlier:
     """
 
     run: str
-    level: str
+    level: Method
     drive: Mapping[str, Any]
     request: IdentifyRequest
     estimates: Mapping[str, Estimate]
@@ -103,9 +103,7 @@ def read_earlier(run: RunDirectory) -> Earlier:
             "the drive measured by itself in this run: its values have no interval", where=str(run.path),
             hint="give a run with another --method",
         )  # fmt: skip
-    level = "inject"
-    if (run.path / FACTS).is_file():
-        level = parse_facts(read_text(run.path / FACTS), where=str(run.path / FACTS)).kind
+    level = read_facts(run).kind if (run.path / FACTS).is_file() else Method.INJECT
     text = read_text(run.path / REQUEST, hint="the run is not complete: give another one")
     request = parse_request(text, where=str(run.path / REQUEST))
     file = _machine_file(run)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pmsmtool.axis.move import RESTING
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.shaft.inertia_ratio import estimate_ratios
-from pmsmtool.identification.tier_evaluate import either_reading
+from pmsmtool.identification.by_pulses import either_reading
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 

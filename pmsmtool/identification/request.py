@@ -7,11 +7,23 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.identification import accuracy
 from pmsmtool.machine.shaft import Brake, Load, Shaft
+
+
+class Method(StrEnum):
+    """Ways to a quantity, as ``identify --method`` names them."""
+
+    INJECT = "inject"
+    RECORDER = "recorder"
+    STANDARD = "standard"
+    VENDOR = "vendor"
+    MANUAL = "manual"
+
 
 QUANTITIES = ("R", "L", "psi", "encoder", "poles", "inverter", "mechanics")
 """What is measured unless something is asked for: all that current and speed control need."""

@@ -1,16 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""``predicted.json`` of a run: what was said before the machine moved; ``refused.json``: what was refused meanwhile."""
+"""The files of an identification in its run: traces, machine file, and the records of what went on meanwhile."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.run_directory import RunDirectory
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import read_trace
 
+MACHINE = "machine.toml"
+NAMEPLATE = "nameplate.toml"
+REPLAYED = "replayed"
+"""Folder of a run for what a replay makes of it once a design stands on its machine file."""
+_MADE_FROM_MACHINE = ("design.toml", "params.toml")
 PREDICTED = "predicted.json"
+"""What was said before the machine moved."""
 SCHEMA = "pmsmtool.predicted/1"
 
 
@@ -50,3 +60,40 @@ def refused_in(run: RunDirectory) -> dict[str, IdentificationError]:
         raise ConfigError(
             f"the record of what was refused is damaged: {error}", where=str(path), hint="identify again"
         ) from error
+
+
+def place_of(run: RunDirectory, text: str) -> tuple[RunDirectory, str]:
+    """Return where a machine file goes, and the beginning of its name in the run: beside one a design was made from."""
+    return (run, "") if _may_write(run, text) else (_beside(run), f"{REPLAYED}/")
+
+
+def _may_write(run: RunDirectory, text: str) -> bool:
+    """Whether a machine file may stand in the run: nothing was made from it yet, or it is the one that was used."""
+    if not any((run.path / name).is_file() for name in _MADE_FROM_MACHINE):
+        return True
+    recorded = run.read().stage("identify")
+    used = run.sha256(MACHINE) if (run.path / MACHINE).is_file() else recorded and recorded.files.get(MACHINE)
+    return hashlib.sha256(text.encode()).hexdigest() == used
+
+
+def _beside(run: RunDirectory) -> RunDirectory:
+    folder = run.path / REPLAYED
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be made: {error.strerror or error}",
+            where=str(folder),
+            hint="check your rights there and the space on the disk",
+        ) from error
+    return RunDirectory(folder)
+
+
+def stored_traces(run: RunDirectory) -> dict[str, Trace]:
+    """Return the traces of a run by name."""
+    return {path.stem: read_trace(path) for path in trace_files(run)}
+
+
+def trace_files(run: RunDirectory) -> list[Path]:
+    """Return the files of the traces of a run, by name."""
+    return sorted((run.path / "traces").glob("*.npz"))

@@ -21,7 +21,7 @@ from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import Track, track
 from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, TRACKED, Known
 from pmsmtool.files import read_text
-from pmsmtool.identification.replay import stored_traces
+from pmsmtool.identification.run_files import stored_traces
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.temperature import loop_coefficient_per_k
 from pmsmtool.run_directory import RunDirectory, Stage

@@ -34,6 +34,7 @@ from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
 from pmsmtool.drive_maps.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
 from pmsmtool.errors import NotAvailable, SdoAbort
+from pmsmtool.identification.request import Method
 
 T = TypeVar("T")
 
@@ -42,16 +43,6 @@ class Tier(StrEnum):
     """How much a drive gives, from most to least."""
 
     FULL = "full"
-    INJECT = "inject"
-    RECORDER = "recorder"
-    STANDARD = "standard"
-    VENDOR = "vendor"
-    MANUAL = "manual"
-
-
-class Method(StrEnum):
-    """Ways to a quantity, as ``identify --method`` names them."""
-
     INJECT = "inject"
     RECORDER = "recorder"
     STANDARD = "standard"
@@ -443,7 +434,7 @@ def _modes(node: DriveNode) -> int:
 
 
 def reference_capabilities(identity: Identity) -> Capabilities:
-    """Return what the reference drive with everything gives, for tests and documentation."""
+    """Return what the reference drive with everything gives."""
     every = frozenset(_SAFE) | frozenset(_INJECT) | frozenset(_RECORD) | frozenset(_PUSH) | {"averages", "line voltage"}
     return Capabilities(identity, reference_map(), True, every)
 

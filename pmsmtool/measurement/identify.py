@@ -1,249 +1,186 @@
 # SPDX-License-Identifier: MIT
-"""Identify the machine on a drive: envelope and consent, then the experiments, whose traces go into a run.
+"""Identify the machine on a drive: one sequence for every method, whose rows are in :data:`METHODS`.
 
-What the estimates are is decided from the stored traces alone (``replay``). Nothing is stored in the drive.
+Envelope and consent, then the experiments, whose traces go into a run, then the evaluation of what is stored there.
+Nothing is stored in the drive.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
-from pmsmtool.cia402 import HOMING_LOST
+from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.envelope import Envelope, largest_acceleration
-from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.port import Drive
-from pmsmtool.errors import ConfigError, DriveFault, IdentificationError, PmsmtoolError, SafetyRefusal
-from pmsmtool.experiments.rotation import dwell_within
-from pmsmtool.identification.replay import NAMEPLATE, evaluated_stage
-from pmsmtool.identification.request import (
-    REQUEST,
-    IdentifyRequest,
-    dump_request,
-    steps_of,
-)
-from pmsmtool.identification.run_files import PREDICTED, REFUSED, dump_predicted, dump_refused
-from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, MachineLimits, MachineParameters
-from pmsmtool.measurement import flux_map, frequency_response, mechanics
-from pmsmtool.measurement.limits import DURATION_S, HEADROOM, Limits, require_speed, unused_current
-from pmsmtool.measurement.measure import Measurement, starting_gains
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
+from pmsmtool.drive.recorded_means import RecordingDrive
+from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
+from pmsmtool.drive.tier_drives import ParameterDrive
+from pmsmtool.drive.vendor_tuning import VendorDrive
+from pmsmtool.errors import DriveFault, IdentificationError, PmsmtoolError, SafetyRefusal
+from pmsmtool.experiments.supply_levels import ReadSupply
+from pmsmtool.flash.map_gate import check_motion
+from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method, dump_request
+from pmsmtool.measurement import by_injection, by_pulses, by_vendor
+from pmsmtool.measurement.by_injection import nameplate_of
+from pmsmtool.measurement.capabilities import Capabilities, Tier, reference_capabilities
 from pmsmtool.measurement.run_account import status_of, text_of
+from pmsmtool.measurement.task import Allow, Keep, Known, Say, Task
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
-from pmsmtool.units import rad_s_from_rpm
+
+SET_UP = "the drive's own set, from its maker's set-up"
+RESTORED = "nothing is stored in the drive; every changed object is restored"
 
 
-def nameplate_of(drive: Drive, name: str) -> MachineFile:
-    """Return the machine file of a drive before anything is identified: its ratings, and what its set says so far."""
+@dataclass(frozen=True, slots=True)
+class Row:
+    """How a method identifies; what a drive must have for it is in ``capabilities.NEEDS``.
 
-    def read(parameter: str) -> float:
-        return drive.read(parameter)
+    Attributes
+    ----------
+    opens : callable
+        The kind of drive that its experiments take.
+    plan : callable
+        Returns the envelope and what a person reads before consenting, or refuses.
+    measure : callable
+        Runs the experiments; returns what the evaluation needs besides the stored traces.
+    evaluate : callable
+        Evaluates what is stored in the run, and writes the machine file.
+    begun : object
+        What to evaluate with where the experiments end early; None: nothing is.
+    """
 
-    machine = MachineParameters(
-        pole_pairs=round(read("motor.pole_pairs")),
-        R_s_ohm=read("motor.R_s_ohm"),
-        L_d_h=read("motor.L_d_h"),
-        L_q_h=read("motor.L_q_h"),
-        psi_f_wb=read("motor.psi_f_wb"),
-        I_nom_apk=read("motor.I_nom_apk"),
-        I_max_apk=read("motor.I_max_apk"),
-        I_max_time_s=read("motor.I_max_time_s"),
-        n_max_rpm=read("motor.n_max_rpm"),
-        T_ref_c=read("motor.T_ref_c"),
-        alpha_R_per_k=read("motor.alpha_R_per_k"),
-        alpha_psi_per_k=read("motor.alpha_psi_per_k"),
-    )
-    inverter = InverterParameters(
-        U_dc_v=read("inverter.U_dc_nom_v"),
-        f_s_hz=1e9 / read("inverter.T_s_ns"),
-        dead_time_s=1e-9 * read("inverter.dead_time_ns"),
-        delay_periods=read("inverter.delay_periods"),
-        voltage_utilisation=read("inverter.voltage_utilisation"),
-    )
-    i_d_min = read("field_weakening.i_d_min_a")
-    limits = MachineLimits(
-        # what is no nearer than I_max is no demagnetisation limit: the design then assumes one
-        i_d_min_apk=i_d_min if i_d_min > -read("motor.I_max_apk") else None,
-        i_trip_apk=read("protection.i_trip_apk"),
-        I_cont_apk=read("protection.I_cont_apk"),
-        U_dc_min_v=read("protection.U_dc_min_v"),
-        U_dc_max_v=read("protection.U_dc_max_v"),
-        n_trip_rpm=read("protection.n_trip_rpm"),
-        T_winding_max_c=read("protection.T_winding_max_c"),
-    )
-    return MachineFile(
-        name,
-        machine,
-        inverter,
-        encoder=EncoderParameters(),
-        limits=limits,
-        provenance={"source": "parameter set and ratings of the drive; the measured values are in [estimate]"},
-    )
+    opens: Callable[[Capabilities], type[CanopenDrive]]
+    plan: Callable[[Task], tuple[Envelope, list[str]]]
+    measure: Callable[[Task, Envelope, Keep, Say], Any]
+    evaluate: Callable[[Task, Any], Stage]
+    begun: Any = None
 
 
-def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
-    """Return the motion envelope: what the request says, else the drive's ratings.
+METHODS: Mapping[Method, Row] = {
+    Method.INJECT: Row(
+        lambda found: CanopenDrive if "averages" in found.features or found.unsafe else RecordingDrive,
+        by_injection.plan, by_injection.measure, by_injection.evaluate, begun=(),
+    ),
+    Method.RECORDER: Row(
+        lambda found: RecorderDrive if found.drive_map.staging else MappedRecorderDrive,
+        by_pulses.plan_recorded, by_pulses.measure_recorded, by_pulses.evaluate,
+    ),
+    Method.STANDARD: Row(
+        lambda found: StandardDrive, by_pulses.plan_polled, by_pulses.measure_polled, by_pulses.evaluate
+    ),
+    Method.VENDOR: Row(lambda found: VendorDrive, by_vendor.plan, by_vendor.measure, by_vendor.evaluate),
+}  # fmt: skip
+OF_LEVEL: Mapping[Tier, Method] = {
+    Tier.FULL: Method.INJECT, Tier.INJECT: Method.INJECT, Tier.RECORDER: Method.RECORDER,
+    Tier.STANDARD: Method.STANDARD,
+}  # fmt: skip
+"""Method with the narrowest intervals at a capability level."""
+
+
+def open_for_level(connection: Connection, node: int, found: Capabilities) -> CanopenDrive:
+    """Return the port that fits what a drive has.
 
     Raises
     ------
     ConfigError
-        The nameplate has no rated current or speed, and none was given.
+        The map is that of another drive: nothing is moved or written through it.
+    NotAvailable
+        It lacks what even its capability level needs.
     """
-    machine = nameplate.machine
-    if machine.I_nom_apk is None or machine.n_max_rpm is None:
-        raise ConfigError("rated current and largest speed must be known", hint="give --i-max and --speed-max")
-    i_max = HEADROOM * machine.I_nom_apk if request.i_max_apk is None else request.i_max_apk
-    speed = rad_s_from_rpm(machine.n_max_rpm) if request.speed_max_rad_s is None else request.speed_max_rad_s
-    i_d_min = nameplate.limits.i_d_min_apk
-    return Envelope(
-        i_max_apk=i_max,
-        speed_max_rad_s=speed,
-        duration_s=DURATION_S,
-        shaft=request.shaft,
-        load=request.load,
-        brake=request.brake,
-        acceleration_rad_s2=largest_acceleration(machine, i_max),
-        i_d_max_apk=machine.I_nom_apk if i_d_min is None else -i_d_min,
-    )
+    check_motion(found.drive_map, found.identity)
+    method = Method.INJECT if found.unsafe else OF_LEVEL.get(found.tier)
+    kind = ParameterDrive if method is None else METHODS[method].opens(found)
+    return kind(connection, node, drive_map=found.drive_map)
 
 
-def with_limits_of(earlier: IdentifyRequest, request: IdentifyRequest, nameplate: MachineFile) -> IdentifyRequest:
-    """Return a request with the limits of an earlier one where it has none: values are compared at like currents.
-
-    They are never above the ratings of the drive, whose motor may be another one now.
-    """
-    own = envelope_of(nameplate, replace(request, i_max_apk=None, speed_max_rad_s=None))
-    i_max, speed = request.i_max_apk, request.speed_max_rad_s
-    if i_max is None and earlier.i_max_apk is not None:
-        i_max = min(earlier.i_max_apk, own.i_max_apk)
-    if speed is None and earlier.speed_max_rad_s is not None:
-        speed = min(earlier.speed_max_rad_s, own.speed_max_rad_s)
-    return replace(request, i_max_apk=i_max, speed_max_rad_s=speed)
-
-
-def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineFile) -> list[str]:
-    """Return what a person reads before consenting: the envelope and what will happen inside it."""
-    steps = steps_of(request.measured, request.shaft == "locked")
-    allowed = [*envelope.lines(), *unused_current(envelope.i_max_apk, nameplate, pulses="map" in steps)]
-    lines = [*allowed, f"the rotor aligns with current vectors: it may jump by half an electrical turn; {HOMING_LOST}"]
-    if "rotation" in steps:
-        lines.append("the shaft turns slowly through one turn each way")
-    if "speeds" in steps:
-        speeds = "four" if request.accuracy is None else "two to four"
-        lines.append("torque pulses turn the shaft both ways")
-        lines.append(f"it coasts with current from {speeds} speeds in each direction")
-    if "turns" in steps:
-        lines.append("it coasts with current from three speeds in each direction once more, for harmonics")
-    if "coasting" in steps:
-        lines.append(mechanics.PLAN_LINE)
-    if "slow" in steps:
-        lines.append("it turns twice each way at 30 rpm at the most")
-    if "response" in steps:
-        lines.append(frequency_response.PLAN_LINE)
-    if "map" in steps:
-        lines += flux_map.plan_lines(nameplate)
-    elif request.map_if_saturated and "speeds" in steps:
-        lines.append(flux_map.IF_SATURATED)
-    lines.append("nothing is stored in the drive; every changed object is restored")
-    return lines
-
-
-def identify_stage(
+def identify(
     run: RunDirectory,
     drive: CanopenDrive,
-    nameplate: MachineFile,
     request: IdentifyRequest,
-    allow_motion: Callable[[Sequence[str]], None],
-    say: Callable[[str], None],
+    allow_motion: Allow,
+    say: Say = lambda text: None,
+    *,
+    method: Method = Method.INJECT,
+    found: Capabilities | None = None,
+    known: Known | None = None,
+    read_supply: ReadSupply | None = None,
 ) -> Stage:
-    """Run the experiments and write ``machine.toml`` and the traces.
+    """Run the experiments of a method, and write their traces and, where it is whole, ``machine.toml``.
+
+    Parameters
+    ----------
+    run : RunDirectory
+        Where everything goes; the caller adds the stage to its record.
+    drive : CanopenDrive
+        Off; opened once more where the method needs another kind of drive.
+    request : IdentifyRequest
+        What is asked.
+    allow_motion : callable
+        Is given the lines a person consents to.
+    say : callable, optional
+        Is told what is done.
+    method : Method, optional
+        How.
+    found : Capabilities, optional
+        What the drive has (``capabilities.examine``); without, it is the reference drive.
+    known : MachineFile and its source, optional
+        What completes the measured values; by injection the drive's own set when not given.
+    read_supply : callable, optional
+        Reads the bench supply where R is asked for by the standard method.
 
     Raises
     ------
     Declined
         The person did not consent; nothing was moved.
+    NotAvailable
+        The request excludes what the method needs, or nothing that was asked for could be identified.
     IdentificationError
         A trap was seen; no number is given.
     StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
         As the guard ends the experiment.
     """
-    request.check()
-    envelope = envelope_of(nameplate, request)
-    envelope.refuse_gravity()
-    steps = steps_of(request.measured, request.shaft == "locked")
-    if "speeds" in steps:
-        require_speed(envelope.speed_max_rad_s, nameplate.machine.n_max_rpm or 0.0)
-    if "rotation" in steps:
-        dwell_within(0.0, envelope.speed_max_rad_s)
-    allow_motion(plan_lines(envelope, request, nameplate))
-    run.save(NAMEPLATE, dump_machine_file(nameplate))
-    run.save(REQUEST, dump_request(request))
-    limits = Limits(
-        I_nom_apk=nameplate.machine.I_nom_apk or envelope.i_max_apk,
-        i_max_apk=envelope.i_max_apk,
-        omega_max_rad_s=envelope.speed_max_rad_s,
-        V_max_v=nameplate.inverter.V_max_v,
-        i_d_max_apk=envelope.i_d_max_apk,
-    )
+    row, found = METHODS[method], found or reference_capabilities(drive.identity)
+    if method is Method.INJECT and known is None:
+        known = nameplate_of(drive), SET_UP
+    with _opened_as(row.opens(found), drive, found) as own:
+        task = Task(run, own, found, request, known, read_supply)
+        envelope, lines = row.plan(task)
+        allow_motion([*envelope.lines(), *lines, RESTORED])
+        run.save(REQUEST, dump_request(request))
+        clock = own.node.connection.clock
+        start = clock.now()
 
-    clock = drive.node.connection.clock
-    start = clock.now()
-    try:
-        unproven = _measure(run, drive, envelope, limits, request, say)
-    except (DriveFault, IdentificationError, SafetyRefusal) as error:
-        # what was measured before is not lost: it is evaluated and recorded, and the run ends as it did
-        with contextlib.suppress(PmsmtoolError):
-            kept = evaluated_stage(run, nameplate, request)
-            run.add(replace(kept, status=status_of(error), note=text_of(error), seconds=clock.now() - start))
-        raise
-    stage = evaluated_stage(run, nameplate, request)
-    return replace(stage, seconds=clock.now() - start, fallbacks=[*stage.fallbacks, *unproven])
+        def keep(name: str, trace: Trace) -> None:
+            run.save(f"traces/{name}.npz", trace_npz(trace))
 
-
-def _measure(
-    run: RunDirectory,
-    drive: CanopenDrive,
-    envelope: Envelope,
-    limits: Limits,
-    request: IdentifyRequest,
-    say: Callable[[str], None],
-) -> list[str]:
-    """Run the experiments inside the guard; traces, predictions and refusals go into the run.
-
-    Returns what a report says of limits that were not proven.
-    """
-
-    def keep(name: str, trace: Trace) -> None:
-        run.save(f"traces/{name}.npz", trace_npz(trace))
-
-    with guarded(drive, envelope, first=starting_gains(limits), say=say) as guard:
-        locked = request.shaft == "locked"
-        measurement = Measurement(
-            guard,
-            limits,
-            keep,
-            say,
-            held=locked,
-            accuracy=request.accuracy,
-            map_if_saturated=request.map_if_saturated,
-        )
-        measurement.spent = lambda: (guard.energised_s, guard.energy_j)
-        measurement.limit_current, measurement.limit_speed = guard.limit_current, guard.limit_speed
-        predictions: list[dict[str, Any]] = []
-
-        def predicted(prediction: dict[str, Any]) -> None:
-            predictions.append(prediction)
-            run.save(PREDICTED, dump_predicted(predictions))
-
-        measurement.predicted = predicted
         try:
-            measurement.run(request.measured)
-        finally:
-            if measurement.refused:
-                run.save(REFUSED, dump_refused(measurement.refused))
-    return measurement.unproven
+            facts = row.measure(task, envelope, keep, say)
+        except (DriveFault, IdentificationError, SafetyRefusal) as error:
+            if row.begun is not None:
+                # what was measured before is not lost: it is evaluated and recorded, and the run ends as it did
+                with contextlib.suppress(PmsmtoolError):
+                    kept = row.evaluate(task, row.begun)
+                    run.add(replace(kept, status=status_of(error), note=text_of(error), seconds=clock.now() - start))
+            raise
+        seconds = clock.now() - start
+    return replace(row.evaluate(task, facts), seconds=seconds)
+
+
+@contextlib.contextmanager
+def _opened_as(kind: type[CanopenDrive], drive: CanopenDrive, found: Capabilities) -> Iterator[CanopenDrive]:
+    """Open a drive once more where a method needs another kind of it."""
+    if type(drive) is kind or kind is CanopenDrive:  # every drive takes what that one does
+        yield drive
+        return
+    own = kind(drive.node.connection, drive.node.node, drive_map=found.drive_map)
+    try:
+        yield own
+    finally:
+        drive.may_be_energised = drive.may_be_energised or own.may_be_energised
+        own.close()

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from pmsmtool.commissioning.report_page import report_page, verdict
+from pmsmtool.identification.by_pulses import FACTS, PulseFacts, dump_facts
+from pmsmtool.identification.by_vendor import ANSWERS
 from pmsmtool.identification.fingerprint import QUANTITIES, fingerprint_stage, read_earlier
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
-from pmsmtool.identification.tier_evaluate import FACTS, TierFacts, dump_facts
+from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method, dump_request
 from pmsmtool.identification.value_verdict import value_facts
-from pmsmtool.identification.vendor_machine import ANSWERS
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.measurement.identify import with_limits_of
+from pmsmtool.measurement.by_injection import with_limits_of
 from pmsmtool.run_directory import RunDirectory, RunRecord, Stage
 from tests.cli.conftest import Tool
 
@@ -158,7 +158,7 @@ def broken(run: RunDirectory, kind: str) -> None:
     elif kind == "level damaged":
         run.save(FACTS, "{")
     elif kind == "another level":
-        run.save(FACTS, dump_facts(TierFacts("recorder")))
+        run.save(FACTS, dump_facts(PulseFacts(Method.RECORDER)))
     elif kind == "no request":
         (run.path / REQUEST).unlink()
     elif kind == "request damaged":

@@ -103,10 +103,10 @@ def test_a_refused_run_names_its_refusal(tool: Tool) -> None:
 def test_whatever_ends_it_is_written_down(
     error: Exception, code: int, state: str, tool: Tool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stage(*asked: object) -> None:
+    def stage(*asked: object, **more: object) -> None:
         raise error
 
-    monkeypatch.setattr(identify, "identify_stage", stage)
+    monkeypatch.setattr(identify, "identify", stage)
     assert tool(*IDENTIFY)[0] == code
     account = only_run().read().account
     assert (account["state"], account["exit_code"], account["error"]) == (state, code, type(error).__name__)
@@ -115,7 +115,7 @@ def test_whatever_ends_it_is_written_down(
 
 def test_a_killed_run_is_not_taken_for_a_complete_one(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A kill and a power cut close nothing: the account stays open, and half a file keeps the name of half a file."""
-    monkeypatch.setattr(identify, "identify_stage", lambda run, *rest: stopped_dead(run))
+    monkeypatch.setattr(identify, "identify", lambda run, *rest, **more: stopped_dead(run))
     monkeypatch.setattr(RunAccount, "_ended", lambda *asked: (_ for _ in ()).throw(OSError("no more power")))
     with monkeypatch.context() as dead:
         dead.setattr(RunDirectory, "add", lambda *asked: None)
@@ -132,12 +132,12 @@ def stopped_dead(run: RunDirectory) -> None:
 
 
 def test_half_a_file_is_named(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stage(run: RunDirectory, *rest: object) -> None:
+    def stage(run: RunDirectory, *rest: object, **more: object) -> None:
         run.save("request.json", "{}")
         (run.path / "traces" / ".levels.npz.part").write_bytes(b"half")
         raise RuntimeError("disk")
 
-    monkeypatch.setattr(identify, "identify_stage", stage)
+    monkeypatch.setattr(identify, "identify", stage)
     tool(*IDENTIFY)
     account = only_run().read().account
     assert account["incomplete"] == ["traces/.levels.npz.part"] and list(account["files"]) == ["request.json"]

@@ -14,9 +14,10 @@ from pmsmtool.bus.connect import connect
 from pmsmtool.cli.identify import supply_reader
 from pmsmtool.cli.main import cli
 from pmsmtool.errors import Declined, NotAvailable
+from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.measurement.capabilities import EXPECTED, Method
+from pmsmtool.measurement.capabilities import EXPECTED
 
 CHANNEL = "interior-2k2?nv=:memory:&drive=cia402"
 

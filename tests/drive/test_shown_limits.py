@@ -25,10 +25,11 @@ from pmsmtool.experiments.current_limit import (
 )
 from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
 from pmsmtool.experiments.speed_limit import show_speed_limit
-from pmsmtool.identification.tier_evaluate import dump_facts, parse_facts
+from pmsmtool.identification.by_pulses import FACTS, dump_facts, read_facts
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.measurement.tier_identify import push_by_torque
+from pmsmtool.measurement.by_pulses import push_by_torque
+from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.node.factory import set_up_values
 from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, PowerDrive
 from pmsmtool.sim.node.session import Session
@@ -160,4 +161,5 @@ def test_a_limit_that_does_not_act_is_kept_with_the_run(tmp_path: Path, monkeypa
         assert isinstance(rig.drive, TorqueDrive)
         facts = push_by_torque(rig.drive, ENVELOPE, lambda name, trace: None, lambda text: None)
     assert facts.limit.startswith("the drive does not keep its own current limit")
-    assert parse_facts(dump_facts(facts), where="run").limit == facts.limit
+    (tmp_path / FACTS).write_text(dump_facts(facts), encoding="utf-8")
+    assert read_facts(RunDirectory(tmp_path)).limit == facts.limit

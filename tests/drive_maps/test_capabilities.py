@@ -26,20 +26,20 @@ from pmsmtool.drive.tier_drives import TorqueDrive
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, IdentificationError, Interrupted, NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.measurement.by_pulses import HEADROOM, push_by_torque, swing_and_record, turn_both_ways
 from pmsmtool.measurement.capabilities import (
     EXPECTED,
     FEATURES,
     NEEDS,
     QUANTITIES,
     Capabilities,
-    Method,
     Tier,
     examine,
     reference_capabilities,
 )
-from pmsmtool.measurement.tier_identify import HEADROOM, push_by_torque, swing_and_record, turn_both_ways
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.simulated_machine import settings_of
 

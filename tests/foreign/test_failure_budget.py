@@ -28,7 +28,7 @@ from pmsmtool.drive.tier_drives import pushing_drive
 from pmsmtool.drive_maps.shipped_maps import family_of
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.measurement.tier_identify import push_by_torque
+from pmsmtool.measurement.by_pulses import push_by_torque
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.node.node import Node
 from pmsmtool.sim.signals import Signal

@@ -14,7 +14,7 @@ from pmsmtool.cli.drive_access import rehearsal_bus
 from pmsmtool.cli.main import cli
 from pmsmtool.cli.options import BusOptions
 from pmsmtool.errors import ConfigError, NotAvailable
-from pmsmtool.identification.tier_evaluate import either_reading, over_torque_constant
+from pmsmtool.identification.by_pulses import either_reading, over_torque_constant
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.sim.channel import parse_channel
 from tests.foreign.data_sheets import GUARDING, Row, copley, epos4, write_eds

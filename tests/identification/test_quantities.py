@@ -12,14 +12,15 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.errors import DriveFault, IdentificationError
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.identification.replay import MACHINE, replay
+from pmsmtool.identification.replay import replay
 from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.run_files import REFUSED, refused_in
+from pmsmtool.identification.run_files import MACHINE, REFUSED, refused_in
 from pmsmtool.identification.verdicts import DESIGNED_FROM, ESSENTIAL, STEP, blocking, verdicts_of
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.measurement import mechanics
-from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.measurement.by_injection import nameplate_of
+from pmsmtool.measurement.identify import identify
 from pmsmtool.measurement.square_waves import SquareStage
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
@@ -27,14 +28,14 @@ from pmsmtool.sim.bus import PmsmSimBus
 CHANNEL = "interior-2k2?nv=:memory:"
 
 
-def identify(folder: Path, quantities: tuple[str, ...]) -> tuple[RunDirectory, Stage, MachineParameters]:
+def identified(folder: Path, quantities: tuple[str, ...]) -> tuple[RunDirectory, Stage, MachineParameters]:
     run = RunDirectory.create(folder, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
     with Connection(PmsmSimBus(CHANNEL)) as connection:
         drive = CanopenDrive(connection, 1)
         nameplate = nameplate_of(drive, "bench")
         try:
             request = IdentifyRequest(quantities=quantities)
-            stage = identify_stage(run, drive, nameplate, request, lambda lines: None, lambda text: None)
+            stage = identify(run, drive, request, lambda lines: None, lambda text: None, known=(nameplate, "bench"))
         finally:
             assert is_safe(drive.node.state()) and not drive.may_be_energised
             drive.close()
@@ -52,7 +53,7 @@ def test_a_refusal_while_measuring_leaves_what_does_not_depend_on_it(
         raise refuse("E_ROTOR_MOVED", "the rotor stands 20 deg off the bias vector", stage="inductance")
 
     monkeypatch.setattr(SquareStage, "measure", refused)
-    run, stage, nameplate = identify(tmp_path, ("R", "poles", "L", "psi"))
+    run, stage, nameplate = identified(tmp_path, ("R", "poles", "L", "psi"))
     assert stage.status == "partial"
     assert set(stage.refused) == {"L", "psi"}
     assert stage.refused["L"].startswith("E_ROTOR_MOVED: the rotor stands 20 deg")
@@ -77,7 +78,7 @@ def test_a_fault_ends_the_run_and_what_was_measured_before_is_kept(
 
     monkeypatch.setattr(SquareStage, "measure", fault)
     with pytest.raises(DriveFault, match="over-speed"):
-        identify(tmp_path, ("R", "poles", "L"))
+        identified(tmp_path, ("R", "poles", "L"))
     (folder,) = tmp_path.iterdir()
     run = RunDirectory(folder)
     (stage,) = run.read().stages
@@ -96,7 +97,7 @@ def test_the_shaft_that_does_not_rest_costs_its_inertia_only(tmp_path: Path, mon
         raise refuse("E_EXCITATION", "the shaft is not at rest", stage="mechanics")
 
     monkeypatch.setattr(mechanics, "_come_to_rest", refused)
-    _, stage, _ = identify(tmp_path, IdentifyRequest().quantities)
+    _, stage, _ = identified(tmp_path, IdentifyRequest().quantities)
     assert set(stage.refused) == {"mechanics"} and stage.status == "partial"
     assert all(line.ok for line in stage.acceptance)
 

@@ -13,10 +13,12 @@ from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.bus.connect import Connection
 from pmsmtool.commissioning.contradiction import compare
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.identification.replay import MACHINE, NAMEPLATE, replay, stored_traces
+from pmsmtool.identification.replay import replay
 from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.run_files import MACHINE, NAMEPLATE, stored_traces
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.measurement.by_injection import nameplate_of
+from pmsmtool.measurement.identify import identify
 from pmsmtool.proof.simulated import as_tested
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, new_record
@@ -43,7 +45,7 @@ def test_resistance_is_accepted_and_true_at_the_reference(name: str, T_c: float,
         drive = CanopenDrive(connection, 1)
         nameplate = nameplate_of(drive, "bench")
         request = IdentifyRequest(quantities=("R",))
-        stage = identify_stage(run, drive, nameplate, request, lambda lines: None, lambda text: None)
+        stage = identify(run, drive, request, lambda lines: None, lambda text: None, known=(nameplate, "bench"))
         drive.close()
     assert stage.status == "pass", stage.acceptance
     values = {value["name"]: value for value in stage.values}
@@ -81,7 +83,7 @@ def test_without_a_sensor_the_interval_reaches_to_the_reference(T_c: float, tmp_
     with Connection(PmsmSimBus(f"{path}?nv=:memory:")) as connection:
         drive = CanopenDrive(connection, 1)
         request = IdentifyRequest(quantities=("R",))
-        identify_stage(run, drive, nameplate_of(drive, "bench"), request, lambda lines: None, lambda text: None)
+        identify(run, drive, request, lambda lines: None, lambda text: None)
         drive.close()
     for name, trace in stored_traces(run).items():
         if "T_winding_c" in trace.signals:

@@ -24,7 +24,7 @@ from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import effort, measure
 from pmsmtool.measurement.effort import ALL, LEVEL_EFFORTS, SPEED_EFFORTS, Effort, effort_for
-from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.measurement.identify import identify
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.speeds import SpeedStage
 from pmsmtool.report.verdict import verdict_of
@@ -45,7 +45,7 @@ def identified(folder: Path, accuracy: float | None, said: list[str]) -> tuple[R
     with Connection(PmsmSimBus("interior-2k2?nv=:memory:")) as connection:
         drive = CanopenDrive(connection, 1)
         request = IdentifyRequest(quantities=("R",), accuracy=accuracy)
-        stage = identify_stage(run, drive, nameplate_of(drive, "bench"), request, lambda lines: None, said.append)
+        stage = identify(run, drive, request, lambda lines: None, said.append)
     return run, stage
 
 

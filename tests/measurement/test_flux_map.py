@@ -22,16 +22,18 @@ from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import standstill
 from pmsmtool.identification.flux_map import MAP_CSV, MAP_FILE, MAP_INTERVALS
-from pmsmtool.identification.replay import replay, stored_traces
+from pmsmtool.identification.replay import replay
 from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.run_files import stored_traces
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_check import check_flux_map
 from pmsmtool.machine.flux_map_import import load_flux_map
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.measurement.by_injection import envelope_of, nameplate_of
 from pmsmtool.measurement.flux_map import IF_SATURATED, measure_map, plan_lines
-from pmsmtool.measurement.identify import envelope_of, identify_stage, nameplate_of
+from pmsmtool.measurement.identify import identify
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.bus import PmsmSimBus
@@ -71,7 +73,7 @@ def test_a_free_rotor_gives_a_map_that_a_replay_repeats(tmp_path: Path) -> None:
         said: list[str] = []
         request = IdentifyRequest(("psi",), i_max_apk=20.0, map_if_saturated=True)  # as `commission` asks
         nameplate = nameplate_of(drive, "bench")
-        stage = identify_stage(run, drive, nameplate, request, said.extend, said.append)
+        stage = identify(run, drive, request, said.extend, said.append, known=(nameplate, "bench"))
         run.add(stage)
         drive.close()
     assert IF_SATURATED in said and any("predicted deviation of a flux" in line for line in said)

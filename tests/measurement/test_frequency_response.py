@@ -22,14 +22,15 @@ from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.identification.frequency_response import RESPONSE_FILE
 from pmsmtool.identification.identified_machine import RESONANCE
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, elastic_mechanics
-from pmsmtool.identification.replay import MACHINE, replay
+from pmsmtool.identification.replay import replay
 from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.run_files import PREDICTED
+from pmsmtool.identification.run_files import MACHINE, PREDICTED
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.frequency_response import PLAN_LINE
-from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.measurement.identify import identify
 from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.bus import PmsmSimBus
 
@@ -56,7 +57,7 @@ def test_the_resonance_of_an_elastic_shaft_its_notch_and_its_replay(tmp_path: Pa
         run = RunDirectory.create(tmp_path, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
         said: list[str] = []
         nameplate = nameplate_of(drive, "bench")
-        stage = identify_stage(run, drive, nameplate, IdentifyRequest(("frf",)), said.extend, said.append)
+        stage = identify(run, drive, IdentifyRequest(("frf",)), said.extend, said.append, known=(nameplate, "bench"))
         run.add(stage)
         drive.close()
     assert PLAN_LINE in said and "two masses" in stage.summary and stage.status == "pass"
@@ -115,7 +116,7 @@ def test_pushes_of_an_elastic_shaft_tell_friction_where_both_inertias_agree(tmp_
         drive = CanopenDrive(connection, 1)
         run = RunDirectory.create(tmp_path, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
         request = IdentifyRequest(("mechanics", "frf"))
-        stage = identify_stage(run, drive, nameplate_of(drive, "bench"), request, lambda plan: None, lambda line: None)
+        stage = identify(run, drive, request, lambda plan: None, lambda line: None)
         drive.close()
     assert "mechanics" not in stage.refused
     found = load_machine_file(run.path / MACHINE).estimates

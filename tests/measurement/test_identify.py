@@ -22,10 +22,12 @@ from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.errors import ConfigError, ExitCode, IdentificationError, Interrupted, NotAvailable
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.identification.evaluate import tolerance_on
-from pmsmtool.identification.replay import MACHINE, REPLAYED, replay
+from pmsmtool.identification.replay import replay
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request, parse_request
+from pmsmtool.identification.run_files import MACHINE, REPLAYED
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.measurement.identify import identify_stage, nameplate_of
+from pmsmtool.measurement.by_injection import nameplate_of
+from pmsmtool.measurement.identify import identify
 from pmsmtool.measurement.square_waves import BIAS_MOST, CROSSING, RIPPLE_LEAST, bias_and_ripple
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
@@ -39,13 +41,13 @@ COARSE_RAD = math.radians(2.0)  # measured: 0.03 to 0.41 deg
 CHANNEL = "interior-2k2?nv=:memory:"
 
 
-def identify(
+def identified(
     drive: CanopenDrive, folder: Path, quantities: tuple[str, ...], tolerance: SensorTolerance | None = None
 ) -> tuple[RunDirectory, Stage]:
     record = new_record(["test"], drive={}, bus={}, versions={}, operator="nobody")
     run = RunDirectory.create(folder, drive.identity.serial, record)
     request = IdentifyRequest(quantities=quantities, tolerance=tolerance or SensorTolerance())
-    stage = identify_stage(run, drive, nameplate_of(drive, "bench"), request, lambda lines: None, lambda text: None)
+    stage = identify(run, drive, request, lambda lines: None, lambda text: None)
     run.add(stage)
     return run, stage
 
@@ -84,7 +86,7 @@ def test_ctrl_c_at_any_moment_leaves_a_drive_that_is_off_and_as_before(
         with monkeypatch.context() as patch:
             patch.setattr(VirtualClock, "wait", interrupted)
             with pytest.raises((Interrupted, KeyboardInterrupt)) as caught:
-                identify(drive, tmp_path, IdentifyRequest().quantities)
+                identified(drive, tmp_path, IdentifyRequest().quantities)
         assert count >= moment
         if isinstance(caught.value, Interrupted):
             assert caught.value.exit_code == ExitCode.INTERRUPTED
@@ -103,7 +105,7 @@ def test_a_speed_limit_that_tells_nothing_is_refused_before_anybody_is_asked(tmp
         drive = CanopenDrive(connection, 1)
         nameplate = nameplate_of(drive, "bench")
         with pytest.raises(IdentificationError, match="E_EXCITATION: the speed limit 1 rpm"):
-            identify_stage(run, drive, nameplate, request, asked.append, asked.append)
+            identify(run, drive, request, asked.append, asked.append, known=(nameplate, "bench"))
         assert not drive.may_be_energised
         drive.close()
     assert asked == []
@@ -118,7 +120,7 @@ def test_the_shaft_turns_no_faster_than_allowed_while_its_pole_pairs_are_counted
     run = RunDirectory.create(tmp_path, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
     with Connection(PmsmSimBus(CHANNEL)) as connection:
         drive = CanopenDrive(connection, 1)
-        stage = identify_stage(run, drive, nameplate_of(drive, "bench"), request, lambda lines: None, lambda text: None)
+        stage = identify(run, drive, request, lambda lines: None, lambda text: None)
         drive.close()
     assert stage.status == "pass", stage.acceptance  # the coarse offset of the slow turn is not judged
     turn = read_trace(run.path / "traces" / "rotation_forward.npz")
@@ -137,7 +139,7 @@ def test_a_reluctance_machine_follows_a_smaller_and_slower_vector(seed: int, tmp
     path.write_text(dump_machine_file(drive_file, embed_flux_map=True), encoding="utf-8")
     with Connection(PmsmSimBus(f"{path}?nv=:memory:")) as connection:
         drive = CanopenDrive(connection, 1)
-        run, _ = identify(drive, tmp_path, ("poles",))
+        run, _ = identified(drive, tmp_path, ("poles",))
         drive.close()
     found = load_machine_file(run.path / MACHINE)
     assert found.machine.pole_pairs == base.machine.pole_pairs
@@ -156,7 +158,7 @@ def test_the_gains_of_another_motor_serve_nobody(factor: float, quantities: tupl
         drive.write({"motor.L_d_h": 0.01 * factor, "motor.L_q_h": 0.01 * factor})
         names += ["motor.L_d_h", "motor.L_q_h"]
         held = [drive.read(name) for name in names]
-        _, stage = identify(drive, tmp_path, quantities)
+        _, stage = identified(drive, tmp_path, quantities)
         assert stage.status == "pass" and not stage.refused
         assert [drive.read(name) for name in names] == held
         drive.close()
@@ -170,7 +172,7 @@ def measured_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Stage
     """A run that has measured R for sensors of 2 %."""
     with Connection(PmsmSimBus(CHANNEL)) as connection:
         drive = CanopenDrive(connection, 1)
-        run, stage = identify(drive, tmp_path_factory.mktemp("once"), ("R",), SensorTolerance(0.02, 0.02))
+        run, stage = identified(drive, tmp_path_factory.mktemp("once"), ("R",), SensorTolerance(0.02, 0.02))
         drive.close()
     return run.path, stage
 

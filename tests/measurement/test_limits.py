@@ -13,7 +13,7 @@ from pmsmtool.experiments.rotation import SLOWEST_STEP_S, STEP_RAD, dwell_within
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import MachineLimits
-from pmsmtool.measurement.identify import envelope_of, nameplate_of, plan_lines
+from pmsmtool.measurement.by_injection import envelope_of, nameplate_of, plan_lines
 from pmsmtool.measurement.limits import LEAST_SPEED_SHARE, Limits, require_speed, unused_current
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.resources import data_folder

@@ -17,7 +17,6 @@ from click.testing import CliRunner
 from benchmarks.tier_intervals import told_by
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
-from pmsmtool.commissioning.tier_stages import open_tier_drive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
@@ -30,10 +29,12 @@ from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import Interrupted, NotAvailable, Partial
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.recorded_push import DELAY_DOUBT, estimate_pushes
+from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.measurement.capabilities import Capabilities, Method, Tier, examine
-from pmsmtool.measurement.tier_identify import swing_and_record
+from pmsmtool.measurement.by_pulses import swing_and_record
+from pmsmtool.measurement.capabilities import Capabilities, Tier, examine
+from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
 
@@ -78,7 +79,7 @@ def test_a_completed_map_lifts_a_copley_to_the_tier_of_recorders(tmp_path: Path)
         assert found.recorder.startswith("trace of i_d_a, i_q_a, U_dc_v, u_d_v")
         row = found.row("R", Method.RECORDER)
         assert row.available and not row.expected  # what was measured was the reference drive's recorder
-        drive = open_tier_drive(connection, 1, found)
+        drive = open_for_level(connection, 1, found)
         assert isinstance(drive, MappedRecorderDrive)
         drive.close()
 
@@ -87,7 +88,7 @@ def test_a_completed_map_lifts_a_copley_to_the_tier_of_recorders(tmp_path: Path)
 def test_each_of_them_is_needed(tmp_path: Path, name: str) -> None:
     with opened(tmp_path, completed(name)) as (connection, found):
         assert found.tier is Tier.STANDARD and "recorder" not in found.features
-        drive = open_tier_drive(connection, 1, found)
+        drive = open_for_level(connection, 1, found)
         assert type(drive) is StandardDrive
         drive.close()
 
@@ -101,7 +102,7 @@ def test_a_drive_that_does_not_have_what_its_map_says_is_no_recorder(tmp_path: P
     with opened(tmp_path, completed(identity="vendor = 0xFB\nproduct = 0x63220000\n"), "epos2") as (connection, found):
         assert found.map_is_drives and "recorder" not in found.features
         assert found.recorder == "not read: the drive has no trace"
-        drive = open_tier_drive(connection, 1, found)
+        drive = open_for_level(connection, 1, found)
         assert type(drive) in (ParameterDrive, StandardDrive)
         drive.close()
 
@@ -109,7 +110,7 @@ def test_a_drive_that_does_not_have_what_its_map_says_is_no_recorder(tmp_path: P
 @pytest.fixture(scope="module")
 def pushed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[MappedRecorderDrive, object]]:
     with opened(tmp_path_factory.mktemp("mapped"), completed()) as (connection, found):
-        drive = open_tier_drive(connection, 1, found)
+        drive = open_for_level(connection, 1, found)
         assert isinstance(drive, MappedRecorderDrive)
         envelope = Envelope(i_max_apk=7.0, speed_max_rad_s=280.0, duration_s=600.0)
         yield drive, told_by(swing_and_record, drive, envelope)
@@ -204,7 +205,7 @@ def test_the_chain_measures_by_it_and_says_what_is_left(tmp_path: Path, monkeypa
 def test_the_recorder_is_brought_back_as_it_was(tmp_path: Path, interrupted: bool) -> None:
     """Also after a push that ends in its middle, with the trace still running."""
     with opened(tmp_path, completed()) as (connection, found):
-        drive = open_tier_drive(connection, 1, found)
+        drive = open_for_level(connection, 1, found)
         assert isinstance(drive, MappedRecorderDrive)
         session = connection.bus.line.nodes[0].session  # type: ignore[attr-defined]
         places = [*((0x2500, k) for k in range(1, 7)), (0x2505, 0), (0x2506, 0), (0x2507, 0)]

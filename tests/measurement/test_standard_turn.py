@@ -18,10 +18,11 @@ from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import IdentificationError
 from pmsmtool.experiments.vector_turn import FIRST_SHARE, LEAD_S, lead_onto_vector
-from pmsmtool.identification.tier_evaluate import tier_result
+from pmsmtool.identification.by_pulses import PulseFacts, pulse_result
+from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.measurement import tier_identify
-from pmsmtool.measurement.tier_identify import HEADROOM, TURNS, turn_both_ways
+from pmsmtool.measurement import by_pulses
+from pmsmtool.measurement.by_pulses import HEADROOM, TURNS, turn_both_ways
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace import Trace
 
@@ -112,7 +113,7 @@ def standard(drive: MachineFile, folder: Path) -> Iterator[tuple[StandardDrive, 
 
 def offset_error_deg(drive: MachineFile, traces: dict[str, Trace]) -> float:
     """Return the error of the offset; the pole pairs are asserted."""
-    found = tier_result(traces, tier_identify.TierFacts("standard")).estimates
+    found = pulse_result(traces, PulseFacts(Method.STANDARD)).estimates
     assert found["pole_pairs"].value == drive.machine.pole_pairs
     truth = settings_of(drive).number("encoder_offset_rad")
     return abs(math.degrees(math.remainder(found["offset_rad"].value - truth, 2.0 * math.pi)))
@@ -139,10 +140,10 @@ def test_dead_time_that_drives_the_swing_is_left_by_a_slower_turn(
     fast_s, (large, slow_s) = 0.02, TURNS[-1]
     traces: dict[str, Trace] = {}
     with standard(drive, tmp_path) as (opened, envelope):
-        monkeypatch.setattr(tier_identify, "TURNS", ((large, fast_s),))
+        monkeypatch.setattr(by_pulses, "TURNS", ((large, fast_s),))
         with pytest.raises(IdentificationError, match="E_ROTOR_MOVED"):
             turn_both_ways(opened, envelope, traces.__setitem__, lambda text: None)
     with standard(drive, tmp_path) as (opened, envelope):
-        monkeypatch.setattr(tier_identify, "TURNS", ((large, slow_s),))
+        monkeypatch.setattr(by_pulses, "TURNS", ((large, slow_s),))
         turn_both_ways(opened, envelope, traces.__setitem__, lambda text: None)
     assert offset_error_deg(drive, traces) < 0.5  # measured: 0.01 deg

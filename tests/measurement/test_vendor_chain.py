@@ -12,8 +12,8 @@ import pytest
 
 from pmsmtool.bus.connection import Connection
 from pmsmtool.commissioning.commission import Commissioning, begin_run
+from pmsmtool.commissioning.level_stages import LevelStages
 from pmsmtool.commissioning.report_page import report_page, verdict
-from pmsmtool.commissioning.tier_stages import TierStages, open_tier_drive
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
@@ -23,6 +23,7 @@ from pmsmtool.errors import Contradiction
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.capabilities import Capabilities, Tier, examine
+from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.proof.stage import ProofRequest
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.sim.bus import PmsmSimBus
@@ -49,7 +50,7 @@ def begun(
             probe.write({"motor.pole_pairs": set_up})
         found = examine(probe.node, drive_map)
         probe.close()
-        drive = open_tier_drive(connection, 1, found)
+        drive = open_for_level(connection, 1, found)
         yield begin_run(drive, folder / "runs", tier=found.tier), drive, found
         drive.close()
 
@@ -57,7 +58,7 @@ def begun(
 def first_stage(folder: Path, drive_map: DriveMap, *, set_up: int = 0) -> tuple[Stage, RunDirectory]:
     """Identification alone, as commission asks for it."""
     with begun(folder, drive_map, set_up=set_up) as (run, drive, found):
-        stages = TierStages(run, drive, found, load_machine_file(PROFILE))
+        stages = LevelStages(run, drive, found, load_machine_file(PROFILE))
         return stages.identify(IdentifyRequest(), lambda lines: None, lambda text: None), run
 
 

@@ -31,9 +31,9 @@ from pmsmtool.errors import (
     NotAvailable,
     SdoAbort,
 )
-from pmsmtool.identification.vendor_machine import coarse_notes, vendor_estimates, vendor_machine
+from pmsmtool.identification.by_vendor import coarse_notes, vendor_estimates, vendor_machine
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.measurement.vendor_identify import identify_vendor
+from pmsmtool.measurement.by_vendor import identify_vendor
 from pmsmtool.sim.node.session import Session
 from tests.measurement.vendor_rig import PROFILE, TRUTH, channel, opened, without_torque
 

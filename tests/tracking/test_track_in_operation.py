@@ -21,7 +21,7 @@ from pmsmtool.errors import ExitCode
 from pmsmtool.identification.track import follow, known_of
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.measurement.identify import nameplate_of
+from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.observe import (
     GIVEN_BACK,
     SAMPLES_PER_WINDOW,

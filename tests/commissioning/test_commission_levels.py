@@ -20,7 +20,6 @@ from pmsmtool.commissioning.closed_stage import LIMITS, NO_BANDWIDTH, NO_INERTIA
 from pmsmtool.commissioning.commission import Commissioning, begin_run, due_stages
 from pmsmtool.commissioning.rated_limits import NAMES
 from pmsmtool.commissioning.report_page import report_page, verdict
-from pmsmtool.commissioning.tier_stages import SET_UP, open_tier_drive
 from pmsmtool.design.closed_drive import RATED, SLOPE, SPEED, TORQUE
 from pmsmtool.design.design_file import load_design
 from pmsmtool.design.loops.open_loops import lacking_gains
@@ -30,10 +29,11 @@ from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, Contradiction, ExitCode, NotAvailable
-from pmsmtool.identification.replay import REPLAYED
-from pmsmtool.identification.tier_evaluate import replay
+from pmsmtool.identification.replay import replay
+from pmsmtool.identification.run_files import REPLAYED
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.capabilities import Capabilities, Tier, examine
+from pmsmtool.measurement.identify import SET_UP, open_for_level
 from pmsmtool.papers.closed_node import ClosedNode
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.proof.stage import ProofRequest
@@ -69,7 +69,7 @@ def opened(options: str, given: DriveMap | None = None) -> Iterator[tuple[Canope
         node = DriveNode(connection, 1)
         found = examine(node, given)
         node.close()
-        drive = open_tier_drive(connection, 1, found)
+        drive = open_for_level(connection, 1, found)
         yield drive, found
         drive.close()
 

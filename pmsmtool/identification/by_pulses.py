@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""What the traces of a tier without injection tell: estimates, the machine file, and the judged stage.
+"""What the traces of drives without injection tell: estimates, the machine file, and the judged stage.
 
-Everything follows from the stored traces, the request and :class:`TierFacts`, so that :func:`replay` gives the same
-bytes years later.
+Everything follows from the stored traces, the request and :class:`PulseFacts`, so that a replay gives the same bytes.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
@@ -25,16 +24,14 @@ from pmsmtool.estimators.rotation_offset import offset_by_turns
 from pmsmtool.estimators.shaft.inertia_ratio import estimate_ratios
 from pmsmtool.files import read_text
 from pmsmtool.identification.calibration import calibrated_traces
+from pmsmtool.identification.completed_machine import completed_machine
 from pmsmtool.identification.evaluate import tolerance_on
+from pmsmtool.identification.judgement import TOLD_BY, judged, stage_of
 from pmsmtool.identification.push_limits import not_told, without
-from pmsmtool.identification.replay import MACHINE, NAMEPLATE, asked_again, place_of
-from pmsmtool.identification.replay import replay as replay_injection
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
+from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method
+from pmsmtool.identification.run_files import MACHINE, place_of
 from pmsmtool.identification.supply_power import resistance_by_supply
-from pmsmtool.identification.tier_machine import tier_machine
-from pmsmtool.identification.tier_verdict import TOLD_BY, judged, stage_of
-from pmsmtool.identification.vendor_machine import ANSWERS
-from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K, magnet_tolerance_per_k
 from pmsmtool.machine.torque import torque_per_ampere
@@ -63,7 +60,7 @@ Voltage = Literal["machine", "link", ""]
 
 
 @dataclass(frozen=True, slots=True)
-class TierResult:
+class PulseResult:
     """Estimates of a run without injection.
 
     Attributes
@@ -82,7 +79,7 @@ class TierResult:
 
 
 @dataclass(frozen=True, slots=True)
-class TierFacts:
+class PulseFacts:
     """What a run without injection was, besides its traces.
 
     Attributes
@@ -111,7 +108,7 @@ class TierFacts:
         What is said of a current limit that was not proven.
     """
 
-    kind: Literal["recorder", "standard"]
+    kind: Method
     period_s: float = 0.0
     pole_pairs: int = 0
     T_winding_c: float | None = None
@@ -126,22 +123,22 @@ class TierFacts:
     limit: str = ""
 
 
-def tier_result(
+def pulse_result(
     traces: Mapping[str, Trace],
-    facts: TierFacts,
+    facts: PulseFacts,
     tolerance: SensorTolerance | None = None,
     inverter: InverterParameters | None = None,
     psi_f_wb: float = 0.0,
     copper: Copper | None = None,
     alpha_psi_per_k: float = MAGNET_ALPHA_PER_K,
-) -> TierResult:
+) -> PulseResult:
     """Estimate from traces.
 
     Parameters
     ----------
     traces : mapping of str to Trace
         In the order they were taken.
-    facts : TierFacts
+    facts : PulseFacts
         Of the run.
     tolerance : SensorTolerance, optional
         Declared sensor tolerances.
@@ -163,7 +160,7 @@ def tier_result(
     if tolerance.bridge_difference_v is not None:
         tolerance = tolerance_on(tolerance, facts.U_dc_v or math.inf)
     recorded, traces = traces, calibrated_traces(traces, tolerance)
-    if facts.kind == "recorder":
+    if facts.kind == Method.RECORDER:
         result = _by_recorder(traces, facts, tolerance, copper or Copper(), alpha_psi_per_k)
         return replace(result, traces=recorded)
     estimates: dict[str, Estimate] = {}
@@ -180,12 +177,12 @@ def tier_result(
         pushed, missing = _by_torque(traces, replace(facts, pole_pairs=pole_pairs), tolerance, inverter, psi_f_wb)
         estimates |= pushed
         missing = {name: why for name, why in missing.items() if name not in estimates}
-    return TierResult(estimates, missing, recorded)
+    return PulseResult(estimates, missing, recorded)
 
 
 def _by_recorder(
-    traces: Mapping[str, Trace], facts: TierFacts, tolerance: SensorTolerance, copper: Copper, alpha_psi_per_k: float
-) -> TierResult:
+    traces: Mapping[str, Trace], facts: PulseFacts, tolerance: SensorTolerance, copper: Copper, alpha_psi_per_k: float
+) -> PulseResult:
     pushes = list(traces.values())
     found = estimate_pushes(pushes, period_s=facts.period_s, pole_pairs=facts.pole_pairs, tolerance=tolerance)
     T_winding_c, T_magnet_c = (math.nan if T is None else T for T in (facts.T_winding_c, facts.T_magnet_c))
@@ -202,12 +199,12 @@ def _by_recorder(
     except IdentificationError as error:
         missing["J_per_psi"] = error.what
     reasons = not_told(estimates, pushes)
-    return TierResult(without(estimates, reasons), missing | reasons, traces)
+    return PulseResult(without(estimates, reasons), missing | reasons, traces)
 
 
 def _by_torque(
     traces: Mapping[str, Trace],
-    facts: TierFacts,
+    facts: PulseFacts,
     tolerance: SensorTolerance,
     inverter: InverterParameters | None,
     psi_f_wb: float,
@@ -281,7 +278,7 @@ def over_torque_constant(ratios: Mapping[str, Estimate]) -> dict[str, Estimate]:
     }  # fmt: skip
 
 
-def below_voltage(facts: TierFacts, utilisation: float, psi_f_wb: float) -> str:
+def below_voltage(facts: PulseFacts, utilisation: float, psi_f_wb: float) -> str:
     """Return what the flux linkage needs of a run that did not reach the voltage limit."""
     text = f"needs a speed at which the voltage ends, and up to {facts.top_rpm:.0f} rpm it did not"
     if psi_f_wb > 0.0:
@@ -307,7 +304,7 @@ def push_estimates(found: PushResult) -> dict[str, Estimate]:
 
 
 def evaluated_stage(
-    run: RunDirectory, facts: TierFacts, request: IdentifyRequest, known: MachineFile | None = None
+    run: RunDirectory, facts: PulseFacts, request: IdentifyRequest, known: MachineFile | None = None
 ) -> Stage:
     """Estimate from the stored traces, write the machine file where it is whole, and judge every value.
 
@@ -320,22 +317,22 @@ def evaluated_stage(
     """
     traces = {name: read_trace(run.path / f"traces/{name}.npz") for name in facts.traces}
     if known is None:
-        result = tier_result(traces, facts, request.tolerance)
+        result = pulse_result(traces, facts, request.tolerance)
     else:
         machine = known.machine
         tolerance = replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(machine))
-        result = tier_result(
+        result = pulse_result(
             traces, facts, tolerance, known.inverter, machine.psi_f_wb, copper_of(known),
             machine.alpha_psi_per_k,
         )  # fmt: skip
-    if {"psi", "mechanics"} & set(request.quantities) and facts.kind == "standard" and not facts.pushed:
+    if {"psi", "mechanics"} & set(request.quantities) and facts.kind == Method.STANDARD and not facts.pushed:
         result = replace(result, missing={**result.missing, "J_per_psi, psi_f_wb": NO_POLE_PAIRS})
     if not any(set(TOLD_BY.get(name, ())) & set(result.estimates) for name in request.quantities):
         reasons = [f"{name}: not available: {why}" for name, why in result.missing.items()]
         raise NotAvailable("\n  - ".join(["nothing that was asked for was identified", *reasons]), where=str(run.path))
-    designed = tier_machine(known, result.estimates, facts.source).machine
+    designed = completed_machine(known, result.estimates, facts.source).machine
     judgement = judged(result.estimates, result.missing, request.quantities, designed)
-    made = tier_machine(known, judgement.kept(result.estimates), facts.source)
+    made = completed_machine(known, judgement.kept(result.estimates), facts.source)
     files = dict.fromkeys((*(f"traces/{name}.npz" for name in traces), REQUEST, FACTS), "")
     if made.machine is not None and judgement.verdicts.accepted:
         text = dump_machine_file(made.machine)
@@ -347,58 +344,29 @@ def evaluated_stage(
     return replace(stage, files=files, fallbacks=fallbacks)
 
 
-def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibration: Sequence[str] = ()) -> Stage:
-    """Recompute every estimate of a run from its traces, whatever its tier; as ``identification.replay.replay``.
-
-    Raises
-    ------
-    ConfigError
-        The run has no traces, or a file that the estimates depend on is gone or damaged.
-    IdentificationError
-        A trap is seen in the traces.
-    """
-    if (run.path / ANSWERS).is_file():
-        raise ConfigError(
-            "the run holds what the drive identified by itself: nothing of that can be recomputed",
-            where=str(run.path),
-            hint="`pmsmtool identify --method vendor` has the drive measure again",
-        )
-    if not (run.path / FACTS).is_file():
-        return replay_injection(run, tolerance, calibration)
-    facts = parse_facts(read_text(run.path / FACTS), where=str(run.path / FACTS))
-    request = asked_again(run, (REQUEST, NAMEPLATE) if facts.source else (REQUEST,), tolerance, calibration)
-    known = load_machine_file(run.path / NAMEPLATE) if facts.source else None
-    recorded = run.read().stage("identify")
-    stage = evaluated_stage(run, facts, request, known)
-    beside = MACHINE not in stage.files and any(name.endswith(MACHINE) for name in stage.files)
-    if recorded is not None and not beside and json.dumps(list(recorded.values)) != json.dumps(list(stage.values)):
-        run.save(REQUEST, dump_request(request))
-        run.add(replace(stage, seconds=recorded.seconds))
-    return stage
-
-
-def dump_facts(facts: TierFacts) -> str:
+def dump_facts(facts: PulseFacts) -> str:
     """Return facts as JSON."""
     return json.dumps(asdict(facts), indent=1) + "\n"
 
 
-def parse_facts(text: str, *, where: str) -> TierFacts:
+def read_facts(run: RunDirectory) -> PulseFacts:
     """Return the facts of a run.
 
     Raises
     ------
     ConfigError
-        It is not what :func:`dump_facts` writes.
+        They are not what :func:`dump_facts` writes.
     """
+    path = run.path / FACTS
     try:
-        facts = json.loads(text)
-        found = TierFacts(**{**facts, "traces": tuple(facts["traces"])})
-        if found.kind not in ("recorder", "standard"):
+        facts = json.loads(read_text(path))
+        found = PulseFacts(**{**facts, "kind": Method(facts["kind"]), "traces": tuple(facts["traces"])})
+        if found.kind not in (Method.RECORDER, Method.STANDARD):
             raise ValueError(f"no kind {found.kind!r}")
     except (ValueError, TypeError, KeyError) as error:
         raise ConfigError(
             f"the record of the capability level is damaged: {error}",
-            where=where,
+            where=str(path),
             hint="identify again; or take the file from a copy of the run",
         ) from error
     return found

@@ -8,10 +8,11 @@ import math
 import pytest
 
 from pmsmtool.errors import IdentificationError
-from pmsmtool.identification import tier_evaluate
-from pmsmtool.identification.tier_evaluate import TierFacts, tier_result
-from pmsmtool.identification.tier_machine import tier_machine
-from pmsmtool.identification.tier_verdict import Judgement, judged, stage_of
+from pmsmtool.identification import by_pulses
+from pmsmtool.identification.by_pulses import PulseFacts, pulse_result
+from pmsmtool.identification.completed_machine import completed_machine
+from pmsmtool.identification.judgement import Judgement, judged, stage_of
+from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
@@ -39,7 +40,7 @@ def estimates(known: MachineFile, **shares: float) -> dict[str, Estimate]:
 
 
 def judgement_of(found: dict[str, Estimate], known: MachineFile | None) -> Judgement:
-    machine = tier_machine(known, found, SHEET).machine
+    machine = completed_machine(known, found, SHEET).machine
     return judged(found, {}, ASKED, machine)
 
 
@@ -61,12 +62,12 @@ def test_an_inertia_that_is_too_wide_leaves_the_flux_linkage(monkeypatch: pytest
     def flux(*args: object, **options: object) -> Estimate:
         return Estimate(0.005, 0.0, 1e-4, "Wb")
 
-    monkeypatch.setattr(tier_evaluate, "estimate_ratios", too_wide)
+    monkeypatch.setattr(by_pulses, "estimate_ratios", too_wide)
     with pytest.raises(IdentificationError, match="E_NOT_IDENTIFIABLE") as caught:
-        tier_result({}, TierFacts("standard", pole_pairs=7, pushed=True))
+        pulse_result({}, PulseFacts(Method.STANDARD, pole_pairs=7, pushed=True))
     assert "bare shaft" in caught.value.likely and "--shaft coupled" in caught.value.hint
-    monkeypatch.setattr(tier_evaluate, "flux_by_undriven_voltage", flux)
-    result = tier_result({}, TierFacts("standard", pole_pairs=7, pushed=True, voltage="machine"))
+    monkeypatch.setattr(by_pulses, "flux_by_undriven_voltage", flux)
+    result = pulse_result({}, PulseFacts(Method.STANDARD, pole_pairs=7, pushed=True, voltage="machine"))
     assert set(result.estimates) == {"psi_f_wb"} and result.missing["J_per_psi"].startswith("E_NOT_IDENTIFIABLE: J/psi")
     refused = judged(result.estimates, result.missing, ("mechanics",), None).verdicts.refused["mechanics"]
     assert refused.startswith("E_NOT_IDENTIFIABLE"), "the reason stands once"
@@ -79,7 +80,7 @@ def test_a_useless_value_is_refused_alone_and_the_others_are_kept(known: Machine
     assert judgement.verdicts.accepted == ("R", "psi") and set(judgement.verdicts.refused) == {"L", "mechanics"}
     kept = judgement.kept(found)
     assert set(kept) == {"R_s_ohm", "psi_f_wb"}, "the friction goes with its inertia"
-    made = tier_machine(known, kept, SHEET)
+    made = completed_machine(known, kept, SHEET)
     stage = stage_of(found, {}, made, judgement, SHEET)
     assert stage.status == "partial" and all(line.ok for line in stage.acceptance)
     assert {v["name"] for v in stage.values if v.get("accepted") is False} == {"L_q_app_h", "J_per_psi"}

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.resistance import at_the_test
+from pmsmtool.identification.completed_machine import CompletedMachine
 from pmsmtool.identification.interval_needs import JUDGED
 from pmsmtool.identification.push_limits import without
-from pmsmtool.identification.tier_machine import TierMachine
 from pmsmtool.identification.value_verdict import STANDS_FOR, judged_values, value_facts
 from pmsmtool.identification.verdicts import NOT_ACCEPTED, STEP, Verdicts, verdicts_of
 from pmsmtool.machine.machine_file import MachineFile
@@ -82,7 +82,11 @@ def _refusal(why: str) -> IdentificationError:
 
 
 def stage_of(
-    estimates: Mapping[str, Estimate], missing: Mapping[str, str], made: TierMachine, judgement: Judgement, source: str
+    estimates: Mapping[str, Estimate],
+    missing: Mapping[str, str],
+    made: CompletedMachine,
+    judgement: Judgement,
+    source: str,
 ) -> Stage:
     """Return the stage as it is recorded, without its files."""
     verdicts, rejected = judgement.verdicts, judgement.rejected

@@ -8,22 +8,26 @@ deviation that it assumes instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from pmsmtool.drive_maps.drive_map import Cell
 from pmsmtool.drive_maps.vendor_tuning import OS_COMMAND, VendorAnswer, VendorTuning
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.identification.tier_machine import ALSO, NEEDED
-from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.identification.completed_machine import ALSO, NEEDED, CompletedMachine
+from pmsmtool.identification.run_files import MACHINE
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.machine_keys import MEASURABLE
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.run_directory import Acceptance, RunDirectory, Stage
 from pmsmtool.units import format_quantity
 
 SOURCE = "vendor"
 PHASE_INDUCTANCE = "L_phase_h"
 """One inductance for both axes: neither L_d nor L_q, but somewhere between or at one of them."""
+ANSWERS = "vendor_tuning.json"
+"""What the drive answered, byte by byte."""
 NO_INTERVAL = "the drive's own, without an interval: its maker states none"
 COARSE = 0.005
 """Half a count, of a value, from which the rounding is told."""
@@ -67,26 +71,7 @@ def vendor_facts(name: str, estimate: Estimate) -> dict[str, Any]:
     return {"name": name, **{key: getattr(estimate, key) for key in keys}}
 
 
-@dataclass(frozen=True, slots=True)
-class VendorMachine:
-    """A machine file with the drive's own values in it.
-
-    Attributes
-    ----------
-    machine : MachineFile or None
-        None without one to complete.
-    given : tuple of str
-        Keys that stay as they were given.
-    notes : tuple of str
-        What was done to the values.
-    """
-
-    machine: MachineFile | None
-    given: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
-def vendor_machine(known: tuple[MachineFile, str] | None, found: Mapping[str, Estimate]) -> VendorMachine:
+def vendor_machine(known: tuple[MachineFile, str] | None, found: Mapping[str, Estimate]) -> CompletedMachine:
     """Put the drive's own values into a machine that is known otherwise.
 
     Parameters
@@ -95,7 +80,7 @@ def vendor_machine(known: tuple[MachineFile, str] | None, found: Mapping[str, Es
         What completes them.
     """
     if known is None:
-        return VendorMachine(None, (), ("no machine file is written: it needs ratings and the inverter, too",))
+        return CompletedMachine(None, (), (), ("no machine file is written: it needs ratings and the inverter, too",))
     given_file, source = known
     table = {key: e for key, e in found.items() if key != PHASE_INDUCTANCE}
     notes = []
@@ -124,7 +109,7 @@ def vendor_machine(known: tuple[MachineFile, str] | None, found: Mapping[str, Es
         provenance={"source": f"{SOURCE}: {', '.join(table) or 'nothing'}; {source}: {', '.join(given)}"},
         simulation={},
     )
-    return VendorMachine(machine, given, tuple(notes))
+    return CompletedMachine(machine, tuple(table), given, tuple(notes))
 
 
 def coarse_notes(tuning: VendorTuning, answers: Mapping[str, VendorAnswer]) -> list[str]:
@@ -154,5 +139,33 @@ def answer_facts(tuning: VendorTuning, answer: VendorAnswer) -> dict[str, Any]:
     }
 
 
-ANSWERS = "vendor_tuning.json"
-"""What the drive answered, byte by byte."""
+def evaluated_stage(
+    run: RunDirectory, tuning: VendorTuning, answers: Sequence[VendorAnswer], known: tuple[MachineFile, str] | None
+) -> Stage:
+    """Take over what the drive answered; the machine file is written where one was given to complete.
+
+    Raises
+    ------
+    IdentificationError
+        A result is a number that no machine has.
+    """
+    by_name = {name: answer for answer in answers for name in answer.values}
+    values = vendor_estimates(tuning, by_name)
+    made = vendor_machine(known, values)
+    files = {ANSWERS: ""}
+    if made.machine is not None:
+        run.save(MACHINE, dump_machine_file(made.machine))
+        files[MACHINE] = ""
+    source = "" if known is None else known[1]
+    ended = Acceptance("the drive's own steps that ended without an error", str(len(answers)), str(len(answers)), True)
+    summary = ", ".join(f"{name} {format_quantity(e.value, e.unit)}" for name, e in values.items())
+    return Stage(
+        "identify",
+        "pass",  # a step that fails ends the run
+        0.0,
+        values=[*(vendor_facts(name, estimate) for name, estimate in values.items()), *made.given_values(source)],
+        acceptance=[ended],
+        fallbacks=[f"{', '.join(values)}: {NO_INTERVAL}", *coarse_notes(tuning, by_name), *made.notes],
+        files=files,
+        summary=f"{summary} (the drive's own)" + (f"; {source}: {', '.join(made.given)}" if made.given else ""),
+    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The chain's stages on a drive that gives less than all: each runs as far as tier and map go, or says what it needs.
+"""The chain's stages on a drive that gives less than all: each runs as far as drive and map go, or says what it needs.
 
 A stage that cannot run raises ``NotAvailable``; the chain records it as not available and goes on. What runs is judged
 by the same criteria as on the reference drive.
@@ -7,11 +7,10 @@ by the same criteria as on the reference drive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pmsmtool.bus.connection import Connection
 from pmsmtool.commissioning.closed_stage import LIMITS, closed_stage, guaranteed, why_no_limits
 from pmsmtool.commissioning.design_stages import lut_stage, margins_stage, tune_stage
 from pmsmtool.commissioning.flash_stages import flash_stage, verify_stage
@@ -21,30 +20,29 @@ from pmsmtool.design.loops.margins import MarginRequest
 from pmsmtool.design.loops.open_loops import CURRENT_LOOPS, lacking_gains
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
-from pmsmtool.drive.recorded_means import RecordingDrive
-from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
-from pmsmtool.drive.tier_drives import ParameterDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.flash.journal import JournalFolder
-from pmsmtool.flash.map_gate import check_map, check_motion
-from pmsmtool.identification.replay import MACHINE, NAMEPLATE
-from pmsmtool.identification.request import QUANTITIES, IdentifyRequest
-from pmsmtool.identification.tier_evaluate import NO_POLE_PAIRS
-from pmsmtool.identification.tier_machine import NEEDED, tier_machine
+from pmsmtool.flash.map_gate import check_map
+from pmsmtool.identification.by_pulses import NO_POLE_PAIRS
+from pmsmtool.identification.completed_machine import NEEDED, completed_machine
+from pmsmtool.identification.request import QUANTITIES, IdentifyRequest, Method
+from pmsmtool.identification.run_files import MACHINE, NAMEPLATE
 from pmsmtool.identification.verdicts import blocking
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.measurement.capabilities import Capabilities, Method, Tier
-from pmsmtool.measurement.identify import identify_stage, nameplate_of
-from pmsmtool.measurement.tier_identify import OVER_TORQUE_CONSTANT, can_measure, tier_stage
-from pmsmtool.measurement.vendor_identify import chain_stage, vendor_line
+from pmsmtool.measurement.by_injection import nameplate_of
+from pmsmtool.measurement.by_pulses import OVER_TORQUE_CONSTANT, measurable
+from pmsmtool.measurement.by_vendor import vendor_line
+from pmsmtool.measurement.capabilities import Capabilities, Tier
+from pmsmtool.measurement.identify import OF_LEVEL, SET_UP, identify
+from pmsmtool.measurement.task import Allow, Say
+from pmsmtool.measurement.vendor_chain import identify_after_drive
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.proof.stage import ProofRequest, prove_stage
 from pmsmtool.run_directory import RunDirectory, Stage
 
 DATA_SHEET = "as given"
-SET_UP = "the drive's own set, from its maker's set-up"
+NO_AVERAGES = "means are made from records: the drive has no averages"
 RECORDER_STEPS = ("speed_step",)
 """Experiments of a proof that need no excitation: a speed reference while the drive records."""
 PREDICTED = ("speed.K_p_nms_per_rad", "speed.filter_hz")
@@ -54,35 +52,10 @@ NOT_SHOWN = (
     "closed-drive`)"
 )
 FOR_READING = "the drive has no object for the table"
-Allow = Callable[[Sequence[str]], None]
-Say = Callable[[str], None]
-
-
-def open_tier_drive(connection: Connection, node: int, found: Capabilities) -> CanopenDrive:
-    """Return the port that fits what a drive has.
-
-    Raises
-    ------
-    ConfigError
-        The map is that of another drive: nothing is moved or written through it.
-    NotAvailable
-        It lacks what even its tier needs.
-    """
-    check_motion(found.drive_map, found.identity)
-    kinds: dict[Tier, type[CanopenDrive]] = {
-        Tier.FULL: CanopenDrive,
-        Tier.INJECT: RecordingDrive,
-        Tier.RECORDER: RecorderDrive,
-        Tier.STANDARD: StandardDrive,
-    }
-    kind = CanopenDrive if found.unsafe else kinds.get(found.tier, ParameterDrive)
-    if kind is RecorderDrive and not found.drive_map.staging:
-        kind = MappedRecorderDrive
-    return kind(connection, node, drive_map=found.drive_map)
 
 
 @dataclass(frozen=True, slots=True)
-class TierStages:
+class LevelStages:
     """The stages of one run on one drive below the full tier.
 
     Parameters
@@ -90,7 +63,7 @@ class TierStages:
     run : RunDirectory
         Where everything goes.
     drive : CanopenDrive
-        As :func:`open_tier_drive` gives it.
+        As ``identify.open_for_level`` gives it.
     found : Capabilities
         What the drive has.
     nameplate : MachineFile or None
@@ -141,7 +114,7 @@ class TierStages:
     # ---- the stages -----------------------------------------------------------------------------
 
     def identify(self, request: IdentifyRequest, allow: Allow, say: Say) -> Stage:
-        """Measure what the tier can; the machine file is completed by what was given.
+        """Measure what the drive allows; the machine file is completed by what was given.
 
         Where nothing can be measured and a machine file was given, the stage is not available and that file stands in
         the run, its values as given.
@@ -153,24 +126,27 @@ class TierStages:
         PmsmtoolError
             As the experiments end.
         """
+        run, drive, found = self.run, self.drive, self.found
+        if found.tier is Tier.INJECT:
+            given = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
+            stage = identify(run, drive, request, allow, say, found=found, known=given)
+            return replace(stage, fallbacks=(*stage.fallbacks, NO_AVERAGES))
         known = self.known()
-        if self.found.tier is Tier.INJECT:
-            return self._by_injection(request, allow, say)
         if known is not None:
-            self.run.save(NAMEPLATE, dump_machine_file(known[0]))
+            run.save(NAMEPLATE, dump_machine_file(known[0]))
         reason = self._nothing()
+        asked = replace(request, quantities=tuple(self._quantities()))
         if self._own_line() and request.shaft != "locked":
-            asked = replace(request, quantities=tuple(self._quantities()))
-            return _stopped(chain_stage(self.run, self.drive, self.found, asked, allow, say, known=known))
+            return _stopped(identify_after_drive(run, drive, asked, allow, say, found=found, known=known))
         if not reason and request.shaft == "locked":
             reason = "needs a rotor that may turn, and the shaft is locked"
         if not reason:
-            asked = replace(request, quantities=tuple(self._quantities()))
-            return _stopped(tier_stage(self.run, self.drive, self.found, asked, allow, say, known=known))
+            method = OF_LEVEL[found.tier]
+            return _stopped(identify(run, drive, asked, allow, say, method=method, found=found, known=known))
         if known is not None:
-            made = tier_machine(known[0], {}, known[1])
+            made = completed_machine(known[0], {}, known[1])
             assert made.machine is not None
-            self.run.save(MACHINE, dump_machine_file(made.machine))
+            run.save(MACHINE, dump_machine_file(made.machine))
             return Stage(
                 "identify", "not available", 0.0, values=made.given_values(known[1]), files={MACHINE: ""}, note=reason
             )
@@ -229,8 +205,7 @@ class TierStages:
         if not self.found.drive_map.staging:
             return known
         if known is None:
-            name = self.found.identity.name or f"drive {self.found.identity.serial:#010x}"
-            known = nameplate_of(self.drive, name), SET_UP
+            known = nameplate_of(self.drive), SET_UP
         offset, reverse = (self.drive.read(f"encoder.{name}") for name in ("offset_rad", "reversed"))
         encoder = replace(known[0].encoder, offset_rad=offset, direction=-1 if reverse else 1)
         return replace(known[0], encoder=encoder), known[1]
@@ -241,7 +216,7 @@ class TierStages:
     def _measurable(self) -> list[str]:
         if self.found.tier is Tier.INJECT:
             return [", ".join(QUANTITIES)]
-        told = can_measure(self.drive, self.found, self.nameplate)
+        told = measurable(OF_LEVEL.get(self.found.tier, Method.STANDARD), self.found, self.nameplate)
         return [*self._own_line(), *(line for line in told if line != OVER_TORQUE_CONSTANT)]
 
     def _own_line(self) -> list[str]:
@@ -301,11 +276,6 @@ class TierStages:
         if self.found.tier is Tier.INJECT:
             return "speed step, current steps, unreachable reference, field weakening"
         return "speed step; the others need excitation"
-
-    def _by_injection(self, request: IdentifyRequest, allow: Allow, say: Say) -> Stage:
-        known = self.nameplate or nameplate_of(self.drive, self.found.identity.name)
-        stage = identify_stage(self.run, self.drive, known, request, allow, say)
-        return replace(stage, fallbacks=(*stage.fallbacks, "means are made from records: the drive has no averages"))
 
     def _refuse(self, reason: str) -> None:
         if reason:

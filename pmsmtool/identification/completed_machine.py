@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The machine file of a tier that measures a part of it: what was measured, and the rest as it was given, by source.
+"""The machine file where a part is measured: that part, and the rest as it was given, by source.
 
 Nothing is made up: a value that was neither measured nor given is named as lacking, and there is no machine file.
 """
@@ -29,8 +29,8 @@ PER_PSI = {"J_per_psi": "J_kgm2", "tau_c_per_psi": "tau_c_nm"}
 
 
 @dataclass(frozen=True, slots=True)
-class TierMachine:
-    """What is known of a machine after a tier's experiments.
+class CompletedMachine:
+    """What is known of a machine after an identification without injection.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class TierMachine:
         ]
 
 
-def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], source: str) -> TierMachine:
+def completed_machine(known: MachineFile | None, found: Mapping[str, Estimate], source: str) -> CompletedMachine:
     """Put measured values into a machine that is known otherwise.
 
     Parameters
@@ -72,7 +72,7 @@ def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], sourc
     """
     if known is None:
         told = {"psi_f_wb", "pole_pairs", "R_s_ohm"} & set(found)
-        return TierMachine(None, tuple(sorted(told)), ())
+        return CompletedMachine(None, tuple(sorted(told)), ())
     values, notes = _at_reference(known, found)
     psi = _flux_of_the_run(known, values.get("psi_f_wb"))
     for ratio, key in PER_PSI.items():
@@ -97,13 +97,13 @@ def tier_machine(known: MachineFile | None, found: Mapping[str, Estimate], sourc
         provenance={"source": f"measured: {', '.join(measured) or 'nothing'}; {source}: {', '.join(given)}"},
         simulation={},
     )
-    return TierMachine(machine, measured, given, (*notes, *more))
+    return CompletedMachine(machine, measured, given, (*notes, *more))
 
 
 def _at_reference(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[dict[str, Estimate], tuple[str, ...]]:
     """Return the measured values; the flux linkage of an unknown temperature with the doubt that leaves.
 
-    The resistance has that already, and where temperatures are known both are at the reference (``tier_evaluate``).
+    The resistance has that already, and where temperatures are known both are at the reference (``by_pulses``).
     """
     values = {name: estimate for name, estimate in found.items() if name in MEASURABLE}
     notes = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,18 +15,18 @@ from click.testing import CliRunner
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
 from pmsmtool.commissioning.commission import begin_run
-from pmsmtool.commissioning.tier_stages import open_tier_drive
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.errors import ConfigError, NotAvailable, Partial
+from pmsmtool.errors import ConfigError, Declined, NotAvailable, Partial
 from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.identification.replay import MACHINE, NAMEPLATE, REPLAYED
-from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.tier_evaluate import FACTS, TierFacts, below_voltage, parse_facts, replay
-from pmsmtool.identification.vendor_machine import ANSWERS
+from pmsmtool.identification.by_pulses import FACTS, PulseFacts, below_voltage, read_facts
+from pmsmtool.identification.by_vendor import ANSWERS
+from pmsmtool.identification.replay import replay
+from pmsmtool.identification.request import IdentifyRequest, Method
+from pmsmtool.identification.run_files import MACHINE, NAMEPLATE, REPLAYED
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.measurement.capabilities import Capabilities, examine
-from pmsmtool.measurement.tier_identify import tier_stage
+from pmsmtool.measurement.identify import OF_LEVEL, identify, open_for_level
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.sim.bus import PmsmSimBus
@@ -44,7 +44,7 @@ def opened(options: str) -> Iterator[tuple[CanopenDrive, Capabilities]]:
         node = DriveNode(connection, 1)
         found = examine(node)
         node.close()
-        drive = open_tier_drive(connection, 1, found)
+        drive = open_for_level(connection, 1, found)
         yield drive, found
         drive.close()
 
@@ -58,13 +58,31 @@ def measured(
         if known is not None:
             run.save(NAMEPLATE, dump_machine_file(known))
         pair = None if known is None else (known, SHEET)
-        stage = tier_stage(run, drive, found, request, lambda lines: None, lambda text: None, known=pair)
+        method = OF_LEVEL[found.tier]
+        stage = identify(run, drive, request, lambda lines: None, method=method, found=found, known=pair)
     run.add(stage)
     return run, stage
 
 
 def told(stage: Stage) -> str:
     return json.dumps([list(stage.values), stage.summary, stage.status, list(stage.fallbacks)])
+
+
+@pytest.mark.parametrize(("method", "told"), [(Method.RECORDER, "recorded"), (Method.STANDARD, "polled")])
+def test_the_method_asked_for_is_the_one_that_runs(method: Method, told: str, tmp_path: Path) -> None:
+    """A drive with a recorder was always pushed by recorded pulses, one with injection by polled ones."""
+    lines: list[str] = []
+
+    def declined(plan: Sequence[str]) -> None:
+        lines.extend(plan)
+        raise Declined("no")
+
+    for options in ("&tier=recorder", ""):
+        with opened(options) as (drive, found), pytest.raises(Declined):
+            request = IdentifyRequest(("psi", "mechanics"), speed_max_rad_s=100.0)
+            known = load_machine_file(PROFILE), SHEET
+            identify(RunDirectory(tmp_path), drive, request, declined, method=method, found=found, known=known)
+    assert sum(f"{told} torque pulses" in line for line in lines) == 2 and not list(tmp_path.iterdir())
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +139,7 @@ def test_a_run_without_a_machine_file_is_replayed_from_the_command_line(tmp_path
     assert stage.status == "partial" and list(stage.refused) == ["psi"] and needed in stage.refused["psi"]
     assert json.loads(outcome.stdout)["values"] == json.loads(told(stage))[0]
 
-    facts = parse_facts((run.path / FACTS).read_text(encoding="utf-8"), where="")
+    facts = read_facts(run)
     assert facts.traces[:2] == ("rotation_forward", "rotation_backward") and facts.pushed and facts.voltage == "link"
     run.save(FACTS, "{}")
     with pytest.raises(ConfigError, match="the record of the capability level is damaged"):
@@ -132,7 +150,7 @@ def test_a_run_without_a_machine_file_is_replayed_from_the_command_line(tmp_path
 
 
 def test_what_the_flux_linkage_needs_is_a_speed_in_numbers() -> None:
-    facts = TierFacts("standard", pole_pairs=3, pushed=True, voltage="link", top_rpm=1000.0, U_dc_v=540.0)
+    facts = PulseFacts(Method.STANDARD, pole_pairs=3, pushed=True, voltage="link", top_rpm=1000.0, U_dc_v=540.0)
     text = below_voltage(facts, 0.5, 0.5)
     assert "up to 1000 rpm it did not" in text and "it ends at about 1719 rpm with 540 V" in text  # 540 / 2 / 0.5 / 3
     assert "given flux linkage" not in below_voltage(facts, 0.5, 0.0)

@@ -6,13 +6,13 @@ friction over the flux linkage from torque pushes; the flux linkage from the vol
 drive shows it, else from the speed at which the voltage ends.
 ``recorder``: resistance, flux linkage, L_q and inertia from recorded torque pulses.
 
-What the traces tell is decided in ``tier_evaluate``.
+What the traces say is decided in ``identification/by_pulses``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from pmsmtool.cia402 import HOMING_LOST
@@ -29,24 +29,24 @@ from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, pu
 from pmsmtool.experiments.recorded_push import PushPlan, swing
 from pmsmtool.experiments.rotation import STEP_RAD, RotationPlan, dwell_within, rotate_vector
 from pmsmtool.experiments.shaft_answer import ShaftAnswer
-from pmsmtool.experiments.supply_levels import LEVELS, ReadSupply, hold_supply_levels
+from pmsmtool.experiments.supply_levels import LEVELS, hold_supply_levels
 from pmsmtool.experiments.vector_turn import lead_onto_vector
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
-from pmsmtool.identification.tier_evaluate import (
+from pmsmtool.identification.by_pulses import (
     FACTS,
     NO_POLE_PAIRS,
     SUPPLY_LEVELS,
-    TierFacts,
+    PulseFacts,
     Voltage,
     dump_facts,
     evaluated_stage,
 )
+from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.measurement.capabilities import QUANTITIES, Capabilities, Method
+from pmsmtool.measurement.capabilities import QUANTITIES, Capabilities
 from pmsmtool.measurement.limits import DURATION_S
-from pmsmtool.run_directory import RunDirectory, Stage
+from pmsmtool.measurement.task import Keep, Say, Task
+from pmsmtool.run_directory import Stage
 from pmsmtool.trace import Trace
-from pmsmtool.trace_file import trace_npz
 from pmsmtool.units import RAD_S_PER_RPM
 
 TURNS = ((0.35, 0.035), (0.7, 0.08))
@@ -71,11 +71,9 @@ UNLIMITED_RPM = 1000.0
 HEADROOM = 1.2
 """Largest current of the envelope over the test current."""
 RPM = RAD_S_PER_RPM
-Keep = Callable[[str, Trace], None]
-Say = Callable[[str], None]
 
 
-def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Say) -> TierFacts:
+def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Say) -> PulseFacts:
     """Turn a current vector through one mechanical turn each way; the drive is off on return.
 
     Raises
@@ -101,10 +99,10 @@ def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Sa
             except IdentificationError as error:
                 if error.reason not in OFF_THE_VECTOR or share == TURNS[-1][0]:
                     raise
-    return TierFacts("standard")
+    return PulseFacts(Method.STANDARD)
 
 
-def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say) -> TierFacts:
+def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say) -> PulseFacts:
     """Push the shaft by torque and poll it; run it up to its voltage, or let it coast; the drive is off on return.
 
     Raises
@@ -141,8 +139,8 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say)
             if top is not None:
                 keep("voltage_limit", top)
     voltage: Voltage = "machine" if shows_voltage else "link" if U_dc > 0.0 else ""
-    return TierFacts(
-        "standard", pushed=True, voltage=voltage, top_rpm=plan.omega_top_rad_s / RPM, U_dc_v=max(0.0, U_dc),
+    return PulseFacts(
+        Method.STANDARD, pushed=True, voltage=voltage, top_rpm=plan.omega_top_rad_s / RPM, U_dc_v=max(0.0, U_dc),
         current_undecided=drive.current_undecided, limit="".join(limit),
     )  # fmt: skip
 
@@ -162,7 +160,7 @@ def _link_v(drive: TorqueCurrent) -> float:
         return 0.0
 
 
-def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: Say) -> TierFacts:
+def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: Say) -> PulseFacts:
     """Swing the shaft by torque pushes and record them; the drive is off on return.
 
     Raises
@@ -195,8 +193,8 @@ def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: 
 
         swing(guard, plan, keep, answered)
     T_winding_c, T_magnet_c = (_temperature(drive, name) for name in ("T_winding_c", "T_magnet_c"))
-    return TierFacts(
-        "recorder", drive.period_s, pole_pairs, T_winding_c, T_magnet_c, limit="".join(limit),
+    return PulseFacts(
+        Method.RECORDER, drive.period_s, pole_pairs, T_winding_c, T_magnet_c, limit="".join(limit),
     )  # fmt: skip
 
 
@@ -209,7 +207,7 @@ def _temperature(drive: RecorderDrive, name: str) -> float | None:
     return shown if math.isfinite(shown) else None
 
 
-def tier_envelope(drive: CanopenDrive, request: IdentifyRequest, known: MachineFile | None = None) -> Envelope:
+def envelope_of(drive: CanopenDrive, request: IdentifyRequest, known: MachineFile | None = None) -> Envelope:
     """Return the motion envelope: what the request says, else the least of the drive's ratings and the machine's.
 
     Raises
@@ -256,29 +254,28 @@ def tier_envelope(drive: CanopenDrive, request: IdentifyRequest, known: MachineF
     )
 
 
-def can_measure(
-    drive: CanopenDrive,
-    found: Capabilities,
-    known: MachineFile | None = None,
-    asked: Sequence[str] = QUANTITIES,
+def measurable(
+    method: Method, found: Capabilities, known: MachineFile | None = None, asked: Sequence[str] = QUANTITIES
 ) -> list[str]:
-    """Return what the tier's experiments tell, one line each; empty when nothing can be measured.
+    """Return what the experiments of a method identify, one line each; empty when nothing can be measured.
 
     Parameters
     ----------
+    method : Method
+        Recorder or standard.
     known : MachineFile, optional
-        What is given; torque pushes need the pole pairs from it, from mode 11 or from the drive's map.
+        What is given; torque pulses need the pole pairs from it, from mode 11 or from the drive's map.
     asked : sequence of str
         Quantities.
     """
-    if isinstance(drive, RecorderDrive):
+    if method is Method.RECORDER:
         return ["R, psi, L_q, J, tau_c from recorded torque pulses"]
     lines = []
-    turns = found.row("poles", Method.STANDARD).available
+    turns = found.row("poles", method).available
     if turns and {"poles", "encoder"} & set(asked):
         lines.append("pole pairs, direction, offset from a vector turned by the commutation angle")
     pole_pairs = turns or known is not None or "motor.pole_pairs" in found.drive_map.cells
-    available = found.row("mechanics", Method.STANDARD).available
+    available = found.row("mechanics", method).available
     if available and pole_pairs and {"psi", "mechanics"} & set(asked):
         lines.append("J/psi, tau_c/psi from polled torque pulses, psi from the voltage limit or the coasting machine")
     elif available and "mechanics" in asked:
@@ -286,115 +283,94 @@ def can_measure(
     return lines
 
 
-def tier_stage(
-    run: RunDirectory,
-    drive: CanopenDrive,
-    found: Capabilities,
-    request: IdentifyRequest,
-    allow_motion: Callable[[Sequence[str]], None],
-    say: Callable[[str], None],
-    *,
-    known: tuple[MachineFile, str] | None = None,
-    read_supply: ReadSupply | None = None,
-) -> Stage:
-    """Run the tier's experiments, keep their traces, and write the machine file where it is whole.
+# ---- the rows of the table of methods ---------------------------------------------------------------
 
-    Parameters
-    ----------
-    drive : CanopenDrive
-        A ``RecorderDrive``, or a drive of the standard tier.
-    found : Capabilities
-        What it has.
-    request : IdentifyRequest
-        ``poles`` or ``encoder`` asks for the turned vector, ``psi`` or ``mechanics`` for torque pushes.
-    known : MachineFile and its source, optional
-        What completes the measured values.
-    read_supply : ReadSupply, optional
-        Reads the bench supply where R was asked for at the standard tier.
 
-    Raises
-    ------
-    NotAvailable
-        The shaft is locked, the pole pairs are not known, or nothing that was asked for could be identified.
-    Declined
-        The person did not consent; nothing was moved.
-    IdentificationError, StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
-        As the experiments end.
-    """
-    if request.shaft == "locked":
+def plan_recorded(task: Task) -> tuple[Envelope, list[str]]:
+    """Return envelope and plan of the recorded torque pulses; refuses a locked shaft."""
+    return _plan(task, measurable(Method.RECORDER, task.found))
+
+
+def plan_polled(task: Task) -> tuple[Envelope, list[str]]:
+    """Return envelope and plan of the standard method; refuses a locked shaft and what cannot be measured."""
+    lines = measurable(Method.STANDARD, task.found, task.machine, task.request.quantities)
+    if task.read_supply is not None and task.found.row("R", Method.STANDARD).available:
+        lines.append(f"R from the power of a bench supply, read {len(LEVELS)} times")
+    return _plan(task, lines)
+
+
+def _plan(task: Task, lines: Sequence[str]) -> tuple[Envelope, list[str]]:
+    if task.request.shaft == "locked":
         raise NotAvailable("without injection the rotor must turn, and the shaft is locked", hint="free the shaft")
-    envelope = tier_envelope(drive, request, None if known is None else known[0])
+    envelope = envelope_of(task.drive, task.request, task.machine)
     envelope.refuse_gravity()
-    moves = can_measure(drive, found, None if known is None else known[0], request.quantities)
-    if read_supply is not None and found.row("R", Method.STANDARD).available:
-        moves.append(f"R from the power of a bench supply, read {len(LEVELS)} times")
-    if not moves:
+    if not lines:
         raise NotAvailable(
             NO_POLE_PAIRS,
-            where=f"node {drive.node.node}",
+            where=f"node {task.drive.node.node}",
             hint="`pmsmtool commission MACHINE` takes them from a machine file (`pmsmtool machine new` writes one)",
         )
-    moves.append(f"the shaft does not come back to where it stood: {HOMING_LOST}")
-    stored = "nothing is stored in the drive; every changed object is restored"
-    allow_motion([*envelope.lines(), *found.replaced, *moves, stored])
-    clock = drive.node.connection.clock
-    start = clock.now()
-    names: dict[str, None] = {}
+    moved = f"the shaft does not come back to where it stood: {HOMING_LOST}"
+    return envelope, [*task.found.replaced, *lines, moved]
 
-    def keep(name: str, trace: Trace) -> None:
-        run.save(f"traces/{name}.npz", trace_npz(trace))
+
+def measure_recorded(task: Task, envelope: Envelope, keep: Keep, say: Say) -> PulseFacts:
+    """Swing the shaft by recorded torque pulses."""
+    assert isinstance(task.drive, RecorderDrive)
+    names: dict[str, None] = {}
+    facts = swing_and_record(task.drive, envelope, _noting(names, keep), say)
+    return _facts(task, facts, names)
+
+
+def measure_polled(task: Task, envelope: Envelope, keep: Keep, say: Say) -> PulseFacts:
+    """Turn the vector where the drive takes an angle, then push by torque where the pole pairs are then known."""
+    drive, found = task.drive, task.found
+    assert isinstance(drive, StandardDrive)
+    names: dict[str, None] = {}
+    keep = _noting(names, keep)
+    facts = PulseFacts(Method.STANDARD, pole_pairs=_given_pole_pairs(task))
+    asked = set(task.request.quantities)
+    turns = bool(asked & {"poles", "encoder"}) and found.row("poles", Method.STANDARD).available
+    if task.read_supply is not None and "R" in asked and found.row("R", Method.STANDARD).available:
+        i_a = envelope.i_max_apk / HEADROOM
+        keep(SUPPLY_LEVELS, hold_supply_levels(drive, envelope, i_a, task.read_supply, say))
+    if turns:
+        turn_both_ways(drive, envelope, keep, say)
+    told = {"psi", "mechanics"} if turns or facts.pole_pairs else {"mechanics"}
+    if asked & told and found.row("mechanics", Method.STANDARD).available:
+        pushing = pushing_drive(drive.node.connection, drive.node.node, found.drive_map)
+        try:
+            facts = replace(push_by_torque(pushing, envelope, keep, say), pole_pairs=facts.pole_pairs)
+        finally:
+            drive.may_be_energised = drive.may_be_energised or pushing.may_be_energised
+            pushing.close()
+    return _facts(task, facts, names)
+
+
+def evaluate(task: Task, facts: PulseFacts) -> Stage:
+    """Evaluate what is stored in the run."""
+    task.run.save(FACTS, dump_facts(facts))
+    return evaluated_stage(task.run, facts, task.request, task.machine)
+
+
+def _noting(names: dict[str, None], keep: Keep) -> Keep:
+    """Return what keeps a trace and notes its name, in the order they are taken."""
+
+    def noted(name: str, trace: Trace) -> None:
+        keep(name, trace)
         names[name] = None
 
-    if isinstance(drive, RecorderDrive):
-        facts = swing_and_record(drive, envelope, keep, say)
-    else:
-        facts = _standard(drive, found, request, envelope, known, keep, say, read_supply)
-    facts = replace(facts, source="" if known is None else known[1], traces=tuple(names))
-    run.save(REQUEST, dump_request(request))
-    run.save(FACTS, dump_facts(facts))
-    stage = evaluated_stage(run, facts, request, None if known is None else known[0])
-    return replace(stage, seconds=clock.now() - start)
+    return noted
 
 
-def _standard(
-    drive: CanopenDrive,
-    found: Capabilities,
-    request: IdentifyRequest,
-    envelope: Envelope,
-    known: tuple[MachineFile, str] | None,
-    keep: Keep,
-    say: Say,
-    read_supply: ReadSupply | None,
-) -> TierFacts:
-    """Turn the vector where the drive takes an angle, then push by torque where the pole pairs are then known."""
-    connection, node = drive.node.connection, drive.node.node
-    facts = TierFacts("standard", pole_pairs=_given_pole_pairs(drive, known))
-    asked = set(request.quantities)
-    turns = bool(asked & {"poles", "encoder"}) and found.row("poles", Method.STANDARD).available
-    reads = "R" in asked and found.row("R", Method.STANDARD).available
-    if reads or turns:
-        turning = drive if type(drive) is StandardDrive else StandardDrive(connection, node, drive_map=found.drive_map)
-        if reads and read_supply is not None:
-            i_a = envelope.i_max_apk / HEADROOM
-            keep(SUPPLY_LEVELS, hold_supply_levels(turning, envelope, i_a, read_supply, say))
-        if turns:
-            turn_both_ways(turning, envelope, keep, say)
-    told = {"psi", "mechanics"} if turns or facts.pole_pairs else {"mechanics"}
-    if not asked & told or not found.row("mechanics", Method.STANDARD).available:
-        return facts
-    pushing = pushing_drive(connection, node, found.drive_map)
-    try:
-        pushed = push_by_torque(pushing, envelope, keep, say)
-    finally:
-        drive.may_be_energised = drive.may_be_energised or pushing.may_be_energised
-        pushing.close()
-    return replace(pushed, pole_pairs=facts.pole_pairs)
+def _facts(task: Task, facts: PulseFacts, names: dict[str, None]) -> PulseFacts:
+    return replace(facts, source="" if task.known is None else task.known[1], traces=tuple(names))
 
 
-def _given_pole_pairs(drive: CanopenDrive, known: tuple[MachineFile, str] | None) -> int:
-    """Return the pole pairs as given, else as the maker's set-up left them in the drive; 0 when neither tells them."""
-    if known is not None:
-        return known[0].machine.pole_pairs
-    if "motor.pole_pairs" in drive.node.map.cells:
-        return round(drive.parameters.read_value("motor.pole_pairs"))
+def _given_pole_pairs(task: Task) -> int:
+    """Return the pole pairs as given, else as the maker's set-up left them in the drive; 0 when neither has them."""
+    if task.machine is not None:
+        return task.machine.machine.pole_pairs
+    if "motor.pole_pairs" in task.drive.node.map.cells:
+        return round(task.drive.parameters.read_value("motor.pole_pairs"))
     return 0

@@ -9,8 +9,9 @@ import pytest
 
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.resistance import Copper, copper_of
-from pmsmtool.identification.tier_evaluate import TierFacts, TierResult, tier_result
-from pmsmtool.identification.tier_machine import UNKNOWN_TEMPERATURE_K, tier_machine
+from pmsmtool.identification.by_pulses import PulseFacts, PulseResult, pulse_result
+from pmsmtool.identification.completed_machine import UNKNOWN_TEMPERATURE_K, completed_machine
+from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
 from tests.estimators.test_recorded_push import PAIRS, T_S, swing
@@ -19,23 +20,23 @@ WARM_C, RISE_K, ALPHA, ALPHA_PSI = 60.0, 40.0, 0.00393, -0.0012
 TOLERANCE = SensorTolerance()
 
 
-def told(T_c: float | None, **known: object) -> TierResult:
-    facts = TierFacts("recorder", T_S, PAIRS, T_winding_c=T_c, T_magnet_c=T_c)
+def told(T_c: float | None, **known: object) -> PulseResult:
+    facts = PulseFacts(Method.RECORDER, T_S, PAIRS, T_winding_c=T_c, T_magnet_c=T_c)
     traces = {f"push_{k}": trace for k, trace in enumerate(swing())}
-    return tier_result(traces, facts, TOLERANCE, **known)  # type: ignore[arg-type]
+    return pulse_result(traces, facts, TOLERANCE, **known)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def warm() -> TierResult:
+def warm() -> PulseResult:
     return told(WARM_C)
 
 
 @pytest.fixture(scope="module")
-def unknown() -> TierResult:
+def unknown() -> PulseResult:
     return told(None)
 
 
-def test_resistance_and_flux_are_told_at_the_reference_temperature(warm: TierResult, unknown: TierResult) -> None:
+def test_resistance_and_flux_are_told_at_the_reference_temperature(warm: PulseResult, unknown: PulseResult) -> None:
     """Nobody says how much of the loop is copper: what devices may be of it widens the interval."""
     R, raw = warm.estimates["R_s_ohm"], unknown.estimates["R_s_ohm_measured"]
     factor = 1.0 + ALPHA * RISE_K
@@ -49,7 +50,7 @@ def test_resistance_and_flux_are_told_at_the_reference_temperature(warm: TierRes
     assert warm.estimates["L_q_app_h"] == unknown.estimates["L_q_app_h"]
 
 
-def test_a_temperature_nobody_knows_is_said(unknown: TierResult) -> None:
+def test_a_temperature_nobody_knows_is_said(unknown: PulseResult) -> None:
     R, raw = unknown.estimates["R_s_ohm"], unknown.estimates["R_s_ohm_measured"]
     assert R.fallback.startswith("winding temperature unknown: R_s as measured") and R.value == raw.value
     hot = 1.0 - 1.0 / (1.0 + ALPHA * 70.0)  # of the winding at 90 degC: farther off than at 5 degC
@@ -58,7 +59,7 @@ def test_a_temperature_nobody_knows_is_said(unknown: TierResult) -> None:
     assert math.isnan(unknown.estimates["R_s_ohm"].T_c)
 
 
-def test_a_known_winding_leaves_no_doubt_about_the_devices(warm: TierResult, unknown: TierResult) -> None:
+def test_a_known_winding_leaves_no_doubt_about_the_devices(warm: PulseResult, unknown: PulseResult) -> None:
     raw = unknown.estimates["R_s_ohm_measured"]
     R = told(WARM_C, copper=Copper(R_winding_ohm=0.3)).estimates["R_s_ohm"]
     assert R.value == pytest.approx(raw.value - 0.3 * ALPHA * RISE_K)
@@ -66,18 +67,18 @@ def test_a_known_winding_leaves_no_doubt_about_the_devices(warm: TierResult, unk
 
 
 def test_a_machine_takes_the_values_once_and_inertia_by_the_flux_of_the_run(
-    warm: TierResult, unknown: TierResult
+    warm: PulseResult, unknown: PulseResult
 ) -> None:
     """J/psi was measured with warm magnets: with the flux at the reference temperature J would be 5 % too large."""
     known = load_machine_file(machine_path("interior-2k2"))
     assert copper_of(known) == Copper(known.machine.T_ref_c, known.machine.alpha_R_per_k)
-    made = tier_machine(known, warm.estimates, "as given").machine
+    made = completed_machine(known, warm.estimates, "as given").machine
     assert made is not None and made.machine.J_kgm2 is not None
     assert made.machine.R_s_ohm == warm.estimates["R_s_ohm"].value
     psi, ratio = warm.estimates["psi_f_wb"].value, warm.estimates["J_per_psi"].value
     assert made.machine.psi_f_wb == psi
     assert made.machine.J_kgm2 == pytest.approx(ratio * psi * (1.0 + ALPHA_PSI * RISE_K))
-    cold = tier_machine(known, unknown.estimates, "as given")
+    cold = completed_machine(known, unknown.estimates, "as given")
     assert cold.machine is not None and any("no sensor shows its temperature" in note for note in cold.notes)
     assert cold.machine.systematic["R_s_ohm"] == unknown.estimates["R_s_ohm"].systematic, "not widened twice"
     assert cold.machine.estimates["R_s_ohm_measured"] == unknown.estimates["R_s_ohm_measured"]
