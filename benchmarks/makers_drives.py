@@ -197,7 +197,8 @@ def flashed(channel: str, family: str) -> tuple[str, str]:
 
 def wrong_units(objects: MakersObjects, machine: MachineFile, family: str) -> tuple[int, list[str]]:
     """Count the rows of a map that the node knows in units of its own, and name those that differ."""
-    motor = set_up_of(machine)
+    drive = ForeignDrive(objects, set_up_of(machine))
+    motor = drive.set_up
     true = {
         "motor.pole_pairs": float(motor.pole_pairs), "motor.R_s_ohm": motor.R_s_ohm, "motor.L_q_h": motor.L_q_h,
         "motor.psi_f_wb": motor.torque_constant / torque_per_ampere(motor.pole_pairs, 1.0),
@@ -205,7 +206,7 @@ def wrong_units(objects: MakersObjects, machine: MachineFile, family: str) -> tu
         "motor.n_max_rpm": motor.n_max_rpm, "reference.tau_rated_nm": motor.torque_nm,
         "current.K_p_q_v_per_a": motor.K_p_v_per_a, "current.K_i_q_v_per_as": motor.K_i_v_per_as,
     }  # fmt: skip
-    drive_map, laws = load_family(family), ForeignDrive(objects, motor).laws
+    drive_map, laws = load_family(family), drive.laws
     wanted = ParameterSet({name: true[name] for name in drive_map.cells if name in true})
     judged, wrong = 0, []
     for name in wanted.values:

@@ -107,7 +107,7 @@ def _check_below_full(
     """Ask, and check what the drive's level lets be seen."""
     from pmsmtool.cia402 import HOMING_LOST
     from pmsmtool.cli.consent import ask_motion
-    from pmsmtool.commissioning.first_check_tiers import check_below_full, envelope_below_full
+    from pmsmtool.commissioning.first_check_tiers import check_below_full, envelope_below_full, turns_a_vector
     from pmsmtool.errors import ConfigError, NotAvailable
     from pmsmtool.identification.request import IdentifyRequest, Method
     from pmsmtool.machine.machine_file import load_machine_file
@@ -135,7 +135,8 @@ def _check_below_full(
         envelope.refuse_gravity()
         lines = [
             *envelope.lines(),
-            f"torque pulses turn the shaft by at most half a turn; {HOMING_LOST}",
+            f"{'a turned vector leads' if turns_a_vector(found) else 'torque pulses turn'} the shaft by at most half a "
+            f"turn; {HOMING_LOST}",
             f"capability level {found.tier}: what it cannot show is listed as NOT CHECKED",
             "nothing is stored in the drive; every changed object is restored",
         ]

@@ -123,6 +123,8 @@ def commission_command(
     from pmsmtool.commissioning.commission import Commissioning, begin_run
     from pmsmtool.commissioning.compared_stage import check_accepted
     from pmsmtool.errors import ConfigError
+    from pmsmtool.flash.journal import JournalFolder
+    from pmsmtool.flash.map_gate import forget_map
     from pmsmtool.run_directory import RunDirectory
 
     if rehearse is not None or eds is not None:
@@ -149,6 +151,8 @@ def commission_command(
                 f"--drive-bandwidth-hz: for a drive that cannot be reflashed, and {found.drive_map.name!r} is none",
                 hint="leave it out: the designed gains can be written to this drive",
             )
+        if begun is None and _starts_blank(bus):
+            forget_map(JournalFolder(found.identity))
         run = begun or begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=_recorded(bus), tier=found.tier)
         progress = StageProgress(out)
         person = _Person(run, drive, bus, motion, out, progress)
@@ -224,6 +228,12 @@ def _as_begun(bus: BusOptions, run: RunDirectory) -> BusOptions:
     if bus.interface is None and bus.channel is None:
         bus = replace(bus, **{key: recorded.get(key) for key in _recorded(bus)})
     return replace(bus, node=recorded.get("node")) if bus.node is None else bus
+
+
+def _starts_blank(bus: BusOptions) -> bool:
+    """Whether the drive is a simulated one without a memory of its own file: nothing was written to it before."""
+    channel = str(bus.channel or "")
+    return bus.simulated() and ("nv=" not in channel or "nv=:memory:" in channel)
 
 
 def _erase_memory(bus: BusOptions, out: Output) -> None:

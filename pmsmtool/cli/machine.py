@@ -8,10 +8,29 @@ from typing import Any
 
 import click
 
-from pmsmtool.cli.options import CURRENT, FILE, FREQUENCY, TIME, Quantity, examples, output_options
+from pmsmtool.cli.options import FILE, FREQUENCY, TIME, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, table
 from pmsmtool.files import write_file
 
+
+class _LineCurrent(click.ParamType[float]):
+    """A line current of a datasheet, as A peak."""
+
+    name = "current"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return A peak; click's error names the option."""
+        from pmsmtool.errors import ConfigError
+        from pmsmtool.machine.datasheet import line_current
+
+        try:
+            return value if isinstance(value, float) else line_current(str(value))
+        except ConfigError as error:
+            parts = (error.what, error.likely, error.hint, "'9A block' is the direct current of block commutation")
+            self.fail("; ".join(part for part in parts if part), param, ctx)
+
+
+_LINE_CURRENT = _LineCurrent()
 _BETWEEN = click.Choice(["line-line", "phase"])
 _SOURCE = click.Choice(["datasheet", "meter", "guess"])
 
@@ -60,11 +79,11 @@ class _AllMissingAtOnce(click.Command):
 @click.option("--l-d", "L_d_h", type=Quantity("inductance"), help="d inductance (the smaller line-line reading).")
 @click.option("--l-q", "L_q_h", type=Quantity("inductance"), help="q inductance (the larger line-line reading).")
 @click.option("--l-between", "L_between", type=_BETWEEN, default="line-line", help="Where they are measured.")
-@click.option("--ke", help="Back-EMF constant: 58Vrms/krpm, 0.39Vpks/rad, 190rpm/Vpk, or a flux 0.41Wb.")
+@click.option("--ke", help="Back-EMF constant: 58Vrms/krpm, 0.39Vpks/rad, 190rpm/Vpk, '285rpm/V block', or 0.41Wb.")
 @click.option("--ke-between", type=_BETWEEN, help="Where the back-EMF is measured.")
 @click.option("--kt", help="Torque constant: 1.74Nm/Arms, 85mNm/Apk, '38mNm/A block'.")
-@click.option("--i-nom", "I_nom_apk", type=CURRENT, help="Rated line current, e.g. 19.8Arms.")
-@click.option("--i-peak", "I_max_apk", type=CURRENT, help="Short-time line current, e.g. 40Arms.")
+@click.option("--i-nom", "I_nom_apk", type=_LINE_CURRENT, help="Rated line current, e.g. 19.8Arms, '9A block'.")
+@click.option("--i-peak", "I_max_apk", type=_LINE_CURRENT, help="Short-time line current, e.g. 40Arms.")
 @click.option("--n-nom", "n_nom_rpm", type=Quantity("rpm"), help="Rated speed, e.g. 3000rpm.")
 @click.option("--n-max", "n_max_rpm", type=Quantity("rpm"), help="Largest speed.")
 @click.option("--inertia", "J_kgm2", type=Quantity("inertia"), help="Inertia, e.g. 12kgcm2.")

@@ -36,6 +36,7 @@ STORE_POLL_S = 0.1
 READY_TIMEOUT_S = 3.0
 """After boot-up a node answers SDO requests within this time."""
 POLL_S = 0.005
+IDENTITY_BYTES = 4
 LONGEST_NAME = 256
 """Bytes of 0x1008 to 0x100A that are read; drives use up to 64."""
 
@@ -355,9 +356,13 @@ def vendor_product_serial(sdo: SdoChannel, drive_map: DriveMap | None = None) ->
 
 
 def identity_number(sdo: SdoChannel, sub: int) -> int:
-    """Return a number of the identity object, 0 where the node lacks it; the vendor (1) is mandatory."""
+    """Return a number of the identity object, 0 where the node lacks it; the vendor (1) is mandatory.
+
+    Of another type than the standard's UNSIGNED32 (CiA 301, 7.5.2.19) a shorter number is taken, a text is none.
+    """
     try:
-        return int.from_bytes(sdo.read(objects.IDENTITY, sub, size=4), "little")
+        data = sdo.upload(objects.IDENTITY, sub, longest=LONGEST_NAME).data
+        return int.from_bytes(data, "little") if len(data) <= IDENTITY_BYTES else 0
     except SdoAbort as abort:
         if sub > 1 and abort.code in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY):
             return 0

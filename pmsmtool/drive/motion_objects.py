@@ -103,13 +103,14 @@ class LimitedSpeed:
 
 
 def held(node: DriveNode, item: DriveObject) -> float | None:
-    """Return the number in an object, None where the drive has none."""
+    """Return the number in an object, None where the drive has none, or another type: it could not be written."""
     try:
-        return node.get(item)
+        data = node.sdo.read(item.index, item.sub)
     except SdoAbort as abort:
         if abort.code in _ABSENT:
             return None
         raise
+    return item.decode(data) if len(data) == item.size else None
 
 
 def _own(node: DriveNode, name: str) -> Quantity | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import codecs
 import re
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, field
 
 from pmsmtool.data_types import DATA_TYPES, codes
@@ -25,6 +25,7 @@ _HAVE_SUBS = frozenset({0x06, 0x08, 0x09})  # DEFSTRUCT, ARRAY, RECORD
 
 _SECTION = re.compile(r"\s*\[([^\]]*)\]?\s*(?:;.*)?$")
 _OBJECT = re.compile(r"([0-9A-Fa-f]{1,4})(?:sub([0-9A-Fa-f]{1,2}))?\Z", re.IGNORECASE)
+_REMARK = re.compile(r"[;#]")
 _NODE_ID = re.compile(r"\$NODEID", re.IGNORECASE)
 _ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
 COMMISSIONING = ("devicecomissioning", "devicecommissioning")
@@ -75,7 +76,10 @@ class Section:
 
 
 def decode(data: bytes) -> tuple[str, str]:
-    """Return text and the name of the encoding that fits: UTF-8 (with or without mark), cp1252, Latin-1."""
+    """Return text and the name of the encoding that fits: UTF-8 (with or without mark), UTF-16, cp1252, Latin-1."""
+    wide = _wide(data)
+    if wide:
+        return data.decode(wide, "replace"), wide
     marked = data.startswith(codecs.BOM_UTF8)
     for encoding in ("utf-8-sig" if marked else "utf-8", "cp1252"):
         try:
@@ -85,8 +89,20 @@ def decode(data: bytes) -> tuple[str, str]:
     return data.decode("latin-1"), "latin-1"
 
 
+def _wide(data: bytes) -> str:
+    """Return the encoding of a text of 16 bits a character, empty for others; data sheets begin with ASCII."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    return {b"\1\0": "utf-16-le", b"\0\1": "utf-16-be"}.get(bytes(map(bool, data[:2])), "")
+
+
+def without_remark(text: str) -> str:
+    """Return a number or a word without what follows it behind ``;`` or ``#`` on its line."""
+    return _REMARK.split(text, maxsplit=1)[0].strip()
+
+
 def parse_integer(text: str, node_id: int | None = None) -> int:
-    """Return an integer as data sheets write it: decimal, hex, with leading zeros, ``$NODEID+0x600``.
+    """Return an integer as data sheets write it: decimal, hex, with leading zeros, ``$NODEID+0x600``, with a remark.
 
     Raises
     ------
@@ -94,7 +110,7 @@ def parse_integer(text: str, node_id: int | None = None) -> int:
         If it is none of these.
     """
     total = 0
-    for part in text.replace(" ", "").replace("\t", "").split("+"):
+    for part in without_remark(text).replace(" ", "").replace("\t", "").split("+"):
         if _NODE_ID.fullmatch(part):
             if node_id is None:
                 raise ValueError("depends on the node id")
@@ -131,8 +147,10 @@ def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Ed
     node = _number(stated, None, f"{where}: NodeID", warnings)
     node = node if isinstance(node, int) else node_id
     objects: dict[tuple[int, int], EdsObject] = {}
+    addresses = [object_of(name) for name in sections]
+    records = {address[0] for address in addresses if address is not None and address[1] is not None}
     for section in sections.values():
-        for entry in _objects_of(section, sections, node, where, warnings):
+        for entry in _objects_of(section, sections, records, node, where, warnings):
             objects.setdefault((entry.index, entry.sub), entry)
     if not objects:
         raise ConfigError(
@@ -202,8 +220,9 @@ def _sections(text: str, where: str, warnings: list[str]) -> dict[str, Section]:
 
 
 def _objects_of(
-    section: Section, sections: dict[str, Section], node: int | None, where: str, warnings: list[str]
-) -> Iterator[EdsObject]:
+    section: Section, sections: dict[str, Section], records: Container[int], node: int | None, where: str,
+    warnings: list[str],
+) -> Iterator[EdsObject]:  # fmt: skip
     address = object_of(section.name)
     if address is None:
         return
@@ -215,6 +234,8 @@ def _objects_of(
         if isinstance(compact, int) and compact > 0:
             yield from _compact(section, index, min(compact, 254), sections, node, place, warnings)
         return
+    if sub is None and index in records:
+        return  # the head of a record, whatever it calls itself
     if sub is not None and f"{index:04x}" not in sections and f"{index:x}" not in sections:
         warnings.append(f"{place}sub{sub:X}: its object has no section, accepted")
     yield _entry(section, index, sub or 0, section.get("parametername"), kind, node, place, warnings)
@@ -257,7 +278,7 @@ def _entry(
         data_type = DOMAIN if kind == _DOMAIN_OBJECT else 0
         if data_type == 0:
             warnings.append(f"{place}sub{sub:X}: no DataType")
-    access = section.get("accesstype").lower()
+    access = without_remark(section.get("accesstype")).lower()
     if access not in _ACCESS:
         warnings.append(f"{place}sub{sub:X}: AccessType {access or 'missing'}, taken as ro")
         access = "ro"
@@ -287,7 +308,7 @@ def _number(
         return None
     try:
         if data_type in (REAL32, REAL64):
-            return float(text)
+            return float(without_remark(text))
         value = parse_integer(text, node)
     except ValueError as error:
         if "node id" not in str(error):

@@ -144,6 +144,11 @@ def _where(identity: Identity) -> str:
     return f"node {identity.node}, 0x1018"
 
 
+def forget_map(folder: JournalFolder) -> None:
+    """Forget the map a drive was written through: it starts from factory memory."""
+    memory_of(folder).unlink(missing_ok=True)
+
+
 def remember_map(drive_map: DriveMap, folder: JournalFolder) -> None:
     """Note the map a drive is written through."""
     if drive_map.staging or not drive_map.scales:

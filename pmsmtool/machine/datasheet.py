@@ -20,12 +20,13 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.units import RAD_S_PER_RPM, RPM_PER_RAD_S, format_quantity
+from pmsmtool.units import RAD_S_PER_RPM, RPM_PER_RAD_S, format_quantity, parse_current
 
 Between = Literal["line-line", "phase"]
 Connection = Literal["star", "delta"]
 Kind = Literal["rms", "peak"]
-CurrentKind = Literal["rms", "peak", "block"]
+CommutatedKind = Literal["rms", "peak", "block"]
+"""``block``: of block commutation, a direct current through two terminals, a direct voltage between them."""
 Source = Literal["datasheet", "meter", "guess"]
 
 
@@ -43,7 +44,7 @@ back-EMF on an oscilloscope."""
 DISAGREEMENT_LIMIT = 0.05
 """Relative difference of the flux from K_e and the flux from K_t that is flagged."""
 
-PEAK_PER_AMPERE: Mapping[CurrentKind, float] = {
+PEAK_PER_AMPERE: Mapping[CommutatedKind, float] = {
     "peak": 1.0,
     "rms": math.sqrt(2.0),
     "block": 2.0 * math.sqrt(3.0) / math.pi,
@@ -79,7 +80,7 @@ class EmfConstant:
     ----------
     value : float
         V s per mechanical rad, or Wb (V s per electrical rad) if ``is_flux``.
-    kind : {"rms", "peak"}
+    kind : {"rms", "peak", "block"}
         What the voltage is; a flux linkage is peak.
     between : {"line-line", "phase"}
         Where it is measured; "phase" of a delta is its winding.
@@ -90,7 +91,7 @@ class EmfConstant:
     """
 
     value: float
-    kind: Kind
+    kind: CommutatedKind
     between: Between
     is_flux: bool
     text: str
@@ -101,7 +102,7 @@ class TorqueConstant:
     """Torque constant: N m per ampere of line current, ``kind`` of that ampere, as printed."""
 
     value: float
-    kind: CurrentKind
+    kind: CommutatedKind
     text: str
 
 
@@ -172,7 +173,9 @@ _PER_SPEED: dict[str, float] = {
 _EMF = re.compile(_NUMBER + r"(m?)V(rms|eff|pk|peak)?/(.+)")
 _EMF_SECONDS = re.compile(_NUMBER + r"(m?)V(rms|eff|pk|peak)?s/rad")
 _FLUX = re.compile(_NUMBER + r"(m?)(Wb|Vs)")
-_SPEED_CONSTANT = re.compile(_NUMBER + r"rpm/V(rms|eff|pk|peak)?")
+_SPEED_CONSTANT = re.compile(_NUMBER + r"(?:rpm|min-1)/V(?:\(?(rms|eff|pk|peak|block|dc)\)?)?")
+_BLOCK_CURRENT = re.compile(_NUMBER + r"(m?)A\s*\(?(?:block|dc)\)?")
+_OR_BLOCK = "; or write 'rpm/V block', where a datasheet of block commutation says no more than rpm/V"
 _TORQUE = re.compile(_NUMBER + r"(m?Nm|oz-?in|lb-?in)/A(?:\(?(rms|eff|pk|peak|block|dc)\)?)?")
 _TORQUE_UNIT = {"Nm": 1.0, "mNm": 1e-3, "ozin": 0.0070615518, "lbin": 0.1129848290}
 """N m; ounce- and pound-force inch by 0.45359237 kg * 9.80665 m/s2 * 0.0254 m (exact definitions)."""
@@ -190,7 +193,7 @@ def _kind(written: str | None, said: Kind | None, text: str) -> Kind:
         raise ConfigError(
             f"{text!r} does not say whether it is rms or peak",
             likely="the two differ by a factor of 1.414",
-            hint="write Vrms or Vpk (Arms or Apk for a torque constant) in the unit",
+            hint=f"write Vrms or Vpk (Arms or Apk for a torque constant) in the unit{_OR_BLOCK}",
         )
     return kind
 
@@ -201,9 +204,10 @@ def parse_emf_constant(text: str, between: Between | None, kind: Kind | None = N
     Parameters
     ----------
     text : str
-        ``58Vrms/krpm``, ``0.39Vpks/rad``, ``42mV/rpm``, ``190rpm/V`` (a speed constant), or a flux linkage ``0.41Wb``.
+        ``58Vrms/krpm``, ``0.39Vpks/rad``, ``42mV/rpm``, ``190rpm/V`` (a speed constant), ``190rpm/V block``, or a flux
+        linkage ``0.41Wb``.
     between : {"line-line", "phase"} or None
-        Where the voltage is measured; needed for all but a flux linkage.
+        Where the voltage is measured; needed for all but a flux linkage and block commutation (the terminals).
     kind : {"rms", "peak"} or None
         When the unit does not say it.
 
@@ -224,12 +228,29 @@ def parse_emf_constant(text: str, between: Between | None, kind: Kind | None = N
         value, written = 1.0 / (float(speed[1]) * RAD_S_PER_RPM), speed[2]
     if not value > 0.0:
         raise ConfigError(f"{text!r} is no back-EMF constant", hint="write it like 58Vrms/krpm, 0.39Vpks/rad or 0.41Wb")
+    if written in ("block", "dc"):
+        if kind is not None or between == "phase":
+            raise ConfigError(f"{text!r} is a direct voltage between two terminals", hint="leave the other word out")
+        return EmfConstant(value, "block", "line-line", False, text)
     if between is None:
-        raise ConfigError(f"{text!r} does not say where the voltage is measured", hint="add line-line or phase")
+        where_said = f"add line-line or phase{_OR_BLOCK}"
+        raise ConfigError(f"{text!r} does not say where the voltage is measured", hint=where_said)
     return EmfConstant(value, _kind(written, kind, text), between, False, text)
 
 
-def parse_torque_constant(text: str, kind: CurrentKind | None = None) -> TorqueConstant:
+def line_current(text: str) -> float:
+    """Return a line current (A peak): as ``units.parse_current`` reads it, or ``9A block``, by the torque it makes.
+
+    Raises
+    ------
+    ConfigError
+        Not readable, or it is not said what the ampere is.
+    """
+    block = _BLOCK_CURRENT.fullmatch(text)
+    return parse_current(text) if block is None else PEAK_PER_AMPERE["block"] * _scaled(block[1], block[2])
+
+
+def parse_torque_constant(text: str, kind: CommutatedKind | None = None) -> TorqueConstant:
     """Read a torque constant: ``1.74Nm/Arms``, ``85mNm/Apk``, ``12 oz-in/Arms``, ``38.5mNm/A block``.
 
     Raises
@@ -322,6 +343,9 @@ def flux_from_emf(K_e: EmfConstant, pole_pairs: int, connection: Connection) -> 
     if K_e.kind == "rms":
         value *= math.sqrt(2.0)
         steps.append("* sqrt 2")
+    if K_e.kind == "block":
+        value *= math.sqrt(3.0) / PEAK_PER_AMPERE["block"] / 1.5
+        steps.append("* pi / 3")
     if K_e.between == "line-line" or connection == "delta":
         value /= math.sqrt(3.0)
         steps.append("/ sqrt 3" if K_e.between == "line-line" else "/ sqrt 3 (delta winding)")

@@ -5,12 +5,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 
-from pmsmtool.commissioning.first_check_tiers import judge_kept
-from pmsmtool.identification.wiring import NOT_CHECKED, WRONG, judge_current, judge_push
+from pmsmtool.commissioning.first_check_tiers import beyond, judge_kept
+from pmsmtool.drive.port import Drive
+from pmsmtool.errors import LimitExceeded
+from pmsmtool.experiments.first_push import WAY_RAD, push_forth_and_back
+from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG, judge_current, judge_push
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.trace import Trace
@@ -77,11 +81,16 @@ def test_pushes_are_judged_by_current_way_and_sign() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shares", "kept"),
-    [((0.9, 0.9), True), ((0.71, 0.65), True), ((1.41, 1.3), True), ((0.33, 0.9), False), ((1.6, -0.05), False)],
-)
-def test_a_push_without_its_current_is_about_the_phases(shares: tuple[float, float], kept: bool) -> None:
-    signals = {"i_command_a": np.array([2.0, -2.0]), "i_q_a": np.array([2.0, -2.0]) * shares}
+    ("shares", "way", "kept"),
+    [
+        ((0.9, 0.9), 0.1, True), ((0.71, 0.65), 0.1, True), ((1.41, 1.3), 0.3, True), ((0.33, 0.9), 0.1, False),
+        ((1.6, -0.05), 0.3, False), ((0.28, 0.52), 0.3, True),  # a slow current loop moves the shaft all the same
+    ],
+)  # fmt: skip
+def test_a_push_without_its_current_is_about_the_phases(shares: tuple[float, float], way: float, kept: bool) -> None:
+    signals = {
+        "i_command_a": np.array([2.0, -2.0]), "i_q_a": np.array([2.0, -2.0]) * shares, "way_rad": np.array([way, -way]),
+    }  # fmt: skip
     found = judge_kept(Trace(np.array([0.0, 1.0]), signals, dict.fromkeys(signals, "A"), {}))
     assert [row.looked_at for row in found if row.verdict == WRONG] == ([] if kept else ["phases"])
 
@@ -92,3 +101,43 @@ def test_a_current_that_breaks_in_at_some_angles_is_an_open_phase() -> None:
     assert not judge_current(Trace(angle, whole, dict.fromkeys(whole, ""), {}), 1.0)
     (found,) = judge_current(Trace(angle, {**whole, "i_q_a": np.sin(angle)}, dict.fromkeys(whole, ""), {}), 1.0)
     assert found.looked_at == "phases" and found.verdict == WRONG
+
+
+class SlowLoop:
+    """A shaft of 1000 rad/s2 per ampere, without friction, behind a current loop of 60 ms."""
+
+    def __init__(self) -> None:
+        self.asked_a = self.i_a = self.omega = self.theta = self.furthest = 0.0
+
+    def command_current(self, i_d_a: float, i_q_a: float) -> None:
+        self.asked_a = i_q_a
+
+    def wait(self, seconds: float) -> None:
+        for _ in range(round(seconds / 1e-3)):
+            self.i_a += (self.asked_a - self.i_a) / 60.0
+            self.omega += self.i_a
+            self.theta += 1e-3 * self.omega
+            self.furthest = max(self.furthest, abs(self.theta))
+
+    def live(self, name: str) -> float:
+        return {"theta_m_rad": self.theta, "i_q_a": self.i_a}[name]
+
+
+def test_a_slow_current_loop_does_not_push_the_shaft_further() -> None:
+    """Short pushes show a tenth of its acceleration: by them the push would go on for three ways and more."""
+    drive = SlowLoop()
+    pushes = push_forth_and_back(cast(Drive, drive), 1.0, 30.0)
+    assert np.all(np.abs(pushes["way_rad"]) < 1.5 * WAY_RAD)
+    assert drive.furthest < np.pi
+
+
+@pytest.mark.parametrize(
+    ("quantity", "turns", "about", "verdict"),
+    [
+        ("time energised", True, "shaft", NOT_SEEN), ("travel", True, "shaft", WRONG),
+        ("travel", False, "phases", WRONG), ("current", True, "phases", WRONG),
+    ],
+)  # fmt: skip
+def test_a_limit_is_about_what_it_shows(quantity: str, turns: bool, about: str, verdict: str) -> None:
+    row = beyond(LimitExceeded(quantity, 2.0, 1.0, "A"), turns)
+    assert (row.looked_at, row.verdict) == (about, verdict)

@@ -13,7 +13,10 @@ from click.testing import CliRunner, Result
 from pmsmtool.cli.drive_access import rehearsal_bus
 from pmsmtool.cli.main import cli
 from pmsmtool.cli.options import BusOptions
+from pmsmtool.drive.port import Identity
 from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.flash.journal import JournalFolder
+from pmsmtool.flash.map_gate import memory_of
 from pmsmtool.identification.by_pulses import either_reading, over_torque_constant
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.sim.channel import parse_channel
@@ -77,6 +80,19 @@ def test_commission_rehearses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         error = run("commission", *option, "--yes").exception
         assert isinstance(error, NotAvailable) and "identify: needs" in str(error) and "torque mode" in str(error)
     assert run("commission", "--eds", "x.eds", "--resume", "runs/1").exit_code == 2
+
+
+def test_a_rehearsal_knows_nothing_of_an_earlier_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The simulated drive has one serial number; its memory begins anew."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path))
+    eds = str(write_eds(tmp_path / "x.eds", epos4(0x25)))
+    held = memory_of(JournalFolder(Identity(1, 0xFB, 0x65510000, 0, 22001)))
+    held.parent.mkdir(parents=True)
+    for channel, kept in (("--eds", eds), False), (("--sim", f"interior-2k2?nv=a.nv&eds={eds}"), True):
+        held.write_text('{"map": "epos4", "sha256": "of another map"}')
+        run("commission", *channel, "--yes")
+        assert held.exists() == kept
 
 
 def test_an_undecided_current_gives_an_interval_of_both_readings() -> None:

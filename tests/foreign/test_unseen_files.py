@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import random
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -44,6 +46,40 @@ def test_caps_names_what_is_missing_and_never_breaks(sources: list[str]) -> None
     for seed in range(SEEDS):
         _, codes, wrong = faults_of(seed, sources, 0, None)
         assert not wrong and codes, (seed, wrong)
+
+
+ODD_TEXTS: dict[str, Callable[[str], bytes]] = {
+    "UTF-16 with a mark": lambda text: text.encode("utf-16"),
+    "UTF-16 without one": lambda text: text.encode("utf-16-le"),
+    "remarks behind the numbers": lambda text: re.sub(r"(?m)^((?!Param).*=.+)$", r"\1 # said; by hand", text).encode(),
+    "no ObjectType": lambda text: text.replace("ObjectType=9\n", "").encode(),
+    "a record called a variable": lambda text: text.replace("ObjectType=9\n", "ObjectType=7\nDataType=7\n").encode(),
+}
+
+
+@pytest.mark.parametrize("odd", ODD_TEXTS)
+def test_an_odd_text_says_the_same(tmp_path: Path, odd: str) -> None:
+    plain = write_eds(tmp_path / "plain.eds", (*epos4(), (0x1018, 0, "U8", "const", "4")))
+    other = tmp_path / "odd.eds"
+    other.write_bytes(ODD_TEXTS[odd](plain.read_text("ascii")))
+    assert read_makers_objects(str(other)).rows == read_makers_objects(str(plain)).rows
+
+
+def test_an_identity_of_another_type_and_an_invented_device_type(tmp_path: Path, tool: Tool) -> None:
+    rows = [row for row in epos4() if row[0] not in (0x1000, 0x1018)]
+    odd: tuple[Row, ...] = (
+        (0x1000, 0, "U32", "ro", "0x00220811"), (0x1018, 1, "U32", "ro", "0xFB"), (0x1018, 2, "VSTR", "ro", "EPOS4"),
+        (0x1018, 3, "U16", "ro", "7"),
+    )  # fmt: skip
+    code, printed, said = tool("caps", "--eds", str(write_eds(tmp_path / "x.eds", [*rows, *odd])))
+    assert code == 0 and "vendor 0x000000fb  product 0x0" in printed, said
+
+
+@pytest.mark.parametrize("row", [(0x6080, 0, "VSTR", "rw", "fast"), (0x6080, 0, "U32", "rw", "4294967295")])
+def test_a_limit_of_another_type_or_beyond_everything_is_no_end(tmp_path: Path, tool: Tool, row: Row) -> None:
+    rows = [each for each in epos4() if each[0] != 0x6080]
+    code, printed, said = tool("caps", "--eds", str(write_eds(tmp_path / "x.eds", [*rows, row])))
+    assert code == 0 and "capability level" in printed, said
 
 
 @pytest.mark.parametrize(

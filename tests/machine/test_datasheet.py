@@ -15,6 +15,7 @@ from pmsmtool.machine.datasheet import (
     TOLERANCE,
     Datasheet,
     disagreement,
+    line_current,
     machine_from_datasheet,
     parse_emf_constant,
     parse_torque_constant,
@@ -88,6 +89,18 @@ def test_every_way_to_print_the_torque_constant(text):
     both = machine_from_datasheet(sheet(K_t=parse_torque_constant(text)))
     assert not both.warnings
     assert [step.key for step in both.conversions].count("(check)") == 1
+
+
+def test_a_datasheet_of_block_commutation():
+    """Its amperes and volts are direct ones through two terminals: K_t = 1 / (speed constant) = 3 sqrt3 / pi p psi."""
+    speed_constant = 30 / math.pi / (3 * math.sqrt(3) / math.pi * P * PSI)
+    for text in (f"{speed_constant!r}rpm/V block", f"{speed_constant!r} rpm/V(dc)"):
+        found = machine_from_datasheet(sheet(K_e=parse_emf_constant(text, None)))
+        assert found.machine_file.machine.psi_f_wb == pytest.approx(PSI, rel=1e-9)
+    with pytest.raises(ConfigError, match="between two terminals"):
+        parse_emf_constant("285rpm/V block", "phase")
+    assert line_current("9A block") == pytest.approx(9 * 2 * math.sqrt(3) / math.pi)  # the same torque
+    assert line_current("9000 mA dc") == line_current("9A(block)") and line_current("9Apk") == 9.0
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,8 @@ COMMUNICATION = frozenset((*range(0x1000, 0x1200), *range(0x1400, 0x1C00)))
 LAST_COMMUNICATION = 0x2000
 PASSED_ON = (0x603F, 0x6040, 0x6041, 0x6007, 0x605A, 0x605E)
 """State machine and option codes: numbers of the standard, whoever the maker is."""
+RATED = ((0x3001, 1), (0x6075, 0))
+"""Rated current, of which a torque command is a share."""
 HELD = (0x6072, 0x6073, 0x6087)
 """Limits whose stored value acts from the start."""
 PDO_OFF = 1 << 31
@@ -65,6 +67,8 @@ class ForeignDrive:
         Identity; where the file leaves it blank, that of the family it is recognised as.
     assumed : tuple of str
         What the simulated drive does that neither file nor standard says.
+    set_up : SetUp
+        The motor, with no more rated current than the drive's object of it holds.
     behind : Behind or None
         The machine behind, while the drive runs; for tests.
     """
@@ -72,10 +76,11 @@ class ForeignDrive:
     def __init__(self, objects: MakersObjects, set_up: SetUp, gains: DrawnGains | None = None) -> None:
         self.objects = objects
         self.gains = gains
+        stated_motor, set_up = set_up, _within(objects, set_up)
         self.laws = laws_of(objects, set_up)
         if gains is not None:
             self.laws |= {(law.index, law.sub): law for law in gains.laws(self.laws)}
-        self._set_up = set_up
+        self.set_up = set_up
         family = family_of(objects)
         stated = objects.stored(0x1018, 1), objects.stored(0x1018, 2)
         self.vendor_product = (stated[0] or family.identity[0], stated[1] or family.identity[1])
@@ -88,6 +93,8 @@ class ForeignDrive:
             for law in self.laws.values()
             if law.set_up is not None and not _holds(objects.rows[law.index, law.sub], law.set_up)
         ]
+        if set_up != stated_motor:
+            beyond.append(f"rated current cut to the drive's {set_up.i_nom_apk:.4g} A peak")
         self.assumed = (*objects.assumed, *own, *blank, *reaction, *beyond)
         self.behind: Behind | None = None
 
@@ -129,7 +136,7 @@ class ForeignDrive:
 
     def attach(self, dictionary: Dictionary, plant: Plant, power: PowerDrive, schedule: Schedule) -> None:
         """Let the objects show and command the running machine, and what they hold take effect."""
-        self.behind = behind = Behind(dictionary, plant, power, self._set_up)
+        self.behind = behind = Behind(dictionary, plant, power, self.set_up)
         inner = {(e.row.index, e.row.sub): e for e in dictionary.by_key.values() if e.row.index in PASSED_ON}
         for (index, sub), entry in inner.items():
             if self.objects.has((index, sub)):
@@ -144,7 +151,7 @@ class ForeignDrive:
             behind.speed_current_loops(self.gains.current_bandwidth / SET_UP_BANDWIDTH)
         self._hook_modes(dictionary, behind)
         if any(mode in POSITION_MODES for mode in modes_of(self.objects)):
-            per_turn, per_rps, _ = units_of(self.objects, self._set_up)
+            per_turn, per_rps, _ = units_of(self.objects, self.set_up)
             period_s = family_of(self.objects).loop_s
             loop = PositionLoop(behind, dictionary, power, schedule, per_turn, per_rps, period_s)
             loop.hook(lambda: dictionary.find(0x6060, 0).integer())
@@ -177,6 +184,17 @@ class ForeignDrive:
         )  # fmt: skip
 
 
+def _within(objects: MakersObjects, set_up: SetUp) -> SetUp:
+    """Return the motor with no more rated current than the drive's own object of it holds, and so much less torque."""
+    shares = [
+        float(objects.rows[law.index, law.sub].high or math.inf) / law.set_up
+        for law in laws_of(objects, set_up).values()
+        if (law.index, law.sub) in RATED and law.set_up
+    ]
+    share = min([1.0, *shares])
+    return replace(set_up, i_nom_apk=share * set_up.i_nom_apk, torque_nm=share * set_up.torque_nm)
+
+
 def _bounds(row: ObjectRow) -> tuple[float, float]:
     return (-math.inf if row.low is None else row.low), (math.inf if row.high is None else row.high)
 
@@ -207,7 +225,8 @@ def _obey(law: Law, entry: Entry, behind: Behind) -> None:
     if act is not None:
         entry.sink = _taken(entry, lambda number: bool(act(behind, number)))
         if law.set_up is not None or law.index in HELD:
-            act(behind, entry.number())
+            with contextlib.suppress(Refused):  # a stored value beyond what the machine behind takes
+                act(behind, entry.number())
 
 
 def _taken(entry: Entry, act: Callable[[float], object]) -> Callable[[bytes], None]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pmsmtool.data_types import BY_SHORT
-from pmsmtool.drive_maps.eds import decode, parse_eds, parse_integer
+from pmsmtool.drive_maps.eds import decode, parse_eds, parse_integer, without_remark
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import read_bytes
 from pmsmtool.sim.node.objects import ObjectRow
@@ -63,7 +63,8 @@ BY_MODE: Mapping[int, tuple[tuple[int, int, str, str, str], ...]] = {
 """Mandatory in a mode of operation (CiA 402-2, its table of objects per mode)."""
 NOT_KEPT = frozenset({0x1003, 0x1010, 0x1011, 0x1013, 0x1020, 0x6040, 0x6071, 0x607A, 0x60FF, 0x60FE})
 """Commands and set points; every other object that can be written outlives a reset once it is stored (assumed)."""
-DRIVE_PROFILE = 402
+DRIVE_PROFILE, PROFILES = 402, range(401, 500)
+"""Another number than a CiA profile's is a placeholder of the file's, where control and status word are there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +112,10 @@ def read_makers_objects(where: str) -> MakersObjects:
         found, label = dict(_of_eds(data, path)), path.stem
     rows, assumed = _completed(found)
     profile = MakersObjects(label, rows, assumed)
-    if profile.stored(0x1000) & 0xFFFF not in (0, DRIVE_PROFILE):
+    stated = profile.stored(0x1000) & 0xFFFF
+    if stated not in (0, DRIVE_PROFILE) and not (stated not in PROFILES and {(0x6040, 0), (0x6041, 0)} <= set(found)):
         raise ConfigError(
-            f"the file is of a device of profile {profile.stored(0x1000) & 0xFFFF}, not of a drive (CiA 402)",
+            f"the file is of a device of profile {stated}, not of a drive (CiA 402)",
             where=where,
             likely="a controller of another profile, which is neither simulated nor moved",
             hint="give the EDS or DCF of a drive",
@@ -202,7 +204,8 @@ def _value(text: str, kind: str) -> str:
     code = BY_SHORT[kind]
     if not code.letter:
         return text.encode("ascii", "replace").decode("ascii")
-    if not text.strip():
+    text = without_remark(text)
+    if not text:
         return "0" if code.is_float else ""  # blank: the file does not say
     try:
         if code.is_float:
