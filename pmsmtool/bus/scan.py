@@ -38,23 +38,6 @@ class FoundNode:
         return self.device_type is not None and self.device_type & 0xFFFF == 402
 
 
-def listen(connection: Connection, seconds: float = LISTEN_S) -> set[int]:
-    """Return the nodes heard without asking anybody."""
-    heard: set[int] = set()
-
-    def note(cob_id: int, data: bytes, timestamp: float) -> None:
-        heard.add(cob_id & 0x7F)
-
-    for node in NODES:
-        connection.subscribe(HEARTBEAT_ID + node, note)
-    try:
-        connection.wait(seconds)
-    finally:
-        for node in NODES:
-            connection.unsubscribe(HEARTBEAT_ID + node, note)
-    return heard
-
-
 def find_nodes(connection: Connection, seconds: float = LISTEN_S) -> list[FoundNode]:
     """Ask every node id for its device type and return who answered or was heard, by node id."""
     types: dict[int, int | None] = {}

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.firmware.image import pack_image, unpack_image
+from pmsmtool.firmware.image import pack_image
 from pmsmtool.native import load
 
 HEADER_FOLDER = Path(__file__).parent / "core"
@@ -119,12 +119,6 @@ class CoreBinding:
         state = self.types["pmsm_state"]()
         self.library.pmsm_init(ctypes.byref(state))
         return state
-
-
-def params_values(params: Any) -> dict[str, float]:
-    """Return the catalogue values of a ``pmsm_params`` without look-up data."""
-    values, _ = unpack_image(bytes(params))
-    return values
 
 
 _STEP_ARGUMENTS = ("pmsm_measurement", "pmsm_reference", "pmsm_output")

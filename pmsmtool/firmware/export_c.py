@@ -22,7 +22,7 @@ from importlib import resources
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.export_example import example_source
 from pmsmtool.firmware.export_readme import readme_text
-from pmsmtool.firmware.image import LUT_FORMAT_BINARY32, crc32, pack_image, saturation_words, unpack_image
+from pmsmtool.firmware.image import LUT_FORMAT_BINARY32, crc32, saturation_words, unpack_image
 from pmsmtool.firmware.laws import LAWS, Law, files_left_out, laws_in_use, with_laws
 from pmsmtool.firmware.params_header import SPDX, c_float, commented
 from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, layout_signature
@@ -303,31 +303,3 @@ def _json(values: Mapping[str, float], image: bytes, design_id: str) -> str:
         "lut_words": image[4 * len(CATALOGUE) :].hex(),
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
-
-
-def image_of_json(text: str) -> bytes:
-    """Return the image a ``_cfg.json`` describes, checked against the CRC it names.
-
-    Raises
-    ------
-    ConfigError
-        If the text is no such file, or its content does not have its CRC.
-    """
-    try:
-        content = json.loads(text)
-        image = pack_image(content["values"], bytes.fromhex(content["lut_words"]))
-        announced = content["crc32"]
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(
-            f"not a configuration that pmsmtool exported: {error}",
-            hint="export it again from the design or the parameter set",
-        ) from error
-    if announced != crc32(image):
-        raise ConfigError(
-            f"the content has CRC {crc32(image):#010x}, the file says {announced}",
-            likely="the file was edited",
-            hint="export it again from the design or the parameter set",
-        )
-    return image

@@ -47,10 +47,6 @@ class QFormat:
     omega_base: float
     constants: Mapping[str, tuple[int, float]]
 
-    def quantise(self, value: float, base: float) -> int:
-        """Return a signal as Q4.27 of its base, saturated as the C code saturates."""
-        return max(-LARGEST, min(LARGEST, round(value / base * ONE)))
-
 
 def _power_of_two(x: float) -> float:
     return math.ldexp(1.0, math.ceil(math.log2(x)))

@@ -24,9 +24,7 @@ from pmsmtool.params.catalogue import (
     INDUCTANCE_RANGE_H,
     LUT_CAPACITY_WORDS,
     SATURATION_VALUES,
-    SCHEMA_VERSION,
     Parameter,
-    layout_signature,
 )
 from pmsmtool.plain_text import counted
 
@@ -221,22 +219,3 @@ def unpack_image(image: bytes) -> tuple[dict[str, float], bytes]:
 def crc32(image: bytes) -> int:
     """Return the CRC-32 (IEEE 802.3, as zlib) of an image: the one number file, tool and drive compare."""
     return zlib.crc32(image) & _WORD_MAX
-
-
-def check_image(image: bytes, schema: int, signature: int, crc: int) -> None:
-    """Refuse an image that is not what its sender says it is, in the drive's order of checks.
-
-    Raises
-    ------
-    ImageRefused
-        Schema, signature or CRC differ from this program's or from the bytes; size, ranges, look-up data.
-    """
-    if schema != SCHEMA_VERSION:
-        raise ImageRefused(ImageStatus.SCHEMA, f"schema {schema}, this program knows {SCHEMA_VERSION}")
-    if signature != layout_signature():
-        raise ImageRefused(
-            ImageStatus.SIGNATURE, f"layout signature {signature:#010x}, this program has {layout_signature():#010x}"
-        )
-    if crc != crc32(image):
-        raise ImageRefused(ImageStatus.CRC, f"CRC {crc32(image):#010x}, announced {crc:#010x}")
-    unpack_image(image)

@@ -14,9 +14,8 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
-from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K
 
 SCHEMA_VERSION = 1
@@ -26,8 +25,6 @@ K_MAX_NOT_DETERMINED = 255
 """Value of ``governor.k_max`` that says: the horizon is not finitely determined."""
 
 WireType = Literal["UNSIGNED8", "UNSIGNED16", "UNSIGNED32", "REAL32"]
-WIRE_SIZE: dict[WireType, int] = {wire: DATA_TYPES[wire].size for wire in get_args(WireType)}
-"""Bytes of an object on the wire (CiA 301, section 7.4.7)."""
 
 
 @dataclass(frozen=True, slots=True)

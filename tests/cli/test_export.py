@@ -25,12 +25,13 @@ from pmsmtool.design.tune import tune
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap, reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.export_c import FLAGS, image_of_json
+from pmsmtool.firmware.export_c import FLAGS
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.resources import data_folder
 from tests.concise_dcf import read_concise
+from tests.firmware.exported_image import image_of_json
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 

@@ -23,10 +23,11 @@ from pmsmtool.cli.main import cli
 from pmsmtool.commissioning.export import image_of
 from pmsmtool.commissioning.parameter_source import load_parameters
 from pmsmtool.errors import ConfigError
-from pmsmtool.firmware.export_c import FLAGS, image_of_json
+from pmsmtool.firmware.export_c import FLAGS
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.params.parameter_set import ParameterSet, default_set, read_parameter_set
 from tests.concise_dcf import read_concise
+from tests.firmware.exported_image import image_of_json
 from tests.simulated_bus import settle
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")

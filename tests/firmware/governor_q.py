@@ -11,12 +11,17 @@ from typing import Any
 
 from pmsmtool.firmware.core_binding import parse_structs
 from pmsmtool.firmware.export_c import FLAGS
-from pmsmtool.firmware.export_q import ONE, fixed_point_files, q_files, q_format
+from pmsmtool.firmware.export_q import LARGEST, ONE, fixed_point_files, q_files, q_format
 
 
 def governor_types(text: str) -> Mapping[str, Any]:
     """ctypes structures of the header, its Q27 numbers being plain words."""
     return parse_structs(text.replace("pmsm_q27 ", "int32_t ").replace("typedef int32_t int32_t", "typedef int x"))
+
+
+def quantised(value: float, base: float) -> int:
+    """A signal as Q4.27 of its base, saturated as the C code saturates."""
+    return max(-LARGEST, min(LARGEST, round(value / base * ONE)))
 
 
 class FixedPointSignals:
@@ -30,7 +35,7 @@ class FixedPointSignals:
 
     def hold(self, v: tuple[float, float]) -> None:
         """Set the last governed reference (A)."""
-        self.state.held.d, self.state.held.q = (self.format.quantise(x, self.format.I_base) for x in v)
+        self.state.held.d, self.state.held.q = (quantised(x, self.format.I_base) for x in v)
 
     def give(
         self,
@@ -48,8 +53,8 @@ class FixedPointSignals:
             ("integrator", integrator, q.U_base),
         ):
             member = getattr(given, part)
-            member.d, member.q = (q.quantise(x, base) for x in pair)
-        given.omega_e, given.V_max = q.quantise(omega_e, q.omega_base), q.quantise(V_max, q.U_base)
+            member.d, member.q = (quantised(x, base) for x in pair)
+        given.omega_e, given.V_max = quantised(omega_e, q.omega_base), quantised(V_max, q.U_base)
 
 
 class FixedPointGovernor(FixedPointSignals):

@@ -10,9 +10,10 @@ from pathlib import Path
 import canopen
 import pytest
 
+from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
-from pmsmtool.params.catalogue import CATALOGUE, WIRE_SIZE, layout_signature
+from pmsmtool.params.catalogue import CATALOGUE, layout_signature
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.node.dictionary import Dictionary
 from pmsmtool.sim.node.eds import FILE_NAME, MAP_NAME, eds_text
@@ -34,7 +35,7 @@ def test_the_map_names_objects_of_the_drive_in_their_types() -> None:
     assert len(drive_map.cells) == len(CATALOGUE)
     for cell in drive_map.cells.values():
         assert rows[cell.index, cell.sub].key == cell.name
-        assert rows[cell.index, cell.sub].data_type.size == WIRE_SIZE[cell.wire]
+        assert rows[cell.index, cell.sub].data_type.size == DATA_TYPES[cell.wire].size
     assert {rows[address].type for address in drive_map.tables.values()} == {"DOMAIN"}
 
 
@@ -67,7 +68,7 @@ def test_every_parameter_is_in_the_table_once(stock_dictionary: canopen.ObjectDi
     rows = {row.key: row for row in object_rows() if row.parameter is not None}
     assert set(rows) == {row.name for row in CATALOGUE}
     for row in CATALOGUE:
-        assert rows[row.name].data_type.size == WIRE_SIZE[row.wire]
+        assert rows[row.name].data_type.size == DATA_TYPES[row.wire].size
         assert rows[row.name].pdo == ("R" if row.live else "0")
 
 

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.firmware.image import ImageStatus, crc32, pack_image
-from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, WIRE_SIZE, Parameter, layout_signature
+from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, Parameter, layout_signature
 from pmsmtool.sim.node.parameter_set import LUT_PARTS, ParameterImage, SetState
 from tests.node.bench import Bench
 from tests.node.raw_client import Aborted, RawClient
@@ -74,8 +75,8 @@ def test_the_image_object_holds_the_bytes_every_other_part_computes(bench: Bench
 def test_every_parameter_is_an_object_of_its_wire_type_with_its_bounds(bench: Bench) -> None:
     client = bench.client
     for row in CATALOGUE:
-        assert len(client.read(row.index, row.sub)) == WIRE_SIZE[row.wire]
-        top = 2 ** (8 * WIRE_SIZE[row.wire]) - 1
+        assert len(client.read(row.index, row.sub)) == DATA_TYPES[row.wire].size
+        top = 2 ** (8 * DATA_TYPES[row.wire].size) - 1
         if not row.is_integer or row.maximum < top:
             with pytest.raises(Aborted) as caught:
                 put(client, row.name, row.maximum + 1 if row.is_integer else row.maximum * 1.001 + 1e-3)

@@ -9,9 +9,10 @@ from collections.abc import Iterator
 import pytest
 
 from pmsmtool.cia402 import Command, Control, State, Status, state_of
+from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.design.tune import tune
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.params.catalogue import CATALOGUE, WIRE_SIZE
+from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.closed_loop import drive_values
 from tests.node.raw_client import Aborted, RawClient
@@ -34,7 +35,7 @@ class Axis:
             if values[row.name] != row.default:
                 value = int(values[row.name]) if row.is_integer else values[row.name]
                 self.client.write(row.index, row.sub, struct.pack("<" + LETTERS[row.wire], value))
-                assert WIRE_SIZE[row.wire] == struct.calcsize(LETTERS[row.wire])
+                assert DATA_TYPES[row.wire].size == struct.calcsize(LETTERS[row.wire])
         self.put(0x60A4, 1, 100 * TURN)
         self.put(0x6081, 0, 2 * TURN)
 
