@@ -160,7 +160,7 @@ def commission_command(
         chain.drive_bandwidth_hz = drive_bandwidth_hz
         chain.accept_contradictions = accept
         chain.require, chain.accept_limits = require, accept_limits
-        for line in () if chain.tier is None else chain.tier.plan_lines():
+        for line in chain.stages.plan_lines():
             out.note(line)
         with _reported(run, out, fresh=begun is None):
             chain.carry_out()

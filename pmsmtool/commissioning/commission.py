@@ -18,12 +18,9 @@ from typing import Any, Protocol
 from pmsmtool import __version__
 from pmsmtool.commissioning.compared_stage import check_accepted, compared, refusal
 from pmsmtool.commissioning.contradiction import DATA_SHEET
-from pmsmtool.commissioning.design_stages import lut_stage, margins_stage, tune_stage
-from pmsmtool.commissioning.flash_stages import flash_stage, verify_stage
 from pmsmtool.commissioning.level_stages import LevelStages
 from pmsmtool.commissioning.rated_limits import within_ratings
 from pmsmtool.commissioning.report_page import report_page
-from pmsmtool.design.design_file import load_design
 from pmsmtool.design.lookup.design import LookupRequest
 from pmsmtool.design.loops.margins import MarginRequest
 from pmsmtool.design.tune_request import TuneRequest
@@ -41,12 +38,10 @@ from pmsmtool.errors import (
     VerifyMismatch,
 )
 from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.verdicts import blocking
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.measurement.capabilities import Capabilities, Tier
-from pmsmtool.measurement.identify import identify
+from pmsmtool.measurement.capabilities import Capabilities, reference_capabilities
 from pmsmtool.measurement.run_account import RunAccount, status_of, text_of
-from pmsmtool.proof.stage import ProofRequest, not_proven, prove_stage
+from pmsmtool.proof.stage import ProofRequest, not_proven
 from pmsmtool.report.verdict import RAN
 from pmsmtool.run_directory import RunDirectory, RunRecord, Stage, new_record
 
@@ -158,7 +153,7 @@ class Commissioning:
     identify, tune, lookup, margins, prove
         What is asked.
     capabilities : Capabilities, optional
-        What a drive below the full tier has: its stages run as far as that goes, and those that cannot run are
+        What a drive below the full level has: its stages run as far as that goes, and those that cannot run are
         recorded as not available. Without, everything is expected, and the chain ends where something is missing.
     drive_bandwidth_hz : float, optional
         Bandwidth of the current control of a drive that keeps its own.
@@ -236,7 +231,7 @@ class Commissioning:
 
     def _refuse_required(self, record: RunRecord) -> None:
         """Refuse, before anything moves or is written, what cannot give a stage that is required."""
-        reasons = {} if self.tier is None else self.tier.unavailable()
+        reasons = self.stages.unavailable()
         reasons |= {stage.name: stage.note for stage in record.stages if stage.status == "not available"}
         lines = [f"{name}: not available: {reasons[name]}" for name in self.require if name in reasons]
         if lines:
@@ -264,7 +259,7 @@ class Commissioning:
             if name == "identify":
                 stage = self._compared(self._without_map(stage))
         except BaseException as error:
-            if isinstance(error, NotAvailable) and self.tier is not None:
+            if isinstance(error, NotAvailable) and not self.stages.whole:
                 self._not_available(name, number, error, clock.now() - start)
                 return
             failed = Stage(name, status_of(error), clock.now() - start, note=text_of(error))
@@ -293,8 +288,8 @@ class Commissioning:
     def _compared(self, stage: Stage) -> Stage:
         """Return the stage with data sheet, drive and measurement side by side: the gate before anything is written."""
         known = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
-        if known is None and self.tier is not None and self.tier.found.tier is not Tier.INJECT:
-            known = self.tier.known()
+        if known is None and not self.stages.injects:
+            known = self.stages.known()
         loaded = self.identify.shaft == "coupled"
         return compared(stage, self.drive, known, loaded=loaded, accept=self.accept_contradictions)
 
@@ -303,53 +298,27 @@ class Commissioning:
         self._settle(Stage(name, "not available", seconds, note=error.what, files=files), number)
 
     @property
-    def tier(self) -> LevelStages | None:
-        """The stages of a drive below the full tier; None for one that has everything, safe or (then refused) not."""
-        if self.capabilities is None or self.capabilities.tier is Tier.FULL or self.capabilities.unsafe:
-            return None
-        return LevelStages(self.run, self.drive, self.capabilities, self.nameplate, self.drive_bandwidth_hz)
+    def stages(self) -> LevelStages:
+        """The stages at the capability level of the drive."""
+        found = self.capabilities or reference_capabilities(self.drive.identity)
+        return LevelStages(self.run, self.drive, found, self.nameplate, self.drive_bandwidth_hz)
 
     def _say(self, line: str) -> None:
         """Tell a line, and the account of the run what it is about."""
         (self.progress if self._account is None else self._account).say(line)
 
     def _steps(self) -> dict[str, Callable[[], Stage]]:
-        say, tier, person = self._say, self.tier, self.person
-        if tier is not None:
-            asked = self.prove or proof_within(self.identify)
-            return {
-                "identify": lambda: tier.identify(self.identify, person.allow_motion, say),
-                "tune": lambda: within_ratings(self.run, tier.tune(self.tune), self.accept_limits),
-                "lut": lambda: tier.lut(self.lookup),
-                "margins": lambda: tier.margins(self.margins),
-                "flash": lambda: tier.flash(person.allow_writing, say),
-                "verify": tier.verify,
-                "prove": lambda: tier.prove(asked, person.allow_motion, say),
-            }
-        return {
-            "identify": self._identify,
-            "tune": lambda: within_ratings(self.run, tune_stage(self.run, self.tune), self.accept_limits),
-            "lut": lambda: lut_stage(self.run, self.lookup),
-            "margins": lambda: margins_stage(self.run, self.margins),
-            "flash": lambda: flash_stage(self.run, self.drive, self.person.allow_writing, say),
-            "verify": lambda: verify_stage(self.run, self.drive),
-            "prove": self._prove,
-        }
-
-    def _identify(self) -> Stage:
-        known = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
-        stage = identify(
-            self.run, self.drive, self.identify, self.person.allow_motion, self._say,
-            found=self.capabilities, known=known,
-        )  # fmt: skip
-        # without a file that a person gave, the drive's own set would stand in: it may be another machine's
-        stops = blocking(stage.refused, given=self.nameplate is not None)
-        return replace(stage, status="fail") if stops else stage
-
-    def _prove(self) -> Stage:
-        design = load_design(self.run.path / "design.toml")
+        say, stages, person = self._say, self.stages, self.person
         asked = self.prove or proof_within(self.identify)
-        return prove_stage(self.run, self.drive, design, asked, self.person.allow_motion, self._say)
+        return {
+            "identify": lambda: stages.identify(self.identify, person.allow_motion, say),
+            "tune": lambda: within_ratings(self.run, stages.tune(self.tune), self.accept_limits),
+            "lut": lambda: stages.lut(self.lookup),
+            "margins": lambda: stages.margins(self.margins),
+            "flash": lambda: stages.flash(person.allow_writing, say),
+            "verify": stages.verify,
+            "prove": lambda: stages.prove(asked, person.allow_motion, say),
+        }
 
     def _make_sure(self) -> None:
         """Leave the machine off, confirmed, where this program may have energised it."""
@@ -467,7 +436,7 @@ def commission(
     identify, tune : optional
         What is asked; the defaults of their classes.
     capabilities : Capabilities, optional
-        Of a drive below the full tier (``measurement.capabilities.examine``,
+        Of a drive below the full level (``measurement.capabilities.examine``,
         ``measurement.identify.open_for_level``).
 
     Raises

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The chain's stages on a drive that gives less than all: each runs as far as drive and map go, or says what it needs.
+"""The chain's stages: each runs as far as drive and map go, or says what it needs.
 
 A stage that cannot run raises ``NotAvailable``; the chain records it as not available and goes on. What runs is judged
 by the same criteria as on the reference drive.
@@ -56,7 +56,7 @@ FOR_READING = "the drive has no object for the table"
 
 @dataclass(frozen=True, slots=True)
 class LevelStages:
-    """The stages of one run on one drive below the full tier.
+    """The stages of one run on one drive.
 
     Parameters
     ----------
@@ -78,8 +78,20 @@ class LevelStages:
     nameplate: MachineFile | None
     drive_bandwidth_hz: float | None = None
 
+    @property
+    def whole(self) -> bool:
+        """Whether every stage is expected: at the full level, and where it lacks only what makes motion safe."""
+        return self.found.tier is Tier.FULL or self.found.unsafe
+
+    @property
+    def injects(self) -> bool:
+        """Whether the machine is identified by injection."""
+        return self.whole or self.found.tier is Tier.INJECT
+
     def plan_lines(self) -> list[str]:
-        """Return what the chain will do, one line per stage, before anything moves."""
+        """Return what the chain will do below the full level, one line per stage, before anything moves."""
+        if self.whole:
+            return []
         drive_map, tier = self.found.drive_map, self.found.tier
         known = self.known()
         lines = [f"capability level {tier}, map {drive_map.name}: {len(drive_map.cells)} parameters"]
@@ -105,6 +117,8 @@ class LevelStages:
 
     def unavailable(self) -> dict[str, str]:
         """Return the stages that drive and map cannot give, with the reason, as known before anything moves."""
+        if self.whole:
+            return {}
         writing, proof = self._no_writing(), self._no_proof()
         reasons = {"flash": writing, "verify": writing, "prove": proof}
         if self.known() is None:
@@ -127,22 +141,22 @@ class LevelStages:
             As the experiments end.
         """
         run, drive, found = self.run, self.drive, self.found
-        if found.tier is Tier.INJECT:
+        if self.injects:
             given = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
-            stage = identify(run, drive, request, allow, say, found=found, known=given)
-            return replace(stage, fallbacks=(*stage.fallbacks, NO_AVERAGES))
+            stage = _stopped(identify(run, drive, request, allow, say, found=found, known=given), given=given)
+            return stage if self.whole else replace(stage, fallbacks=(*stage.fallbacks, NO_AVERAGES))
         known = self.known()
         if known is not None:
             run.save(NAMEPLATE, dump_machine_file(known[0]))
         reason = self._nothing()
         asked = replace(request, quantities=tuple(self._quantities()))
         if self._own_line() and request.shaft != "locked":
-            return _stopped(identify_after_drive(run, drive, asked, allow, say, found=found, known=known))
+            return _stopped(identify_after_drive(run, drive, asked, allow, say, found=found, known=known), True)
         if not reason and request.shaft == "locked":
             reason = "needs a rotor that may turn, and the shaft is locked"
         if not reason:
             method = OF_LEVEL[found.tier]
-            return _stopped(identify(run, drive, asked, allow, say, method=method, found=found, known=known))
+            return _stopped(identify(run, drive, asked, allow, say, method=method, found=found, known=known), True)
         if known is not None:
             made = completed_machine(known[0], {}, known[1])
             assert made.machine is not None
@@ -262,7 +276,7 @@ class LevelStages:
         return ""
 
     def _no_proof(self) -> str:
-        if self.found.drive_map.staging and self.found.tier in (Tier.INJECT, Tier.RECORDER):
+        if self.found.drive_map.staging and (self.injects or self.found.tier is Tier.RECORDER):
             return ""
         cells = self.found.drive_map.cells
         reason = "the drive's current-loop gains cannot be read"
@@ -282,9 +296,12 @@ class LevelStages:
             raise NotAvailable(reason, where=f"node {self.found.identity.node}")
 
 
-def _stopped(stage: Stage) -> Stage:
-    """Return a stage that fails where pole pairs or angle are refused; what else is lacking is as given, unchecked."""
-    return replace(stage, status="fail") if blocking(stage.refused, given=True) else stage
+def _stopped(stage: Stage, given: object) -> Stage:
+    """Return a stage that fails where pole pairs or angle are refused; what else is lacking is as given, unchecked.
+
+    Without a machine file that a person gave, the drive's own set would stand in: it may be another machine's.
+    """
+    return replace(stage, status="fail") if blocking(stage.refused, given=given is not None) else stage
 
 
 def _without_base(run: RunDirectory, drive_map: DriveMap) -> list[str]:

@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks.prove_verdicts import Shared
 from pmsmtool.bus.connect import Connection
-from pmsmtool.commissioning import commission
+from pmsmtool.commissioning import commission, level_stages
 from pmsmtool.commissioning.commission import STAGES, Commissioning, begin_run, due_stages
 from pmsmtool.commissioning.export import image_of
 from pmsmtool.design.loops.margins import MarginRequest
@@ -328,7 +328,7 @@ def test_a_measured_flux_that_contradicts_the_file_ends_the_chain(
         for key in ("pole_pairs", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")
     ]
     measured = Stage("identify", "pass", 1.0, values=values)
-    monkeypatch.setattr(commission, "identify", lambda *_, **__: measured)
+    monkeypatch.setattr(level_stages, "identify", lambda *_, **__: measured)
     before = active_crc(drive)
     run = begin_run(drive, tmp_path)
     person = Told()
