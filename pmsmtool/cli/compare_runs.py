@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.options import examples, output_options
+from pmsmtool.cli.options import FILE, examples, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.cli.output_file import figure_format, save_figure
 
 if TYPE_CHECKING:
     from pmsmtool.machine.machine_file import MachineFile
@@ -26,8 +27,9 @@ if TYPE_CHECKING:
 @click.argument("first", type=click.Path(path_type=Path))
 @click.argument("second", type=click.Path(path_type=Path))
 @click.option("--check", is_flag=True, help="Exit code 1 where a value differs beyond its interval, or one is missing.")
+@click.option("--plot", "plot_path", type=FILE, help="Differences over their intervals to write (.svg, .png, .pdf).")
 @output_options
-def diff_command(first: Path, second: Path, check: bool, out: Output) -> None:
+def diff_command(first: Path, second: Path, check: bool, plot_path: Path | None, out: Output) -> None:
     """Compare what two runs identified, with the 95 % interval of the difference.
 
     Runs of one drive share its sensors, so only what scatters counts; of two drives the whole interval does. Resistance
@@ -36,10 +38,14 @@ def diff_command(first: Path, second: Path, check: bool, out: Output) -> None:
     Of two runs of `pmsmtool move`: following error, settling and current of the same move, number by number. The exit
     code with --check is then 1 where the second one follows worse.
     """
-    from pmsmtool.errors import CheckFailed
+    from pmsmtool.errors import CheckFailed, ConfigError
     from pmsmtool.identification.compared_runs import differences, same_drive, told
 
+    if plot_path is not None:
+        figure_format(plot_path)
     if _moved(first, second):
+        if plot_path is not None:
+            raise click.UsageError("--plot draws what two runs identified, not two moves")
         _diff_of_moves(first, second, check, out)
         return
     (record, file), (other_record, other) = read_run(first), read_run(second)
@@ -52,6 +58,13 @@ def diff_command(first: Path, second: Path, check: bool, out: Output) -> None:
     data = [{**_facts(row), "verdict": row.verdict} for row in rows]
     heads = ("quantity", "first", "second", "difference", "interval", "verdict")
     out.result("diff", {"same_drive": same, "quantities": data}, [*table(heads, cells), last])
+    if plot_path is not None:
+        from pmsmtool.report.figures import difference_figure
+
+        drawn = {row.name: (row.difference, row.interval) for row in rows if row.interval > 0.0}
+        if not drawn:
+            raise ConfigError("the runs have no quantity in common that could be drawn", where=str(second))
+        save_figure(difference_figure(drawn, "").canvas, plot_path)
     if check and changed:
         raise CheckFailed(
             f"{', '.join(changed)}: not the same in both runs", where=str(second),

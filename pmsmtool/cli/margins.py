@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.options import Quantity, examples, output_options
+from pmsmtool.cli.options import FILE, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, table
-from pmsmtool.cli.output_file import inside
+from pmsmtool.cli.output_file import figure_format, inside, save_figure
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
@@ -55,6 +55,7 @@ IN_PROCESS = 20_000
 @click.option("--u-dc", "U_dc_v", type=(_VOLTAGE, _VOLTAGE), metavar="LOW HIGH", help="Range of the DC link.  [+-5 %]")
 @click.option("--winding", "T_winding_c", type=(_TEMPERATURE, _TEMPERATURE), metavar="LOW HIGH", help="Winding.")
 @click.option("--magnet", "T_magnet_c", type=(_TEMPERATURE, _TEMPERATURE), metavar="LOW HIGH", help="Magnet.")
+@click.option("--plot", "plot_path", type=FILE, help="Margins over the box to write (.svg, .png, .pdf).")
 @output_options
 def margins_command(
     design: Path,
@@ -67,6 +68,7 @@ def margins_command(
     U_dc_v: tuple[float, float] | None,
     T_winding_c: tuple[float, float] | None,
     T_magnet_c: tuple[float, float] | None,
+    plot_path: Path | None,
     out: Output,
     **asked: Any,
 ) -> None:
@@ -84,6 +86,8 @@ def margins_command(
     from pmsmtool.design.tolerance import tolerance_box
     from pmsmtool.errors import CheckFailed, NotAvailable
 
+    if plot_path is not None:
+        figure_format(plot_path)
     file = inside(design, "design.toml")
     source = load_design(file)
     box = tolerance_box(source.machine, U_dc_v=U_dc_v, T_winding_c=T_winding_c, T_magnet_c=T_magnet_c)
@@ -111,6 +115,8 @@ def margins_command(
     out.result("margins", found, lambda: _lines(report, simulated))
     for note in report.notes:
         out.note(note)
+    if plot_path is not None:
+        _plot(report, plot_path)
     if not ok:
         bad = [spread.name for spread in (*report.loops, *report.headroom) if not spread.ok]
         bad += _failed(simulated)
@@ -126,6 +132,20 @@ def margins_command(
             hint="`pmsmtool tune --map FAMILY --drive-bandwidth-hz HZ` checks the loops of a drive with fixed "
             "firmware; --voltage-headroom, --current-headroom and --thermal-headroom judge the rest",
         )
+
+
+def _plot(report: MarginReport, path: Path) -> None:
+    import math
+
+    from pmsmtool.report.figures import bands_figure
+
+    groups: dict[str, dict[str, tuple[float, float, float, float]]] = {}
+    for spread in (row for row in (*report.loops, *report.headroom) if row.unit != "us"):  # follows from the phase
+        high = spread.percentiles.get(95.0, spread.nominal)
+        limit = math.nan if spread.least is None else spread.least
+        if all(map(math.isfinite, (spread.worst, spread.nominal, high))):
+            groups.setdefault(spread.unit, {})[spread.name] = (spread.worst, spread.nominal, high, limit)
+    save_figure(bands_figure(groups, "").canvas, path)
 
 
 def _scenario(name: str | None, source: Design) -> Scenario | None:

@@ -34,6 +34,8 @@ def save_figure(figure: Figure, path: Path) -> None:
     import matplotlib
 
     suffix = figure_format(path)
+    if figure.get_layout_engine() is None:
+        figure.set_layout_engine("constrained")  # laid out before, for the fonts of a page
     out = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "pmsmtool", "svg.fonttype": "path"}):
         figure.savefig(out, format=suffix, metadata=_FIGURE_METADATA[suffix])

@@ -13,6 +13,7 @@ import click
 from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import FILE, examples, options_named, output_options, overspeed_option
 from pmsmtool.cli.output import Output, table
+from pmsmtool.cli.output_file import figure_format, save_figure
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import write_file
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 @click.option("-o", "--output", "path", type=FILE, required=True, help="Design file to write.")
 @click.option("--params", "params_path", type=FILE, help="Parameter set to write.  [default: beside "
               "it, params.toml for design.toml, X.params.toml for X.toml]")  # fmt: skip
+@click.option("--plot", "plot_path", type=FILE, help="Bode plot of the loops to write (.svg, .png, .pdf).")
 @click.option("--controller", type=click.Choice(["pi", "polar"]), default="pi", help="Field-oriented PI, or polar.")
 @click.option(
     "--polar-law",
@@ -104,7 +106,13 @@ if TYPE_CHECKING:
               "[default: torque limit / J]")  # fmt: skip
 @output_options
 def tune_command(
-    machine: str, path: Path, params_path: Path | None, map_file: Path | None, out: Output, **asked: Any
+    machine: str,
+    path: Path,
+    params_path: Path | None,
+    map_file: Path | None,
+    plot_path: Path | None,
+    out: Output,
+    **asked: Any,
 ) -> None:
     """Design the control of MACHINE (a machine file, a run directory or a profile).
 
@@ -129,15 +137,20 @@ def tune_command(
         _axis(load_machine_file(machine), drive_map, asked, axis, path, params_path or _params_path(path), out)
         return
     _refuse_without_axis(axis)
+    if plot_path is not None:
+        figure_format(plot_path)
     design = _design(load_machine_file(machine), drive_map, asked)
     params = design.parameter_set()
     params_path = _params_path(path) if params_path is None else params_path
     write_file(path, design_text(design))
     write_file(params_path, params.to_toml())
+    if plot_path is not None:
+        _plot(design, plot_path)
     data = {
         "machine": design.name,
         "design": path,
         "params": params_path,
+        "plot": plot_path,
         "content": params.content_hash(),
         "values": {name: design[name] for name in design.values},
         "loops": design.loops,
@@ -148,6 +161,16 @@ def tune_command(
     for note in design.notes:
         out.note(note)
     out.note(f"wrote {path}, {params_path}")
+
+
+def _plot(design: Design, path: Path) -> None:
+    from pmsmtool.design.loops.open_loops import open_loops
+    from pmsmtool.report.figures import bode_figure
+
+    loops = open_loops(design)
+    if not loops:
+        raise ConfigError("the design has no loops to draw: the drive's gains cannot be written", where=str(path))
+    save_figure(bode_figure(loops, {name: design.loops[name] for name in loops}).canvas, path)
 
 
 _AXIS = ("axis_phase_margin_deg", "axis_peak_db", "loop_rate_hz")

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
+_BAND = "#e5e7eb"
 _SALT = "pmsmtool"
 _SIZE = (9.0, 3.4)
 _MEASURED, _MODEL, _OTHER, _LIMIT = "#1f5fa8", "#c2410c", "#4b5563", "#9ca3af"
@@ -84,7 +85,7 @@ def resistance_figure(levels: Trace, R_ohm: float, curve: InverterCurve) -> Figu
         f"DC levels up to {peak:.4g} A and R = {R_ohm:.5g} ohm at the temperature of the measurement; what is left "
         f"over is the voltage error of one inverter phase, sampled at {len(curve.i_phase_a)} currents."
     )
-    return Figure(svg(canvas), caption)
+    return _finished(canvas, caption)
 
 
 def inductance_figure(shots: Mapping[str, Trace], fits: Mapping[str, AxisFit], sigma_a: float) -> Figure:
@@ -117,7 +118,7 @@ def inductance_figure(shots: Mapping[str, Trace], fits: Mapping[str, AxisFit], s
         rms = sigma_a * math.sqrt(float(np.mean(fit.residuals[0] ** 2)))
         texts.append(f"{axis}: rms residual {1e3 * rms:.3g} mA over {len(shot)} samples, chi2 {fit.chi2:.3g}")
     panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-    return Figure(svg(canvas), f"Square-wave injection, first periods; {'; '.join(texts)}.")
+    return _finished(canvas, f"Square-wave injection, first periods; {'; '.join(texts)}.")
 
 
 def flux_figure(result: FluxResult) -> Figure:
@@ -143,7 +144,7 @@ def flux_figure(result: FluxResult) -> Figure:
         f"temperature of the run; the largest d current changes the flux of the magnets by "
         f"{100 * result.curvature:+.2g} %."
     )
-    return Figure(svg(canvas), caption)
+    return _finished(canvas, caption)
 
 
 def bode_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMargins]) -> Figure:
@@ -180,8 +181,8 @@ def bode_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMargin
         for name, m in found.items()
         if name in loops
     ]
-    return Figure(
-        svg(canvas), f"Open loops as sampled, delay included; phase, gain and delay margin: {'; '.join(texts)}."
+    return _finished(
+        canvas, f"Open loops as sampled, delay included; phase, gain and delay margin: {'; '.join(texts)}."
     )
 
 
@@ -210,10 +211,8 @@ def nyquist_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMar
         axes.set(xlim=(-NYQUIST_SIZE, 1.0), ylim=(-NYQUIST_SIZE, 1.0), aspect="equal", xlabel="Re L")
         axes.set_title(f"{name}: {least:.2f} from -1", loc="left", fontsize=9)
     panels[0].set_ylabel("Im L")
-    return Figure(
-        svg(canvas), "Nyquist curves of the open loops as sampled. Dotted: least distance from -1 (modulus margin); "
-        "dashed: unit circle."
-    )  # fmt: skip
+    caption = "Nyquist curves of the open loops as sampled. Dotted: least distance from -1 (modulus margin); dashed: "
+    return _finished(canvas, caption + "unit circle.")
 
 
 def margin_map_figure(
@@ -242,7 +241,7 @@ def margin_map_figure(
     axes.annotate("designed", designed, xytext=(8, 6), textcoords="offset points", color=_MEASURED)
     axes.grid(False)
     axes.set(xlabel="inductance of the machine / designed", ylabel="delay / control periods")
-    return Figure(svg(canvas), caption)
+    return _finished(canvas, caption)
 
 
 def envelope_figure(
@@ -277,7 +276,7 @@ def envelope_figure(
     right.set(xlabel="i_d / A", ylabel="i_q / A", aspect="equal", xlim=(-edge, 0.15 * edge), ylim=(0.0, edge))
     right.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     limits = f" Limits that bind in the table: {', '.join(binding)}." if binding else ""
-    return Figure(svg(canvas), f"Torque over speed and the current loci behind it.{limits}")
+    return _finished(canvas, f"Torque over speed and the current loci behind it.{limits}")
 
 
 def band_figure(rows: Mapping[str, tuple[float, float, float, float]], unit: str, caption: str) -> Figure:
@@ -290,15 +289,48 @@ def band_figure(rows: Mapping[str, tuple[float, float, float, float]], unit: str
     unit : str
         Of all four.
     """
-    canvas, (axes,) = _canvas(1, 1, height=0.25 + 0.12 * len(rows))
-    for y, (low, middle, high, limit) in enumerate(rows.values()):
-        axes.plot([low, high], [y, y], "-", lw=5.0, color=_LIMIT, solid_capstyle="butt")
-        axes.plot(middle, y, "o", ms=5, color=_MEASURED)
-        if math.isfinite(limit):
-            axes.plot([limit, limit], [y - 0.35, y + 0.35], color=_MODEL)
+    return bands_figure({unit: rows}, caption)
+
+
+def bands_figure(groups: Mapping[str, Mapping[str, tuple[float, float, float, float]]], caption: str) -> Figure:
+    """As :func:`band_figure`, one pair of axes per unit.
+
+    Parameters
+    ----------
+    groups : mapping of str to mapping
+        Rows by unit.
+    """
+    lines = sum(map(len, groups.values()))
+    canvas, panels = _canvas(len(groups), 1, height=0.25 * len(groups) + 0.12 * lines)
+    for axes, (unit, rows) in zip(panels, groups.items(), strict=True):
+        for y, (low, middle, high, limit) in enumerate(rows.values()):
+            axes.plot([low, high], [y, y], "-", lw=5.0, color=_LIMIT, solid_capstyle="butt")
+            axes.plot(middle, y, "o", ms=5, color=_MEASURED)
+            if math.isfinite(limit):
+                axes.plot([limit, limit], [y - 0.35, y + 0.35], color=_MODEL)
+        axes.set_yticks(range(len(rows)), list(rows))
+        axes.set(xlabel=unit, ylim=(len(rows) - 0.5, -0.5))
+    return _finished(canvas, caption)
+
+
+def difference_figure(rows: Mapping[str, tuple[float, float]], caption: str) -> Figure:
+    """Draw differences of two runs over the half widths of their 95 % intervals: inside -1 to 1 they agree.
+
+    Parameters
+    ----------
+    rows : mapping of str to (difference, interval)
+        In one unit each; the interval is not zero.
+    """
+    shares = {name: difference / interval for name, (difference, interval) in rows.items()}
+    canvas, (axes,) = _canvas(1, 1, height=0.3 + 0.12 * len(rows))
+    axes.axvspan(-1.0, 1.0, color=_BAND)
+    for y, share in enumerate(shares.values()):
+        axes.plot(share, y, "o", ms=5, color=_MEASURED if abs(share) <= 1.0 else _MODEL)
+    edge = 1.1 * max(1.5, *(abs(share) for share in shares.values()))
     axes.set_yticks(range(len(rows)), list(rows))
-    axes.set(xlabel=unit, ylim=(len(rows) - 0.5, -0.5))
-    return Figure(svg(canvas), caption)
+    axes.set(xlabel="second minus first / half width of the 95 % interval", xlim=(-edge, edge))
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    return _finished(canvas, caption)
 
 
 def series_figure(
@@ -318,7 +350,7 @@ def series_figure(
     axes.errorbar(numbers, values, yerr=halves, fmt="o", ms=4, lw=1.0, color=_MEASURED)
     axes.set(xlabel="run", ylabel=f"{name} / {unit}")
     axes.xaxis.get_major_locator().set_params(integer=True)
-    return Figure(svg(canvas), f"{name} over the runs, with the total 95 % interval of each; grey: the median.")
+    return _finished(canvas, f"{name} over the runs, with the total 95 % interval of each; grey: the median.")
 
 
 _SIGNAL_LABELS = {"i_d_a": "i_d / A", "i_q_a": "i_q / A", "omega_e_rad_s": "speed / rad/s (el)"}
@@ -360,7 +392,11 @@ def proof_figure(
         axes.set_ylabel(_SIGNAL_LABELS.get(signal, signal))
     panels[0].legend(loc="best")
     panels[-1].set_xlabel("time / ms")
-    return Figure(svg(canvas), caption)
+    return _finished(canvas, caption)
+
+
+def _finished(canvas: Canvas, caption: str) -> Figure:
+    return Figure(svg(canvas), caption, canvas=canvas)
 
 
 def _canvas(rows: int, columns: int, *, height: float = 1.0, sharex: bool = False) -> tuple[Canvas, Any]:

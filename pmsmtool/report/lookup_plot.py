@@ -15,8 +15,14 @@ from pmsmtool.design.lookup.table import LookupTable, electrical_speed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+BESIDE = 1.05
+"""Edge of the drawn current plane, over I_max."""
+
 PLANE_POINTS = 161
 """Points along each axis of the current plane."""
+
+_LEGEND: dict[str, Any] = {"fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "frameon": False}
+"""Beside the axes, clear of what is drawn."""
 
 LIMITS_SHOWN = 4
 """Voltage (or flux) limits drawn in the current plane."""
@@ -26,7 +32,7 @@ def lookup_figure(table: LookupTable, lines: Mapping[str, Locus]) -> Figure:
     """Return a figure with three panels; matplotlib is imported here."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13.0, 4.4), layout="constrained")
+    figure = Figure(figsize=(14.5, 4.4), layout="constrained")
     plane, envelope, margin = figure.subplots(1, 3)
     _plane(plane, table, lines)
     _envelope(envelope, table, lines)
@@ -38,28 +44,39 @@ def _plane(axes: Any, table: LookupTable, lines: Mapping[str, Locus]) -> None:
     I_max = table.I_max_apk
     angle = np.linspace(0.0, 2.0 * math.pi, 181)
     axes.plot(I_max * np.cos(angle), I_max * np.sin(angle), color="0.5", linewidth=1.0, label="I_max")
-    i = np.linspace(-1.05 * I_max, 1.05 * I_max, PLANE_POINTS)
+    i = np.linspace(-BESIDE * I_max, BESIDE * I_max, PLANE_POINTS)
     i_d, i_q = np.meshgrid(i, i)
     torque = table.machine.torque_nm(i_d, i_q)
     axes.contour(i, i, torque, levels=10, colors="0.8", linewidths=0.6)
     if table.axis_kind == "speed":
         V = float(table.V_max_v.min())
         shown = np.linspace(0.0, float(table.y.max()), LIMITS_SHOWN + 1)[1:]
-        for omega in electrical_speed(table.machine, shown):
+        for n, omega in zip(shown, electrical_speed(table.machine, shown), strict=True):
             demand = table.machine.voltage_v(i_d, i_q, omega)
-            axes.contour(i, i, demand, levels=[V], colors="tab:blue", linewidths=0.8)
-        title = "voltage limits at " + ", ".join(f"{n:.0f}" for n in shown) + " rpm"
+            ellipse = axes.contour(i, i, demand, levels=[V], colors="tab:blue", linewidths=0.8)
+            _label(axes, ellipse, f"{n:.0f} rpm", I_max)
+        title = f"blue: voltage limit of {V:.4g} V at a speed"
     else:
         shown = np.linspace(float(table.y.min()), float(table.y.max()), LIMITS_SHOWN)
         demand = np.hypot(*table.machine.flux(i_d, i_q))
-        axes.contour(i, i, demand, levels=shown, colors="tab:blue", linewidths=0.8)
-        title = "flux limits " + ", ".join(f"{psi:.3g}" for psi in shown) + " Wb"
+        limits = axes.contour(i, i, demand, levels=shown, colors="tab:blue", linewidths=0.8)
+        axes.clabel(limits, fmt="%.3g Wb", fontsize=7)
+        title = "blue: flux limits"
     for name, colour in (("mtpa", "tab:green"), ("largest", "tab:red"), ("mtpv", "tab:purple")):
-        if name in lines and not np.isnan(lines[name].i_q_a).all():
+        if name in lines and np.any(np.hypot(lines[name].i_d_a, lines[name].i_q_a) <= BESIDE * I_max):
             axes.plot(lines[name].i_d_a, lines[name].i_q_a, color=colour, label=name)
     axes.set(xlabel="i_d / A", ylabel="i_q / A", aspect="equal", xlim=(i[0], i[-1]), ylim=(i[0], i[-1]))
     axes.set_title(title, fontsize=9)
-    axes.legend(fontsize=8, loc="upper right")
+    axes.legend(**_LEGEND)
+
+
+def _label(axes: Any, ellipse: Any, text: str, I_max: float) -> None:
+    """Write beside an ellipse at its lowest point inside the current limit, away from the loci of positive torque."""
+    points = np.concatenate([path.vertices for path in ellipse.get_paths()])
+    inside = points[np.hypot(*points.T) <= I_max]
+    if len(inside):
+        at = inside[np.argmin(inside[:, 1])]
+        axes.annotate(text, at, xytext=(3, 3), textcoords="offset points", color="tab:blue", fontsize=7)
 
 
 def _envelope(axes: Any, table: LookupTable, lines: Mapping[str, Locus]) -> None:
@@ -76,7 +93,7 @@ def _envelope(axes: Any, table: LookupTable, lines: Mapping[str, Locus]) -> None
     axes.set(xlabel=_y_label(table), ylabel="torque / N m", ylim=(-1.1 * reach, 1.3 * reach))
     axes.set_title("torque that can be reached", fontsize=9)
     axes.grid(color="0.9")
-    axes.legend(fontsize=8)
+    axes.legend(**_LEGEND)
 
 
 def _margin(figure: Any, axes: Any, table: LookupTable) -> None:

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 POINTS_MAX = 4000
 """Points of a line; a longer signal is shown as the least and the largest value of each of its stretches."""
 
+SMALLEST_SHARE = 1e-4
+"""Least span of an axis over the largest value of its unit in the figure: what is smaller is rounding, no signal."""
+
 RPM_PER_RAD_S = 9.549296585513721
 
 
@@ -79,6 +82,9 @@ def trace_figure(trace: Trace, panels: Sequence[Panel] = PANELS, title: str = ""
     axes = np.atleast_1d(figure.subplots(len(shown), 1, sharex=True))
     for panel, at in zip(shown, axes, strict=True):
         _draw(at, trace, panel)
+        unit = panel.label.rpartition(" / ")[2]
+        alike = [other for other in shown if other.label.rpartition(" / ")[2] == unit]
+        _widen(at, SMALLEST_SHARE * max(_largest(trace, other) for other in alike))
     axes[-1].set_xlabel("time / s")
     if title:
         figure.suptitle(title, fontsize=10)
@@ -93,7 +99,19 @@ def _draw(axes: Any, trace: Trace, panel: Panel) -> None:
     axes.set_ylabel(panel.label)
     axes.grid(color="0.9")
     if len(present) > 1:
-        axes.legend(fontsize=8, loc="upper right")
+        axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+
+
+def _largest(trace: Trace, panel: Panel) -> float:
+    values = [panel.factor * np.abs(trace[name]) for name, _, _ in panel.lines if name in trace.signals]
+    return max((float(np.nanmax(value, initial=0.0)) for value in values), default=0.0)
+
+
+def _widen(axes: Any, least: float) -> None:
+    """Let the axis span at least ``least`` about its middle."""
+    low, high = axes.get_ylim()
+    if high - low < least:
+        axes.set_ylim(0.5 * (low + high - least), 0.5 * (low + high + least))
 
 
 def thinned(t_s: NDArray[np.float64], value: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -24,13 +24,14 @@ if TYPE_CHECKING:
 class Figure:
     """One plot: inline SVG text, its caption, the stage whose numbers it explains, and how well it shows the verdict.
 
-    The figure of the largest ``weight`` stands below the verdict.
+    The figure of the largest ``weight`` stands below the verdict. ``canvas`` is matplotlib's own, for other formats.
     """
 
     svg: str
     caption: str
     stage: str = ""
     weight: float = 0.0
+    canvas: Any = field(default=None, repr=False, compare=False)
 
 
 Cell = tuple[Any, str]

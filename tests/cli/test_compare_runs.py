@@ -157,3 +157,15 @@ def test_a_drift_is_seen_and_scatter_is_none() -> None:
 def test_few_runs_have_no_spread() -> None:
     (row,) = series((str(k), {"R_s_ohm": R}) for k in range(LEAST_SERIES - 1))
     assert math.isnan(row.spread) and row.odd == () and row.runs == LEAST_SERIES - 1
+
+
+@pytest.mark.chain
+def test_figures_of_design_margins_and_two_runs(tmp_path: Path) -> None:
+    first, second = run_of(tmp_path, "a", {"R_s_ohm": R}), run_of(tmp_path, "b", {"R_s_ohm": moved(R, 0.01)})
+    told("diff", first, second, "--plot", tmp_path / "diff.svg")
+    told("tune", "interior-2k2", "-o", tmp_path / "d.toml", "--plot", tmp_path / "tune.png")
+    told("margins", tmp_path / "d.toml", "--plot", tmp_path / "margins.pdf")
+    heads = {name: (tmp_path / name).read_bytes()[:5] for name in ("diff.svg", "tune.png", "margins.pdf")}
+    assert heads == {"diff.svg": b"<?xml", "tune.png": b"\x89PNG\r", "margins.pdf": b"%PDF-"}
+    outcome = CliRunner().invoke(cli, ["diff", str(first), str(second), "--plot", "x.gif"])
+    assert isinstance(outcome.exception, ConfigError) and "use .svg, .png or .pdf" in str(outcome.exception)

@@ -26,6 +26,9 @@ def test_the_figure_shows_the_whole_current_circle_the_loci_and_the_margins() ->
         assert high == pytest.approx(1.05 * I_MAX)
     drawn = {str(line.get_label()): line.get_xydata() for line in plane.get_lines()}
     np.testing.assert_allclose(np.hypot(*drawn["I_max"].T), I_MAX)
+    assert [text.get_text() for text in plane.texts] == ["750 rpm", "1500 rpm", "2250 rpm", "3000 rpm"]
+    for axes in (plane, envelope):  # clear of what is drawn
+        assert axes.get_legend().get_bbox_to_anchor().x0 >= axes.bbox.x1 - 1e-9
     np.testing.assert_array_equal(drawn["mtpa"], np.column_stack([lines["mtpa"].i_d_a, lines["mtpa"].i_q_a]))
     shown = {str(line.get_label()): line.get_xydata() for line in envelope.get_lines()}
     np.testing.assert_array_equal(

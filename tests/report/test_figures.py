@@ -119,6 +119,13 @@ def test_rows_are_drawn_from_quantile_to_quantile_against_their_limit(canvases: 
     assert x == [(41.0, 62.0), (60.0,), (45.0, 45.0), (3.0, 5.0), (4.0,)]
 
 
+def test_a_difference_beyond_its_interval_lies_outside_the_band(canvases: list[Any]) -> None:
+    figures.difference_figure({"R_s_ohm": (0.1, 0.2), "L_d_h": (-0.5, 0.1)}, "")
+    axes = canvases[0].axes[0]
+    assert [float(line.get_xdata()[0]) for line in axes.lines] == [0.5, -5.0]
+    assert len({line.get_color() for line in axes.lines}) == 2 and axes.get_xlim() == pytest.approx((-5.5, 5.5))
+
+
 def test_text_stays_text_and_no_date_is_written(canvases: list[Any]) -> None:
     inside, beyond = (np.array([-0.5, 0.0]), np.array([0.5, 0.0])), (np.array([-9.0, -8.0]), np.array([5.0, 4.0]))
     figure = figures.envelope_figure(

@@ -173,6 +173,14 @@ def test_figure_has_a_panel_per_present_quantity():
         trace_figure(trace(100), [Panel("x", (("nothing", "n", "-"),))])
 
 
+def test_rounding_is_not_drawn_as_a_signal():
+    t = np.arange(100) * 1e-4
+    rounding = {"i_d_a": 1e-13 * np.sin(50.0 * t), "i_q_a": 6.0 * np.cos(50.0 * t)}
+    upper, lower = trace_figure(Trace(t, rounding, {"i_d_a": "A", "i_q_a": "A"})).axes
+    assert upper.get_ylim() == pytest.approx((-3e-4, 3e-4), rel=1e-6)
+    assert lower.get_ylim()[1] > 6.0
+
+
 def test_thinning_keeps_every_extreme_value():
     t = np.arange(100_003) * 1e-5
     value = np.random.default_rng(0).normal(size=len(t))
