@@ -19,7 +19,9 @@ from tests.firmware.projection_twin import (
     TWO,
     ZERO,
     Row,
+    find_corner,
     project_row,
+    project_row_from,
     project_rows,
     row_share,
     scale_voltage,
@@ -34,6 +36,7 @@ MEAN_WEIGHT, SURE_SHARE, SLOW_GAIN, NEAR_SHARE = f(0.05), f(0.01), f(0.1), f(0.2
 SHRINK, FORCED = f(0.95), f(1.2)
 TRIALS, INSIDE = 2, f(0.9999995)
 FLAG_FALLBACK = 64
+TRIES, FOUND = 6, 255
 
 
 @dataclass
@@ -51,6 +54,9 @@ class GovernedTwin(Twin):
     off_model: bool = False
     u: Vector = (ZERO, ZERO)
     reachable: Vector | None = None
+    multiplier: np.float32 = ZERO
+    corner: Vector = (ZERO, ZERO)
+    cornered: int = 0
     omega: np.float32 = ZERO
     T_s: np.float32 = ZERO
     V_max: np.float32 = ZERO
@@ -187,6 +193,24 @@ class GovernedTwin(Twin):
         v, basis = found if more is None else more
         return v, basis[0]
 
+    def approach(self, rows: list[Row], steady: int, r: Vector) -> Vector:
+        """The reachable request of the line search: steady-state row and corner with the current row in turn."""
+        last, kept = rows[steady], self.reachable
+        pre, self.reachable = Row(last.dd, last.dq, last.qd, last.qq, last.c, last.V * f(0.99999)), None
+        if kept is not None:
+            self.corner, found = find_corner(rows[-1], pre, r, self.corner, 1)
+            self.cornered = FOUND if found else self.cornered + 1 if self.cornered < TRIES else 0
+            return self.corner if found else kept
+        v, self.multiplier = project_row_from(pre, r, self.multiplier, 2)
+        if len(rows) <= steady + 1 or square(v) <= rows[-1].V * rows[-1].V:
+            self.cornered = 0
+            return v
+        if self.cornered == 0:
+            share = rows[-1].V / np.sqrt(square(v))
+            self.corner = share * v[0], share * v[1]
+        self.reachable = v
+        return self.corner if self.cornered == FOUND else v
+
     def pre_project(self, rows: list[Row], steady: int, r: Vector) -> tuple[Vector, bool]:
         """The reachable request, and whether the period has time left to start a transfer."""
         last, kept = rows[steady], self.reachable
@@ -206,7 +230,10 @@ class GovernedTwin(Twin):
         options, r, may_start = int(self.values["governor.options"]), request, True
         rows, steady, offset = self.rows()
         if options & PRE_PROJECTION:
-            r, may_start = self.pre_project(rows, steady, r)
+            if int(self.values["governor.mode"]) == LINE:
+                r = self.approach(rows, steady, r)
+            else:
+                r, may_start = self.pre_project(rows, steady, r)
         asks_first = int(self.values["governor.mode"]) in (PAPER, BEST)
         self.binding = NONE
         if asks_first and self.admits(rows, steady, r):

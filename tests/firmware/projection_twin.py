@@ -76,22 +76,32 @@ def times(s: Symmetric, x: Vector) -> Vector:
 
 
 def project_row(row: Row, r: Vector) -> Vector:
+    return project_row_from(row, r, ZERO, ROUNDS)[0]
+
+
+def project_row_from(row: Row, r: Vector, multiplier: np.float32, most: int) -> tuple[Vector, np.float32]:
+    """Point and multiplier after so many steps from a first guess of the multiplier."""
     a = row.voltage(r)
     power = square(a)
     if power <= row.V * row.V:
-        return r
+        return r, ZERO
     K, enough = row.gram(), row.V * (ONE + ROW_TOLERANCE)
-    S, multiplier, w = factor(ONE, ZERO, ONE), ZERO, a
-    for _ in range(ROUNDS):
+    S, w, least = factor(ONE, ZERO, ONE), a, ZERO
+    if multiplier > 0:
+        S = factor(ONE + multiplier * K[0], multiplier * K[1], ONE + multiplier * K[2])
+        w, least = solve(S, a), row.V * (ONE - ROW_TOLERANCE)
+        power = square(w)
+    for _ in range(most):
         size = np.sqrt(power)
-        if size <= enough:
+        if least <= size <= enough:
             break
         multiplier = multiplier + (size - row.V) * power / (row.V * dot(w, solve(S, times(K, w))))
+        multiplier, least = max(multiplier, ZERO), ZERO
         S = factor(ONE + multiplier * K[0], multiplier * K[1], ONE + multiplier * K[2])
         w = solve(S, a)
         power = square(w)
     step = row.transposed(w)
-    return r[0] - multiplier * step[0], r[1] - multiplier * step[1]
+    return (r[0] - multiplier * step[0], r[1] - multiplier * step[1]), multiplier
 
 
 def smallest_voltage(goal: Row, limit: Row) -> Vector:
@@ -121,10 +131,10 @@ def smallest_voltage(goal: Row, limit: Row) -> Vector:
     return back.voltage((scale * y[0] - limit.c[0], scale * y[1] - limit.c[1]))
 
 
-def find_corner(first: Row, second: Row, r: Vector, v: Vector) -> tuple[Vector, bool]:
+def find_corner(first: Row, second: Row, r: Vector, v: Vector, most: int = CORNER_STEPS) -> tuple[Vector, bool]:
     """Last point of Newton's method, and whether it is the optimum."""
     limits = first.V * first.V, second.V * second.V
-    for _ in range(CORNER_STEPS):
+    for _ in range(most):
         w1, w2 = first.voltage(v), second.voltage(v)
         f1, f2 = HALF * (square(w1) - limits[0]), HALF * (square(w2) - limits[1])
         n1, n2 = first.transposed(w1), second.transposed(w2)

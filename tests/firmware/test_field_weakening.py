@@ -198,14 +198,19 @@ def test_steady_current_of_table_1_is_the_optimum(mode: int, rpm: float, torque:
     assert pytest.approx(6 * (0.41 + 0.0002 * expected[0]) * expected[1], abs=BIAS_NM) == T
 
 
+FIELD_WEAKENING_STEPS = 14
+"""Newton steps of one period, an iteration counted as three: ``STEPS_MOST`` of ``field_weakening.c``."""
+
+
 def test_iterations_are_few_warm_and_bounded_cold() -> None:
     warm = ramp(governed(ACCELERATED), 40.0, (400, 800))["iterations"]
     called = warm[3000:][warm[3000:] > 0]
     assert np.percentile(called, 95) <= 16  # projections and their Newton steps; 5 FISTA steps
     loop = Loop(core(), weakening(ACCELERATED, field_weakening__iterations=100), omega=800 * RPM, U_dc=V_DC)
-    live = loop.step(mode=MODE_TORQUE, tau_ref=40.0)
-    assert live.iterations <= 300
-    assert abs(6 * (0.41 + 0.0002 * live.i_d_req) * live.i_q_req - 40) < 0.1
+    for allowed in (0.2, 0.01):  # measured 0.13, 0.0002
+        live = loop.step(mode=MODE_TORQUE, tau_ref=40.0)
+        assert 0 < live.iterations <= FIELD_WEAKENING_STEPS
+        assert abs(6 * (0.41 + 0.0002 * live.i_d_req) * live.i_q_req - 40) < allowed
 
 
 def test_accelerated_answers_a_torque_step_at_once_and_the_printed_one_waits() -> None:

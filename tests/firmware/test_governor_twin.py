@@ -24,7 +24,7 @@ from tests.firmware.closed_loop import (
     reference_case,
 )
 from tests.firmware.core_twin import f
-from tests.firmware.governor_twin import GovernedTwin
+from tests.firmware.governor_twin import FOUND, GovernedTwin
 
 V_DC = 210.0
 CASES = {
@@ -58,6 +58,16 @@ CASES = {
         ),
         900.0,
     ),
+    "line search, corner": (
+        reference_case(
+            7540.0,
+            governor__mode=LINE,
+            governor__eps=0.001,
+            governor__I_transient_apk=50.0,
+            governor__options=CURRENT_ROW | PRE_PROJECTION,
+        ),
+        750.0,
+    ),
     "best, corner": (
         reference_case(
             7540.0,
@@ -78,7 +88,7 @@ def test_governor_equals_the_twin_bit_for_bit(case: str) -> None:
     loop.plant.psi *= 0.93  # a machine that is not the controller's
     rng = np.random.default_rng(4)
     target = (0.0, 0.0)
-    seen, bindings = 0, set()
+    seen, bindings, cornered = 0, set(), set()
     for k in range(420):
         if k % 60 == 0:
             angle, size = rng.uniform(0, 2 * math.pi), 50 * math.sqrt(rng.uniform())
@@ -95,9 +105,11 @@ def test_governor_equals_the_twin_bit_for_bit(case: str) -> None:
         assert (live.flags & 0x7F) == (twin.flags & 0x7F), k
         seen |= live.flags
         bindings.add(live.binding)
+        cornered.add(twin.cornered)
     assert seen & FLAG_ACTIVE
     assert (0 in bindings) or (250 in bindings)
     if case in ("best", "best, corner"):
         assert 250 in bindings
+    assert (FOUND in cornered) == (case == "line search, corner")
     if not case.startswith("line search"):
         assert seen & FLAG_FALLBACK

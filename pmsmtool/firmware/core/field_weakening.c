@@ -12,12 +12,20 @@
  * The search is kept to i_d <= max(0, i_dLM), where the cost is well behaved for salient machines, and to
  * i_d >= i_d_min.
  */
+#include "active_set.h"
 #include "pmsm_period.h"
 
-#define STEPS_PER_PERIOD 8u          /* Newton steps and iterations of an accelerated call */
+#define STEPS_PER_PERIOD 11u         /* Newton steps after which an accelerated call goes on in the next period */
+#define STEPS_MOST 14u               /* and those that it may take in one */
+#define CORNER_STEPS 4u              /* of Newton's method for the corner, from near it */
+#define CORNER_NONE 0u
+#define CORNER_KNOWN 1u
+#define CORNER_DOUBTED 2u            /* none was found: the two rows may have no common point */
+#define ITERATION_STEPS 3u           /* an iteration without its projection takes as long as so many of them */
 #define STEP_END PMSM_C(2e-5)        /* A: a smaller change ends the iteration */
 #define HALVINGS 8u                  /* of an Armijo step */
 #define TORQUE_EVENT PMSM_C(0.02)    /* of rated torque: a larger change of the request is answered at once */
+#define WITHIN PMSM_C(1.000002)       /* on the square: rounding of a point on a row's boundary */
 #define IGNORED_SHARE PMSM_C(1e-3)   /* below this share of V_m the rotation voltage of I_m does not matter */
 
 typedef struct {
@@ -26,8 +34,12 @@ typedef struct {
     pmsm_real d_min, d_max;
     pmsm_real h1, h2, i_d_lm, tau;
     pmsm_real k_t, k_s;    /* T = (k_t + k_s i_d) i_q */
-    uint32_t empty;        /* 1: no current satisfied both rows */
-    uint32_t steps;
+    uint32_t empty;        /* 1: no current satisfied both rows at the last projection */
+    uint32_t steps;        /* Newton steps so far, of those that a period may take */
+    pmsm_real multiplier;  /* of the voltage row in the last projection: the next one is near */
+    uint32_t corner_state; /* of that projection, whether it was on both rows */
+    pmsm_dq corner;
+    uint32_t accelerated;
     uint32_t left;         /* iterations that an accelerated call still may take */
 } problem;
 
@@ -65,8 +77,12 @@ static problem state_problem(const pmsm_period *period, pmsm_real tau)
         tau,
         period->state->derived.torque_per_flux * period->magnetics->psi_f,
         period->state->derived.torque_per_flux * (period->magnetics->L_d_app - period->magnetics->L_q_app),
+        period->state->fw_empty,
         0u,
-        0u,
+        period->state->fw_multiplier,
+        period->state->fw_corner_state,
+        period->state->fw_reference,
+        (p->field_weakening_mode == PMSM_FW_ACCELERATED) ? 1u : 0u,
         0u};
     return q;
 }
@@ -109,8 +125,72 @@ static pmsm_dq project_on_bound(problem *q, pmsm_real d, pmsm_real i_q)
     return x;
 }
 
-/* Projection on (44). Empty: the point of the circle with the smallest voltage, flagged. */
-static pmsm_dq project(problem *q, pmsm_dq y)
+static uint32_t is_within(const pmsm_row *row, pmsm_dq x)
+{
+    return (pmsm_square(pmsm_voltage_of(row, x)) <= WITHIN * row->V * row->V) ? 1u : 0u;
+}
+
+static pmsm_dq on_circle(pmsm_dq x, pmsm_real radius)
+{
+    const pmsm_real scale = radius / PMSM_SQRT(pmsm_square(x));
+    const pmsm_dq v = {scale * x.d, scale * x.q};
+    return v;
+}
+
+/* The point of the circle with the smallest voltage; 1: even that is outside the ellipse, as far as the steps told. */
+static uint32_t is_empty(problem *q, pmsm_dq *smallest)
+{
+    *smallest = pmsm_smallest_voltage(&q->row[1], &q->row[0], &q->steps);
+    return (q->steps < PMSM_PROJECTION_STEPS && is_within(&q->row[1], *smallest) == 0u) ? 1u : 0u;
+}
+
+/* Nearest point of current circle and voltage ellipse: that of the one which the other admits, else their corner. A
+ * corner to which y is drawn by both rows is the optimum wherever the search began: it begins where the last one was,
+ * else at the nearest point of the ellipse, moved inwards on to the circle, which is just outside the ellipse. Where
+ * that finds none, the next projection begins with the smallest voltage. Empty: the point of the circle with that,
+ * flagged. */
+static pmsm_dq nearest(problem *q, pmsm_dq y)
+{
+    const pmsm_row *circle = &q->row[0];
+    const pmsm_row *ellipse = &q->row[1];
+    const pmsm_dq x = (pmsm_square(y) <= circle->V * circle->V) ? y : on_circle(y, circle->V);
+    if (q->rows < 2u || is_within(ellipse, x) != 0u) {
+        q->empty = 0u;
+        return x;
+    }
+    pmsm_dq smallest;
+    const uint32_t doubted = (q->corner_state == CORNER_DOUBTED || q->empty != 0u) ? 1u : 0u;
+    q->empty = (doubted != 0u) ? is_empty(q, &smallest) : 0u;
+    if (q->empty != 0u) {
+        return smallest;
+    }
+    pmsm_dq corner = q->corner;
+    if (q->corner_state == CORNER_KNOWN) {
+        if (pmsm_find_corner(circle, ellipse, y, CORNER_STEPS, &corner, &q->steps) != 0u) {
+            q->corner = corner;
+            return corner;
+        }
+        q->corner_state = CORNER_DOUBTED;
+    }
+    const pmsm_dq alone = pmsm_project_row_from(ellipse, y, &q->multiplier, PMSM_PROJECTION_STEPS, &q->steps);
+    if (is_within(circle, alone) != 0u) {
+        q->corner_state = CORNER_NONE;
+        return alone;
+    }
+    corner = on_circle(alone, circle->V);
+    const uint32_t found =
+        (doubted != 0u) ? pmsm_project_pair(circle, ellipse, y, corner, smallest, &corner, &q->steps)
+                        : pmsm_find_corner(circle, ellipse, y, CORNER_STEPS, &corner, &q->steps);
+    q->corner_state = (found != 0u || doubted != 0u) ? CORNER_KNOWN : CORNER_DOUBTED;
+    q->corner = corner;
+    if (found == 0u) {
+        q->steps = PMSM_PROJECTION_STEPS; /* the next period goes on from here */
+    }
+    return corner;
+}
+
+/* The same from nothing, with all the steps of a period. */
+static pmsm_dq nearest_anew(problem *q, pmsm_dq y)
 {
     pmsm_dq x = y;
     uint32_t active;
@@ -122,6 +202,13 @@ static pmsm_dq project(problem *q, pmsm_dq y)
         q->empty = 1u;
     }
     q->steps += steps + more;
+    return x;
+}
+
+/* Projection on (44) and the bounds of i_d. */
+static pmsm_dq project(problem *q, pmsm_dq y)
+{
+    const pmsm_dq x = (q->accelerated != 0u) ? nearest(q, y) : nearest_anew(q, y);
     if (x.d > q->d_max) {
         return project_on_bound(q, q->d_max, y.q);
     }
@@ -184,27 +271,34 @@ static pmsm_dq gradient_steps(problem *q, const pmsm_params *params, pmsm_dq x)
     return x;
 }
 
-/* FISTA (Beck, Teboulle, DOI 10.1137/080716542) with gradient restart, step 1/L from a local bound of the curvature. */
-static pmsm_dq accelerated_steps(problem *q, pmsm_dq x)
+/* FISTA (Beck, Teboulle, DOI 10.1137/080716542) with gradient restart, step 1/L from a local bound of the curvature. A
+ * projection that used up the period's steps is not taken: the next period goes on from its multiplier, and with the
+ * momentum of the last iteration. */
+static void accelerated_steps(problem *q, pmsm_state *state)
 {
-    pmsm_real t = PMSM_C(1.0);
-    x = project(q, x);
-    pmsm_dq y = x;
-    while (q->left > 0u && q->empty == 0u) {
+    const uint32_t last = q->steps + STEPS_PER_PERIOD;
+    pmsm_real t = state->fw_momentum;
+    pmsm_dq x = state->fw_reference;
+    pmsm_dq y = state->fw_ahead;
+    while (q->left > 0u && q->steps < last) {
         const pmsm_real e = torque_error(q, y);
         const pmsm_real slope = q->k_t + q->k_s * y.d;
         const pmsm_real side = q->k_s * y.q;
         const pmsm_real curvature = PMSM_C(2.1) * q->h1 * (slope * slope + side * side + pmsm_abs(q->k_s * e)) +
                                     PMSM_C(2.0) * q->h2;
-        q->left--;
         if (curvature <= PMSM_C(0.0)) {
             q->left = 0u;
             break;
         }
+        const pmsm_real step = PMSM_C(1.0) / curvature;
         const pmsm_dq g = gradient(q, y);
-        const pmsm_dq down = {y.d - g.d / curvature, y.q - g.q / curvature};
+        const pmsm_dq down = {y.d - step * g.d, y.q - step * g.q};
+        q->steps += ITERATION_STEPS;
         const pmsm_dq z = project(q, down);
-        q->steps++;
+        q->left--;
+        if (q->steps >= PMSM_PROJECTION_STEPS && q->empty == 0u) {
+            break;
+        }
         if ((y.d - z.d) * (z.d - x.d) + (y.q - z.q) * (z.q - x.q) > PMSM_C(0.0)) {
             t = PMSM_C(1.0);
         }
@@ -215,15 +309,13 @@ static pmsm_dq accelerated_steps(problem *q, pmsm_dq x)
         y.q = z.q + ahead * (z.q - x.q);
         x = z;
         t = t_next;
-        if (change < STEP_END) {
+        if (change < STEP_END || q->empty != 0u) {
             q->left = 0u;
         }
-        if (q->steps >= STEPS_PER_PERIOD) {
-            break;
-        }
     }
-    q->left = (q->empty != 0u) ? 0u : q->left;
-    return x;
+    state->fw_momentum = t;
+    state->fw_reference = x;
+    state->fw_ahead = y;
 }
 
 static uint32_t is_due(const pmsm_period *period, pmsm_real tau)
@@ -247,17 +339,24 @@ pmsm_dq pmsm_field_weakening(pmsm_period *period, pmsm_real tau)
         state->fw_count = params->field_weakening_N_fw;
         state->fw_left = params->field_weakening_iterations;
         state->fw_tau = tau;
+        state->fw_momentum = PMSM_C(1.0);
+        state->fw_ahead = state->fw_reference;
     }
     if (state->fw_left > 0u) {
         problem q = state_problem(period, tau);
         q.left = state->fw_left;
-        if (params->field_weakening_mode == PMSM_FW_ACCELERATED) {
-            state->fw_reference = accelerated_steps(&q, state->fw_reference);
+        if (q.accelerated != 0u) {
+            q.steps = PMSM_PROJECTION_STEPS - STEPS_MOST;
+            accelerated_steps(&q, state);
             state->fw_left = q.left;
+            q.steps -= PMSM_PROJECTION_STEPS - STEPS_MOST;
+            period->steps += q.steps;
         } else {
             state->fw_reference = gradient_steps(&q, params, state->fw_reference);
             state->fw_left = 0u;
         }
+        state->fw_multiplier = q.multiplier;
+        state->fw_corner_state = q.corner_state;
         state->fw_empty = q.empty;
         state->live.iterations += q.steps;
     }

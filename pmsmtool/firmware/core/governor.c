@@ -15,6 +15,9 @@
 #define LANDING_REST PMSM_C(0.26)          /* deadbeat would be 0; the rest is for an inductance that is off */
 #define INSIDE PMSM_C(0.9999995)           /* of the limit: rounding leaves the modulator nothing to cut */
 #define PRE_PROJECTION_MARGIN PMSM_C(0.99999)
+#define APPROACH_STEPS 2u                  /* of a row in a period */
+#define APPROACH_TRIES 6u                  /* periods for a corner, then the search begins again */
+#define CORNER_FOUND 255u
 #define EMPTY_MARGIN PMSM_C(1.00001)       /* on the square: rounding of a set that is just not empty */
 
 static pmsm_real share_of_way(pmsm_dq p, pmsm_dq r, pmsm_dq v)
@@ -130,10 +133,15 @@ static pmsm_dq restrain(pmsm_period *period, pmsm_governor_rows *rows, pmsm_dq r
     if (pmsm_has_option(period, PMSM_GOVERNOR_MINIMUM_TIME) == 0u || asks_first(period->params) == 0u) {
         return pmsm_governor_solve(period, rows, r, binding, steps);
     }
-    pmsm_dq v = pmsm_smallest_voltage(steady, &rows->row[0], steps);
-    const uint32_t empty = (pmsm_square(pmsm_voltage_of(steady, v)) > EMPTY_MARGIN * steady->V * steady->V) ? 1u : 0u;
-    rows->smallest_known = 1u;
-    rows->smallest = v;
+    const uint32_t busy = (period->steps > 0u) ? 1u : 0u;
+    pmsm_dq v = r;
+    uint32_t empty = 0u;
+    if (busy == 0u) {
+        v = pmsm_smallest_voltage(steady, &rows->row[0], steps);
+        empty = (pmsm_square(pmsm_voltage_of(steady, v)) > EMPTY_MARGIN * steady->V * steady->V) ? 1u : 0u;
+        rows->smallest_known = 1u;
+        rows->smallest = v;
+    }
     *binding = PMSM_BINDING_EMPTY;
     period->flags |= (empty != 0u) ? (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK : 0u;
     const enum pmsm_transfer transfer = steer(period, rows, r, &v);
@@ -144,10 +152,10 @@ static pmsm_dq restrain(pmsm_period *period, pmsm_governor_rows *rows, pmsm_dq r
     }
     const uint32_t barred = (transfer == PMSM_TRANSFER_BARRED) ? 1u : 0u;
     const pmsm_real hold = pmsm_square(pmsm_voltage_of(steady, period->i_model));
-    if (empty != 0u || (barred != 0u && hold > period->V_max * period->V_max)) {
+    if (busy == 0u && (empty != 0u || (barred != 0u && hold > period->V_max * period->V_max))) {
         return v; /* out of the reach of the voltage: back into it first */
     }
-    if (barred != 0u || transfer == PMSM_TRANSFER_SOUGHT || rows->may_start == 0u) { /* little time: row 0 only */
+    if (busy != 0u || barred != 0u || transfer == PMSM_TRANSFER_SOUGHT || rows->may_start == 0u) { /* little time */
         *binding = 0u;
         return pmsm_project_row(&rows->row[0], r, steps);
     }
@@ -156,7 +164,8 @@ static pmsm_dq restrain(pmsm_period *period, pmsm_governor_rows *rows, pmsm_dq r
 
 /* The reachable request: inside the steady-state row, and inside the current row where both can be met. The second is
  * costly, so unless a transfer is under way it is done in every other period, and what it was done for stands
- * meanwhile; the period between is for the rows, or to start a transfer. */
+ * meanwhile; the period between is for the rows, or to start a transfer. Nor is it done beside a step of the field
+ * weakening, whose currents are within both rows but for what its margin does not cover. */
 static pmsm_dq pre_project(pmsm_period *period, pmsm_governor_rows *rows, pmsm_dq r, uint32_t *steps)
 {
     pmsm_state *state = period->state;
@@ -172,6 +181,10 @@ static pmsm_dq pre_project(pmsm_period *period, pmsm_governor_rows *rows, pmsm_d
     if (fresh != 0u && state->time_to_go <= PMSM_C(0.0)) {
         return state->reachable;
     }
+    rows->may_start = 0u;
+    if (period->steps > 0u) {
+        return v;
+    }
     const pmsm_row both[2] = {pre, *last};
     pmsm_active_set set;
     pmsm_projection_begin(&set, both, r);
@@ -180,10 +193,41 @@ static pmsm_dq pre_project(pmsm_period *period, pmsm_governor_rows *rows, pmsm_d
     if (pmsm_projection_extend(&set, 2u, steps) != PMSM_PROJECTION_EMPTY) {
         v = set.v; /* else it stays */
     }
-    rows->may_start = 0u;
     state->reachable = v;
     state->reachable_age = 1u;
     return v;
+}
+
+/* The same for little time: two steps of Newton's method in a period, which go on where the last period's ended.
+ * Outside the current row they are for the row alone and for the corner of both in turn. Until that is found the
+ * request stays on the row alone; the line search keeps it inside the current row. */
+static pmsm_dq approach(pmsm_period *period, const pmsm_governor_rows *rows, pmsm_dq r, uint32_t *steps)
+{
+    pmsm_state *state = period->state;
+    const pmsm_row *last = &rows->row[rows->count - 1u];
+    pmsm_row pre = rows->row[rows->steady];
+    pre.V *= PRE_PROJECTION_MARGIN;
+    if (state->reachable_age != 0u) {
+        state->reachable_age = 0u;
+        const uint32_t found = pmsm_find_corner(last, &pre, r, 1u, &state->corner, steps);
+        const uint32_t tries = (state->cornered < APPROACH_TRIES) ? state->cornered + 1u : 0u;
+        state->cornered = (found != 0u) ? CORNER_FOUND : tries;
+        return (found != 0u) ? state->corner : state->reachable;
+    }
+    const pmsm_dq v = pmsm_project_row_from(&pre, r, &state->reachable_multiplier, APPROACH_STEPS, steps);
+    const pmsm_real square = pmsm_square(v);
+    if (rows->count <= rows->steady + 1u || square <= last->V * last->V) {
+        state->cornered = 0u;
+        return v;
+    }
+    if (state->cornered == 0u) { /* on the circle, which is just outside the ellipse */
+        const pmsm_real share = last->V / PMSM_SQRT(square);
+        state->corner.d = share * v.d;
+        state->corner.q = share * v.q;
+    }
+    state->reachable = v;
+    state->reachable_age = 1u;
+    return (state->cornered == CORNER_FOUND) ? state->corner : v;
 }
 
 static void choose(pmsm_period *period, pmsm_governor_rows *rows, uint32_t off_model)
@@ -191,10 +235,11 @@ static void choose(pmsm_period *period, pmsm_governor_rows *rows, uint32_t off_m
     pmsm_live *live = &period->state->live;
     const pmsm_dq request = period->reference;
     uint32_t binding = PMSM_BINDING_NONE;
-    uint32_t steps = 0u;
+    uint32_t steps = period->steps;
     pmsm_dq r = request;
     if (pmsm_has_option(period, PMSM_GOVERNOR_PRE_PROJECTION) != 0u) {
-        r = pre_project(period, rows, request, &steps);
+        r = (period->params->governor_mode == PMSM_GOVERNOR_LINE) ? approach(period, rows, request, &steps)
+                                                                  : pre_project(period, rows, request, &steps);
     }
     pmsm_dq v;
     if (asks_first(period->params) != 0u && pmsm_governor_admits(period, rows, r) != 0u) {
@@ -213,7 +258,7 @@ static void choose(pmsm_period *period, pmsm_governor_rows *rows, uint32_t off_m
     }
     live->kappa = share_of_way(period->state->reference_held, request, v);
     live->binding = binding;
-    live->iterations += steps;
+    live->iterations += steps - period->steps;
     period->reference = v;
 }
 

@@ -159,9 +159,16 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     pmsm_real time_to_go;    /* s, of the minimum-time transfer in progress, 0 when there is none */
     pmsm_dq reachable;       /* A, a request's projection on steady-state and current row */
     uint32_t reachable_age;  /* 1: computed in the last period, 0: not valid */
+    pmsm_real reachable_multiplier; /* line search: of the steady-state row in that projection */
+    pmsm_dq corner;          /* A, line search: where the search for the corner of both rows is */
+    uint32_t cornered;       /* steps of that search, 255: found */
     uint32_t landing;        /* 1: a minimum-time transfer has not reached its target yet */
     pmsm_real fw_tau;        /* N m, request of the last optimisation */
     uint32_t fw_left;        /* iterations that it has left for the following periods */
+    pmsm_real fw_momentum;   /* of its last iteration, and the point ahead from which the next one starts (A) */
+    pmsm_dq fw_ahead;
+    pmsm_real fw_multiplier; /* of the voltage row in its last projection */
+    uint32_t fw_corner_state; /* whether that was on the current row, too */
     uint32_t fw_empty;       /* 1: it found no current that satisfies both limits */
     pmsm_real i2t_carry;     /* rounding remainder of i2t */
     uint32_t i2t_exhausted;  /* 1 from a used-up budget until a tenth of it has recovered */

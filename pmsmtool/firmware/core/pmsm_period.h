@@ -35,6 +35,7 @@ typedef struct {
     pmsm_dq u_compensation;    /* V, dead-time compensation, when it is to be recorded */
     uint32_t hexagon;          /* 1: the demand may use the inverter's hexagon, only the legs limit it */
     uint32_t flags;
+    uint32_t steps;            /* Newton steps of field weakening and governor, up to PMSM_PROJECTION_STEPS */
 } pmsm_period;
 
 /* derived.c */

@@ -26,7 +26,7 @@ typedef struct {                  /* the row |M v + c| <= V */
 #ifdef PMSM_REAL_DOUBLE
 #define PMSM_PROJECTION_STEPS 32u
 #else
-#define PMSM_PROJECTION_STEPS 16u
+#define PMSM_PROJECTION_STEPS 17u
 #endif
 
 /* M v + c. */

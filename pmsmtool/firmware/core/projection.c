@@ -12,11 +12,9 @@
 #ifdef PMSM_REAL_DOUBLE
 #define ROW_TOLERANCE 1e-11  /* | |w| - V | / V of a single-row projection */
 #define PAIR_TOLERANCE 1e-12 /* | |w|^2/V^2 - 1 | at a corner */
-#define CORNER_STEPS 8u
 #else
 #define ROW_TOLERANCE 1e-6F
 #define PAIR_TOLERANCE 1e-6F
-#define CORNER_STEPS 6u
 #endif
 
 typedef struct { /* symmetric 2x2 */
@@ -85,35 +83,53 @@ static pmsm_real excess(const pmsm_row *row, pmsm_real inverse, pmsm_dq v)
 
 /* --- one row active ---------------------------------------------------------------------------------------------- */
 
-pmsm_dq pmsm_project_row(const pmsm_row *row, pmsm_dq r, uint32_t *steps)
+pmsm_dq pmsm_project_row_from(const pmsm_row *row, pmsm_dq r, pmsm_real *multiplier, uint32_t most, uint32_t *steps)
 {
     const pmsm_dq a = pmsm_voltage_of(row, r);
     pmsm_real square = pmsm_square(a);
     if (square <= row->V * row->V) {
+        *multiplier = PMSM_C(0.0);
         return r;
     }
     /* (E + lambda K) w = a with |w| = V, K = M M^T; v = r - lambda M^T w */
     const symmetric K = {row->m_dd * row->m_dd + row->m_dq * row->m_dq, row->m_dd * row->m_qd + row->m_dq * row->m_qq,
                          row->m_qd * row->m_qd + row->m_qq * row->m_qq};
     const pmsm_real enough = row->V * (PMSM_C(1.0) + ROW_TOLERANCE);
+    const uint32_t last = (*steps + most < PMSM_PROJECTION_STEPS) ? *steps + most : PMSM_PROJECTION_STEPS;
     factor S = {{PMSM_C(1.0), PMSM_C(0.0), PMSM_C(1.0)}, PMSM_C(1.0)};
-    pmsm_real lambda = PMSM_C(0.0);
+    pmsm_real lambda = *multiplier;
+    pmsm_real least = PMSM_C(0.0); /* of |w| at a first guess: beyond its zero Newton's method comes back below it */
     pmsm_dq w = a;
-    while (*steps < PMSM_PROJECTION_STEPS) {
+    if (lambda > PMSM_C(0.0)) {
+        S = shifted_identity(K, lambda);
+        w = solve(&S, a);
+        square = pmsm_square(w);
+        least = row->V * (PMSM_C(1.0) - ROW_TOLERANCE);
+    }
+    while (*steps < last) {
         const pmsm_real size = PMSM_SQRT(square);
-        if (size <= enough) {
+        if (size <= enough && size >= least) {
             break;
         }
         const pmsm_dq z = solve(&S, times(K, w));
         lambda += (size - row->V) * square / (row->V * pmsm_dot(w, z));
+        lambda = (lambda > PMSM_C(0.0)) ? lambda : PMSM_C(0.0);
+        least = PMSM_C(0.0);
         S = shifted_identity(K, lambda);
         w = solve(&S, a);
         square = pmsm_square(w);
         (*steps)++;
     }
+    *multiplier = lambda;
     const pmsm_dq step = transposed_times(row, w);
     const pmsm_dq v = {r.d - lambda * step.d, r.q - lambda * step.q};
     return v;
+}
+
+pmsm_dq pmsm_project_row(const pmsm_row *row, pmsm_dq r, uint32_t *steps)
+{
+    pmsm_real multiplier = PMSM_C(0.0);
+    return pmsm_project_row_from(row, r, &multiplier, PMSM_PROJECTION_STEPS, steps);
 }
 
 /* --- two rows active --------------------------------------------------------------------------------------------- */
@@ -136,11 +152,12 @@ static pmsm_real square_of_change(const pmsm_row *row, pmsm_dq step)
 /* Newton's method for the corner where both rows are met with equality; 1 when it is the optimum, that is when r - v is
  * a non-negative combination of the two outward normals. The rows are quadratic, so what a step leaves of |w|^2 - V^2
  * is the square of the change of w: known without looking again. */
-static uint32_t find_corner(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq *v, uint32_t *steps)
+uint32_t pmsm_find_corner(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, uint32_t most, pmsm_dq *v,
+                          uint32_t *steps)
 {
     const pmsm_real limit_1 = first->V * first->V;
     const pmsm_real limit_2 = second->V * second->V;
-    for (uint32_t k = 0u; k < CORNER_STEPS && *steps < PMSM_PROJECTION_STEPS; k++) {
+    for (uint32_t k = 0u; k < most && *steps < PMSM_PROJECTION_STEPS; k++) {
         const pmsm_dq w1 = pmsm_voltage_of(first, *v);
         const pmsm_dq w2 = pmsm_voltage_of(second, *v);
         const pmsm_real f1 = PMSM_C(0.5) * (pmsm_square(w1) - limit_1);
@@ -155,7 +172,7 @@ static uint32_t find_corner(const pmsm_row *first, const pmsm_row *second, pmsm_
         const pmsm_dq step = {(f1 * n2.q - f2 * n1.q) * inverse, (f2 * n1.d - f1 * n2.d) * inverse};
         v->d -= step.d;
         v->q -= step.q;
-        (*steps)++;
+        *steps += PMSM_CORNER_COST;
         if (square_of_change(first, step) <= PAIR_TOLERANCE * limit_1 &&
             square_of_change(second, step) <= PAIR_TOLERANCE * limit_2) {
             const pmsm_dq pull = {r.d - v->d, r.q - v->q};
@@ -181,7 +198,7 @@ static pmsm_dq on_arc(const pmsm_row *first, pmsm_dq a, pmsm_dq b, pmsm_real t)
  * met at once. On the boundary of the first row the excess of the second grows from that point like a parabola, which
  * tells where to start Newton's method: also the short lens of two rows that hardly meet has its corners where the
  * parabola says. */
-static uint32_t project_pair(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq outside, pmsm_dq best,
+uint32_t pmsm_project_pair(const pmsm_row *first, const pmsm_row *second, pmsm_dq r, pmsm_dq outside, pmsm_dq best,
                              pmsm_dq *v, uint32_t *steps)
 {
     const pmsm_real inverse = PMSM_C(1.0) / (second->V * second->V);
@@ -194,7 +211,7 @@ static uint32_t project_pair(const pmsm_row *first, const pmsm_row *second, pmsm
     const pmsm_real within = (depth > PMSM_C(0.0)) ? depth : PMSM_C(0.0);
     const pmsm_real share = PMSM_SQRT(within / (within + excess(second, inverse, outside)));
     *v = on_arc(first, a, b, PMSM_C(1.0) - share);
-    return find_corner(first, second, r, v, steps);
+    return pmsm_find_corner(first, second, r, PMSM_CORNER_STEPS, v, steps);
 }
 
 pmsm_dq pmsm_smallest_voltage(const pmsm_row *goal, const pmsm_row *limit, uint32_t *steps)
@@ -279,7 +296,7 @@ static uint32_t exchange(pmsm_active_set *set, uint32_t k, uint32_t *steps)
         const pmsm_dq best =
             (known != 0u) ? set->smallest : pmsm_smallest_voltage(&set->row[second], &set->row[first], steps);
         pmsm_dq x;
-        if (project_pair(&set->row[first], &set->row[second], r, (inside != 0u) ? set->v : alone, best, &x,
+        if (pmsm_project_pair(&set->row[first], &set->row[second], r, (inside != 0u) ? set->v : alone, best, &x,
                          steps) != 0u &&
             satisfies(set, set->basis[1u - j], x) != 0u) {
             set->basis[0] = k;

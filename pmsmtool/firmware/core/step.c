@@ -40,6 +40,8 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->time_to_go = PMSM_C(0.0);
     state->landing = 0u;
     state->reachable_age = 0u;
+    state->reachable_multiplier = PMSM_C(0.0);
+    state->cornered = 0u;
     state->fw_left = 0u;
     state->speed_integrator = PMSM_C(0.0);
     state->notch_1 = PMSM_C(0.0);
@@ -51,6 +53,8 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->fw_count = 0u;
     state->fw_tau = PMSM_C(0.0);
     state->fw_empty = 0u;
+    state->fw_multiplier = PMSM_C(0.0);
+    state->fw_corner_state = 0u;
     state->speed_count = 0u;
     state->polar = no_polar;
 }
@@ -292,6 +296,7 @@ void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut
     period.sine_half = PMSM_C(0.0);
     period.cosine_half = PMSM_C(0.0); /* not known yet */
     period.flags = 0u;
+    period.steps = 0u;
     state->live.kappa = PMSM_C(1.0);
     state->live.binding = PMSM_BINDING_NONE;
     state->live.iterations = 0u;
