@@ -190,6 +190,18 @@ def test_the_bound_is_where_a_small_load_just_shows() -> None:
     assert set(below.found) and not beyond.found
 
 
+def come_to_rest(trace: Trace) -> Trace:
+    theta = trace["theta_M_rad"].copy()
+    theta[ROWS // 2 :] = theta[ROWS // 2]
+    return replace(trace, signals={**trace.signals, "theta_M_rad": theta})
+
+
+def test_records_in_which_the_shaft_came_to_rest_do_not_count() -> None:
+    good = records(2e-3, 9)
+    found = estimate([*good[:3], *map(come_to_rest, good[3:])]).inertia
+    assert found is not None and found.value == pytest.approx(2e-3, rel=5e-3)
+
+
 def test_what_gives_no_response_is_refused_by_name() -> None:
     good = records(2e-3, 9)
 
@@ -200,8 +212,11 @@ def test_what_gives_no_response_is_refused_by_name() -> None:
 
     assert reason(good[:2]) == "E_EXCITATION"
     rng = np.random.default_rng(4)
-    still = [replace(t, signals={**t.signals, "theta_M_rad": 1e-5 * rng.standard_normal(ROWS)}) for t in good]
-    assert reason(still) == "E_COHERENCE"
+    alone = [
+        replace(t, signals={**t.signals, "theta_M_rad": 20.0 * t.t_s + 1e-5 * rng.standard_normal(ROWS)}) for t in good
+    ]
+    assert reason(alone) == "E_COHERENCE"
+    assert reason([*good[:2], *map(come_to_rest, good[2:])]) == "E_EXCITATION"
     clipped = replace(good[0], signals={**good[0].signals, "flagged": np.ones(ROWS)})
     assert reason([clipped, *good[1:]]) == "E_CLIPPED"
 

@@ -19,6 +19,7 @@ from pmsmtool.errors import NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult
+from pmsmtool.experiments.frequency_response import keep_speed, plan_frequency_response
 from pmsmtool.identification.frequency_response import RESPONSE_FILE
 from pmsmtool.identification.identified_machine import RESONANCE
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, elastic_mechanics
@@ -123,6 +124,39 @@ def test_pushes_of_an_elastic_shaft_tell_friction_where_both_inertias_agree(tmp_
     for name, true in (("J_kgm2", 0.016), ("B_nms", truth.machine.B_nms), ("tau_c_nm", truth.machine.tau_c_nm)):
         assert abs(found[name].value - (true or 0.0)) < total_half_width(found[name])
         assert found[name].fallback == ELASTIC_FALLBACK and any(ELASTIC_FALLBACK in text for text in stage.fallbacks)
+
+
+class SwingingDrive:
+    """A shaft of 153 rad/s2 per ampere that friction of 60 mA brakes, under a speed controller that swings."""
+
+    period_s = 1e-4
+    omega, i_q, t = 0.0, None, 0.0
+
+    def command_speed(self, omega_rad_s: float) -> None:
+        self.omega, self.i_q = omega_rad_s, None
+
+    def command_current(self, i_d: float, i_q: float) -> None:
+        self.i_q = i_q
+
+    def wait(self, seconds: float) -> None:
+        self.t += seconds
+        if self.i_q is not None:
+            self.omega = max(0.0, self.omega + 153.0 * (self.i_q - 0.06) * seconds)
+
+    def average(self, names: tuple[str, ...], periods: int) -> dict[str, float]:
+        self.wait(periods * self.period_s)
+        return {"omega_e_rad_s": 3.0 * self.omega, "i_q_a": 0.06 + 0.2 * math.sin(2.0 * self.t + 1.0)}
+
+    def halves(self, names: tuple[str, ...], half: int) -> tuple[dict[str, float], dict[str, float], int]:
+        return self.average(names, half), self.average(names, half), 2 * half
+
+
+def test_the_current_that_keeps_a_speed_is_found_beside_a_controller_that_swings() -> None:
+    drive, plan = SwingingDrive(), plan_frequency_response(1.0, 16.0, 0.016, 153.0 * 0.016, 1e-4)
+    swung = drive.average(("i_q_a",), 2000)["i_q_a"]
+    bias = keep_speed(drive, plan, 3, None)  # type: ignore[arg-type]
+    assert abs(bias - 0.06) < plan.bias_doubt_a(drive.period_s) < abs(swung - 0.06)
+    assert keep_speed(drive, plan, 3, 0.07) == pytest.approx(0.06, abs=1e-3)  # type: ignore[arg-type]
 
 
 def test_pushes_that_tell_another_inertia_tell_nothing() -> None:
