@@ -182,12 +182,12 @@ def scaled_covariance(jacobian: NDArray[np.float64]) -> tuple[NDArray[np.float64
     return (root @ root.T) / np.outer(scale, scale), math.sqrt(float(values[-1] / values[0]))
 
 
-def condition_gate(condition: float, pair: str, stage: str) -> None:
+def condition_gate(condition: float, pair: str, stage: str, limit: float = CONDITION_LIMIT) -> None:
     """Refuse a fit whose parameters cannot be separated; ``pair`` names them."""
-    if condition > CONDITION_LIMIT:
+    if condition > limit:
         raise refuse(
             "E_NOT_IDENTIFIABLE",
-            f"{pair} cannot be separated, scaled condition number {condition:.2g} > {CONDITION_LIMIT:g}",
+            f"{pair} cannot be separated, scaled condition number {condition:.2g} > {limit:g}",
             stage=stage,
         )
 
