@@ -52,7 +52,7 @@ NUMBERS = ("value", "std", "systematic", "total_95", "coverage_factor", "n", "ch
 """What a row of a stage may say in numbers."""
 TRACES = re.compile(
     r"(zero_current|phase_vectors|phase_pairs|levels|supply_levels|first_turn|rotation_(forward|backward)|speeds"
-    r"(_after_map)?|voltage_limit|(torque_)?push_\d{1,3}|coast_\d{1,3}|map_\d{1,4}|square_[dq]_\d{1,6})"
+    r"(_after_map)?|voltage_limit|(torque_)?push_\d{1,3}|coast_\d{1,3}|map_\d{1,4}|(square|angle)_[dq]_\d{1,6})"
 )
 FACTS = ("period_s", "decimation", "pretrigger", "polled", "coasting", "i_command_a", "half_period", "held", "i_max_a",
          "U_dc_v", "i_bias_a")  # fmt: skip

@@ -23,7 +23,7 @@ from pmsmtool.estimators.injection.inductance import FrameAhead, InductanceResul
 from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstant
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.noise import Noise, estimate_noise
-from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases
+from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases, over_phases
 from pmsmtool.estimators.resistance import (
     R_MEASURED,
     Copper,
@@ -50,7 +50,7 @@ MOTION_STD = 0.2
 """Relative standard deviation of the rotor's answer to an injection as the pushes show it: friction takes part."""
 RELUCTANCE_STD = 0.3
 """Standard deviation of what reluctance takes from it, relative: the inductances are rough and incremental."""
-FIXED = ("levels", "square_")
+FIXED = ("levels", "square_", "angle_")
 """Beginnings of the names of traces whose current vector keeps its angle."""
 MOSFET_LINK_V = 100.0
 """Below this DC link bridges are made of MOSFETs, which have no threshold."""
@@ -177,7 +177,7 @@ def evaluate(
     traces : mapping of str to Trace
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
         ``phase_pairs``, ``rotation_forward``, ``rotation_backward``, ``square_d_<half period>``,
-        ``square_q_<half period>``, ``speeds``, ``map_<k>``, ``speeds_after_map``,
+        ``square_q_<half period>``, ``angle_d_<k>``, ``angle_q_<k>``, ``speeds``, ``map_<k>``, ``speeds_after_map``,
         ``inertia_<k>``, ``frf_<k>``, ``turns_<k>``, ``slow_<k>``.
     period_s : float
         Control period (s).
@@ -231,7 +231,8 @@ def evaluate(
             R = replace(R, R_s=widened(R.R_s, mismatch), R_measured=widened(R.R_measured, mismatch))
             result = replace(result, resistance=R)
     if "phase_pairs" in traces and result.resistance is not None:
-        result = replace(result, pairs=check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve))
+        pairs = check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve)
+        result = replace(result, pairs=pairs, resistance=over_phases(result.resistance, pairs, tolerance))
     if "rotation_backward" in traces:
         turns = traces["rotation_forward"], traces["rotation_backward"]
         result = replace(result, encoder=attempt("encoder", lambda: estimate_encoder(*turns, JUMP_LIMIT_RAD)))
@@ -391,6 +392,7 @@ def inductance_of(
     assert result.resistance is not None and result.encoder is not None
     pole_pairs = round(result.encoder.pole_pairs.value)
     shots = {axis: shots_of(traces, axis, pole_pairs) for axis in "dq"}
+    further = {axis: shots_of(traces, axis, pole_pairs, "angle") for axis in "dq"}
     offset = result.offset
     frame = None
     if offset is not None and result.flux is not None:
@@ -407,6 +409,7 @@ def inductance_of(
         instant=None if result.flux is None else result.flux.shown,
         U_dc_v=U_dc_v,
         tolerance=tolerance,
+        further=further,
     )
 
 
@@ -428,9 +431,10 @@ def motion_of(traces: Mapping[str, Trace], psi_wb: float, q_shots: Sequence[Trac
     return Motion(per_f, MOTION_STD * per_f + RELUCTANCE_STD * abs(free - per_f))
 
 
-def shots_of(traces: Mapping[str, Trace], axis: str, pole_pairs: int) -> list[Trace]:
-    """Return the square-wave shots of one axis, the shorter half period first."""
-    names = sorted((name for name in traces if name.startswith(f"square_{axis}_")), key=lambda name: int(name[9:]))
+def shots_of(traces: Mapping[str, Trace], axis: str, pole_pairs: int, kind: str = "square") -> list[Trace]:
+    """Return the square-wave shots of one axis, the shorter half period (of ``angle``: the first angle) first."""
+    head = f"{kind}_{axis}_"
+    names = sorted((name for name in traces if name.startswith(head)), key=lambda name: int(name[len(head) :]))
     return [
         Trace(trace.t_s, trace.signals, trace.units, {**trace.meta, "pole_pairs": pole_pairs})
         for trace in (traces[name] for name in names)

@@ -28,6 +28,7 @@ LOSS_DOUBT = 0.01
 STATISTICAL_LIMIT = 0.15
 """Largest relative statistical half width: beyond it the display is too coarse for this drive's copper loss."""
 LEAST_LEVELS = 5
+ONE_VECTOR = "along one current vector: by how much the phases differ is not in the interval"
 
 
 def resistance_by_supply(levels: Trace, *, tolerance: SensorTolerance | None = None) -> Estimate:
@@ -64,7 +65,7 @@ def resistance_by_supply(levels: Trace, *, tolerance: SensorTolerance | None = N
     doubt = math.hypot(2.0 * (tolerance or SensorTolerance()).current_gain, SUPPLY_TOLERANCE, LOSS_DOUBT)
     found = Estimate(
         value, std, doubt * value, "ohm", n=len(x), method="power of a bench supply, read at several currents",
-        dof=float(dof),
+        dof=float(dof), fallback=ONE_VECTOR,
     )  # fmt: skip
     half = statistical_half_width(found) / value
     if half > STATISTICAL_LIMIT:

@@ -184,7 +184,9 @@ class Measurement:
     def _driven(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> bool:
         """Run what needs the rotor's angle; whether the machine runs under control by what was found."""
         shots = self._effort.shot_samples
-        square = SquareStage(self.drive, self.limits, self._keep_for_later, self.say, self.ripple_share, shots)
+        square = SquareStage(
+            self.drive, self.limits, self._keep_for_later, self.say, self.ripple_share, shots, self.held
+        )
         inductances = (
             self._attempt("L", lambda: square.measure(noise, resistance, encoder)) if "square" in steps else None
         )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from pmsmtool.drive.port import Drive
@@ -13,13 +13,15 @@ from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import square_injection
+from pmsmtool.experiments.vector_turn import TURN_S, turn_vector
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.trace import Trace
 
 BIAS_SHARE = 0.5
 BIAS_TRIES = 4
-BIAS_OFF_RAD = math.radians(6.0)
-"""Angle between rotor and bias vector that a load or friction may make (electrical)."""
+BIAS_OFF_RAD = math.radians(20.0)
+"""Angle between rotor and bias vector that a load or friction may make (electrical): the frame then goes to the rotor.
+Friction at rest 1.6 times the Coulomb torque left 7.9 degrees."""
 ALIGN_TRIES = 3
 """Times the frame follows a rotor that was moved by the change of the frame itself."""
 NOISE_RIPPLE = 25.0
@@ -33,6 +35,19 @@ RIPPLE_LEAST = 0.2
 CROSSING = 0.433
 """A ripple on q reaches the phases at half the bias by sqrt(3)/4 of its peak-to-peak value
 (docs/identification.md, 3.2)."""
+FURTHER_RAD, FURTHER_STEP_RAD = math.radians(15.0), math.radians(30.0)
+"""First further angle of the rotor, and the distance to others that serve as well: every phase carries a quarter of the
+bias there, and a quarter of an electrical turn on."""
+FURTHER_NEAR_RAD = (math.radians(7.0), math.radians(4.0))
+"""Distance from the first, and from a quarter of a turn beyond it, at which the vector is not corrected any more."""
+FURTHER_OFF_RAD = math.radians(9.0)
+"""Distance from it at which the rotor may stay: friction held one 6 degrees beside its vector, and let it jump 38."""
+FURTHER_TRIES, FURTHER_MOST_RAD = 5, math.radians(20.0)
+"""Corrections of the vector that leads it there, and the largest of them."""
+FURTHER_TURN_S = 0.12
+"""Shortest turn of the vector; a quarter of a turn takes the usual time."""
+FURTHER_SAMPLES, FURTHER_LEAD_S = 512, 0.1
+"""Samples of a shot there, and its lead: the comparison needs a tenth of a percent of L, not the best that can be."""
 U_SHARE = 0.5
 """Largest injection amplitude, of the largest voltage."""
 
@@ -76,6 +91,7 @@ class SquareStage:
     say: Callable[[str], None]
     ripple_share: float
     samples: int = square_injection.SHOT_SAMPLES
+    held: bool = False
 
     def measure(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult) -> tuple[float, float]:
         """Record the shots; return rough inductances (H) from ripple and voltage, enough for a current controller."""
@@ -95,8 +111,10 @@ class SquareStage:
         plan = square_injection.SquarePlan(bias, ripple, U_SHARE * limits.V_max_v, samples=self.samples)
         plan = self._hold_stable_bias(plan, encoder, knee, noise)
         rough: list[float] = []
+        amplitudes: dict[square_injection.Axis, float] = {}
         first_v = None
-        for axis in ("d", "q"):
+        axes: tuple[square_injection.Axis, ...] = ("d", "q")
+        for axis in axes:
             amplitude = square_injection.find_amplitude(self.drive, plan, axis, first_v)
             first_v = square_injection.NEXT_SHARE * amplitude
             for half_period in plan.half_periods:
@@ -109,8 +127,83 @@ class SquareStage:
             if slow:
                 shot = square_injection.inject_square(self.drive, plan, axis, slow, amplitude * last / slow)
                 self.keep(f"square_{axis}_{slow}", shot)
+            amplitudes[axis] = amplitude
+        plan = self._further_angles(plan, encoder, knee, amplitudes)
         self.drive.command_current(0.0, 0.0, fixed_angle_rad=plan.angle_rad)
         return rough[0], rough[1]
+
+    def _further_angles(
+        self,
+        plan: square_injection.SquarePlan,
+        encoder: EncoderResult,
+        knee_a: float,
+        amplitudes: Mapping[square_injection.Axis, float],
+    ) -> square_injection.SquarePlan:
+        """Record shots at two angles a quarter of an electrical turn apart, as far as the rotor follows the vector."""
+        if self.held:
+            return plan
+        self.say("L_d, L_q over the angle: square waves at two more angles of the rotor")
+        at = replace(plan, lead_s=FURTHER_LEAD_S)
+        target = FURTHER_RAD
+        for k in range(2):
+            at = self._rotor_to(target, FURTHER_NEAR_RAD[k], at, encoder, elsewhere=not k)
+            beside = abs(math.remainder(at.angle_rad, math.pi / 3.0))
+            if abs(beside - FURTHER_RAD) > FURTHER_OFF_RAD:
+                self.say("  the rotor does not follow the vector to them")
+                break
+            ripple = clear_ripple(plan.ripple_a, plan.bias_d_a, knee_a, beside)
+            for axis, amplitude in amplitudes.items():
+                shot = square_injection.inject_square(
+                    self.drive,
+                    at,
+                    axis,
+                    plan.half_periods[0],
+                    ripple / plan.ripple_a * amplitude,
+                    min(self.samples, FURTHER_SAMPLES),
+                )
+                self.keep(f"angle_{axis}_{k}", shot)
+            target = at.angle_rad + 0.5 * math.pi
+        return at
+
+    def _rotor_to(
+        self,
+        target_rad: float,
+        near_rad: float,
+        plan: square_injection.SquarePlan,
+        encoder: EncoderResult,
+        *,
+        elsewhere: bool,
+    ) -> square_injection.SquarePlan:
+        """Turn the rotor to an angle, the vector as far beyond it as friction asks; the frame then stands on the rotor.
+
+        With ``elsewhere`` a rotor that jumps past it goes on to the next angle that serves. The plan's angle on return
+        is that of the rotor (rad electrical).
+        """
+        vector, wanted = plan.angle_rad, target_rad
+        for _ in range(FURTHER_TRIES):
+            self._turn(plan, vector, wanted)
+            vector = wanted
+            rotor = self._rotor(encoder, vector)
+            if elsewhere and rotor > target_rad + near_rad:
+                target_rad += FURTHER_STEP_RAD
+            if abs(rotor - target_rad) <= near_rad:
+                break
+            wanted = vector + max(-FURTHER_MOST_RAD, min(FURTHER_MOST_RAD, target_rad - rotor))
+        self._turn(plan, vector, rotor)  # slowly: a frame that jumps there pulls the rotor along
+        return replace(plan, angle_rad=self._rotor(encoder, rotor))
+
+    def _turn(self, plan: square_injection.SquarePlan, start_rad: float, end_rad: float) -> None:
+        """Turn the bias to an angle, and wait for it."""
+        turn_s = max(FURTHER_TURN_S, TURN_S * abs(end_rad - start_rad) / (0.5 * math.pi))
+        turn_vector(self.drive, plan.bias_d_a, start_rad, end_rad, turn_s)
+        square_injection.hold_bias(self.drive, replace(plan, angle_rad=end_rad))
+
+    def _rotor(self, encoder: EncoderResult, vector_rad: float) -> float:
+        """Electrical angle of the rotor near a vector (rad)."""
+        periods = max(1, round(0.02 / self.drive.period_s))
+        theta_M = self.drive.average(("theta_m_rad",), periods)["theta_m_rad"]
+        theta_e = encoder.direction * encoder.pole_pairs.value * theta_M - encoder.offset.value
+        return vector_rad + math.remainder(theta_e - vector_rad, 2.0 * math.pi)
 
     def _hold_stable_bias(
         self, plan: square_injection.SquarePlan, encoder: EncoderResult, knee_a: float, noise: Noise
@@ -145,7 +238,4 @@ class SquareStage:
 
     def _rotor_ahead(self, encoder: EncoderResult, plan: square_injection.SquarePlan) -> float:
         """Electrical angle of the rotor, with the coarse offset, ahead of the frozen frame (rad)."""
-        periods = max(1, round(0.02 / self.drive.period_s))
-        theta_M = self.drive.average(("theta_m_rad",), periods)["theta_m_rad"]
-        theta_e = encoder.direction * encoder.pole_pairs.value * theta_M - encoder.offset.value
-        return math.remainder(theta_e - plan.angle_rad, 2.0 * math.pi)
+        return self._rotor(encoder, plan.angle_rad) - plan.angle_rad

@@ -8,11 +8,14 @@ import pytest
 
 from pmsmtool.errors import ExitCode, IdentificationError
 from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.estimate import SensorTolerance, Verdict
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise, estimate_noise
-from pmsmtool.estimators.phase_check import check_pairs, check_phases
+from pmsmtool.estimators.phase_check import check_pairs, check_phases, over_phases
 from pmsmtool.estimators.refusals import REFUSALS, refuse
+from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.estimators.sensor_mismatch import without_mismatch
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
 
@@ -190,6 +193,19 @@ def test_equal_pairs_show_their_resistance_whatever_the_dead_time() -> None:
     assert result.resistance_ohm == pytest.approx((2.0, 2.0, 2.0))
     assert result.spread == pytest.approx(0.0, abs=1e-12) and result.mismatch.spread == pytest.approx(0.0, abs=1e-12)
     assert result.judged
+
+
+def test_unequal_phases_give_the_mean_of_them() -> None:
+    """Levels are held with phase a idle: they show the mean of b and c."""
+    found = check_pairs(pairs((2.06, 1.98, 1.96)), NOISE, STEP)
+    R = Estimate(1.97, 1e-3, 0.01, "ohm", T_c=20.0)
+    levels = ResistanceResult(R, R, STEP, 5.0, 0.0, 1.0, Verdict.PASS)
+    mean = over_phases(levels, found, SensorTolerance())
+    assert mean.R_measured.value == pytest.approx(2.0) and mean.R_s.value == pytest.approx(2.0)
+    assert mean.R_s.systematic >= 0.03  # what a pair of phases is off the mean
+    assert "a 2.06, b 1.98, c 1.96" in mean.R_s.fallback
+    alike = check_pairs(pairs((2.001, 2.0, 2.0)), NOISE, STEP)
+    assert over_phases(levels, alike, SensorTolerance()) is levels
 
 
 @pytest.mark.parametrize(

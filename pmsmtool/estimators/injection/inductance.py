@@ -18,7 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, Verdict, chi2_gate, condition_gate
+from pmsmtool.estimators.injection.angle_dependence import AngleDependence, over_angle
 from pmsmtool.estimators.injection.axis_fit import AxisFit, fit_axis
 from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, VoltageError, projected, with_line
@@ -70,6 +72,7 @@ two branches, left 1.13 and 1.69 of it, and L_d, L_q 1.4 and 2.5 % off."""
 MINIMUM_PERIODS = 20
 """Full periods of the square wave below which a shot is not an excitation."""
 CURVE_POINTS = 256
+ONE_ANGLE = "at one angle of the rotor: what unequal phases and slots change over the angle is not in the interval"
 ANISOTROPY_LIMIT = 0.03
 """(1/L_d - 1/L_q) over the mean below which the axis angle cannot be told from the inductances."""
 
@@ -144,6 +147,7 @@ def estimate_inductances(
     instant: ShownInstant | None = None,
     U_dc_v: float = math.inf,
     tolerance: SensorTolerance | None = None,
+    further: Mapping[str, Sequence[Trace]] | None = None,
 ) -> InductanceResult:
     """Incremental inductances from square-wave shots.
 
@@ -170,6 +174,8 @@ def estimate_inductances(
         DC link (V): height of the bridge's pulses; infinite: the mean voltage is taken for all of a period.
     tolerance : SensorTolerance
         Declared sensor tolerances.
+    further : mapping of str to sequence of Trace, optional
+        Shots at two more angles of the rotor by axis, with the shortest half period: L is then the mean over the angle.
 
     Raises
     ------
@@ -207,6 +213,7 @@ def estimate_inductances(
             frame, fallback = FrameAhead(angle, angle, angle_std), "frame offset from the cross responses"
         else:
             frame, fallback = FrameAhead(0.0, 0.0, 0.0), "frame offset unknown, machine nearly round: axes as they are"
+    uneven = _over_angle(fits, shots, further or {}, inverter, U_dc_v)
     values, stds = _unmix(fits, {axis: factor for axis, (_, factor, _) in widen.items()}, frame)
     biases = {"d": _bias(d_shots, frame.d_rad), "q": _bias(q_shots, frame.q_rad)}
     dependent = tuple(
@@ -239,6 +246,7 @@ def estimate_inductances(
         )
         for axis in fits
     }
+    estimates = {axis: _with_angle(L, uneven.get(axis)) for axis, L in estimates.items()}
     # an angle that is old shows what a late sample does and leaves L larger by R t: L is the middle, both are inside
     half_apart = 0.5 * R_ohm * (0.0 if instant is None else max(0.0, instant.value_s))
     if half_apart > 0.0:
@@ -263,6 +271,39 @@ def estimate_inductances(
         else tuple((weight, instant.sampling(delay, lag)) for weight, delay, lag in fits["q"].places),
         apart_s=apart_s,
     )
+
+
+def _over_angle(
+    fits: Mapping[str, AxisFit],
+    shots: Mapping[str, Sequence[Shot]],
+    further: Mapping[str, Sequence[Trace]],
+    inverter: InverterCurve | None,
+    U_dc_v: float,
+) -> dict[str, AngleDependence]:
+    """Return by axis how its inductance depends on the angle of the rotor, where that was measured."""
+    found = {}
+    for axis, records in further.items():
+        stage = f"inductance over the angle, {axis} axis"
+        try:
+            others = [_shot(record, axis, inverter, U_dc_v, stage) for record in records]
+        except IdentificationError:
+            continue  # a rotor that moved there, or a limited voltage: L is that of its own angle
+        if others:
+            angles = [record.meta["fixed_angle_rad"] for record in records]
+            found[axis] = over_angle(fits[axis], shots[axis][0], others, angles)
+    return found
+
+
+def _with_angle(L: Estimate, at: AngleDependence | None) -> Estimate:
+    """Return an inductance as the mean over the angle. A controller of one L meets all: how far it goes is inside."""
+    told = ONE_ANGLE
+    if at is not None:
+        where = "mean over the angle" if at.mean != 1.0 else "at one angle"
+        told = f"{where}, it changes by {100.0 * at.spread:.2g} %" if at.spread else ""
+        value = at.mean * L.value
+        systematic = math.hypot(at.mean * L.systematic, at.spread * value)
+        L = replace(L, value=value, std=at.mean * L.std, systematic=systematic)
+    return replace(L, fallback="; ".join(filter(None, (told, L.fallback))))
 
 
 def _fitted(
