@@ -79,7 +79,7 @@ def write_plan(
         progress=lambda done, total: out.status(f"{done}/{total}"),
     )  # fmt: skip
     jobs.append(job)
-    job.admit()  # nobody is asked for what would be refused after his consent
+    job.admit(store=store)  # nobody is asked for what would be refused after his consent
     node.sdo.finish_within(math.inf)  # a person may take his time, and a download has limits of its own
     if job.has_work(store=store):
         lines = [*plan.lines(), *plan.after_lines(store=store)]

@@ -92,7 +92,7 @@ def flash_fleet(
                 )
             return
         for job in jobs:
-            job.admit()
+            job.admit(store=store)
         due = [job for job in jobs if job.has_work(store=store)]
         if alone is not None:
             alone.check(jobs, due, motion, out, lines)

@@ -21,10 +21,11 @@ from pmsmtool.design.loops.open_loops import CURRENT_LOOPS, lacking_gains
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
-from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
+from pmsmtool.flash.download import NO_STORE
 from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.map_gate import check_map
-from pmsmtool.identification.by_pulses import NO_POLE_PAIRS
+from pmsmtool.identification.by_pulses import NO_POLE_PAIRS, TOO_WIDE
 from pmsmtool.identification.completed_machine import NEEDED, completed_machine
 from pmsmtool.identification.request import QUANTITIES, IdentifyRequest, Method
 from pmsmtool.identification.run_files import MACHINE, NAMEPLATE
@@ -130,8 +131,8 @@ class LevelStages:
     def identify(self, request: IdentifyRequest, allow: Allow, say: Say) -> Stage:
         """Measure what the drive allows; the machine file is completed by what was given.
 
-        Where nothing can be measured and a machine file was given, the stage is not available and that file stands in
-        the run, its values as given.
+        Where nothing can be measured, or nothing closely enough, and a machine file was given, the stage is not
+        available and that file stands in the run, its values as given.
 
         Raises
         ------
@@ -156,7 +157,12 @@ class LevelStages:
             reason = "needs a rotor that may turn, and the shaft is locked"
         if not reason:
             method = OF_LEVEL[found.tier]
-            return _stopped(identify(run, drive, asked, allow, say, method=method, found=found, known=known), True)
+            try:
+                return _stopped(identify(run, drive, asked, allow, say, method=method, found=found, known=known), True)
+            except IdentificationError as error:
+                if error.reason != TOO_WIDE or self.nameplate is None:
+                    raise
+                reason = f"nothing was identified: {error.what}; likely {error.likely}; {error.hint}"
         if known is not None:
             made = completed_machine(known[0], {}, known[1])
             assert made.machine is not None
@@ -273,7 +279,7 @@ class LevelStages:
             check_map(drive_map, self.found.identity, JournalFolder(self.found.identity))
         except ConfigError as error:
             return error.what
-        return ""
+        return "" if self.drive.node.can_store() else NO_STORE
 
     def _no_proof(self) -> str:
         if self.found.drive_map.staging and (self.injects or self.found.tier is Tier.RECORDER):

@@ -285,6 +285,14 @@ class DriveNode:
                     raise
                 self.connection.wait(POLL_S)
 
+    def can_store(self) -> bool:
+        """Whether the node has the command that stores all parameters."""
+        try:
+            self.sdo.read(*objects.STORE_ALL)
+        except SdoAbort as abort:
+            return abort.code not in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX)
+        return True
+
     def store(self) -> None:
         """Store all parameters; the command is sent once, flash memory wears out.
 

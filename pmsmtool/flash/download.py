@@ -25,6 +25,7 @@ from pmsmtool.drive.port import Identity
 from pmsmtool.errors import (
     DriveTimeout,
     Interrupted,
+    NotAvailable,
     PmsmtoolError,
     SafetyRefusal,
     SdoAbort,
@@ -42,6 +43,7 @@ CONSUMERS_MAX = 8
 LISTEN_S = 0.25
 """Before the first write the bus is listened to this long: another master would be heard."""
 _STARTS = 2
+NO_STORE = "the drive has no command that stores parameters (0x1010:01): a written set would be lost at the next reset"
 NOTHING_WRITTEN = "nothing was written: the drive holds the set that it held before"
 
 
@@ -161,7 +163,7 @@ class Download:
             Ctrl-C, after the roll-back. From the save request on the download is finished first. It says which set
             the drive holds.
         """
-        self._gate()
+        self._gate(store)
         if (aside := self.folder.set_aside_damaged()) is not None:
             self._say(f"the last journal was damaged, is kept as {aside}; what the drive held before is not known")
         if not self.has_work(store=store):
@@ -208,22 +210,33 @@ class Download:
         same_marks = self._old_marks.get("design_id") == self._wanted_marks.get("design_id")
         return bool(self.plan.changes) or not same_marks or (store and not self._was_stored)
 
-    def admit(self) -> None:
+    def admit(self, *, store: bool = True) -> None:
         """Refuse what no consent would allow: a map that is not this drive's, a drive that may move; only reads.
+
+        Parameters
+        ----------
+        store : bool
+            As of :meth:`run`.
 
         Raises
         ------
         ConfigError, SafetyRefusal
             As ``flash.map_gate.check_map`` and :func:`refuse_while_enabled`.
+        NotAvailable
+            It is to be stored, and the drive has no command for it.
         """
         check_map(self.node.map, self.identity, self.folder)
+        if store and not self.node.can_store():
+            raise NotAvailable(
+                NO_STORE, where=f"node {self.node.node}",
+                hint="`flash-params --no-store` lets the set act until then; nothing was written",
+            )  # fmt: skip
         refuse_while_enabled(self.node)
 
-    def _gate(self) -> None:
+    def _gate(self, store: bool) -> None:
         check_identity(self.node, self.identity)
-        check_map(self.node.map, self.identity, self.folder)
+        self.admit(store=store)
         self._parameters.check_layout()
-        refuse_while_enabled(self.node)
         if self._parameters.is_staged():
             raise SafetyRefusal(
                 "the drive holds a staged set that another program has begun",

@@ -10,15 +10,29 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from pmsmtool.bus.connect import connect
 from pmsmtool.cli.drive_access import rehearsal_bus
 from pmsmtool.cli.main import cli
 from pmsmtool.cli.options import BusOptions
+from pmsmtool.commissioning import level_stages
+from pmsmtool.commissioning.commission import begin_run
+from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.port import Identity
-from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.drive_maps.shipped_maps import load_family
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
+from pmsmtool.flash.download import Download
 from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.map_gate import memory_of
+from pmsmtool.flash.restore import plan_download
 from pmsmtool.identification.by_pulses import either_reading, over_torque_constant
+from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.profile import machine_path
+from pmsmtool.measurement.capabilities import examine
+from pmsmtool.measurement.identify import open_for_level
+from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.run_directory import Stage
 from pmsmtool.sim.channel import parse_channel
 from tests.foreign.data_sheets import GUARDING, Row, copley, epos4, write_eds
 
@@ -110,3 +124,46 @@ def test_without_pole_pairs_the_torque_constant_divides() -> None:
     assert set(found) == {"J_per_kt", "tau_c_per_kt"}
     assert found["J_per_kt"].value == pytest.approx(0.02) and found["J_per_kt"].std == pytest.approx(2e-4)
     assert found["tau_c_per_kt"].unit == "A"
+
+
+@pytest.mark.parametrize("sheet", [True, False])
+def test_an_inertia_that_is_not_known_closely_enough_ends_no_rehearsal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sheet: bool
+) -> None:
+    """A light bare shaft behind a drive without a speed limit: what the machine file states stands in."""
+
+    def too_wide(*args: object, **named: object) -> Stage:
+        raise IdentificationError("E_NOT_IDENTIFIABLE", "J/psi is 1 +-1", likely="a bare shaft", hint="add inertia")
+
+    monkeypatch.setattr(level_stages, "identify", too_wide)
+    nameplate = load_machine_file(machine_path("interior-2k2")) if sheet else None
+    with connect("pmsmsim", f"interior-2k2?nv=:memory:&eds={write_eds(tmp_path / 'x.eds', epos4())}") as connection:
+        node = DriveNode(connection, 1)
+        found = examine(node)
+        node.close()
+        drive = open_for_level(connection, 1, found)
+        begun = begin_run(drive, tmp_path / "runs", tier=found.tier)
+        stages = level_stages.LevelStages(begun, drive, found, nameplate)
+        if sheet:
+            stage = stages.identify(IdentifyRequest(), lambda lines: None, lambda text: None)
+            assert stage.status == "not available" and "add inertia" in stage.note and "machine.toml" in stage.files
+        else:
+            with pytest.raises(IdentificationError):
+                stages.identify(IdentifyRequest(), lambda lines: None, lambda text: None)
+        drive.close()
+
+
+def test_a_drive_that_cannot_store_is_not_written(tmp_path: Path) -> None:
+    eds = write_eds(tmp_path / "x.eds", epos4())
+    with connect("pmsmsim", f"interior-2k2?nv=:memory:&eds={eds}") as connection:
+        node = DriveNode(connection, 1, drive_map=load_family("epos4"))
+        identity = node.identity()
+        plan = plan_download(node, ParameterSet({"current.K_p_q_v_per_a": 2.0}))
+        job = Download(node, identity, plan, {}, JournalFolder(identity, tmp_path))
+        before = node.sdo.read(0x30A0, 1)
+        with pytest.raises(NotAvailable, match="0x1010:01"):
+            job.run()
+        assert node.sdo.read(0x30A0, 1) == before
+        job.run(store=False)
+        assert node.sdo.read(0x30A0, 1) != before
+        node.close()
