@@ -19,7 +19,7 @@ from pmsmtool.design.loops.current_loop import (
     modulus_optimum_bandwidth,
     second_order,
 )
-from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
+from pmsmtool.design.loops.sampled_loop import SampledLoop, _real_roots, margins
 from pmsmtool.errors import DesignInfeasible
 
 R, L_D, L_Q, T_S = 0.137, 2.3e-3, 2.1e-3, 1.0 / 12e3
@@ -177,3 +177,9 @@ def test_unstable_and_conditionally_stable_loops_are_told() -> None:
     assert conditionally.stable
     reduced = scaled(SampledLoop((1.2, -2.1, 0.93), (1.0, -3.0, 3.0, -1.0), 1.0), conditionally.gain_reduction)
     assert spectral_radius(reduced) == pytest.approx(1.0, abs=1e-7)
+
+
+def test_a_constant_has_no_roots() -> None:
+    """The gain of such a loop crosses nothing; (x - 0.5) (x + 2) has one root in cos(theta)."""
+    assert _real_roots(np.array([2.0])).size == 0 and _real_roots(np.array([0.0])).size == 0
+    assert _real_roots(np.array([-0.5, 1.5, 0.5])) == pytest.approx([math.pi / 3.0])

@@ -148,6 +148,8 @@ def test_random_samples_have_the_deviation_they_were_given() -> None:
         assert samples.column(name).std() == pytest.approx(deviation.std, rel=0.03)
         assert samples.column(name).mean() == pytest.approx(1.0, abs=4.0 * deviation.std / 200.0)
     assert samples.column("T_winding_c").min() >= box.T_winding_c[0]
+    point = samples.column("operating_point")  # between the inductance of the design and the least
+    assert 0.0 <= point.min() < 0.02 and 0.98 < point.max() <= 1.0
 
 
 def test_assumptions_and_bad_ranges_are_told() -> None:

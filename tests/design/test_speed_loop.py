@@ -16,6 +16,7 @@ from pmsmtool.design.loops.speed_loop import (
     SpeedPath,
     notch_coefficients,
     pole_placement,
+    position_gain,
     small_time_constants,
     speed_loop,
     symmetric_optimum,
@@ -119,6 +120,13 @@ def test_pole_placement_on_the_stiff_machine() -> None:
     assert np.abs(poles) == pytest.approx(60.0)
     with pytest.raises(DesignInfeasible, match="friction"):
         pole_placement(1e-4, 1.0, 10.0, 1.0)
+
+
+def test_a_slow_position_loop_crosses_at_its_gain() -> None:
+    """Far below the speed loop's bandwidth the shaft follows the speed: K_p / (j omega) is one at omega = K_p."""
+    gains = symmetric_optimum(J, small_time_constants(path(), ALPHA), symmetric_ratio(math.radians(60.0)))
+    K_p, crossover = position_gain(gains, path())
+    assert crossover == pytest.approx(K_p, rel=0.25)  # measured 0.17 above it: the speed loop's own overshoot
 
 
 def test_notch_is_unity_outside_and_deep_at_its_frequency() -> None:

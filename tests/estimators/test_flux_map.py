@@ -16,7 +16,7 @@ from benchmarks.analytic_saturation import BridgeSaturation
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline, basis, break_points
 from pmsmtool.estimators.flux.map_fit import MagnetFlux, fit_coenergy
-from pmsmtool.estimators.flux.map_result import FluxMapResult, estimate_flux_map
+from pmsmtool.estimators.flux.map_result import FluxMapResult, _axis, estimate_flux_map
 from pmsmtool.estimators.flux.map_rows import Frame, smooth_angle
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
@@ -207,3 +207,8 @@ def test_a_coarse_encoder_is_smoothed_and_a_shaft_that_is_not_rigid_is_not() -> 
     assert np.array_equal(smooth_angle(rough, i, flux - flux[:, :1], T_s), rough)
     still = np.full(2048, 0.7)
     assert np.array_equal(smooth_angle(still, i, flux, T_s), still)
+
+
+def test_the_nodes_of_a_map_reach_from_end_to_end_and_hold_zero() -> None:
+    nodes = _axis(np.array([-3.0, 0.0, 8.0]), 5.0)
+    assert (nodes[0], nodes[-1]) == (-3.0, 5.0) and 0.0 in nodes and np.all(np.diff(nodes) > 0.0)

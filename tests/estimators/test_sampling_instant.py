@@ -105,6 +105,14 @@ def test_dead_time_moves_the_pulses_of_two_legs_by_half() -> None:
     assert standstill_instant_s(Sampling(), MODULATION) == -0.5 * MODULATION.dead_time_s
 
 
+def test_a_resistance_too_small_to_divide_by_is_none() -> None:
+    u = 20.0 * np.sign(np.sin(2 * math.pi * np.arange(60) / 12.0 + 0.1))
+    share = np.abs(u) / 100.0
+    pulses = Pulses(share, u / share, 0.0)
+    small, none = (respond(AxisModel(3e-3, R_ohm, 1.0, 0.0), u, T_S, 0.3, pulses) for R_ohm in (1e-3, 1e-12))
+    assert np.max(np.abs(small - none)) < 1e-3 * np.max(np.abs(none))  # measured 3e-4: R T_s/L each period
+
+
 @pytest.mark.parametrize("lag_s", [0.0, 6e-6, 40e-6])
 @pytest.mark.parametrize("delay", [0.9, 1.0, 1.05, 0.7])
 def test_pulses_against_steps_between_all_edges(delay: float, lag_s: float) -> None:

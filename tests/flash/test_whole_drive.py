@@ -82,6 +82,8 @@ def test_commands_set_points_and_what_is_of_one_device_are_left_out() -> None:
     names = ("Internal LR Identification Control", "Current Mode Setting Value", "Serial number", "Controller gain")
     kept, left_out = kept_objects(Listed(0x2400, sub, name) for sub, name in enumerate(names))
     assert [item.name for item in kept] == ["Controller gain"] and len(left_out) == 3
+    commands = (0x1003, 0x1010, 0x1011, 0x1013, 0x1023, 0x1026, 0x6040)
+    assert not kept_objects(Listed(index, 1, "object") for index in commands)[0]
 
 
 def test_a_spare_part_holds_all_of_it(tmp_path: Path) -> None:
