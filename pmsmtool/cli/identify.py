@@ -40,7 +40,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     ),
 )
 @click.argument(
-    "quantities", nargs=-1, metavar="[R|L|psi|encoder|poles|inverter|mechanics|map|frf|cogging|harmonics|all]..."
+    "quantities", nargs=-1, metavar="[R|L|psi|encoder|poles|inverter|mechanics|map|frf|cogging|harmonics|hall|all]..."
 )
 @click.option(
     "--method",
@@ -99,7 +99,7 @@ def identify_command(
 ) -> None:
     """Measure resistance, inverter error, inductances, flux linkage, encoder and inertia of the connected machine.
 
-    Without a quantity all but map, frf, cogging and harmonics are measured.
+    Without a quantity all but map, frf, cogging, harmonics and hall are measured.
 
     \b
     map        flux linkages over the current plane, with saturation
@@ -107,6 +107,7 @@ def identify_command(
     frf        mechanical frequency response, and its resonance
     cogging    torque over the angle, in slow turns
     harmonics  5th, 7th, 11th and 13th harmonic of the back-EMF
+    hall       order of the wires and alignment of Hall sensors; alone
     A locked rotor (--shaft locked) allows R, inverter and map.
 
     The limits are printed and consent is asked before anything moves. Every value has a statistical and a systematic
@@ -124,6 +125,12 @@ def identify_command(
     from pmsmtool.identification.calibration import calibrated_tolerance
     from pmsmtool.identification.request import NEEDS, QUANTITIES, IdentifyRequest, Method
 
+    if quantities == ("hall",) and replay is None and fingerprint is None:
+        from pmsmtool.cli.drive_access import read_map
+        from pmsmtool.cli.identify_hall import identify_hall
+
+        identify_hall(bus, motion, out, runs, read_map(map_file))
+        return
     declared = None if sensor_tol is None else SensorTolerance(current_gain=sensor_tol, voltage_gain=sensor_tol)
     if replay is not None:
         if fingerprint is not None:

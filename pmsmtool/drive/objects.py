@@ -166,6 +166,7 @@ LIVE: dict[str, DriveObject] = {
     "binding": DriveObject(0x2070, 0x17, "I"),
     "iterations": DriveObject(0x2070, 0x18, "I"),
     "following_error_rad": DriveObject(0x2070, 0x19, "f"),
+    "hall_pattern": DriveObject(0x2070, 0x1A, "I"),
 }
 """Live quantities of the reference drive; also what its recorder and its averages take."""
 

@@ -121,6 +121,12 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
         "turn the shaft by hand and watch theta_m in `pmsmtool monitor`",
     ),
     (
+        "E_HALL",
+        "the Hall wires do not show three sensors a third of an electrical turn apart",
+        "a wire that is open or shorted, no supply at the sensors, or sensors 60 degrees apart",
+        "measure the three wires while you turn the shaft by hand: each is high for half an electrical turn",
+    ),
+    (
         "E_VENDOR_VALUE",
         "the drive's own identification gives a number that no machine has",
         "the drive works with R, L or pole pairs of another machine, or the map reads another firmware",

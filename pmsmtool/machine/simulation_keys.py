@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+from pmsmtool.machine.hall import HALL_ORDERS
 from pmsmtool.machine.key import Key, Value
 
 _TABLE = "simulation"
@@ -81,6 +82,11 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number("encoder_twice_rad", "rad", -0.1, 0.1, 0.0, "encoder error twice per turn, amplitude (mechanical)"),
     _number("encoder_noise_rad", "rad", 0.0, 0.01, 0.0, "encoder noise, white, standard deviation (mechanical)"),
     _number("encoder_latency_s", "s", 0, 1e-3, 0.0, "age of an encoder sample"),
+    _choice("hall_order", ("none", *HALL_ORDERS), "none", "Hall sensors: phase of the sensor on wires 1, 2, 3"),
+    _number("hall_offset_rad", "rad", -_PI2, _PI2, 0.0, "electrical angle by which all sensors are turned"),
+    _number("hall_error_a_rad", "rad", -1, 1, 0.0, "placement error of the sensor of phase a, electrical"),
+    _number("hall_error_b_rad", "rad", -1, 1, 0.0, "placement error of the sensor of phase b, electrical"),
+    _number("hall_error_c_rad", "rad", -1, 1, 0.0, "placement error of the sensor of phase c, electrical"),
     _number("shunt_blind_s", "s", 0, 1e-4, 0.0, "low-side pulses shorter than this cannot be read, 0 in-phase sensors"),
     # temperatures
     _number("T_winding_c", "degC", -60, 300, 20.0, "winding temperature at the start"),

@@ -182,6 +182,7 @@ static void sample(pmsm_sim *sim, const pmsm_output *acting, double T_s, double 
     sensors->i_a = (float)seen[0];
     sensors->i_b = (float)seen[1];
     sensors->i_c = (float)seen[2];
+    sensors->hall = pmsm_sensor_hall(setup, sim->plant.machine.pole_pairs * sim->plant.state.theta_M);
     sensors->U_dc = (float)(setup->U_dc_gain * sim->U_dc);
     sensors->T_winding = (float)(setup->T_lag > 0.0 ? sim->T_winding_shown : sim->plant.T_winding);
     sensors->T_magnet = (float)sim->plant.T_magnet;

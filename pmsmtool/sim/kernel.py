@@ -116,6 +116,8 @@ class Sensors(ctypes.Structure):
         ("blind", _f64),
         ("cubic", _f64),
         ("drift", _f64),
+        ("hall_axis", _f64 * 3),
+        ("hall", _u32),
     )
 
 

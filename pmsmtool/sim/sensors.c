@@ -124,3 +124,15 @@ double pmsm_sensor_angle(const pmsm_sensor_setup *setup, pmsm_random *random, do
     }
     return theta;
 }
+
+uint32_t pmsm_sensor_hall(const pmsm_sensor_setup *setup, double theta_e)
+{
+    uint32_t pattern = 0;
+    for (uint32_t k = 0; setup->hall != 0 && k < 3; k++) {
+        double s, c, turn = (theta_e - setup->hall_axis[k]) / PMSM_REAL64_TWO_PI;
+        turn -= nearest(turn);
+        pmsm_real64_sincos(PMSM_REAL64_TWO_PI * turn, &s, &c);
+        pattern |= (c >= 0.0 ? 1u : 0u) << k;
+    }
+    return pattern;
+}

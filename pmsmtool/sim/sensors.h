@@ -27,6 +27,8 @@ typedef struct {
     double blind;                /* s: shortest low-side pulse a shunt can read, 0: in-phase sensors */
     double cubic;                /* share of the full scale at full scale: gain i + cubic i^3 / full_scale^2 */
     double drift;                /* A/s, offset of phase a; that of b drifts against it */
+    double hall_axis[3];         /* rad electrical: middle of the half turn in which a Hall wire is high */
+    uint32_t hall;               /* 1: there are Hall sensors */
 } pmsm_sensor_setup;
 
 enum pmsm_sensor_fault {
@@ -59,5 +61,8 @@ double pmsm_sensor_current(const pmsm_sensor_setup *setup, pmsm_random *random, 
 /* Encoder position (rad mechanical, unwrapped) of the rotor at theta_M turning at omega_M. */
 double pmsm_sensor_angle(const pmsm_sensor_setup *setup, pmsm_random *random, double theta_M, double omega_M,
                          double pole_pairs);
+
+/* Levels of the Hall wires, bit k of wire k, at an electrical angle; 0 without sensors. */
+uint32_t pmsm_sensor_hall(const pmsm_sensor_setup *setup, double theta_e);
 
 #endif

@@ -35,6 +35,7 @@ class Signal(IntEnum):
     T_MAGNET = 23
     THETA_M = 24
     FOLLOWING_ERROR = 25
+    HALL = 26
 
 
 class Truth(IntEnum):

@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.machine.hall import hall_axis
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.sim.kernel import Application, Rotor, Setup, library
@@ -275,6 +276,11 @@ def _sensors(out: Any, machine_file: MachineFile, settings: Settings, violations
     out.encoder_noise = settings.number("encoder_noise_rad")
     out.encoder_once, out.encoder_twice = settings.number("encoder_once_rad"), settings.number("encoder_twice_rad")
     out.cubic, out.drift = settings.number("sensor_cubic"), settings.number("sensor_drift_apk_per_s")
+    order = settings.text("hall_order")
+    out.hall = int(order != "none")
+    if out.hall:
+        offset = settings.number("hall_offset_rad")
+        out.hall_axis[:] = [offset + hall_axis(x) + settings.number(f"hall_error_{x}_rad") for x in order]
     out.T_lag, out.blind = settings.number("T_sensor_lag_s"), settings.number("shunt_blind_s")
 
 

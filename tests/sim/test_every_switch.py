@@ -139,8 +139,10 @@ SWITCHES: dict[str, tuple[Value, Mapping[str, Value]]] = {
 }
 """Key: another value, and what must be on for it to matter."""
 
-ELSEWHERE = {"serial"}
-"""Keys that no trace shows: the serial number is an object of the node (tests/node)."""
+HALL = {"hall_order", "hall_offset_rad", *(f"hall_error_{phase}_rad" for phase in "abc")}
+ELSEWHERE = {"serial", *HALL}
+"""Keys that no trace of `simulate` shows: the serial number is an object of the node (tests/node), the Hall wires are
+(tests/cli/test_identify_hall)."""
 
 SCENARIO = Scenario(
     "switches",

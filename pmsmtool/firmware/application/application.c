@@ -120,6 +120,7 @@ float pmsm_application_signal(const pmsm_application *app, uint32_t signal)
     case PMSM_SIGNAL_T_MAGNET: return s->T_magnet;
     case PMSM_SIGNAL_THETA_M: return mechanical_angle(app);
     case PMSM_SIGNAL_FOLLOWING_ERROR: return app->position.error * pmsm_increment(app);
+    case PMSM_SIGNAL_HALL: return (float)s->hall;
     default: return 0.0F;
     }
 }

@@ -30,6 +30,7 @@ enum pmsm_signal {
     PMSM_SIGNAL_I_A, PMSM_SIGNAL_I_B, PMSM_SIGNAL_I_C, PMSM_SIGNAL_U_DC,
     PMSM_SIGNAL_T_WINDING, PMSM_SIGNAL_T_MAGNET, PMSM_SIGNAL_THETA_M, /* mechanical, unwrapped, rad */
     PMSM_SIGNAL_FOLLOWING_ERROR, /* rad, mechanical: reference less position */
+    PMSM_SIGNAL_HALL,
     PMSM_SIGNAL_COUNT
 };
 
@@ -42,6 +43,7 @@ typedef struct {                 /* what the sensors deliver at the sampling ins
     uint32_t encoder_failed;     /* 1: turns and angle are no reading */
     uint32_t limits;             /* limit switches that are active: bit 0 negative, bit 1 positive direction */
     uint32_t adc_clipped;        /* 1: a sample stood at full scale */
+    uint32_t hall;               /* levels of the Hall wires, bit k of wire k; nothing but the recorder reads them */
 } pmsm_sensors;
 
 enum pmsm_shape {                /* object 0x2050:01 */

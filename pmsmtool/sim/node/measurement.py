@@ -56,6 +56,7 @@ LIVE_SIGNALS: dict[str, Signal] = {
     "binding": Signal.BINDING,
     "iterations": Signal.ITERATIONS,
     "following_error_rad": Signal.FOLLOWING_ERROR,
+    "hall_pattern": Signal.HALL,
 }
 """Live values (key behind ``live.``) and the core's signal behind each."""
 
