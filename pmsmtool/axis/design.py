@@ -7,6 +7,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from pmsmtool.axis.loops import AxisGains, AxisPath
 from pmsmtool.axis.mechanics import Mechanics, mechanics_of
 from pmsmtool.axis.reference import Profile, jerk_limited, plan
@@ -15,6 +17,7 @@ from pmsmtool.axis.tracking import best_share, following_error
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop
 from pmsmtool.design.loops.sampled_loop import SampledLoop
+from pmsmtool.design.loops.speed_loop import Notch
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.tolerance import NORMAL_95, tolerance_box
 from pmsmtool.errors import ConfigError, DesignInfeasible
@@ -164,6 +167,72 @@ def from_pid(K_P: float, K_I: float, K_D: float, like: AxisGains) -> AxisGains:
     apart = math.sqrt(max(K_P * K_P - 4.0 * K_D * K_I, 0.0))
     K_v = min(((K_P + sign * apart) / (2.0 * K_D) for sign in (1.0, -1.0)), key=lambda root: abs(root - like.K_v))
     return replace(like, K_p=K_D, K_i=K_P - K_D * K_v, K_v=K_v)
+
+
+def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisDrive) -> AxisDesign:
+    """Return a design of the axis, with the gains a drive holds where a move is predicted to be followed worse without.
+
+    What is compared is the largest following error of one move: that of the loops, with the feed-forward that belongs
+    to the gains, and what Coulomb friction adds. Stored gains that are unstable at a corner of the box are not kept.
+
+    Parameters
+    ----------
+    stored : mapping
+        What the drive holds, by catalogue name; without all gains of its controller nothing is compared.
+    """
+    design, box = made.design, made.box
+    speed, position = _stored_gains(stored, made, drive)
+    if speed is None or position is None:
+        return replace(made, design=replace(design, notes=(*design.notes, "the stored gains do not tell both loops")))
+    stable = all(
+        found.nominal.loop.stable and math.isfinite(found.phase_deg)
+        for found in (box.judged(speed, "speed"), box.judged(position, "position"))
+    )
+    J, friction = box.path.shaft.J, design.machine.machine.tau_c_nm or 0.0
+    jerk = float(design.facts["axis_jerk_rad_s3"]) if drive.own_core or PROFILE[3] in drive.offers else math.inf
+    limits = Profile(float(design.facts["axis_speed_rad_s"]), float(design.facts["axis_acceleration_rad_s2"]), jerk)
+    plain, added = following_error(box.plant, box.path, position, plan(WAY_RAD, limits))
+    held = stored.get(CASCADE[2], 0.0) / J
+    wave = plain - plain.mean() + held * (added - added.mean())
+    before = float(np.max(np.abs(wave))) + friction / position.pid[0] if stable else math.inf
+    after = float(design.facts["axis_following_error_rad"]) + float(design.facts["axis_friction_error_rad"])
+    told: dict[str, Scalar] = {"axis_error_rad": after, "axis_stored_error_rad": before}
+    if after <= before:
+        return replace(made, design=replace(design, facts={**design.facts, **told}))
+    share, error = best_share(plain, added)
+    errors = f"{math.degrees(before):.3g} deg of following error, {math.degrees(after):.3g} designed"
+    how = f"as the drive holds it: {errors}"
+    gains = {name: DesignValue(stored[name], how, design.values[name].loop) for name in _gain_rows(drive)}
+    forward = f"{share:g} of the inertia: the least predicted following error"
+    gains |= {
+        name: DesignValue(share * J, forward)
+        for name in (*CASCADE[2:], SPEED_FORWARD[0])
+        if name in design.values and name in drive.offers
+    }
+    told |= {
+        "axis_inertia_ff_share": share, "axis_following_error_rad": error,
+        "axis_friction_error_rad": friction / position.pid[0], "axis_error_rad": error + friction / position.pid[0],
+    }  # fmt: skip
+    note = "the stored gains are kept: the designed ones, with the margins asked for, would follow worse"
+    base = replace(design, facts={**design.facts, **told}, notes=(*design.notes, note))
+    return AxisDesign(_judged(base, gains, box, speed, position), box, speed, position)
+
+
+def _gain_rows(drive: AxisDrive) -> tuple[str, ...]:
+    return (*SPEED, *(PID[:3] if drive.pid else CASCADE[:1]))
+
+
+def _stored_gains(
+    stored: Mapping[str, float], made: AxisDesign, drive: AxisDrive
+) -> tuple[AxisGains | None, AxisGains | None]:
+    """Return the loops that stored gains make; None where one is missing or off."""
+    if not all(stored.get(name, 0.0) > 0.0 for name in _gain_rows(drive)):
+        return None, None
+    notch = Notch(stored.get(NOTCH[0], 0.0), *(stored.get(name, 1.0) for name in NOTCH[1:]))
+    speed = AxisGains(stored[SPEED[0]], stored[SPEED[1]], stored.get(CASCADE[0], made.speed.K_v), notch)
+    if not drive.pid:
+        return speed, speed
+    return speed, replace(from_pid(stored[PID[0]], stored[PID[1]], stored[PID[2]], made.position), notch=notch)
 
 
 def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDesign:

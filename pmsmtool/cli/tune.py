@@ -95,6 +95,8 @@ if TYPE_CHECKING:
 @click.option("--axis-peak-db", type=float, default=6.0, metavar="DB", help="Largest |S| of both loops over it.")
 @click.option("--loop-rate-hz", type=float, metavar="HZ", help="Rate of the drive's speed and position loops.  "
               "[default: as its map states]")  # fmt: skip
+@click.option("--stored", type=FILE, metavar="FILE", help="What the drive holds (`pmsmtool backup`): its gains are "
+              "kept where the designed ones would follow worse.")  # fmt: skip
 @overspeed_option
 @map_option
 @click.option("--drive-bandwidth-hz", type=float, metavar="HZ", help="Current bandwidth of a drive with fixed "
@@ -173,12 +175,29 @@ def _plot(design: Design, path: Path) -> None:
     save_figure(bode_figure(loops, {name: design.loops[name] for name in loops}).canvas, path)
 
 
-_AXIS = ("axis_phase_margin_deg", "axis_peak_db", "loop_rate_hz")
+_AXIS = ("axis_phase_margin_deg", "axis_peak_db", "loop_rate_hz", "stored")
 
 
 def _refuse_without_axis(axis: dict[str, Any]) -> None:
-    if axis["loop_rate_hz"] is not None:
-        raise ConfigError("--loop-rate-hz: for the loops of --axis", hint="add --axis")
+    for name in ("loop_rate_hz", "stored"):
+        if axis[name] is not None:
+            raise ConfigError(f"--{name.replace('_', '-')}: for the loops of --axis", hint="add --axis")
+
+
+def _stored(path: Path | None, drive_map: DriveMap) -> dict[str, float] | None:
+    """Return what a backup of the drive holds, by catalogue name."""
+    if path is None:
+        return None
+    from pmsmtool.flash.journal import read_snapshot
+    from pmsmtool.flash.restore import snapshot_set
+
+    snapshot = read_snapshot(path)
+    if not drive_map.is_for(snapshot.identity.vendor, snapshot.identity.product):
+        raise ConfigError(
+            f"the backup is not of a drive of the map {drive_map.name!r}", where=str(path),
+            hint="`pmsmtool backup --map NAME` of the drive that is tuned makes one",
+        )  # fmt: skip
+    return dict(snapshot_set(drive_map, snapshot.entries).values)
 
 
 def _axis(
@@ -197,7 +216,7 @@ def _axis(
     if bandwidth_hz is not None:
         asked["bandwidth_hz"] = bandwidth_hz
     request = AxisRequest(axis["axis_phase_margin_deg"], axis["axis_peak_db"], axis["loop_rate_hz"], filter_hz)
-    design = design_axis(source, TuneRequest(**asked), request, drive_map)
+    design = design_axis(source, TuneRequest(**asked), request, drive_map, _stored(axis["stored"], drive_map))
     params = axis_parameters(design)
     write_file(path, design_text(design))
     write_file(params_path, params.to_toml())

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
-from pmsmtool.axis.design import AXIS_ROWS, CASCADE, PID, SPEED, AxisDrive, AxisRequest, with_axis
+from pmsmtool.axis.design import AXIS_ROWS, CASCADE, PID, SPEED, AxisDrive, AxisRequest, at_least_as_good, with_axis
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
@@ -25,8 +26,14 @@ def axis_drive(drive_map: DriveMap) -> AxisDrive:
     )  # fmt: skip
 
 
-def design_axis(source: MachineFile, request: TuneRequest, axis: AxisRequest, drive_map: DriveMap) -> Design:
-    """Design the axis of a machine on a drive.
+def design_axis(
+    source: MachineFile,
+    request: TuneRequest,
+    axis: AxisRequest,
+    drive_map: DriveMap,
+    stored: Mapping[str, float] | None = None,
+) -> Design:
+    """Design the axis of a machine on a drive; with what the drive holds, never for a larger following error than that.
 
     Raises
     ------
@@ -35,7 +42,10 @@ def design_axis(source: MachineFile, request: TuneRequest, axis: AxisRequest, dr
     DesignInfeasible
         No gains keep the margins over the tolerance box.
     """
-    made = with_axis(tune(source, request), axis, axis_drive(drive_map))
+    drive = axis_drive(drive_map)
+    made = with_axis(tune(source, request), axis, drive)
+    if stored is not None:
+        made = at_least_as_good(made, stored, drive)
     if drive_map.staging:
         return made.design
     lacking = not_offered(drive_map)

@@ -144,3 +144,24 @@ def test_what_cannot_be_designed_is_refused() -> None:
     path, _ = axis_path(tune(source), ASKED, drive, mechanics_of(source))
     with pytest.raises(DesignInfeasible, match="no gains have 120 degree"):
         stiffest(Box(path, ()), Limits(120.0, 6.0))
+
+
+@pytest.mark.chain
+def test_gains_that_follow_better_are_kept() -> None:
+    """A drive that was tuned sharper than the margins asked for; before, its following error was made larger."""
+    source, own = machine(), load_family("pmsmsim")
+    sharp = design_axis(source, TuneRequest(), AxisRequest(phase_margin_deg=25.0, peak_db=10.0), own)
+    names = ("speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad", "position.K_p_per_s")
+    stored = {name: sharp[name] for name in names} | {"position.inertia_ff_kgm2": sharp["position.inertia_ff_kgm2"]}
+    made = design_axis(source, TuneRequest(), ASKED, own, stored)
+    assert all(made[name] == stored[name] for name in names)
+    assert made.facts["axis_error_rad"] <= made.facts["axis_stored_error_rad"] * (1.0 + 1e-9)
+    assert made.facts["axis_position_S_peak_db"] > 6.0, "and the design says what margins they have"
+    assert any("are kept" in note for note in made.notes)
+    calm = {**stored, names[0]: 0.1 * stored[names[0]], names[1]: 0.01 * stored[names[1]], names[2]: 5.0}
+    wild = {**stored, names[0]: 40.0 * stored[names[0]]}
+    plain = designed("pmsmsim", 0.0, 0.0)
+    for other in (calm, wild):
+        assert [design_axis(source, TuneRequest(), ASKED, own, other)[name] for name in names] == [
+            plain[name] for name in names
+        ]

@@ -28,6 +28,14 @@ def test_gains_of_the_axis_reach_the_drive(tool: Tool, tmp_path: Path) -> None:
         # the second file is the first one's set: nothing is left to write
         assert ("12 of 12 objects change" in said) is (source == "axis.toml")
     assert tool("verify", "axis.params.toml", *DRIVE)[0] == 0
+    # what the drive holds now is as good as what is designed, and the factory's gains are worse
+    assert tool("backup", "-o", "stored.json", *DRIVE)[0] == 0
+    again = ("tune", "interior-2k2", "-o", "again.toml", "--axis", "--stored", "stored.json", "--json", "--map")
+    code, printed, _ = tool(*again, "epos4")
+    facts = json.loads(printed)["facts"]
+    assert code == 0 and facts["axis_stored_error_rad"] == pytest.approx(facts["axis_error_rad"], rel=0.05)
+    code, _, said = tool(*again, "ingenia")
+    assert code == 2 and "not of a drive of the map" in said
 
 
 def test_a_drive_without_units_gets_a_table_and_exit_code_10(tool: Tool) -> None:
