@@ -23,7 +23,7 @@ from pmsmtool.design.tolerance import NORMAL_95, tolerance_box
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.params.catalogue import MIDDLE_KIND, TORQUE_PER_AMPERE
+from pmsmtool.params.catalogue import INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
 from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 
 CASCADE = ("position.K_p_per_s", "position.velocity_ff", "position.inertia_ff_kgm2")
@@ -38,7 +38,7 @@ PROFILE = (
     "reference.profile_speed_rpm", "reference.profile_acceleration_rpm_per_s",
     "reference.profile_deceleration_rpm_per_s", "reference.profile_jerk_rpm_per_s2",
 )  # fmt: skip
-AXIS_ROWS = frozenset((TORQUE_PER_AMPERE, *CASCADE, *PID, *SPEED, *SPEED_FORWARD, *NOTCH, *PROFILE))
+AXIS_ROWS = frozenset((TORQUE_PER_AMPERE, INCREMENTS, *CASCADE, *PID, *SPEED, *SPEED_FORWARD, *NOTCH, *PROFILE))
 """What the design of an axis decides, and what is written into a drive for it."""
 SPEED_LOOP, POSITION_LOOP = "axis_speed", "axis_position"
 
@@ -50,6 +50,8 @@ data sheet's."""
 UNKNOWN_KIND = 0.2
 """Of one taken from psi_f, where nothing says if the drive's amperes are peak, rms or block: the middle of peak and rms
 is 19 % from both."""
+ASSUMED_BITS = 16
+"""Of an encoder that the machine file does not state: the drive's own increments are what counts."""
 RESONANCE = 0.03
 """Half width (relative) of a resonance without a standard deviation."""
 DAMPING_SHARE = 0.5
@@ -183,7 +185,8 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     design, box = made.design, made.box
     speed, position = _stored_gains(stored, made, drive)
     if speed is None or position is None:
-        return replace(made, design=replace(design, notes=(*design.notes, "the stored gains do not tell both loops")))
+        note = "no comparison with the stored gains: those of one loop are missing or zero"
+        return replace(made, design=replace(design, notes=(*design.notes, note)))
     stable = all(
         found.nominal.loop.stable and math.isfinite(found.phase_deg)
         for found in (box.judged(speed, "speed"), box.judged(position, "position"))
@@ -445,4 +448,7 @@ def axis_values(
         K_t = MIDDLE_KIND * torque_per_ampere(machine.pole_pairs, machine.psi_f_wb)
         how = "1.5 p psi_f per ampere, between peak and rms: compared, never written"
         values[TORQUE_PER_AMPERE] = DesignValue(K_t, how)
+    if INCREMENTS in drive.offers:
+        bits = source.encoder.bits or ASSUMED_BITS
+        values[INCREMENTS] = DesignValue(2.0**bits, "of the encoder; the drive's own are taken, never written")
     return values

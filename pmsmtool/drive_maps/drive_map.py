@@ -24,7 +24,7 @@ from pmsmtool.drive_maps.vendor_tuning import VendorTuning
 from pmsmtool.drive_maps.wire_units import as_peak
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.params.catalogue import CATALOGUE, TORQUE_PER_AMPERE
+from pmsmtool.params.catalogue import CATALOGUE, INCREMENTS, OWN_SCALES, TORQUE_PER_AMPERE
 from pmsmtool.params.parameter_set import SATURATION, TABLE_NAMES, ParameterSet
 from pmsmtool.plain_text import counted
 
@@ -41,6 +41,8 @@ LETTERS: dict[str, str] = {
 
 IN_AMPERES = "kept in amperes: `pmsmtool tune --axis` designs it with the torque of an ampere"
 """Why a gain is not written that needs the torque per ampere beside it."""
+PER_INCREMENT = "kept per increment of the encoder: `pmsmtool tune --axis` designs it with the drive's own increments"
+NOT_ALONE = {TORQUE_PER_AMPERE: IN_AMPERES, INCREMENTS: PER_INCREMENT}
 REFERENCE_VENDOR = 0x706D736D
 REFERENCE_PRODUCT = 0x00000001
 REFERENCE_TABLES = {
@@ -323,26 +325,30 @@ class DriveMap:
     def decode(self, found: Mapping[str, bytes], given: Mapping[str, float] | None = None) -> ParameterSet:
         """Return the set that a drive's bytes mean.
 
-        ``given`` has values that the drive has no object for and others are counted by. Gains in amperes are left out
-        where neither says the torque of an ampere.
+        ``given`` has values that the drive has no object for and others are counted by. Gains in amperes, or per
+        increment, are left out where neither says what those are.
         """
         values: dict[str, float] = dict(given or {})
         # Gains first: an integral time is decoded with its gain.
         for cell in sorted(self.cells.values(), key=lambda cell: bool(cell.gain)):
-            if cell.name in found and not (cell.gain not in values and self._rests_on_torque(cell)):
+            if cell.name in found and not (cell.gain not in values and self.scale_of(cell)):
                 values[cell.name] = cell.decode(found[cell.name], values)
         tables = {n: decode_table(n, found[n], values) for n in TABLE_NAMES if found.get(n)}
         return ParameterSet(values, tables, name=self.name)
 
     def writes(self, name: str, values: Mapping[str, float]) -> bool:
-        """Whether a value with a row is written: never the torque per ampere, and what rests on it only with it."""
-        return name != TORQUE_PER_AMPERE and (
-            TORQUE_PER_AMPERE in values or not self._rests_on_torque(self.cells[name])
-        )
+        """Whether a value with a row is written: never what a drive scales by, and what rests on it only with it."""
+        if name in OWN_SCALES:
+            return False
+        scale = self.scale_of(self.cells[name])
+        return not scale or scale in values
 
-    def _rests_on_torque(self, cell: Cell) -> bool:
-        """Whether a value is counted by the torque per ampere, itself or through its gain."""
-        return cell.form == "current" or (cell.gain in self.cells and self.cells[cell.gain].form == "current")
+    def scale_of(self, cell: Cell) -> str:
+        """Return which of a drive's own scales a value is counted by, itself or through its gain; empty: none."""
+        if cell.gain == INCREMENTS:
+            return INCREMENTS
+        amperes = cell.form == "current" or (cell.gain in self.cells and self.cells[cell.gain].form == "current")
+        return TORQUE_PER_AMPERE if amperes else ""
 
     def missing(self, wanted: ParameterSet) -> tuple[str, ...]:
         """Return the entries of a set that this drive has no object for."""
@@ -350,7 +356,7 @@ class DriveMap:
 
     def quantised(self, wanted: ParameterSet) -> ParameterSet:
         """Return what the drive will really hold of a set."""
-        given = {name: wanted.values[name] for name in (TORQUE_PER_AMPERE,) if name in wanted.values}
+        given = {name: wanted.values[name] for name in OWN_SCALES if name in wanted.values}
         return self.decode(self.encode(wanted), given)
 
     def address(self, name: str) -> tuple[int, int]:
@@ -376,10 +382,8 @@ class DriveMap:
         names = list(names)
         lacking = (name for name in names if name not in self.cells and name not in self.tables)
         missing = {name: self.left_out.get(name, f"the map {self.name!r} has no row for it") for name in lacking}
-        if TORQUE_PER_AMPERE in names:
-            return missing
-        amperes = (name for name in names if name in self.cells and self._rests_on_torque(self.cells[name]))
-        return missing | dict.fromkeys(amperes, IN_AMPERES)
+        scales = {name: self.scale_of(self.cells[name]) for name in names if name in self.cells}
+        return missing | {name: NOT_ALONE[scale] for name, scale in scales.items() if scale and scale not in names}
 
     @property
     def scales(self) -> bool:

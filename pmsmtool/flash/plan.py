@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive_maps.drive_map import DriveMap, address_in
 from pmsmtool.errors import ConfigError
-from pmsmtool.params.catalogue import BY_NAME, MIDDLE_KIND, TORQUE_PER_AMPERE
+from pmsmtool.params.catalogue import BY_NAME, INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
 from pmsmtool.params.diff import table_unit
 from pmsmtool.params.parameter_set import ParameterSet
 
@@ -162,6 +162,8 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
             violations=violations,
         )
     wanted, given = _with_own_torque(drive_map, wanted, found)
+    wanted, own = _with_own_increments(drive_map, wanted, found)
+    given |= own
     encoded = drive_map.encode(wanted)
     held = drive_map.decode(encoded, given).values
     before = drive_map.decode({name: data for name, data in found.items() if name in drive_map.cells}, given).values
@@ -204,6 +206,29 @@ def _with_own_torque(
         )  # fmt: skip
     values = {**wanted.values, TORQUE_PER_AMPERE: own}
     return replace(wanted, values=values), {TORQUE_PER_AMPERE: own}
+
+
+def _with_own_increments(
+    drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, bytes]
+) -> tuple[ParameterSet, dict[str, float]]:
+    """Return the set with the increments of a turn that the drive itself holds, where gains are counted by them.
+
+    Raises
+    ------
+    ConfigError
+        It holds none.
+    """
+    cell = drive_map.cells.get(INCREMENTS)
+    if cell is None or INCREMENTS not in wanted.values:
+        return wanted, {}
+    own = cell.decode(found[INCREMENTS], {})
+    if not own > 0.0:
+        raise ConfigError(
+            "the drive holds no increments of a turn, and its position gain is counted by them",
+            where=f"{INCREMENTS} -> 0x{cell.index:04X}:{cell.sub:02X}", likely="its encoder is not set up",
+            hint="set the encoder up with the maker's software",
+        )  # fmt: skip
+    return replace(wanted, values={**wanted.values, INCREMENTS: own}), {INCREMENTS: own}
 
 
 def names_to_read(drive_map: DriveMap, wanted: ParameterSet) -> tuple[str, ...]:

@@ -435,6 +435,7 @@ CLOSED_DRIVE: tuple[Parameter, ...] = tuple(
             "slope limit of the torque set-point",
         ),
         ("reference.K_t_nm_per_a", 0x2023, 1, _F32, "N m/A", 1, 1e-6, 1e4, False, "torque per ampere as a drive counts it"),
+        ("reference.encoder_increments", 0x608F, 1, _F32, "1", 65536, 4, 2**32, False, "increments of a turn, of positions"),
         ("reference.profile_speed_rpm", 0x6081, 0, _F32, "rpm", 1000, 0, 1e6, False, "speed of a move"),
         (
             "reference.profile_acceleration_rpm_per_s",
@@ -473,6 +474,9 @@ CLOSED_DRIVE: tuple[Parameter, ...] = tuple(
 
 TORQUE_PER_AMPERE = "reference.K_t_nm_per_a"
 """What gains in amperes rest on: compared with what a drive holds, never written."""
+INCREMENTS = "reference.encoder_increments"
+"""What gains per increment rest on: a drive's own are taken, never written."""
+OWN_SCALES = (TORQUE_PER_AMPERE, INCREMENTS)
 MIDDLE_KIND = 2.0**0.25
 """Torque per ampere of unknown kind over that per ampere peak: the geometric mean of peak and rms, 19 % from both."""
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from functools import cache
 
@@ -23,7 +24,7 @@ from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.flash.plan import make_plan, names_to_read
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.params.catalogue import MIDDLE_KIND, TORQUE_PER_AMPERE
+from pmsmtool.params.catalogue import INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
 
 ASKED = AxisRequest()
 SLACK_DEG, SLACK_DB = 0.3, 0.1
@@ -165,3 +166,19 @@ def test_gains_that_follow_better_are_kept() -> None:
         assert [design_axis(source, TuneRequest(), ASKED, own, other)[name] for name in names] == [
             plain[name] for name in names
         ]
+
+
+def test_a_gain_per_increment_follows_the_increments_that_the_drive_holds() -> None:
+    """Ingenia keeps K_p in (rev/s)/cnt: at 2000 counts of a turn a gain of 1/s is 1/2000."""
+    drive_map = load_family("ingenia")
+    wanted = axis_parameters(designed("ingenia", 0.0, 0.0))
+    found = {name: bytes(drive_map.cells[name].size) for name in names_to_read(drive_map, wanted)}
+    found[INCREMENTS] = (2000).to_bytes(4, "little")
+    plan = make_plan(drive_map, wanted, found)
+    gain = next(change for change in plan.entries if change.name == "position.K_p_per_s")
+    assert struct.unpack("<f", gain.new)[0] == pytest.approx(wanted.values[gain.name] / 2000.0, rel=1e-6)
+    assert INCREMENTS not in [change.name for change in plan.entries], "how the encoder is set up is not ours to write"
+    found[INCREMENTS] = bytes(4)
+    with pytest.raises(ConfigError, match="no increments of a turn"):
+        make_plan(drive_map, wanted, found)
+    assert "increments" in drive_map.not_written(["position.K_p_per_s"])["position.K_p_per_s"]

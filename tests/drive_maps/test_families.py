@@ -28,7 +28,7 @@ from pmsmtool.flash.download import Download
 from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.map_gate import check_map, memory_of, remember_map
 from pmsmtool.flash.restore import plan_download, take_backup
-from pmsmtool.params.catalogue import CATALOGUE, TORQUE_PER_AMPERE
+from pmsmtool.params.catalogue import CATALOGUE, INCREMENTS, TORQUE_PER_AMPERE
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.node.family import STANDARD
 
@@ -82,6 +82,9 @@ def random_design(rng: np.random.Generator) -> dict[str, float]:
         "reference.tau_rated_nm": torque / between(0.5, 10.0),
         "reference.torque_slope_nm_per_s": torque * between(0.1, 500.0),
         **{f"reference.profile_{key}": between(1.0, 1e5) for key in PROFILE},
+        "position.K_p_per_s": between(1.0, 1000.0),
+        "position.velocity_ff": float(rng.uniform(0.0, 1.0)),
+        "position.inertia_ff_kgm2": between(1e-6, 1.0),
     }
 
 
@@ -90,15 +93,17 @@ K_T = 2.3
 
 
 def in_amperes(drive_map: DriveMap, rng: np.random.Generator) -> dict[str, float]:
-    """Gains that a family keeps in amperes, within its types."""
-    resting = [cell for name, cell in drive_map.cells.items() if not drive_map.writes(name, {})]
-    return {cell.name: cell.factor * K_T * float(rng.uniform(1.0, 3e4)) for cell in resting} | {TORQUE_PER_AMPERE: K_T}
+    """Gains that a family keeps in amperes or per increment, within its types, and what it scales them by."""
+    resting = [cell for cell in drive_map.cells.values() if drive_map.scale_of(cell) == TORQUE_PER_AMPERE]
+    gains = {cell.name: cell.factor * K_T * float(rng.uniform(1.0, 3e4)) for cell in resting}
+    return gains | {TORQUE_PER_AMPERE: K_T, INCREMENTS: 8192.0}
 
 
 def torque_of(design: dict[str, float], drive_map: DriveMap) -> dict[str, float]:
-    """The torque of an ampere, where any gain is kept in amperes."""
+    """What a drive scales gains by, where it keeps any in amperes or per increment."""
     resting = any(cell.form == "current" for cell in drive_map.cells.values())
-    return {TORQUE_PER_AMPERE: design[TORQUE_PER_AMPERE]} if resting else {}
+    scales = {TORQUE_PER_AMPERE: design[TORQUE_PER_AMPERE]} if resting else {}
+    return scales | ({INCREMENTS: design[INCREMENTS]} if INCREMENTS in drive_map.cells else {})
 
 
 @pytest.mark.chain
