@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from pmsmtool.cli.options import BusOptions, MotionOptions
     from pmsmtool.drive_maps.drive_map import DriveMap
-    from pmsmtool.estimators.hall import HallAlignment
+    from pmsmtool.identification.hall import HallAlignment
 
 I_SHARE = 0.6
 """Current of the vector, of the rated one."""
@@ -42,8 +42,8 @@ def identify_hall(bus: BusOptions, motion: MotionOptions, out: Output, runs: Pat
     from pmsmtool.drive.envelope import Envelope
     from pmsmtool.drive.guard import guarded
     from pmsmtool.errors import NotAvailable
-    from pmsmtool.estimators.hall import hall_alignment
     from pmsmtool.experiments.hall_turn import WAY_RAD, turn_over_halls
+    from pmsmtool.identification.hall import hall_alignment
     from pmsmtool.run_directory import Stage
     from pmsmtool.trace_file import trace_npz
     from pmsmtool.units import rad_s_from_rpm

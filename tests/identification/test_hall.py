@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.hall import hall_alignment
+from pmsmtool.identification.hall import hall_alignment
 from pmsmtool.machine.hall import HALL_ORDERS, hall_axis
 from pmsmtool.trace import Trace
 
