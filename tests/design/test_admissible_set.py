@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,6 +143,8 @@ def test_the_straight_segment_is_recognised() -> None:
     assert not SECOND_ORDER.has_straight_segment()
     other = PredictionModel(R, L_D, L_Q, PSI, T_S, imc(R, L_D, 4000.0), imc(R, L_Q, 3000.0))
     assert not other.has_straight_segment()
+    slower = (replace(gains, K_i=0.5 * gains.K_i) for gains in (imc(R, L_D, 4000.0), imc(R, L_Q, 4000.0)))
+    assert not PredictionModel(R, L_D, L_Q, PSI, T_S, *slower).has_straight_segment()
 
 
 def test_an_unstable_prediction_is_refused() -> None:

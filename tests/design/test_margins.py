@@ -112,6 +112,7 @@ def test_the_nominal_row_is_the_design_itself() -> None:
         for loop in ("current_d", "current_q", "speed"):
             assert nominal[f"{loop}_phase"][0] == pytest.approx(design.loops[loop].phase_margin_deg, abs=1e-6)
             assert nominal[f"{loop}_gain"][0] == pytest.approx(design.loops[loop].gain_margin_db, abs=1e-6)
+            assert nominal[f"{loop}_delay"][0] == pytest.approx(1e6 * design.loops[loop].delay_margin_s, rel=1e-6)
 
 
 @pytest.mark.chain

@@ -15,7 +15,7 @@ from pmsmtool.bus.connect import connect
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.motion_objects import POSITION
 from pmsmtool.drive.objects import DriveObject
-from pmsmtool.drive.process_data import live_values
+from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.errors import NotAvailable
 from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.node import Node
@@ -35,6 +35,15 @@ def test_drive_sends_and_is_restored() -> None:
             assert 290 <= live.received <= 320 and bench.bus.line.frames - frames < 330, "no request is sent"
         assert bench.memory() == before
         assert bench.session.nmt is NmtState.PRE_OPERATIONAL
+
+
+def test_a_short_message_is_left_out() -> None:
+    live = LiveValues({"first": DriveObject(0x2000, 1, "H"), "second": DriveObject(0x2000, 2, "i")})
+    live.expect(0x181, ("first", "second"))
+    live.take(0x181, bytes((1, 0, 2, 0)), 0.0)
+    assert live.received == 0
+    live.take(0x181, bytes((1, 0, 2, 0, 0, 0)), 0.0)
+    assert live.received == 1 and live.values == {"first": 1.0, "second": 2.0}
 
 
 def test_values_follow_the_machine() -> None:
