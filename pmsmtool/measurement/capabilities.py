@@ -2,7 +2,7 @@
 """What a drive can give: quantity x method x expected interval x what is missing, decided from map and drive.
 
 The map states what a family can do, the drive itself must confirm it: supported modes (0x6502) and objects that answer.
-Expected intervals are those measured on simulated nodes of the tier (:data:`EXPECTED`); where nothing was measured,
+Expected intervals are those measured on simulated nodes of the level (:data:`WAYS`); where nothing was measured,
 nothing is said.
 """
 
@@ -50,8 +50,6 @@ class Tier(StrEnum):
     MANUAL = "manual"
 
 
-QUANTITIES = ("R", "L", "psi", "map", "inverter", "encoder", "poles", "mechanics", "frf", "cogging", "harmonics")
-
 FEATURES: Mapping[str, str] = {
     "heartbeat": "consumer heartbeat (0x1016)",
     "abort option": "abort connection option (0x6007)",
@@ -87,60 +85,6 @@ _PUSH = (*_BOUNDED, "push", "position", "current")
 _WATCHED = (*_SAFE, "position", "current")
 """What the guard needs while the drive runs by itself."""
 
-NEEDS: Mapping[str, Mapping[Method, tuple[str, ...]]] = {
-    "R": {
-        Method.INJECT: _INJECT,
-        Method.RECORDER: _RECORD,
-        Method.STANDARD: (*_STANDARD, "bench supply"),
-        Method.VENDOR: (*_WATCHED, "vendor R"),
-        Method.MANUAL: (),
-    },
-    "L": {
-        Method.INJECT: _INJECT,
-        Method.RECORDER: _RECORD,
-        Method.VENDOR: (*_WATCHED, "vendor L"),
-        Method.MANUAL: (),
-    },
-    "psi": {
-        Method.INJECT: _INJECT,
-        Method.RECORDER: _RECORD,
-        Method.STANDARD: (*_PUSH, "line voltage"),
-        Method.VENDOR: (*_WATCHED, "vendor psi"),
-        Method.MANUAL: (),
-    },
-    "map": {Method.INJECT: _INJECT},
-    "inverter": {Method.INJECT: _INJECT},
-    "encoder": {Method.INJECT: _INJECT, Method.STANDARD: _STANDARD},
-    "poles": {
-        Method.INJECT: _INJECT,
-        Method.STANDARD: _STANDARD,
-        Method.VENDOR: (*_WATCHED, "vendor poles"),
-        Method.MANUAL: (),
-    },
-    "mechanics": {
-        Method.INJECT: _INJECT,
-        Method.RECORDER: (*_RECORD, "position"),
-        Method.STANDARD: _PUSH,
-        Method.MANUAL: (),
-    },
-    "frf": {Method.INJECT: _INJECT},
-    "cogging": {Method.INJECT: _INJECT},
-    "harmonics": {Method.INJECT: _INJECT},
-}
-"""Methods of each quantity and what they need."""
-
-NOTES: Mapping[tuple[str, Method], str] = {
-    ("R", Method.RECORDER): "where the inverter's error does not hide it",
-    ("R", Method.STANDARD): "the loop, at the temperature of the run",
-    ("L", Method.RECORDER): "L_q at running currents only",
-    ("psi", Method.RECORDER): "the drive must commutate already",
-    ("psi", Method.STANDARD): "where the voltage limit is within the speed limit, or the drive shows its voltage",
-    ("mechanics", Method.RECORDER): "J/psi and tau_c/psi",
-    ("mechanics", Method.STANDARD): "J/psi and tau_c/psi; over the torque constant where the pole pairs are not known",
-    ("L", Method.VENDOR): "one inductance for both axes, unless the map has a result for each",
-}
-
-
 @dataclass(frozen=True, slots=True)
 class Expected:
     """An interval measured on simulated drives.
@@ -169,6 +113,28 @@ class Expected:
     def __str__(self) -> str:
         with_what = f" with {self.given}" if self.given else ""
         return f"{self.name} +-{self.half_width:.2g} {self.unit}{with_what}"
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A method of a quantity.
+
+    Attributes
+    ----------
+    needs : tuple of str
+        Keys of :data:`FEATURES`.
+    expected : tuple of Expected
+        Total 95 % half widths that 90 % of random simulated drives kept to, with sensors of 1 %.
+    note : str
+        What limits it.
+    from_records : tuple of Expected
+        The same on drives without averages, whose means are made from records.
+    """
+
+    needs: tuple[str, ...] = ()
+    expected: tuple[Expected, ...] = ()
+    note: str = ""
+    from_records: tuple[Expected, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +206,7 @@ class Capabilities:
         for tier, needs in _TIERS:
             if self.features >= {*needs, *self._always}:
                 return tier
-        return Tier.VENDOR if any(self.row(name, Method.VENDOR).available for name in NEEDS) else Tier.MANUAL
+        return Tier.VENDOR if any(self.row(name, Method.VENDOR).available for name in WAYS) else Tier.MANUAL
 
     @property
     def unsafe(self) -> bool:
@@ -250,18 +216,18 @@ class Capabilities:
 
     def rows(self) -> tuple[Row, ...]:
         """Return every quantity by every method."""
-        return tuple(self.row(quantity, method) for quantity in QUANTITIES for method in NEEDS[quantity])
+        return tuple(self.row(quantity, method) for quantity in WAYS for method in WAYS[quantity])
 
     def row(self, quantity: str, method: Method) -> Row:
         """Return one way to one quantity."""
-        if method not in NEEDS[quantity]:
+        way = WAYS[quantity].get(method)
+        if way is None:
             return Row(quantity, method, (f"another method: {quantity} has no {method} method",))
-        needs = NEEDS[quantity][method]
-        needs = tuple(dict.fromkeys((*self._always, *needs))) if needs else needs
+        needs = dict.fromkeys((*self._always, *way.needs)) if way.needs else ()
         missing = tuple(FEATURES[need] for need in needs if need not in self.features)
-        expected, note = EXPECTED.get((quantity, method), ()), NOTES.get((quantity, method), "")
+        expected, note = way.expected, way.note
         if method is Method.INJECT and "averages" not in self.features:
-            expected = FROM_RECORDS.get(quantity, ())  # the others come from drives that average by themselves
+            expected = way.from_records  # the others come from drives that average by themselves
             note = "; ".join(part for part in (note, "means are made from records") if part)
         if self.current_undecided and (quantity, method) == ("mechanics", Method.STANDARD):
             expected, note = (), f"{note}; {UNDECIDED}"
@@ -271,7 +237,7 @@ class Capabilities:
 
     def best(self, quantity: str) -> Row | None:
         """Return the first measuring method of a quantity that is available."""
-        rows = (self.row(quantity, method) for method in NEEDS[quantity] if method in MEASURING)
+        rows = (self.row(quantity, method) for method in WAYS[quantity] if method in MEASURING)
         return next((row for row in rows if row.available), None)
 
     @property
@@ -299,7 +265,7 @@ class Capabilities:
     def _reasons(self, quantities: Sequence[str], method: Method | None) -> list[str]:
         lines = []
         for quantity in quantities:
-            rows = [self.row(quantity, m) for m in (NEEDS[quantity] if method is None else (method,))]
+            rows = [self.row(quantity, m) for m in (WAYS[quantity] if method is None else (method,))]
             if any(row.available and row.method in MEASURING for row in rows):
                 lines.append(f"{quantity}: by itself yes ({self._how(quantity, method)}), together with the others no")
                 continue
@@ -451,39 +417,94 @@ _BLIND_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --spee
 
 def _expected(program: str, drives: int, *rows: tuple[str, float, str], given: str = "") -> tuple[Expected, ...]:
     return tuple(Expected(name, half, unit, drives, program, given) for name, half, unit in rows)
-
-
-EXPECTED: Mapping[tuple[str, Method], tuple[Expected, ...]] = {
-    ("R", Method.INJECT): _expected(_FULL, 400, ("R_s_ohm", 4.5, "%")),
-    ("L", Method.INJECT): _expected(_FULL, 400, ("L_d_h", 1.5, "%"), ("L_q_h", 1.5, "%")),
-    ("psi", Method.INJECT): _expected(_FULL, 400, ("psi_f_wb", 1.1, "%")),
-    ("encoder", Method.INJECT): _expected(_FULL, 400, ("offset_rad", 0.04, "deg")),
-    ("mechanics", Method.INJECT): _expected(_MECHANICS, 70, ("J_kgm2", 1.5, "%")),
-    ("R", Method.RECORDER): _expected(_RECORDER_RUN, 194, ("R_s_ohm", 7.4, "%")),
-    ("L", Method.RECORDER): _expected(_RECORDER_RUN, 195, ("L_q_app_h", 6.9, "%")),
-    ("psi", Method.RECORDER): _expected(_RECORDER_RUN, 200, ("psi_f_wb", 1.2, "%")),
-    ("mechanics", Method.RECORDER): _expected(
-        _RECORDER_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")
-    ),
-    ("R", Method.STANDARD): _expected(_SUPPLY_RUN, 60, ("R_s_ohm", 3.0, "%")),
-    ("encoder", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("offset_rad", 0.4, "deg")),
-    ("poles", Method.STANDARD): _expected(_STANDARD_RUN, 200, ("pole_pairs", 0.1, "%")),
-    ("psi", Method.STANDARD): (
-        *_expected(_BLIND_RUN, 26, ("psi_f_wb", 6.4, "%")),
-        *_expected(_STANDARD_RUN, 194, ("psi_f_wb", 3.7, "%"), given=_DEAD_TIME),
-    ),
-    ("mechanics", Method.STANDARD): _expected(
-        _STANDARD_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")
-    ),
-}
-"""Total 95 % half widths that 90 % of random simulated drives of the tier kept to, with sensors of 1 %."""
-
 _INJECT_RUN = "benchmarks.tier_intervals inject --drives 200 --first 63000"
-FROM_RECORDS: Mapping[str, tuple[Expected, ...]] = {
-    "R": _expected(_INJECT_RUN, 200, ("R_s_ohm", 4.5, "%")),
-    "L": _expected(_INJECT_RUN, 200, ("L_d_h", 1.5, "%"), ("L_q_h", 1.5, "%")),
-    "psi": _expected(_INJECT_RUN, 200, ("psi_f_wb", 1.2, "%")),
-    "encoder": _expected(_INJECT_RUN, 200, ("offset_rad", 0.05, "deg")),
-    "mechanics": _expected(_INJECT_RUN, 200, ("J_kgm2", 1.5, "%")),
-}
-"""The same by injection on drives without averages, whose means are made from records."""
+
+
+def _vendor(quantity: str, note: str = "") -> Way:
+    return Way((*_WATCHED, f"vendor {quantity}"), note=note)
+
+
+WAYS: Mapping[str, Mapping[Method, Way]] = {
+    "R": {
+        Method.INJECT: Way(
+            _INJECT, _expected(_FULL, 400, ("R_s_ohm", 4.5, "%")),
+            from_records=_expected(_INJECT_RUN, 200, ("R_s_ohm", 4.5, "%")),
+        ),
+        Method.RECORDER: Way(
+            _RECORD, _expected(_RECORDER_RUN, 194, ("R_s_ohm", 7.4, "%")),
+            "where the inverter's error does not hide it",
+        ),
+        Method.STANDARD: Way(
+            (*_STANDARD, "bench supply"), _expected(_SUPPLY_RUN, 60, ("R_s_ohm", 3.0, "%")),
+            "the loop, at the temperature of the run",
+        ),
+        Method.VENDOR: _vendor("R"),
+        Method.MANUAL: Way(),
+    },
+    "L": {
+        Method.INJECT: Way(
+            _INJECT, _expected(_FULL, 400, ("L_d_h", 1.5, "%"), ("L_q_h", 1.5, "%")),
+            from_records=_expected(_INJECT_RUN, 200, ("L_d_h", 1.5, "%"), ("L_q_h", 1.5, "%")),
+        ),
+        Method.RECORDER: Way(
+            _RECORD, _expected(_RECORDER_RUN, 195, ("L_q_app_h", 6.9, "%")), "L_q at running currents only"
+        ),
+        Method.VENDOR: _vendor("L", "one inductance for both axes, unless the map has a result for each"),
+        Method.MANUAL: Way(),
+    },
+    "psi": {
+        Method.INJECT: Way(
+            _INJECT, _expected(_FULL, 400, ("psi_f_wb", 1.1, "%")),
+            from_records=_expected(_INJECT_RUN, 200, ("psi_f_wb", 1.2, "%")),
+        ),
+        Method.RECORDER: Way(
+            _RECORD, _expected(_RECORDER_RUN, 200, ("psi_f_wb", 1.2, "%")), "the drive must commutate already"
+        ),
+        Method.STANDARD: Way(
+            (*_PUSH, "line voltage"),
+            (
+                *_expected(_BLIND_RUN, 26, ("psi_f_wb", 6.4, "%")),
+                *_expected(_STANDARD_RUN, 194, ("psi_f_wb", 3.7, "%"), given=_DEAD_TIME),
+            ),
+            "where the voltage limit is within the speed limit, or the drive shows its voltage",
+        ),
+        Method.VENDOR: _vendor("psi"),
+        Method.MANUAL: Way(),
+    },
+    "map": {Method.INJECT: Way(_INJECT)},
+    "inverter": {Method.INJECT: Way(_INJECT)},
+    "encoder": {
+        Method.INJECT: Way(
+            _INJECT, _expected(_FULL, 400, ("offset_rad", 0.04, "deg")),
+            from_records=_expected(_INJECT_RUN, 200, ("offset_rad", 0.05, "deg")),
+        ),
+        Method.STANDARD: Way(_STANDARD, _expected(_STANDARD_RUN, 200, ("offset_rad", 0.4, "deg"))),
+    },
+    "poles": {
+        Method.INJECT: Way(_INJECT),
+        Method.STANDARD: Way(_STANDARD, _expected(_STANDARD_RUN, 200, ("pole_pairs", 0.1, "%"))),
+        Method.VENDOR: _vendor("poles"),
+        Method.MANUAL: Way(),
+    },
+    "mechanics": {
+        Method.INJECT: Way(
+            _INJECT, _expected(_MECHANICS, 70, ("J_kgm2", 1.5, "%")),
+            from_records=_expected(_INJECT_RUN, 200, ("J_kgm2", 1.5, "%")),
+        ),
+        Method.RECORDER: Way(
+            (*_RECORD, "position"),
+            _expected(_RECORDER_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")),
+            "J/psi and tau_c/psi",
+        ),
+        Method.STANDARD: Way(
+            _PUSH, _expected(_STANDARD_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")),
+            "J/psi and tau_c/psi; over the torque constant where the pole pairs are not known",
+        ),
+        Method.MANUAL: Way(),
+    },
+    "frf": {Method.INJECT: Way(_INJECT)},
+    "cogging": {Method.INJECT: Way(_INJECT)},
+    "harmonics": {Method.INJECT: Way(_INJECT)},
+}  # fmt: skip
+"""Methods of each quantity: what the drive must have, what to expect, what limits it."""
+QUANTITIES = tuple(WAYS)

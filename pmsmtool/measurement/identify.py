@@ -39,7 +39,7 @@ RESTORED = "nothing is stored in the drive; every changed object is restored"
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """How a method identifies; what a drive must have for it is in ``capabilities.NEEDS``.
+    """How a method identifies; what a drive must have for it is in ``capabilities.WAYS``.
 
     Attributes
     ----------

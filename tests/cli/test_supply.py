@@ -17,7 +17,7 @@ from pmsmtool.errors import Declined, NotAvailable
 from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.measurement.capabilities import EXPECTED
+from pmsmtool.measurement.capabilities import WAYS
 
 CHANNEL = "interior-2k2?nv=:memory:&drive=cia402"
 
@@ -39,7 +39,7 @@ def test_resistance_by_a_bench_supply(monkeypatch: pytest.MonkeyPatch, tmp_path:
     assert found["method"] == "power of a bench supply, read at several currents"
     assert found["value"] == pytest.approx(truth, rel=0.02)  # measured: 0.3 %
     half = 100.0 * ((found["coverage_factor"] * found["std"]) ** 2 + found["systematic"] ** 2) ** 0.5 / found["value"]
-    (expected,) = EXPECTED["R", Method.STANDARD]
+    (expected,) = WAYS["R"][Method.STANDARD].expected
     assert half <= 1.1 * expected.half_width  # measured: 2.7 of 3.0 %
     assert "bench supply, read 8 times" in outcome.stderr and "pole pairs, direction" not in outcome.stderr
     replayed = CliRunner().invoke(cli, ["identify", "--replay", facts["run"], "--json"])

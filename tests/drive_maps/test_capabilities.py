@@ -31,10 +31,8 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_m
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.measurement.by_pulses import HEADROOM, push_by_torque, swing_and_record, turn_both_ways
 from pmsmtool.measurement.capabilities import (
-    EXPECTED,
     FEATURES,
-    NEEDS,
-    QUANTITIES,
+    WAYS,
     Capabilities,
     Tier,
     examine,
@@ -102,10 +100,10 @@ def test_examining_only_reads() -> None:
 def test_every_quantity_is_listed_with_every_method() -> None:
     found = examined("")
     rows = found.rows()
-    assert {(row.quantity, row.method) for row in rows} == {(q, m) for q in QUANTITIES for m in NEEDS[q]}
+    assert {(row.quantity, row.method) for row in rows} == {(q, m) for q in WAYS for m in WAYS[q]}
     for row in rows:
         assert row.available == (not row.missing)
-    assert all(set(needs) <= set(FEATURES) for methods in NEEDS.values() for needs in methods.values())
+    assert all(set(way.needs) <= set(FEATURES) for methods in WAYS.values() for way in methods.values())
     for row in rows:
         for expected in row.expected:  # an interval without a program that measured it is a guess
             assert expected.drives >= 10 and expected.program.startswith("benchmarks.")
@@ -114,7 +112,7 @@ def test_every_quantity_is_listed_with_every_method() -> None:
 @pytest.mark.chain
 def test_what_caps_promises_is_what_is_found_without_a_dead_time() -> None:
     """Torque pushes of the standard tier: without a machine file that names the dead time nothing tells the voltage."""
-    promised = {expected.given: expected.half_width for expected in EXPECTED["psi", Method.STANDARD]}
+    promised = {expected.given: expected.half_width for expected in WAYS["psi"][Method.STANDARD].expected}
     known = load_machine_file(machine_path("interior-2k2")).inverter
     assert known is not None
     for given, inverter in (
@@ -328,4 +326,4 @@ def test_an_interrupted_run_is_stopped_and_restored(tier: str) -> None:
 @pytest.mark.parametrize("family", family_names())
 def test_caps_works_on_every_family(family: str) -> None:
     found = examined(f"&drive={family}")
-    assert len(found.rows()) == sum(map(len, NEEDS.values()))
+    assert len(found.rows()) == sum(map(len, WAYS.values()))
