@@ -68,10 +68,14 @@ def check_command(
         ]
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
         found = check_wiring(drive, stated, envelope, out.note)
-    _conclude(out, found)
+    _conclude(out, found, "" if machine_file else OF_THE_DRIVE)
 
 
-def _conclude(out: Output, found: list[Finding]) -> None:
+OF_THE_DRIVE = "what is stated is what the drive holds: name the connected motor, `pmsmtool check MACHINE`; else "
+"""Before the next step where no motor was given: a new drive holds another one's values."""
+
+
+def _conclude(out: Output, found: list[Finding], stated_by: str = "") -> None:
     """Print the table; raises where something is wrong, or what matters was not seen."""
     from pmsmtool.errors import CheckFailed, Partial
     from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG
@@ -85,8 +89,9 @@ def _conclude(out: Output, found: list[Finding]) -> None:
     if wrong:
         first = wrong[0]
         raise CheckFailed(
-            f"{first.looked_at}: {first.shown}", likely=first.likely, hint="switch off, correct it, and check again"
-        )
+            f"{first.looked_at}: {first.shown}", likely=first.likely,
+            hint=f"{stated_by}switch off, correct it, and check again",
+        )  # fmt: skip
     unseen = [finding.looked_at for finding in found if finding.verdict in (NOT_SEEN, NOT_CHECKED)]
     if any(name in unseen for name in ("phases", "shaft", "pole pairs")):
         raise Partial(f"not judged: {', '.join(unseen)}", hint="this drive does not show them; look at them yourself")

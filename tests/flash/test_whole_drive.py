@@ -183,6 +183,18 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert int.from_bytes(DriveNode(connection, 1).sdo.read(0x30A0, 1), "little") != CHANGED[0x30A0, 1]
 
 
+def test_the_file_of_another_maker_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settle(tmp_path, monkeypatch)
+    path = write_eds(tmp_path / "x.eds", ROWS)
+    (tmp_path / "other.eds").write_text("[DeviceInfo]\nVendorNumber=0x1234\n" + OTHERS)
+    outcome = tool("--sim", f"interior-2k2?nv=a.nv&eds={path}", "backup", "--eds", "other.eds", "-o", "drive.json")
+    assert "for vendor 0x00001234, the drive is of vendor" in str(outcome.exception)
+    assert not (tmp_path / "drive.json").exists()
+
+
+OTHERS = "[1017]\nParameterName=Heartbeat\nDataType=0x0006\nAccessType=rw\nDefaultValue=0\n"
+
+
 def test_a_drive_that_cannot_store_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settle(tmp_path, monkeypatch)
     path = write_eds(tmp_path / "x.eds", tuple(row for row in ROWS if row not in STORE))
