@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import math
+import shutil
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -28,6 +30,8 @@ KEEP_S = 60.0
 SHOWN = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "omega_e_rad_s", "U_dc_v")
 """Without a choice: as many as process data hold."""
 STATUS_S = 1.0
+PLAIN_S = 0.25
+CLEAR = "\x1b[H\x1b[2J"
 
 
 def _complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
@@ -44,6 +48,7 @@ def _complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
         "pmsmtool --sim interior-2k2 scope --for 30s",
         "pmsmtool -n 5 scope i_d_a i_q_a 'u_*' --rate 50Hz",
         "pmsmtool -n 5 scope --pdo --rate 200Hz --keep 20s -o last.csv",
+        "pmsmtool -n 5 scope --plain i_q_a",
     ),
 )
 @click.argument("signals", nargs=-1, metavar="[SIGNAL]...", shell_complete=_complete)
@@ -52,6 +57,7 @@ def _complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
 @click.option("--keep", "keep_s", type=DURATION, help=f"The latest time that is kept, drawn and written; default "
               f"{KEEP_S:g}s, or all of --for.")  # fmt: skip
 @click.option("--pdo", is_flag=True, help="Let the drive send them (at most 6); its PDOs are restored afterwards.")
+@click.option("--plain", is_flag=True, help="Draw in the terminal; no page, no browser.")
 @click.option("--port", type=WholeNumber("port", 0, 65535), default=0, help="Port of the page; 0 takes a free one.")
 @click.option("-o", "--output", "path", type=FILE, help="Trace to write at the end (.npz or .csv).")
 @bus_options
@@ -64,6 +70,7 @@ def scope_command(
     seconds: float | None,
     keep_s: float | None,
     pdo: bool,
+    plain: bool,
     port: int,
     path: Path | None,
 ) -> None:
@@ -71,7 +78,7 @@ def scope_command(
 
     SIGNAL is a name of `monitor`, or several with * and ?. The page is at the address that is printed, for browsers on
     this computer only (127.0.0.1). It zooms and moves, has two cursors and a trigger, and writes CSV and PNG. The
-    simulated drive of this process runs at the pace of the wall clock.
+    simulated drive of this process runs at the pace of the wall clock. --plain draws in the terminal instead.
     """
     from pmsmtool.cli.live_server import LiveServer, Samples
     from pmsmtool.drive.objects import signal_unit
@@ -86,6 +93,11 @@ def scope_command(
         node.sdo.finish_within(math.inf)
         samples = Samples(names, math.ceil(keep_s * rate_hz) + 1)
         told = [{"name": name, "unit": signal_unit(name)} for name in names]
+        if plain:
+            _draw_plainly(node, samples, 1.0 / rate_hz, seconds, out, pdo)
+            if path is not None and samples.count:
+                _write(samples, path, f"node {identity.node}", out)
+            return
         title = f"{identity.name or 'drive'}, node {identity.node}, serial {identity.serial}"
         server = LiveServer(port, template("scope.html.j2").render(), samples, {
             "title": title, "keep_s": keep_s, "signals": told,
@@ -100,6 +112,29 @@ def scope_command(
             finally:
                 if path is not None and samples.count:
                     _write(samples, path, title, out)
+
+
+def _draw_plainly(
+    node: DriveNode, samples: Samples, period_s: float, seconds: float | None, out: Output, pdo: bool
+) -> None:
+    """Draw the signals over the last drawing while they come; where the output is no terminal, once at the end."""
+    from pmsmtool.drive.objects import signal_unit
+    from pmsmtool.report.terminal_plot import ASCII, BLOCKS, terminal_plot
+
+    units = {name: signal_unit(name) for name in samples.names}
+    levels = BLOCKS if (sys.stdout.encoding or "").lower().replace("-", "") == "utf8" else ASCII
+
+    def draw(before: str = CLEAR) -> None:
+        trace = samples.trace(units, {})
+        width = shutil.get_terminal_size().columns
+        click.echo(before + "\n".join(terminal_plot(trace.t_s, trace.signals, units, width, levels)))
+
+    live = sys.stdout.isatty()
+    try:
+        _follow(node, samples, period_s, seconds, out, pdo=pdo, shown=draw if live else None)
+    finally:
+        if samples.count:
+            draw(CLEAR if live else "")
 
 
 def _check(signals: tuple[str, ...], path: Path | None) -> None:
@@ -137,8 +172,9 @@ def _chosen(node: DriveNode, signals: tuple[str, ...]) -> list[str]:
 
 
 def _follow(
-    node: DriveNode, samples: Samples, period_s: float, seconds: float | None, out: Output, *, pdo: bool
-) -> None:
+    node: DriveNode, samples: Samples, period_s: float, seconds: float | None, out: Output, *, pdo: bool,
+    shown: Callable[[], None] | None = None,
+) -> None:  # fmt: skip
     """Read until the time is over, Ctrl-C or an error, at the pace of the wall clock; the page hears which it was."""
     from pmsmtool.drive.live_readings import readings, sent
     from pmsmtool.errors import PmsmtoolError
@@ -149,7 +185,10 @@ def _follow(
         with closing(read(node, list(samples.names), period_s, seconds)) as source:
             for t_s, values in source:
                 samples.add(t_s, values.values())
-                if t_s - said_s >= STATUS_S:
+                if shown is not None and t_s - said_s >= PLAIN_S:
+                    said_s = t_s
+                    shown()
+                elif shown is None and t_s - said_s >= STATUS_S:
                     said_s = t_s
                     out.status(f"{t_s:.0f} s, {samples.count} readings")
                 time.sleep(max(0.0, begun + t_s - time.monotonic()))  # time of a simulated bus passes at once

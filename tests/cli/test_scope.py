@@ -62,6 +62,14 @@ def test_process_data_and_the_choice_without_names(tool: Tool) -> None:
     assert tuple(sorted(trace.signals)) == tuple(sorted(scope.SHOWN)) and 95 <= len(trace) <= 101
 
 
+@pytest.mark.usefixtures("at_once")
+def test_plain_draws_in_the_terminal_and_serves_no_page(tool: Tool) -> None:
+    code, out, _ = tool(*SIM, "--plain", "i_q_a", "U_dc_v", "--for", "1s", "-o", "x.csv")
+    assert code == 0 and "127.0.0.1" not in out
+    assert re.search(r"^U_dc_v \d+ V$", out, re.MULTILINE) and re.search(r"[▁-█]{9}|[#@]{9}", out)
+    assert read_trace(Path("x.csv")).units["i_q_a"] == "A"
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
