@@ -13,7 +13,6 @@ from pmsmtool.cli.options import FILE, BusOptions, bus_options, examples, output
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
-    from pmsmtool.drive.port import Identity
     from pmsmtool.flash.whole_drive import Listed
 
 
@@ -43,7 +42,7 @@ def backup_command(
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.journal import write_snapshot
     from pmsmtool.flash.restore import take_backup
-    from pmsmtool.flash.whole_drive import take_whole_backup
+    from pmsmtool.flash.whole_drive import other_product, take_whole_backup
 
     if path.exists() and not force:
         raise ConfigError("the file exists", where=str(path), hint="choose another name, or --force")
@@ -61,7 +60,8 @@ def backup_command(
             snapshot = take_backup(node, identity, progress=progress)
         else:
             identity = node.identity()
-            _refuse_other_maker(str(eds), identity, out)
+            if eds is not None and (warning := other_product(eds, identity)):
+                out.warn(warning)
             snapshot, left_out = take_whole_backup(node, identity, listed, progress=progress)
             if not snapshot.entries:
                 raise ConfigError("the drive has none of the file's objects", where=str(eds), hint="give its own file")
@@ -76,28 +76,6 @@ def backup_command(
         "left_out": left_out,
     }
     out.result("backup", data, [f"{len(snapshot.entries)} objects of serial {identity.serial} in {path}"])
-
-
-def _refuse_other_maker(eds: str, identity: Identity, out: Output) -> None:
-    """Refuse the data sheet of another vendor, and warn of one of another product; a table states neither."""
-    from pmsmtool.drive_maps.eds import parse_eds
-    from pmsmtool.errors import ConfigError
-    from pmsmtool.files import read_bytes
-
-    if eds.partition("#")[0].lower().endswith(".csv"):
-        return
-    sheet = parse_eds(read_bytes(Path(eds)), eds)
-    if sheet.vendor and sheet.vendor != identity.vendor:
-        raise ConfigError(
-            f"the file is for vendor {sheet.vendor:#010x}, the drive is of vendor {identity.vendor:#010x}", where=eds,
-            likely="the file of another maker was given, or another drive answers on this node",
-            hint="give the EDS or DCF of this drive; nothing was saved",
-        )  # fmt: skip
-    if sheet.product and sheet.product != identity.product:
-        out.warn(
-            f"{eds} is for product {sheet.product:#x}, the drive is product {identity.product:#x}: "
-            "objects that the file lacks are not saved"
-        )
 
 
 def _listed(eds: str) -> list[Listed]:

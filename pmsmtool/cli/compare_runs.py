@@ -63,7 +63,9 @@ def diff_command(first: Path, second: Path, check: bool, plot_path: Path | None,
 
         drawn = {row.name: (row.difference, row.interval) for row in rows if row.interval > 0.0}
         if not drawn:
-            raise ConfigError("the runs have no quantity in common that could be drawn", where=str(second))
+            raise ConfigError(
+                "the runs have no quantity in common that could be drawn", where=str(second), hint="leave --plot out"
+            )
         save_figure(difference_figure(drawn, "").canvas, plot_path)
     if check and changed:
         raise CheckFailed(

@@ -116,7 +116,9 @@ def margins_command(
     for note in report.notes:
         out.note(note)
     if plot_path is not None:
-        _plot(report, plot_path)
+        from pmsmtool.report.figures import margin_figure
+
+        save_figure(margin_figure(report).canvas, plot_path)
     if not ok:
         bad = [spread.name for spread in (*report.loops, *report.headroom) if not spread.ok]
         bad += _failed(simulated)
@@ -132,20 +134,6 @@ def margins_command(
             hint="`pmsmtool tune --map FAMILY --drive-bandwidth-hz HZ` checks the loops of a drive with fixed "
             "firmware; --voltage-headroom, --current-headroom and --thermal-headroom judge the rest",
         )
-
-
-def _plot(report: MarginReport, path: Path) -> None:
-    import math
-
-    from pmsmtool.report.figures import bands_figure
-
-    groups: dict[str, dict[str, tuple[float, float, float, float]]] = {}
-    for spread in (row for row in (*report.loops, *report.headroom) if row.unit != "us"):  # follows from the phase
-        high = spread.percentiles.get(95.0, spread.nominal)
-        limit = math.nan if spread.least is None else spread.least
-        if all(map(math.isfinite, (spread.worst, spread.nominal, high))):
-            groups.setdefault(spread.unit, {})[spread.name] = (spread.worst, spread.nominal, high, limit)
-    save_figure(bands_figure(groups, "").canvas, path)
 
 
 def _scenario(name: str | None, source: Design) -> Scenario | None:

@@ -18,30 +18,9 @@ from pmsmtool.plain_text import counted
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from pmsmtool.drive.live_readings import Column
+
 DEFAULT_RATE_HZ = 5.0
-
-
-class _Column:
-    """Running statistics of one quantity (Welford)."""
-
-    def __init__(self) -> None:
-        self.last = self.low = self.high = math.nan
-        self._count = 0
-        self._mean = 0.0
-        self._square = 0.0
-
-    def add(self, value: float) -> None:
-        self.last = value
-        self.low = value if self._count == 0 else min(self.low, value)
-        self.high = value if self._count == 0 else max(self.high, value)
-        self._count += 1
-        step = value - self._mean
-        self._mean += step / self._count
-        self._square += step * (value - self._mean)
-
-    @property
-    def std(self) -> float:
-        return math.sqrt(self._square / (self._count - 1)) if self._count > 1 else 0.0
 
 
 @click.command(
@@ -82,7 +61,7 @@ def monitor_command(
     --log reads a recorded bus (candump -L, Vector ASC and others; --trace-can writes them) and needs no drive. What a
     PDO carries is read from the log, else from --eds. --map gives names and units; without it the reference objects.
     """
-    from pmsmtool.drive.live_readings import available, readings, sent
+    from pmsmtool.drive.live_readings import Column, available, readings, sent
     from pmsmtool.drive.objects import signal_unit
     from pmsmtool.errors import ConfigError
 
@@ -108,7 +87,7 @@ def monitor_command(
         if as_csv:
             click.echo(",".join(["t_s", *names]))
             click.echo(",".join(["s", *map(signal_unit, names)]))
-        columns = {name: _Column() for name in names}
+        columns = {name: Column() for name in names}
         try:
             source = sent if pdo else readings
             for t_s, values in source(node, names, period_s, seconds):
@@ -138,6 +117,7 @@ def _show_log(
     as_csv: bool,
 ) -> None:
     from pmsmtool.bus.bus_log import BusLog
+    from pmsmtool.drive.live_readings import Column
     from pmsmtool.drive.logged_values import logged_values, quantities
     from pmsmtool.drive_maps.eds import parse_eds
     from pmsmtool.errors import ConfigError
@@ -162,7 +142,7 @@ def _show_log(
             f"{counted(len(frames), 'frame')}, and none holds a quantity that is asked for", where=str(path),
             hint="give the drive's --map or --eds, another node (-n), or another -g",
         )  # fmt: skip
-    columns = {name: _Column() for name in dict.fromkeys(name for _, values in rows for name in values)}
+    columns = {name: Column() for name in dict.fromkeys(name for _, values in rows for name in values)}
     units = {quantity.name: quantity.unit for quantity in named.values()}
     if as_csv:
         click.echo(",".join(["t_s", *columns]))
@@ -180,7 +160,7 @@ def _show_log(
     out.note(f"node {drive.node}: {counted(len(frames), 'frame')} in {frames[-1].t_s:.6g} s")
 
 
-def _lines(columns: dict[str, _Column], units: dict[str, str] | None = None) -> list[str]:
+def _lines(columns: dict[str, Column], units: dict[str, str] | None = None) -> list[str]:
     from pmsmtool.drive.objects import signal_unit
 
     rows = [
@@ -197,7 +177,7 @@ def _lines(columns: dict[str, _Column], units: dict[str, str] | None = None) -> 
     return table(("quantity", "value", "unit", "min", "max", "std"), rows)
 
 
-def _show(columns: dict[str, _Column]) -> None:
+def _show(columns: dict[str, Column]) -> None:
     """Draw the table over the last one."""
     lines = _lines(columns)
     click.echo("\x1b[H\x1b[2J" + "\n".join(lines))

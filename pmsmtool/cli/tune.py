@@ -171,7 +171,8 @@ def _plot(design: Design, path: Path) -> None:
 
     loops = open_loops(design)
     if not loops:
-        raise ConfigError("the design has no loops to draw: the drive's gains cannot be written", where=str(path))
+        raise ConfigError("the design has no loops to draw: the drive's gains cannot be written", where=str(path),
+                          hint="leave --plot out, or state --drive-bandwidth-hz")  # fmt: skip
     save_figure(bode_figure(loops, {name: design.loops[name] for name in loops}).canvas, path)
 
 

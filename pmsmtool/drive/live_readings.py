@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator
 
 from pmsmtool.drive.drive_node import DriveNode
@@ -15,6 +16,31 @@ SILENT_S = 1.0
 
 Readings = Generator[tuple[float, dict[str, float]], None, None]
 """Time since the first reading (s), and the value of every quantity by its name."""
+
+
+class Column:
+    """Running statistics of one quantity (Welford)."""
+
+    def __init__(self) -> None:
+        self.last = self.low = self.high = math.nan
+        self._count = 0
+        self._mean = 0.0
+        self._square = 0.0
+
+    def add(self, value: float) -> None:
+        """Take a value."""
+        self.last = value
+        self.low = value if self._count == 0 else min(self.low, value)
+        self.high = value if self._count == 0 else max(self.high, value)
+        self._count += 1
+        step = value - self._mean
+        self._mean += step / self._count
+        self._square += step * (value - self._mean)
+
+    @property
+    def std(self) -> float:
+        """Standard deviation; 0 of a single value."""
+        return math.sqrt(self._square / (self._count - 1)) if self._count > 1 else 0.0
 
 
 def available(node: DriveNode, wanted: Callable[[str], object]) -> list[str]:

@@ -73,7 +73,7 @@ class MappedRecorderDrive(RecorderDrive, TorqueDrive):
         self.commands_bounded_current = False  # a speed step is the drive's own
         traces = recorder_of(self.node, POLL_PERIOD_S)
         if not isinstance(traces, CommandedRecorder):
-            raise NotAvailable("the drive has no recorder of a maker's", where=f"node {self.node.node}")
+            raise NotAvailable("pmsmtool reads no recorder of this drive", where=f"node {self.node.node}")
         self.traces = traces
         self.period_s = traces.period_s
         self._apart = 1

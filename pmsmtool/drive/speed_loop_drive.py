@@ -149,7 +149,7 @@ class SpeedLoopDrive(TorqueDrive):
 
     def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
         """Refuse: the drive is in its velocity mode."""
-        raise NotAvailable("the drive follows a speed here, no current", where=f"node {self.node.node}")
+        raise NotAvailable("in its velocity mode it takes no current", where=f"node {self.node.node}")
 
     def _counts(self, omega_m_rad_s: float) -> int:
         return round(omega_m_rad_s / self.rad_s_per_count)

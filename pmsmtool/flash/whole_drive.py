@@ -12,13 +12,16 @@ import hashlib
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap, address_in
-from pmsmtool.errors import SdoAbort
+from pmsmtool.drive_maps.eds import parse_eds
+from pmsmtool.errors import ConfigError, SdoAbort
+from pmsmtool.files import read_bytes
 from pmsmtool.flash.journal import MARKS, Entry, Snapshot
 
 ROUNDS = 3
@@ -249,3 +252,28 @@ def _read_or_none(sdo: SdoChannel, place: tuple[int, int]) -> bytes | None:
 def parameters_of(node: DriveNode) -> DriveParameters:
     """Return the access that fits the node's map: by catalogue name, or by address where it scales nothing."""
     return DriveParameters(node) if node.map.scales else WholeDrive(node)
+
+
+def other_product(eds: str, identity: Identity) -> str:
+    """Return a warning where a data sheet is for another product than the drive; empty where it is not, or a table.
+
+    Raises
+    ------
+    ConfigError
+        It is for another vendor.
+    """
+    if eds.partition("#")[0].lower().endswith(".csv"):
+        return ""
+    sheet = parse_eds(read_bytes(Path(eds)), eds)
+    if sheet.vendor and sheet.vendor != identity.vendor:
+        raise ConfigError(
+            f"the file is for vendor {sheet.vendor:#010x}, the drive is of vendor {identity.vendor:#010x}", where=eds,
+            likely="the file of another maker was given, or another drive answers on this node",
+            hint="give the EDS or DCF of this drive; nothing was saved",
+        )  # fmt: skip
+    if not sheet.product or sheet.product == identity.product:
+        return ""
+    return (
+        f"{eds} is for product {sheet.product:#x}, the drive is product {identity.product:#x}: objects that the file "
+        "lacks are not saved"
+    )

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.design.loops.margins import MarginReport
 from pmsmtool.design.loops.sampled_loop import LoopMargins, SampledLoop
 from pmsmtool.design.prediction import Prediction
 from pmsmtool.estimators.flux.linkage import FluxResult
@@ -311,6 +312,23 @@ def bands_figure(groups: Mapping[str, Mapping[str, tuple[float, float, float, fl
         axes.set_yticks(range(len(rows)), list(rows))
         axes.set(xlabel=unit, ylim=(len(rows) - 0.5, -0.5))
     return _finished(canvas, caption)
+
+
+def margin_figure(report: MarginReport) -> Figure:
+    """Draw margins and headroom from the worst corner to the 95 % quantile, else the nominal value; no delay margins.
+
+    Parameters
+    ----------
+    report : MarginReport
+        Of ``margin_report``.
+    """
+    groups: dict[str, dict[str, tuple[float, float, float, float]]] = {}
+    for spread in (row for row in (*report.loops, *report.headroom) if row.unit != "us"):
+        high = spread.percentiles.get(95.0, spread.nominal)
+        limit = math.nan if spread.least is None else spread.least
+        if all(map(math.isfinite, (spread.worst, spread.nominal, high))):
+            groups.setdefault(spread.unit, {})[spread.name] = (spread.worst, spread.nominal, high, limit)
+    return bands_figure(groups, "")
 
 
 def difference_figure(rows: Mapping[str, tuple[float, float]], caption: str) -> Figure:

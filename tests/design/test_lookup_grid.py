@@ -399,7 +399,7 @@ def test_a_flux_table_does_not_pretend_to_know_iron_loss() -> None:
     axis = np.linspace(-200.0, 200.0, 9)
     flux = np.hypot(*M.flux(axis[:, None], axis[None, :])) ** 2
     loss = FluxMap(axis, axis, 60.0 * flux, 0.4 * flux)
-    with pytest.raises(ConfigError, match="knows no speed"):
+    with pytest.raises(ConfigError, match="iron loss depends on the speed"):
         flux_table(replace(M, loss_map=loss), torque_nm=[20.0], flux_limit_wb=[0.1], I_max_apk=150.0)
     source = load_machine_file(PROFILES / "mtpv-test.toml")
     rated, request = ratings(source, 0.92 * source.inverter.V_max_v), LookupRequest("flux", 5, 5)

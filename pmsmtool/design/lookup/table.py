@@ -218,7 +218,7 @@ def flux_table(
     """
     if machine.loss_map is not None:
         raise ConfigError(
-            "knows no speed, so it cannot minimise iron loss", where="flux table", hint="take a table over speed"
+            "iron loss depends on the speed, which it lacks", where="flux table", hint="take a table over speed"
         )
     y = np.atleast_1d(np.asarray(flux_limit_wb, dtype=np.float64))
     lossless = replace(machine, R=0.0)

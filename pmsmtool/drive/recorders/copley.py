@@ -35,7 +35,7 @@ class RowRecorder(CommandedRecorder):
         reference_ns = self._get(objects.REFERENCE_PERIOD_NS)
         self._channels_there = min(self._get(objects.COUNT), objects.CHANNELS)
         if reference_ns <= 0:
-            raise NotAvailable("the drive reports its trace has no period", where=f"node {self._node.node}, 0x2502:00")
+            raise NotAvailable("the drive reports no sampling period", where=f"node {self._node.node}, 0x2502:00")
         return 1e-9 * reference_ns
 
     def _start(self, signals: Sequence[str], samples: int, decimation: int) -> None:

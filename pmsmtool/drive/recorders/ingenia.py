@@ -35,7 +35,7 @@ class MonitorRecorder(CommandedRecorder):
         rate_hz, self._largest = self._get(objects.LOOP_RATE_HZ), self._get(objects.LARGEST_BYTES)
         if rate_hz <= 0:
             raise NotAvailable(
-                f"the drive reports its loop runs at {rate_hz} Hz", where=f"node {self._node.node}, 0x2520:00"
+                f"the drive reports a loop rate of {rate_hz} Hz", where=f"node {self._node.node}, 0x2520:00"
             )
         return 1.0 / rate_hz
 
