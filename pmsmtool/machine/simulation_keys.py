@@ -112,6 +112,8 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number("backlash_rad", "rad", 0, 1, 0.0, "play of the elastic shaft, from end to end"),
     _choice("rotor", ("free", "locked", "driven"), "free", "free, held, or turned by a load machine"),
     _number("driven_rpm", "rpm", -1e6, 1e6, 0.0, "speed of a driven rotor"),
+    _number("limit_switch_negative_rad", "rad", -1e6, 1e6, -1e6, "limit switch, active below this angle of the shaft"),
+    _number("limit_switch_positive_rad", "rad", -1e6, 1e6, 1e6, "limit switch, active above this angle of the shaft"),
     _number("theta_M_start_rad", "rad", -_PI2, _PI2, 0.0, "mechanical angle at the start"),
     _number("cogging_nm", "N m", 0, 1e4, 0.0, "amplitude of the cogging torque"),
     _whole("cogging_periods", 0, 10000, 0, "cogging periods per mechanical turn"),

@@ -82,6 +82,9 @@ class KernelCore:
         self.torque_safely_off = self._fault == "safe_torque_off"
         self._link_v = settings.number("U_dc_v")
         self.simulation = Simulation(setup, self._image, keep)
+        switches = [f"limit_switch_{way}_rad" for way in ("negative", "positive")]
+        if any(name in machine_file.simulation for name in switches):
+            self.simulation.library.pmsm_sim_set_switches(self.simulation.sim, *map(settings.number, switches))
         self.simulation.library.pmsm_sim_watch(self.simulation.sim, 1)
         self._parameters_changed()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -15,6 +16,7 @@ from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.closed_loop import drive_values
+from pmsmtool.sim.drive_kernel import KernelCore
 from tests.node.raw_client import Aborted, RawClient
 
 pytestmark = pytest.mark.chain
@@ -256,3 +258,12 @@ def test_a_homing_is_interrupted_and_unknown_methods_are_refused(axis: Axis) -> 
     for method in (0, 1, 19, 36, -3):
         with pytest.raises(Aborted):
             axis.put(0x6098, 0, method, "b")
+
+
+@pytest.mark.parametrize(("start_rad", "active"), [(0.0, 0), (0.4, 2), (-0.6, 1)])
+def test_limit_switches_of_the_machine_file(start_rad: float, active: int) -> None:
+    base = load_machine_file("jercic-2017")
+    settings = {"theta_M_start_rad": start_rad, "limit_switch_negative_rad": -0.5, "limit_switch_positive_rad": 0.3}
+    core = KernelCore(replace(base, simulation={**base.simulation, **settings}), 1)
+    core.run(3)
+    assert core.position().limits == active

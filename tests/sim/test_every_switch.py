@@ -140,9 +140,10 @@ SWITCHES: dict[str, tuple[Value, Mapping[str, Value]]] = {
 """Key: another value, and what must be on for it to matter."""
 
 HALL = {"hall_order", "hall_offset_rad", *(f"hall_error_{phase}_rad" for phase in "abc")}
-ELSEWHERE = {"serial", *HALL}
-"""Keys that no trace of `simulate` shows: the serial number is an object of the node (tests/node), the Hall wires are
-(tests/cli/test_identify_hall)."""
+LIMITS = {"limit_switch_negative_rad", "limit_switch_positive_rad"}
+ELSEWHERE = {"serial", *HALL, *LIMITS}
+"""Keys that no trace of `simulate` shows: serial number and limit switches are objects of the node (tests/node), and so
+are the Hall wires (tests/cli/test_identify_hall)."""
 
 SCENARIO = Scenario(
     "switches",
