@@ -42,6 +42,8 @@ AXIS_ROWS = frozenset((TORQUE_PER_AMPERE, INCREMENTS, *CASCADE, *PID, *SPEED, *S
 """What the design of an axis decides, and what is written into a drive for it."""
 SPEED_LOOP, POSITION_LOOP = "axis_speed", "axis_position"
 
+LOOSEST = Limits(20.0, 12.0)
+"""Least phase margin and largest |S| that may be asked for, and with which stored gains are kept."""
 ASSUMED_RATE_HZ = 1000.0
 """Rate of the loops of a drive that says none."""
 OWN_TORQUE = 0.1
@@ -87,10 +89,12 @@ class AxisRequest:
 
     def __post_init__(self) -> None:
         wrong = []
-        if not 20.0 <= self.phase_margin_deg <= 75.0:
-            wrong.append(f"axis_phase_margin_deg = {self.phase_margin_deg!r} is not between 20 and 75 degree")
-        if not 2.0 <= self.peak_db <= 12.0:
-            wrong.append(f"axis_peak_db = {self.peak_db!r} is not between 2 and 12 dB")
+        if not LOOSEST.phase_deg <= self.phase_margin_deg <= 75.0:
+            wrong.append(
+                f"axis_phase_margin_deg = {self.phase_margin_deg!r} is not between {LOOSEST.phase_deg:g} and 75 degree"
+            )
+        if not 2.0 <= self.peak_db <= LOOSEST.S_db:
+            wrong.append(f"axis_peak_db = {self.peak_db!r} is not between 2 and {LOOSEST.S_db:g} dB")
         for name in ("loop_rate_hz", "speed_filter_hz"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
@@ -175,7 +179,8 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     """Return a design of the axis, with the gains a drive holds where a move is predicted to be followed worse without.
 
     What is compared is the largest following error of one move: that of the loops, with the feed-forward that belongs
-    to the gains, and what Coulomb friction adds. Stored gains that are unstable at a corner of the box are not kept.
+    to the gains, and what Coulomb friction adds. Stored gains with margins beyond :data:`LOOSEST` at a
+    corner of the box are not kept, and the design says so.
 
     Parameters
     ----------
@@ -187,10 +192,9 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     if speed is None or position is None:
         note = "no comparison with the stored gains: those of one loop are missing or zero"
         return replace(made, design=replace(design, notes=(*design.notes, note)))
-    stable = all(
-        found.nominal.loop.stable and math.isfinite(found.phase_deg)
-        for found in (box.judged(speed, "speed"), box.judged(position, "position"))
-    )
+    judged = (box.judged(speed, "speed"), box.judged(position, "position"))
+    phase, peak = min(found.phase_deg for found in judged), max(found.S_db for found in judged)
+    stable = math.isfinite(phase)
     J, friction = box.path.shaft.J, design.machine.machine.tau_c_nm or 0.0
     jerk = float(design.facts["axis_jerk_rad_s3"]) if drive.own_core or PROFILE[3] in drive.offers else math.inf
     limits = Profile(float(design.facts["axis_speed_rad_s"]), float(design.facts["axis_acceleration_rad_s2"]), jerk)
@@ -202,6 +206,12 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     told: dict[str, Scalar] = {"axis_error_rad": after, "axis_stored_error_rad": before}
     if after <= before:
         return replace(made, design=replace(design, facts={**design.facts, **told}))
+    if phase < LOOSEST.phase_deg or peak > LOOSEST.S_db:
+        note = (
+            f"the stored gains would follow better ({math.degrees(before):.3g} against {math.degrees(after):.3g} deg), "
+            f"with {phase:.3g} deg and {peak:.3g} dB over the tolerance box: they are not kept"
+        )
+        return replace(made, design=replace(design, facts={**design.facts, **told}, notes=(*design.notes, note)))
     share, error = best_share(plain, added)
     errors = f"{math.degrees(before):.3g} deg of following error, {math.degrees(after):.3g} designed"
     how = f"as the drive holds it: {errors}"

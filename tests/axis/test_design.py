@@ -161,11 +161,14 @@ def test_gains_that_follow_better_are_kept() -> None:
     assert any("are kept" in note for note in made.notes)
     calm = {**stored, names[0]: 0.1 * stored[names[0]], names[1]: 0.01 * stored[names[1]], names[2]: 5.0}
     wild = {**stored, names[0]: 40.0 * stored[names[0]]}
+    edge = {name: stored[name] * 1.4**power for name, power in zip(names, (1, 2, 1), strict=True)}
     plain = designed("pmsmsim", 0.0, 0.0)
-    for other in (calm, wild):
+    for other in (calm, wild, edge):
         assert [design_axis(source, TuneRequest(), ASKED, own, other)[name] for name in names] == [
             plain[name] for name in names
         ]
+    told = [note for note in design_axis(source, TuneRequest(), ASKED, own, edge).notes if "not kept" in note]
+    assert told, "followed better, with margins that may not be asked for"
 
 
 def test_a_gain_per_increment_follows_the_increments_that_the_drive_holds() -> None:
