@@ -119,8 +119,8 @@ def _check_below_full(
     from pmsmtool.measurement.capabilities import Tier
     from pmsmtool.measurement.identify import open_for_level
 
-    if found.tier not in (Tier.STANDARD, Tier.RECORDER):
-        missing = found.row("mechanics", Method.STANDARD).missing
+    missing = found.row("mechanics", Method.STANDARD).missing
+    if found.tier not in (Tier.STANDARD, Tier.RECORDER) or missing:
         raise NotAvailable(
             f"nothing can be moved on this drive: it needs {', '.join(missing) or 'objects of CiA 402'}",
             where=f"node {found.identity.node}", hint="`pmsmtool caps` lists what it can measure",

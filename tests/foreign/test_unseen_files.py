@@ -127,3 +127,10 @@ def test_a_position_too_coarse_for_a_speed_moves_nothing(tool: Tool) -> None:
     code, out, _ = tool("caps", "--eds", "x.eds", "--json")
     ways = {(row["quantity"], row["method"]): row for row in json.loads(out)["quantities"]}
     assert code == 0 and "position" in str(ways["mechanics", "standard"]["needs"])
+
+
+def test_a_position_that_cannot_be_read_moves_nothing(tmp_path: Path, tool: Tool) -> None:
+    rows = [*(each for each in epos4() if each[0] != 0x6064), (0x6064, 0, "I32", "wo", "")]
+    channel = f"interior-2k2?nv=:memory:&eds={write_eds(tmp_path / 'x.eds', rows)}"
+    code, _, said = tool("--sim", channel, "--yes", "check", str(machine_path("interior-2k2")))
+    assert code == 9 and "position in increments" in said and "supervision tested" not in said
