@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -40,7 +39,7 @@ from pmsmtool.identification.calibration import calibrated_traces
 from pmsmtool.identification.cogging import Cogging, cogging_of
 from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
-from pmsmtool.identification.mechanics import elastic_mechanics, mechanics_of
+from pmsmtool.identification.mechanics import NOT_RIGID, of_no_rigid_shaft, pushes_of
 from pmsmtool.identification.sampling import resistance_as_sampled
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
@@ -76,6 +75,7 @@ class Evaluation:
     inductance: InductanceResult | None = None
     flux: FluxResult | None = None
     mechanics: MechanicsResult | None = None
+    inertia: Estimate | None = None
     flux_map: FluxMapResult | None = None
     frequency_response: FrequencyResponse | None = None
     cogging: Cogging | None = None
@@ -139,9 +139,11 @@ class Evaluation:
             found["offset_rad"] = self.offset
         if self.mechanics is not None:
             found |= {"J_kgm2": self.mechanics.J, "B_nms": self.mechanics.B, "tau_c_nm": self.mechanics.tau_c}
+        if self.inertia is not None:
+            found["J_kgm2"] = self.inertia
         if self.frequency_response is not None:
             found |= self.frequency_response.found
-            if self.mechanics is None and self.frequency_response.inertia is not None:
+            if "J_kgm2" not in found and self.frequency_response.inertia is not None:
                 found["J_kgm2"] = self.frequency_response.inertia
         found.update((name, estimate) for name, estimate in self.map_estimates.items() if name not in found)
         return found
@@ -261,16 +263,14 @@ def evaluate(
         dead_time_s = max(0.0, result.resistance.V_dead_v) * period_s / U_dc_v
     shaft = result
     rough_L_h = _rough_inductance(traces, "d"), _rough_inductance(traces, "q")
-    moved = partial(mechanics_of, traces, shaft, tolerance, dead_time_s, period_s, rough_L_h)
-    moving = replace(shaft, mechanics=attempt("mechanics", moved))
+    pushes = pushes_of(traces, shaft, tolerance, dead_time_s, period_s, rough_L_h)
+    moving = shaft if pushes is None else replace(shaft, mechanics=attempt("mechanics", pushes.mechanics))
     response = attempt("frf", lambda: frequency_response.frequency_response_of(traces, moving, tolerance, dead_time_s))
-    rigid = refused.get("mechanics")
-    inertia = None if response is None else response.inertia
-    if rigid is not None and rigid.reason == "E_MODEL_MISMATCH" and inertia is not None:
-        elastic = elastic_mechanics(partial(moved, elastic=True), inertia)
+    if pushes is not None and "mechanics" in refused and refused["mechanics"].reason in NOT_RIGID:
+        elastic, inertia, response = of_no_rigid_shaft(pushes, response)
+        moving = replace(moving, mechanics=elastic, inertia=inertia)
         if elastic is not None:
             del refused["mechanics"]
-            moving = replace(moving, mechanics=elastic)
     modulation = None
     if shaft.resistance is not None and shaft.inductance is not None and "speeds" in traces:
         L_h = shaft.inductance.L_d.value, shaft.inductance.L_q.value

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,19 +19,24 @@ from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_instant_s
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR
-from pmsmtool.estimators.shaft.mechanics import MechanicsResult, Torque, estimate_mechanics
+from pmsmtool.estimators.shaft.mechanics import MechanicsResult, Torque, estimate_mechanics, mean_inertia
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
 from pmsmtool.trace import Trace
 
 if TYPE_CHECKING:
+    from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
     from pmsmtool.identification.evaluate import Evaluation
 
 Array = NDArray[np.float64]
 
+NOT_RIGID = ("E_MODEL_MISMATCH", "E_NOT_IDENTIFIABLE", "E_NOT_CONVERGED")
+"""Reasons for which pushes are refused where a rigid shaft does not explain them."""
 TRACE = "inertia_"
 """Followed by a number: push, coasting, push the other way, coasting."""
 ELASTIC_FALLBACK = "torque pulses on a shaft that is not rigid; J agrees with the frequency response"
+MEAN_FALLBACK = "mean acceleration of torque pulses on a shaft that is not rigid; friction is not known"
+PLAY_FALLBACK = "torque pulses on a shaft with play, of which a small torque turns a part"
 SATURATION_DOUBT = 0.25
 """Relative standard deviation of the torque without a flux map, of the curvature of psi_d over i_d: the flux that a q
 current takes from the d axis is not seen. The saturated profile has a curvature of 3 % and its J was 0.77 % off."""
@@ -41,17 +47,69 @@ SAMPLE_DOUBT = 0.2
 drives with a switched inverter 0.02 to 0.5 % of J went down to at most 0.03 % with it."""
 
 
-def mechanics_of(
+@dataclass(frozen=True, slots=True)
+class Pushes:
+    """The traces of a run of pushes, and what turns their currents into torque.
+
+    Attributes
+    ----------
+    parts : list of Trace
+        Pushes with the mean currents of the periods, in the frame of the d axis, and coasting.
+    torque : callable
+        Torque (N m) of arrays of i_d, i_q (A).
+    scale_std, tilt_std : float
+        Relative standard deviations of its scale, and of what it is off at the fastest speed.
+    direction, pole_pairs : int
+        Sign of the encoder's count along the phase order, and pole pairs.
+    tolerance : SensorTolerance or None
+        Declared sensor tolerances.
+    """
+
+    parts: list[Trace]
+    torque: Torque
+    torque_per_a: float
+    sigma_a: float
+    scale_std: float
+    tilt_std: float
+    direction: int
+    pole_pairs: int
+    tolerance: SensorTolerance | None
+
+    def mechanics(self, *, elastic: bool = False) -> MechanicsResult:
+        """Return inertia and friction; ``elastic``: take any torque that a rigid shaft does not explain for noise.
+
+        Raises
+        ------
+        IdentificationError
+            As the estimator refuses.
+        """
+        return estimate_mechanics(
+            self.parts,
+            self.torque,
+            self.torque_per_a,
+            self.sigma_a,
+            self.scale_std,
+            direction=self.direction,
+            tolerance=self.tolerance,
+            tilt_std=self.tilt_std,
+            pole_pairs=self.pole_pairs,
+            elastic=elastic,
+        )
+
+    def inertia(self) -> Estimate | None:
+        """Return the inertia alone, of the mean accelerations; None where they tell none."""
+        return mean_inertia(self.parts, self.torque, self.scale_std, self.direction, self.tolerance)
+
+
+def pushes_of(
     traces: Mapping[str, Trace],
     result: Evaluation,
     tolerance: SensorTolerance | None,
     dead_time_s: float = 0.0,
     period_s: float = 0.0,
     rough_L_h: tuple[float, float] = (0.0, 0.0),
-    *,
-    elastic: bool = False,
-) -> MechanicsResult | None:
-    """Return inertia and friction; None without the run, or without a flux linkage.
+) -> Pushes | None:
+    """Return the pushes of a run; None without them, or without a flux linkage.
 
     Parameters
     ----------
@@ -65,13 +123,6 @@ def mechanics_of(
         Of a leg, and of the control (s): they displace the samples of the current.
     rough_L_h : (float, float)
         Inductances (H) for that displacement where they are refused; 0: not known.
-    elastic : bool
-        Take any torque that a rigid shaft does not explain for noise.
-
-    Raises
-    ------
-    IdentificationError
-        As the estimator refuses.
     """
     parts = [traces[f"{TRACE}{k}"] for k in range(sum(name.startswith(TRACE) for name in traces))]
     if not parts or result.flux is None or result.encoder is None or result.offset is None:
@@ -95,38 +146,58 @@ def mechanics_of(
             displaced = max(displaced, abs(float(np.mean(after - before))) / size)
             eddy = _eddy_share(part, pole_pairs, result)
             tilt = max(tilt, math.hypot(doubt * float(np.mean((after - before)[fast])) / size, eddy))
-    return estimate_mechanics(
+    return Pushes(
         parts,
         torque,
         torque_per_ampere(pole_pairs, psi.value),
         result.noise.sigma_a,
         torque_doubt(result.flux, doubt * displaced, mapped=result.flux_map is not None),
-        direction=direction,
-        tolerance=tolerance,
-        tilt_std=math.hypot(TILT_FLOOR, tilt),
-        pole_pairs=pole_pairs,
-        elastic=elastic,
+        math.hypot(TILT_FLOOR, tilt),
+        direction,
+        pole_pairs,
+        tolerance,
     )
 
 
-def elastic_mechanics(estimate: Callable[[], MechanicsResult | None], inertia: Estimate) -> MechanicsResult | None:
-    """Return what pushes of a shaft that is not rigid tell; None unless J is that of the frequency response.
+def of_no_rigid_shaft(
+    pushes: Pushes, response: FrequencyResponse | None
+) -> tuple[MechanicsResult | None, Estimate | None, FrequencyResponse | None]:
+    """Return what pushes of a shaft that is not rigid tell, else its inertia, and what of the response holds.
+
+    A small random torque turns only what is this side of a play, pushes all of it: a response that shows less inertia
+    than they do is none of the whole shaft. Where it shows more, neither is believed.
 
     Parameters
     ----------
-    estimate : callable
-        :func:`mechanics_of` with ``elastic``.
-    inertia : Estimate
-        By the frequency response (kg m2); both have the torque's scale in common.
+    pushes : Pushes
+        A rigid shaft does not explain them.
+    response : FrequencyResponse or None
+        It has the torque's scale in common with them.
     """
-    try:
-        found = estimate()
-    except IdentificationError:
-        return None
-    if found is None or not cross_check("J_kgm2", "J_kgm2", found.J, inertia).agrees:
-        return None
-    J, B, tau_c = (replace(value, fallback=ELASTIC_FALLBACK) for value in (found.J, found.B, found.tau_c))
-    return replace(found, J=J, B=B, tau_c=tau_c)
+    small = None if response is None else response.inertia
+    found = None
+    if small is not None:
+        with contextlib.suppress(IdentificationError):
+            found = pushes.mechanics(elastic=True)
+    whole = pushes.inertia() if found is None else found.J
+    if whole is None:
+        return None, None, response
+    why = MEAN_FALLBACK if found is None else ELASTIC_FALLBACK
+    if response is not None and small is not None:
+        check = cross_check("J_kgm2", "J_kgm2", small, whole)
+        if check.agrees and found is None:
+            return None, None, response
+        if not check.agrees:
+            both = f"{small.value:.3g} kg m2 by a small torque, {whole.value:.3g} by pulses"
+            response = replace(response, found={}, inertia=None, reason=f"the shaft has play, or is not linear: {both}")
+            if check.difference > 0.0:
+                return None, None, response
+            why = f"{PLAY_FALLBACK}: {both}"
+    if found is None:
+        return None, replace(whole, fallback=why), response
+    finer = small if why == ELASTIC_FALLBACK and small is not None and small.std < found.J.std else found.J
+    J, B, tau_c = (replace(value, fallback=why) for value in (finer, found.B, found.tau_c))
+    return replace(found, J=J, B=B, tau_c=tau_c), None, response
 
 
 def torque_doubt(flux: FluxResult, displaced: float = 0.0, *, mapped: bool = False) -> float:

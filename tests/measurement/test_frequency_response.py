@@ -18,11 +18,18 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.errors import NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.experiments.frequency_response import keep_speed, plan_frequency_response
 from pmsmtool.identification.frequency_response import RESPONSE_FILE
 from pmsmtool.identification.identified_machine import RESONANCE
-from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, elastic_mechanics
+from pmsmtool.identification.mechanics import (
+    ELASTIC_FALLBACK,
+    MEAN_FALLBACK,
+    PLAY_FALLBACK,
+    Pushes,
+    of_no_rigid_shaft,
+)
 from pmsmtool.identification.replay import replay
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.identification.run_files import MACHINE, PREDICTED
@@ -159,20 +166,45 @@ def test_the_current_that_keeps_a_speed_is_found_beside_a_controller_that_swings
     assert keep_speed(drive, plan, 3, 0.07) == pytest.approx(0.06, abs=1e-3)  # type: ignore[arg-type]
 
 
-def test_pushes_that_tell_another_inertia_tell_nothing() -> None:
-    def of(J_kgm2: float) -> MechanicsResult:
+class Pushed(Pushes):
+    """Pushes that tell the inertia of a shaft that is not rigid, or only that of their mean accelerations."""
+
+    def __init__(self, J_kgm2: float, mean_kgm2: float) -> None:
+        object.__setattr__(self, "sigma_a", J_kgm2)
+        object.__setattr__(self, "scale_std", mean_kgm2)
+
+    def mechanics(self, *, elastic: bool = False) -> MechanicsResult:
+        J = self.sigma_a
+        if not J:
+            raise refuse("E_NOT_CONVERGED", "no minimum", stage="mechanics")
         values = [Estimate(value, 0.01 * value, 0.0, unit) for value, unit in
-                  ((J_kgm2, "kg m2"), (1e-3, "N m s"), (0.1, "N m"))]  # fmt: skip
+                  ((J, "kg m2"), (1e-3, "N m s"), (0.1, "N m"))]  # fmt: skip
         return MechanicsResult(*values, (0.0, 0.0, 0.0), 1.0, 1.0, 1.0, True)
 
-    def refused() -> MechanicsResult:
-        raise refuse("E_NOT_CONVERGED", "no minimum", stage="mechanics")
+    def inertia(self) -> Estimate | None:
+        J = self.scale_std
+        return Estimate(J, 0.04 * J, 0.0, "kg m2") if J else None
 
-    inertia = Estimate(0.016, 1.6e-4, 0.0, "kg m2")
-    agreeing = elastic_mechanics(lambda: of(0.0162), inertia)
-    assert agreeing is not None and agreeing.tau_c.fallback == ELASTIC_FALLBACK
-    assert elastic_mechanics(lambda: of(0.0170), inertia) is None
-    assert elastic_mechanics(refused, inertia) is None is elastic_mechanics(lambda: None, inertia)
+
+def test_pushes_that_tell_another_inertia_are_believed_only_where_a_small_torque_turns_less() -> None:
+    nothing = np.zeros(0)
+    resonance = {"resonance_hz": Estimate(50.0, 0.1, 0.0, "Hz")}
+    response = FrequencyResponse(nothing, nothing.astype(complex), nothing, nothing, 800.0, 1.0, 1.0, 0.0, resonance,
+                                 inertia=Estimate(0.016, 1.2e-4, 0.0, "kg m2"))  # fmt: skip
+    agreeing, _, kept = of_no_rigid_shaft(Pushed(0.0162, 0.0), response)
+    assert agreeing is not None and agreeing.tau_c.fallback == ELASTIC_FALLBACK and kept is response
+    assert agreeing.J.value == 0.016, "that of the response, which is known better"
+    loose, _, beside = of_no_rigid_shaft(Pushed(0.0320, 0.0), response)
+    assert loose is not None and loose.J.value == 0.0320 and loose.J.fallback.startswith(PLAY_FALLBACK)
+    assert beside is not None and beside.inertia is None and not beside.found and "play" in beside.reason
+    lighter, nowhere, doubted = of_no_rigid_shaft(Pushed(0.0150, 0.0), response)
+    assert lighter is nowhere is None and doubted is not None and doubted.inertia is None
+    assert of_no_rigid_shaft(Pushed(0.0, 0.0), response) == (None, None, response)
+    assert of_no_rigid_shaft(Pushed(0.0, 0.0165), response) == (None, None, response), "the response is the finer one"
+    _, mean, beside = of_no_rigid_shaft(Pushed(0.0, 0.0320), response)
+    assert mean is not None and mean.fallback.startswith(PLAY_FALLBACK) and beside is not None and not beside.inertia
+    _, mean, none = of_no_rigid_shaft(Pushed(0.0, 0.0320), None)
+    assert mean is not None and mean.fallback == MEAN_FALLBACK and none is None
 
 
 def test_no_notch_without_a_resonance_and_none_beyond_the_speed_controller() -> None:

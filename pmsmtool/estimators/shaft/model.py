@@ -84,7 +84,7 @@ class Problem:
         return SHAFT + int(self.drag) + int(self.runs[0].disturbances.torque.shape[1])
 
     def _off(self, k: int, x: Array) -> Array:
-        """Residual of one trace's positions (rad)."""
+        """Residual of one trace's positions (rad); not finite where no motion follows: a fit takes that back."""
         run, first = self.runs[k], self.shared + 2 * k
         own = x[[*range(SHAFT), first, first + 1]]
         torque = run.torque - x[SHAFT] * run.square if self.drag else run.torque
@@ -92,7 +92,10 @@ class Problem:
         if self.shared > self.sizes.start:
             torque = torque + run.disturbances.torque @ x[self.sizes]
             shown = shown - run.disturbances.position @ x[self.sizes]
-        return positions(torque, run.T, own) - shown
+        try:
+            return positions(torque, run.T, own) - shown
+        except OverflowError:
+            return np.full(len(shown), np.nan)
 
     def of_run(self, k: int, x: Array) -> Array:
         """Whitened residual of one trace."""

@@ -29,8 +29,15 @@ def positions(torque: Array, T: float, x: Array) -> Array:
         Length of an interval (s).
     x : ndarray, shape (5,)
         ln J, B, tau_c, first position and first speed.
+
+    Raises
+    ------
+    OverflowError
+        The speed would grow or decay within a fiftieth of an interval: a step of a fit that leads nowhere.
     """
     J, B, tau_c = math.exp(float(x[0])), float(x[1]), float(x[2])
+    if not abs(B) * T <= DECAY_MOST * J:
+        raise OverflowError("a shaft without a motion between the intervals")
     theta, omega = float(x[3]), float(x[4])
     out = np.empty(len(torque) + 1)
     out[0] = theta
@@ -57,8 +64,6 @@ def _turning(torque: Array, T: float, omega: float, shaft: tuple[float, float, f
     J, B, tau_c = shaft
     sign, x = math.copysign(1.0, omega), B * T / J
     n = len(torque) if abs(x) * len(torque) <= DECAY_MOST else max(1, int(DECAY_MOST / abs(x)))
-    if abs(x) > DECAY_MOST:
-        return np.empty(0), omega
     gone = 1.0 if x == 0.0 else -math.expm1(-x) / x
     later = 0.5 - x / 6.0 + x * x / 24.0 - x**3 / 120.0 if abs(x) < SERIES_BELOW else (1.0 - gone) / x
     rate = (torque[:n] - tau_c * sign) / J
