@@ -33,7 +33,7 @@ EMPTY, STEERED = 254, 250
 EMPTY_MARGIN, HOLD_SHARE, LANDING_REST, ACCURACY, CLOSE_SHARE = f(1.00001), f(0.99), f(0.26), f(1e-2), f(0.95)
 STILL_SHARE, MODEL_SHARE = f(0.2), f(0.1)
 MEAN_WEIGHT, SURE_SHARE, SLOW_GAIN, NEAR_SHARE = f(0.05), f(0.01), f(0.1), f(0.2)
-SHRINK, FORCED = f(0.95), f(1.2)
+SHRINK, FORCED, FASTER = f(0.85), f(1.2), f(1.4)
 TRIALS, INSIDE = 2, f(0.9999995)
 FLAG_FALLBACK = 64
 TRIES, FOUND = 6, 255
@@ -358,7 +358,7 @@ class GovernedTwin(Twin):
 
     def keep_current(self, offset: Vector, w: Vector) -> Vector | None:
         model, i = self.model_voltage(self.i), self.i
-        per = self.T_s / self["motor.L_d_h"], self.T_s / self["motor.L_q_h"]
+        per = FASTER * self.T_s / self["motor.L_d_h"], FASTER * self.T_s / self["motor.L_q_h"]
         hold = model[0] + offset[0], model[1] + offset[1]
         free = i[0] - per[0] * hold[0], i[1] - per[1] * hold[1]
         limit, now = self["governor.I_transient_apk"], square(i)

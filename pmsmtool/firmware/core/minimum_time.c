@@ -17,7 +17,8 @@
 #define LONGEST_ANGLE PMSM_C(100.0)  /* rad */
 #define HOLD_SHARE PMSM_C(0.99)      /* of V_max: a current that needs more is not held at its limit */
 #define CLOSE_SHARE PMSM_C(0.95)     /* of the transient current limit */
-#define SHRINK PMSM_C(0.95)          /* of the square of a current little beyond the limit, in a period */
+#define SHRINK PMSM_C(0.85)          /* of the square of a current little beyond the limit, in a period */
+#define FASTER PMSM_C(1.4)           /* than the model a machine may be: 30 % less inductance than designed for */
 #define FORCED PMSM_C(1.2)           /* of the square of the limit: the EMF has driven a current that far beyond */
 #define ACCURACY PMSM_C(1e-2)        /* of V T, before the last step of Newton's method */
 
@@ -96,17 +97,19 @@ static enum pmsm_transfer find_time(const transfer *t, pmsm_real least, pmsm_rea
     return (*T * pmsm_abs(t->omega) <= LONGEST_ANGLE) ? PMSM_TRANSFER_SOUGHT : PMSM_TRANSFER_NONE;
 }
 
-/* Does the Euler step under w keep the transient current limit? A current little beyond it (an inductance that is off
- * has led it there) is led back, one far beyond it must not grow. If not, turn w, keeping its size, just so far that it
- * does: the path slides along the limit with the full voltage, on the side nearer to w. Not while the voltage cannot
- * hold the present current: getting out of there goes first. 0: w would break the limit. */
+/* Does the Euler step under w keep the transient current limit, also where the current moves FASTER than the model's,
+ * from the sampled one on? A current little beyond it (an inductance that is off has led it there) is led back, one far
+ * beyond it must not grow. If not, turn w, keeping its size, just so far that it does: the path slides along the limit
+ * with the full voltage, on the side nearer to w. Not while the voltage cannot hold the present current: getting out of
+ * there goes first. 0: w would break the limit. */
 static uint32_t keep_current(const pmsm_period *period, pmsm_dq offset, pmsm_dq *w)
 {
     const pmsm_params *params = period->params;
-    const pmsm_dq i = period->i_model;
+    const pmsm_dq i = {period->i.d + FASTER * (period->i_model.d - period->i.d),
+                       period->i.q + FASTER * (period->i_model.q - period->i.q)};
     const pmsm_dq model = pmsm_model_voltage(period, i);
-    const pmsm_real per_d = period->state->derived.T_s / period->magnetics->L_d;
-    const pmsm_real per_q = period->state->derived.T_s / period->magnetics->L_q;
+    const pmsm_real per_d = FASTER * period->state->derived.T_s / period->magnetics->L_d;
+    const pmsm_real per_q = FASTER * period->state->derived.T_s / period->magnetics->L_q;
     const pmsm_dq hold = {model.d + offset.d, model.q + offset.q};
     const pmsm_dq free = {i.d - per_d * hold.d, i.q - per_q * hold.q}; /* at zero voltage */
     const pmsm_real limit = (pmsm_real)params->governor_I_transient_apk;
