@@ -125,6 +125,7 @@ class SimulatedDrives:
         self._base_speed: list[float] = []
         self._phase: list[int] = []
         self._coasting = np.random.default_rng([seed, 2]).integers(1, COAST_PERIODS + 1, runs).tolist()
+        self._held = np.random.default_rng([seed, 3]).uniform(-1.0, 1.0, runs).tolist()
         self.setups = [*self._drawn(base, machine, conditions, runs, seed)]
 
     def _drawn(
@@ -182,7 +183,8 @@ class SimulatedDrives:
 
     def _move(self, row: int, experiment: Experiment, defect: Defect | None) -> Array:
         drive = self._start(row, experiment, defect)
-        hold(drive, experiment, self._increments, self._T_s, self._phase[row])
+        held_nm = self._held[row] * self.setups[row].machine.tau_c
+        hold(drive, experiment, self._increments, self._T_s, self._phase[row], held_nm)
         return record_move(drive, experiment)
 
     def _get_ready(self, drive: Simulation, row: int, experiment: Experiment, run_in: int) -> None:

@@ -20,8 +20,12 @@ AWAITED_STEPS = 4
 """Steps of the speed loop within which a move has begun (measured: 1)."""
 
 
-def hold(simulation: Simulation, experiment: Experiment, increments: int, T_s: float, phase: int) -> None:
+def hold(
+    simulation: Simulation, experiment: Experiment, increments: int, T_s: float, phase: int, held_nm: float
+) -> None:
     """Let the position loop hold the shaft where it is, ready for the move of an experiment.
+
+    The torque that the loop holds against friction is what stopped the shaft before: any within the Coulomb torque.
 
     Parameters
     ----------
@@ -31,6 +35,8 @@ def hold(simulation: Simulation, experiment: Experiment, increments: int, T_s: f
         Control period (s).
     phase : int
         Control periods more than the drive holds.
+    held_nm : float
+        Torque that is held (N m).
     """
     assert experiment.move is not None
     asked = simulation.position.asked
@@ -41,6 +47,7 @@ def hold(simulation: Simulation, experiment: Experiment, increments: int, T_s: f
     simulation.reference.mode = ControlMode.POSITION
     simulation.word(Part.ENABLED).value = 1
     simulation.run(phase + round(HELD_S / T_s))
+    simulation.floats_at(Part.SPEED_INTEGRAL, 1)[0] = held_nm
 
 
 def record_move(simulation: Simulation, experiment: Experiment) -> Array:

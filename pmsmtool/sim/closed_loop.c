@@ -50,6 +50,7 @@ void *pmsm_sim_part(pmsm_drive *drive, uint32_t part)
     case PMSM_PART_LIVE: return &drive->application.control.live;
     case PMSM_PART_APPLICATION: return &drive->application;
     case PMSM_PART_POSITION: return &drive->application.position;
+    case PMSM_PART_SPEED_INTEGRAL: return &drive->application.control.speed_integrator;
     default: return NULL;
     }
 }

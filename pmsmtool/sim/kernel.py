@@ -313,6 +313,7 @@ class Part(IntEnum):
     LIVE = 13
     APPLICATION = 14
     POSITION = 15
+    SPEED_INTEGRAL = 16
 
 
 _LAYOUT_SIM, _LAYOUT_DRIVE = 0, 1
