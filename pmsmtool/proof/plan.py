@@ -12,6 +12,7 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Shape
 from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.identification.mechanics import PLAY_FALLBACK
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import RAD_S_PER_RPM
 
@@ -431,6 +432,9 @@ def _moves(s: _Sizes, increments: int) -> tuple[Experiment, ...] | str:
     K_p, slope = s.design["position.K_p_per_s"], s.design["speed.acceleration_rpm_per_s"] * RPM
     if K_p <= 0.0:
         return "position moves: the design has no position controller"
+    inertia = s.design.machine.estimates.get("J_kgm2")
+    if inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK):
+        return "position moves: the shaft has play, which nothing predicts"
     if not increments:
         return "position moves: the drive does not state the increments of a turn (0x608F)"
     acceleration = MOVE_ACCELERATION * slope * min(1.0, s.i_lim / s.design["motor.I_max_apk"])

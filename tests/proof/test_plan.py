@@ -15,6 +15,7 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.port import Injection
 from pmsmtool.errors import NotAvailable
+from pmsmtool.identification.mechanics import PLAY_FALLBACK
 from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
@@ -49,7 +50,10 @@ def test_everything_the_issue_asks_for_is_there() -> None:
 
 def test_a_drive_without_what_a_move_needs_is_told() -> None:
     made = design()
+    J = Estimate(0.0364, 8e-4, 0.0, "kg m2", fallback=f"{PLAY_FALLBACK}: 0.0193 by a small torque, 0.0364 by pulses")
+    loose = replace(made, machine=replace(made.machine, estimates={**made.machine.estimates, "J_kgm2": J}))
     for without, why in (
+        (plan_proof(loose, conditions(made)), "the shaft has play"),
         (plan_proof(changed(made, position__K_p_per_s=0.0), conditions(made)), "no position controller"),
         (plan_proof(made, conditions(made, encoder_counts=0)), "increments of a turn"),
         (plan_proof(made, conditions(made, encoder_counts=4)), "too coarse"),
