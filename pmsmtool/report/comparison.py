@@ -74,7 +74,7 @@ _NOT_OF_THE_MACHINE = ("lut.format", "lut.axis_kind", "governor.mode", "governor
 
 def marks(names: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> dict[str, str]:
     """Return which parameters follow from values that were not checked, and from which."""
-    open_ = unchecked(row for row in rows if row["measured"] is None)
+    open_ = unchecked(row for row in rows if row.get("measured") is None)
     found = {}
     for name in names:
         own = (name.removeprefix("motor."),) if name.startswith("motor.") else ()

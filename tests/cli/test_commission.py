@@ -107,7 +107,7 @@ def test_a_failed_criterion_ends_the_chain_and_resume_goes_on_there_on_the_runs_
     assert [given["subject"] for given in record.consents] == ["writing", "motion"]
     assert record.stages[-1].name == "prove" and record.stages[-1].status == "pass"
     page = (directory.path / "report.html").read_text()
-    assert ">SIMULATED DRIVE, PASS: 7 of 7 stages ran" in page and page.count("<svg") == 13
+    assert ">SIMULATED DRIVE, PASS: 7 of 7 stages ran" in page and page.count("<svg") == 15
     assert (directory.path / "machine.toml").read_bytes() == measured
     assert tool("verify", *bus[:-1], "run")[0] == 0
     assert tool("commission", "--resume", "run")[0] == 0, "nothing is left to do, so nobody is asked"
