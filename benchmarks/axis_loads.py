@@ -85,7 +85,7 @@ def error_rad(truth: MachineFile, params: ParameterSet, design: Design) -> float
     decimation = max(1, math.ceil(seconds / (ROWS * T_s)))
     nothing = Excitation(Shape.NONE, Injection.SPEED, 0.0)
     experiment = Experiment("move", "", 0.0, nothing, ROWS, decimation, judged=MOVE_SIGNALS, move=move)
-    hold(simulation, experiment, 2**ENCODER_BITS, T_s, 0)
+    hold(simulation, experiment, 2**ENCODER_BITS, T_s, 0, 0.0)
     found = float(np.max(np.abs(record_move(simulation, experiment)[:, 0])))
     return found if math.isfinite(found) else math.inf
 

@@ -322,7 +322,10 @@ def _furthest(rows: Array, shift: Array, radius: Array, objective: Array, x: Arr
             gradient = weight * objective - 2.0 * pull.sum(axis=0)
             hessian = 2.0 * (flat * np.repeat(slack, 2)[:, None]).T @ flat + 4.0 * pull.T @ pull
             hessian.flat[:: n + 1] += _RIDGE * np.trace(hessian)
-            step = np.linalg.solve(hessian, gradient)
+            try:
+                step = np.linalg.solve(hessian, gradient)
+            except np.linalg.LinAlgError:  # close to one disc's border all others round away: the shortest step
+                step = np.linalg.lstsq(hessian, gradient)[0]
             x = x + min(1.0, _STEP_INSIDE * _inside_share((flat @ step).reshape(-1, 2), y, square)) * step
             if float(gradient @ step) <= _NEWTON_DONE:
                 break
