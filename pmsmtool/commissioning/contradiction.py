@@ -286,7 +286,8 @@ def _judged(row: Row, file: MachineFile, found: Mapping[str, _Measured], *, used
         least = measured.value - measured.half
         good = measured.value + measured.half >= low and least <= high
         if good and row.name == "R_s_ohm" and least * (1.0 - DEVICE_SHARE) > high - DEVICES_LEAST_OHM:
-            return replace(row, verdict="NOT CHECKED")  # another motor's sheet may look the same
+            # another motor's sheet may look the same
+            return replace(row, verdict="NOT CHECKED", tolerance=f"{text}; to check it, measure the winding alone")
         return replace(row, verdict="agrees" if good else "contradicts", cause="" if good else _cause(row, measured))
     if row.held is None or (row.factory and not used):
         return replace(row, verdict="NOT CHECKED")

@@ -63,7 +63,7 @@ class Evaluation:
     """What the traces of a run say; None where an experiment was not run, or is in ``refused`` with its reason.
 
     ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics``, ``frf``,
-    ``cogging`` and ``harmonics``.
+    ``cogging`` and ``harmonics``. ``inertia`` is that by mean accelerations, where the mechanics are refused.
     """
 
     noise: Noise

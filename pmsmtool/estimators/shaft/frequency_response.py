@@ -64,7 +64,7 @@ simulated drive: 0.014 too much, 0.005 by the fit."""
 INERTIA_FLOOR = 1e-3
 """Relative deviation of the inertia beyond the fit's and the torque's: see
 ``tests/measurement/test_frequency_response``."""
-INERTIA_FALLBACK = "from the frequency response, without torque pulses and coasting; friction is not known"
+INERTIA_FALLBACK = "from the frequency response alone: friction is not known, and a load behind a play is not seen"
 METHOD = "random torque at speed, maximum likelihood in the frequency domain"
 
 

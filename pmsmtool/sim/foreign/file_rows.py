@@ -64,7 +64,7 @@ BY_MODE: Mapping[int, tuple[tuple[int, int, str, str, str], ...]] = {
 NOT_KEPT = frozenset({0x1003, 0x1010, 0x1011, 0x1013, 0x1020, 0x6040, 0x6071, 0x607A, 0x60FF, 0x60FE})
 """Commands and set points; every other object that can be written outlives a reset once it is stored (assumed)."""
 DRIVE_PROFILE, PROFILES = 402, range(401, 500)
-"""Another number than a CiA profile's is a placeholder of the file's, where control and status word are there."""
+"""A file that states no CiA profile, and has control and status word, is that of a drive all the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,8 @@ def read_makers_objects(where: str) -> MakersObjects:
     rows, assumed = _completed(found)
     profile = MakersObjects(label, rows, assumed)
     stated = profile.stored(0x1000) & 0xFFFF
-    if stated not in (0, DRIVE_PROFILE) and not (stated not in PROFILES and {(0x6040, 0), (0x6041, 0)} <= set(found)):
+    has_words = {(0x6040, 0), (0x6041, 0)} <= set(found)
+    if stated not in (0, DRIVE_PROFILE) and (stated in PROFILES or not has_words):
         raise ConfigError(
             f"the file is of a device of profile {stated}, not of a drive (CiA 402)",
             where=where,
