@@ -10,6 +10,7 @@ import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, Verdict
+from pmsmtool.estimators.injection.angle_dependence import UNSEEN_RANGE
 from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.inductance import EDGE_STD, FrameAhead, InductanceResult, estimate_inductances
 from pmsmtool.estimators.injection.output_error import AxisModel
@@ -228,7 +229,9 @@ def test_every_number_says_which_inductance_and_where(plain: Shots) -> None:
     result = plain.estimate(0)
     assert "incremental" in result.L_d.method
     assert result.L_d.i_d_apk == pytest.approx(BIAS * plain.drives.I_r[0], rel=0.05)
-    assert result.L_d.systematic == pytest.approx(result.L_d.value * math.hypot(0.01, 0.01))
+    # two sensor gains of 1 %, and one angle of the rotor: what a harmonic may add there is inside, and said
+    assert result.L_d.systematic == pytest.approx(result.L_d.value * math.hypot(0.01, 0.01, UNSEEN_RANGE))
+    assert "one angle" in result.L_d.fallback and "3 %" in result.L_d.fallback
 
 
 def test_two_frequencies_that_disagree_are_both_reported(plain: Shots) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, Verdict, chi2_gate, condition_gate
-from pmsmtool.estimators.injection.angle_dependence import AngleDependence, over_angle
+from pmsmtool.estimators.injection.angle_dependence import UNSEEN_RANGE, AngleDependence, over_angle
 from pmsmtool.estimators.injection.axis_fit import AxisFit, fit_axis
 from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, VoltageError, projected, with_line
@@ -72,7 +72,10 @@ two branches, left 1.13 and 1.69 of it, and L_d, L_q 1.4 and 2.5 % off."""
 MINIMUM_PERIODS = 20
 """Full periods of the square wave below which a shot is not an excitation."""
 CURVE_POINTS = 256
-ONE_ANGLE = "at one angle of the rotor: what unequal phases and slots change over the angle is not in the interval"
+ONE_ANGLE = (
+    "at one angle of the rotor: that unequal phases and slots change it over the angle by "
+    f"{100.0 * UNSEEN_RANGE:.2g} % is assumed"
+)
 ANISOTROPY_LIMIT = 0.03
 """(1/L_d - 1/L_q) over the mean below which the axis angle cannot be told from the inductances."""
 
@@ -288,22 +291,26 @@ def _over_angle(
             others = [_shot(record, axis, inverter, U_dc_v, stage) for record in records]
         except IdentificationError:
             continue  # a rotor that moved there, or a limited voltage: L is that of its own angle
-        if others:
-            angles = [record.meta["fixed_angle_rad"] for record in records]
-            found[axis] = over_angle(fits[axis], shots[axis][0], others, angles)
+        angles = [record.meta["fixed_angle_rad"] for record in records]
+        if others and (at := over_angle(fits[axis], shots[axis][0], others, angles)):
+            found[axis] = at
     return found
 
 
 def _with_angle(L: Estimate, at: AngleDependence | None) -> Estimate:
     """Return an inductance as the mean over the angle. A controller of one L meets all: how far it goes is inside."""
-    told = ONE_ANGLE
-    if at is not None:
+    if at is None:
+        told, at = ONE_ANGLE, AngleDependence(1.0, UNSEEN_RANGE)
+    else:
         where = "mean over the angle" if at.mean != 1.0 else "at one angle"
         told = f"{where}, it changes by {100.0 * at.spread:.2g} %" if at.spread else ""
-        value = at.mean * L.value
-        systematic = math.hypot(at.mean * L.systematic, at.spread * value)
-        L = replace(L, value=value, std=at.mean * L.std, systematic=systematic)
-    return replace(L, fallback="; ".join(filter(None, (told, L.fallback))))
+    return replace(
+        L,
+        value=at.mean * L.value,
+        std=at.mean * L.std,
+        systematic=math.hypot(at.mean * L.systematic, at.spread * at.mean * L.value),
+        fallback="; ".join(filter(None, (told, L.fallback))),
+    )
 
 
 def _fitted(
