@@ -125,9 +125,9 @@ def machines_for(objects: MakersObjects, name: str, first: int) -> Iterator[tupl
 
 
 def with_encoder(objects: MakersObjects, name: str, machine: MachineFile) -> tuple[str, MachineFile]:
-    """Return the machine with the encoder that the file states (0x608F), where it states another one."""
+    """Return the machine with the encoder that the file states for good (0x608F, ro), where it states another one."""
     row = objects.rows.get((0x608F, 1))
-    counts = int(row.default, 0) if row is not None and row.default else 0
+    counts = int(row.default, 0) if row is not None and row.default and row.access != "rw" else 0
     if counts < LEAST_COUNTS or machine.encoder.bits is None or counts == 1 << machine.encoder.bits:
         return name, machine
     bits = counts.bit_length() - 1 if counts & counts - 1 == 0 else None  # a machine file knows powers of two

@@ -50,6 +50,7 @@ TRANSPORT_CODES = frozenset(
 BLOCK_REFUSED_CODES = frozenset({AbortCode.COMMAND, AbortCode.ACCESS})
 """What servers without block transfer answer to its initiate; other codes are about the object."""
 
+_MANUAL = "look the object up in the drive's manual or EDS; `pmsmtool info` names drive and firmware"
 _LIKELY: dict[int, tuple[str, str]] = {
     AbortCode.NO_OBJECT: ("the drive's firmware does not have this object", "compare `pmsmtool info` with the map"),
     AbortCode.NO_SUBINDEX: ("the drive's firmware does not have this object", "compare `pmsmtool info` with the map"),
@@ -58,7 +59,8 @@ _LIKELY: dict[int, tuple[str, str]] = {
     AbortCode.VALUE: ("the value is outside what the drive accepts", "`pmsmtool param help NAME` shows the limits"),
     AbortCode.DEVICE_STATE: ("the drive is enabled or in fault", "`pmsmtool stop`, then `pmsmtool fault show`"),
     AbortCode.LOCAL_CONTROL: ("the drive is under local control", "release the panel or the vendor's software"),
-    AbortCode.READ_ONLY: ("the object only reports", ""),
+    AbortCode.READ_ONLY: ("the object only reports", _MANUAL),
+    AbortCode.WRITE_ONLY: ("the object can only be written", _MANUAL),
 }
 
 
@@ -71,5 +73,5 @@ def abort_text(code: int) -> str:
 
 
 def abort_advice(code: int) -> tuple[str, str]:
-    """Return the likely cause and the next step for an abort code; empty where there is none."""
-    return _LIKELY.get(code, ("", ""))
+    """Return the likely cause and the next step for an abort code; the cause is empty where the code tells none."""
+    return _LIKELY.get(code, ("", _MANUAL))

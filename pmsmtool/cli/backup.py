@@ -64,7 +64,7 @@ def backup_command(
                 out.warn(warning)
             snapshot, left_out = take_whole_backup(node, identity, listed, progress=progress)
             if not snapshot.entries:
-                raise ConfigError("the drive has none of the file's objects", where=str(eds), hint="give its own file")
+                raise ConfigError("the file names no setting of this drive", where=str(eds), hint="give its own file")
     write_snapshot(path, snapshot)
     for label, reason in left_out.items():
         out.note(f"not saved: {label}: {reason}")

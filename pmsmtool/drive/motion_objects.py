@@ -55,7 +55,8 @@ TORQUE_SLOPE = DriveObject(0x6087, 0, "I")
 SLOW_SLOPE_S = 0.5
 """Time to the rated torque from which a slope of the drive's own leaves nothing of a push: the shortest lasts 40 ms. As
 stored, one maker's drive takes 10 s; others take no time (0), or 0.1 ms."""
-_ABSENT = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX)
+_ABSENT = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY)
+"""What cannot be read back proves nothing, and counts as missing."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,9 +25,11 @@ _HAVE_SUBS = frozenset({0x06, 0x08, 0x09})  # DEFSTRUCT, ARRAY, RECORD
 
 _SECTION = re.compile(r"\s*\[([^\]]*)\]?\s*(?:;.*)?$")
 _OBJECT = re.compile(r"([0-9A-Fa-f]{1,4})(?:sub([0-9A-Fa-f]{1,2}))?\Z", re.IGNORECASE)
-_REMARK = re.compile(r"[;#]")
+_REMARK = re.compile(r"[;#]|//")
 _NODE_ID = re.compile(r"\$NODEID", re.IGNORECASE)
 _ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
+_WORDED = {"readwrite": "rw", "read": "ro", "readonly": "ro", "write": "wo", "writeonly": "wo", "constant": "const"}
+_NOT_LETTERS = re.compile(r"[^a-z]")
 COMMISSIONING = ("devicecomissioning", "devicecommissioning")
 """The standard's own spelling and the right one."""
 
@@ -97,8 +99,8 @@ def _wide(data: bytes) -> str:
 
 
 def without_remark(text: str) -> str:
-    """Return a number or a word without what follows it behind ``;`` or ``#`` on its line."""
-    return _REMARK.split(text, maxsplit=1)[0].strip()
+    """Return a number or a word without quotes and without what follows it behind ``;``, ``#`` or ``//``."""
+    return _REMARK.split(text, maxsplit=1)[0].strip(" \t\"'")
 
 
 def parse_integer(text: str, node_id: int | None = None) -> int:
@@ -278,7 +280,8 @@ def _entry(
         data_type = DOMAIN if kind == _DOMAIN_OBJECT else 0
         if data_type == 0:
             warnings.append(f"{place}sub{sub:X}: no DataType")
-    access = without_remark(section.get("accesstype")).lower()
+    access = _NOT_LETTERS.sub("", without_remark(section.get("accesstype")).lower())
+    access = _WORDED.get(access, access)
     if access not in _ACCESS:
         warnings.append(f"{place}sub{sub:X}: AccessType {access or 'missing'}, taken as ro")
         access = "ro"

@@ -333,7 +333,11 @@ class Download:
     def _write_marks(self, marks: Mapping[str, bytes]) -> None:
         for name, index, sub in MARKS:
             if name in self._old_marks and name in marks:
-                self.node.sdo.download(index, sub, marks[name])
+                try:
+                    self.node.sdo.download(index, sub, marks[name])
+                except SdoAbort:
+                    if self.node.map.staging:
+                        raise  # of another maker's drive it is no part of the set
 
     def _verify(
         self, entries: tuple[Change, ...], marks: Mapping[str, bytes], crc: int | None, *, stored: bool = True
@@ -342,11 +346,11 @@ class Download:
         found = self._parameters.read([entry.name for entry in entries], progress=self._progress)
         wrong = self._not_excused(entries, found)
         held = self._read_marks()
-        wrong += [
-            f"{name}: wrote {marks[name].hex(' ')}, reads {held[name].hex(' ')}"
-            for name in held
-            if name in marks and held[name] != marks[name]
-        ]
+        lost = [name for name in held if name in marks and held[name] != marks[name]]
+        if lost and not self.node.map.staging:
+            self._say("the drive does not keep the date of its configuration (0x1020)")
+            lost = []
+        wrong += [f"{name}: wrote {marks[name].hex(' ')}, reads {held[name].hex(' ')}" for name in lost]
         if crc is not None:
             numbers = {"active": self._parameters.crc_active}
             numbers |= {"stored": self._parameters.crc_stored} if stored else {}

@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pmsmtool.bus.sdo import SdoChannel
+from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap, address_in
-from pmsmtool.drive_maps.eds import parse_eds
+from pmsmtool.drive_maps.eds import Eds, parse_eds, parse_integer
 from pmsmtool.errors import ConfigError, SdoAbort
 from pmsmtool.files import read_bytes
 from pmsmtool.flash.journal import MARKS, Entry, Snapshot
@@ -254,6 +255,15 @@ def parameters_of(node: DriveNode) -> DriveParameters:
     return DriveParameters(node) if node.map.scales else WholeDrive(node)
 
 
+def _stated_vendor(sheet: Eds) -> int | None:
+    """Return the vendor in the file's own 0x1018; makers leave [DeviceInfo] as a template had it."""
+    item = sheet.objects.get((objects.IDENTITY, 1))
+    try:
+        return None if item is None else parse_integer(item.value or item.default or "0")
+    except ValueError:
+        return None
+
+
 def other_product(eds: str, identity: Identity) -> str:
     """Return a warning where a data sheet is for another product than the drive; empty where it is not, or a table.
 
@@ -265,7 +275,7 @@ def other_product(eds: str, identity: Identity) -> str:
     if eds.partition("#")[0].lower().endswith(".csv"):
         return ""
     sheet = parse_eds(read_bytes(Path(eds)), eds)
-    if sheet.vendor and sheet.vendor != identity.vendor:
+    if sheet.vendor and identity.vendor not in (sheet.vendor, _stated_vendor(sheet)):
         raise ConfigError(
             f"the file is for vendor {sheet.vendor:#010x}, the drive is of vendor {identity.vendor:#010x}", where=eds,
             likely="the file of another maker was given, or another drive answers on this node",

@@ -335,7 +335,11 @@ def measure_polled(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Puls
         i_a = envelope.i_max_apk / HEADROOM
         keep(SUPPLY_LEVELS, hold_supply_levels(drive, envelope, i_a, task.read_supply, say))
     if turns:
-        turn_both_ways(drive, envelope, keep, say)
+        try:
+            turn_both_ways(drive, envelope, keep, say)
+        except NotAvailable as refused:  # announced in 0x6502, and refused when it is asked for
+            refused.hint = "ask for the other quantities alone: `pmsmtool identify psi mechanics`"
+            raise
     told = {"psi", "mechanics"} if turns or facts.pole_pairs else {"mechanics"}
     if asked & told and found.row("mechanics", Method.STANDARD).available:
         pushing = pushing_drive(drive.node.connection, drive.node.node, found.drive_map)

@@ -309,9 +309,9 @@ def test_without_a_torque_mode_the_current_limit_is_the_push(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("rows", "units"),
     [
-        (((0x608F, 1, "U32", "rw", "2000"), (0x608F, 2, "U32", "rw", "1")), 2000.0),
-        (((0x608F, 1, "U32", "rw", "2000"), (0x607E, 0, "U8", "rw", "0x80")), -2000.0),
-        (((0x608F, 1, "U32", "rw", "2000"), (0x60A8, 0, "U32", "rw", "0xFF410000")), 3600.0),
+        (((0x608F, 1, "U32", "ro", "2000"), (0x608F, 2, "U32", "rw", "1")), 2000.0),
+        (((0x608F, 1, "U32", "ro", "2000"), (0x607E, 0, "U8", "rw", "0x80")), -2000.0),
+        (((0x608F, 1, "U32", "ro", "2000"), (0x60A8, 0, "U32", "rw", "0xFF410000")), 3600.0),
         (((0x6092, 1, "U32", "rw", "360"), (0x6091, 1, "U32", "rw", "10"), (0x6091, 2, "U32", "rw", "1")), 36.0),
     ],
 )
@@ -330,7 +330,7 @@ def test_position_is_counted_as_the_drive_counts(tmp_path: Path, rows: tuple[Row
 
 
 def test_a_gear_without_a_feed_is_refused(tmp_path: Path) -> None:
-    rows: tuple[Row, ...] = ((0x608F, 1, "U32", "rw", "2000"), (0x6091, 1, "U32", "rw", "10"))
+    rows: tuple[Row, ...] = ((0x608F, 1, "U32", "ro", "2000"), (0x6091, 1, "U32", "rw", "10"))
     with pytest.raises(NotAvailable, match="gear of 10"), opened(tmp_path, (*epos4(), *rows)):
         pass
 

@@ -15,7 +15,10 @@ from pmsmtool.sim.signals import Signal
 if TYPE_CHECKING:
     from pmsmtool.machine.machine_file import MachineFile
 
-INNER_MODES = {3: Mode.PROFILE_VELOCITY, 4: Mode.PROFILE_TORQUE, 9: Mode.CYCLIC_VELOCITY, 10: Mode.CYCLIC_TORQUE}
+INNER_MODES = {
+    3: Mode.PROFILE_VELOCITY, 4: Mode.PROFILE_TORQUE, 9: Mode.CYCLIC_VELOCITY, 10: Mode.CYCLIC_TORQUE,
+    11: Mode.IDENTIFICATION,
+}  # fmt: skip
 """Modes that move the simulated machine by themselves; the others, but those of position, are taken without current."""
 RAD_S_PER_MRPM = 2.0 * math.pi / 60_000.0
 """Not the tool's: a mistake in its units must not agree with itself here."""
@@ -25,6 +28,8 @@ SPEED_RAD_S, SPEED_INTEGRAL = 60.0, 0.25
 """Bandwidth of the speed loop as a set-up tool leaves it, and its integral rate as a share of it."""
 STORED_RATIO = 4.0
 """Crossover of the speed over the position gain and over the integral rate, as a maker's tool leaves them."""
+ANGLE_COUNTS = 65536
+"""Of the commutation angle 0x60EA per electrical turn (CiA 402-2)."""
 POSITION_MODES = (1, 8)
 """Modes in which ``position.PositionLoop`` commands the torque."""
 
@@ -190,8 +195,14 @@ class Behind:
         if self.power.state.energised and self.dictionary["cia402.mode"].integer() == Mode.CYCLIC_TORQUE:
             self.largest_step = max(self.largest_step, step)
         self._torque_nm = torque_nm
-        rated_nm = self.dictionary["cia402.rated_torque"].number() / 1000.0
-        self._write("cia402.target_torque", 1000.0 * torque_nm / rated_nm)
+        if self.dictionary["cia402.mode"].integer() == Mode.IDENTIFICATION:
+            self._write("set_point.i_q_a", torque_nm / self.set_up.torque_constant)
+            return
+        self.push(torque_nm)
+
+    def command_angle(self, counts: float) -> None:
+        """Take the master's commutation angle: the torque current flows at it, wherever the rotor is."""
+        self._write("set_point.fixed_angle_rad", 2.0 * math.pi * counts / ANGLE_COUNTS)
 
     def push(self, torque_nm: float) -> None:
         """Take a torque of the drive's own position loop (N m)."""

@@ -66,8 +66,20 @@ def position_units(objects: MakersObjects, counts: int) -> float:
     gear = max(1, objects.stored(0x6091, 1)) / max(1, objects.stored(0x6091, 2))
     if feed > 1:
         return feed / shaft / gear
+    return encoder_resolution(objects, counts) / max(1, objects.stored(0x608F, 2))
+
+
+def encoder_resolution(objects: MakersObjects, counts: int) -> float:
+    """Return what 0x608F:01 holds once the motor is entered, as near as the file's limits let it.
+
+    A file's own number stays where the object cannot be written, and where position has other units anyway.
+    """
+    row, turns = objects.rows.get((0x608F, 1)), max(1, objects.stored(0x608F, 2))
     stated = objects.stored(0x608F, 1)
-    return stated / max(1, objects.stored(0x608F, 2)) if stated > 1 else float(counts)
+    if row is None or not row.data_type.letter or (stated > 1 and row.access != "rw"):
+        return float(stated if stated > 1 else counts * turns)
+    low, high = (1.0 if row.low is None else row.low), (math.inf if row.high is None else row.high)
+    return float(round(min(max(counts * turns, low), high)))
 
 
 def speed_units(objects: MakersObjects, per_turn: float) -> tuple[float, str]:
@@ -102,6 +114,7 @@ def standard_laws(objects: MakersObjects, set_up: SetUp, per_turn: float, per_rp
         0x6071, 0, f"{STANDARD}, permille of the rated torque",
         act=lambda behind, n: behind.command_torque(1e-3 * n * torque),
     )  # fmt: skip
+    yield Law(0x60EA, 0, f"{STANDARD}, 65536 a turn", set_up=0.0, act=lambda behind, n: behind.command_angle(n))
     if objects.stored(0x6087):  # 0: the file does not say; no slope is assumed
         yield Law(0x6087, 0, f"{STANDARD}, permille/s", act=lambda behind, n: behind.torque_slope(n))
     yield Law(0x6077, 0, STANDARD, show=lambda behind: 1000.0 * behind.torque_nm() / torque)
@@ -118,6 +131,4 @@ def standard_laws(objects: MakersObjects, set_up: SetUp, per_turn: float, per_rp
     ):  # fmt: skip
         if objects.stored(index) == 0:
             yield Law(index, 0, f"{speed}; of a move {ASSUMED}", set_up=per_rps * turns)
-    if objects.stored(0x608F, 1) <= 1:
-        yield Law(0x608F, 1, STANDARD, set_up=set_up.counts)
-        yield Law(0x608F, 2, STANDARD, set_up=1.0)
+    yield Law(0x608F, 1, STANDARD, set_up=encoder_resolution(objects, set_up.counts))

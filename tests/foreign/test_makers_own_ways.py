@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: MIT
+"""What public files of makers do that the standard does not say: objects that only take, marks that are not kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.cli.main import run
+from pmsmtool.drive_maps.eds import parse_eds
+from pmsmtool.machine.profile import machine_path
+from pmsmtool.sim.foreign.file_rows import read_makers_objects
+from pmsmtool.sim.foreign.laws import encoder_resolution
+from tests.cli.conftest import Tool
+from tests.foreign.data_sheets import COMMON, HEARTBEAT, TORQUE, Row, epos4, faulhaber, identity, write_eds
+from tests.simulated_bus import settle
+
+KEPT: tuple[Row, ...] = (
+    (0x1010, 1, "U32", "rw", ""), (0x1020, 1, "U32", "rw", "0"), (0x1020, 2, "U32", "rw", "0"),
+)  # fmt: skip
+"""A command to store; the simulated drive forgets 0x1020, the date of its configuration, in a reset."""
+PROFILE = "interior-2k2"
+
+
+@pytest.fixture
+def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Tool:
+    settle(tmp_path, monkeypatch)
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        code = run(arguments)
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def commissioned(
+    tool: Tool, rows: tuple[Row, ...], limits: dict[tuple[int, int], tuple[int, int]] | None = None
+) -> tuple[int, str]:
+    write_eds(Path("x.eds"), rows, limits)
+    code, _, said = tool("--yes", "commission", str(machine_path(PROFILE)), "--eds", "x.eds")
+    return code, said
+
+
+@pytest.mark.chain
+def test_a_drive_that_holds_the_set_is_neither_stored_nor_reset(tool: Tool) -> None:
+    """Its encoder, 2048 as the file has it, is entered like the rest of the motor: no contradiction."""
+    rows = tuple(row for row in faulhaber() if row[0] != 0x608F)
+    code, said = commissioned(tool, (*rows, *KEPT, (0x608F, 1, "U32", "rw", "2048")))
+    assert code == 10 and "[1/7] identify  PASS" in said, said
+    assert "objects written: the drive holds them already; nothing was stored, no reset" in said
+    assert "drive is reset" not in said
+
+
+@pytest.mark.chain
+def test_a_date_that_the_drive_does_not_keep_is_no_failure(tool: Tool) -> None:
+    code, said = commissioned(tool, (*epos4(), *KEPT))
+    assert code == 10 and "[5/7] flash     PASS  2 of 3 objects written" in said, said
+
+
+@pytest.mark.chain
+def test_a_date_that_the_drive_refuses_is_no_failure(tool: Tool) -> None:
+    marks = ((0x1020, 1, "U32", "ro", "0"), (0x1020, 2, "U32", "ro", "0"))
+    code, said = commissioned(tool, (*epos4(), KEPT[0], *marks))
+    assert code == 10 and "[5/7] flash     PASS  2 of 3 objects written" in said, said
+
+
+ANGLE: tuple[Row, ...] = (
+    *COMMON, *HEARTBEAT, *TORQUE, *identity(0x3FF, 7), (0x6502, 0, "U32", "ro", "0x60D"), (0x60EA, 0, "U16", "rw", "0"),
+    *((index, 0, "U16", "rw", "") for index in (0x6072, 0x6073)), (0x608F, 1, "U32", "rw", "1"),
+    *((index, 0, "U32", "rw", "") for index in (0x6075, 0x6076, 0x6080)), (0x6078, 0, "I16", "ro", ""),
+    (0x6007, 0, "I16", "rw", "1"), (0x605A, 0, "I16", "rw", "2"),
+)  # fmt: skip
+"""A drive by CiA 402 alone, with mode 11 and its commutation angle."""
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("taken", [True, False])
+def test_mode_11_tells_pole_pairs_and_its_refusal_leaves_the_pulses(tool: Tool, taken: bool) -> None:
+    """Some drives announce bit 10 of 0x6502 and refuse the mode; torque pulses need it not, a design neither."""
+    code, said = commissioned(tool, ANGLE, None if taken else {(0x6060, 0): (0, 10)})
+    refused = said.count("at most 6.08 Apk") == 2  # asked again
+    pole_pairs = next(line.split()[-2:] for line in said.splitlines() if line.split()[:1] == ["pole_pairs"])
+    assert code == 10 and "[1/7] identify  PASS" in said and "J_per_psi" in said, said
+    assert refused == (not taken) and pole_pairs == (["3", "agrees"] if taken else ["NOT", "CHECKED"]), said
+
+
+def test_a_limit_that_only_takes_is_no_limit(tool: Tool) -> None:
+    write_eds(Path("x.eds"), (*epos4(), (0x6073, 0, "U16", "wo", "1000")))
+    code, printed, said = tool("caps", "--eds", "x.eds")
+    assert code == 0 and "capability level standard" in printed, said
+
+
+def test_a_file_that_states_two_vendors_is_for_both(tool: Tool) -> None:
+    path = write_eds(Path("x.eds"), epos4())
+    path.write_text(path.read_text().replace("[DeviceInfo]\n", "[DeviceInfo]\nVendorNumber=0x65\n"))
+    channel = f"{PROFILE}?nv=:memory:&eds=x.eds"
+    code, _, said = tool("--sim", channel, "backup", "--eds", "x.eds", "-o", "b.json")
+    assert code == 0, said
+    path.write_text(path.read_text().replace("DefaultValue=0xfb", "DefaultValue=0x66"))
+    code, _, said = tool("--sim", channel.replace("x.eds", "y.eds"), "caps")
+    write_eds(Path("y.eds"), epos4())
+    code, _, said = tool("--sim", channel.replace("x.eds", "y.eds"), "backup", "--eds", "x.eds", "-o", "c.json")
+    assert code == 2 and "the file is for vendor 0x00000065" in said
+
+
+def test_quotes_remarks_and_words_for_access() -> None:
+    text = '[2000]\nParameterName="a"\nDataType="0x0006" // word\nAccessType=Read/Write\nLowLimit = "5" ; low\n'
+    (entry,) = parse_eds(text.encode()).objects.values()
+    assert (entry.data_type, entry.access, entry.low) == (6, "rw", 5)
+
+
+@pytest.mark.parametrize(("access", "high", "held"), [("rw", 1 << 20, 4096), ("rw", 1000, 1000), ("ro", 1 << 20, 2048)])
+def test_the_encoder_is_entered_where_the_object_takes_it(tmp_path: Path, access: str, high: int, held: int) -> None:
+    rows = ((0x608F, 1, "U32", access, "2048"), *epos4())
+    objects = read_makers_objects(str(write_eds(tmp_path / "x.eds", rows, {(0x608F, 1): (1, high)})))
+    assert encoder_resolution(objects, 4096) == held
