@@ -28,6 +28,7 @@ from pmsmtool.experiments.hall_turn import turn_over_halls
 from pmsmtool.identification.hall import HallAlignment, hall_alignment
 from pmsmtool.machine.hall import HALL_ORDERS
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.sim.simulated_machine import settings_of
 
 ERROR_DEG, TURN_DEG = (5.0, 15.0), 25.0
 I_SHARE = 0.6
@@ -43,7 +44,10 @@ def with_halls(seed: int) -> tuple[MachineFile, str, float]:
     drive = draw_drive(seed)
     halls = {f"hall_error_{phase}_rad": float(error) for phase, error in zip("abc", errors, strict=True)}
     settings = {**drive.simulation, **halls, "hall_order": order, "hall_offset_rad": turn}
-    return replace(drive, simulation=settings), order, turn + float(errors.mean())
+    truth = replace(drive, simulation=settings)
+    seen = settings_of(truth)  # with leads exchanged the sensors stand otherwise to the drive's phases
+    middle = float(np.mean([seen.number(f"hall_error_{phase}_rad") for phase in "abc"]))
+    return truth, seen.text("hall_order"), seen.number("hall_offset_rad") + middle
 
 
 def aligned(truth: MachineFile) -> HallAlignment:

@@ -11,18 +11,19 @@ from pmsmtool.commissioning.compared_stage import held_values
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.objects import LIVE, DriveObject
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, SdoAbort
 from pmsmtool.estimators.noise import estimate_noise
 from pmsmtool.estimators.phase_check import check_phases
 from pmsmtool.experiments import standstill
-from pmsmtool.experiments.first_turn import lead_half_a_turn
+from pmsmtool.experiments.first_turn import HALL, SIGNALS, lead_half_a_turn
 from pmsmtool.identification.wiring import (
     NOT_SEEN,
     OK,
     WRONG,
     Finding,
+    judge_halls,
     judge_sensors,
     judge_supply,
     judge_turn,
@@ -51,7 +52,7 @@ ABOUT = {"E_CURRENT_SENSOR": "current sensors", "E_SNR": "current sensors"}
 ALL = ("supply", "phases", "current sensors", "shaft", "pole pairs", "encoder sign")
 ORDER = (
     "safe torque off", "supply", "limit switches", "current sensors", "phases", "shaft", "encoder counts", "pole pairs",
-    "encoder sign",
+    "encoder sign", "Hall wires",
 )  # fmt: skip
 TURNED_BY = "a load that turns the shaft; wrong counts per turn or pole pairs"
 FAULTS = (
@@ -105,12 +106,13 @@ def check_wiring(
         stated.inverter.V_max_v,
     )  # fmt: skip
     rest_v = drive.live("U_dc_v")
+    halls = (HALL,) if drive.node.has(LIVE[HALL].index, LIVE[HALL].sub) else ()
     supply = judge_supply(rest_v, None, stated.inverter.U_dc_v)
     if supply.verdict != OK:  # with half of its voltage a drive does not even switch on
         return _ordered([*found, supply])
     try:
         with guarded(drive, envelope, first=starting_gains(limits), say=say) as guard:
-            _look(guard, stated, envelope.i_max_apk / HEADROOM, rest_v, against, found, say)
+            _look(guard, stated, envelope.i_max_apk / HEADROOM, rest_v, against, halls, found, say)
     except SdoAbort:
         raise  # a refused object is no wiring
     except DriveFault as error:  # the guard has stopped the machine
@@ -152,6 +154,7 @@ def _look(
     i_a: float,
     rest_v: float,
     against: bool,
+    halls: tuple[str, ...],
     found: list[Finding],
     say: Callable[[str], None],
 ) -> None:
@@ -170,8 +173,12 @@ def _look(
     found += [Finding("phases", OK, "all three carry the current"), judge_sensors(vectors)]
     say("shaft: half a turn forward and back")
     pole_pairs = round(stated.machine.pole_pairs)
-    turn = lead_half_a_turn(drive, i_a, pole_pairs, standstill.PHASE_ANGLES_RAD[-1])
+    turn = lead_half_a_turn(
+        drive, i_a, pole_pairs, standstill.PHASE_ANGLES_RAD[-1], signals=(*SIGNALS, *halls)
+    )  # fmt: skip
     found += [judge_supply(rest_v, turn, stated.inverter.U_dc_v), *judge_turn(turn, pole_pairs, against)]
+    if halls and found[-1].verdict != NOT_SEEN:
+        found.append(judge_halls(turn))
 
 
 def _counts(drive: CanopenDrive, stated: MachineFile) -> Finding:

@@ -23,6 +23,8 @@ MARGIN = 0.9
 """Of half a turn, for the swing at its end."""
 
 SIGNALS = ("theta_m_rad", "U_dc_v")
+HALL = "hall_pattern"
+"""Levels of the Hall wires: read once a step, as their mean says nothing."""
 
 
 def lead_half_a_turn(
@@ -44,12 +46,12 @@ def lead_half_a_turn(
     start_rad : float
         Electrical angle of the vector that was held last.
     signals : tuple of str
-        What the drive shows of :data:`SIGNALS`, and of ``i_q_a``.
+        What the drive shows of :data:`SIGNALS`, of ``i_q_a``, and of :data:`HALL`.
 
     Returns
     -------
     Trace
-        ``theta_imposed_rad`` (electrical, unwrapped), ``theta_M_rad`` (mechanical), ``U_dc_v`` where it is shown;
+        ``theta_imposed_rad`` (electrical, unwrapped), ``theta_M_rad`` (mechanical), what else is shown;
         ``at_rest`` 1 in the three rows before, between and after the two ways.
     """
     turn_vector(drive, i_a, start_rad, 0.0)
@@ -85,6 +87,6 @@ def _led(drive: Drive, i_a: float, angle_rad: float, dwell_s: float, signals: tu
 
 
 def _row(drive: Drive, angle_rad: float, signals: tuple[str, ...], *, at_rest: bool) -> dict[str, float]:
-    means = drive.average(signals, max(1, round(ROW_S / drive.period_s)))
-    row = {"theta_imposed_rad": angle_rad, "theta_M_rad": means["theta_m_rad"], "at_rest": float(at_rest)}
-    return row | {name: means[name] for name in signals if name != "theta_m_rad"}
+    means = dict(drive.average([name for name in signals if name != HALL], max(1, round(ROW_S / drive.period_s))))
+    row = {"theta_imposed_rad": angle_rad, "theta_M_rad": means.pop("theta_m_rad"), "at_rest": float(at_rest)}
+    return row | means | ({HALL: drive.live(HALL)} if HALL in signals else {})

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pmsmtool.errors import IdentificationError
+from pmsmtool.identification.hall import hall_alignment
 from pmsmtool.trace import Trace
 
 OK, WRONG, NOT_SEEN, NOT_CHECKED = "ok", "WRONG", "not seen", "NOT CHECKED"
@@ -31,10 +33,14 @@ SAGS = 0.1
 U_DC_RANGE = (0.7, 1.4)
 """DC link over the stated one beyond which it is not the supply that was stated."""
 
+HALL_WAY_RAD = math.radians(455.0)
+"""Electrical way of the first turn from which on Hall wires are judged: friction is taken up, then a whole turn."""
+
 LEAST_CURRENT = 0.3
 """Current that is shown at the end of a push, of the one asked for: less is not given. (A reading as peak of what is
 rms makes 0.71, and a slow current loop is not at its end.)"""
 NOT_LED = "the vector does not lead the rotor"
+HALLS_BY = "Hall wires of the connector; two motor leads swapped, if the encoder's sign is wrong, too"
 HELD_BY = "brake shut, or the shaft is held; an encoder that does not count; friction above this torque"
 SLIPS_BY = "friction, cogging or a load beyond this torque; a brake that is half open"
 SIGN_BY = "two motor leads swapped, or the encoder's tracks; identify finds the sign by itself and sets it"
@@ -120,6 +126,31 @@ def _pole_pairs(ratio: float, stated: int, same: float) -> Finding:
     if any(abs(factor / usual - 1.0) <= same for usual in COUNT_FACTORS):
         return Finding("encoder counts", WRONG, seen, f"{counts}; or {pairs}")
     return Finding("pole pairs", WRONG, seen, f"{pairs}; or {counts}")
+
+
+def judge_halls(turn: Trace) -> Finding:
+    """Judge the Hall wires by the sectors that a led rotor passes.
+
+    Parameters
+    ----------
+    turn : Trace
+        As of :func:`judge_turn`, with ``hall_pattern``: bit k is wire k + 1.
+    """
+    name, pattern, led = "Hall wires", turn["hall_pattern"], turn["at_rest"] < 0.5
+    if np.ptp(pattern) == 0.0:
+        return Finding(name, NOT_SEEN, "no wire changes: none is connected, or none is supplied")
+    imposed = turn["theta_imposed_rad"][led]
+    if np.ptp(imposed) < HALL_WAY_RAD:
+        way = math.degrees(float(np.ptp(imposed)))
+        return Finding(name, NOT_SEEN, f"the turn of {way:.3g} deg (electrical) is too short; see identify hall")
+    signals = {"commanded_rad": imposed, "angle_rad": imposed, "hall_pattern": pattern[led]}
+    try:
+        found = hall_alignment(Trace(turn.t_s[led], signals, dict.fromkeys(signals, "1"), {}))
+    except IdentificationError as error:
+        return Finding(name, WRONG, error.what, "a wire that is open, or sensors 60 deg apart; " + HALLS_BY)
+    if found.wiring:
+        return Finding(name, WRONG, found.wiring, HALLS_BY)
+    return Finding(name, OK, f"in the order of the phases, {math.degrees(found.offset_rad):+.2g} deg off (electrical)")
 
 
 def judge_current(turn: Trace, i_a: float) -> list[Finding]:

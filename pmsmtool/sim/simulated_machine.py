@@ -74,6 +74,10 @@ class Settings:
         return bool(self._values[name])
 
 
+EXCHANGED = {ord("b"): "c", ord("c"): "b"}
+"""Phases of the motor at the drive's leads b and c, where these are exchanged; ``none`` has neither letter."""
+
+
 @next_step(NEXT_STEP)
 def settings_of(machine_file: MachineFile) -> Settings:
     """Return the simulation settings as the drive meets them; the encoder's kind falls back to ``[encoder]``.
@@ -93,7 +97,11 @@ def settings_of(machine_file: MachineFile) -> Settings:
         values["encoder_bits"] = machine_file.encoder.bits
     if values["leads_swapped"]:
         values["encoder_reversed"] = not values["encoder_reversed"]
-        for name in ("encoder_offset_rad", "theta_M_start_rad"):
+        # the sensors sit in the motor: those of its phases b and c have their places on the drive's axes exchanged
+        values["hall_order"] = str(values["hall_order"]).translate(EXCHANGED)
+        b, c = "hall_error_b_rad", "hall_error_c_rad"
+        values[b], values[c] = values[c], values[b]
+        for name in ("encoder_offset_rad", "theta_M_start_rad", "hall_offset_rad", "hall_error_a_rad", b, c):
             values[name] = -float(values.get(name, 0.0))  # type: ignore[arg-type]
     if values["drive_fault"] not in DRIVE_FAULTS:
         raise ConfigError(

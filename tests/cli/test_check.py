@@ -45,6 +45,9 @@ def checked(tool: Tool, extra: str) -> tuple[int, dict[str, tuple[str, str]], st
         ('drive_fault = "phases_shorted"', "phases"),
         ('drive_fault = "safe_torque_off"', "safe torque off"),
         ('drive_fault = "supply_limit"', "supply"),
+        ('hall_order = "abc"', ""),
+        ('hall_order = "bac"', "Hall wires"),
+        ('hall_order = "abc"\nleads_swapped = true', "encoder sign"),
     ],
 )
 def test_the_first_wrong_row_is_what_was_done(extra: str, wrong: str, tool: Tool) -> None:

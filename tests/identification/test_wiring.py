@@ -10,21 +10,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pmsmtool.identification.wiring import NOT_SEEN, OK, WRONG, judge_sensors, judge_supply, judge_turn
+from pmsmtool.identification.wiring import NOT_SEEN, OK, WRONG, judge_halls, judge_sensors, judge_supply, judge_turn
+from pmsmtool.machine.hall import HALL_ORDERS, hall_axis
 from pmsmtool.trace import Trace
 
 
-def turned(pole_pairs: float, *, way_rad: float = 9.0, lag_rad: float = 0.0, U_dc_v: float = 48.0) -> Trace:
-    """A rotor of (apparent) pole pairs led forward and back, ``lag_rad`` behind at both ends."""
-    there = np.linspace(0.0, way_rad, 20)
+def turned(
+    pole_pairs: float, *, way_rad: float = 9.0, lag_rad: float = 0.0, U_dc_v: float = 48.0, rows: int = 20
+) -> Trace:
+    """A rotor of (apparent) pole pairs led forward and back in ``rows`` each, ``lag_rad`` behind at both ends."""
+    there, n = np.linspace(0.0, way_rad, rows), 2 * rows + 3
     imposed = np.concatenate([[0.0], there, [way_rad], there[::-1], [0.0]])
-    behind = np.concatenate([np.full(22, lag_rad), np.full(21, -lag_rad)])
-    behind[0] = lag_rad
-    at_rest = np.zeros(43)
-    at_rest[[0, 21, 42]] = 1.0
+    behind = np.concatenate([np.full(rows + 2, lag_rad), np.full(rows + 1, -lag_rad)])
+    at_rest = np.zeros(n)
+    at_rest[[0, rows + 1, n - 1]] = 1.0
     theta = (imposed - behind) / pole_pairs
-    signals = {"theta_imposed_rad": imposed, "theta_M_rad": theta, "U_dc_v": np.full(43, U_dc_v), "at_rest": at_rest}
-    return Trace(np.arange(43.0), signals, dict.fromkeys(signals, "1"), {})
+    signals = {"theta_imposed_rad": imposed, "theta_M_rad": theta, "U_dc_v": np.full(n, U_dc_v), "at_rest": at_rest}
+    return Trace(np.arange(float(n)), signals, dict.fromkeys(signals, "1"), {})
 
 
 def wrong(turn: Trace, stated: int, *, against: bool = False) -> list[tuple[str, str]]:
@@ -58,6 +60,40 @@ def test_a_wrong_ratio_is_named(true: int, stated: int, counts: float, named: st
 def test_the_sign_is_held_against_what_the_drive_is_set_for(sign: int, against: bool) -> None:
     agrees = (sign < 0) == against
     assert [name for name, _ in wrong(turned(sign * 3), 3, against=against)] == ([] if agrees else ["encoder sign"])
+
+
+def showing(turn: Trace, pattern: np.ndarray) -> Trace:
+    return Trace(turn.t_s, {**turn.signals, "hall_pattern": pattern}, {**turn.units, "hall_pattern": "1"}, {})
+
+
+def with_halls(turn: Trace, order: str, *, pole_pairs: int = 3, errors_rad: tuple[float, ...] = (0, 0, 0)) -> Trace:
+    """Sensors that are high for half a turn about their phases' axes, displaced by the errors."""
+    theta_e = pole_pairs * turn["theta_M_rad"]
+    axes = [hall_axis(x) + errors_rad["abc".index(x)] for x in order]
+    pattern = sum((np.cos(theta_e - axis) >= 0.0).astype(float) * 2**k for k, axis in enumerate(axes))
+    return showing(turn, np.asarray(pattern))
+
+
+@given(
+    order=st.sampled_from(HALL_ORDERS),
+    errors_deg=st.tuples(*3 * [st.floats(-15.0, 15.0)]),
+    lag_deg=st.floats(0.0, 30.0),
+)
+def test_hall_wires_in_another_order_are_named(order: str, errors_deg: tuple[float, ...], lag_deg: float) -> None:
+    turn = turned(3, way_rad=0.9 * math.pi * 3, lag_rad=math.radians(lag_deg), rows=60)
+    row = judge_halls(with_halls(turn, order, errors_rad=tuple(map(math.radians, errors_deg))))
+    assert row.verdict == (OK if order == "abc" else WRONG)
+    assert order == "abc" or "wires" in row.shown
+
+
+def test_hall_wires_that_do_not_change_or_a_turn_that_is_too_short() -> None:
+    turn = turned(3, way_rad=0.9 * math.pi * 3, rows=60)
+    pulled_up = showing(turn, np.full(len(turn.t_s), 7.0))  # inputs without sensors
+    assert judge_halls(pulled_up).verdict == NOT_SEEN
+    short = with_halls(turned(2, way_rad=0.9 * math.pi * 2, rows=60), "bac", pole_pairs=2)
+    assert (judge_halls(short).verdict, "identify hall" in judge_halls(short).shown) == (NOT_SEEN, True)
+    open_wire = judge_halls(showing(turn, with_halls(turn, "abc")["hall_pattern"] // 2.0 * 2.0))
+    assert (open_wire.verdict, "wire 1 does not change" in open_wire.shown) == (WRONG, True)
 
 
 @pytest.mark.parametrize("turn", [turned(1e9), turned(3, lag_rad=math.radians(50.0))])
