@@ -376,7 +376,7 @@ def _work(seeds: list[int], results: multiprocessing.Queue[tuple[int, tuple[str,
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         os.environ["PMSMTOOL_HOME"] = folder
-        Path(SET_FILE).write_text('schema = "pmsmtool.params/1"\n[values]\n"motor.R_s_ohm" = 0.25\n')
+        Path(SET_FILE).write_text('schema = "pmsmtool.params/1"\n[motor]\nR_s_ohm = 0.25\n')
         for seed in seeds:
             command, limit_s = COMMANDS[seed % len(COMMANDS)]
             results.put((seed, command, *examine(seed, command, limit_s)))
