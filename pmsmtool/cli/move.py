@@ -131,7 +131,7 @@ def move_command(
             *envelope.lines(),
             f"the shaft moves by {math.degrees(way_rad):.4g} deg and back with the drive's own position loop, {times} "
             f"time{'s' if times > 1 else ''}",
-            f"voltage off at a following error of {math.degrees(drive.error_limit_rad):.3g} deg",
+            f"voltage off where the shaft is {math.degrees(drive.error_limit_rad):.3g} deg behind and comes no nearer",
             *(f"lent: {name} {value:.5g} {_unit(name)}" for name, value in lent.items()),
             "nothing is stored in the drive; every changed object is restored",
         ]  # fmt: skip

@@ -27,13 +27,21 @@ from pmsmtool.trace import Trace
 SHOWN = ("position", "demand", "current")
 
 
+FOLLOWS_S, FOLLOWS_SHARE = 0.05, 0.01
+"""A shaft is on its way where in that time it has come nearer by that share of the limit. As their makers' tools leave
+them, loops of 15 rad/s without feed-forward lag 63 to 80 degrees of a move by 90; blocked ones come no nearer."""
+WHOLE_WAY = 2.2
+"""Limit of the lag over that of a shaft that stands; the latter is half of the way."""
+
+
 class PositionDrive(TorqueDrive):
     """A drive that follows a position by its own loop, from where it stands.
 
     Attributes
     ----------
     error_limit_rad : float
-        Following error at which the voltage is removed.
+        Following error at which the voltage is removed, unless the shaft is on its way to the demand; at ``WHOLE_WAY``
+        times that, in any case.
     current_allowed_apk : float
         Rated current, or the drive's own limit where that is smaller (A peak).
     sends : bool
@@ -135,13 +143,21 @@ class PositionDrive(TorqueDrive):
             self._take(now, *(self.node.get(item) for item in (POSITION, POSITION_DEMAND, self._current.item)))
         super().wait(max(0.0, end - clock.now()))
         if self._taken and self._recording:
-            error = abs(self._taken[-1][2] - self._taken[-1][1])
-            if error > self.error_limit_rad:
+            error = self._taken[-1][2] - self._taken[-1][1]
+            if abs(error) > self.error_limit_rad and (
+                not self._follows(error) or abs(error) > WHOLE_WAY * self.error_limit_rad
+            ):
                 raise LimitExceeded(
-                    "following error", error, self.error_limit_rad, "rad", where=f"node {self.node.node}",
+                    "following error", abs(error), self.error_limit_rad, "rad", where=f"node {self.node.node}",
                     likely="the position loop oscillates or saturates, or the shaft is blocked",
                     hint="the voltage is off; ask for a slower move, or look at the gains",
                 )  # fmt: skip
+
+    def _follows(self, error: float) -> bool:
+        """Whether the shaft turns towards the demand: a calm loop without feed-forward lags by speed over its gain."""
+        end = self._taken[-1][0]
+        before = next((sample for sample in reversed(self._taken) if sample[0] <= end - FOLLOWS_S), self._taken[0])
+        return math.copysign(1.0, error) * (self._taken[-1][1] - before[1]) > FOLLOWS_SHARE * self.error_limit_rad
 
     def _take(self, t_s: float, position: float, demand: float, current: float) -> None:
         angles = (self._angle(counts - self._start_counts) for counts in (position, demand))

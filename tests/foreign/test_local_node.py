@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A drive that is not ours: canopen's LocalNode with the objects of a maker's drive, asked, saved, restored, written."""
+"""A drive that is not ours: canopen's LocalNode with a maker's objects is asked, saved, restored and written."""
 
 from __future__ import annotations
 
