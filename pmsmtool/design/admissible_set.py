@@ -153,14 +153,11 @@ class Horizon:
         Tightening of the steady-state row; None without that row.
     omega_e : float
         Electrical speed (rad/s).
-    bounds : StateBounds or None
-        States it was determined for; None for all.
     """
 
     k_max: int | None
     eps: float | None
     omega_e: float
-    bounds: StateBounds | None = None
 
     @property
     def by_tolerance(self) -> bool:
@@ -221,12 +218,12 @@ def horizon(
     # Horizons are short where they exist: search upwards in growing steps, then bisect.
     while test.excess(high) > REDUNDANT:
         if high == cap:
-            return Horizon(None, eps, omega_e, bounds)
+            return Horizon(None, eps, omega_e)
         low, high = high, min(2 * high + 1, cap)
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if test.excess(middle) <= REDUNDANT else (middle, high)
-    return Horizon(high, eps, omega_e, bounds)
+    return Horizon(high, eps, omega_e)
 
 
 class _Redundancy:

@@ -56,14 +56,11 @@ class ConditionMap:
         Axes.
     condition : ndarray, shape (n, m)
         V_max / V_a, infinite at zero voltage, NaN out of reach.
-    relative_gain : ndarray, shape (n, m)
-        Static relative gain of the pairing i_d <- V_a, i_q <- delta; below 0.5 the other pairing is the better one.
     """
 
     speed_rpm: Array
     torque_nm: Array
     condition: Array
-    relative_gain: Array
 
     def share_above(self, limit: float) -> float:
         """Return the share of the reachable points whose condition number exceeds a limit."""
@@ -77,13 +74,13 @@ def condition_map(
     """Return the conditioning over a grid; every point is the steady state of least loss."""
     speeds, torques = np.asarray(speed_rpm, dtype=np.float64), np.asarray(torque_nm, dtype=np.float64)
     shape = (len(speeds), len(torques))
-    condition, gain = np.full(shape, np.nan), np.full(shape, np.nan)
+    condition = np.full(shape, np.nan)
     for k, rpm in enumerate(speeds):
         for n, torque in enumerate(torques):
             found = conditioning(machine, float(rpm) * RPM * machine.pole_pairs, float(torque), V_max)
             if found.reachable:
-                condition[k, n], gain[k, n] = found.condition, found.relative_gain_dc
-    return ConditionMap(speeds, torques, condition, gain)
+                condition[k, n] = found.condition
+    return ConditionMap(speeds, torques, condition)
 
 
 def stability_map(

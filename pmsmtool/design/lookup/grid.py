@@ -55,8 +55,6 @@ class InterpolationError:
         Voltage beyond the limit (V; Wb for a flux table); 0 when it is never exceeded.
     current_a : float
         Current beyond I_max (A); 0 when it is never exceeded.
-    torque_at : tuple of float
-        Torque (N m) and speed (rpm; Wb) of the cell that decides ``torque_nm``.
     holes : int
         Cells with a corner without a point; the bounds hold outside them only as far as points exist.
     """
@@ -64,7 +62,6 @@ class InterpolationError:
     torque_nm: float
     voltage_v: float
     current_a: float
-    torque_at: tuple[float, float]
     holes: int
 
 
@@ -148,15 +145,10 @@ def interpolation_error(table: LookupTable, points: int = POINTS_PER_INTERVAL) -
 
 def _bounds(table: LookupTable, errors: Array) -> InterpolationError:
     worst = errors.max(axis=2)
-    cell = np.unravel_index(int(np.argmax(worst[..., 0])), worst.shape[:2])
     missing = np.asarray(np.isnan(table.i_d_a).any(axis=2))
     holes = missing[:-1, :-1] | missing[1:, :-1] | missing[:-1, 1:] | missing[1:, 1:]
     torque, voltage, current = (max(0.0, BOUND_SAFETY * float(worst[..., k].max())) for k in range(3))
-    centre = (
-        0.5 * float(table.torque_nm[cell[0]] + table.torque_nm[cell[0] + 1]),
-        0.5 * float(table.y[cell[1]] + table.y[cell[1] + 1]),
-    )
-    return InterpolationError(torque, voltage, current, centre, int(holes.sum()))
+    return InterpolationError(torque, voltage, current, int(holes.sum()))
 
 
 @dataclass(frozen=True, slots=True)
