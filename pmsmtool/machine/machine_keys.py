@@ -76,6 +76,7 @@ INVERTER_KEYS: tuple[Key, ...] = (
     _key("inverter", "voltage_error_v", "V", -1e3, 1e3, (), "voltage error of one phase there", kind="floats"),
     _key("inverter", "current_lag_s", "s", 0, 1e-3, None, "time constant of the current sensors"),
     _key("inverter", "sampling_instant_s", "s", -1e-3, 1e-3, None, "sampling of the currents after the PWM centre"),
+    _key("inverter", "U_dc_chopper_v", "V", 1, 2000, None, "voltage at which a brake chopper holds the link"),
 )
 
 ENCODER_KEYS: tuple[Key, ...] = (

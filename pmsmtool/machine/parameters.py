@@ -119,7 +119,8 @@ class InverterParameters:
     ``voltage_error_i_apk`` and ``voltage_error_v`` are the identified voltage error of one phase over its current
     (increasing currents, odd in the current where only positive ones are given); ``V_dead_v`` and ``i_knee_apk``
     are its plateau and knee, what the drive's own compensation takes. ``current_lag_s`` is the time constant of the
-    current sensors, ``sampling_instant_s`` when they are sampled after the PWM centre.
+    current sensors, ``sampling_instant_s`` when they are sampled after the PWM centre. ``U_dc_chopper_v``
+    is the voltage at which a brake chopper holds the link; None: there is none.
     """
 
     U_dc_v: float
@@ -133,6 +134,7 @@ class InverterParameters:
     voltage_error_v: tuple[float, ...] = ()
     current_lag_s: float | None = None
     sampling_instant_s: float | None = None
+    U_dc_chopper_v: float | None = None
 
     @property
     def T_s(self) -> float:

@@ -59,6 +59,9 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number("U_dc_ripple_hz", "Hz", 0, 1e5, 300.0, "frequency of the DC-link ripple"),
     _number("U_dc_source_ohm", "ohm", 0, 100, 0.0, "resistance of the supply: the link falls under load"),
     _number("U_dc_source_s", "s", 0, 10, 1e-3, "time constant of that resistance and the link's capacitor"),
+    _number("U_dc_capacitance_f", "F", 0, 10, 0.0, "capacitor of a supply that feeds only; 0: it holds the link"),
+    _number("U_dc_chopper_v", "V", 0, 2000, None, "brake chopper of that link", "[inverter] U_dc_chopper_v"),
+    _number("U_dc_chopper_ohm", "ohm", 0, 1e4, 0.0, "its resistor; 0: it holds its voltage"),
     # the sensors
     _number("sensor_gain_a", "1", 0.5, 2, 1.0, "gain of the current sensor of phase a"),
     _number("sensor_gain_b", "1", 0.5, 2, 1.0, "gain of the current sensor of phase b"),

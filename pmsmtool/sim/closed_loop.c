@@ -100,13 +100,14 @@ static void apply_schedules(pmsm_sim *sim, double t, double T_s)
 
 static double dc_link(const pmsm_sim *sim, double t)
 {
-    const double U_dc = sim->setup.U_dc - sim->setup.U_dc_source * sim->link_current;
-    if (sim->setup.U_dc_ripple == 0.0)
-        return U_dc;
-    const double turns = sim->setup.U_dc_ripple_hz * t;
-    double s, c;
-    pmsm_real64_sincos(PMSM_REAL64_TWO_PI * (turns - (double)(int64_t)turns), &s, &c);
-    return U_dc + sim->setup.U_dc_ripple * s;
+    double supply = sim->setup.U_dc - sim->setup.U_dc_source * sim->link_current;
+    if (sim->setup.U_dc_ripple != 0.0) {
+        const double turns = sim->setup.U_dc_ripple_hz * t;
+        double s, c;
+        pmsm_real64_sincos(PMSM_REAL64_TWO_PI * (turns - (double)(int64_t)turns), &s, &c);
+        supply += sim->setup.U_dc_ripple * s;
+    }
+    return supply > sim->link_charge ? supply : sim->link_charge;
 }
 
 /* The bridge takes the sum of duty times current from the capacitor, which the supply recharges. */
@@ -117,6 +118,19 @@ static void load_link(pmsm_sim *sim, const pmsm_output *acting, double T_s)
     for (int x = 0; x < 3 && acting->gates; x++)
         current += duty[x] * pmsm_plant_leg_current(&sim->plant, x);
     sim->link_current += (current - sim->link_current) * T_s / (sim->setup.U_dc_source_time + T_s);
+}
+
+/* Energy balance of the capacitor over a period. A supply that has failed is one of 0 V. */
+static void charge_link(pmsm_sim *sim, double T_s)
+{
+    const double C = sim->setup.U_dc_capacitance, limit = sim->setup.U_dc_chopper, R = sim->setup.U_dc_chopper_ohm;
+    const double left = sim->U_dc * sim->U_dc - 2.0 * sim->inverter.energy / C;
+    double charge = left > 0.0 ? sqrt(left) : 0.0;
+    if (limit > 0.0 && charge > limit) {
+        const double burnt = R > 0.0 ? charge * (1.0 - T_s / (R * C)) : limit;
+        charge = burnt > limit ? burnt : limit;
+    }
+    sim->link_charge = charge;
 }
 
 /* ---- sampling ----------------------------------------------------------------------------------------------- */
@@ -345,6 +359,8 @@ static void run_period(pmsm_sim *sim)
     pmsm_inverter_run(&sim->inverter, &sim->plant, &sim->lag, done, T_s);
     if (sim->setup.U_dc_source > 0.0)
         load_link(sim, &acting, T_s);
+    if (sim->inverter.metered)
+        charge_link(sim, T_s);
     if (sim->plant.machine.thermal_capacity > 0.0)
         pmsm_plant_heat(&sim->plant, T_s);
     if (sim->setup.sensors.T_lag > 0.0)
@@ -389,6 +405,7 @@ void pmsm_sim_start(pmsm_sim *sim, pmsm_drive *drive, const pmsm_sim_setup *setu
     pmsm_plant_start(&sim->plant, setup->theta_M, setup->omega_M);
     sim->inverter.setup = setup->inverter;
     pmsm_inverter_start(&sim->inverter, &sim->plant);
+    sim->inverter.metered = setup->U_dc_capacitance > 0.0 ? 1u : 0u;
     sim->lag.tau = setup->sensor_lag;
     sim->lag.decay_h = -1.0;
     sim->T_winding_shown = setup->T_winding;

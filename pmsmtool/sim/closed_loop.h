@@ -65,6 +65,8 @@ typedef struct {               /* everything that is fixed during a run */
     pmsm_sensor_setup sensors;
     double U_dc, U_dc_ripple, U_dc_ripple_hz;
     double U_dc_source, U_dc_source_time; /* ohm of the supply, s of its resistance with the link's capacitor */
+    double U_dc_capacitance;   /* F behind a supply that takes nothing back; 0: the supply holds the link */
+    double U_dc_chopper, U_dc_chopper_ohm; /* V from which a brake chopper is on, 0 none; ohm, 0: it holds that voltage */
     double T_winding, T_magnet; /* degC at the start */
     double theta_M, omega_M;   /* at the start */
     double load;               /* N m */
@@ -93,6 +95,7 @@ typedef struct pmsm_sim {
     double i_read[3];          /* A, last current a shunt could read */
     double U_dc;               /* V, of this period */
     double link_current;       /* A, that the supply gives */
+    double link_charge;        /* V, of the link's capacitor */
     double T_winding_shown;    /* degC, of the lagging sensor */
     double encoder_held;       /* rad, reading of a stuck encoder */
     uint32_t encoder_is_held;

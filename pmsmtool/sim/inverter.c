@@ -57,9 +57,14 @@ static double shape_slope(uint32_t shape)
     }
 }
 
+double pmsm_leg_dead_voltage(const pmsm_leg_error *error, int leg, double i)
+{
+    return error->V_dead[leg] * shape_value(error->shape, i * error->i_knee_inverse);
+}
+
 double pmsm_leg_error_voltage(const pmsm_leg_error *error, int leg, double i)
 {
-    double v = error->V_dead[leg] * shape_value(error->shape, i * error->i_knee_inverse);
+    double v = pmsm_leg_dead_voltage(error, leg, i);
     if (error->V_device > 0.0)
         v += error->V_device * pmsm_real64_tanh(i * error->V_device_knee_inverse);
     return v;
@@ -89,7 +94,8 @@ static void begin_averaged(pmsm_inverter *inverter, const double duty[3])
     pmsm_leg_vector(inverter->averaged.v, &inverter->averaged.alpha, &inverter->averaged.beta);
     if (inverter->exact)
         return;
-    const double V_max = inverter->U_dc * largest(setup->dead_time) / inverter->T_s;
+    const int switching = largest(duty) > 0.0; /* shorted windings have no dead time */
+    const double V_max = switching ? inverter->U_dc * largest(setup->dead_time) / inverter->T_s : 0.0;
     const double reach = inverter->T_s / inverter->L_min; /* A per V that one period can move */
     double knee = setup->i_knee, slope = setup->r_switch + largest(setup->r_leg);
     uint32_t substeps = 1;
@@ -318,6 +324,8 @@ void pmsm_inverter_start(pmsm_inverter *inverter, const pmsm_plant *plant)
     inverter->L_min = pmsm_plant_smallest_inductance(plant);
     inverter->volt_seconds_alpha = inverter->volt_seconds_beta = 0.0;
     inverter->elapsed = 0.0;
+    inverter->metered = 0;
+    inverter->energy = 0.0;
     inverter->event_overruns = 0;
 }
 
@@ -329,6 +337,7 @@ void pmsm_inverter_begin(pmsm_inverter *inverter, const double duty[3], uint32_t
     inverter->T_s = T_s;
     inverter->volt_seconds_alpha = inverter->volt_seconds_beta = 0.0;
     inverter->elapsed = 0.0;
+    inverter->energy = 0.0;
     inverter->circuit = inverter->setup.model == PMSM_INVERTER_SWITCHED || !gates || open[0] || open[1] || open[2];
     if (!gates) {
         inverter->substeps = DIODE_SUBSTEPS;

@@ -12,7 +12,7 @@
  *           its thresholds stays without current until the circuit drives one again.
  *
  * Gates off and open phases are circuits in both models: diodes against the DC link, and no path at all.
- * The DC link is held over a PWM period. The period starts where all legs are low: sampling there meets
+ * The DC link is held over a PWM period; what the machine gives and takes in it is counted where asked. The period starts where all legs are low: sampling there meets
  * the ripple's mean.
  */
 #ifndef PMSM_INVERTER_H
@@ -84,6 +84,8 @@ typedef struct {
     uint32_t substeps;       /* per period, averaged model */
     double volt_seconds_alpha, volt_seconds_beta; /* V s since the start of the period, at the terminals */
     double elapsed;          /* s in the period */
+    uint32_t metered;        /* 1: energy is counted */
+    double energy;           /* J into the machine since the start of the period */
     uint64_t event_overruns; /* intervals left before all zero crossings were resolved */
 } pmsm_inverter;
 

@@ -39,19 +39,40 @@ static void follow_lag(pmsm_current_lag *lag, const double i_start[3], const dou
     }
 }
 
+/* Mean power (W) that the legs take from the link: their currents at the voltage of the rail they are connected to, the
+ * devices' drops and slopes left out. Dead time is a connection to the other rail. */
+static double taken_from_link(const pmsm_inverter *inverter, const pmsm_supply *supply, const double i_start[3],
+                              const double i_end[3])
+{
+    const double U_dc = inverter->U_dc, drop = inverter->setup.V_switch + inverter->setup.V_diode + V_SAME;
+    double power = 0.0;
+    for (int x = 0; x < 3; x++) {
+        const double i = 0.5 * (i_start[x] + i_end[x]);
+        double v = supply->v[x];
+        if (inverter->circuit)
+            v = v < drop ? 0.0 : (v > U_dc - drop ? U_dc : v);
+        else if (supply->error)
+            v -= pmsm_leg_dead_voltage(supply->error, x, i);
+        power += v * i;
+    }
+    return power;
+}
+
 void pmsm_leg_advance(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, const pmsm_supply *supply,
                       double h)
 {
     double i_start[3], i_end[3];
-    if (lag)
+    if (lag || inverter->metered)
         leg_currents(plant, i_start);
     pmsm_plant_advance(plant, supply, h);
     if (supply->blocked >= 0 && supply->blocked < 3)
         pmsm_plant_clear_current(plant, supply->blocked); /* its slope was held at zero: take out what the step left */
-    if (lag) {
+    if (lag || inverter->metered)
         leg_currents(plant, i_end);
+    if (lag)
         follow_lag(lag, i_start, i_end, h);
-    }
+    if (inverter->metered)
+        inverter->energy += taken_from_link(inverter, supply, i_start, i_end) * h;
     inverter->volt_seconds_alpha += plant->u_alpha * h;
     inverter->volt_seconds_beta += plant->u_beta * h;
 }

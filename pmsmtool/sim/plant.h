@@ -63,6 +63,7 @@ typedef struct {
 /* Averaged inverter error of one leg as a function of its current (inverter.c). */
 struct pmsm_leg_error;
 double pmsm_leg_error_voltage(const struct pmsm_leg_error *error, int leg, double i);
+double pmsm_leg_dead_voltage(const struct pmsm_leg_error *error, int leg, double i); /* its dead time alone */
 
 /* What the three terminals do during one interval. */
 typedef struct {

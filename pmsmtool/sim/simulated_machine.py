@@ -168,6 +168,8 @@ def build_setup(
     setup.U_dc, setup.load = settings.number("U_dc_v"), settings.number("load_nm")
     setup.U_dc_ripple, setup.U_dc_ripple_hz = settings.number("U_dc_ripple_v"), settings.number("U_dc_ripple_hz")
     setup.U_dc_source, setup.U_dc_source_time = settings.number("U_dc_source_ohm"), settings.number("U_dc_source_s")
+    setup.U_dc_capacitance = settings.number("U_dc_capacitance_f")
+    setup.U_dc_chopper, setup.U_dc_chopper_ohm = settings.number("U_dc_chopper_v"), settings.number("U_dc_chopper_ohm")
     setup.T_winding, setup.T_magnet = settings.number("T_winding_c"), settings.number("T_magnet_c")
     setup.theta_M = settings.number("theta_M_start_rad")
     driven = setup.machine.rotor == Rotor.DRIVEN and start_rad_s == 0.0

@@ -45,6 +45,7 @@ DEAD = {"deadtime_shape": "tanh", "dead_time_s": 2e-6}
 EDGES = {"inverter_model": "switched", "dead_time_s": 2e-6}
 DEVICES = {**EDGES, "device_drop_v": 1.0, "diode_drop_v": 1.0}
 HEATED = {"thermal_on": True, "thermal_capacity_j_per_k": 10.0}
+BRAKED = {"rotor": "driven", "driven_rpm": -400.0}
 ELASTIC = {"J_load_kgm2": 0.01, "coupling_stiffness_nm_per_rad": 500.0}
 
 SWITCHES: dict[str, tuple[Value, Mapping[str, Value]]] = {
@@ -66,6 +67,9 @@ SWITCHES: dict[str, tuple[Value, Mapping[str, Value]]] = {
     "U_dc_ripple_hz": (100.0, {"U_dc_ripple_v": 20.0}),
     "U_dc_source_ohm": (2.0, {}),
     "U_dc_source_s": (0.01, {"U_dc_source_ohm": 2.0}),
+    "U_dc_capacitance_f": (1e-3, BRAKED),
+    "U_dc_chopper_v": (541.0, {**BRAKED, "U_dc_capacitance_f": 1e-3}),
+    "U_dc_chopper_ohm": (2000.0, {**BRAKED, "U_dc_capacitance_f": 1e-3, "U_dc_chopper_v": 541.0}),
     "sensor_gain_a": (1.05, {}),
     "sensor_gain_b": (1.05, {}),
     "sensor_gain_c": (1.05, {}),
