@@ -18,7 +18,7 @@ from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop
 from pmsmtool.design.loops.sampled_loop import SampledLoop
 from pmsmtool.design.loops.speed_loop import Notch
-from pmsmtool.design.ratings import ratings
+from pmsmtool.design.ratings import ratings_of
 from pmsmtool.design.tolerance import NORMAL_95, tolerance_box
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
@@ -399,9 +399,7 @@ def _half_width(source: MachineFile, key: str, value: float, otherwise: float) -
 
 def profile_of(design: Design, shaft: Mechanics, gains: AxisGains, T: float) -> Profile:
     """Return the limits of a move that torque and voltage allow, and that leaves the load at rest."""
-    source = design.machine
-    margin = float(design.request["voltage_margin"])
-    rated = ratings(source, (1.0 - margin) * source.inverter.V_max_v)
+    source, rated = design.machine, ratings_of(design)
     top_rpm = min(rated.n_max_rpm, rated.base_speed_rpm) if rated.base_speed_rpm > 0.0 else rated.n_max_rpm
     speed = SPEED_SHARE * rad_s_from_rpm(top_rpm)
     friction = (source.machine.tau_c_nm or 0.0) + shaft.B * speed

@@ -75,16 +75,13 @@ def lut_command(
     from pmsmtool.design.lookup.file import table_csv, table_facts, table_npz
     from pmsmtool.design.lookup.iron_loss import load_iron_loss_map
     from pmsmtool.design.lookup.loci import loci
-    from pmsmtool.design.ratings import rating_values, reaction_of
     from pmsmtool.machine.flux_map_check import check_flux_map
     from pmsmtool.machine.profile import machine_path
 
     file = Path(source) / "design.toml"
     if not file.is_file():
         file = machine_path(source)
-    machine, rated, margin, protection = _limits(file, voltage_margin)
-    protection = overspeed_protection or protection
-    values = rating_values(machine, rated, protection)
+    machine, rated, margin = _limits(file, voltage_margin, overspeed_protection)
     if iron_loss is None and machine.machine.iron_loss_map is not None:
         iron_loss = file.parent / machine.machine.iron_loss_map
     loss_map = None if iron_loss is None else load_iron_loss_map(iron_loss)
@@ -100,15 +97,15 @@ def lut_command(
         save_figure(lookup_figure(made.table, lines), plot_path)
         written.append(plot_path)
     notes = list(made.notes)
-    if at_a_fault := reaction_of(machine, rated, values, protection).note:
-        notes.append(at_a_fault)
+    if rated.reaction.note:
+        notes.append(rated.reaction.note)
     out.result("lut", {"files": written, "notes": notes, **facts, **_counts(made)}, lambda: _lines(made))
     for note in (*notes, *(check_flux_map(machine.flux_map).complaints if machine.flux_map else ())):
         out.note(note)
     out.note(f"wrote {', '.join(map(str, written))}")
 
 
-def _limits(file: Path, voltage_margin: float | None) -> tuple[Any, Any, float, Any]:
+def _limits(file: Path, voltage_margin: float | None, protection: Protection | None) -> tuple[Any, Any, float]:
     from pmsmtool.design.design_file import load_machine_or_design
     from pmsmtool.design.ratings import ratings
     from pmsmtool.design.tune_request import TuneRequest
@@ -116,8 +113,8 @@ def _limits(file: Path, voltage_margin: float | None) -> tuple[Any, Any, float, 
     machine, design = load_machine_or_design(file)
     if voltage_margin is None:
         voltage_margin = TuneRequest().voltage_margin if design is None else design["field_weakening.margin"]
-    rated = ratings(machine, (1.0 - voltage_margin) * machine.inverter.V_max_v)
-    return machine, rated, voltage_margin, None if design is None else design.request.get("overspeed_protection")
+    stated: Any = protection or (None if design is None else design.request.get("overspeed_protection"))
+    return machine, ratings(machine, (1.0 - voltage_margin) * machine.inverter.V_max_v, stated), voltage_margin
 
 
 def _counts(made: LookupDesign) -> dict[str, Any]:

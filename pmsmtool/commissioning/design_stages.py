@@ -16,7 +16,7 @@ from pmsmtool.design.lookup.file import lut_values, table_csv, table_facts, tabl
 from pmsmtool.design.lookup.loci import loci
 from pmsmtool.design.loops.margins import JUDGED_PERCENTILE, MarginRequest, Spread, margin_report
 from pmsmtool.design.loops.sampled_loop import LoopMargins
-from pmsmtool.design.ratings import ratings
+from pmsmtool.design.ratings import ratings_of
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
@@ -92,9 +92,7 @@ def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
         Not even a table within the widest of ``lookup.design.BOUNDS`` fits the drive's memory.
     """
     design = load_design(run.path / "design.toml")
-    margin = design["field_weakening.margin"]
-    rated = ratings(design.machine, (1.0 - margin) * design.machine.inverter.V_max_v)
-    made = design_table(design.machine, rated, request, margin)
+    made = design_table(design.machine, ratings_of(design), request, design["field_weakening.margin"])
     table, error = made.table, made.error
     used = design["field_weakening.mode"] == FIELD_WEAKENING["lookup"]
     if used:

@@ -215,7 +215,8 @@ def tune_closed(source: MachineFile, request: TuneRequest, drive: ClosedDrive) -
     """
     unheld = tune(source, replace(request, controller="pi", governor="off", field_weakening="off", predictor=False))
     design = _as_controlled(unheld, drive)
-    rated = ratings(source, (1.0 - request.voltage_margin) * source.inverter.V_max_v)
+    V_limit = (1.0 - request.voltage_margin) * source.inverter.V_max_v
+    rated = ratings(source, V_limit, request.overspeed_protection)
     loops = current_loops(design, drive)
     found = _Projection(source, rated, request, drive, loops).guarantee()
     how = f"{drive.name}: largest torque x speed whose demand is bounded by the voltage limit"

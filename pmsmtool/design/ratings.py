@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
-from pmsmtool.design.design_file import DesignValue
+from pmsmtool.design.design_file import Design, DesignValue
 from pmsmtool.design.lookup.table import RPM, torque_limits
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.errors import ConfigError
@@ -61,6 +62,10 @@ class Ratings:
         Largest torque the speed controller may ask for (N m).
     i_d_min_a : float
         Most negative i_d (A).
+    U_dc_max_v, n_trip_rpm : float
+        Overvoltage (V) and overspeed (rpm) trip.
+    reaction : FaultReaction
+        What a fault does to the inverter.
     base_speed_rpm : float
         Speed at which rated torque takes the whole voltage (rpm).
     methods : mapping of str to str
@@ -73,12 +78,15 @@ class Ratings:
     n_max_rpm: float
     tau_max_nm: float
     i_d_min_a: float
+    U_dc_max_v: float
+    n_trip_rpm: float
+    reaction: FaultReaction
     base_speed_rpm: float
     methods: Mapping[str, str]
 
 
-def ratings(source: MachineFile, V_limit_v: float) -> Ratings:
-    """Collect the ratings.
+def ratings(source: MachineFile, V_limit_v: float, protection: Protection | None = None) -> Ratings:
+    """Collect the ratings, at most the speed at which a fault can still be handled.
 
     Parameters
     ----------
@@ -86,11 +94,15 @@ def ratings(source: MachineFile, V_limit_v: float) -> Ratings:
         Machine, inverter and limits.
     V_limit_v : float
         Voltage in use (V peak), for the base speed.
+    protection : str, optional
+        What holds the DC link at over-speed, as asked for (``TuneRequest.overspeed_protection``).
 
     Raises
     ------
     ConfigError
         No current rating at all.
+    DesignInfeasible
+        As :func:`~pmsmtool.machine.uncontrolled_generation.fault_reaction`.
     """
     machine, limits = source.machine, source.limits
     if machine.I_nom_apk is None and machine.I_max_apk is None:
@@ -123,12 +135,36 @@ def ratings(source: MachineFile, V_limit_v: float) -> Ratings:
             n_max, methods["n_max"] = machine.n_nom_rpm, "rated speed: no largest speed is given"
         else:
             n_max, methods["n_max"] = base, "base speed at rated current: no speed is given"
+    U_max, methods["U_dc_max"] = _either(
+        limits.U_dc_max_v,
+        min(U_DC_RANGE[1] * source.inverter.U_dc_v, BY_NAME["protection.U_dc_max_v"].maximum),
+        f"{U_DC_RANGE[1]:g} U_dc",
+    )
+    n_trip, methods["n_trip"] = _either(limits.n_trip_rpm, TRIP_SPEED_RATIO * n_max, f"{TRIP_SPEED_RATIO:g} n_max")
+    if protection is None and source.inverter.U_dc_chopper_v is not None:
+        protection = "chopper"
+    stands = i_d_min if limits.i_d_min_apk is None else limits.i_d_min_apk
+    reaction = fault_reaction(machine, source.inverter.U_dc_v, U_max, n_trip, stands, protection)
+    if n_trip > reaction.trip_most_rpm:
+        n_trip, methods["n_trip"] = reaction.trip_most_rpm, "speed of uncontrolled generation"
+    if n_max > reaction.n_most_rpm:
+        n_max, methods["n_max"] = reaction.n_most_rpm, "below uncontrolled generation: nothing holds the link there"
     plane = at_temperature(machine, source.flux_map)
     shaft = float(torque_limits(plane, [0.0], [_UNLIMITED_V], I_max, i_d_min).largest_nm[0, 0])
     methods["tau_max"] = "torque of least current at I_max"
     if limits.tau_max_nm is not None and limits.tau_max_nm < shaft:
         shaft, methods["tau_max"] = limits.tau_max_nm, GIVEN
-    return Ratings(I_nom, I_max, I_cont, n_max, shaft, i_d_min, base, methods)
+    return Ratings(I_nom, I_max, I_cont, n_max, shaft, i_d_min, U_max, n_trip, reaction, base, methods)
+
+
+def ratings_of(design: Design) -> Ratings:
+    """Return the ratings that a design was made with."""
+    V_limit = (1.0 - design["field_weakening.margin"]) * design.machine.inverter.V_max_v
+    return ratings(design.machine, V_limit, cast("Protection | None", design.request.get("overspeed_protection")))
+
+
+def _either(given: float | None, assumed: float, how: str) -> tuple[float, str]:
+    return (assumed, how) if given is None else (given, GIVEN)
 
 
 _UNLIMITED_V = 1e9
@@ -159,16 +195,9 @@ def base_speed_rpm(source: MachineFile, I_apk: float, i_d_min_a: float, V_limit_
     return omega / machine.pole_pairs * RPM
 
 
-def rating_values(source: MachineFile, rated: Ratings, protection: Protection | None = None) -> dict[str, DesignValue]:
-    """Return the catalogue values of motor, inverter, protection and encoder; ``protection`` is that at over-speed.
-
-    Raises
-    ------
-    DesignInfeasible
-        As :func:`~pmsmtool.machine.uncontrolled_generation.fault_reaction`.
-    """
-    protected = _protection(source, rated, protection)
-    return {**_motor(source, rated), **_inverter(source), **protected, **_encoder(source)}
+def rating_values(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
+    """Return the catalogue values of motor, inverter, protection and encoder."""
+    return {**_motor(source, rated), **_inverter(source), **_protection(source, rated), **_encoder(source)}
 
 
 def _motor(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
@@ -213,29 +242,21 @@ def _inverter(source: MachineFile) -> dict[str, DesignValue]:
     }
 
 
-def _protection(source: MachineFile, rated: Ratings, protection: Protection | None) -> dict[str, DesignValue]:
-    limits, U_dc = source.limits, source.inverter.U_dc_v
-    low, high = U_DC_RANGE
-    highest = BY_NAME["protection.U_dc_max_v"].maximum
-
-    def either(given: float | None, assumed: float, how: str) -> DesignValue:
-        return DesignValue(assumed, how) if given is None else DesignValue(given, GIVEN)
-
-    found = {
-        "protection.i_trip_apk": either(
-            limits.i_trip_apk, TRIP_CURRENT_RATIO * rated.I_max_apk, f"{TRIP_CURRENT_RATIO:g} I_max"
-        ),
-        "protection.U_dc_min_v": either(limits.U_dc_min_v, low * U_dc, f"{low:g} U_dc"),
-        "protection.U_dc_max_v": either(limits.U_dc_max_v, min(high * U_dc, highest), f"{high:g} U_dc"),
-        "protection.n_trip_rpm": either(
-            limits.n_trip_rpm, TRIP_SPEED_RATIO * rated.n_max_rpm, f"{TRIP_SPEED_RATIO:g} n_max"
-        ),
-        "protection.T_winding_max_c": either(limits.T_winding_max_c, WINDING_LIMIT_C, "insulation class F assumed"),
-        "protection.I_cont_apk": DesignValue(rated.I_cont_apk, rated.methods["I_cont"]),
+def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
+    limits, how, low = source.limits, rated.methods, U_DC_RANGE[0]
+    i_trip = _either(limits.i_trip_apk, TRIP_CURRENT_RATIO * rated.I_max_apk, f"{TRIP_CURRENT_RATIO:g} I_max")
+    U_min = _either(limits.U_dc_min_v, low * source.inverter.U_dc_v, f"{low:g} U_dc")
+    T_max = _either(limits.T_winding_max_c, WINDING_LIMIT_C, "insulation class F assumed")
+    return {
+        "protection.i_trip_apk": DesignValue(*i_trip),
+        "protection.U_dc_min_v": DesignValue(*U_min),
+        "protection.U_dc_max_v": DesignValue(rated.U_dc_max_v, how["U_dc_max"]),
+        "protection.n_trip_rpm": DesignValue(rated.n_trip_rpm, how["n_trip"]),
+        "protection.T_winding_max_c": DesignValue(*T_max),
+        "protection.I_cont_apk": DesignValue(rated.I_cont_apk, how["I_cont"]),
+        "protection.n_short_circuit_rpm": DesignValue(rated.reaction.short_from_rpm, rated.reaction.how),
         "governor.I_transient_apk": DesignValue(rated.I_max_apk, "I_max"),
     }
-    reaction = reaction_of(source, rated, found, protection)
-    return found | {"protection.n_short_circuit_rpm": DesignValue(reaction.short_from_rpm, reaction.how)}
 
 
 def sag_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict[str, float]:
@@ -247,14 +268,6 @@ def sag_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict[str
         sagged, full = (float(x) for x in np.nan_to_num(found.largest_nm[0]))
         facts[f"sag_torque_share_{where}"] = max(sagged, 0.0) / full if full > 0.0 else 0.0
     return facts
-
-
-def reaction_of(
-    source: MachineFile, rated: Ratings, values: Mapping[str, DesignValue], protection: Protection | None = None
-) -> FaultReaction:
-    """Return what a fault does to the inverter, by the limits among the values."""
-    U_max, n_trip = (float(values[f"protection.{name}"].value) for name in ("U_dc_max_v", "n_trip_rpm"))
-    return fault_reaction(source.machine, source.inverter.U_dc_v, U_max, n_trip, rated.i_d_min_a, protection)
 
 
 def _encoder(source: MachineFile) -> dict[str, DesignValue]:

@@ -30,7 +30,7 @@ from pmsmtool.design.loops.speed_loop import (
     symmetric_optimum,
     symmetric_ratio,
 )
-from pmsmtool.design.ratings import Ratings, rating_values, ratings, reaction_of, sag_facts
+from pmsmtool.design.ratings import Ratings, rating_values, ratings, sag_facts
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
@@ -79,12 +79,12 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
     """
     request = TuneRequest() if request is None else request
     V_limit = (1.0 - request.voltage_margin) * source.inverter.V_max_v
-    rated = ratings(source, V_limit)
+    rated = ratings(source, V_limit, request.overspeed_protection)
     values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}
-    values |= rating_values(source, rated, request.overspeed_protection)
-    reaction = reaction_of(source, rated, values, request.overspeed_protection)
-    told = (reaction.note,) if reaction.note else ()
-    generation = {} if math.isinf(reaction.generation_rpm) else {"generation_rpm": reaction.generation_rpm}
+    values |= rating_values(source, rated)
+    told = (rated.reaction.note,) if rated.reaction.note else ()
+    n_ucg = rated.reaction.generation_rpm
+    generation = {} if math.isinf(n_ucg) else {"generation_rpm": n_ucg}
     choice = choose_current(source, request, rated.I_max_apk)
     weakening = design_field_weakening(source, rated, _weakening_mode(source, request), request.voltage_margin)
     gains = {axis: choice.gains(axis) for axis in "dq"}

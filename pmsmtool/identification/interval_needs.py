@@ -17,7 +17,7 @@ import numpy as np
 
 from pmsmtool.design.headroom import headroom
 from pmsmtool.design.loops.margins import MarginProblem, MarginRequest, evaluate, margin_problem
-from pmsmtool.design.ratings import base_speed_rpm, ratings
+from pmsmtool.design.ratings import base_speed_rpm, ratings_of
 from pmsmtool.design.tolerance import PARAMETERS, Samples
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
@@ -94,7 +94,7 @@ def interval_needs(
     try:
         design = tune(source, _BARE)
         problem = margin_problem(design)
-        rated = ratings(source, problem.limits.utilisation * source.inverter.U_dc_v)
+        rated = ratings_of(design)
         base_rpm = base_speed_rpm(source, rated.I_nom_apk, rated.i_d_min_a, source.inverter.V_max_v)
     except (ConfigError, DesignInfeasible):
         return without_design

@@ -3,8 +3,9 @@
 
 With the gates off the diodes rectify the back-EMF: above the speed at which its line-to-line amplitude reaches the
 link's limit the rotor drives the voltage there (Jahns and Caliskan, IEEE Trans. Ind. Appl. 35 (1999) 1347-1357).
-Shorted windings keep the link out of it; their flux linkage stands still in the stator frame while the rotor turns, so
-i_d passes -(psi_f + |psi|)/L_d, |psi| being the linkage at the instant of the short circuit; R takes some of that away.
+A brake chopper that takes the rectified current, psi_f/L_d at most, holds it. Shorted windings keep the link out of it;
+their flux linkage stands still in the stator frame while the rotor turns, so i_d passes -(psi_f + |psi|)/L_d, |psi|
+being the linkage at the instant of the short circuit; R takes some of that away. With neither, no speed beyond it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ COLD_C = 0.0
 
 Protection = Literal["chopper", "short-circuit"]
 """What keeps the link below its limit at a fault: a brake chopper that a person states, or shorted windings."""
-HINT = "fit a brake chopper and state it (--overspeed-protection chopper), or lower n_max"
+SPEED_ROOM = 1.05
+"""Over-speed trip over the largest speed, at least: what a speed loop overshoots."""
+HINT = "fit a brake chopper and state it (--overspeed-protection chopper, or U_dc_chopper_v), or lower n_max_rpm"
 
 
 def generation_rpm(machine: MachineParameters, U_dc_max_v: float) -> float:
@@ -46,6 +49,8 @@ class FaultReaction:
         Speed of uncontrolled generation (rpm).
     short_from_rpm : float
         Speed (rpm) above which a fault shorts the windings; 0: it removes the gates at every speed.
+    trip_most_rpm : float
+        Largest over-speed trip (rpm) at which this reaction keeps the link below its limit; infinity: any.
     how : str
         Why.
     note : str
@@ -54,8 +59,14 @@ class FaultReaction:
 
     generation_rpm: float
     short_from_rpm: float
+    trip_most_rpm: float
     how: str
     note: str
+
+    @property
+    def n_most_rpm(self) -> float:
+        """Largest speed (rpm) below that trip."""
+        return self.trip_most_rpm / SPEED_ROOM
 
 
 def fault_reaction(
@@ -75,11 +86,11 @@ def fault_reaction(
     U_dc_nom_v, U_dc_max_v : float
         Nominal voltage of the link and its limit (V).
     n_trip_rpm : float
-        Largest speed at which a fault can occur (rpm).
+        Largest speed at which a fault can occur (rpm), as asked for.
     i_d_min_a : float
         Most negative i_d that the magnet stands (A).
     protection : str, optional
-        What a person states or asks for; None: a short circuit where the magnet stands it.
+        What a person states or asks for; None: a short circuit where the magnet stands it, else no speed beyond.
 
     Raises
     ------
@@ -87,23 +98,30 @@ def fault_reaction(
         A short circuit is asked for that demagnetises the machine; or nothing protects the link at a fault at the
         machine's rated speed.
     """
+    any_rpm = math.inf
     from_rpm = generation_rpm(machine, U_dc_max_v)
     if n_trip_rpm <= from_rpm:
-        return FaultReaction(from_rpm, 0.0, "gates off: the back-EMF stays below U_dc_max at n_trip", "")
-    if protection == "chopper":
-        return FaultReaction(from_rpm, 0.0, "gates off: a brake chopper holds the DC link, as stated", "")
+        return FaultReaction(from_rpm, 0.0, any_rpm, "gates off: the back-EMF stays below U_dc_max at n_trip", "")
     psi = _cold(machine)
-    # the voltage limit at that speed bounds the linkage there: V_max / omega = psi U_nom / U_max
-    peak = -psi * (1.0 + U_dc_nom_v / U_dc_max_v) / machine.L_d_decoupling_h
+    if protection == "chopper":
+        rectified, note = -psi / machine.L_d_decoupling_h, ""
+        if rectified < i_d_min_a:
+            note = (
+                f"a fault above {from_rpm:.4g} rpm rectifies through the brake chopper: i_d can reach {rectified:.4g} "
+                f"A, beyond the {i_d_min_a:.4g} A allowed (magnet)"
+            )
+        return FaultReaction(from_rpm, 0.0, any_rpm, "gates off: a brake chopper holds the DC link, as stated", note)
+    # from where the back-EMF reaches the nominal link: the linkage at the voltage limit is that of the magnet there
+    peak = -2.0 * psi / machine.L_d_decoupling_h
     if peak >= i_d_min_a:
-        how = f"short circuit above uncontrolled generation: i_d to {peak:.4g} A at most, {i_d_min_a:.4g} A allowed"
-        return FaultReaction(from_rpm, from_rpm, how, "")
+        how = f"short circuit where the EMF reaches U_dc: i_d to {peak:.4g} A at most, {i_d_min_a:.4g} A allowed"
+        return FaultReaction(from_rpm, generation_rpm(machine, U_dc_nom_v), any_rpm, how, "")
     what = (
         f"a fault above {from_rpm:.4g} rpm charges the DC link over {U_dc_max_v:.4g} V (uncontrolled generation, up to "
         f"n_trip {n_trip_rpm:.4g} rpm); a short circuit would take i_d to {peak:.4g} A, beyond the "
         f"{i_d_min_a:.4g} A allowed"
     )
-    if protection is not None or (machine.n_nom_rpm or 0.0) > from_rpm:
+    if protection is not None or (machine.n_nom_rpm or 0.0) > from_rpm / SPEED_ROOM:
         raise DesignInfeasible(what, where="--overspeed-protection" if protection else "n_nom_rpm", hint=HINT)
-    note = f"{what}: {HINT}"
-    return FaultReaction(from_rpm, 0.0, "gates off: a short circuit takes i_d beyond its limit", note)
+    note = f"largest speed {from_rpm / SPEED_ROOM:.4g} rpm, trip at {from_rpm:.4g} rpm: {what}; {HINT}"
+    return FaultReaction(from_rpm, 0.0, from_rpm, "gates off: a short circuit takes i_d beyond its limit", note)

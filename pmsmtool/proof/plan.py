@@ -294,7 +294,8 @@ class _Sizes:
 
 def _generation_rpm(design: Design) -> float:
     """Speed (rpm) above which a fault charges the DC link; infinity where shorted windings or a chopper prevent it."""
-    chopper = design.request.get("overspeed_protection") == "chopper"
+    stated = design.machine.inverter.U_dc_chopper_v is not None
+    chopper = stated or design.request.get("overspeed_protection") == "chopper"
     protected = chopper or design["protection.n_short_circuit_rpm"] > 0.0
     return math.inf if protected else float(design.facts.get("generation_rpm", math.inf))
 

@@ -11,7 +11,7 @@ import pytest
 
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.parameters import MachineParameters
-from pmsmtool.machine.uncontrolled_generation import COLD_C, fault_reaction, generation_rpm
+from pmsmtool.machine.uncontrolled_generation import COLD_C, SPEED_ROOM, fault_reaction, generation_rpm
 from pmsmtool.units import rpm_from_rad_s
 from tests.firmware.linear_plant import LinearPlant
 
@@ -30,8 +30,9 @@ def test_the_peak_of_a_short_circuit_bounds_that_of_the_plant() -> None:
     """From every current at the voltage limit, at the speed of uncontrolled generation and above."""
     n = generation_rpm(MACHINE, U_MAX)
     told = fault_reaction(MACHINE, U_NOM, U_MAX, 2.0 * n, -1e3)
-    assert told.short_from_rpm == pytest.approx(n) and not told.note
-    bound = -PSI_COLD * (1.0 + U_NOM / U_MAX) / 2.3e-3
+    n = told.short_from_rpm
+    assert n == pytest.approx(generation_rpm(MACHINE, U_NOM)) and not told.note and math.isinf(told.n_most_rpm)
+    bound = -2.0 * PSI_COLD / 2.3e-3
     assert f"{bound:.4g} A at most" in told.how
     lowest = 0.0
     for share in (1.0, 1.5):
@@ -51,8 +52,10 @@ def test_a_magnet_that_does_not_stand_it_keeps_the_gates_off_and_says_so() -> No
     told = fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -56.0)
     assert told.short_from_rpm == 0.0 and "chopper" in told.note and f"{n:.4g} rpm" in told.note
     assert told.generation_rpm == pytest.approx(rpm_from_rad_s(U_MAX / (math.sqrt(3.0) * 4 * PSI_COLD)))
+    assert told.trip_most_rpm == pytest.approx(n) and told.n_most_rpm == pytest.approx(n / SPEED_ROOM)
     stated = fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -56.0, "chopper")
-    assert stated.short_from_rpm == 0.0 and not stated.note and "chopper" in stated.how
+    assert stated.short_from_rpm == 0.0 and "chopper" in stated.how and math.isinf(stated.trip_most_rpm)
+    assert f"i_d can reach {-PSI_COLD / 2.3e-3:.4g} A, beyond the -56 A allowed" in stated.note
     assert fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -1e3, "chopper").short_from_rpm == 0.0
     with pytest.raises(DesignInfeasible, match="i_d to .* beyond the -56 A allowed"):
         fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -56.0, "short-circuit")
@@ -67,5 +70,5 @@ def test_a_rated_speed_that_nothing_protects_is_refused() -> None:
     with pytest.raises(DesignInfeasible) as refused:
         fault_reaction(rated, U_NOM, U_MAX, 1.4 * n, -56.0)
     assert "--overspeed-protection chopper" in refused.value.hint
-    assert not fault_reaction(rated, U_NOM, U_MAX, 1.4 * n, -56.0, "chopper").note
-    assert fault_reaction(rated, U_NOM, U_MAX, 1.4 * n, -1e3).short_from_rpm == pytest.approx(n)
+    assert not fault_reaction(rated, U_NOM, U_MAX, 1.4 * n, -190.0, "chopper").note
+    assert fault_reaction(rated, U_NOM, U_MAX, 1.4 * n, -1e3).short_from_rpm > 0.0

@@ -30,7 +30,7 @@ from pmsmtool.design.loops.vector_margins import (
     speed_response,
     vector_margins,
 )
-from pmsmtool.design.ratings import ratings
+from pmsmtool.design.ratings import ratings_of
 from pmsmtool.design.tolerance import Samples, ToleranceBox
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
@@ -216,8 +216,7 @@ class BlockResult:
 def margin_problem(design: Design) -> MarginProblem:
     """Collect what the evaluation needs from a design."""
     source = design.machine
-    margin = design["field_weakening.margin"]
-    rated = ratings(source, (1.0 - margin) * source.inverter.V_max_v)
+    rated = ratings_of(design)
     T_s, delay = source.inverter.T_s, design["inverter.delay_periods"]
     machine = source.machine
     plants = {
@@ -239,7 +238,7 @@ def margin_problem(design: Design) -> MarginProblem:
     speed = _speed(design, source, gains["q"], plants["q"], predictor)
     crossover = 0.0 if speed is None else margins(speed).crossover_rad_s
     least = least_inductance(source, rated.I_max_apk)
-    cells = operating_cells(source, rated, margin)
+    cells = operating_cells(source, rated, design["field_weakening.margin"])
     return MarginProblem(machine, plants, least, gains, predictor, speed, crossover, cells, limits)
 
 
