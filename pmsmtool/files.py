@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+from difflib import get_close_matches
 from pathlib import Path
 
 from pmsmtool.errors import ConfigError
@@ -52,7 +53,7 @@ def read_bytes(path: Path, *, largest: int = TEXT_BYTES, hint: str = "check the 
                 raise too_large("the file", largest, where)
             content = stream.read() if regular else stream.read(largest + 1)
     except FileNotFoundError:
-        raise ConfigError("no such file", where=where, hint=hint) from None
+        raise ConfigError("no such file", where=where, likely=near_names(path), hint=hint) from None
     except ConfigError:
         raise
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
@@ -69,9 +70,23 @@ def read_text(path: Path, *, largest: int = TEXT_BYTES, encoding: str = "utf-8",
         text = read_bytes(path, largest=largest, hint=hint).decode(encoding)
     except UnicodeDecodeError as error:
         raise ConfigError(
-            f"cannot be read as text: {error}", where=str(path), hint="give a text file in UTF-8"
+            f"cannot be read as text: byte {error.start + 1} is not {encoding.upper()}",
+            where=str(path),
+            likely="an editor saved it in another encoding (UTF-16, Windows-1252), or it is no text",
+            hint="save it as UTF-8",
         ) from None
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+
+
+def near_names(path: Path) -> str:
+    """Return which file of the same folder may be meant, as a question; empty when none is near or readable."""
+    try:
+        names = [entry.name for entry in Path(path).parent.iterdir()]
+    except (OSError, ValueError):
+        return ""
+    typed = Path(path).name
+    near = [name for name in names if Path(name).stem == typed] or get_close_matches(typed, names, 2)
+    return f"did you mean {' or '.join(str(Path(path).with_name(name)) for name in near)}?" if near else ""
 
 
 def too_large(what: str, largest: int, where: str) -> ConfigError:
@@ -128,9 +143,12 @@ def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: 
             _sync_folder(path.parent)
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else "") or error
-        raise ConfigError(
-            f"cannot be written: {reason}", where=str(path), likely="a read-only or full disk", hint=hint
-        ) from error
+        likely = "a read-only or full disk"
+        if isinstance(error, FileNotFoundError):
+            likely = f"there is no folder {path.parent}"
+        elif isinstance(error, PermissionError):
+            likely = "you may not write there, or another program holds the file"
+        raise ConfigError(f"cannot be written: {reason}", where=str(path), likely=likely, hint=hint) from error
 
 
 def _sync_folder(folder: Path) -> None:

@@ -34,9 +34,11 @@ def parse_toml(text: str, *, where: str) -> dict[str, Any]:
         Not TOML, or a whole number beyond 64 bit.
     """
     try:
-        tables = tomllib.loads(text)
+        tables = tomllib.loads(text.removeprefix("\ufeff"))  # Windows editors begin UTF-8 with this mark
     except (ValueError, RecursionError) as error:  # beside its own error: numbers of 5000 digits, brackets 1000 deep
-        raise ConfigError(f"is not TOML: {error}", where=where, likely="a missing quote or bracket") from None
+        raise ConfigError(
+            f"is not TOML: {error}", where=where, likely="a missing quote or bracket, or a decimal comma"
+        ) from None
     for name, number in _whole_numbers(tables, ""):
         if not -LARGEST_WHOLE <= number < LARGEST_WHOLE:
             raise ConfigError("is a whole number beyond the 64 bit of TOML", where=f"{where}:{name}")
@@ -52,6 +54,14 @@ def read_toml(path: Path, *, hint: str = "check the path") -> dict[str, Any]:
         Missing, unreadable, or as :func:`parse_toml`.
     """
     return parse_toml(read_text(path, hint=hint), where=str(path))
+
+
+def written_value(text: str) -> Any:
+    """Return the value of ``KEY=VALUE`` as TOML reads it; what is no TOML is text."""
+    try:
+        return tomllib.loads(f"x = {text}")["x"]
+    except (ValueError, RecursionError):
+        return text.strip()
 
 
 def _whole_numbers(value: Any, name: str) -> Iterator[tuple[str, int]]:

@@ -74,9 +74,9 @@ _UNITS: tuple[Unit, ...] = (
     Unit("1", "ratio"),
     Unit("%", "ratio", ("percent",), exponent=-2),
     Unit("dB", "level"),
-    Unit("ohm", "resistance", ("Ohm", "\u03a9", "\u2126"), True),  # Greek omega, ohm sign
+    Unit("ohm", "resistance", ("Ohm", "ohms", "Ohms", "\u03a9", "\u2126"), True),  # Greek omega, ohm sign
     Unit("H", "inductance", (), True),
-    Unit("Wb", "flux linkage", ("Vs", "V s"), True),
+    Unit("Wb", "flux linkage", ("V s",), True),
     Unit("V", "voltage", (), True),
     Unit("A", "current", (), True),
     Unit("Hz", "frequency", (), True),
@@ -88,20 +88,20 @@ _UNITS: tuple[Unit, ...] = (
     Unit("rad/s", "angular speed"),
     Unit("1/s", "angular speed"),
     Unit("rpm", "angular speed", ("r/min", "1/min", "min-1"), True, factor=RAD_S_PER_RPM),
-    Unit("rad/s2", "angular acceleration", ("rad/s^2",)),
+    Unit("rad/s2", "angular acceleration", ()),
     Unit("rpm/s", "angular acceleration", factor=RAD_S_PER_RPM),
     Unit("rad/s3", "angular jerk"),
     Unit("rpm/s2", "angular jerk", factor=RAD_S_PER_RPM),
-    Unit("N m", "torque", ("Nm", "N*m"), True),
+    Unit("N m", "torque", (), True),
     Unit("N m/s", "torque slope"),
-    Unit("kg m2", "inertia", ("kgm2", "kg m^2", "kg*m^2", "kg m²", "kgm²")),
-    Unit("kg cm2", "inertia", ("kgcm2", "kg cm^2", "kg*cm^2", "kg cm²", "kgcm²"), exponent=-4),
-    Unit("g cm2", "inertia", ("gcm2", "g cm^2", "g*cm^2", "g cm²", "gcm²"), exponent=-7),
+    Unit("kg m2", "inertia", ()),
+    Unit("kg cm2", "inertia", exponent=-4),
+    Unit("g cm2", "inertia", exponent=-7),
     Unit("kg m2/Wb", "inertia over flux linkage"),
     Unit("kg m2 A/(N m)", "inertia over torque constant"),
     Unit("N m/Wb", "torque over flux linkage"),
-    Unit("N m s", "viscous friction", ("Nms", "Nm s", "Nms/rad"), True),
-    Unit("N m s2", "drag over speed squared", ("Nms2", "Nm s2"), True),
+    Unit("N m s", "viscous friction", ("N m s/rad",), True),
+    Unit("N m s2", "drag over speed squared", (), True),
     Unit("degC", "temperature", ("°C",)),
     Unit("K", "temperature difference"),
     Unit("1/K", "temperature coefficient", ("/K",)),
@@ -111,7 +111,7 @@ _UNITS: tuple[Unit, ...] = (
     Unit("F", "capacitance", (), True),
     Unit("J/K", "heat capacity", (), True),
     Unit("K/W", "thermal resistance"),
-    Unit("A s", "charge", ("As",), True),
+    Unit("A s", "charge", (), True),
     Unit("A/s", "current slope"),
     Unit("V/A", "gain V/A"),
     Unit("V/(A s)", "gain V/(A s)"),
@@ -161,24 +161,42 @@ def check_unit(symbol: str) -> Unit:
     )
 
 
+_JOINED = str.maketrans({" ": "", "*": "", "^": "", "\u00b7": "", "\u22c5": "", "\u00b2": "2", "\u00b3": "3"})
+"""How a person writes products and powers: none of it is told apart (``g cm2``, ``gcm^2``, ``g·cm²``)."""
+
+
+def _near_unit(spelled: str, dimension: str) -> str:
+    """Return which unit of the dimension may be meant, as a question; empty when none is near."""
+    names = [
+        prefix + unit.symbol.translate(_JOINED)
+        for unit in _UNITS
+        if unit.dimension == dimension
+        for prefix in (("", "m", "u", "k") if unit.prefixable else ("",))
+    ]
+    same = [name for name in names if name.casefold() == spelled.translate(_JOINED).casefold()]
+    near = same or get_close_matches(spelled, names, n=1, cutoff=0.7)
+    return f"did you mean {near[0]}?" if near else ""
+
+
 def _split(text: str, example: str) -> tuple[Decimal, str]:
     match = _NUMBER.fullmatch(text)
     if match is None or match[2].startswith(","):
-        likely = "a decimal comma" if "," in text else ""
+        likely = "a decimal comma: write a point" if "," in text else ""
         raise ConfigError(f"{text!r} is not a number with a unit", likely=likely, hint=f"write it like {example}")
     return Decimal(match[1]), match[2]
 
 
 def _spelled_unit(spelled: str, dimension: str) -> tuple[Unit, int] | None:
     """The unit a person wrote and the power of ten of its prefix; None when it is not of the dimension."""
+    joined = spelled.translate(_JOINED)
     for unit in _UNITS:
         if unit.dimension != dimension:
             continue
-        for name in (unit.symbol, *unit.spellings):
-            if spelled == name:
+        for name in (unit.symbol.translate(_JOINED), *(spelling.translate(_JOINED) for spelling in unit.spellings)):
+            if joined == name:
                 return unit, 0
-            if unit.prefixable and spelled[:1] in PREFIXES and spelled[1:].lstrip() == name:
-                return unit, PREFIXES[spelled[0]]
+            if unit.prefixable and joined[:1] in PREFIXES and joined[1:] == name:
+                return unit, PREFIXES[joined[0]]
     return None
 
 
@@ -210,7 +228,8 @@ def parse_quantity(text: str, dimension: str) -> float:
     if found is None:
         other = next((d for d in DIMENSIONS if _spelled_unit(spelled, d) is not None), None)
         reason = f"is a unit of {other}, not of {wanted.dimension}" if other else f"is no unit of {wanted.dimension}"
-        raise ConfigError(f"{spelled!r} in {text!r} {reason}", hint=f"write it like {example}")
+        near = "" if other else _near_unit(spelled, wanted.dimension)
+        raise ConfigError(f"{spelled!r} in {text!r} {reason}", likely=near, hint=f"write it like {example}")
     unit, prefix = found
     exact = float(value.scaleb(prefix + unit.exponent - wanted.exponent))
     return _finite(exact if unit.factor == wanted.factor else exact * (unit.factor / wanted.factor), text)

@@ -76,3 +76,24 @@ def test_the_usual_rights_of_a_new_file_are_kept(tmp_path):
     (tmp_path / "usual").touch()
     write_file(tmp_path / "ours", b"")
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+@pytest.mark.parametrize(("typed", "asked"), [("motr.toml", "motor.toml"), ("motor", "motor.toml"), ("q.bin", "")])
+def test_a_missing_file_asks_for_the_near_one(tmp_path, typed, asked):
+    (tmp_path / "motor.toml").touch()
+    with pytest.raises(ConfigError, match="no such file") as caught:
+        read_text(tmp_path / typed)
+    assert caught.value.likely == (f"did you mean {tmp_path / asked}?" if asked else "")
+
+
+def test_a_missing_folder_is_no_full_disk(tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        write_file(tmp_path / "none" / "out", b"")
+    assert caught.value.likely == f"there is no folder {tmp_path / 'none'}"
+
+
+def test_another_encoding_is_named(tmp_path):
+    (tmp_path / "m.toml").write_bytes("name = 'ü'".encode("utf-16"))
+    with pytest.raises(ConfigError, match="byte 1 is not UTF-8") as caught:
+        read_text(tmp_path / "m.toml")
+    assert "UTF-16" in caught.value.likely

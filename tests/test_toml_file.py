@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.toml_file import parse_toml, read_toml
+from pmsmtool.toml_file import parse_toml, read_toml, written_value
 
 
 def test_tables_are_returned(tmp_path: Path) -> None:
@@ -40,3 +40,13 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     path.write_bytes(b"a = '\xff'")
     with pytest.raises(ConfigError, match="cannot be read as text"):
         read_toml(path)
+
+
+def test_the_mark_of_windows_editors_is_no_mistake(tmp_path: Path) -> None:
+    path = tmp_path / "marked.toml"
+    path.write_bytes(b"\xef\xbb\xbfa = 1\n")
+    assert read_toml(path) == {"a": 1}
+
+
+def test_a_value_of_the_command_line_is_read_as_toml_and_else_as_text() -> None:
+    assert [written_value(text) for text in ("true", "1e3", "a", "[1, 2]", "0.5 ")] == [True, 1e3, "a", [1, 2], 0.5]

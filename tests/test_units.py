@@ -164,3 +164,26 @@ def test_quantities_take_a_customary_prefix():
     assert format_quantity(12000.0, "Hz") == "12 kHz"
     assert format_quantity(0.137, "ohm") == "0.137 ohm"
     assert format_quantity(0.577, "1") == "0.577"
+
+
+@pytest.mark.parametrize(
+    "text", ["832gcm2", "832 g cm2", "832gcm^2", "832 g\u00b7cm\u00b2", "832 g*cm^2", "8.32e-5kgm^2"]
+)
+def test_products_and_powers_are_written_in_many_ways(text):
+    assert parse_quantity(text, "inertia") == pytest.approx(8.32e-5, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "dimension", "asked"),
+    [
+        ("0.279mh", "inductance", "did you mean mH?"),
+        ("3480RPM", "angular speed", "did you mean rpm?"),
+        ("800hz", "frequency", "did you mean Hz?"),
+        ("832gm2", "inertia", "did you mean"),
+        ("5banana", "voltage", ""),
+    ],
+)
+def test_an_unknown_unit_is_asked_back(text, dimension, asked):
+    with pytest.raises(ConfigError) as caught:
+        parse_quantity(text, dimension)
+    assert caught.value.likely.startswith(asked) and bool(caught.value.likely) == bool(asked)

@@ -87,6 +87,7 @@ def _units() -> str:
     return "\n".join(
         [
             "A value carries its unit: 800Hz, 1.2mH, 1200rpm; prefixes p n u m k M G where the unit takes one.",
+            "Spaces, * and ^ make no difference: gcm2, g cm2 and g*cm^2 are one unit.",
             "A current carries its kind too: 12Apk (amplitude) or 8.5Arms. A bare number where a unit is due: refused.",
             "An option or key that ends in a unit (--bandwidth-hz, R_s_ohm) takes the bare number in that unit.",
             "",
@@ -155,7 +156,7 @@ def _simulation() -> str:
     return "\n".join(
         [
             "[simulation] of a machine file is for the simulated drive alone; design commands ignore it.",
-            "Each key is a switch: `simulate --set KEY=VALUE` changes it for one run.",
+            "For one run: `simulate --set KEY=VALUE`, or a simulated drive --sim 'NAME?KEY=VALUE&KEY=VALUE'.",
             "",
             *_keys(SIMULATION_KEYS),
             "",

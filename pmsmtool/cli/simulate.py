@@ -110,17 +110,14 @@ def _list(out: Output) -> None:
 
 def _changes(given: tuple[str, ...]) -> dict[str, Any]:
     """``KEY=VALUE`` as TOML would read it; a bare word is text."""
-    import tomllib
+    from pmsmtool.toml_file import written_value
 
     found: dict[str, Any] = {}
     for text in given:
         name, equals, value = text.partition("=")
         if not equals:
             raise click.UsageError(f"--set {text!r} is not KEY=VALUE")
-        try:
-            found[name.strip()] = tomllib.loads(f"x = {value}")["x"]
-        except tomllib.TOMLDecodeError:
-            found[name.strip()] = value.strip()
+        found[name.strip()] = written_value(value)
     return found
 
 

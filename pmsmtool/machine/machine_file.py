@@ -28,7 +28,7 @@ from pmsmtool.machine.parameters import (
     MachineLimits,
     MachineParameters,
 )
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.profile import NAMED, machine_path
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS, resolved_simulation
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
@@ -104,7 +104,7 @@ def load_machine_file(source: str | Path) -> MachineFile:
         There is no such file, it cannot be read, or everything that is wrong in it.
     """
     path = machine_path(source)
-    text = read_text(path, hint="`pmsmtool sim list` names the profiles")
+    text = read_text(path, hint=NAMED)
     return parse_machine(text, where=str(path), folder=Path(path).parent)
 
 

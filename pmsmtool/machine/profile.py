@@ -6,7 +6,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import near_names
 from pmsmtool.resources import data_folder
+
+NAMED = "`pmsmtool sim list` names the profiles, `pmsmtool machine new` writes a file from a data sheet"
+"""Next step where a machine is not found."""
 
 
 def profile_names() -> list[str]:
@@ -41,6 +45,6 @@ def machine_path(source: str | Path) -> Path:
     near = get_close_matches(str(source), profile_names(), 3)
     raise ConfigError(
         f"no profile and no file is named {str(source)!r}",
-        likely=f"did you mean {' or '.join(near)}?" if near else "",
-        hint="`pmsmtool sim list` names the profiles",
+        likely=f"did you mean {' or '.join(near)}?" if near else near_names(path),
+        hint=NAMED,
     )

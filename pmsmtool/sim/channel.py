@@ -20,12 +20,14 @@ NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
 ``jitter`` how late (s) a process data object is sent at most; default: not late
 ``speed``  how fast idle time passes at most, as a multiple of the wall clock; default: at once
 ========== =============================================================================================
+
+Any key of ``[simulation]`` may stand here, too (``leads_swapped=true``), and outranks that of the machine file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +38,7 @@ from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
 from pmsmtool.sim.faults import load_faults
 from pmsmtool.sim.line import Line
 from pmsmtool.sim.node.face import DriveFace
@@ -44,6 +47,7 @@ from pmsmtool.sim.node.family import TIER_HIDES, Face, Reduced
 from pmsmtool.sim.node.lss import UNCONFIGURED
 from pmsmtool.sim.node.memory import FileStorage, Memory, RamStorage, Storage
 from pmsmtool.sim.node.node import Node
+from pmsmtool.toml_file import written_value
 
 if TYPE_CHECKING:
     from pmsmtool.drive_maps.drive_map import DriveMap
@@ -81,6 +85,7 @@ class Channel:
     level: str | None = None
     filter: float = 0.0
     jitter: float = 0.0
+    simulation: Mapping[str, Any] = field(default_factory=dict)
 
 
 def _whole(low: int, high: int) -> Callable[[str], int]:
@@ -130,6 +135,7 @@ _KEYS: dict[str, Callable[[str], Any]] = {
 }
 
 
+_SIMULATION = frozenset(key.name for key in SIMULATION_KEYS)
 _OLDER = {"tier": "level"}
 """Older names of keys, which scripts may still use."""
 
@@ -143,13 +149,19 @@ def parse_channel(text: str | None) -> Channel:
     ConfigError
         Everything that is wrong with the string.
     """
-    name, _, query = (text or "").partition("?")
+    name, begun, query = (text or "").partition("?")
     values: dict[str, Any] = {}
+    changes: dict[str, Any] = {}
     violations = []
+    if not begun and "=" in name:
+        violations.append("a ? is missing: it stands between the name and the first key")
     for typed, value in parse_qsl(query, keep_blank_values=True):
         key = _OLDER.get(typed, typed)
+        if key not in _KEYS and key in _SIMULATION:
+            changes[key] = written_value(value)
+            continue
         if key not in _KEYS:
-            near = get_close_matches(key, _KEYS, 1)
+            near = get_close_matches(key, [*_KEYS, *_SIMULATION], 1)
             violations.append(f"{key}: unknown key" + (f", did you mean {near[0]}?" if near else ""))
             continue
         try:
@@ -160,10 +172,10 @@ def parse_channel(text: str | None) -> Channel:
         raise ConfigError(
             "the channel of the simulated bus cannot be used",
             where=f"channel {text!r}",
-            hint=f"NAME[?key=value&...] with {', '.join(_KEYS)}",
+            hint=f"NAME[?key=value&...] with {', '.join(_KEYS)}, or a key of `pmsmtool help simulation`",
             violations=violations,
         )
-    return Channel(name=name or DEFAULT_PROFILE, **values)
+    return Channel(name=name or DEFAULT_PROFILE, simulation=changes, **values)
 
 
 def _storage(channel: Channel, stem: str, position: int) -> Storage:
@@ -241,6 +253,7 @@ def build_line(
         The machine file, the faults file or the memory cannot be used, or there are not so many node ids.
     """
     from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.sim.simulated_machine import with_simulation
 
     first = DEFAULT_NODE_ID if channel.node is None else channel.node
     if first != UNCONFIGURED and first + channel.nodes - 1 > LARGEST_NODE_ID:
@@ -248,7 +261,7 @@ def build_line(
             f"node ids {first} .. {first + channel.nodes - 1} exceed {LARGEST_NODE_ID}", where=f"channel {channel.name}"
         )
     path = machine_path(channel.name)
-    machine_file = load_machine_file(path)
+    machine_file = with_simulation(load_machine_file(path), channel.simulation)
     face = _face(channel, machine_file)
     other = channel.drive if channel.eds is None else channel.eds.replace("#", "-").replace("/", "-")
     stem = path.stem if face is None or isinstance(face, Reduced) else f"{path.stem}-{Path(str(other)).stem}"

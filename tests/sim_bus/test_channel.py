@@ -127,3 +127,23 @@ def test_every_profile_makes_a_drive(name: str) -> None:
     assert int(client.number(0x6041, 0, "H")) & 0x6F == 0x27
     assert client.number(0x603F, 0, "H") == 0
     bus.shutdown()
+
+
+def test_a_string_changes_the_simulated_drive() -> None:
+    channel = parse_channel("interior-2k2?leads_swapped=true&drive_fault=safe_torque_off&serial=7&nv=:memory:")
+    assert channel.simulation == {"leads_swapped": True, "drive_fault": "safe_torque_off", "serial": 7}
+    seen = []
+    build_line(channel, make_core=lambda machine_file, seed: seen.append(machine_file) or SimpleCore())  # type: ignore[func-returns-value]
+    assert seen[0].simulation.items() >= dict(channel.simulation).items()
+
+
+def test_a_bad_value_of_a_simulated_drive_is_named() -> None:
+    with pytest.raises(ConfigError, match="leads_swapped is text, allowed are true and false"):
+        build_line(parse_channel("interior-2k2?leads_swapped=yes"), make_core=lambda machine_file, seed: SimpleCore())
+    with pytest.raises(ConfigError, match="did you mean leads_swapped"):
+        parse_channel("p?leads_swap=true")
+
+
+def test_a_string_without_its_question_mark_says_so() -> None:
+    with pytest.raises(ConfigError, match=r"a \? is missing"):
+        parse_channel("motor.toml&drive=epos4")
