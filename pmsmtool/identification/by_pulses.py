@@ -31,6 +31,7 @@ from pmsmtool.identification.push_limits import not_told, without
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method
 from pmsmtool.identification.run_files import MACHINE, place_of
 from pmsmtool.identification.supply_power import resistance_by_supply
+from pmsmtool.identification.wiring import judge_pulses
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K, magnet_tolerance_per_k
@@ -55,6 +56,8 @@ TOO_WIDE = "E_NOT_IDENTIFIABLE"
 """Refusal of ratios whose interval is too wide: the flux linkage beside them stands, and the chain goes on."""
 LIGHT_SHAFT = "a bare shaft with little inertia: the torque that is safe if the tool fails hardly exceeds friction"
 ADD_INERTIA = "couple an inertia to the shaft and say --shaft coupled, or allow more current (--i-max)"
+SIGN = "encoder sign"
+CHECK_WIRING = "switch off and measure the three line-line resistances; `pmsmtool check` looks at the wiring"
 UNDECIDED = "no source says whether this drive's amperes are peak or rms: the interval holds for both"
 Voltage = Literal["machine", "link", ""]
 
@@ -214,6 +217,12 @@ def _by_torque(
     missing = {"R_s_ohm": NO_POWER, "L_d_h, L_q_h": NO_VOLTAGE}
     estimates: dict[str, Estimate] = {}
     too_wide: IdentificationError | None = None
+    for wrong in judge_pulses(pushes):
+        if wrong.looked_at == "phases":
+            raise IdentificationError(
+                "E_PHASE_OPEN", wrong.shown, where="torque pulses", likely=wrong.likely, hint=CHECK_WIRING
+            )
+        missing[SIGN] = f"{wrong.shown} (likely {wrong.likely}; try: `pmsmtool check`)"
     try:
         estimates = estimate_ratios(pushes, pole_pairs=pole_pairs or 1, tolerance=tolerance)
     except IdentificationError as error:
@@ -339,7 +348,13 @@ def evaluated_stage(
         place, prefix = place_of(run, text)
         place.save(MACHINE, text)
         files[f"{prefix}{MACHINE}"] = ""
-    stage = stage_of(result.estimates, result.missing, made, judgement, facts.source)
+    missing = dict(result.missing)
+    wrong = {SIGN: missing.pop(SIGN)} if SIGN in missing else {}
+    stage = stage_of(result.estimates, missing, made, judgement, facts.source)
+    if wrong:  # inertia and friction are right all the same: said beside them, so that nobody closes a speed loop on it
+        status = "partial" if stage.status == "pass" else stage.status
+        said = f"{stage.summary}; {SIGN}: {wrong[SIGN]}"
+        stage = replace(stage, status=status, summary=said, refused={**stage.refused, **wrong})
     fallbacks = [*stage.fallbacks, facts.limit] if facts.limit else stage.fallbacks
     return replace(stage, files=files, fallbacks=fallbacks)
 

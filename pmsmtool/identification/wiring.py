@@ -9,6 +9,7 @@ it: four counts per line, and poles given for pole pairs.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,11 +40,17 @@ HALL_WAY_RAD = math.radians(455.0)
 LEAST_CURRENT = 0.3
 """Current that is shown at the end of a push, of the one asked for: less is not given. (A reading as peak of what is
 rms makes 0.71, and a slow current loop is not at its end.)"""
+LEAST_SAMPLES = 8
+"""Of a torque pulse whose bend is looked at."""
 NOT_LED = "the vector does not lead the rotor"
 HALLS_BY = "Hall wires of the connector; two motor leads swapped, if the encoder's sign is wrong, too"
 HELD_BY = "brake shut, or the shaft is held; an encoder that does not count; friction above this torque"
 SLIPS_BY = "friction, cogging or a load beyond this torque; a brake that is half open"
-SIGN_BY = "two motor leads swapped, or the encoder's tracks; identify finds the sign by itself and sets it"
+SIGN_BY = "two motor leads swapped, or the encoder's tracks"
+SIGN_FOUND = f"{SIGN_BY}; identify finds the sign by itself and sets it"
+POLARITY_BY = f"the polarity of the position (0x607E), or {SIGN_BY}"
+FALLS = "the position falls under positive torque"
+OPEN_BY = "an open phase, or the supply in current limit"
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +116,7 @@ def judge_turn(turn: Trace, pole_pairs: int, counts_against: bool) -> list[Findi
         _pole_pairs(abs(ratio), pole_pairs, LAG_RAD / way_rad),
         Finding("encoder sign", OK, seen)
         if against == counts_against
-        else Finding("encoder sign", WRONG, seen, SIGN_BY),
+        else Finding("encoder sign", WRONG, seen, SIGN_FOUND),
     ]
 
 
@@ -168,7 +175,7 @@ def judge_current(turn: Trace, i_a: float) -> list[Finding]:
     if share >= LEAST_CURRENT:
         return []
     seen = f"at a tenth of the angles {100.0 * share:.2g} % of the current asked for is shown, or less"
-    return [Finding("phases", WRONG, seen, "an open phase, or the supply in current limit")]
+    return [Finding("phases", WRONG, seen, OPEN_BY)]
 
 
 def judge_push(pushes: Trace) -> list[Finding]:
@@ -190,7 +197,7 @@ def judge_push(pushes: Trace) -> list[Finding]:
     found = []
     if share < LEAST_CURRENT:
         seen = f"the drive shows {100.0 * share:.2g} % of the current asked for"
-        found.append(Finding("phases", WRONG, seen, "an open phase, or the supply in current limit"))
+        found.append(Finding("phases", WRONG, seen, OPEN_BY))
     if not np.any(way):
         return [*found, Finding("shaft", NOT_SEEN, "what is wrong comes first")]
     if way[0] * way[1] >= 0.0:
@@ -198,9 +205,33 @@ def judge_push(pushes: Trace) -> list[Finding]:
         return [*found, Finding("shaft", WRONG, seen, "a load that turns the shaft; the encoder's sign or offset")]
     found.append(Finding("shaft", OK, f"torque forth and back moves it by {ways}"))
     if way[0] * command[0] < 0.0:
-        seen = "the position falls under positive torque"
-        return [*found, Finding("encoder sign", WRONG, seen, "the polarity of the position (0x607E), or " + SIGN_BY)]
+        return [*found, Finding("encoder sign", WRONG, FALLS, POLARITY_BY)]
     return [*found, Finding("encoder sign", OK, "the position grows under positive torque")]
+
+
+def judge_pulses(pulses: Sequence[Trace]) -> list[Finding]:
+    """Return what longer torque pulses show to be wrong: no current that was asked for, a position that falls.
+
+    Parameters
+    ----------
+    pulses : sequence of Trace
+        ``theta_M_rad``, ``i_q_a``, and in the conditions the ``i_command_a`` of each.
+    """
+    known = [pulse for pulse in pulses if len(pulse) > LEAST_SAMPLES and pulse.meta.get("i_command_a")]
+    if not known:
+        return []
+    commands = [float(pulse.meta["i_command_a"]) for pulse in known]
+    shown = np.concatenate([pulse["i_q_a"][len(pulse) // 4 :] / i for pulse, i in zip(known, commands, strict=True)])
+    low, share = (float(np.percentile(shown, percent)) for percent in (10.0, 50.0))
+    if share < LEAST_CURRENT:
+        return [Finding("phases", WRONG, f"the drive shows {100.0 * share:.2g} % of the current asked for", OPEN_BY)]
+    if low < LEAST_CURRENT * share:  # 0.87 to 0.98 of it on healthy drives, 0.02 to 0.1 with an open phase that turns
+        seen = f"at a tenth of the angles {100.0 * max(0.0, low):.2g} % of the current asked for is shown, or less"
+        return [Finding("phases", WRONG, seen, OPEN_BY)]
+    bends = [float(np.polyfit(pulse.t_s - pulse.t_s[0], pulse["theta_M_rad"], 2)[0]) for pulse in known]
+    if sum(math.copysign(1.0, bend * i) for bend, i in zip(bends, commands, strict=True)) < 0.0:
+        return [Finding("encoder sign", WRONG, FALLS, POLARITY_BY)]
+    return []
 
 
 def judge_sensors(vectors: Trace) -> Finding:

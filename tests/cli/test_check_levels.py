@@ -14,7 +14,7 @@ from pmsmtool.commissioning.first_check_tiers import beyond, judge_kept
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import LimitExceeded
 from pmsmtool.experiments.first_push import WAY_RAD, push_forth_and_back
-from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG, judge_current, judge_push
+from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG, judge_current, judge_pulses, judge_push
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.trace import Trace
@@ -141,3 +141,38 @@ def test_a_slow_current_loop_does_not_push_the_shaft_further() -> None:
 def test_a_limit_is_about_what_it_shows(quantity: str, turns: bool, about: str, verdict: str) -> None:
     row = beyond(LimitExceeded(quantity, 2.0, 1.0, "A"), turns)
     assert (row.looked_at, row.verdict) == (about, verdict)
+
+
+def pulsed(shown: float, sense: float, noise_rad: float = 0.0, seed: int = 1) -> list[tuple[str, str]]:
+    """Verdicts on twelve pulses of which ``shown`` of the command is seen and that move the shaft in ``sense``."""
+    rng, pulses = np.random.default_rng(seed), []
+    for command in (0.3, -0.3, 0.3, -0.3, 0.5, -0.5, 0.5, -0.5, 0.7, -0.7, 0.7, -0.7):
+        t = np.linspace(0.0, 0.08, 80)
+        way = sense * 40.0 * command * t * t - 2.0 * command * t + rng.normal(0.0, noise_rad, len(t))
+        signals = {"theta_M_rad": way, "i_q_a": np.full(len(t), shown * command)}
+        pulses.append(Trace(t, signals, {"theta_M_rad": "rad", "i_q_a": "A"}, {"i_command_a": command}))
+    return [(row.looked_at, row.verdict) for row in judge_pulses(pulses)]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_pulses_of_identify_show_a_missing_current_and_a_wrong_sign(seed: int) -> None:
+    """The bend of the least pulse is 0.08 rad in its time; an encoder of 1024 counts leaves 2 mrad of noise."""
+    assert pulsed(0.97, 1.0, 2e-3, seed) == pulsed(0.71, 1.0, 2e-3, seed) == []
+    assert pulsed(0.97, -1.0, 2e-3, seed) == [("encoder sign", WRONG)]
+    assert pulsed(0.21, 1.0, 2e-3, seed) == [("phases", WRONG)]
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize(
+    ("key", "code", "named"),
+    [
+        ("leads_swapped=true", 10, "encoder sign: the position falls under positive torque"),
+        ("phase_open=a", 6, "an open phase, or the supply in current limit"),
+        ("drive_fault=not_connected", 6, "a motor lead that is not connected"),
+    ],
+)
+def test_identify_names_wrong_wiring_of_an_epos4(tool: Tool, key: str, code: int, named: str) -> None:
+    """Before, an open phase was called a shaft with little inertia, and swapped leads were not named at all."""
+    channel = f"interior-2k2?nv=:memory:&drive=epos4&{key}"
+    got, out, told = tool("-i", "pmsmsim", "-c", channel, "identify", "mechanics", "--yes")
+    assert got == code and named in out + told
