@@ -216,7 +216,8 @@ def _bound_violations(name: str, value: float) -> list[str]:
 def _table_violations(values: Mapping[str, float], tables: Mapping[str, Sequence[float]]) -> list[str]:
     """Compare the tables with their descriptors, as far as the set holds them."""
     look_up = {name: table for name, table in tables.items() if name in LUT_NAMES}
-    return [*_saturation_violations(values, tables.get(SATURATION, ())), *_look_up_violations(values, look_up)]
+    nodes = tables.get(SATURATION, ())
+    return [*_saturation_violations(values, nodes), *_look_up_violations(values, look_up, len(nodes))]
 
 
 def _saturation_violations(values: Mapping[str, float], nodes: Sequence[float]) -> list[str]:
@@ -228,7 +229,9 @@ def _saturation_violations(values: Mapping[str, float], nodes: Sequence[float]) 
     return []
 
 
-def _look_up_violations(values: Mapping[str, float], tables: Mapping[str, Sequence[float]]) -> list[str]:
+def _look_up_violations(
+    values: Mapping[str, float], tables: Mapping[str, Sequence[float]], saturation_words: int
+) -> list[str]:
     """NaN marks a cell without a point."""
     found = []
     for name, table in tables.items():
@@ -247,7 +250,7 @@ def _look_up_violations(values: Mapping[str, float], tables: Mapping[str, Sequen
         given = len(tables.get(name, ()))
         if given != (count if present else 0):
             found.append(f"{name} has {given} numbers, the descriptor says {count if present else 'no table'}")
-    words = n_x + n_y + n_z + 2 * (n_x * n_y * n_z if kind == 1 else (n_x * n_y * n_z + 1) // 2)
+    words = n_x + n_y + n_z + 2 * (n_x * n_y * n_z if kind == 1 else (n_x * n_y * n_z + 1) // 2) + saturation_words
     if present and words > LUT_CAPACITY_WORDS:
         found.append(f"axes and tables need {words} words, the drive has {LUT_CAPACITY_WORDS}")
     return found

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from benchmarks.default_governor import draw
 from pmsmtool.cli.main import cli
 from pmsmtool.design.lookup import design as lookup_design
 from pmsmtool.design.lookup.design import LookupDesign, LookupRequest, design_table
@@ -32,14 +33,16 @@ from pmsmtool.design.lookup.loci import loci
 from pmsmtool.design.lookup.table import CUT, RPM, LookupTable, electrical_speed, flux_table, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.design.ratings import ratings
+from pmsmtool.design.tune import tune
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.firmware.core_binding import core
-from pmsmtool.firmware.image import pack_image
+from pmsmtool.firmware.image import lut_size_words, pack_image
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS
 from pmsmtool.params.parameter_set import ParameterSet, default_set
+from pmsmtool.sim.closed_loop import image_of
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 M = OperatingMachine(4, 0.05, 1e-3, 2.5e-3, 0.1)
@@ -472,3 +475,17 @@ def test_a_table_of_a_design_uses_its_limits(tmp_path: Path) -> None:
 def test_capacity_is_the_drives() -> None:
     assert table_words(63, 63, 1, "float32") <= LUT_CAPACITY_WORDS < table_words(64, 64, 1, "float32")
     assert isinstance(interpolation_error(made("interior-2k2").table), InterpolationError)
+
+
+def test_a_table_leaves_room_for_the_saturation_table() -> None:
+    """75 x 53 nodes in float32 need 8079 words, with the saturation table 8275: the drive refused the set of `tune`."""
+    source = draw("saturated", 8601)
+    stored = tune(source).parameter_set()
+    words = lut_size_words(stored.values)
+    assert words <= LUT_CAPACITY_WORDS and not stored.violations()
+    assert len(image_of(source, stored)) > 4 * words
+    zeros = (0.0,) * (75 * 53)
+    nodes = {"lut.i_d_a": zeros, "lut.i_q_a": zeros, "lut.axis_x": tuple(map(float, range(75)))}
+    full = {**stored.values, "lut.format": 1.0, "lut.n_x": 75.0}
+    full_set = replace(stored, values=full, tables={**stored.tables, **nodes})
+    assert any("axes and tables need 8275 words" in line for line in full_set.violations())

@@ -35,7 +35,8 @@ from pmsmtool.design.ratings import SAG_SHARE, Ratings
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS
+from pmsmtool.machine.saturation_table import NODES_D, NODES_Q
+from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS, SATURATION_VALUES
 
 Array = NDArray[np.float64]
 
@@ -170,7 +171,7 @@ def design_table(
     torque = problem.largest_torque()
     if request.torque_points is not None and request.y_points is not None:
         x = np.linspace(-torque, torque, request.torque_points)
-        stored = _fitting(request, x.size, y[1].size, problem.V_max.size)
+        stored = _fitting(request, _capacity_words(source), x.size, y[1].size, problem.V_max.size)
         table = as_stored(problem.solve(*stored_axes(x, y[1], problem.U_dc)), stored)
         return LookupDesign(table, stored, interpolation_error(table), (*notes, *problem.flux_note(table)))
     x = np.linspace(-torque, torque, FIRST_TORQUES)
@@ -178,7 +179,7 @@ def design_table(
     failed: DesignInfeasible | None = None
     for torque_bound, voltage_bound in _bounds(request):
         for stored in _formats(request, first=failed is None):
-            bounds = GridBounds(torque_bound * torque, voltage_bound * limit, stored, LUT_CAPACITY_WORDS)
+            bounds = GridBounds(torque_bound * torque, voltage_bound * limit, stored, _capacity_words(source))
             try:
                 table, error = refined_table(problem.solve, x, y[0], problem.U_dc, bounds)
             except DesignInfeasible as refused:
@@ -217,12 +218,17 @@ def _wider(request: LookupRequest, torque_bound: float, voltage_bound: float) ->
     )
 
 
-def _fitting(request: LookupRequest, n_x: int, n_y: int, n_z: int) -> StoredFormat:
+def _capacity_words(source: MachineFile) -> int:
+    """Words that the saturation table of a flux map leaves."""
+    return LUT_CAPACITY_WORDS - (NODES_D * NODES_Q * SATURATION_VALUES if source.flux_map is not None else 0)
+
+
+def _fitting(request: LookupRequest, capacity: int, n_x: int, n_y: int, n_z: int) -> StoredFormat:
     """Format of a uniform table: as asked, else float32 unless only int16 fits the drive."""
     if request.stored == "int16":
         return "int16"
-    if request.stored == "auto" and table_words(n_x, n_y, n_z, "float32") > LUT_CAPACITY_WORDS:
-        return "int16" if table_words(n_x, n_y, n_z, "int16") <= LUT_CAPACITY_WORDS else "float32"
+    if request.stored == "auto" and table_words(n_x, n_y, n_z, "float32") > capacity:
+        return "int16" if table_words(n_x, n_y, n_z, "int16") <= capacity else "float32"
     return "float32"
 
 
