@@ -23,7 +23,7 @@ from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.papers.closed_node import STANDARD, ClosedNode, Nodes, Seat
+from pmsmtool.papers.closed_drive import STANDARD, ClosedNode, Nodes, Seat
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.simulated_machine import with_simulation
 

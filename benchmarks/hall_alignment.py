@@ -24,7 +24,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.experiments.hall_turn import turn_over_halls
+from pmsmtool.experiments.rotation import turn_over_halls
 from pmsmtool.identification.hall import HallAlignment, hall_alignment
 from pmsmtool.machine.hall import HALL_ORDERS
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file

@@ -9,7 +9,7 @@
 Drives follow from their seeds (``random_drives.py``). The simulated node has the objects of its tier only:
 ``drive=cia402`` with the master's commutation angle, or the reference drive without excitation (``tier=recorder``) or
 averages (``tier=inject``). ``supply``: R of the standard tier from the readings of the simulated bench supply
-(``sim/bench_supply.py``). ``--speed`` is the largest speed that is allowed, over the nameplate's: the flux linkage of
+(``sim/channel.py``). ``--speed`` is the largest speed that is allowed, over the nameplate's: the flux linkage of
 the standard tier needs one at which the voltage ends. ``--no-machine``: no machine file tells that tier the inverter.
 Every estimate is printed on stderr as error and half width (relative, or in deg); with ``--record FILE`` it goes there
 too, and a second run goes on behind it.

@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pmsmtool.axis.loops import AxisGains, AxisPath
+from pmsmtool.axis.loops import AxisGains, AxisPath, best_share, following_error
 from pmsmtool.axis.mechanics import Mechanics, mechanics_of
 from pmsmtool.axis.reference import Profile, jerk_limited, plan
 from pmsmtool.axis.search import Box, Case, Judged, Limits, stiffest
-from pmsmtool.axis.tracking import best_share, following_error
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop
 from pmsmtool.design.loops.sampled_loop import SampledLoop

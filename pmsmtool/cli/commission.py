@@ -237,7 +237,7 @@ def _starts_blank(bus: BusOptions) -> bool:
 
 
 def _erase_memory(bus: BusOptions, out: Output) -> None:
-    from pmsmtool.sim.factory_memory import erase_memory
+    from pmsmtool.sim.channel import erase_memory
 
     channel = bus.channel
     if channel is None and bus.interface is None:

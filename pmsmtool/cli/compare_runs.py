@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pmsmtool.cli.options import FILE, examples, output_options
-from pmsmtool.cli.output import Output, table
-from pmsmtool.cli.output_file import figure_format, save_figure
+from pmsmtool.cli.output import Output, figure_format, save_figure, table
 
 if TYPE_CHECKING:
     from pmsmtool.machine.machine_file import MachineFile

@@ -36,7 +36,7 @@ def doctor_command(bus: BusOptions, out: Output, find_bitrate: bool, listen_s: f
     Lists what each usual adapter needs on this system, and the options for it. Exit code 3 when a bus is configured and
     no node answers on it. Ends within 60 s and the time of listening.
     """
-    from pmsmtool.bus.in_time import in_time
+    from pmsmtool.bus.connect import in_time
     from pmsmtool.errors import BusError
 
     rounds = 9.0 if find_bitrate else 1.0

@@ -322,7 +322,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison |
 
     from pmsmtool.cli.output import table
     from pmsmtool.errors import IdentificationError, Partial
-    from pmsmtool.identification.accuracy import accuracy_line, accuracy_told
+    from pmsmtool.identification.request import accuracy_line, accuracy_told
     from pmsmtool.report.report import total_interval
     from pmsmtool.report.verdict import on_which_drive
     from pmsmtool.units import format_estimate, format_quantity

@@ -42,7 +42,7 @@ def identify_hall(bus: BusOptions, motion: MotionOptions, out: Output, runs: Pat
     from pmsmtool.drive.envelope import Envelope
     from pmsmtool.drive.guard import guarded
     from pmsmtool.errors import NotAvailable
-    from pmsmtool.experiments.hall_turn import WAY_RAD, turn_over_halls
+    from pmsmtool.experiments.rotation import WAY_RAD, turn_over_halls
     from pmsmtool.identification.hall import hall_alignment
     from pmsmtool.run_directory import Stage
     from pmsmtool.trace_file import trace_npz

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.options import FILE, Quantity, examples, output_options, overspeed_option
-from pmsmtool.cli.output import Output, table
-from pmsmtool.cli.output_file import save_figure
+from pmsmtool.cli.output import Output, save_figure, table
 from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
@@ -73,8 +72,7 @@ def lut_command(
     """
     from pmsmtool.design.lookup.design import LookupRequest, design_table
     from pmsmtool.design.lookup.file import table_csv, table_facts, table_npz
-    from pmsmtool.design.lookup.iron_loss import load_iron_loss_map
-    from pmsmtool.design.lookup.loci import loci
+    from pmsmtool.design.lookup.loci import load_iron_loss_map, loci
     from pmsmtool.machine.flux_map_check import check_flux_map
     from pmsmtool.machine.profile import machine_path
 

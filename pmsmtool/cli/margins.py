@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""``pmsmtool margins``: what a design tolerates, over what the machine may be."""
+"""``pmsmtool margins``: what a design tolerates, over what the machine may be.
+
+Work of a batch is done by this process, a pool of processes, or a Dask cluster.
+"""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from pmsmtool.cli.options import FILE, Quantity, examples, output_options
-from pmsmtool.cli.output import Output, table
-from pmsmtool.cli.output_file import figure_format, inside, save_figure
+from pmsmtool.cli.output import Output, figure_format, inside, save_figure, table
+from pmsmtool.errors import BusError, NotAvailable
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
@@ -79,7 +84,7 @@ def margins_command(
     cores of this computer or on a Dask cluster. Exit code 1 when a margin asked for fails at a corner or at the 5th
     percentile, or when more than 5 % of the simulated drives trip.
     """
-    from pmsmtool.cli.scheduler import executor
+    from pmsmtool.cli.margins import executor
     from pmsmtool.commissioning.held_design import why_not_judged
     from pmsmtool.design.design_file import load_design
     from pmsmtool.design.loops.margins import MarginRequest, margin_report
@@ -217,3 +222,57 @@ def _table(spreads: Sequence[Spread] | Sequence[Observed], worst: str = "worst c
         verdict = "-" if s.least is None else "PASS" if s.ok else "FAIL"
         rows.append([s.name, s.unit, f"{s.nominal:.4g}", f"{s.worst:.4g}", *shares, asked, verdict])
     return table(heads, rows)
+
+
+@contextmanager
+def executor(scheduler: str, workers: int | None = None) -> Iterator[Any]:
+    """Open an executor with ``map``, as ``concurrent.futures``.
+
+    Parameters
+    ----------
+    scheduler : str
+        ``local`` (this process; None is given), ``processes``, or the address of a Dask scheduler
+        (``tcp://host:8786``).
+    workers : int, optional
+        Processes of the pool.
+
+    Raises
+    ------
+    NotAvailable
+        The extra ``cluster`` is not installed.
+    BusError
+        The cluster does not answer.
+    """
+    if scheduler == "local":
+        yield None
+    elif scheduler == "processes":
+        import concurrent.futures
+        import multiprocessing
+
+        # spawn: the parent may hold threads (a bus, a plot), which a forked child would inherit locked
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+            yield pool
+    else:
+        yield from _cluster(scheduler)
+
+
+def _cluster(address: str) -> Iterator[Any]:
+    try:
+        Client = importlib.import_module("distributed").Client
+    except ImportError:
+        raise NotAvailable(
+            "a Dask cluster needs the package distributed",
+            where=f"--scheduler {address}",
+            hint="pip install 'pmsmtool[cluster]', or --scheduler processes",
+        ) from None
+    try:
+        client = Client(address, timeout="10s", set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise BusError(
+            f"no Dask scheduler answers: {error}",
+            where=f"--scheduler {address}",
+            hint="start one with `dask scheduler`, or --scheduler processes",
+        ) from error
+    with client:
+        yield client.get_executor(pure=False, retries=3)

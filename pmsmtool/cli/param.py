@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.errors import PmsmtoolError
-    from pmsmtool.params.diff import Difference
-    from pmsmtool.params.parameter_set import ParameterSet
+    from pmsmtool.params.parameter_set import Difference, ParameterSet
 
 _ADDRESS = re.compile(r"(0[xX][0-9a-fA-F]{1,4})(?::([0-9a-fA-F]{1,2}))?")
 
@@ -167,7 +166,7 @@ def dump_command(bus: BusOptions, out: Output, everything: bool, path: Path | No
 def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, map_file: Path | None) -> None:
     """Compare any two of: device, default, a parameter set, a design, a DCF, a run directory."""
     from pmsmtool.errors import CheckFailed
-    from pmsmtool.params.diff import compare
+    from pmsmtool.params.parameter_set import compare
 
     drive_map = read_map(map_file)
     if "device" in (old, new):

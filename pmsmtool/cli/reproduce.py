@@ -51,7 +51,7 @@ def reproduce_command(
         raise click.UsageError("missing argument FIGURE: a name of --list, or all")
     if figure == "all" and (figure_path is not None or (path is not None and path.suffix.lower() in _SUFFIXES)):
         raise click.UsageError("all figures need a folder: -o DIR")
-    from pmsmtool.cli.output_file import figure_format
+    from pmsmtool.cli.output import figure_format
     from pmsmtool.errors import CheckFailed
     from pmsmtool.papers.registry import FIGURES, find, reproduce
 
@@ -141,7 +141,7 @@ def _text(found: Reproduction) -> Iterator[str]:
 
 
 def _write(found: Reproduction, path: Path | None, figure_path: Path | None, out: Output) -> None:
-    from pmsmtool.cli.output_file import make_folder, save_figure
+    from pmsmtool.cli.output import make_folder, save_figure
     from pmsmtool.files import write_file
     from pmsmtool.papers.drawing import csv_text, figure_of
 

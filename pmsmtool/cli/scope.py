@@ -119,7 +119,7 @@ def _draw_plainly(
 ) -> None:
     """Draw the signals over the last drawing while they come; where the output is no terminal, once at the end."""
     from pmsmtool.drive.objects import signal_unit
-    from pmsmtool.report.terminal_plot import ASCII, BLOCKS, terminal_plot
+    from pmsmtool.report.plots import ASCII, BLOCKS, terminal_plot
 
     units = {name: signal_unit(name) for name in samples.names}
     levels = BLOCKS if (sys.stdout.encoding or "").lower().replace("-", "") == "utf8" else ASCII

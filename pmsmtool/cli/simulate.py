@@ -67,7 +67,7 @@ def simulate_command(
         raise click.UsageError("which --scenario? --list names the built-in ones")
     if path is None and figure_path is None and not out.json:
         raise click.UsageError("nothing to write: give -o, --plot or --json")
-    from pmsmtool.cli.output_file import figure_format
+    from pmsmtool.cli.output import figure_format
     from pmsmtool.errors import ConfigError
     from pmsmtool.sim.simulate import find_drive, find_scenario, run_scenario
 
@@ -142,7 +142,7 @@ def _write(trace: Trace, path: Path | None, figure_path: Path | None, out: Outpu
         write_trace(trace, path)
         out.note(f"wrote {path}")
     if figure_path is not None:
-        from pmsmtool.cli.output_file import save_figure
+        from pmsmtool.cli.output import save_figure
         from pmsmtool.report.plots import trace_figure
 
         save_figure(trace_figure(trace, title=f"{trace.meta['machine']}: {trace.meta['scenario']}"), figure_path)

@@ -12,8 +12,7 @@ import click
 
 from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import FILE, examples, options_named, output_options, overspeed_option
-from pmsmtool.cli.output import Output, table
-from pmsmtool.cli.output_file import figure_format, save_figure
+from pmsmtool.cli.output import Output, figure_format, save_figure, table
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import write_file
 

@@ -22,8 +22,7 @@ from pmsmtool.drive_maps.sheet_check import contradictions, types_of
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.image import crc32, pack_image
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
-from pmsmtool.params.diff import table_unit
-from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.params.parameter_set import ParameterSet, table_unit
 from pmsmtool.plain_text import counted
 from pmsmtool.resources import data_folder
 

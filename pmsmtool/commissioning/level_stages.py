@@ -35,9 +35,8 @@ from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.by_pulses import OVER_TORQUE_CONSTANT, measurable
 from pmsmtool.measurement.by_vendor import vendor_line
 from pmsmtool.measurement.capabilities import Capabilities, Tier
-from pmsmtool.measurement.identify import OF_LEVEL, SET_UP, identify
+from pmsmtool.measurement.identify import OF_LEVEL, SET_UP, identify, identify_after_drive
 from pmsmtool.measurement.task import Allow, Say
-from pmsmtool.measurement.vendor_chain import identify_after_drive
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.proof.stage import ProofRequest, prove_stage
 from pmsmtool.run_directory import RunDirectory, Stage

@@ -17,9 +17,8 @@ from pmsmtool.design.design_file import Design, DesignValue
 from pmsmtool.design.lookup.table import RPM, torque_limits
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.dead_time import dead_time_compensation
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.parameters import MachineParameters, dead_time_compensation
 from pmsmtool.machine.temperature import loop_coefficient_per_k
 from pmsmtool.machine.uncontrolled_generation import FaultReaction, Protection, fault_reaction
 from pmsmtool.params.catalogue import BY_NAME

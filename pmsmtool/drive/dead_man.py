@@ -20,8 +20,7 @@ from pmsmtool.cia402 import AbortConnection, FaultReaction, QuickStop, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
-from pmsmtool.drive.expected_pdo import expect_pdo
-from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat
+from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat, expect_pdo
 from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import SafetyRefusal, SdoAbort
 

@@ -7,8 +7,7 @@ import math
 from dataclasses import dataclass
 
 from pmsmtool.errors import SafetyRefusal
-from pmsmtool.machine.parameters import MachineParameters
-from pmsmtool.machine.shaft import Brake, Load, Shaft
+from pmsmtool.machine.parameters import Brake, Load, MachineParameters, Shaft
 from pmsmtool.units import format_current, rpm_from_rad_s
 
 OFF_S = 0.5

@@ -4,6 +4,10 @@
 A push from rest, coasting, a push the other way through standstill, coasting (docs/identification.md, 3.5). The shaft
 coasts with the voltage off: the sampled current of a switched bridge is not the mean of its ripple, which at commanded
 zero current leaves a torque of a part in a thousand of the rated one, as much as a good bearing's friction.
+
+Turns at a low speed under the speed controller, both ways: current and position show what torque the angle adds.
+
+Fast coasting hides a torque of a high order: its ripple of the position falls with the square of order and speed.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ from dataclasses import dataclass, replace
 
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
 from pmsmtool.experiments.signals import readable
+from pmsmtool.experiments.speed_run import reach
 from pmsmtool.trace import Trace
 
 SIGNALS = ("i_d_a", "i_q_a", "theta_m_rad", "flags")
@@ -132,3 +137,26 @@ def _rows(drive: Drive, seconds: float, most: int) -> tuple[int, int]:
     periods = max(2, round(seconds / drive.period_s))
     decimation = max(1, math.ceil(periods / most))
     return periods // decimation, decimation
+
+
+SPEED_RAD_S = math.pi
+"""30 rpm: the noise of the position rises with the square of the speed, and slower ones come near to sticking."""
+TURNS = 2.1
+SETTLE_S, REACH_S, BAND = 0.5, 4.0, 0.3
+"""Time after the speed is reached; longest time for that; relative band, within which cogging may move it."""
+
+
+def record_slow_turns(drive: Drive, pole_pairs: int, speed_rad_s: float, keep: Callable[[Trace], None]) -> None:
+    """Record turns in either direction; each trace is handed over as soon as it is there.
+
+    The drive is enabled on entry with a speed controller that holds the machine; it is asked for standstill on return.
+    """
+    for speed in (speed_rad_s, -speed_rad_s):
+        drive.command_speed(speed)
+        omega_e = pole_pairs * speed
+        reach(drive, omega_e, limit_s=REACH_S, band_rad_s=BAND * abs(omega_e))
+        drive.wait(SETTLE_S)
+        periods = round(TURNS * 2.0 * math.pi / abs(speed) / drive.period_s)
+        decimation = math.ceil(periods / ROWS)
+        keep(readable(drive.record(SIGNALS, periods // decimation, decimation=decimation)))
+    drive.command_speed(0.0)

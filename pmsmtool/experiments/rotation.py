@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""Turn a current vector slowly forward and back: the rotor follows, and the encoder is counted."""
+"""Turn a current vector slowly forward and back: the rotor follows, and the encoder is counted.
+
+A rotor that a current vector turns slowly over a turn and back, while the Hall wires are read.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError
 from pmsmtool.experiments.signals import table
-from pmsmtool.experiments.vector_turn import RAMP_S, come_to_rest, rising, turn_vector
+from pmsmtool.experiments.vector_turn import RAMP_S, come_to_rest, lead_onto_vector, rising, turn_vector
 from pmsmtool.trace import Trace
 from pmsmtool.units import RPM_PER_RAD_S
 
@@ -169,3 +174,51 @@ def _step(drive: Drive, plan: RotationPlan, angle: float) -> dict[str, float]:
 def _row(drive: Drive, angle: float) -> dict[str, float]:
     measured = drive.average(("theta_m_rad",), max(1, round(ROW_S / drive.period_s)))
     return {"theta_imposed_rad": angle, "theta_M_rad": measured["theta_m_rad"]}
+
+
+HALL_STEP_RAD = math.radians(2.0)
+HALL_DWELL_S = 0.04
+"""Steps of the vector, and time on each: with the window below 44 degrees per second."""
+HALL_LOOK_S = 0.005
+"""The current is averaged at the end of a step: where a phase current changes its sign, the inverter's dead time takes
+the vector up to 9 degrees off what is commanded, and the rotor goes with it."""
+WAY_RAD = math.radians(460.0)
+"""One way: the turn that is evaluated, behind the way that takes up the friction."""
+RAMP_STEPS = 20
+RAMP_SLOWEST = 0.1
+"""The vector comes to speed over so many steps, from this share of it: a rotor without friction does not swing."""
+
+
+def turn_over_halls(drive: Drive, i_a: float) -> Trace:
+    """Turn the rotor both ways over more than an electrical turn; the vector stands at the end.
+
+    Parameters
+    ----------
+    drive : Drive
+        Enabled.
+    i_a : float
+        Length of the vector (A peak).
+
+    Returns
+    -------
+    Trace
+        ``commanded_rad`` and ``angle_rad`` of the vector (electrical), and ``hall_pattern``, by steps.
+    """
+    steps = round(WAY_RAD / HALL_STEP_RAD)
+    lead_onto_vector(drive, i_a, 0.0)
+    ramp = [max(RAMP_SLOWEST, share) for share in rising(RAMP_STEPS)]
+    periods = max(1, round(HALL_LOOK_S / drive.period_s))
+    rows: list[tuple[float, float, float, float]] = []
+    t_s = 0.0
+    for k in (*range(1, steps + 1), *range(steps - 1, -1, -1)):
+        gone, commanded = len(rows) % steps, HALL_STEP_RAD * k
+        drive.command_current(i_a, 0.0, fixed_angle_rad=commanded)
+        dwell = HALL_DWELL_S / (ramp[gone] if gone < RAMP_STEPS else 1.0)
+        drive.wait(dwell)
+        seen = drive.average(("i_d_a", "i_q_a"), periods)
+        off = math.atan2(seen["i_q_a"], seen["i_d_a"])
+        t_s += dwell + HALL_LOOK_S
+        rows.append((t_s, commanded, commanded + off, drive.live("hall_pattern")))
+    table = np.array(rows)
+    units = {"commanded_rad": "rad", "angle_rad": "rad", "hall_pattern": "1"}
+    return Trace(table[:, 0], dict(zip(units, table[:, 1:].T, strict=True)), units, {"i_a": i_a})

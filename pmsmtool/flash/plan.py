@@ -14,8 +14,7 @@ from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive_maps.drive_map import DriveMap, address_in
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
-from pmsmtool.params.diff import table_unit
-from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.params.parameter_set import ParameterSet, table_unit
 
 QUANTISATION_SHOWN = 1e-6
 """Relative rounding from which the value the drive holds is shown beside the one asked for (binary32: 6e-8)."""

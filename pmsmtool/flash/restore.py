@@ -20,8 +20,7 @@ from pmsmtool.flash.map_gate import contradictions
 from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
 from pmsmtool.flash.whole_drive import parameters_of
 from pmsmtool.params.catalogue import BY_NAME, layout_signature
-from pmsmtool.params.diff import table_unit
-from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.params.parameter_set import ParameterSet, table_unit
 from pmsmtool.plain_text import counted
 
 CONFIGURATION_EPOCH = datetime.date(1984, 1, 1)

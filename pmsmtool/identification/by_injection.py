@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""From the stored traces of an identification by injection to its machine file and the judged stage."""
+"""From the stored traces of an identification by injection to its machine file and the judged stage.
+
+The machine file that an identification leaves: accepted values in place of the nameplate's.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 from pmsmtool.estimators.resistance import copper_of
 from pmsmtool.identification import flux_map, frequency_response, value_verdict
-from pmsmtool.identification.accuracy import accuracy_facts, accuracy_line
 from pmsmtool.identification.cogging import save_cogging
 from pmsmtool.identification.evaluate import Evaluation, evaluate
-from pmsmtool.identification.identified_machine import machine_of
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
+from pmsmtool.identification.flux_map import with_map
+from pmsmtool.identification.request import REQUEST, IdentifyRequest, accuracy_facts, accuracy_line, dump_request
 from pmsmtool.identification.run_files import (
     MACHINE,
     NAMEPLATE,
@@ -131,4 +134,69 @@ def _evaluation(question: _Question) -> Evaluation:
         U_dc_v=nameplate.inverter.U_dc_v,
         tolerance=replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(nameplate.machine)),
         ended=refused_in(run),
+    )
+
+
+RESONANCE = ("resonance_hz", "antiresonance_hz", "resonance_zeta")
+"""Keys of a second mass: a response without one takes them out of the machine file."""
+
+
+def machine_of(
+    evaluation: Evaluation,
+    nameplate: MachineFile,
+    conditions: Mapping[str, object],
+    rejected: Collection[str] = (),
+) -> MachineFile:
+    """Return the machine file with every identified value in place of the nameplate's.
+
+    What was not identified, and what is ``rejected`` by its key, keeps the nameplate's value; ``[estimate]`` names
+    what was.
+    """
+    found = {name: estimate for name, estimate in evaluation.estimates().items() if name not in rejected}
+    values = {name: found[name].value for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2") if name in found}
+    machine = replace(nameplate.machine, **values)  # type: ignore[arg-type]
+    if evaluation.mechanics is not None:
+        B, tau_c = evaluation.mechanics.B, evaluation.mechanics.tau_c
+        machine = replace(machine, tau_c_nm=max(0.0, tau_c.value), B_nms=max(0.0, B.value))
+    if evaluation.frequency_response is not None:
+        resonant = {name: estimate.value for name, estimate in evaluation.frequency_response.found.items()}
+        machine = replace(machine, **{**dict.fromkeys(RESONANCE), **resonant})  # type: ignore[arg-type]
+    if machine.R_winding_ohm is not None and machine.R_winding_ohm > machine.R_s_ohm:
+        machine = replace(machine, R_winding_ohm=machine.R_s_ohm)  # a copper part is no more than what was measured
+    flux_map = nameplate.flux_map
+    if evaluation.flux_map is not None:
+        machine, flux_map = with_map(machine, evaluation.map_estimates), evaluation.flux_map.flux_map
+    inverter, encoder = nameplate.inverter, nameplate.encoder
+    if evaluation.encoder is not None:
+        machine = replace(machine, pole_pairs=round(evaluation.encoder.pole_pairs.value))
+        encoder = replace(encoder, direction=evaluation.encoder.direction)
+    if "offset_rad" in found:
+        encoder = replace(encoder, offset_rad=found["offset_rad"].value)
+    if evaluation.resistance is not None:
+        curve = evaluation.resistance.curve
+        plateau = max(0.0, evaluation.resistance.V_dead_v)
+        inverter = replace(
+            inverter,
+            V_dead_v=plateau,
+            i_knee_apk=curve.knee_a(plateau),
+            voltage_error_i_apk=tuple(map(float, curve.i_phase_a)),
+            voltage_error_v=tuple(map(float, curve.u_error_v)),
+        )
+    measurable = {name: estimate for name, estimate in found.items() if name != "pole_pairs"}
+    return replace(
+        nameplate,
+        machine=machine,
+        inverter=inverter,
+        encoder=encoder,
+        std={**nameplate.std, **{name: e.std for name, e in measurable.items()}},
+        systematic={**nameplate.systematic, **{name: e.systematic for name, e in measurable.items()}},
+        estimates={
+            **nameplate.estimates,
+            **found,
+            **evaluation.ripples(),
+            **{check.name: check.estimate for check in evaluation.checks},
+        },
+        conditions=dict(conditions),
+        simulation={},
+        flux_map=flux_map,
     )

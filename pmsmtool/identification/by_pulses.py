@@ -20,17 +20,15 @@ from pmsmtool.estimators.flux.voltage_flux import flux_by_undriven_voltage, flux
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
 from pmsmtool.estimators.resistance import R_MEASURED, Copper, copper_of
 from pmsmtool.estimators.resistance import normalised as resistance_at_reference
-from pmsmtool.estimators.rotation_offset import offset_by_turns
 from pmsmtool.estimators.shaft.inertia_ratio import estimate_ratios
+from pmsmtool.estimators.shaft.position import offset_by_turns
 from pmsmtool.files import read_text
 from pmsmtool.identification.calibration import calibrated_traces
 from pmsmtool.identification.completed_machine import completed_machine
 from pmsmtool.identification.evaluate import tolerance_on
-from pmsmtool.identification.judgement import TOLD_BY, judged, stage_of
-from pmsmtool.identification.push_limits import not_told, without
+from pmsmtool.identification.judgement import TOLD_BY, judged, not_told, resistance_by_supply, stage_of, without
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method
 from pmsmtool.identification.run_files import MACHINE, place_of
-from pmsmtool.identification.supply_power import resistance_by_supply
 from pmsmtool.identification.wiring import judge_pulses
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters

@@ -1,18 +1,71 @@
 # SPDX-License-Identifier: MIT
-"""What an identification is asked: quantities, the experiments behind them, and the request as a run keeps it."""
+"""What an identification is asked: quantities, the experiments behind them, and the request as a run keeps it.
+
+Whether the accuracy that was asked for is reached: statistical and misfit part of R, L and psi, relative, 95 %.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
+from typing import Any
 
 from pmsmtool.errors import ConfigError, NotAvailable
-from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.identification import accuracy
-from pmsmtool.machine.shaft import Brake, Load, Shaft
+from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
+from pmsmtool.identification.prediction import NAMES
+from pmsmtool.machine.parameters import Brake, Estimate, Load, Shaft
+
+KEYS: Mapping[str, tuple[str, ...]] = {"R": ("R_s_ohm",), "L": ("L_d_h", "L_q_h"), "psi": ("psi_f_wb",)}
+"""Machine-file keys of the quantities that an accuracy can be asked of."""
+
+
+def accuracy_facts(
+    asked: float | None, quantities: Iterable[str], found: Mapping[str, Estimate]
+) -> dict[str, dict[str, Any]]:
+    """Return for every value that was asked for its half width (None: no value) and whether it is small enough.
+
+    Parameters
+    ----------
+    asked : float or None
+        Relative half width (1); None: nothing is returned.
+    quantities : iterable of str
+        What was asked for, ``R L psi ...``.
+    found : mapping of str to Estimate
+        By machine-file key.
+    """
+    if asked is None:
+        return {}
+    facts = {}
+    for key in (key for quantity in quantities for key in KEYS.get(quantity, ())):
+        estimate = found.get(key)
+        half = None
+        if estimate is not None and estimate.value:
+            half = statistical_half_width(estimate) / abs(estimate.value)
+        facts[key] = {"asked": asked, "statistical_95": half, "reached": half is not None and half <= asked}
+    return facts
+
+
+def accuracy_told(values: Sequence[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """Return the facts that the values of a stage keep as ``accuracy``; empty where none was asked for."""
+    return {value["name"]: value["accuracy"] for value in values if "accuracy" in value}
+
+
+def accuracy_line(facts: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the facts as a person reads them; empty without any."""
+    if not facts:
+        return ""
+    parts, missed = [], []
+    for key, fact in facts.items():
+        half = fact["statistical_95"]
+        parts.append(f"{NAMES[key]} {'no value' if half is None else f'{100.0 * half:.2g} %'}")
+        if not fact["reached"]:
+            missed.append(NAMES[key])
+    asked = next(iter(facts.values()))["asked"]
+    verdict = f"not reached: {', '.join(missed)}" if missed else "reached"
+    return f"accuracy {100.0 * asked:.3g} % (95 %, without the sensors' part): {', '.join(parts)}; {verdict}"
 
 
 class Method(StrEnum):
@@ -109,9 +162,9 @@ class IdentifyRequest:
             raise ConfigError(
                 f"cannot identify {', '.join(unknown) or 'nothing'}", hint=f"choose from {', '.join(NEEDS)}, or all"
             )
-        if self.accuracy is not None and not set(self.quantities) & set(accuracy.KEYS):
+        if self.accuracy is not None and not set(self.quantities) & set(KEYS):
             raise ConfigError(
-                f"--accuracy is that of {', '.join(accuracy.KEYS)}, and none of them is asked for",
+                f"--accuracy is that of {', '.join(KEYS)}, and none of them is asked for",
                 hint="leave --accuracy out, or identify one of them, too",
             )
         turning = [name for name in self.quantities if name != "map" and set(NEEDS[name]) & {"rotation", "speeds"}]

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.flux_map import FluxMap
-from pmsmtool.machine.flux_map_check import flux_range
-from pmsmtool.machine.flux_map_reciprocity import reciprocal_change
+from pmsmtool.machine.flux_map_check import flux_range, reciprocal_change
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.expected_pdo import expects_pdos
+from pmsmtool.drive.heartbeat import expects_pdos
 from pmsmtool.drive.mapped_recorder_drive import records_pushes
 from pmsmtool.drive.motion_objects import (
     NO_RATED,
@@ -84,6 +84,7 @@ _STANDARD = (*_BOUNDED, "position", "commutation angle")
 _PUSH = (*_BOUNDED, "push", "position", "current")
 _WATCHED = (*_SAFE, "position", "current")
 """What the guard needs while the drive runs by itself."""
+
 
 @dataclass(frozen=True, slots=True)
 class Expected:
@@ -417,6 +418,8 @@ _BLIND_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --spee
 
 def _expected(program: str, drives: int, *rows: tuple[str, float, str], given: str = "") -> tuple[Expected, ...]:
     return tuple(Expected(name, half, unit, drives, program, given) for name, half, unit in rows)
+
+
 _INJECT_RUN = "benchmarks.tier_intervals inject --drives 200 --first 63000"
 
 

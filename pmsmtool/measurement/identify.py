@@ -3,12 +3,14 @@
 
 Envelope and consent, then the experiments, whose traces go into a run, then the evaluation of what is stored there.
 Nothing is stored in the drive.
+
+The drive's own identification, then the pulses of its capability level: one stage of both.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,18 +22,25 @@ from pmsmtool.drive.recorded_means import RecordingDrive
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.tier_drives import ParameterDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
-from pmsmtool.errors import DriveFault, IdentificationError, PmsmtoolError, SafetyRefusal
+from pmsmtool.errors import DriveFault, IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal
 from pmsmtool.experiments.supply_levels import ReadSupply
 from pmsmtool.flash.map_gate import check_motion
+from pmsmtool.identification.by_vendor import SOURCE
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method, dump_request
+from pmsmtool.identification.run_files import MACHINE
+from pmsmtool.identification.verdicts import KEYS
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.measurement import by_injection, by_pulses, by_vendor
 from pmsmtool.measurement.by_injection import nameplate_of
+from pmsmtool.measurement.by_pulses import measurable
+from pmsmtool.measurement.by_vendor import vendor_quantities
 from pmsmtool.measurement.capabilities import Capabilities, Tier, reference_capabilities
 from pmsmtool.measurement.run_account import status_of, text_of
 from pmsmtool.measurement.task import Allow, Keep, Known, Say, Task
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import trace_npz
+from pmsmtool.units import format_quantity
 
 SET_UP = "the drive's own set, from its maker's set-up"
 RESTORED = "nothing is stored in the drive; every changed object is restored"
@@ -184,3 +193,88 @@ def _opened_as(kind: type[CanopenDrive], drive: CanopenDrive, found: Capabilitie
     finally:
         drive.may_be_energised = drive.may_be_energised or own.may_be_energised
         own.close()
+
+
+def identify_after_drive(
+    run: RunDirectory,
+    drive: CanopenDrive,
+    request: IdentifyRequest,
+    allow_motion: Allow,
+    say: Say,
+    *,
+    found: Capabilities,
+    known: Known | None = None,
+) -> Stage:
+    """Have the drive identify by itself, then measure what its objects allow besides; one stage of both.
+
+    Raises
+    ------
+    PmsmtoolError
+        As either ends.
+    """
+    asked = replace(request, quantities=vendor_quantities(found))
+    own = identify(run, drive, asked, allow_motion, say, method=Method.VENDOR, found=found, known=known)
+    if not measurable(Method.STANDARD, found, None if known is None else known[0]):
+        return own
+    reason = _wrong_set_up(drive, own)
+    if reason:
+        return replace(own, fallbacks=(*own.fallbacks, reason))
+    completed = None if known is None else (load_machine_file(run.path / MACHINE), known[1])
+    try:
+        rest = identify(run, drive, request, allow_motion, say, method=Method.STANDARD, found=found, known=completed)
+    except NotAvailable as lacking:
+        return replace(own, fallbacks=(*own.fallbacks, *lacking.what.splitlines()))
+    return _joined(run, own, rest, known)
+
+
+def _wrong_set_up(drive: CanopenDrive, own: Stage) -> str:
+    """Return why a drive must not be pushed by torque: it commutates by pole pairs that are not the machine's."""
+    told = next((round(float(value["value"])) for value in own.values if value["name"] == "pole_pairs"), None)
+    if told is None or "motor.pole_pairs" not in drive.node.map.cells:
+        return ""
+    held = round(drive.parameters.read_value("motor.pole_pairs"))
+    if held == told:
+        return ""
+    return f"torque pulses: not available: the drive is set to {held} pole pairs and measures {told}; set it up first"
+
+
+def _joined(run: RunDirectory, own: Stage, rest: Stage, known: Known | None) -> Stage:
+    """Join both: a measured value with its interval outranks the drive's own, which is then named beside it."""
+    measured = {str(value["name"]): value for value in rest.values if "std" in value and value.get("accepted", True)}
+    vendor = {str(value["name"]): value for value in own.values if value["source"] == SOURCE}
+    kept = {name: value for name, value in vendor.items() if name not in measured}
+    refused = {name: why for name, why in rest.refused.items() if not set(KEYS.get(name, ())) & set(kept)}
+    given = [value for value in rest.values if "std" not in value and value["name"] not in vendor]
+    beside = [
+        f"{name}: the drive's own value is {format_quantity(value['value'], value['unit'])}, "
+        f"{100.0 * (value['value'] / measured[name]['value'] - 1.0):+.2g} % of the measured one"
+        for name, value in vendor.items()
+        if name in measured
+    ]
+    if known is not None and MACHINE in rest.files:
+        _write_sources(run, [str(value["name"]) for value in given], known[1])
+    return replace(
+        rest,
+        status="partial" if refused else "pass",  # the drive's own values are accepted, or it ended there
+        refused=refused,
+        seconds=own.seconds + rest.seconds,
+        values=[*measured.values(), *kept.values(), *given],
+        acceptance=[*own.acceptance, *(line for line in rest.acceptance if line.ok)],
+        fallbacks=[*own.fallbacks, *beside, *rest.fallbacks],
+        files={**own.files, **rest.files},
+        summary="; ".join([own.summary.split("; ")[0], *rest.summary.split("; ")[:1], *_given_text(given, known)]),
+    )
+
+
+def _given_text(given: Sequence[Mapping[str, object]], known: Known | None) -> list[str]:
+    return [f"{known[1]}: {', '.join(str(value['name']) for value in given)}"] if given and known is not None else []
+
+
+def _write_sources(run: RunDirectory, given: Sequence[str], source: str) -> None:
+    """Say in the machine file where each value comes from."""
+    path = run.path / MACHINE
+    machine = load_machine_file(path)
+    by = {"measured": "pmsmtool", SOURCE: SOURCE}
+    parts = {who: [name for name, e in machine.estimates.items() if e.source == said] for who, said in by.items()}
+    text = "; ".join(f"{who}: {', '.join(names)}" for who, names in (*parts.items(), (source, given)) if names)
+    run.save(MACHINE, dump_machine_file(replace(machine, provenance={"source": text})))

@@ -23,10 +23,17 @@ from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
-from pmsmtool.experiments.current_limit import LimitCurrent, not_shown, require_limit, show_current_limit, unproven
+from pmsmtool.experiments.current_limit import (
+    LimitCurrent,
+    LimitSpeed,
+    not_shown,
+    require_limit,
+    show_current_limit,
+    show_speed_limit,
+    unproven,
+)
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
-from pmsmtool.experiments.speed_limit import LimitSpeed, show_speed_limit
 from pmsmtool.experiments.vector_turn import RAMP_S
 from pmsmtool.identification.evaluate import flux_of, resistance_of, tolerance_on
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict

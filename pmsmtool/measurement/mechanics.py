@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.experiments import mechanics_run, slow_turns, speed_run
+from pmsmtool.experiments import mechanics_run, speed_run
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.identification.cogging import SLOW_TRACE
 from pmsmtool.identification.mechanics import TRACE
@@ -85,10 +85,10 @@ def measure_cogging(
     drive: Drive, limits: Limits, keep: Callable[[str, Trace], None], say: Callable[[str], None]
 ) -> None:
     """Record slow turns; the drive holds the speed controller of the runs before."""
-    speed = min(slow_turns.SPEED_RAD_S, SLOW_SHARE * limits.omega_max_rad_s)
-    say(f"cogging: {slow_turns.TURNS:g} turns each way at {rpm_from_rad_s(speed):.0f} rpm")
+    speed = min(mechanics_run.SPEED_RAD_S, SLOW_SHARE * limits.omega_max_rad_s)
+    say(f"cogging: {mechanics_run.TURNS:g} turns each way at {rpm_from_rad_s(speed):.0f} rpm")
     pole_pairs = round(drive.read("motor.pole_pairs"))
-    slow_turns.record_slow_turns(drive, pole_pairs, speed, numbered(drive, SLOW_TRACE, keep))
+    mechanics_run.record_slow_turns(drive, pole_pairs, speed, numbered(drive, SLOW_TRACE, keep))
     # the records are whole: a shaft that does not come to rest is what the next experiment refuses
     speed_run.reach(drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * pole_pairs * limits.omega_max_rad_s)
 

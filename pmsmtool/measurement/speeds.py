@@ -14,7 +14,7 @@ from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
-from pmsmtool.experiments import emf_run, speed_run
+from pmsmtool.experiments import speed_run
 from pmsmtool.experiments.shaft_answer import FIRST_S, FIRST_SHARE
 from pmsmtool.experiments.speed_run import SpeedPlan
 from pmsmtool.identification.emf_harmonics import TRACE as EMF_TRACE
@@ -122,13 +122,13 @@ class SpeedStage:
     def record_harmonics(self, plan: SpeedPlan) -> None:
         """Record voltages and currents over turns at the speeds of the flux run, whose gains the drive holds."""
         self.say(
-            f"harmonics of the back-EMF: records at {len(emf_run.SHARES)} speeds up to "
+            f"harmonics of the back-EMF: records at {len(speed_run.EMF_SHARES)} speeds up to "
             f"{rpm_from_rad_s(plan.omega_max_rad_s):.0f} rpm, both directions, i_d of +-{plan.i_d_a:.3g} A"
         )
         delay = {"delay_periods": self.drive.read("inverter.delay_periods")}
         keep_part = numbered(self.drive, EMF_TRACE, self.keep)
         pole_pairs = round(self.drive.read("motor.pole_pairs"))
-        emf_run.record_turns(
+        speed_run.record_turns(
             self.drive, plan, pole_pairs, lambda trace: keep_part(replace(trace, meta={**trace.meta, **delay}))
         )
         speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * plan.omega_max_rad_s * pole_pairs)

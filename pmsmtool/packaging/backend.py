@@ -17,11 +17,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pmsmtool.packaging import contents, wheel
+from pmsmtool.packaging import wheel
 from pmsmtool.packaging.build_kernels import build_all
 from pmsmtool.packaging.compiler import Compiler, build_compiler, system_compiler
+from pmsmtool.packaging.kernels import here, local_wheel_tag
 from pmsmtool.packaging.page_module import build_page_module
-from pmsmtool.packaging.targets import here, local_wheel_tag
 
 Settings = Mapping[str, Any] | None
 
@@ -99,7 +99,7 @@ def build_sdist(sdist_directory: str, config_settings: Settings = None) -> str:
     with tempfile.TemporaryDirectory() as scratch:
         metadata = _metadata(Path(scratch))
         name = metadata.name.removesuffix(".dist-info")
-        return wheel.write_source_archive(Path(sdist_directory), name, metadata, contents.source_files(root)).name
+        return wheel.write_source_archive(Path(sdist_directory), name, metadata, wheel.source_files(root)).name
 
 
 def wheel_for(
@@ -116,7 +116,7 @@ def wheel_for(
     with tempfile.TemporaryDirectory() as scratch:
         built = build_all(root / "pmsmtool", Path(scratch), compiler, platform=platform, strict=strict)
         built += build_page_module(root / "pmsmtool", Path(scratch), strict=strict)
-        files: dict[str, Path | bytes] = {**contents.package_files(root)}
+        files: dict[str, Path | bytes] = {**wheel.package_files(root)}
         files |= {f"pmsmtool/_native/{library.name}": library for library in built}
         return wheel.write_wheel(folder, metadata, f"py3-none-{platform_tag}", files)
 

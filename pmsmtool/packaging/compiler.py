@@ -14,8 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pmsmtool.native import library_name
-from pmsmtool.packaging.kernels import COMMON_DEFINES, COMPILE_FLAGS, INCLUDE_FOLDERS, WARNING_FLAGS, Kernel
-from pmsmtool.packaging.targets import Target, here
+from pmsmtool.packaging.kernels import (
+    COMMON_DEFINES,
+    COMPILE_FLAGS,
+    INCLUDE_FOLDERS,
+    WARNING_FLAGS,
+    Kernel,
+    Target,
+    here,
+)
 
 CANDIDATES: tuple[str, ...] = ("cc", "gcc", "clang")
 ZIG = "zig"

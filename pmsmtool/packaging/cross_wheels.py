@@ -23,12 +23,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pmsmtool.native import PAGE_MODULE, library_name
-from pmsmtool.packaging import backend, contents
+from pmsmtool.packaging import backend
 from pmsmtool.packaging.build_kernels import PACKAGE
 from pmsmtool.packaging.compiler import CompilerError, zig_compiler
-from pmsmtool.packaging.kernels import KERNELS
+from pmsmtool.packaging.kernels import KERNELS, TARGETS, Target, here
 from pmsmtool.packaging.symbols import Binary, read_binary
-from pmsmtool.packaging.targets import TARGETS, Target, here
+from pmsmtool.packaging.wheel import package_files
 
 SYMBOL_PREFIX = "pmsm_"
 LINKER_SYMBOLS = frozenset({"__dso_handle", "_mh_dylib_header"})
@@ -69,7 +69,7 @@ def record_faults(archive: zipfile.ZipFile) -> list[str]:
 
 def wheel_faults(wheel: Path, target: Target, root: Path) -> tuple[list[str], dict[str, frozenset[str]]]:
     """Return what is wrong with a wheel, and kernel -> exported symbols."""
-    expected = set(contents.package_files(root))
+    expected = set(package_files(root))
     kernels = [kernel for kernel in KERNELS if kernel.source_files(root / "pmsmtool")]
     expected |= {f"pmsmtool/_native/{library_name(kernel.name, target.platform)}" for kernel in kernels}
     expected.add(f"pmsmtool/_native/{PAGE_MODULE}")

@@ -15,8 +15,7 @@ from pathlib import Path
 
 from pmsmtool.native import PAGE_MODULE
 from pmsmtool.packaging.compiler import CompilerError, run_compiler, zig_compiler
-from pmsmtool.packaging.kernels import COMPILE_FLAGS, INCLUDE_FOLDERS, SIMULATION, Kernel, is_current
-from pmsmtool.packaging.targets import Target
+from pmsmtool.packaging.kernels import COMPILE_FLAGS, INCLUDE_FOLDERS, SIMULATION, Kernel, Target, is_current
 
 SOURCES = Kernel("pmsm_page", SIMULATION, without=("sim/monte_carlo.c",))
 """Without the threads of the Monte Carlo run: a page has none."""

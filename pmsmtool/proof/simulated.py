@@ -23,7 +23,7 @@ from pmsmtool.design.tolerance import Samples, tolerance_box
 from pmsmtool.drive.port import Excitation, Injection
 from pmsmtool.estimators.resistance import at_the_test
 from pmsmtool.identification.sampling import INSTANT, LAG
-from pmsmtool.machine.flux_map_scaled import FluxScale, ScalableMap
+from pmsmtool.machine.flux_map import FluxScale, ScalableMap
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import iron_drag

@@ -37,7 +37,7 @@ from pmsmtool.errors import (
 )
 from pmsmtool.files import write_file
 from pmsmtool.flash.restore import plan_download
-from pmsmtool.machine.shaft import Brake, Load, Shaft
+from pmsmtool.machine.parameters import Brake, Load, Shaft
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.proof.judgement import Judgement, judge, with_ripple
 from pmsmtool.proof.measured import SpeedNotReached, run_experiments

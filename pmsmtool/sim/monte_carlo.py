@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.machine.flux_map_scaled import FluxScale, ScalableMap
+from pmsmtool.machine.flux_map import FluxScale, ScalableMap
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import open_simulation

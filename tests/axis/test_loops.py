@@ -12,7 +12,7 @@ import pytest
 
 from pmsmtool.axis.loops import AxisGains, AxisPath, Loop, Structure, closed_loop_poles, lifted, open_loop
 from pmsmtool.axis.mechanics import Mechanics
-from pmsmtool.axis.robustness import axis_margins
+from pmsmtool.axis.search import axis_margins
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, notch_coefficients, speed_loop

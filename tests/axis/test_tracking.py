@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pmsmtool.axis.loops import AxisGains, AxisPath, Structure, lifted
+from pmsmtool.axis.loops import AxisGains, AxisPath, Structure, best_share, following_error, lifted
 from pmsmtool.axis.mechanics import Mechanics
 from pmsmtool.axis.reference import Profile, plan
-from pmsmtool.axis.tracking import best_share, following_error
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
 
 T = 4e-4

@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.bus.adapter_setup import ADAPTERS, how_to_set_up, meant_interface
+from pmsmtool.bus.connect import in_time
 from pmsmtool.bus.examination import _heard, adapters
-from pmsmtool.bus.in_time import in_time
 from pmsmtool.cli import doctor
 from pmsmtool.cli.main import cli
 from pmsmtool.errors import BusError

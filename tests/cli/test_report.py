@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.cli.main import run as program
-from pmsmtool.cli.print_page import find_browser, print_page
+from pmsmtool.cli.report import find_browser, print_page
 from pmsmtool.commissioning import report_page
 from pmsmtool.commissioning.design_stages import lut_stage, tune_stage
 from pmsmtool.design.design_file import load_design

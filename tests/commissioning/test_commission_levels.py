@@ -34,7 +34,7 @@ from pmsmtool.identification.run_files import REPLAYED
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.capabilities import Capabilities, Tier, examine
 from pmsmtool.measurement.identify import SET_UP, open_for_level
-from pmsmtool.papers.closed_node import ClosedNode
+from pmsmtool.papers.closed_drive import ClosedNode
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.proof.stage import ProofRequest
 from pmsmtool.resources import data_folder

@@ -31,8 +31,7 @@ from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.papers.closed_drive import closed_drive
-from pmsmtool.papers.closed_node import ClosedNode, Seat
+from pmsmtool.papers.closed_drive import ClosedNode, Seat, closed_drive
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.simulated_machine import with_simulation

@@ -28,8 +28,7 @@ from pmsmtool.design.lookup.grid import (
     lsb_a,
     table_words,
 )
-from pmsmtool.design.lookup.iron_loss import load_iron_loss_map
-from pmsmtool.design.lookup.loci import loci
+from pmsmtool.design.lookup.loci import load_iron_loss_map, loci
 from pmsmtool.design.lookup.table import CUT, RPM, LookupTable, electrical_speed, flux_table, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.design.ratings import ratings

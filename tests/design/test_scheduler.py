@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.cli.scheduler import executor
+from pmsmtool.cli.margins import executor
 from pmsmtool.design.design_file import design_text
 from pmsmtool.design.loops.margins import BLOCK, margin_report
 from pmsmtool.design.tolerance import tolerance_box

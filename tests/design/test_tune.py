@@ -24,10 +24,9 @@ from pmsmtool.design.ratings import base_speed_rpm, ratings
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible
-from pmsmtool.machine.dead_time import dead_time_compensation
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.parameters import InverterParameters, MachineLimits, MachineParameters
+from pmsmtool.machine.parameters import InverterParameters, MachineLimits, MachineParameters, dead_time_compensation
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import parse_parameter_set
 
@@ -261,12 +260,12 @@ def test_command_exit_codes(tmp_path: Path) -> None:
 
 def test_choices_of_the_command_are_those_of_the_design() -> None:
     from pmsmtool.cli.tune import tune_command
-    from pmsmtool.design import field_weakening, governor, polar_laws
+    from pmsmtool.design import field_weakening, governor, polar_values
 
     choices = {p.name: tuple(p.type.choices) for p in tune_command.params if hasattr(p.type, "choices")}
     assert choices["governor"] == tuple(governor.MODES)
     assert choices["field_weakening"] == ("auto", *field_weakening.MODES)
-    assert choices["polar_law"] == tuple(polar_laws.LAWS)
+    assert choices["polar_law"] == tuple(polar_values.LAWS)
     for name, options in choices.items():
         for option in options:
             assert TuneRequest(**{name: option}).table()[name] == option

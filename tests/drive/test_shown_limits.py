@@ -20,11 +20,11 @@ from pmsmtool.experiments.current_limit import (
     LimitShown,
     require_limit,
     show_current_limit,
+    show_speed_limit,
     show_torque_limit,
     unproven,
 )
 from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
-from pmsmtool.experiments.speed_limit import show_speed_limit
 from pmsmtool.identification.by_pulses import FACTS, dump_facts, read_facts
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path

@@ -10,7 +10,7 @@ import pytest
 
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.estimators.estimate import total_half_width
-from pmsmtool.estimators.rotation_offset import ASYMMETRY, FLOOR_RAD, offset_by_turns
+from pmsmtool.estimators.shaft.position import ASYMMETRY, FLOOR_RAD, offset_by_turns
 from pmsmtool.trace import Trace
 
 PAIRS, STEP = 3, math.radians(15.0)

@@ -418,7 +418,7 @@ def test_measured_map():
 
 
 def test_slopes_matrix_against_scipy():
-    from pmsmtool.machine.flux_map_reciprocity import spline_slopes_matrix
+    from pmsmtool.machine.flux_map_check import spline_slopes_matrix
 
     rng = np.random.default_rng(7)
     axis, values = np.cumsum(rng.uniform(0.1, 1.0, 9)), rng.normal(size=9)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from benchmarks.analytic_saturation import BridgeSaturation, saturated_pmsyrm_map
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.flux_map import FluxMap
-from pmsmtool.machine.flux_map_check import check_flux_map, flux_range
-from pmsmtool.machine.flux_map_reciprocity import LoopIntegrals, reciprocal_change
+from pmsmtool.machine.flux_map_check import LoopIntegrals, check_flux_map, flux_range, reciprocal_change
 from pmsmtool.machine.flux_map_repair import FluxGrid, fill_holes, make_reciprocal, rotate, symmetrise
 
 MEASURED_MAP = Path(__file__).parents[2].parent / "shared" / "maps" / "baldor_400rpm_map.npz"

@@ -17,9 +17,8 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import run as main
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.errors import ConfigError, ExitCode, NotAvailable
-from pmsmtool.identification.accuracy import accuracy_facts, accuracy_line
 from pmsmtool.identification.prediction import Prediction
-from pmsmtool.identification.request import IdentifyRequest, dump_request, parse_request
+from pmsmtool.identification.request import IdentifyRequest, accuracy_facts, accuracy_line, dump_request, parse_request
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import effort, measure

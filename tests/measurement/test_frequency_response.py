@@ -21,8 +21,8 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.experiments.frequency_response import keep_speed, plan_frequency_response
+from pmsmtool.identification.by_injection import RESONANCE
 from pmsmtool.identification.frequency_response import RESPONSE_FILE
-from pmsmtool.identification.identified_machine import RESONANCE
 from pmsmtool.identification.mechanics import (
     ELASTIC_FALLBACK,
     MEAN_FALLBACK,

@@ -15,7 +15,7 @@ import pytest
 
 from pmsmtool.cli.main import run as program
 from pmsmtool.experiments.recorded_push import VOLTAGE_SHARE, PushPlan, _slower
-from pmsmtool.identification.push_limits import reluctance_share
+from pmsmtool.identification.judgement import reluctance_share
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 from tests.simulated_bus import settle

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.packaging import backend, compiler, page_module
-from pmsmtool.packaging.targets import here
+from pmsmtool.packaging.kernels import here
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from pmsmtool.packaging import contents
+from pmsmtool.packaging import wheel
 from pmsmtool.packaging.compiler import CANDIDATES
 from pmsmtool.packaging.kernels import KERNELS
 
@@ -63,10 +63,10 @@ class Installation:
 def install(folder: Path, *, editable: bool, compilers: bool) -> Installation:
     """Install a copy of this checkout in a fresh environment, with or without the system's compilers."""
     sources = folder / "checkout"
-    for name, path in contents.source_files(ROOT).items():
+    for name, path in wheel.source_files(ROOT).items():
         (sources / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(path, sources / name)
-    for name in contents.DATA_FOLDERS:
+    for name in wheel.DATA_FOLDERS:
         (sources / name).mkdir(exist_ok=True)
     venv.create(folder / "environment", with_pip=False)
     python = folder / "environment" / "bin" / "python"
@@ -86,9 +86,7 @@ def install(folder: Path, *, editable: bool, compilers: bool) -> Installation:
 
 def data_lines(root: Path) -> list[str]:
     """What the probe prints for the data folders that stand in ``root``."""
-    files = {
-        name: [p for p in contents.source_files(ROOT) if p.startswith(f"{name}/")] for name in contents.DATA_FOLDERS
-    }
+    files = {name: [p for p in wheel.source_files(ROOT) if p.startswith(f"{name}/")] for name in wheel.DATA_FOLDERS}
     return [
         " ".join([str(root / name), *(p.removeprefix(f"{name}/") for p in sorted(found))])
         for name, found in files.items()
@@ -99,10 +97,8 @@ def test_installed_wheel_has_kernels_and_data_and_leaves_the_sources_clean(tmp_p
     found = install(tmp_path, editable=False, compilers=True)
     package = next((tmp_path / "environment").rglob("site-packages")) / "pmsmtool"
     assert found.probe(tmp_path) == [str(package / "_native"), *data_lines(package / "_data")]
-    left = {path.name for path in found.sources.iterdir()} - {
-        name.split("/")[0] for name in contents.source_files(ROOT)
-    }
-    assert left <= set(contents.DATA_FOLDERS)
+    left = {path.name for path in found.sources.iterdir()} - {name.split("/")[0] for name in wheel.source_files(ROOT)}
+    assert left <= set(wheel.DATA_FOLDERS)
     assert not (found.sources / "pmsmtool" / "_native").exists()
     help_text = subprocess.run([tmp_path / "environment/bin/pmsmtool", "--version"], capture_output=True, text=True)
     assert "No module named 'click'" in help_text.stderr  # the entry point is there; its dependencies were left out

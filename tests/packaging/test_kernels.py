@@ -12,9 +12,8 @@ import pytest
 from pmsmtool import native
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.packaging import build_kernels, compiler, cross_wheels, kernels
-from pmsmtool.packaging.kernels import KERNELS, Kernel
+from pmsmtool.packaging.kernels import KERNELS, Kernel, here
 from pmsmtool.packaging.symbols import read_binary
-from pmsmtool.packaging.targets import here
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "pmsmtool"

@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.packaging import compiler, cross_wheels
-from pmsmtool.packaging.kernels import COMPILE_FLAGS
+from pmsmtool.packaging.kernels import COMPILE_FLAGS, TARGETS, Target
 from pmsmtool.packaging.symbols import Binary, read_binary
-from pmsmtool.packaging.targets import TARGETS, Target
 
 SOURCE = """\
 #include <string.h>

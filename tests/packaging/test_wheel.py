@@ -14,7 +14,7 @@ import pytest
 
 from pmsmtool import resources
 from pmsmtool.errors import ConfigError, PmsmtoolError
-from pmsmtool.packaging import contents, cross_wheels, wheel
+from pmsmtool.packaging import cross_wheels, wheel
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -86,11 +86,11 @@ def tracked() -> list[str]:
 
 
 def test_every_tracked_file_has_its_place() -> None:
-    in_wheel = set(contents.package_files(ROOT).values())
-    package = [name for name in tracked() if name.startswith(("pmsmtool/", *(f"{f}/" for f in contents.DATA_FOLDERS)))]
+    in_wheel = set(wheel.package_files(ROOT).values())
+    package = [name for name in tracked() if name.startswith(("pmsmtool/", *(f"{f}/" for f in wheel.DATA_FOLDERS)))]
     assert package
     assert [name for name in package if ROOT / name not in in_wheel] == []
-    in_archive = set(contents.source_files(ROOT))
+    in_archive = set(wheel.source_files(ROOT))
     assert [name for name in tracked() if name not in in_archive] == []
 
 
@@ -100,7 +100,7 @@ def test_nothing_generated_is_packed(tmp_path: Path) -> None:
         (tmp_path / name).write_text("")
     (tmp_path / "pmsmtool" / "__pycache__").mkdir()
     (tmp_path / "pmsmtool" / "__pycache__" / "a.py").write_text("")
-    assert set(contents.package_files(tmp_path)) == {"pmsmtool/a.py", "pmsmtool/_data/profiles/p.toml"}
+    assert set(wheel.package_files(tmp_path)) == {"pmsmtool/a.py", "pmsmtool/_data/profiles/p.toml"}
 
 
 @pytest.mark.parametrize("name", ["profiles", "firmware-params"])

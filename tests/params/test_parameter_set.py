@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
-from pmsmtool.params.diff import compare
-from pmsmtool.params.parameter_set import ParameterSet, default_set, parse_parameter_set
+from pmsmtool.params.parameter_set import ParameterSet, compare, default_set, parse_parameter_set
 
 LUT = {
     "lut.axis_x": (0.0, 5.0, 10.0),

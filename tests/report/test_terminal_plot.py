@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pmsmtool.report.terminal_plot import ASCII, BLOCKS, HEIGHT, terminal_plot
+from pmsmtool.report.plots import ASCII, BLOCKS, HEIGHT, terminal_plot
 
 
 @pytest.mark.parametrize("levels", [BLOCKS, ASCII])

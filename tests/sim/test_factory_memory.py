@@ -9,7 +9,7 @@ import pytest
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.resources import data_folder
-from pmsmtool.sim.factory_memory import erase_memory
+from pmsmtool.sim.channel import erase_memory
 
 
 @pytest.fixture

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pmsmtool.machine.flux_map import FluxMap
+from pmsmtool.machine.flux_map import FluxMap, FluxScale, ScalableMap
 from pmsmtool.machine.flux_map_cells import library
-from pmsmtool.machine.flux_map_scaled import FluxScale, ScalableMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import simulate

@@ -19,7 +19,7 @@ from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult, resistance_warmed
 from pmsmtool.machine.flux_map import FluxMap, require_monotonic
-from pmsmtool.machine.flux_map_reciprocity import reciprocal_change
+from pmsmtool.machine.flux_map_check import reciprocal_change
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
