@@ -93,6 +93,12 @@ def test_mode_11_tells_pole_pairs_and_its_refusal_leaves_the_pulses(tool: Tool, 
     assert refused == (not taken) and pole_pairs == (["3", "agrees"] if taken else ["NOT", "CHECKED"]), said
 
 
+def test_what_the_drive_cannot_hold_is_said(tool: Tool) -> None:
+    rows = tuple(row for row in faulhaber() if row[0] != 0x608F)
+    code, said = commissioned(tool, (*rows, (0x608F, 1, "U32", "rw", "2048")), {(0x608F, 1): (1, 65535)})
+    assert code == 10 and "x.eds: 0x608F:01 cannot hold this motor's 131072" in said, said
+
+
 def test_a_limit_that_only_takes_is_no_limit(tool: Tool) -> None:
     write_eds(Path("x.eds"), (*epos4(), (0x6073, 0, "U16", "wo", "1000")))
     code, printed, said = tool("caps", "--eds", "x.eds")

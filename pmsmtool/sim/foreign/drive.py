@@ -15,10 +15,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp
+from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.families import family_of, laws_of, modes_of, units_of
-from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects
+from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects, read_makers_objects
 from pmsmtool.sim.foreign.guarding import NodeGuarding
 from pmsmtool.sim.foreign.laws import Law
 from pmsmtool.sim.foreign.position import PositionLoop
@@ -27,6 +27,7 @@ from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.node.objects import ObjectRow
 
 if TYPE_CHECKING:
+    from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.sim.node.power_drive import Plant, PowerDrive
     from pmsmtool.sim.node.schedule import Schedule
     from pmsmtool.sim.node.session import Session
@@ -67,6 +68,8 @@ class ForeignDrive:
         Identity; where the file leaves it blank, that of the family it is recognised as.
     assumed : tuple of str
         What the simulated drive does that neither file nor standard says.
+    unheld : tuple of str
+        What of the motor the file's own limits do not let be entered, one line each.
     set_up : SetUp
         The motor, with no more rated current than the drive's object of it holds.
     behind : Behind or None
@@ -88,14 +91,15 @@ class ForeignDrive:
         own = [f"0x{law.index:04X}:{law.sub:02X} {law.source}" for law in self.laws.values() if "assumed" in law.source]
         blank = [] if all(stated) else [f"0x1018 blank in the file: taken as {self.vendor_product}"]
         reaction = [] if objects.has((0x6007, 0)) else ["no 0x6007: a lost master is a fault (0x605E), voltage off"]
-        beyond = [
+        unheld = [
             f"0x{law.index:04X}:{law.sub:02X} cannot hold this motor's {law.set_up:.0f}"
             for law in self.laws.values()
             if law.set_up is not None and not _holds(objects.rows[law.index, law.sub], law.set_up)
         ]
         if set_up != stated_motor:
-            beyond.append(f"rated current cut to the drive's {set_up.i_nom_apk:.4g} A peak")
-        self.assumed = (*objects.assumed, *own, *blank, *reaction, *beyond)
+            unheld.append(f"rated current cut to the drive's {set_up.i_nom_apk:.4g} A peak")
+        self.unheld = tuple(unheld)
+        self.assumed = (*objects.assumed, *own, *blank, *reaction, *unheld)
         self.behind: Behind | None = None
 
     def dress(self, dictionary: Dictionary) -> None:
@@ -182,6 +186,17 @@ class ForeignDrive:
             find(0x100C, 0), find(0x100D, 0), heartbeat, session.schedule, session.answer_guarding,
             lambda: session.power.connection_lost(0), session.power.connection_regained,
         )  # fmt: skip
+
+
+def unheld_of(file: str, machine_file: MachineFile) -> tuple[str, ...]:
+    """Return what of a motor a drive cannot hold by the limits of its file (path, or ``TABLE.csv#FAMILY``).
+
+    Raises
+    ------
+    ConfigError
+        As ``file_rows.read_makers_objects``.
+    """
+    return ForeignDrive(read_makers_objects(file), set_up_of(machine_file)).unheld
 
 
 def _within(objects: MakersObjects, set_up: SetUp) -> SetUp:

@@ -74,12 +74,18 @@ def encoder_resolution(objects: MakersObjects, counts: int) -> float:
 
     A file's own number stays where the object cannot be written, and where position has other units anyway.
     """
-    row, turns = objects.rows.get((0x608F, 1)), max(1, objects.stored(0x608F, 2))
-    stated = objects.stored(0x608F, 1)
-    if row is None or not row.data_type.letter or (stated > 1 and row.access != "rw"):
-        return float(stated if stated > 1 else counts * turns)
+    row, wanted = objects.rows.get((0x608F, 1)), wanted_resolution(objects, counts)
+    if row is None or not row.data_type.letter or row.access != "rw":
+        return wanted
     low, high = (1.0 if row.low is None else row.low), (math.inf if row.high is None else row.high)
-    return float(round(min(max(counts * turns, low), high)))
+    return float(round(min(max(wanted, low), high)))
+
+
+def wanted_resolution(objects: MakersObjects, counts: int) -> float:
+    """Return what 0x608F:01 should hold with the motor: the file's own number where it is fixed."""
+    row, stated = objects.rows.get((0x608F, 1)), objects.stored(0x608F, 1)
+    fixed = stated > 1 and (row is None or row.access != "rw")
+    return float(stated if fixed else counts * max(1, objects.stored(0x608F, 2)))
 
 
 def speed_units(objects: MakersObjects, per_turn: float) -> tuple[float, str]:
@@ -131,4 +137,4 @@ def standard_laws(objects: MakersObjects, set_up: SetUp, per_turn: float, per_rp
     ):  # fmt: skip
         if objects.stored(index) == 0:
             yield Law(index, 0, f"{speed}; of a move {ASSUMED}", set_up=per_rps * turns)
-    yield Law(0x608F, 1, STANDARD, set_up=encoder_resolution(objects, set_up.counts))
+    yield Law(0x608F, 1, STANDARD, set_up=wanted_resolution(objects, set_up.counts))
