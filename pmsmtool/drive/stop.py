@@ -84,7 +84,12 @@ def disable(node: DriveNode) -> State:
     StopNotConfirmed
         The statusword does not.
     """
-    state = node.disable_voltage(STATE_TIMEOUT_S)
+    try:
+        state = node.disable_voltage(STATE_TIMEOUT_S)
+    except SdoAbort:  # it takes no controlword: what its statusword shows counts
+        state = node.state()
+        if not is_safe(state):
+            raise
     if state is None or not is_safe(state):
         raise not_confirmed(node, f"the statusword still shows {state_text(state)}")
     return state

@@ -93,6 +93,16 @@ def test_mode_11_tells_pole_pairs_and_its_refusal_leaves_the_pulses(tool: Tool, 
     assert refused == (not taken) and pole_pairs == (["3", "agrees"] if taken else ["NOT", "CHECKED"]), said
 
 
+def test_a_drive_that_is_off_and_takes_no_controlword_is_off(tool: Tool) -> None:
+    """One file's limits let no controlword be written; its statusword shows that nothing is energised."""
+    write_eds(Path("x.eds"), epos4(), {(0x6040, 0): (0x8000, 0xFFFF)})
+    channel = f"{PROFILE}?nv=:memory:&eds=x.eds"
+    code, printed, said = tool("--sim", channel, "stop")
+    assert code == 0 and "NOT CONFIRMED" not in said + printed, said
+    code, _, said = tool("--sim", channel, "--yes", "jog", "--current", "1Apk", "--for", "0.1s")
+    assert code in (4, 9) and "NOT CONFIRMED" not in said, said
+
+
 def test_what_the_drive_cannot_hold_is_said(tool: Tool) -> None:
     rows = tuple(row for row in faulhaber() if row[0] != 0x608F)
     code, said = commissioned(tool, (*rows, (0x608F, 1, "U32", "rw", "2048")), {(0x608F, 1): (1, 65535)})
