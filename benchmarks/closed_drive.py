@@ -4,7 +4,7 @@
 Run from the repository: ``python -m benchmarks.closed_drive [--drives 100] [--first 1]``; about 0.4 s of one core per
 drive. Machines around interior-2k2 (R, L, saliency, flux, inertia, intervals), the truth anywhere in their intervals,
 link and temperatures anywhere in their ranges; speed, acceleration and rise of the limits at random. Each drive is a
-simulated node of the standard tier: its torque is asked for far beyond the limits and turns at random times, while a
+simulated node of the standard level: its torque is asked for far beyond the limits and turns at random times, while a
 load machine moves the speed within the guarantee, as fast as it says. Exit code 1 when one drive leaves its bound.
 """
 

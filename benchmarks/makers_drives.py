@@ -8,7 +8,7 @@
 A table has the columns of ``sim/foreign/file_rows.py``; every family in it is a node. `caps`, `identify`, `commission`
 and `flash-params` run at their default options with consent, on the machine of a profile, or on random ones from their
 seeds (``random_drives.py``); a drive that by its file cannot commutate that machine gets the first random one that
-it can. One row per node: tier and map, what was told with its error and half width against the simulated truth, the
+it can. One row per node: level and map, what was told with its error and half width against the simulated truth, the
 stages of the chain, what was written, and for what was not had the first reason. Every row that could be written is
 also counted against the node's own units. Exit code 1 where a truth lies outside its interval, or a unit is wrong.
 """
@@ -65,7 +65,7 @@ class Row:
     """What one node gave; texts as the table shows them."""
 
     node: str
-    tier: str
+    level: str
     map: str
     identify: str
     commission: str
@@ -78,7 +78,7 @@ class Row:
     def cells(self) -> tuple[str, ...]:
         """Return the columns of the table."""
         why = "; ".join(dict.fromkeys(self.reasons)) or "-"
-        return self.node, f"{self.tier}, {self.map}", self.identify, self.commission, self.flash, why
+        return self.node, f"{self.level}, {self.map}", self.identify, self.commission, self.flash, why
 
 
 HEADS = ("node", "`caps`: level, map", "`identify`", "`commission`", "`flash-params`", "what is not had, and why")
@@ -254,7 +254,7 @@ def row_of(file: str, name: str, first: int) -> tuple[Row, int]:
     shown = tuple(short(line) for line in (*reasons, missing, unwritten, *wrong) if line)
     seconds = time.perf_counter() - began
     row = Row(
-        label, facts["tier"], facts["map"], told, chain, written, shown, tuple(keys), good and not wrong, seconds
+        label, facts["level"], facts["map"], told, chain, written, shown, tuple(keys), good and not wrong, seconds
     )  # fmt: skip
     return row, judged
 

@@ -40,7 +40,7 @@ from pmsmtool.report.comparison import unchecked
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.sim.bus import PmsmSimBus
 
-LEVELS = {"full": "", "inject": "&tier=inject", "recorder": "&tier=recorder", "standard": "&drive=cia402"}
+LEVELS = {"full": "", "inject": "&level=inject", "recorder": "&level=recorder", "standard": "&drive=cia402"}
 ERRORS: dict[str, tuple[tuple[str, ...], float]] = {
     "pole pairs x2": (("pole_pairs",), 2.0),
     "pole pairs /2": (("pole_pairs",), 0.5),
@@ -135,7 +135,7 @@ def commission_one(job: tuple[str, str, int, bool]) -> Outcome:
             node.close()
             drive = open_for_level(connection, 1, found)
             before = _contents(drive)
-            run = begin_run(drive, Path("runs"), tier=found.tier)
+            run = begin_run(drive, Path("runs"), level=found.level)
             ends = error == RIGHT and not to_the_end
             chain = Commissioning(
                 run, drive, Agrees(writes=True), BehindTheGate(ends=ends), file,

@@ -3,7 +3,7 @@
 
     python -m benchmarks.vendor_identification --drives 40 --first 8000
 
-The drives of ``benchmarks/tier_intervals.py`` (``random_drives.py``) behind the objects of the synapticon map,
+The drives of ``benchmarks/level_intervals.py`` (``random_drives.py``) behind the objects of the synapticon map,
 read by ``identify --method vendor``. The values have no interval, so that nothing is judged: the table says what a
 simple method on such drives is worth, and that what is stored is what was answered. One inductance stands for both
 axes; it is compared with L_d, on which the simulated rotor is held. Every error is printed on stderr.
@@ -18,8 +18,8 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
+from benchmarks.level_intervals import truth_of
 from benchmarks.random_drives import draw_drive
-from benchmarks.tier_intervals import truth_of
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.vendor_tuning import VendorDrive

@@ -46,7 +46,7 @@ FILED = {
 }  # fmt: skip
 """What is wrong in FILE."""
 KINDS = (*WIRED, *FILED)
-LEVELS = {"full": "", "inject": "&tier=inject", "recorder": "&tier=recorder", "standard": "&drive=cia402"}
+LEVELS = {"full": "", "inject": "&level=inject", "recorder": "&level=recorder", "standard": "&drive=cia402"}
 
 
 def drive_of(seed: int, wired: dict[str, object]) -> MachineFile:

@@ -76,7 +76,8 @@ def _facts(found: Capabilities, denied: Mapping[str, str]) -> dict[str, Any]:
         "map": found.drive_map.name,
         "map_sha256": map_hash(found.drive_map),
         "map_is_drives": found.map_is_drives,
-        "tier": found.tier.value,
+        "level": found.level.value,
+        "tier": found.level.value,  # the older name: scripts may read it
         "features": sorted(found.features),
         "recorder": found.recorder,
         "replaced": list(found.replaced),
@@ -143,7 +144,7 @@ def _lines(found: Capabilities, denied: Mapping[str, str]) -> list[str]:
     lines = [
         f"node {identity.node}  {identity.name}  vendor {identity.vendor:#010x}  product {identity.product:#x}  "
         f"serial {identity.serial}",
-        f"map {found.drive_map.name} ({len(found.drive_map.cells)} parameters)  capability level {found.tier}",
+        f"map {found.drive_map.name} ({len(found.drive_map.cells)} parameters)  capability level {found.level}",
         *([f"recorder: {found.recorder}"] if found.recorder else []),
         *found.replaced,
         "",

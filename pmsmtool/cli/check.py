@@ -99,11 +99,11 @@ def _conclude(out: Output, found: list[Finding], stated_by: str = "") -> None:
 
 def _below_full(bus: BusOptions, map_file: Path | None) -> Capabilities | None:
     """Return what the drive has where that is less than the full level, None where all is there."""
-    from pmsmtool.measurement.capabilities import Tier, examine
+    from pmsmtool.measurement.capabilities import CapabilityLevel, examine
 
     with open_node(bus, within_s=LOOKING_S) as node:
         found = examine(node, None if map_file is None else read_map(map_file))
-    return None if found.tier in (Tier.FULL, Tier.INJECT) else found
+    return None if found.level in (CapabilityLevel.FULL, CapabilityLevel.INJECT) else found
 
 
 def _check_below_full(
@@ -112,15 +112,15 @@ def _check_below_full(
     """Ask, and check what the drive's level lets be seen."""
     from pmsmtool.cia402 import HOMING_LOST
     from pmsmtool.cli.consent import ask_motion
-    from pmsmtool.commissioning.first_check_tiers import check_below_full, envelope_below_full, turns_a_vector
+    from pmsmtool.commissioning.first_check_levels import check_below_full, envelope_below_full, turns_a_vector
     from pmsmtool.errors import ConfigError, NotAvailable
     from pmsmtool.identification.request import IdentifyRequest, Method
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.measurement.capabilities import Tier
+    from pmsmtool.measurement.capabilities import CapabilityLevel
     from pmsmtool.measurement.identify import open_for_level
 
     missing = found.row("mechanics", Method.STANDARD).missing
-    if found.tier not in (Tier.STANDARD, Tier.RECORDER) or missing:
+    if found.level not in (CapabilityLevel.STANDARD, CapabilityLevel.RECORDER) or missing:
         raise NotAvailable(
             f"nothing can be moved on this drive: it needs {', '.join(missing) or 'objects of CiA 402'}",
             where=f"node {found.identity.node}", hint="`pmsmtool caps` lists what it can measure",
@@ -142,7 +142,7 @@ def _check_below_full(
             *envelope.lines(),
             f"{'a turned vector leads' if turns_a_vector(found) else 'torque pulses turn'} the shaft by at most half a "
             f"turn; {HOMING_LOST}",
-            f"capability level {found.tier}: what it cannot show is listed as NOT CHECKED",
+            f"capability level {found.level}: what it cannot show is listed as NOT CHECKED",
             "nothing is stored in the drive; every changed object is restored",
         ]
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)

@@ -157,7 +157,9 @@ def commission_command(
             )
         if begun is None and _starts_blank(bus):
             forget_map(JournalFolder(found.identity))
-        run = begun or begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=_recorded(bus), tier=found.tier)
+        run = begun or begin_run(
+            drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=_recorded(bus), level=found.level
+        )
         progress = StageProgress(out)
         person = _Person(run, drive, bus, motion, out, progress)
         chain = Commissioning(run, drive, person, progress, **asked, capabilities=found)

@@ -26,7 +26,7 @@ from pmsmtool.estimators.refusals import REFUSALS
 from pmsmtool.identification.request import Method
 from pmsmtool.identification.run_files import MACHINE, stored_traces
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.measurement.capabilities import QUANTITIES, Tier
+from pmsmtool.measurement.capabilities import QUANTITIES, CapabilityLevel
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.run_directory import RunDirectory, RunRecord, Stage, Status
@@ -119,9 +119,9 @@ def _drive(record: RunRecord) -> dict[str, Any]:
     """Vendor, product and firmware tell a kind of drive; the serial number and the texts of a drive are one's own."""
     numbers = {key: record.drive.get(key) for key in ("vendor", "product", "revision")}
     kept: dict[str, Any] = {key: n for key, n in numbers.items() if type(n) is int and 0 <= n < _WORD}
-    tier = _one_of(record.drive.get("tier"), tuple(Tier))
+    level = _one_of(record.drive.get("level", record.drive.get("tier")), tuple(CapabilityLevel))
     family = _one_of(record.drive.get("map"), family_names())
-    return kept | ({"tier": tier} if tier else {}) | ({"map": family} if family else {})
+    return kept | ({"level": level} if level else {}) | ({"map": family} if family else {})
 
 
 def _one_of(text: Any, known: Sequence[str]) -> str:

@@ -375,12 +375,12 @@ def begin_run(
     *,
     command: Sequence[str] = ("commission",),
     bus: Mapping[str, Any] | None = None,
-    tier: str = "",
+    level: str = "",
 ) -> RunDirectory:
     """Make the run directory of a drive below ``runs``; raises ``ConfigError`` when it cannot be written."""
     record = new_record(
         command,
-        drive={**drive_facts(drive.identity), **({"tier": tier, "map": drive.node.map.name} if tier else {})},
+        drive={**drive_facts(drive.identity), **({"level": level, "map": drive.node.map.name} if level else {})},
         bus={**(bus or {}), "node": drive.identity.node},
         versions={"pmsmtool": __version__, **{name: version(name) for name in ("numpy", "scipy", "python-can")}},
     )

@@ -34,7 +34,7 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.by_pulses import OVER_TORQUE_CONSTANT, measurable
 from pmsmtool.measurement.by_vendor import vendor_line
-from pmsmtool.measurement.capabilities import Capabilities, Tier
+from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel
 from pmsmtool.measurement.identify import OF_LEVEL, SET_UP, identify, identify_after_drive
 from pmsmtool.measurement.task import Allow, Say
 from pmsmtool.params.parameter_set import read_parameter_set
@@ -83,20 +83,20 @@ class LevelStages:
     @property
     def whole(self) -> bool:
         """Whether every stage is expected: at the full level, and where it lacks only what makes motion safe."""
-        return self.found.tier is Tier.FULL or self.found.unsafe
+        return self.found.level is CapabilityLevel.FULL or self.found.unsafe
 
     @property
     def injects(self) -> bool:
         """Whether the machine is identified by injection."""
-        return self.whole or self.found.tier is Tier.INJECT
+        return self.whole or self.found.level is CapabilityLevel.INJECT
 
     def plan_lines(self) -> list[str]:
         """Return what the chain will do below the full level, one line per stage, before anything moves."""
         if self.whole:
             return []
-        drive_map, tier = self.found.drive_map, self.found.tier
+        drive_map, level = self.found.drive_map, self.found.level
         known = self.known()
-        lines = [f"capability level {tier}, map {drive_map.name}: {len(drive_map.cells)} parameters"]
+        lines = [f"capability level {level}, map {drive_map.name}: {len(drive_map.cells)} parameters"]
         lines.append("identify: " + ("; ".join(self._measurable()) or f"not available: {self._nothing()}"))
         rest = "what is measured"
         if known is not None:
@@ -157,7 +157,7 @@ class LevelStages:
         if not reason and request.shaft == "locked":
             reason = "needs a rotor that may turn, and the shaft is locked"
         if not reason:
-            method = OF_LEVEL[found.tier]
+            method = OF_LEVEL[found.level]
 
             def measured(wanted: IdentifyRequest) -> Stage:
                 return _stopped(identify(run, drive, wanted, allow, say, method=method, found=found, known=known), True)
@@ -229,7 +229,7 @@ class LevelStages:
         """Prove what the drive can show."""
         self._need_design()
         self._refuse(self._no_proof())
-        if self.found.tier is Tier.RECORDER:
+        if self.found.level is CapabilityLevel.RECORDER:
             request = replace(request, experiments=RECORDER_STEPS)
         return prove_stage(self.run, self.drive, load_design(self.run.path / "design.toml"), request, allow, say)
 
@@ -247,17 +247,17 @@ class LevelStages:
         return replace(known[0], encoder=encoder), known[1]
 
     def _complete(self, known: Any) -> bool:
-        return known is not None or self.found.tier is Tier.INJECT
+        return known is not None or self.found.level is CapabilityLevel.INJECT
 
     def _measurable(self) -> list[str]:
-        if self.found.tier is Tier.INJECT:
+        if self.found.level is CapabilityLevel.INJECT:
             return [", ".join(QUANTITIES)]
-        told = measurable(OF_LEVEL.get(self.found.tier, Method.STANDARD), self.found, self.nameplate)
+        told = measurable(OF_LEVEL.get(self.found.level, Method.STANDARD), self.found, self.nameplate)
         return [*self._own_line(), *(line for line in told if line != OVER_TORQUE_CONSTANT)]
 
     def _own_line(self) -> list[str]:
         """Return what the drive's own identification tells; where a recorder measures with intervals, it is not run."""
-        return [] if self.found.tier in (Tier.INJECT, Tier.RECORDER) else vendor_line(self.found)
+        return [] if self.found.level in (CapabilityLevel.INJECT, CapabilityLevel.RECORDER) else vendor_line(self.found)
 
     def _quantities(self) -> list[str]:
         return [
@@ -298,7 +298,7 @@ class LevelStages:
         return "" if self.drive.node.can_store() else NO_STORE
 
     def _no_proof(self) -> str:
-        if self.found.drive_map.staging and (self.injects or self.found.tier is Tier.RECORDER):
+        if self.found.drive_map.staging and (self.injects or self.found.level is CapabilityLevel.RECORDER):
             return ""
         cells = self.found.drive_map.cells
         reason = "the drive's current-loop gains cannot be read"
@@ -309,7 +309,7 @@ class LevelStages:
         return reason + (NOT_SHOWN if design.is_file() and guaranteed(load_design(design)) else "")
 
     def _provable(self) -> str:
-        if self.found.tier is Tier.INJECT:
+        if self.found.level is CapabilityLevel.INJECT:
             return "speed step, current steps, unreachable reference, field weakening"
         return "speed step; the others need excitation"
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A drive of another maker whose map names enough of its recorder: torque pushes recorded at its own loop's rate.
 
-Position, speed and current are polled as on any drive of the standard tier; what is recorded comes from the recorder
+Position, speed and current are polled as on any drive of the standard level; what is recorded comes from the recorder
 that the map describes. A recorder that holds fewer rows than asked for takes them further apart.
 """
 
@@ -22,7 +22,7 @@ from pmsmtool.drive.port import Recording
 from pmsmtool.drive.recorders.choice import recorder_of
 from pmsmtool.drive.recorders.commanded import CommandedRecorder
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S, RecorderDrive
-from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import BusError, NotAvailable, SdoAbort
 from pmsmtool.estimators.recorded_push import DELAY_DOUBT

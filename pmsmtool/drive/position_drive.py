@@ -19,7 +19,7 @@ from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits, hel
 from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.drive.set_point import POSITION_DEMAND, TARGET_POSITION, WHOLE, start_move
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S
-from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import LimitExceeded, NotAvailable, SdoAbort
 from pmsmtool.trace import Trace

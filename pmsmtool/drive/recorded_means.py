@@ -139,7 +139,7 @@ class RecordedMeans(Recorder):
 
 
 class RecordingDrive(CanopenDrive):
-    """The reference drive's port with :class:`RecordedMeans` for its averages (tier ``inject``)."""
+    """The reference drive's port with :class:`RecordedMeans` for its averages (level ``inject``)."""
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)

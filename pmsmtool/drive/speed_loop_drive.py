@@ -22,7 +22,7 @@ from pmsmtool.drive.motion_objects import POSITION, TORQUE_PERMILLE, allowed, cu
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S
-from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import LimitExceeded, NotAvailable, SdoAbort
 from pmsmtool.trace import Trace

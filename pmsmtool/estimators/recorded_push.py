@@ -31,7 +31,7 @@ DELAY_DOUBT = "delay_doubt_periods"
 less is known of a drive's voltages."""
 LEAST_PUSHES = 6
 # Model errors: 95 % half widths beyond what fit and shapes show, chosen on 119 random drives (seeds 8000 to 8041 and
-# 65000 to 65076 of benchmarks.tier_intervals); the errors are theirs.
+# 65000 to 65076 of benchmarks.level_intervals); the errors are theirs.
 L_Q_FLOOR = 0.025
 """Of L_q (relative): median 0.2 %, 1.6 % on nine of ten, up to 5 %."""
 L_Q_PER_ERROR = 0.015

@@ -39,8 +39,8 @@ from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 from pmsmtool.units import RPM_PER_RAD_S
 
-FACTS = "tier.json"
-"""What the estimates depend on besides traces, request and nameplate."""
+FACTS, OLDER_FACTS = "level.json", "tier.json"
+"""What the estimates depend on besides traces, request and nameplate; its older name is still read."""
 UTILISATION = 1.0 / math.sqrt(3.0)
 """Largest phase voltage amplitude over the DC link where no machine file says it."""
 NO_RESISTANCE = "the inverter's error at running currents hides it on this drive; needs current set-points"
@@ -340,7 +340,7 @@ def evaluated_stage(
     designed = completed_machine(known, result.estimates, facts.source).machine
     judgement = judged(result.estimates, result.missing, request.quantities, designed)
     made = completed_machine(known, judgement.kept(result.estimates), facts.source)
-    files = dict.fromkeys((*(f"traces/{name}.npz" for name in traces), REQUEST, FACTS), "")
+    files = dict.fromkeys((*(f"traces/{name}.npz" for name in traces), REQUEST, facts_name(run) or FACTS), "")
     if made.machine is not None and judgement.verdicts.accepted:
         text = dump_machine_file(made.machine)
         place, prefix = place_of(run, text)
@@ -362,15 +362,23 @@ def dump_facts(facts: PulseFacts) -> str:
     return json.dumps(asdict(facts), indent=1) + "\n"
 
 
-def read_facts(run: RunDirectory) -> PulseFacts:
-    """Return the facts of a run.
+def facts_name(run: RunDirectory) -> str | None:
+    """Return the name of the file of facts of a run; None where it has none: it was identified by injection."""
+    return next((name for name in (FACTS, OLDER_FACTS) if (run.path / name).is_file()), None)
+
+
+def read_facts(run: RunDirectory) -> PulseFacts | None:
+    """Return the facts of a run, None where it has none.
 
     Raises
     ------
     ConfigError
         They are not what :func:`dump_facts` writes.
     """
-    path = run.path / FACTS
+    name = facts_name(run)
+    if name is None:
+        return None
+    path = run.path / name
     try:
         facts = json.loads(read_text(path))
         found = PulseFacts(**{**facts, "kind": Method(facts["kind"]), "traces": tuple(facts["traces"])})

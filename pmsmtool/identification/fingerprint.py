@@ -11,7 +11,7 @@ from typing import Any
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
 from pmsmtool.files import read_text
-from pmsmtool.identification.by_pulses import FACTS, read_facts
+from pmsmtool.identification.by_pulses import read_facts
 from pmsmtool.identification.by_vendor import ANSWERS
 from pmsmtool.identification.compared_runs import Difference, differences, same_drive, told
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method, parse_request
@@ -103,7 +103,8 @@ def read_earlier(run: RunDirectory) -> Earlier:
             "the drive measured by itself in this run: its values have no interval", where=str(run.path),
             hint="give a run with another --method",
         )  # fmt: skip
-    level = read_facts(run).kind if (run.path / FACTS).is_file() else Method.INJECT
+    facts = read_facts(run)
+    level = facts.kind if facts else Method.INJECT
     text = read_text(run.path / REQUEST, hint="the run is not complete: give another one")
     request = parse_request(text, where=str(run.path / REQUEST))
     file = _machine_file(run)

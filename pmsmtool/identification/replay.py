@@ -45,7 +45,7 @@ def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibrat
             where=str(run.path),
             hint="`pmsmtool identify --method vendor` has the drive measure again",
         )
-    pulses = by_pulses.read_facts(run) if (run.path / by_pulses.FACTS).is_file() else None
+    pulses = by_pulses.read_facts(run)
     named = pulses is None or bool(pulses.source)
     for name in (NAMEPLATE, REQUEST) if named else (REQUEST,):
         if not (run.path / name).is_file():

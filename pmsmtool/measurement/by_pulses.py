@@ -21,7 +21,7 @@ from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration
 from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive, guarded
 from pmsmtool.drive.motion_objects import allowed, current_limits, rated_apk, speed_limits, trips_itself
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
-from pmsmtool.drive.tier_drives import SpeedPushDrive, TorqueDrive, pushing_drive
+from pmsmtool.drive.torque_drives import SpeedPushDrive, TorqueDrive, pushing_drive
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.experiments.current_limit import LimitShown, require_limit, show_torque_limit, unproven

@@ -39,7 +39,7 @@ from pmsmtool.identification.request import Method
 T = TypeVar("T")
 
 
-class Tier(StrEnum):
+class CapabilityLevel(StrEnum):
     """How much a drive gives, from most to least."""
 
     FULL = "full"
@@ -202,17 +202,21 @@ class Capabilities:
     current_undecided: bool = False
 
     @property
-    def tier(self) -> Tier:
-        """The highest tier whose needs are met."""
-        for tier, needs in _TIERS:
+    def level(self) -> CapabilityLevel:
+        """The highest level whose needs are met."""
+        for level, needs in _LEVELS:
             if self.features >= {*needs, *self._always}:
-                return tier
-        return Tier.VENDOR if any(self.row(name, Method.VENDOR).available for name in WAYS) else Tier.MANUAL
+                return level
+        return (
+            CapabilityLevel.VENDOR
+            if any(self.row(name, Method.VENDOR).available for name in WAYS)
+            else CapabilityLevel.MANUAL
+        )
 
     @property
     def unsafe(self) -> bool:
-        """Whether the full tier lacks only what makes motion safe: such a drive is refused, it is no lower tier."""
-        missing = set(dict(_TIERS)[Tier.FULL]) - self.features
+        """Whether the full level lacks only what makes motion safe: such a drive is refused, it is no lower level."""
+        missing = set(dict(_LEVELS)[CapabilityLevel.FULL]) - self.features
         return bool(missing) and missing <= set(_SAFE)
 
     def rows(self) -> tuple[Row, ...]:
@@ -243,7 +247,7 @@ class Capabilities:
 
     @property
     def _always(self) -> tuple[str, ...]:
-        """What every motion needs: a reference drive without its own safety is not moved by a lower tier either."""
+        """What every motion needs: a reference drive without its own safety is not moved by a lower level either."""
         return _SAFE if self.drive_map.staging else ()
 
     def require(self, quantities: Sequence[str], method: Method | None) -> Method:
@@ -284,11 +288,11 @@ class Capabilities:
 UNDECIDED = "no source says whether its amperes are peak or rms: +-17 % more"
 MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD, Method.VENDOR)
 """Methods that measure, the best first."""
-_TIERS = (
-    (Tier.FULL, (*_INJECT, "averages")),
-    (Tier.INJECT, _INJECT),
-    (Tier.RECORDER, _RECORD),
-    (Tier.STANDARD, (*_BOUNDED, "push")),
+_LEVELS = (
+    (CapabilityLevel.FULL, (*_INJECT, "averages")),
+    (CapabilityLevel.INJECT, _INJECT),
+    (CapabilityLevel.RECORDER, _RECORD),
+    (CapabilityLevel.STANDARD, (*_BOUNDED, "push")),
 )
 
 
@@ -408,19 +412,19 @@ def reference_capabilities(identity: Identity) -> Capabilities:
 
 _FULL = "benchmarks.identification_coverage --drives 400 --first 70000"
 _MECHANICS = "benchmarks.mechanics_accuracy --drives 240 --first 67000"
-_RECORDER_RUN = "benchmarks.tier_intervals recorder --drives 200 --first 65302"
-_STANDARD_RUN = "benchmarks.tier_intervals standard --drives 200 --first 64200 --speed 1.35"
+_RECORDER_RUN = "benchmarks.level_intervals recorder --drives 200 --first 65302"
+_STANDARD_RUN = "benchmarks.level_intervals standard --drives 200 --first 64200 --speed 1.35"
 
-_SUPPLY_RUN = "benchmarks.tier_intervals supply --drives 60 --first 65000"
+_SUPPLY_RUN = "benchmarks.level_intervals supply --drives 60 --first 65000"
 _DEAD_TIME = "a machine file that names the dead time"
-_BLIND_RUN = "benchmarks.tier_intervals standard --drives 27 --first 5076 --speed 1.35 --no-machine"
+_BLIND_RUN = "benchmarks.level_intervals standard --drives 27 --first 5076 --speed 1.35 --no-machine"
 
 
 def _expected(program: str, drives: int, *rows: tuple[str, float, str], given: str = "") -> tuple[Expected, ...]:
     return tuple(Expected(name, half, unit, drives, program, given) for name, half, unit in rows)
 
 
-_INJECT_RUN = "benchmarks.tier_intervals inject --drives 200 --first 63000"
+_INJECT_RUN = "benchmarks.level_intervals inject --drives 200 --first 63000"
 
 
 def _vendor(quantity: str, note: str = "") -> Way:

@@ -20,7 +20,7 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
 from pmsmtool.drive.recorded_means import RecordingDrive
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
-from pmsmtool.drive.tier_drives import ParameterDrive
+from pmsmtool.drive.torque_drives import ParameterDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
 from pmsmtool.errors import DriveFault, IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal
 from pmsmtool.experiments.supply_levels import ReadSupply
@@ -34,7 +34,7 @@ from pmsmtool.measurement import by_injection, by_pulses, by_vendor
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.by_pulses import measurable
 from pmsmtool.measurement.by_vendor import vendor_quantities
-from pmsmtool.measurement.capabilities import Capabilities, Tier, reference_capabilities
+from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, reference_capabilities
 from pmsmtool.measurement.run_account import status_of, text_of
 from pmsmtool.measurement.task import Allow, Keep, Known, Say, Task
 from pmsmtool.run_directory import RunDirectory, Stage
@@ -85,9 +85,9 @@ METHODS: Mapping[Method, Row] = {
     ),
     Method.VENDOR: Row(lambda found: VendorDrive, by_vendor.plan, by_vendor.measure, by_vendor.evaluate),
 }  # fmt: skip
-OF_LEVEL: Mapping[Tier, Method] = {
-    Tier.FULL: Method.INJECT, Tier.INJECT: Method.INJECT, Tier.RECORDER: Method.RECORDER,
-    Tier.STANDARD: Method.STANDARD,
+OF_LEVEL: Mapping[CapabilityLevel, Method] = {
+    CapabilityLevel.FULL: Method.INJECT, CapabilityLevel.INJECT: Method.INJECT,
+    CapabilityLevel.RECORDER: Method.RECORDER, CapabilityLevel.STANDARD: Method.STANDARD,
 }  # fmt: skip
 """Method with the narrowest intervals at a capability level."""
 
@@ -103,7 +103,7 @@ def open_for_level(connection: Connection, node: int, found: Capabilities) -> Ca
         It lacks what even its capability level needs.
     """
     check_motion(found.drive_map, found.identity)
-    method = Method.INJECT if found.unsafe else OF_LEVEL.get(found.tier)
+    method = Method.INJECT if found.unsafe else OF_LEVEL.get(found.level)
     kind = ParameterDrive if method is None else METHODS[method].opens(found)
     return kind(connection, node, drive_map=found.drive_map)
 

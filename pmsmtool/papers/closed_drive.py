@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The governor of a closed drive on a simulated node of the standard tier: what it promises, and what it costs.
+"""The governor of a closed drive on a simulated node of the standard level: what it promises, and what it costs.
 
-A simulated drive of the standard tier under a torque that its master asks for, while a load machine sets the speed.
+A simulated drive of the standard level under a torque that its master asks for, while a load machine sets the speed.
 
 The node is operated through its object dictionary, what it did is read from the simulation itself.
 """
@@ -132,7 +132,7 @@ class OpenDrive(_Rig):
 
 
 class ClosedNode(_Rig):
-    """A drive of the standard tier on a machine whose speed is imposed.
+    """A drive of the standard level on a machine whose speed is imposed.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def source() -> MachineFile:
 
 
 def design(request: TuneRequest) -> tuple[Design, Guarantee]:
-    """Return the design for the standard-tier node; its current bandwidth is what its maker's tool has set up."""
+    """Return the design for the standard-level node; its current bandwidth is what its maker's tool has set up."""
     file = source()
     bandwidth = SET_UP_BANDWIDTH / file.inverter.T_s / (2.0 * np.pi)
     offers = frozenset(load_family(STANDARD).cells)

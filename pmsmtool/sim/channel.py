@@ -54,7 +54,7 @@ from pmsmtool.sim.faults import load_faults
 from pmsmtool.sim.line import Line
 from pmsmtool.sim.node.face import DriveFace
 from pmsmtool.sim.node.factory import drive_settings
-from pmsmtool.sim.node.family import TIER_HIDES, Face, Reduced
+from pmsmtool.sim.node.family import LEVEL_HIDES, Face, Reduced
 from pmsmtool.sim.node.lss import UNCONFIGURED
 from pmsmtool.sim.node.memory import FileStorage, Memory, RamStorage, Storage
 from pmsmtool.sim.node.node import Node
@@ -125,8 +125,8 @@ def _short_time(text: str) -> float:
 
 
 def _level(text: str) -> str:
-    if text not in TIER_HIDES:
-        raise ValueError(f"must be one of {', '.join(TIER_HIDES)}")
+    if text not in LEVEL_HIDES:
+        raise ValueError(f"must be one of {', '.join(LEVEL_HIDES)}")
     return text
 
 

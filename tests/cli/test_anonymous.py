@@ -60,7 +60,7 @@ def made(folder: Path, name: Namer | None = None) -> Path:
     """Make a run of every kind of record; with names in all its free texts."""
     text = name if name is not None else (lambda: "plain")
     drive = {"node": 5, "vendor": 0xFB, "product": 0x65510000, "revision": 0x01700000, "serial": SERIAL, "name": text(),
-             "hardware": text(), "software": text(), "tier": "standard", "map": "epos4"}  # fmt: skip
+             "hardware": text(), "software": text(), "level": "standard", "map": "epos4"}  # fmt: skip
     versions = {"pmsmtool": "0.1.0", "numpy": text()}
     record = new_record([text(), text()], drive=drive, bus={"interface": "socketcan", "channel": text()},
                         versions=versions, operator=text(), instruments=[text()])  # fmt: skip
@@ -98,7 +98,7 @@ def made(folder: Path, name: Namer | None = None) -> Path:
 
 def test_it_holds_what_a_drive_did(tmp_path: Path) -> None:
     found = anonymous_run(made(tmp_path))
-    assert found["drive"] == {"vendor": 0xFB, "product": 0x65510000, "revision": 0x01700000, "tier": "standard",
+    assert found["drive"] == {"vendor": 0xFB, "product": 0x65510000, "revision": 0x01700000, "level": "standard",
                               "map": "epos4"}  # fmt: skip
     (stage,) = found["stages"]
     assert (stage["stage"], stage["status"], stage["criteria"]) == ("identify", "partial", [True, False])

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from pmsmtool.commissioning.first_check_tiers import beyond, judge_kept
+from pmsmtool.commissioning.first_check_levels import beyond, judge_kept
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import LimitExceeded
 from pmsmtool.experiments.first_push import WAY_RAD, push_forth_and_back
@@ -44,7 +44,7 @@ def checked(tool: Tool, level: str, extra: str = "encoder_bits = 17") -> tuple[i
     ],
 )  # fmt: skip
 def test_a_drive_with_a_recorder(extra: str, wrong: str, tool: Tool) -> None:
-    code, rows = checked(tool, "tier=recorder", extra)
+    code, rows = checked(tool, "level=recorder", extra)
     assert [name for name, verdict in rows.items() if verdict == WRONG] == ([wrong] if wrong else []), rows
     assert code == (1 if wrong else 10)
     assert rows["current sensors"] == NOT_CHECKED
@@ -60,7 +60,7 @@ def test_a_makers_drive_lists_what_it_cannot_show(tool: Tool, tmp_path: Path) ->
 
 
 def test_without_a_machine_file_nothing_moves(tool: Tool) -> None:
-    code, _, told = tool("-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&tier=recorder", "check", "--yes")
+    code, _, told = tool("-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&level=recorder", "check", "--yes")
     assert code == 2 and "MACHINE is missing" in told
 
 

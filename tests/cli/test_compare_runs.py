@@ -93,7 +93,7 @@ def test_values_that_scatter_as_they_say_differ_in_one_of_twenty() -> None:
 def test_a_drive_is_known_by_its_serial_number_whatever_else_was_recorded() -> None:
     """A commissioning records level and map of the drive, too: `diff` took it for another one."""
     drive = {"node": 1, "vendor": 5, "product": 2, "serial": 7, "software": "1.0"}
-    assert same_drive(drive, {**drive, "node": 3, "software": "1.1", "tier": "full", "map": "pmsmsim"})
+    assert same_drive(drive, {**drive, "node": 3, "software": "1.1", "level": "full", "map": "pmsmsim"})
     assert not same_drive(drive, {**drive, "serial": 8}) and not same_drive(drive, {**drive, "product": 3})
     assert not same_drive({**drive, "serial": 0}, {**drive, "serial": 0})
 

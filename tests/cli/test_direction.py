@@ -30,8 +30,8 @@ CASES: dict[str, dict[str, Value]] = {
 }
 LEVELS = {
     "full": ("", ("poles", "L")),
-    "inject": ("&tier=inject", ("poles", "L")),
-    "recorder": ("&tier=recorder", ("psi",)),
+    "inject": ("&level=inject", ("poles", "L")),
+    "recorder": ("&level=recorder", ("psi",)),
     "standard": ("&drive=cia402", ("encoder", "poles")),
 }
 """Channel, and the shortest of what this level measures after the direction is known."""

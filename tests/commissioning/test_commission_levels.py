@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The chain on drives of every tier and mapped family: partial, and each stage that did not run with its reason."""
+"""The chain on drives of every level and mapped family: partial, and each stage that did not run with its reason."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from pmsmtool.errors import ConfigError, Contradiction, ExitCode, NotAvailable
 from pmsmtool.identification.replay import replay
 from pmsmtool.identification.run_files import REPLAYED
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.measurement.capabilities import Capabilities, Tier, examine
+from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, examine
 from pmsmtool.measurement.identify import SET_UP, open_for_level
 from pmsmtool.papers.closed_drive import ClosedNode
 from pmsmtool.params.parameter_set import read_parameter_set
@@ -49,7 +49,7 @@ pytestmark = pytest.mark.chain
 
 PROFILE = data_folder("profiles") / "interior-2k2.toml"
 INJECT_OFF = 2e-3
-"""Largest error of an identified value on the inject tier, of R ten times that. Seven seeds of the drive's noise: L at
+"""Largest error of an identified value on the inject level, of R ten times that. Seven seeds of the drive's noise: L at
 most 0.09 %, psi_f 0.02 %, J 0.05 %, R 0.21 %."""
 FEW = ProofRequest(runs=32)
 """The proof's own tests run all of its experiments."""
@@ -88,7 +88,7 @@ def chain(
 def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run of a drive that takes a rated current alone: its machine file is what was given."""
     with opened("&drive=faulhaber") as (drive, found):
-        run = begin_run(drive, tmp_path_factory.mktemp("designed"), tier=found.tier)
+        run = begin_run(drive, tmp_path_factory.mktemp("designed"), level=found.level)
         progress, _ = chain(run, drive, found)
     assert progress.ended == {
         "identify": "not available", "tune": "not available", "lut": "pass", "margins": "not available",
@@ -106,7 +106,7 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def continued(designed: Path, folder: Path, drive: CanopenDrive, found: Capabilities) -> RunDirectory:
     """That run from its design on, as if this drive had been there from its beginning."""
-    run = begin_run(drive, folder, tier=found.tier)
+    run = begin_run(drive, folder, level=found.level)
     for name in ("machine.toml", "nameplate.toml"):
         shutil.copy(designed / name, run.path)
     run.write(replace(run.read(), stages=RunDirectory(designed).read().stages[:1]))
@@ -167,7 +167,7 @@ def test_nothing_is_moved_through_a_map_that_names_no_drive(family: str, designe
 def test_one_pair_of_gains_is_the_smaller_of_both_axes(tmp_path: Path) -> None:
     """EPOS4 has one pair: the q gain of a machine with L_q > L_d would be too large for d; measured by pushes alone."""
     with opened("&drive=epos4") as (drive, found):
-        run = begin_run(drive, tmp_path, tier=found.tier)
+        run = begin_run(drive, tmp_path, level=found.level)
         progress, _ = chain(run, drive, found)
         assert progress.ended["identify"] == progress.ended["flash"] == "pass"
         design = load_design(run.path / "design.toml")
@@ -198,7 +198,7 @@ def test_a_drive_that_cannot_be_reflashed_is_kept_out_of_saturation_by_its_limit
     hertz = SET_UP_BANDWIDTH / sheet.inverter.T_s / (2.0 * math.pi)
     assert why_no_limits(drive_map, None) == NO_BANDWIDTH
     with opened("&drive=cia402", drive_map) as (drive, found):
-        run = begin_run(drive, tmp_path, tier=found.tier)
+        run = begin_run(drive, tmp_path, level=found.level)
         progress, person = Quiet(), Told()
         chain = Commissioning(
             run, drive, person, progress, sheet, capabilities=found, drive_bandwidth_hz=hertz,
@@ -227,7 +227,7 @@ def test_a_drive_that_cannot_be_reflashed_is_kept_out_of_saturation_by_its_limit
 
 def test_without_a_data_sheet_what_is_missing_is_named(tmp_path: Path) -> None:
     with opened("&drive=epos4") as (drive, found):
-        run = begin_run(drive, tmp_path, tier=found.tier)
+        run = begin_run(drive, tmp_path, level=found.level)
         progress, _ = chain(run, drive, found, sheet=False)
     assert progress.ended["identify"] == "pass" and progress.ended["tune"] == "not available"
     assert "R_s_ohm, L_d_h, L_q_h" in run.read().stage("tune").note  # type: ignore[union-attr]
@@ -241,7 +241,7 @@ def test_a_file_of_other_pole_pairs_than_the_drive_holds_writes_nothing(tmp_path
     with opened("&drive=epos4") as (drive, found):
         names = list(found.drive_map.cells)
         before = DriveParameters(drive.node).read(names)
-        run, person = begin_run(drive, tmp_path, tier=found.tier), Told()
+        run, person = begin_run(drive, tmp_path, level=found.level), Told()
         with pytest.raises(Contradiction, match="pole_pairs: the data sheet states 7, the drive holds 3") as ended:
             Commissioning(run, drive, person, Quiet(), wrong, capabilities=found).carry_out()
         assert DriveParameters(drive.node).read(names) == before and not person.shown
@@ -254,9 +254,9 @@ def test_a_file_of_other_pole_pairs_than_the_drive_holds_writes_nothing(tmp_path
     assert "Data sheet, drive, measured" in report_page(run.path)
 
 
-def test_recorder_tier_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Path) -> None:
-    with opened("&tier=recorder") as (drive, found):
-        run = begin_run(drive, tmp_path, tier=found.tier)
+def test_recorder_level_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Path) -> None:
+    with opened("&level=recorder") as (drive, found):
+        run = begin_run(drive, tmp_path, level=found.level)
         progress, _ = chain(run, drive, found, sheet=False)
     assert set(progress.ended.values()) == {"pass"}
     proof = run.read().stage("prove")
@@ -269,14 +269,14 @@ def test_recorder_tier_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Pat
     assert report_page(run.path).count(">{}</td>".format(SET_UP.replace("'", "&#39;"))) == 3
     given = next(value for value in run.read().stage("identify").values if value["name"] == "L_d_h")  # type: ignore[union-attr]
     assert given["source"] == SET_UP and "std" not in given
-    # the tier does not measure the encoder: its maker's offset must not be overwritten
+    # the level does not measure the encoder: its maker's offset must not be overwritten
     offset = load_machine_file(run.path / "machine.toml").encoder.offset_rad
     assert offset == pytest.approx(load_machine_file(PROFILE).encoder.offset_rad, abs=0.01)
 
 
-def test_inject_tier_is_commissioned_whole_and_replayed(tmp_path: Path) -> None:
-    with opened("&tier=inject") as (drive, found):
-        run = begin_run(drive, tmp_path, tier=found.tier)
+def test_inject_level_is_commissioned_whole_and_replayed(tmp_path: Path) -> None:
+    with opened("&level=inject") as (drive, found):
+        run = begin_run(drive, tmp_path, level=found.level)
         progress, _ = chain(run, drive, found, sheet=False, proof=replace(FEW, experiments=("q_steps",)))
     assert len(progress.ended) == 7 and set(progress.ended.values()) == {"pass"}
     stage = run.read().stage("identify")
@@ -291,9 +291,9 @@ def test_inject_tier_is_commissioned_whole_and_replayed(tmp_path: Path) -> None:
     assert (run.path / "machine.toml").read_bytes() == before and not (run.path / REPLAYED).exists()
 
 
-def test_inject_tier_measures_like_the_full_one_with_means_from_records(tmp_path: Path) -> None:
-    with opened("&tier=inject") as (drive, found):
-        assert found.tier is Tier.INJECT and found.best("L") is not None
+def test_inject_level_measures_like_the_full_one_with_means_from_records(tmp_path: Path) -> None:
+    with opened("&level=inject") as (drive, found):
+        assert found.level is CapabilityLevel.INJECT and found.best("L") is not None
         angles = [drive.live("theta_m_rad")]
         for _ in range(2):
             drive.recorder.start_average(("theta_m_rad", "U_dc_v"), 800)

@@ -182,7 +182,7 @@ def test_a_design_of_a_closed_drive_survives_its_file() -> None:
 
 
 def test_from_the_machine_to_the_objects_of_the_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """tune --map, flash-params --map, verify: through a user's own map of a drive of the standard tier."""
+    """tune --map, flash-params --map, verify: through a user's own map of a drive of the standard level."""
     monkeypatch.chdir(tmp_path)
     text = (data_folder("firmware-params") / "cia402" / "map.toml").read_text(encoding="utf-8")
     Path("mine.toml").write_text(

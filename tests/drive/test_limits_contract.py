@@ -30,7 +30,7 @@ from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
 from pmsmtool.drive.port import Drive
 from pmsmtool.drive.recorded_means import RecordedMeans
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
-from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
@@ -83,8 +83,8 @@ def _inject(connection: Connection) -> CanopenDrive:
 
 CLASSES = {
     "full": DriveClass("", lambda bus: CanopenDrive(bus, 1)),
-    "inject": DriveClass("&tier=inject", _inject),
-    "recorder": DriveClass("&tier=recorder", lambda bus: RecorderDrive(bus, 1)),
+    "inject": DriveClass("&level=inject", _inject),
+    "recorder": DriveClass("&level=recorder", lambda bus: RecorderDrive(bus, 1)),
     "standard": _family("cia402", StandardDrive),
     "torque": _family("epos4", TorqueDrive),
     "mapped-rows": _written(completed(), MappedRecorderDrive),

@@ -22,7 +22,7 @@ SIGNALS = ("u_d_v", "i_d_a", "theta_m_rad", "T_winding_c")
 
 @pytest.fixture
 def drive() -> Iterator[RecordingDrive]:
-    with Connection(PmsmSimBus("interior-2k2?nv=:memory:&tier=inject")) as connection:
+    with Connection(PmsmSimBus("interior-2k2?nv=:memory:&level=inject")) as connection:
         made = RecordingDrive(connection, 1)
         yield made
         made.close()

@@ -12,7 +12,7 @@ import pytest
 from pmsmtool.drive.guard import GuardedDrive, guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.drive.standard_drive import TorqueCurrent
-from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.errors import SafetyRefusal
 from pmsmtool.experiments import current_limit
 from pmsmtool.experiments.current_limit import (
@@ -162,4 +162,5 @@ def test_a_limit_that_does_not_act_is_kept_with_the_run(tmp_path: Path, monkeypa
         facts = push_by_torque(rig.drive, ENVELOPE, lambda name, trace: None, lambda text: None)
     assert facts.limit.startswith("the drive does not keep its own current limit")
     (tmp_path / FACTS).write_text(dump_facts(facts), encoding="utf-8")
-    assert read_facts(RunDirectory(tmp_path)).limit == facts.limit
+    kept = read_facts(RunDirectory(tmp_path))
+    assert kept is not None and kept.limit == facts.limit

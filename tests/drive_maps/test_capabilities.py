@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from benchmarks.level_intervals import told_by
 from benchmarks.random_drives import draw_drive
-from benchmarks.tier_intervals import told_by
 from pmsmtool.bus.connect import connect
 from pmsmtool.cia402 import State
 from pmsmtool.cli.main import cli
@@ -22,7 +22,7 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
-from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, IdentificationError, Interrupted, NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
@@ -34,7 +34,7 @@ from pmsmtool.measurement.capabilities import (
     FEATURES,
     WAYS,
     Capabilities,
-    Tier,
+    CapabilityLevel,
     examine,
     reference_capabilities,
 )
@@ -56,29 +56,30 @@ def examined(options: str) -> Capabilities:
 
 
 @pytest.mark.parametrize(
-    ("options", "tier", "map_name"),
+    ("options", "level", "map_name"),
     [
-        ("", Tier.FULL, "pmsmsim"),
-        ("&tier=inject", Tier.INJECT, "pmsmsim"),
-        ("&tier=recorder", Tier.RECORDER, "pmsmsim"),
-        ("&drive=cia402", Tier.STANDARD, "cia402"),
-        ("&drive=epos4", Tier.STANDARD, "epos4"),
-        ("&drive=epos2", Tier.MANUAL, "epos2"),
-        ("&drive=faulhaber", Tier.MANUAL, "faulhaber"),
-        ("&drive=copley", Tier.STANDARD, "copley"),
-        ("&drive=zeroerr", Tier.STANDARD, "zeroerr"),
+        ("", CapabilityLevel.FULL, "pmsmsim"),
+        ("&level=inject", CapabilityLevel.INJECT, "pmsmsim"),
+        ("&tier=inject", CapabilityLevel.INJECT, "pmsmsim"),  # the older name of the key
+        ("&level=recorder", CapabilityLevel.RECORDER, "pmsmsim"),
+        ("&drive=cia402", CapabilityLevel.STANDARD, "cia402"),
+        ("&drive=epos4", CapabilityLevel.STANDARD, "epos4"),
+        ("&drive=epos2", CapabilityLevel.MANUAL, "epos2"),
+        ("&drive=faulhaber", CapabilityLevel.MANUAL, "faulhaber"),
+        ("&drive=copley", CapabilityLevel.STANDARD, "copley"),
+        ("&drive=zeroerr", CapabilityLevel.STANDARD, "zeroerr"),
     ],
 )
-def test_tier_from_map_and_drive(options: str, tier: Tier, map_name: str) -> None:
+def test_level_from_map_and_drive(options: str, level: CapabilityLevel, map_name: str) -> None:
     found = examined(options)
-    assert (found.tier, found.drive_map.name) == (tier, map_name)
+    assert (found.level, found.drive_map.name) == (level, map_name)
 
 
 def test_the_drive_must_confirm_what_its_map_says(tmp_path: Path) -> None:
     faults = tmp_path / "faults.toml"
     faults.write_text('[[absent]]\nobject = "0x1016"\n')
     found = examined(f"&faults={faults}")
-    assert found.tier is Tier.MANUAL  # without heartbeat supervision nothing is moved
+    assert found.level is CapabilityLevel.MANUAL  # without heartbeat supervision nothing is moved
     assert "consumer heartbeat (0x1016)" in found.row("R", Method.INJECT).missing
     faults.write_text('[[absent]]\nobject = "0x2060"\n')
     assert "recorder" not in examined(f"&faults={faults}").features
@@ -111,7 +112,7 @@ def test_every_quantity_is_listed_with_every_method() -> None:
 
 @pytest.mark.chain
 def test_what_caps_promises_is_what_is_found_without_a_dead_time() -> None:
-    """Torque pushes of the standard tier: without a machine file that names the dead time nothing tells the voltage."""
+    """Torque pushes of the standard level: without a file that names the dead time nothing tells the voltage."""
     promised = {expected.given: expected.half_width for expected in WAYS["psi"][Method.STANDARD].expected}
     known = load_machine_file(machine_path("interior-2k2")).inverter
     assert known is not None
@@ -158,7 +159,7 @@ def test_caps_as_a_table_and_as_json() -> None:
     assert "not available: needs" in outcome.stdout
     outcome = run("--sim", CHANNEL, "caps", "--json")
     facts = json.loads(outcome.stdout)
-    assert facts["schema"] == "pmsmtool.caps/1" and facts["tier"] == "full"
+    assert facts["schema"] == "pmsmtool.caps/1" and facts["level"] == facts["tier"] == "full"
     by_way = {(row["quantity"], row["method"]): row for row in facts["quantities"]}
     assert by_way["psi", "inject"]["expected"][0]["name"] == "psi_f_wb"
     assert by_way["map", "inject"]["available"] and by_way["map", "inject"]["expected"] == []
@@ -179,8 +180,8 @@ def test_caps_of_an_unknown_drive_says_so() -> None:
         ("&drive=epos2", (), "encoder by standard: not available: needs"),
         ("&drive=cia402", ("L",), "L by recorder: not available: needs a recorder of currents and voltages"),
         ("&drive=epos2", ("mechanics",), "mechanics by standard: not available: needs torque mode"),
-        ("&tier=recorder", ("encoder",), "encoder by inject: not available: needs"),
-        ("&tier=recorder", ("R", "encoder"), "R: by itself yes (recorder), together with the others no"),
+        ("&level=recorder", ("encoder",), "encoder by inject: not available: needs"),
+        ("&level=recorder", ("R", "encoder"), "R: by itself yes (recorder), together with the others no"),
         ("", ("R", "--method", "vendor"), "R by vendor: not available: needs the maker's identification"),
         ("", ("R", "--method", "manual"), "R by manual: a number you bring"),
         ("", ("map", "--method", "standard"), "map has no standard method"),
@@ -199,7 +200,7 @@ def test_identify_ends_in_exit_9_and_names_what_is_missing(
 
 def test_a_locked_shaft_gives_nothing_without_injection(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    outcome = run("--sim", CHANNEL + "&tier=recorder", "--yes", "identify", "psi", "--shaft", "locked")
+    outcome = run("--sim", CHANNEL + "&level=recorder", "--yes", "identify", "psi", "--shaft", "locked")
     assert isinstance(outcome.exception, NotAvailable) and "must turn" in str(outcome.exception)
 
 
@@ -238,7 +239,7 @@ def test_a_known_drive_is_told_its_map() -> None:
     assert isinstance(outcome.exception, ConfigError)
 
 
-# ---- the experiments of the lower tiers ------------------------------------------------------------
+# ---- the experiments of the lower capability levels ------------------------------------------------------------
 
 
 def machine(tmp_path: Path, seed: int) -> tuple[MachineFile, Path]:
@@ -264,7 +265,7 @@ def test_pole_pairs_and_offset_of_a_random_drive_by_cia402(tmp_path: Path) -> No
         standard.close()
     truth = settings_of(drive).number("encoder_offset_rad")
     assert found["pole_pairs"].value == drive.machine.pole_pairs
-    # issue: 2 deg; the program benchmarks.tier_intervals measured 0.2 deg at most over 40 drives
+    # issue: 2 deg; the program benchmarks.level_intervals measured 0.2 deg at most over 40 drives
     assert abs(math.degrees(math.remainder(found["offset_rad"].value - truth, 2.0 * math.pi))) < 0.5
 
 
@@ -272,11 +273,11 @@ def test_pole_pairs_and_offset_of_a_random_drive_by_cia402(tmp_path: Path) -> No
 def test_flux_linkage_by_a_recorder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """On the profile: its inverter is averaged, so that the test is quick; random drives are the program's."""
     monkeypatch.chdir(tmp_path)
-    outcome = run("--sim", CHANNEL + "&tier=recorder", "--yes", "identify", "R", "psi", "L", "--json")
+    outcome = run("--sim", CHANNEL + "&level=recorder", "--yes", "identify", "R", "psi", "L", "--json")
     assert outcome.exit_code == 0, outcome.exception
     found = {value["name"]: value for value in json.loads(outcome.stdout)["values"]}
     truth = load_machine_file(data_folder("profiles") / "interior-2k2.toml").machine
-    # random drives are judged by benchmarks.tier_intervals
+    # random drives are judged by benchmarks.level_intervals
     assert found["psi_f_wb"]["value"] == pytest.approx(truth.psi_f_wb, rel=0.015)
     assert found["L_q_app_h"]["value"] == pytest.approx(truth.L_q_h, rel=0.05)
     assert found["R_s_ohm"]["value"] == pytest.approx(truth.R_s_ohm, rel=0.03)
@@ -287,7 +288,7 @@ def test_a_recorder_drive_that_does_not_commutate_is_refused(tmp_path: Path) -> 
     drive, path = machine(tmp_path, 105)
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace("[simulation]", '[simulation]\nrotor = "locked"'), encoding="utf-8")
-    with connect("pmsmsim", f"{path}?nv=:memory:&tier=recorder") as connection:
+    with connect("pmsmsim", f"{path}?nv=:memory:&level=recorder") as connection:
         recorder = RecorderDrive(connection, 1)
         with pytest.raises(IdentificationError, match="E_EXCITATION"):
             told_by(swing_and_record, recorder, envelope_for(drive))
@@ -295,10 +296,10 @@ def test_a_recorder_drive_that_does_not_commutate_is_refused(tmp_path: Path) -> 
         recorder.close()
 
 
-@pytest.mark.parametrize("tier", ["drive=cia402", "tier=recorder"])
-def test_an_interrupted_run_is_stopped_and_restored(tier: str) -> None:
+@pytest.mark.parametrize("level", ["drive=cia402", "level=recorder"])
+def test_an_interrupted_run_is_stopped_and_restored(level: str) -> None:
     """Ctrl-C with current flowing: stopped, confirmed, no torque left behind, every object as it was."""
-    with connect("pmsmsim", f"{CHANNEL}&{tier}") as connection:
+    with connect("pmsmsim", f"{CHANNEL}&{level}") as connection:
         session = connection.bus.line.nodes[0].session  # type: ignore[attr-defined]
 
         def memory() -> dict[int, bytes]:
@@ -308,7 +309,7 @@ def test_an_interrupted_run_is_stopped_and_restored(tier: str) -> None:
         before = memory()
         drive = (
             StandardDrive(connection, 1, drive_map=load_family("cia402"))
-            if tier == "drive=cia402"
+            if level == "drive=cia402"
             else RecorderDrive(connection, 1)
         )
         experiment = turn_both_ways if isinstance(drive, StandardDrive) else swing_and_record

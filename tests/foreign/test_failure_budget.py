@@ -24,7 +24,7 @@ from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
 from pmsmtool.drive.envelope import OFF_S, Envelope
 from pmsmtool.drive.guard import FRESH_S, OVERSHOOT, GuardedDrive
 from pmsmtool.drive.heartbeat import PERIOD_S
-from pmsmtool.drive.tier_drives import pushing_drive
+from pmsmtool.drive.torque_drives import pushing_drive
 from pmsmtool.drive_maps.shipped_maps import family_of
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path

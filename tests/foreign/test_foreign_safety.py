@@ -23,7 +23,7 @@ from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import WATCH_S, guarded
 from pmsmtool.drive.motion_objects import position_units, watched_by_tool
-from pmsmtool.drive.tier_drives import SpeedPushDrive, TorqueDrive, pushing_drive
+from pmsmtool.drive.torque_drives import SpeedPushDrive, TorqueDrive, pushing_drive
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import family_of, load_family
 from pmsmtool.errors import DriveFault, LimitExceeded, NotAvailable, SafetyRefusal

@@ -80,7 +80,7 @@ def test_caps_tells_what_it_gives(ask: Ask) -> None:
     code, printed, said = ask("caps", "--json")
     assert code == 0, said
     facts = json.loads(printed)
-    assert facts["map"] == "epos4" and facts["tier"] == "standard"
+    assert facts["map"] == "epos4" and facts["level"] == "standard"
 
 
 def test_saved_changed_and_brought_back(drive: Drive, ask: Ask) -> None:

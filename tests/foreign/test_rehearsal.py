@@ -56,7 +56,7 @@ def ways(facts: dict[str, object]) -> dict[tuple[str, str], dict[str, object]]:
 
 def test_what_an_eds_will_give(tmp_path: Path) -> None:
     facts = asked(tmp_path, epos4())
-    assert facts["tier"] == "standard" and facts["map"] == "epos4" and facts["replaced"] == []
+    assert facts["level"] == "standard" and facts["map"] == "epos4" and facts["replaced"] == []
     row = ways(facts)["mechanics", "standard"]
     assert row["available"] and row["expected"] == [], "a promise of 1.5 % would be of a current whose kind is known"
     assert "peak or rms" in str(row["note"])
@@ -64,13 +64,13 @@ def test_what_an_eds_will_give(tmp_path: Path) -> None:
 
 def test_what_replaces_a_missing_limit_is_said(tmp_path: Path) -> None:
     facts = asked(tmp_path, copley())
-    assert facts["tier"] == "standard" and facts["map"] == "copley"
+    assert facts["level"] == "standard" and facts["map"] == "copley"
     assert "0x6080" in str(facts["replaced"]) and "this program looks" in str(facts["replaced"])
 
 
 def test_without_supervision_nothing_is_moved(tmp_path: Path) -> None:
     facts = asked(tmp_path, tuple(row for row in copley() if row not in GUARDING))
-    assert facts["tier"] == "manual"
+    assert facts["level"] == "manual"
     assert "consumer heartbeat (0x1016), or node guarding (0x100C, 0x100D)" in str(ways(facts)["psi", "standard"])
 
 
@@ -142,7 +142,7 @@ def test_an_inertia_that_is_not_known_closely_enough_ends_no_rehearsal(
         found = examine(node)
         node.close()
         drive = open_for_level(connection, 1, found)
-        begun = begin_run(drive, tmp_path / "runs", tier=found.tier)
+        begun = begin_run(drive, tmp_path / "runs", level=found.level)
         stages = level_stages.LevelStages(begun, drive, found, nameplate)
         if sheet:
             stage = stages.identify(IdentifyRequest(), lambda lines: None, lambda text: None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``identify --replay`` on runs of the lower tiers: the same numbers from the stored traces, and others where asked."""
+"""``identify --replay`` at lower capability levels: the same numbers from the stored traces, others where asked."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.errors import ConfigError, Declined, NotAvailable, Partial
 from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.identification.by_pulses import FACTS, PulseFacts, below_voltage, read_facts
+from pmsmtool.identification.by_pulses import FACTS, OLDER_FACTS, PulseFacts, below_voltage, read_facts
 from pmsmtool.identification.by_vendor import ANSWERS
 from pmsmtool.identification.replay import replay
 from pmsmtool.identification.request import IdentifyRequest, Method
@@ -54,11 +54,11 @@ def measured(
 ) -> tuple[RunDirectory, Stage]:
     request = IdentifyRequest(quantities, **limits)  # type: ignore[arg-type]
     with opened(options) as (drive, found):
-        run = begin_run(drive, folder, tier=found.tier)
+        run = begin_run(drive, folder, level=found.level)
         if known is not None:
             run.save(NAMEPLATE, dump_machine_file(known))
         pair = None if known is None else (known, SHEET)
-        method = OF_LEVEL[found.tier]
+        method = OF_LEVEL[found.level]
         stage = identify(run, drive, request, lambda lines: None, method=method, found=found, known=pair)
     run.add(stage)
     return run, stage
@@ -77,7 +77,7 @@ def test_the_method_asked_for_is_the_one_that_runs(method: Method, told: str, tm
         lines.extend(plan)
         raise Declined("no")
 
-    for options in ("&tier=recorder", ""):
+    for options in ("&level=recorder", ""):
         with opened(options) as (drive, found), pytest.raises(Declined):
             request = IdentifyRequest(("psi", "mechanics"), speed_max_rad_s=100.0)
             known = load_machine_file(PROFILE), SHEET
@@ -87,9 +87,9 @@ def test_the_method_asked_for_is_the_one_that_runs(method: Method, told: str, tm
 
 @pytest.fixture(scope="module")
 def recorded_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Stage]:
-    """A run of the recorder tier with a machine file."""
+    """A run of the recorder level with a machine file."""
     folder = tmp_path_factory.mktemp("recorded")
-    run, stage = measured("&tier=recorder", folder, ("R", "psi", "L"), load_machine_file(PROFILE))
+    run, stage = measured("&level=recorder", folder, ("R", "psi", "L"), load_machine_file(PROFILE))
     return run.path, stage
 
 
@@ -100,11 +100,18 @@ def recorded(recorded_once: tuple[Path, Stage], tmp_path: Path) -> tuple[RunDire
     return RunDirectory(tmp_path / "run"), recorded_once[1]
 
 
-def test_a_run_of_the_recorder_tier_gives_the_same_bytes(recorded: tuple[RunDirectory, Stage]) -> None:
+def test_a_run_of_the_recorder_level_gives_the_same_bytes(recorded: tuple[RunDirectory, Stage]) -> None:
     assert_replayed(*recorded)
 
 
-def test_a_run_of_the_standard_tier_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_a_run_with_the_older_name_of_its_facts_is_replayed(recorded: tuple[RunDirectory, Stage]) -> None:
+    run, stage = recorded
+    (run.path / FACTS).rename(run.path / OLDER_FACTS)
+    again = replay(run)
+    assert told(again) == told(stage) and OLDER_FACTS in again.files and FACTS not in again.files
+
+
+def test_a_run_of_the_standard_level_gives_the_same_bytes(tmp_path: Path) -> None:
     assert_replayed(*measured("&drive=cia402", tmp_path, ASKED, load_machine_file(PROFILE)))
 
 
@@ -140,6 +147,7 @@ def test_a_run_without_a_machine_file_is_replayed_from_the_command_line(tmp_path
     assert json.loads(outcome.stdout)["values"] == json.loads(told(stage))[0]
 
     facts = read_facts(run)
+    assert facts is not None
     assert facts.traces[:2] == ("rotation_forward", "rotation_backward") and facts.pushed and facts.voltage == "link"
     run.save(FACTS, "{}")
     with pytest.raises(ConfigError, match="the record of the capability level is damaged"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The recorder tier tells R and psi at the reference temperature, as the full one; ratios stay those of the run."""
+"""The recorder level tells R and psi at the reference temperature, as the full one; ratios stay those of the run."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from benchmarks.tier_intervals import told_by
+from benchmarks.level_intervals import told_by
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
 from pmsmtool.drive.drive_node import DriveNode, is_safe
@@ -23,7 +23,7 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.mapped_recorder_drive import DELAY_DOUBT_PERIODS, RECORDED, MappedRecorderDrive
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.standard_drive import StandardDrive
-from pmsmtool.drive.tier_drives import ParameterDrive
+from pmsmtool.drive.torque_drives import ParameterDrive
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import Interrupted, NotAvailable, Partial
@@ -33,7 +33,7 @@ from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.measurement.by_pulses import swing_and_record
-from pmsmtool.measurement.capabilities import Capabilities, Tier, examine
+from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, examine
 from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
@@ -73,9 +73,9 @@ def opened(folder: Path, text: str, family: str = "") -> Iterator[tuple[Connecti
         yield connection, found
 
 
-def test_a_completed_map_lifts_a_copley_to_the_tier_of_recorders(tmp_path: Path) -> None:
+def test_a_completed_map_lifts_a_copley_to_the_level_of_recorders(tmp_path: Path) -> None:
     with opened(tmp_path, completed()) as (connection, found):
-        assert found.tier is Tier.RECORDER
+        assert found.level is CapabilityLevel.RECORDER
         assert found.recorder.startswith("trace of i_d_a, i_q_a, U_dc_v, u_d_v")
         row = found.row("R", Method.RECORDER)
         assert row.available and not row.expected  # what was measured was the reference drive's recorder
@@ -87,7 +87,7 @@ def test_a_completed_map_lifts_a_copley_to_the_tier_of_recorders(tmp_path: Path)
 @pytest.mark.parametrize("name", ADDED)
 def test_each_of_them_is_needed(tmp_path: Path, name: str) -> None:
     with opened(tmp_path, completed(name)) as (connection, found):
-        assert found.tier is Tier.STANDARD and "recorder" not in found.features
+        assert found.level is CapabilityLevel.STANDARD and "recorder" not in found.features
         drive = open_for_level(connection, 1, found)
         assert type(drive) is StandardDrive
         drive.close()

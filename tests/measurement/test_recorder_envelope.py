@@ -27,7 +27,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def identified(profile: str, *quantities: str) -> int:
-    channel = f"{profile}?tier=recorder&nv=:memory:"
+    channel = f"{profile}?level=recorder&nv=:memory:"
     return program(["-i", "pmsmsim", "-c", channel, "--yes", "identify", *quantities, "--json"])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The turned vector of the standard tier: rotors that swung away from it, by a fall onto it or by the dead time."""
+"""The turned vector of the standard level: rotors that swung away from it, by a fall onto it or by the dead time."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import Contradiction
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.measurement.capabilities import Capabilities, Tier, examine
+from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, examine
 from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.proof.stage import ProofRequest
 from pmsmtool.run_directory import RunDirectory, Stage
@@ -51,7 +51,7 @@ def begun(
         found = examine(probe.node, drive_map)
         probe.close()
         drive = open_for_level(connection, 1, found)
-        yield begin_run(drive, folder / "runs", tier=found.tier), drive, found
+        yield begin_run(drive, folder / "runs", level=found.level), drive, found
         drive.close()
 
 
@@ -64,7 +64,7 @@ def first_stage(folder: Path, drive_map: DriveMap, *, set_up: int = 0) -> tuple[
 
 def chain(
     folder: Path, drive_map: DriveMap, *, sheet: bool = True, pole_pairs: int = 3
-) -> tuple[RunDirectory, Quiet, Tier]:
+) -> tuple[RunDirectory, Quiet, CapabilityLevel]:
     """The whole chain, with a data sheet that may be another machine's."""
     nameplate = load_machine_file(PROFILE)
     nameplate = replace(nameplate, machine=replace(nameplate.machine, pole_pairs=pole_pairs))
@@ -74,12 +74,12 @@ def chain(
             run, drive, Told(), progress, nameplate if sheet else None, identify=IdentifyRequest(),
             prove=ProofRequest(runs=32), capabilities=found,
         ).carry_out()  # fmt: skip
-    return run, progress, found.tier
+    return run, progress, found.level
 
 
-def test_commission_of_the_vendor_tier_ends_green_with_what_it_gives(tmp_path: Path) -> None:
-    run, progress, tier = chain(tmp_path, without_torque(load_family("synapticon")))
-    assert tier is Tier.VENDOR
+def test_commission_of_the_vendor_level_ends_green_with_what_it_gives(tmp_path: Path) -> None:
+    run, progress, level = chain(tmp_path, without_torque(load_family("synapticon")))
+    assert level is CapabilityLevel.VENDOR
     assert progress.ended["identify"] == progress.ended["lut"] == "pass"
     assert set(progress.ended.values()) == {
         "pass",
@@ -95,7 +95,7 @@ def test_commission_of_the_vendor_tier_ends_green_with_what_it_gives(tmp_path: P
     notes = tolerance_box(machine).notes
     assert "R_s_ohm: the drive's own value has no interval, 3 % assumed" in notes
     page = report_page(run.path)
-    assert "the drive&#39;s own: " in page and '>none</td>' in page
+    assert "the drive&#39;s own: " in page and ">none</td>" in page
 
 
 def test_without_a_data_sheet_the_drives_values_are_told_and_nothing_is_designed(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_without_a_data_sheet_the_drives_values_are_told_and_nothing_is_designed
 
 
 def test_measured_values_outrank_the_drives_own(tmp_path: Path) -> None:
-    """Standard tier: J and psi by torque pushes, the rest by the drive; psi of both is compared."""
+    """Standard level: J and psi by torque pushes, the rest by the drive; psi of both is compared."""
     stage, run = first_stage(tmp_path, load_family("synapticon"))
     assert stage.status == "pass"
     by_name = {str(value["name"]): value for value in stage.values}

@@ -299,7 +299,7 @@ def test_nothing_is_started_on_a_drive_that_the_map_does_not_name(tmp_path: Path
     assert "in a map that names this drive" in str(run(*without).exception)
 
 
-def test_caps_shows_the_tier(tmp_path: Path) -> None:
+def test_caps_shows_the_level(tmp_path: Path) -> None:
     outcome = run("--sim", channel(tmp_path, without_torque(load_family("synapticon"))), "caps")
     assert "capability level vendor" in outcome.stdout
     line = next(line for line in outcome.stdout.splitlines() if line.startswith("R ") and "vendor" in line)

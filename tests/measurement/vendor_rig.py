@@ -22,7 +22,7 @@ TRUTH = load_machine_file(PROFILE).machine
 
 
 def without_torque(drive_map: DriveMap) -> DriveMap:
-    """The same drive without modes that this program pushes it by: what is left is the vendor tier."""
+    """The same drive without modes that this program pushes it by: what is left is the vendor level."""
     return replace(drive_map, capabilities=replace(drive_map.capabilities, torque_mode=False, velocity_mode=False))
 
 

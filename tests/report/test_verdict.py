@@ -121,7 +121,7 @@ def test_a_stop_that_was_not_confirmed_is_the_first_of_the_report() -> None:
     assert "STOP NOT CONFIRMED" not in render(record(account=over)), "a later run of the stage ended well"
 
 
-@pytest.mark.parametrize("face", ["", "&drive=epos4", "&drive=copley", "&drive=faulhaber", "&tier=recorder"])
+@pytest.mark.parametrize("face", ["", "&drive=epos4", "&drive=copley", "&drive=faulhaber", "&level=recorder"])
 def test_a_served_simulation_is_known_by_the_name_it_gives_itself(face: str) -> None:
     with Connection(PmsmSimBus(f"interior-2k2?nv=:memory:{face}")) as connection:
         node = DriveNode(connection, 1)

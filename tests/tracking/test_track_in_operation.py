@@ -264,7 +264,7 @@ def interrupt_at(instant_s: float, patched: pytest.MonkeyPatch) -> None:
     [
         (("--nv", "drive.nv"), "--scenario gives the drive a set of its own"),
         (("interior-2k2?drive=epos4",), "only the reference drive runs by itself"),
-        (("interior-2k2?tier=recorder",), "only the reference drive runs by itself"),
+        (("interior-2k2?level=recorder",), "only the reference drive runs by itself"),
     ],
 )
 def test_what_cannot_run_by_itself_is_refused(

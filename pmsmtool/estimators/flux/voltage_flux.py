@@ -26,7 +26,7 @@ UNDRIVEN_FLOOR = 0.01
 """Relative 95 % model error of the undriven voltage: polled speed and voltage are not of the same instant."""
 DEAD_TIME = 1.07
 """What the dead time takes of the largest voltage, over t_d f_s U_dc, at the small current of the top: fitted to 75
-random drives (benchmarks.tier_intervals standard --first 5000; constant 0.0 %, rest 0.7 % rms, at most 2.7 %)."""
+random drives (benchmarks.level_intervals standard --first 5000; constant 0.0 %, rest 0.7 % rms, at most 2.7 %)."""
 LIMIT_DOUBT = 0.035
 """Relative 95 % doubt of the largest voltage where the dead time is known."""
 BLIND_DOUBT = 0.06

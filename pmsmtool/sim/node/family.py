@@ -51,7 +51,7 @@ MODE_BITS = {
 """Bits of object 0x6502."""
 COMMUTATION_ANGLE = 0x60EA
 ANGLE_COUNT_RAD = 2.0 * math.pi / 65536.0
-TIER_HIDES = {"inject": (0x2063, 0x2064), "recorder": (0x2050, 0x2051, 0x2052, 0x2063, 0x2064)}
+LEVEL_HIDES = {"inject": (0x2063, 0x2064), "recorder": (0x2050, 0x2051, 0x2052, 0x2063, 0x2064)}
 """What a reduced reference drive does not have: window averages; the excitation and current set-points too."""
 RECORDERS: Mapping[str, Callable[[DriveMap, Dictionary, Plant], object]] = {
     "index": Monitor,
@@ -131,15 +131,15 @@ class Face:
 
 @dataclass(frozen=True, slots=True)
 class Reduced:
-    """The reference drive without a part of its own objects: what a lower tier leaves.
+    """The reference drive without a part of its own objects: what a lower level leaves.
 
     Attributes
     ----------
-    tier : str
-        Key of :data:`TIER_HIDES`.
+    level : str
+        Key of :data:`LEVEL_HIDES`.
     """
 
-    tier: str
+    level: str
 
     @property
     def vendor_product(self) -> tuple[int, int]:
@@ -158,10 +158,10 @@ class Reduced:
         """Return none."""
 
     def dress(self, dictionary: Dictionary) -> None:
-        """Hide what the tier does not have."""
-        for index in TIER_HIDES[self.tier]:
+        """Hide what the level does not have."""
+        for index in LEVEL_HIDES[self.level]:
             dictionary.hide(index)
-        if self.tier == "recorder":
+        if self.level == "recorder":
             modes = [mode for mode in MODE_BITS if mode is not Mode.CYCLIC_TORQUE_ANGLE]
             for entry in _modes(modes, dictionary):
                 dictionary.show(entry)

@@ -29,7 +29,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.standard_drive import StandardDrive
-from pmsmtool.drive.tier_drives import TorqueDrive, pushing_drive
+from pmsmtool.drive.torque_drives import TorqueDrive, pushing_drive
 from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, NotAvailable, SdoAbort
 from pmsmtool.experiments.first_push import WAY_RAD, push_forth_and_back
 from pmsmtool.experiments.first_turn import lead_half_a_turn

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Estimators of the lower tiers on traces whose truth is written down: values, intervals, refusals."""
+"""Estimators of the lower capability levels on traces whose truth is written down: values, intervals, refusals."""
 
 from __future__ import annotations
 

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Identify random drives at the tiers below the full one and say how wide and how true the printed intervals are.
+"""Identify random drives below the full capability level: how wide and how true the printed intervals are.
 
-    python -m benchmarks.tier_intervals standard --drives 200 --first 5000 --speed 1.35
-    python -m benchmarks.tier_intervals supply --drives 60 --first 65000
-    python -m benchmarks.tier_intervals recorder --drives 200 --first 5000
-    python -m benchmarks.tier_intervals inject --drives 200 --first 7200
+    python -m benchmarks.level_intervals standard --drives 200 --first 5000 --speed 1.35
+    python -m benchmarks.level_intervals supply --drives 60 --first 65000
+    python -m benchmarks.level_intervals recorder --drives 200 --first 5000
+    python -m benchmarks.level_intervals inject --drives 200 --first 7200
 
-Drives follow from their seeds (``random_drives.py``). The simulated node has the objects of its tier only:
-``drive=cia402`` with the master's commutation angle, or the reference drive without excitation (``tier=recorder``) or
-averages (``tier=inject``). ``supply``: R of the standard tier from the readings of the simulated bench supply
+Drives follow from their seeds (``random_drives.py``). The simulated node has the objects of its level only:
+``drive=cia402`` with the master's commutation angle, or the reference drive without excitation (``level=recorder``) or
+averages (``level=inject``). ``supply``: R of the standard level from the readings of the simulated bench supply
 (``sim/channel.py``). ``--speed`` is the largest speed that is allowed, over the nameplate's: the flux linkage of
-the standard tier needs one at which the voltage ends. ``--no-machine``: no machine file tells that tier the inverter.
+the standard level needs one at which the voltage ends. ``--no-machine``: no machine file tells that level the inverter.
 Every estimate is printed on stderr as error and half width (relative, or in deg); with ``--record FILE`` it goes there
 too, and a second run goes on behind it.
 
@@ -42,7 +42,7 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.recorded_means import RecordingDrive
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
-from pmsmtool.drive.tier_drives import TorqueDrive
+from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
@@ -63,14 +63,14 @@ from pmsmtool.trace import Trace
 CHANNELS = {
     "standard": "&drive=cia402",
     "supply": "&drive=cia402",
-    "recorder": "&tier=recorder",
-    "inject": "&tier=inject",
+    "recorder": "&level=recorder",
+    "inject": "&level=inject",
 }
 TOO_NARROW = 1e-3
 OF_THE_MACHINE = ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2", "offset_rad")
-"""What is judged at tier inject, at the reference temperature."""
+"""What is judged at level inject, at the reference temperature."""
 AT_REFERENCE = {"inject": OF_THE_MACHINE, "recorder": ("R_s_ohm", "psi_f_wb")}
-"""What a tier tells at the reference temperature; the ratios to psi are at the temperature of the run."""
+"""What a level tells at the reference temperature; the ratios to psi are at the temperature of the run."""
 
 
 def truth_of(drive: MachineFile) -> dict[str, float]:
@@ -92,7 +92,7 @@ def truth_of(drive: MachineFile) -> dict[str, float]:
     }
 
 
-def identify(tier: str, drive: MachineFile, path: Path, speed: float, *, given: bool = True) -> PulseResult:
+def identify(level: str, drive: MachineFile, path: Path, speed: float, *, given: bool = True) -> PulseResult:
     """Run one drive; the inverter is known where a machine file is given."""
     machine = drive.machine
     envelope = Envelope(
@@ -100,14 +100,14 @@ def identify(tier: str, drive: MachineFile, path: Path, speed: float, *, given: 
         speed_max_rad_s=speed * (machine.n_max_rpm or 1000.0) * math.pi / 30.0,
         duration_s=600.0,
     )
-    with connect("pmsmsim", f"{path}?nv=:memory:{CHANNELS[tier]}") as connection:
-        if tier == "inject":
+    with connect("pmsmsim", f"{path}?nv=:memory:{CHANNELS[level]}") as connection:
+        if level == "inject":
             return _by_injection(RecordingDrive(connection, 1))
-        if tier == "recorder":
+        if level == "recorder":
             return told_by(swing_and_record, RecorderDrive(connection, 1), envelope)
         family = load_family("cia402")
         turning = StandardDrive(connection, 1, drive_map=family)
-        if tier == "supply":
+        if level == "supply":
             return _by_supply(turning, envelope, lambda i_a: connection.bus.read_supply(1))  # type: ignore[attr-defined]
         found = told_by(turn_both_ways, turning, envelope)
         turning.close()
@@ -154,17 +154,17 @@ def _by_injection(drive: RecordingDrive) -> PulseResult:
     return PulseResult({name: estimates[name] for name in OF_THE_MACHINE}, {}, {})
 
 
-def judged(tier: str, seed: int, speed: float, *, given: bool = True) -> dict[str, Any]:
+def judged(level: str, seed: int, speed: float, *, given: bool = True) -> dict[str, Any]:
     """Identify one drive; returns errors and half widths, or the refusal."""
     drive = draw_drive(seed)
     truth = truth_of(drive)
     values = settings_of(drive)
-    truth |= {name: values.number(name) for name in AT_REFERENCE.get(tier, ()) if not name.endswith("_rad")}
+    truth |= {name: values.number(name) for name in AT_REFERENCE.get(level, ()) if not name.endswith("_rad")}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.toml"
         path.write_text(dump_machine_file(drive), encoding="utf-8")
         try:
-            result = identify(tier, drive, path, speed, given=given)
+            result = identify(level, drive, path, speed, given=given)
         except PmsmtoolError as error:
             return {"seed": seed, "refused": getattr(error, "reason", type(error).__name__)}
     row: dict[str, Any] = {"seed": seed, "missing": sorted(result.missing), "found": {}}
@@ -206,7 +206,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("tier", choices=sorted(CHANNELS))
+    parser.add_argument("level", choices=sorted(CHANNELS))
     parser.add_argument("--drives", type=int, default=40)
     parser.add_argument("--first", type=int, default=100)
     parser.add_argument("--speed", type=float, default=1.0)
@@ -220,11 +220,11 @@ def main() -> None:
     for seed in range(options.first, options.first + options.drives):
         if seed in done:
             continue
-        rows.append(judged(options.tier, seed, options.speed, given=not options.no_machine))
+        rows.append(judged(options.level, seed, options.speed, given=not options.no_machine))
         if options.record is not None:
             with options.record.open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(rows[-1]) + "\n")
-    print(f"{options.tier}: {len(rows)} drives from seed {options.first}, speed {options.speed:g} of the nameplate's")
+    print(f"{options.level}: {len(rows)} drives from seed {options.first}, speed {options.speed:g} of the nameplate's")
     print("\n".join(table(rows)))
 
 
