@@ -150,6 +150,8 @@ def _why_closed(name: str | None, error: Exception) -> str:
         return "this system has no SocketCAN"
     if getattr(error, "errno", None) == errno.ENODEV:
         return "the channel does not exist, or is down"
+    if "library" in str(error) or "dll" in str(error).lower():
+        return f"the maker's library for {name} is not installed"
     return f"wrong channel for {name}" if name else ""
 
 

@@ -17,6 +17,7 @@ import click
 from pmsmtool.cli.drive_access import map_option, read_map, rehearsal_bus
 from pmsmtool.cli.options import (
     FILE,
+    HZ,
     BusOptions,
     MotionOptions,
     bus_options,
@@ -58,7 +59,7 @@ LIMITS = ("current", "speed")
 @click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
 @click.option("--flux-map", is_flag=True, help="Measure the flux map, and design with it, whether the machine "
               "saturates or not.")  # fmt: skip
-@click.option("--bandwidth-hz", type=float, metavar="HZ", help="Bandwidth of the current loops.  [default: modulus "
+@click.option("--bandwidth-hz", type=HZ, metavar="HZ", help="Bandwidth of the current loops.  [default: modulus "
               "optimum, lowered to the margins]")  # fmt: skip
 @click.option("--phase-margin-deg", type=float, default=45.0, metavar="DEG", help="Least phase margin of the design.")
 @click.option("--gain-margin-db", type=float, default=6.0, metavar="DB", help="Least gain margin of the design.")

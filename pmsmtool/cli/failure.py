@@ -111,6 +111,11 @@ def _tell_usage(error: click.ClickException) -> int:
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         _echo(error.format_message())
         return int(ExitCode.USAGE)
+    if isinstance(error, click.NoSuchOption) and error.possibilities:  # compared with their dashes, which all share
+        from difflib import get_close_matches
+
+        near = [o for o in error.possibilities if get_close_matches(error.option_name.strip("-"), [o.strip("-")])]
+        error = click.NoSuchOption(error.option_name, possibilities=near, ctx=error.ctx)
     place = f"{error.ctx.command_path} --help" if isinstance(error, click.UsageError) and error.ctx else ""
     message = error.format_message().strip()
     _tell(ConfigError(message[:1].lower() + message[1:].rstrip("."), hint=place))

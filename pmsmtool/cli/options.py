@@ -8,6 +8,7 @@ what is given nowhere is left to python-can's own configuration.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import re
@@ -63,9 +64,12 @@ class Quantity(click.ParamType[float]):
         As ``units.UNITS`` names it.
     positive : bool
         Whether zero and less are refused: a limit of zero would be taken for none.
+    bare : bool
+        Whether the number may stand alone: the option's name ends in its unit.
     """
 
-    def __init__(self, dimension: str, *, positive: bool = False) -> None:
+    def __init__(self, dimension: str, *, positive: bool = False, bare: bool = False) -> None:
+        self.bare = bare
         self.name = dimension
         self.dimension = dimension
         self.positive = positive
@@ -76,6 +80,9 @@ class Quantity(click.ParamType[float]):
 
         if isinstance(value, float):
             return value
+        if self.bare:
+            with contextlib.suppress(ValueError):
+                return float(value)
         try:
             found = parse_quantity(str(value), self.dimension)
         except ConfigError as error:
@@ -97,6 +104,7 @@ class FilePath(click.Path):
 
 NODE = WholeNumber("node", 1, 127)
 BITRATE = WholeNumber("bit rate", 1, 10**7)
+HZ, DEG, DB = (Quantity(unit, bare=True) for unit in ("Hz", "deg", "dB"))
 FILE = FilePath(dir_okay=False)
 SERIAL = WholeNumber("serial", 0, 0xFFFFFFFF_FFFFFFFF)
 CURRENT = Quantity("current")

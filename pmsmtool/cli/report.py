@@ -54,6 +54,8 @@ def report_command(run: Path, path: Path | None, anonymous: bool, junit: bool, p
         return
     from pmsmtool.commissioning.report_page import how_it_ended, report_page, verdict
 
+    if pdf:
+        require_browser()
     path = path or run / ("junit.xml" if junit else "report.html")
     found, ended = verdict(run), how_it_ended(run)
     if junit:
@@ -119,20 +121,20 @@ def find_browser() -> str | None:
     return next((path for path in found if path), None)
 
 
-def print_page(page: Path, pdf: Path) -> None:
-    """Print an HTML page to a PDF.
-
-    Raises
-    ------
-    ConfigError
-        No browser is found, or it wrote nothing.
-    """
+def require_browser() -> str:
+    """Return the browser; raises ``ConfigError`` where none is found."""
     browser = find_browser()
     if browser is None:
         raise ConfigError(
             "no browser was found to make a PDF", where=os.environ.get(BROWSER, ""),
             likely="Chromium, Chrome and Edge are looked for", hint=f"install one, or name it in {BROWSER}; {_WITHOUT}",
         )  # fmt: skip
+    return browser
+
+
+def print_page(page: Path, pdf: Path) -> None:
+    """Print an HTML page to a PDF; raises ``ConfigError`` where no browser is found, or it wrote nothing."""
+    browser = require_browser()
     # a browser of the administrator (a container, a build server) does not start inside its own sandbox
     alone = ("--no-sandbox",) if getattr(os, "geteuid", lambda: 1)() == 0 else ()
     with tempfile.TemporaryDirectory(prefix="pmsmtool-", ignore_cleanup_errors=True) as folder:

@@ -8,7 +8,15 @@ from pathlib import Path
 import click
 
 from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map, refuse_another_family
-from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, output_options, write_options
+from pmsmtool.cli.options import (
+    BusOptions,
+    FilePath,
+    MotionOptions,
+    bus_options,
+    examples,
+    output_options,
+    write_options,
+)
 from pmsmtool.cli.output import Output
 
 
@@ -20,7 +28,7 @@ from pmsmtool.cli.output import Output
         "pmsmtool -n 6 restore drive.json --other-drive --dry-run",
     ),
 )
-@click.argument("snapshot_file", metavar="[FILE]", type=FILE, required=False)
+@click.argument("snapshot_file", metavar="[FILE]", type=FilePath(), required=False)
 @click.option("--other-drive", is_flag=True, help="The backup is of another drive of this kind (a spare part).")
 @click.option("--dry-run", is_flag=True, help="Show what would change and stop.")
 @map_option

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.drive_access import map_option, read_map
-from pmsmtool.cli.options import FILE, examples, options_named, output_options, overspeed_option
+from pmsmtool.cli.options import DB, DEG, FILE, HZ, examples, options_named, output_options, overspeed_option
 from pmsmtool.cli.output import Output, figure_format, save_figure, table
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import write_file
@@ -50,11 +50,11 @@ if TYPE_CHECKING:
     default="imc",
     help="Rule of the current gains.",
 )
-@click.option("--bandwidth-hz", type=float, metavar="HZ", help="Bandwidth of the current loops (second-order: natural "
+@click.option("--bandwidth-hz", type=HZ, metavar="HZ", help="Bandwidth of the current loops (second-order: natural "
               "frequency).  [default: modulus optimum, lowered to the margins]")  # fmt: skip
 @click.option("--damping", type=float, default=1.0, help="Damping of second-order.")
-@click.option("--phase-margin-deg", type=float, default=45.0, metavar="DEG", help="Least phase margin, delay included.")
-@click.option("--gain-margin-db", type=float, default=6.0, metavar="DB", help="Least gain margin.")
+@click.option("--phase-margin-deg", type=DEG, default=45.0, metavar="DEG", help="Least phase margin, with delay.")
+@click.option("--gain-margin-db", type=DB, default=6.0, metavar="DB", help="Least gain margin.")
 @click.option("--predictor/--no-predictor", default=False, help="One-step prediction of the current.")
 @click.option(
     "--speed-method",
@@ -62,14 +62,14 @@ if TYPE_CHECKING:
     default="symmetric-optimum",
     help="Rule of the speed gains.",
 )
-@click.option("--speed-bandwidth-hz", type=float, metavar="HZ", help="Crossover of the speed loop.  [default: from "
+@click.option("--speed-bandwidth-hz", type=HZ, metavar="HZ", help="Crossover of the speed loop.  [default: from "
               "--speed-phase-margin-deg]")  # fmt: skip
-@click.option("--speed-phase-margin-deg", type=float, default=60.0, metavar="DEG", help="Of the symmetric optimum.")
+@click.option("--speed-phase-margin-deg", type=DEG, default=60.0, metavar="DEG", help="Of the symmetric optimum.")
 @click.option("--speed-damping", type=float, default=1.0, help="Damping of pole-placement.")
 @click.option("--speed-decimation", type=int, metavar="N", help="Control periods per speed-controller period.")
-@click.option("--speed-filter-hz", type=float, metavar="HZ", help="Cut-off of the speed filter.")
+@click.option("--speed-filter-hz", type=HZ, metavar="HZ", help="Cut-off of the speed filter.")
 @click.option("--pll-rad-s", type=float, metavar="RAD/S", help="Pole of the speed estimate.")
-@click.option("--notch-hz", type=float, metavar="HZ", help="Notch on the torque, 0 off.  [default: at the resonance "
+@click.option("--notch-hz", type=HZ, metavar="HZ", help="Notch on the torque, 0 off.  [default: at the resonance "
               "that identify frf found]")  # fmt: skip
 @click.option("--notch-zeta-num", type=float, default=0.05, help="Numerator damping of the notch.")
 @click.option("--notch-zeta-den", type=float, default=0.5, help="Denominator damping of the notch.")
@@ -89,16 +89,16 @@ if TYPE_CHECKING:
 )
 @click.option("--axis", is_flag=True, help="Design speed and position loops of the axis with its load; the parameter "
               "set then holds nothing else.")  # fmt: skip
-@click.option("--axis-phase-margin-deg", type=float, default=45.0, metavar="DEG", help="Least phase margin of both "
+@click.option("--axis-phase-margin-deg", type=DEG, default=45.0, metavar="DEG", help="Least phase margin of both "
               "loops over the tolerance box.")  # fmt: skip
-@click.option("--axis-peak-db", type=float, default=6.0, metavar="DB", help="Largest |S| of both loops over it.")
-@click.option("--loop-rate-hz", type=float, metavar="HZ", help="Rate of the drive's speed and position loops.  "
+@click.option("--axis-peak-db", type=DB, default=6.0, metavar="DB", help="Largest |S| of both loops over it.")
+@click.option("--loop-rate-hz", type=HZ, metavar="HZ", help="Rate of the drive's speed and position loops.  "
               "[default: as its map states]")  # fmt: skip
 @click.option("--stored", type=FILE, metavar="FILE", help="What the drive holds (`pmsmtool backup`): its gains are "
               "kept where the designed ones would follow worse.")  # fmt: skip
 @overspeed_option
 @map_option
-@click.option("--drive-bandwidth-hz", type=float, metavar="HZ", help="Current bandwidth of a drive with fixed "
+@click.option("--drive-bandwidth-hz", type=HZ, metavar="HZ", help="Current bandwidth of a drive with fixed "
               "firmware (--map).")  # fmt: skip
 @click.option("--limit-speed-rpm", type=float, metavar="RPM", help="Speed up to which a drive of --map never saturates."
               "  [default: at the most torque x speed]")  # fmt: skip

@@ -16,12 +16,15 @@ from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.drive_maps.sheet_check import other_identity
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_bytes, read_text
+from pmsmtool.machine.machine_file import SCHEMA as MACHINE_SCHEMA
+from pmsmtool.machine.profile import profile_names
 from pmsmtool.params import parameter_set
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
 from pmsmtool.toml_file import parse_toml
 
 NEXT_STEP = "give a parameter set, a design, a DCF, a table of `lut`, or a run directory"
 
+AS_TUNE_WRITES = "give design.toml or params.toml as `tune` writes them"
 _IN_A_RUN = ("params.toml", "design.toml")
 _DCF_SUFFIXES = (".dcf", ".eds")
 
@@ -64,7 +67,7 @@ def load_parameters(path: str | Path, drive_map: DriveMap | None = None) -> Para
     raise ConfigError(
         f"schema is {schema!r}, expected {design_file.SCHEMA!r} or {parameter_set.SCHEMA!r}",
         where=str(path),
-        hint="give design.toml or params.toml as `tune` writes them",
+        **(_tune_first(str(path)) if schema == MACHINE_SCHEMA else {"hint": AS_TUNE_WRITES}),
     )
 
 
@@ -76,12 +79,24 @@ def _for_drive(found: ParameterSet, drive_map: DriveMap | None) -> ParameterSet:
     return replace(found, values={**found.values, **gains}, provenance=provenance)
 
 
+def _tune_first(machine: str) -> dict[str, str]:
+    """Return cause and next step of a machine that was given where a design is due."""
+    return {"likely": "a machine has no gains yet", "hint": f"`pmsmtool tune {machine} -o design.toml` designs them"}
+
+
 def _file(path: Path) -> Path:
+    if not path.exists() and str(path) in profile_names():
+        raise ConfigError("is a profile, no design", where=str(path), **_tune_first(str(path)))
     if not path.is_dir():
         return path
     found = next((path / name for name in _IN_A_RUN if (path / name).is_file()), None)
     if found is None:
-        raise ConfigError("there is no design in this folder", where=str(path), hint="`pmsmtool tune` writes one")
+        ended = (path / "run.json").is_file()
+        raise ConfigError(
+            "there is no design in this folder", where=str(path),
+            likely="the run ended before its stage tune" if ended else "",
+            hint=f"`pmsmtool commission --resume {path}` goes on with it" if ended else "`pmsmtool tune` writes one",
+        )  # fmt: skip
     return found
 
 

@@ -78,7 +78,9 @@ class Design:
     tables: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> float:
-        """Return one value by catalogue name."""
+        """Return one value by catalogue name; raises ``KeyError`` with the nearest names where there is none."""
+        if name not in self.values:
+            raise KeyError(f"a design has no {name!r}{did_you_mean(name, list(self.values))}")
         return self.values[name].value
 
     @property

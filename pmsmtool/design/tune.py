@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
@@ -34,7 +35,7 @@ from pmsmtool.design.ratings import Ratings, rating_values, ratings, sag_facts
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
-from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import SATURATION
 
@@ -59,13 +60,13 @@ _CURRENT_OPTIONS = 0b111
 _PREDICTOR_OPTION = 1 << 4
 
 
-def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
+def tune(source: MachineFile | str | Path, request: TuneRequest | None = None) -> Design:
     """Design a drive.
 
     Parameters
     ----------
-    source : MachineFile
-        Machine, inverter, encoder and limits.
+    source : MachineFile, str or Path
+        Machine, inverter, encoder and limits; text names a file, a run directory or a shipped profile.
     request : TuneRequest, optional
         What is asked; the defaults of the class.
 
@@ -78,6 +79,8 @@ def tune(source: MachineFile, request: TuneRequest | None = None) -> Design:
         nothing holds the DC link at a fault at rated speed.
     """
     request = TuneRequest() if request is None else request
+    if not isinstance(source, MachineFile):
+        source = load_machine_file(source)
     V_limit = (1.0 - request.voltage_margin) * source.inverter.V_max_v
     rated = ratings(source, V_limit, request.overspeed_protection)
     values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}

@@ -131,9 +131,9 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DamagedSnapshot(f"not a snapshot: {error}", where=where, likely="it was edited or cut") from error
+        raise DamagedSnapshot(f"is no whole backup: {error}", where=where, likely="it was edited or cut") from error
     if not isinstance(document, dict):
-        raise DamagedSnapshot("not a snapshot: it holds no names", where=where)
+        raise DamagedSnapshot("is no backup: it holds no names", where=where)
     schema, check = document.get("schema"), document.pop("check", None)
     if isinstance(schema, str) and schema != SCHEMA:
         raise ConfigError(
@@ -143,7 +143,7 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
         )
     if check != check_sum(document):
         raise DamagedSnapshot(
-            "the snapshot is damaged: its check sum does not fit", where=where, likely="it was edited or cut"
+            "the backup is damaged: its check sum does not fit", where=where, likely="it was edited or cut"
         )
     wrong: list[str] = []
     identity = document.pop("identity", None)
@@ -167,6 +167,11 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
 @next_step(NEXT_STEP)
 def read_snapshot(path: Path) -> Snapshot:
     """Read a snapshot file; raises ``ConfigError`` naming it."""
+    if path.is_dir():
+        raise ConfigError(
+            "is a folder, no backup", where=str(path), likely="a run directory: it holds a set, no backup",
+            hint=f"`pmsmtool flash-params {path}` writes the set of a run; restore takes a file of `pmsmtool backup`",
+        )  # fmt: skip
     return parse_snapshot(read_text(path), str(path))
 
 

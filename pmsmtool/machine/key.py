@@ -124,8 +124,9 @@ def _kind(value: Any) -> str:
 
 
 def did_you_mean(name: str, known: Sequence[str]) -> str:
-    """Return ``; did you mean X?`` for the nearest known name, or an empty text."""
-    near = get_close_matches(name, known, n=1, cutoff=0.6)
+    """Return ``; did you mean X?`` for the first known name that begins so, or the nearest; or an empty text."""
+    begins = [each for each in known if name and each.startswith(name)]
+    near = begins or get_close_matches(name, known, n=1, cutoff=0.6)
     return f"; did you mean {near[0]}?" if near else ""
 
 

@@ -41,6 +41,20 @@ def test_a_misspelt_name_is_recognised(typed: str, meant: str, capsys: pytest.Ca
     assert "did you mean" in answer and meant.lower() in answer
 
 
+@pytest.mark.parametrize(("typed", "near"), [("--force", ""), ("--bandwith-hz", "--bandwidth-hz")])
+def test_an_option_is_compared_without_its_dashes(typed: str, near: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["tune", "interior-2k2", typed, "3"]) == ExitCode.USAGE
+    answer = capsys.readouterr().err
+    assert near in answer and ("id you mean" in answer) == bool(near), "--force was answered with --stored"
+
+
+@pytest.mark.parametrize(("typed", "held"), [("800", "800"), ("800Hz", "800"), ("0.8kHz", "800"), ("800V", "")])
+def test_an_option_in_hertz_takes_the_unit_too(typed: str, held: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code = run(["tune", "interior-2k2", "-o", "/dev/null", "--bandwidth-hz", typed])
+    assert (code == 2) == (not held)
+    assert f"imc, {held} Hz" in capsys.readouterr().out if held else "not of frequency" in capsys.readouterr().err
+
+
 def test_the_version_has_a_short_option(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["-V"]) == run(["--version"]) == 0
     short, long = capsys.readouterr().out.splitlines()
