@@ -20,8 +20,8 @@ PHASE_ANGLES_RAD = (0.0, 2.0 * math.pi / 3.0, 4.0 * math.pi / 3.0)
 DC_ANGLE_RAD = math.pi / 2.0
 """One phase idle (docs/identification.md, 3.1)."""
 
-MEANS = ("u_d_v", "i_d_a", "u_q_v", "i_q_a", "T_winding_c")
-"""What is averaged over a whole window at each level."""
+MEANS = ("u_d_v", "i_d_a", "u_q_v", "i_q_a", "T_winding_c", "U_dc_v")
+"""What is averaged over a whole window at each level; with angle and flags the eight that a drive averages at once."""
 
 LEVEL_WINDOW = 1600
 """Control periods averaged at each level (docs/identification.md, 3.1)."""
