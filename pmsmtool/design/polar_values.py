@@ -2,13 +2,9 @@
 """Parameters of control in polar coordinates (``polar.py``): which law, its speeds, and what the true loop makes of it.
 
 The times are those of Miyajima et al. 2013 and of the laws built on it, in control periods: they were found at 0.1 ms.
-
-The laws of control in polar coordinates by name, and the option bits of the drive (``firmware/core/polar.c``).
 """
 
 from __future__ import annotations
-
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -23,31 +19,12 @@ from pmsmtool.design.polar import (
     design_at,
     largest_i_q,
 )
+from pmsmtool.design.polar_laws import LAWS, LINEAR_RANGE, ON_MEASUREMENT, PHASE_LAWS, PREDICT, SURFACE_ONLY
 from pmsmtool.design.polar_map import stability_map
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import torque_per_ampere
-
-LAWS: Mapping[str, int] = {
-    "conventional": 1,
-    "proposed": 2,
-    "linear": 3,
-    "linear-printed": 4,
-    "regularised": 5,
-    "unified": 6,
-}
-"""``polar.mode`` of the catalogue."""
-
-SURFACE_ONLY = ("conventional", "proposed", "linear", "linear-printed")
-"""Laws of the paper: they hold for L_d = L_q."""
-
-ON_MEASUREMENT, NO_ANTI_WINDUP, PREDICT, LINEAR_RANGE = 1, 2, 4, 8
-"""Bits of ``polar.options``: P and D on the measurement, (ablation), prediction, switch to the regularised law."""
-
-PHASE_LAWS = ("conventional", "proposed")
-"""Laws of section III: the phase is the input for i_q, which needs speed."""
-
 
 TAU_PERIODS = 10.0
 """Equivalent time constant of the coefficient diagram method, in control periods."""
@@ -106,7 +83,7 @@ def polar_values(
     source, rated : MachineFile, Ratings
         Machine and its limits.
     law : str
-        A key of :data:`LAWS`.
+        A key of :data:`polar_laws.LAWS`.
     weakening : str
         Mode of field weakening that was designed; other than ``lookup`` it is switched off.
 

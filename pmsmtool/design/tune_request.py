@@ -13,7 +13,7 @@ from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING_MODES
 from pmsmtool.design.governor import MODES as GOVERNOR_MODES
 from pmsmtool.design.loops.current_loop import Method
 from pmsmtool.design.loops.speed_loop import SpeedMethod
-from pmsmtool.design.polar_values import LAWS as POLAR_LAWS
+from pmsmtool.design.polar_laws import LAWS as POLAR_LAWS
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.key import Key, KeyKind, check_table
 from pmsmtool.machine.uncontrolled_generation import Protection
@@ -30,7 +30,7 @@ class TuneRequest:
     controller : str
         ``pi`` (field-oriented) or ``polar`` (voltage amplitude and phase as inputs).
     polar_law : str
-        Law of ``polar`` (``polar_values.LAWS``).
+        Law of ``polar`` (``polar_laws.LAWS``).
     method : str
         Rule of the current gains: ``imc``, ``modulus-optimum`` or ``second-order``.
     bandwidth_hz : float or None

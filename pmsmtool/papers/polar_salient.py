@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from pmsmtool.design.polar_values import LAWS
+from pmsmtool.design.polar_laws import LAWS
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file

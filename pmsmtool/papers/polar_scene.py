@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.design.polar_values import LAWS, LINEAR_RANGE, NO_ANTI_WINDUP, ON_MEASUREMENT, PREDICT
+from pmsmtool.design.polar_laws import LAWS, LINEAR_RANGE, NO_ANTI_WINDUP, ON_MEASUREMENT, PREDICT
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.machine.key import Value

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.design.polar_values import LINEAR_RANGE
+from pmsmtool.design.polar_laws import LINEAR_RANGE
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible
