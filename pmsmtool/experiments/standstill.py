@@ -112,8 +112,8 @@ def _there_and_back(up: Sequence[float]) -> tuple[float, ...]:
 
 
 def record_zero_current(drive: Drive) -> Trace:
-    """Record both axis currents of a drive that is off, in a fixed frame."""
-    return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "flags"), NOISE_SAMPLES))
+    """Record both axis currents and the link of a drive that is off, in a fixed frame."""
+    return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "U_dc_v", "flags"), NOISE_SAMPLES))
 
 
 def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace:

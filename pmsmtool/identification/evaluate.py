@@ -41,6 +41,7 @@ from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
 from pmsmtool.identification.mechanics import NOT_RIGID, of_no_rigid_shaft, pushes_of
 from pmsmtool.identification.sampling import resistance_as_sampled
+from pmsmtool.identification.wiring import Finding, supply_under_load
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.trace import Trace
@@ -71,6 +72,7 @@ class Evaluation:
     mismatch: SensorMismatch | None = None
     pairs: PairCheck | None = None
     resistance: ResistanceResult | None = None
+    supply: Finding | None = None
     encoder: EncoderResult | None = None
     inductance: InductanceResult | None = None
     flux: FluxResult | None = None
@@ -228,6 +230,7 @@ def evaluate(
             return None
 
     if "levels" in traces:
+        result = replace(result, supply=supply_under_load(traces["zero_current"], traces["levels"]))
         R = attempt("R", lambda: resistance_of(traces["levels"], result.noise, copper, tolerance))
         if R is not None:
             R = replace(R, R_s=widened(R.R_s, mismatch), R_measured=widened(R.R_measured, mismatch))

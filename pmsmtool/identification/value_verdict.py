@@ -16,6 +16,7 @@ from pmsmtool.identification import flux_map, frequency_response
 from pmsmtool.identification.evaluate import Evaluation
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
 from pmsmtool.identification.sampling import timing_warnings
+from pmsmtool.identification.wiring import WRONG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.run_directory import Acceptance
@@ -89,6 +90,8 @@ def summary_of(evaluation: Evaluation, found: Mapping[str, Estimate]) -> str:
 def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
     """Return what a reader should know about a result that was accepted all the same."""
     lines = []
+    if evaluation.supply is not None and evaluation.supply.verdict == WRONG:
+        lines.append(f"supply: {evaluation.supply.shown}: {evaluation.supply.likely}")
     if evaluation.resistance is not None and evaluation.resistance.verdict is Verdict.WARN:
         lines.append("R_s: the fit is above its chi-square limit, the interval is widened")
     if evaluation.mismatch is not None and evaluation.mismatch.corrected:

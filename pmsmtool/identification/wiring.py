@@ -263,7 +263,14 @@ def judge_supply(U_rest_v: float, turn: Trace | None, U_stated_v: float | None) 
         least = float(np.min(turn["U_dc_v"]))
         if least < (1.0 - SAGS) * U_rest_v:
             return Finding(
-                "supply", WRONG, f"DC link falls from {U_rest_v:.4g} V to {least:.4g} V under a small current",
+                "supply", WRONG, f"DC link falls from {U_rest_v:.4g} V to {least:.4g} V under the current of the test",
                 "the supply is in current limit, or its fuse or pre-charge resistor is still in the way",
             )  # fmt: skip
     return Finding("supply", OK, f"DC link {U_rest_v:.4g} V{stated}")
+
+
+def supply_under_load(at_rest: Trace, loaded: Trace) -> Finding | None:
+    """Judge the DC link under a current against that without one; None where either was not recorded (``U_dc_v``)."""
+    if "U_dc_v" not in at_rest.signals or "U_dc_v" not in loaded.signals:
+        return None
+    return judge_supply(float(np.mean(at_rest["U_dc_v"])), loaded, None)

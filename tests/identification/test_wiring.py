@@ -10,7 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pmsmtool.identification.wiring import NOT_SEEN, OK, WRONG, judge_halls, judge_sensors, judge_supply, judge_turn
+from pmsmtool.identification.wiring import (
+    NOT_SEEN,
+    OK,
+    WRONG,
+    judge_halls,
+    judge_sensors,
+    judge_supply,
+    judge_turn,
+    supply_under_load,
+)
 from pmsmtool.machine.hall import HALL_ORDERS, hall_axis
 from pmsmtool.trace import Trace
 
@@ -111,6 +120,16 @@ def test_a_rotor_that_is_held_or_slips_says_nothing_of_the_rest(turn: Trace) -> 
 )  # fmt: skip
 def test_the_supply(rest: float, loaded: float, stated: float | None, verdict: str) -> None:
     assert judge_supply(rest, turned(3, U_dc_v=loaded), stated).verdict == verdict
+
+
+def test_the_supply_under_the_levels_of_R() -> None:
+    def link(volts: float) -> Trace:
+        return Trace(np.arange(3.0), {"U_dc_v": np.full(3, volts)}, {"U_dc_v": "V"}, {})
+
+    found = supply_under_load(link(210.0), link(126.0))
+    assert found is not None and found.verdict == WRONG and "current limit" in found.likely
+    assert supply_under_load(link(210.0), link(205.0)).verdict == OK  # type: ignore[union-attr]
+    assert supply_under_load(Trace(np.arange(3.0), {}, {}, {}), link(205.0)) is None  # recorded before there was one
 
 
 @pytest.mark.parametrize(("gain", "offset", "verdict"), [(1.0, 0.3, OK), (1.02, 0.0, OK), (1.1, 0.0, WRONG)])

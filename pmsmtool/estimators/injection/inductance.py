@@ -114,7 +114,7 @@ class InductanceResult:
     frequency_dependent : tuple of str
         Axes whose inductances differ by more than 1 % between the injection frequencies.
     axis_angle_rad : float
-        Angle of the frame ahead of the axis of largest 1/L, from the cross responses; NaN for a round machine.
+        Angle of the frame ahead of the d axis, from the cross responses; NaN for a round machine.
     verdict : Verdict
         ``warn`` above the chi-square limit or when frequency dependent.
     sampling : Sampling or None
@@ -464,7 +464,10 @@ def _cross_response(shot: Shot, fit: AxisFit, sigma_a: float) -> tuple[float, fl
 
 
 def _axis_angle(fits: Mapping[str, AxisFit], cross: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
-    """Angle of the frame ahead of the axis of largest inverse inductance, from all four responses (rad)."""
+    """Angle of the frame ahead of the d axis, from all four responses (rad).
+
+    The bias holds the rotor within 45 degrees. The d axis is that of the largest 1/L on most machines, of the smallest on some.
+    """
     g_d, g_q = 1.0 / fits["d"].L_h, 1.0 / fits["q"].L_h
     weights = [1.0 / (g_d * cross["d"][1]) ** 2, 1.0 / (g_q * cross["q"][1]) ** 2]
     g_dq = (weights[0] * g_d * cross["d"][0] + weights[1] * g_q * cross["q"][0]) / sum(weights)
@@ -473,7 +476,8 @@ def _axis_angle(fits: Mapping[str, AxisFit], cross: Mapping[str, tuple[float, fl
     if difference < ANISOTROPY_LIMIT * (g_d + g_q):
         return math.nan, math.nan
     # frame ahead by eps: G' = R(-eps) G R(eps), so 2 g_dq = -(g_d - g_q)_true sin(2 eps)
-    return 0.5 * math.atan2(-2.0 * g_dq, g_d - g_q), std / difference
+    sense = math.copysign(1.0, g_d - g_q)
+    return 0.5 * math.atan2(-2.0 * sense * g_dq, abs(g_d - g_q)), std / difference
 
 
 def _unmix(
