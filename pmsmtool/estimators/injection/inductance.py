@@ -466,7 +466,7 @@ def _cross_response(shot: Shot, fit: AxisFit, sigma_a: float) -> tuple[float, fl
 def _axis_angle(fits: Mapping[str, AxisFit], cross: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
     """Angle of the frame ahead of the d axis, from all four responses (rad).
 
-    The bias holds the rotor within 45 degrees. The d axis is that of the largest 1/L on most machines, of the smallest on some.
+    The bias holds the rotor within 45 degrees. The d axis has the largest 1/L on most machines, the smallest on some.
     """
     g_d, g_q = 1.0 / fits["d"].L_h, 1.0 / fits["q"].L_h
     weights = [1.0 / (g_d * cross["d"][1]) ** 2, 1.0 / (g_q * cross["q"][1]) ** 2]
