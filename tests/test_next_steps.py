@@ -21,7 +21,6 @@ from pmsmtool import errors
 from pmsmtool.commissioning.parameter_source import load_parameters
 from pmsmtool.design.design_file import design_text, load_machine_or_design, parse_design
 from pmsmtool.design.lookup.file import table_parameters
-from pmsmtool.design.lookup.loci import load_iron_loss_map
 from pmsmtool.design.tune import tune
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.dcf import update_dcf, values_of
@@ -32,6 +31,7 @@ from pmsmtool.errors import ConfigError, PmsmtoolError, next_step
 from pmsmtool.flash.journal import Entry, Snapshot, parse_snapshot, read_snapshot
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz, load_flux_map
+from pmsmtool.machine.iron_loss_map import load_iron_loss_map
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
 from pmsmtool.npz_file import read_npz
 from pmsmtool.params.parameter_set import default_set, parse_parameter_set, read_parameter_set
@@ -193,7 +193,7 @@ READERS = (
     "machine/machine_file", "machine/flux_map_import", "machine/flux_map_table", "machine/mat_file", "trace_file",
     "sim/scenarios", "sim/faults", "sim/channel", "sim/simulated_machine", "drive_maps/dcf", "drive_maps/eds",
     "drive_maps/drive_map_file", "drive_maps/drive_map", "params/parameter_set", "design/design_file",
-    "proof/prediction_file", "design/lookup/loci", "design/lookup/file", "npz_file", "toml_file", "flash/journal",
+    "proof/prediction_file", "machine/iron_loss_map", "design/lookup/file", "npz_file", "toml_file", "flash/journal",
     "commissioning/parameter_source",
 )  # fmt: skip
 

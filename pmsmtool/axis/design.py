@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pmsmtool.axis.loops import AxisGains, AxisPath, best_share, following_error
-from pmsmtool.axis.mechanics import Mechanics, mechanics_of
 from pmsmtool.axis.reference import Profile, jerk_limited, plan
 from pmsmtool.axis.search import Box, Case, Judged, Limits, stiffest
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
@@ -22,6 +21,7 @@ from pmsmtool.design.tolerance import NORMAL_95, tolerance_box
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.machine.two_masses import Mechanics, mechanics_of
 from pmsmtool.params.catalogue import INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
 from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 

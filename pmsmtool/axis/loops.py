@@ -23,7 +23,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.axis.mechanics import Mechanics, sampled
 from pmsmtool.axis.reference import Move
 from pmsmtool.design.loops.sampled_loop import SampledLoop
 from pmsmtool.design.loops.speed_loop import (
@@ -35,6 +34,7 @@ from pmsmtool.design.loops.speed_loop import (
     speed_estimate,
     torque_path,
 )
+from pmsmtool.machine.two_masses import Mechanics, sampled
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -72,8 +72,9 @@ def lut_command(
     """
     from pmsmtool.design.lookup.design import LookupRequest, design_table
     from pmsmtool.design.lookup.file import table_csv, table_facts, table_npz
-    from pmsmtool.design.lookup.loci import load_iron_loss_map, loci
+    from pmsmtool.design.lookup.loci import loci
     from pmsmtool.machine.flux_map_check import check_flux_map
+    from pmsmtool.machine.iron_loss_map import load_iron_loss_map
     from pmsmtool.machine.profile import machine_path
 
     file = Path(source) / "design.toml"
@@ -84,8 +85,7 @@ def lut_command(
         iron_loss = file.parent / machine.machine.iron_loss_map
     loss_map = None if iron_loss is None else load_iron_loss_map(iron_loss)
     made = design_table(machine, rated, LookupRequest(**asked), margin, loss_map)
-    facts = table_facts(made.table, made.stored, made.error)
-    lines = loci(made.table)
+    facts, lines = table_facts(made.table, made.stored, made.error), loci(made.table)
     write_file(path, table_npz(made.table, facts, lines))
     write_file(path.with_suffix(".csv"), table_csv(made.table))
     written = [path, path.with_suffix(".csv")]

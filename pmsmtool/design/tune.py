@@ -8,7 +8,7 @@ on its way pays for what is imported here.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
@@ -26,6 +26,7 @@ from pmsmtool.design.loops.speed_loop import (
     SpeedPath,
     pole_placement,
     position_gain,
+    slowed,
     small_time_constants,
     speed_loop,
     symmetric_optimum,
@@ -36,6 +37,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.two_masses import shafts_of
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import SATURATION
 
@@ -241,6 +243,9 @@ def _design_speed(
         return _Part(values, {}, {}, ("speed control is off: the machine file has no inertia J_kgm2", *notes))
     path = SpeedPath(J, source.machine.B_nms or 0.0, current.loop("q"), decimation, pll, filter_hz, notch)
     gains = _speed_gains(request, path, current.alpha)
+    paths = [replace(path, shaft=shaft) for shaft in shafts_of(source)]
+    if paths and request.speed_bandwidth_hz is None:
+        path, gains = paths[0], slowed(gains, paths)
     found = margins(speed_loop(gains, path))
     if not found.stable:
         raise DesignInfeasible(
@@ -265,7 +270,7 @@ def _design_speed(
         "position.inertia_ff_kgm2": DesignValue(J, "J"),
     }
     facts: dict[str, Scalar] = {
-        "speed_crossover_rad_s": found.crossover_rad_s,
+        "speed_crossover_rad_s": gains.omega_c if paths else found.crossover_rad_s,
         "position_crossover_rad_s": crossover,
     }
     return _Part(values, {"speed": found}, facts, notes)

@@ -12,7 +12,6 @@ import pytest
 
 from pmsmtool.axis.design import PID, AxisGains, AxisRequest, axis_path, from_pid, with_axis
 from pmsmtool.axis.loops import lifted
-from pmsmtool.axis.mechanics import mechanics_of
 from pmsmtool.axis.search import Box, Limits, axis_margins, stiffest
 from pmsmtool.commissioning.axis_design import axis_drive, axis_parameters, design_axis, not_offered
 from pmsmtool.design.design_file import Design, design_text, parse_design
@@ -23,6 +22,7 @@ from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.flash.plan import make_plan, names_to_read
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.two_masses import mechanics_of
 from pmsmtool.params.catalogue import INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
 
 ASKED = AxisRequest()

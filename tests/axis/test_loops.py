@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from pmsmtool.axis.loops import AxisGains, AxisPath, Loop, Structure, closed_loop_poles, lifted, open_loop
-from pmsmtool.axis.mechanics import Mechanics
 from pmsmtool.axis.search import axis_margins
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, notch_coefficients, speed_loop
+from pmsmtool.machine.two_masses import Mechanics
 
 T = 4e-4
 CURRENT = axis_loop(imc(0.5, 2e-3, 900.0), AxisPlant(0.5, 2e-3, T, 1.5))

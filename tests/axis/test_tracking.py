@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from pmsmtool.axis.loops import AxisGains, AxisPath, Structure, best_share, following_error, lifted
-from pmsmtool.axis.mechanics import Mechanics
 from pmsmtool.axis.reference import Profile, plan
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
+from pmsmtool.machine.two_masses import Mechanics
 
 T = 4e-4
 CURRENT = axis_loop(imc(0.5, 2e-3, 900.0), AxisPlant(0.5, 2e-3, T, 1.5))

@@ -28,7 +28,7 @@ from pmsmtool.design.lookup.grid import (
     lsb_a,
     table_words,
 )
-from pmsmtool.design.lookup.loci import load_iron_loss_map, loci
+from pmsmtool.design.lookup.loci import loci
 from pmsmtool.design.lookup.table import CUT, RPM, LookupTable, electrical_speed, flux_table, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.design.ratings import ratings
@@ -37,6 +37,7 @@ from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.firmware.core_binding import core
 from pmsmtool.firmware.image import lut_size_words, pack_image
 from pmsmtool.machine.flux_map import FluxMap
+from pmsmtool.machine.iron_loss_map import load_iron_loss_map
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS

@@ -4,25 +4,31 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pmsmtool.axis.loops import AxisGains, AxisPath, lifted, open_loop
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import (
+    ELASTIC_MODULUS,
     Notch,
     SpeedGains,
+    SpeedMethod,
     SpeedPath,
     notch_coefficients,
     pole_placement,
     position_gain,
+    slowed,
     small_time_constants,
     speed_loop,
     symmetric_optimum,
     symmetric_ratio,
 )
 from pmsmtool.errors import DesignInfeasible
+from pmsmtool.machine.two_masses import Mechanics
 from tests.design.test_current_loop import scaled
 
 R, L_Q, T_S, J, B = 0.137, 2.1e-3, 1.0 / 12e3, 0.05, 0.01
@@ -31,6 +37,8 @@ DECIMATION, PLL, FILTER_HZ = 10, 1200.0, 200.0
 
 PULSE_TOLERANCE = 1e-9
 """Lifted loop against the simulated pulse response, relative to its largest sample (measured 2e-11)."""
+TWO_MASSES = 1e-5
+"""Loop with two masses against that of the axis, relative."""
 
 
 OFF = Notch()
@@ -159,3 +167,31 @@ def test_the_modulus_margin_of_a_slow_loop_is_that_of_a_fine_grid(slower: float)
     loop = speed_loop(gains, path())
     fine = np.geomspace(1e-5, 1.0, 200_001) * math.pi / loop.T_s
     assert margins(loop).modulus_margin == pytest.approx(np.min(np.abs(1.0 + loop.at(fine))), rel=1e-7)
+
+
+def elastic(zeta: float) -> SpeedPath:
+    """Twelve times the rotor's inertia behind a shaft."""
+    return replace(path(), shaft=Mechanics(J, B, 55.6, 200.0, zeta))
+
+
+def test_the_loop_of_two_masses_is_that_of_the_axis() -> None:
+    """``axis`` builds the same loop from states, by another way."""
+    gains = SpeedGains(1.0, 20.0, 20.0, SpeedMethod.SYMMETRIC_OPTIMUM)
+    omega = np.geomspace(3.0, 0.9 * math.pi / (DECIMATION * T_S), 40)
+    one = elastic(0.02)
+    assert one.shaft is not None
+    other = AxisPath(one.shaft, one.current, DECIMATION, pll_rad_s=PLL, filter_hz=FILTER_HZ)
+    theirs = open_loop(lifted(other), other, AxisGains(1.0, 20.0, 1.0), "speed", omega, lifted(other).at(omega))
+    assert np.max(np.abs(speed_loop(gains, one).at(omega) / theirs - 1.0)) < TWO_MASSES
+
+
+def test_a_speed_loop_is_as_slow_as_an_elastic_shaft_needs() -> None:
+    T_sum = small_time_constants(path(), ALPHA)
+    rigid = symmetric_optimum(J, T_sum, symmetric_ratio(math.radians(60.0)))
+    shaft = elastic(0.01)
+    assert margins(speed_loop(rigid, path())).stable and not margins(speed_loop(rigid, shaft)).stable
+    slower = slowed(rigid, [shaft, elastic(0.005)])
+    found = margins(speed_loop(slower, elastic(0.005)))
+    assert found.stable and found.modulus_margin >= ELASTIC_MODULUS
+    assert slower.K_i / slower.K_p**2 == pytest.approx(rigid.K_i / rigid.K_p**2), "the same shape"
+    assert slowed(rigid, [path()]) == rigid, "a rigid shaft needs nothing"

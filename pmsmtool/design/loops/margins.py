@@ -21,8 +21,8 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.design.headroom import Headroom, HeadroomLimits, OperatingCells, headroom, operating_cells
 from pmsmtool.design.loops.bandwidth import least_inductance
 from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop
+from pmsmtool.design.loops.open_loops import designed_speed_loop
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
-from pmsmtool.design.loops.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, speed_loop
 from pmsmtool.design.loops.vector_margins import (
     Response,
     VectorMargins,
@@ -32,7 +32,6 @@ from pmsmtool.design.loops.vector_margins import (
 )
 from pmsmtool.design.ratings import ratings_of
 from pmsmtool.design.tolerance import Samples, ToleranceBox
-from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 
@@ -235,26 +234,11 @@ def margin_problem(design: Design) -> MarginProblem:
         design["inverter.voltage_utilisation"], design["motor.I_max_apk"], design["protection.I_cont_apk"],
         design["protection.T_winding_max_c"],
     )  # fmt: skip
-    speed = _speed(design, source, gains["q"], plants["q"], predictor)
+    speed = designed_speed_loop(design, axis_loop(gains["q"], plants["q"], plants["q"] if predictor else None))
     crossover = 0.0 if speed is None else margins(speed).crossover_rad_s
     least = least_inductance(source, rated.I_max_apk)
     cells = operating_cells(source, rated, design["field_weakening.margin"])
     return MarginProblem(machine, plants, least, gains, predictor, speed, crossover, cells, limits)
-
-
-def _speed(
-    design: Design, source: MachineFile, gains: CurrentGains, plant: AxisPlant, predictor: bool
-) -> SampledLoop | None:
-    J = source.machine.J_kgm2
-    if J is None or design["speed.K_p_nms_per_rad"] == 0.0:
-        return None
-    path = SpeedPath(
-        J, source.machine.B_nms or 0.0, axis_loop(gains, plant, plant if predictor else None),
-        int(design["speed.decimation"]), design["encoder.pll_bandwidth_rad_s"], design["speed.filter_hz"],
-        Notch(design["speed.notch_hz"], design["speed.notch_zeta_num"], design["speed.notch_zeta_den"]),
-    )  # fmt: skip
-    K_p, K_i = design["speed.K_p_nms_per_rad"], design["speed.K_i_nm_per_rad"]
-    return speed_loop(SpeedGains(K_p, K_i, 0.0, SpeedMethod.SYMMETRIC_OPTIMUM), path)
 
 
 def evaluate(problem: MarginProblem, samples: Samples) -> BlockResult:

@@ -12,6 +12,7 @@ from pmsmtool.design.loops.bandwidth import least_inductance
 from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop, maximum_delay_periods
 from pmsmtool.design.loops.sampled_loop import LoopMargins, SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, speed_loop
+from pmsmtool.machine.two_masses import shafts_of
 
 CURRENT_GAINS = (
     "current.K_p_d_v_per_a", "current.K_i_d_v_per_as", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as",
@@ -31,23 +32,29 @@ _FACTS = {
 
 def open_loops(design: Design) -> dict[str, SampledLoop]:
     """Return the open loops that a design is judged by, from the gains that stand in it."""
-    machine = design.machine.machine
     predicts = bool(design.request.get("predictor", False))
     loops = {}
     for axis in "dq":
         plant = _plant(design, axis)
         loops[f"current_{axis}"] = axis_loop(_gains(design, axis), plant, plant if predicts else None)
-    if SPEED_LOOP in design.loops and machine.J_kgm2 is not None:
-        notch = Notch(design["speed.notch_hz"], design["speed.notch_zeta_num"], design["speed.notch_zeta_den"])
-        path = SpeedPath(
-            machine.J_kgm2, machine.B_nms or 0.0, loops["current_q"], int(design["speed.decimation"]),
-            design["encoder.pll_bandwidth_rad_s"], design["speed.filter_hz"], notch,
-        )  # fmt: skip
-        gain = SpeedGains(
-            design["speed.K_p_nms_per_rad"], design["speed.K_i_nm_per_rad"], 0.0, SpeedMethod.SYMMETRIC_OPTIMUM
-        )
-        loops[SPEED_LOOP] = speed_loop(gain, path)
+    speed = designed_speed_loop(design, loops["current_q"])
+    if speed is not None:
+        loops[SPEED_LOOP] = speed
     return {name: loop for name, loop in loops.items() if name in design.loops}
+
+
+def designed_speed_loop(design: Design, current: SampledLoop) -> SampledLoop | None:
+    """Return the speed loop of a design's gains above a current loop of the q axis; None where it has none."""
+    machine, K_p = design.machine.machine, design["speed.K_p_nms_per_rad"]
+    if machine.J_kgm2 is None or K_p == 0.0:
+        return None
+    path = SpeedPath(
+        machine.J_kgm2, machine.B_nms or 0.0, current, int(design["speed.decimation"]),
+        design["encoder.pll_bandwidth_rad_s"], design["speed.filter_hz"],
+        Notch(design["speed.notch_hz"], design["speed.notch_zeta_num"], design["speed.notch_zeta_den"]),
+        next(iter(shafts_of(design.machine)), None),
+    )  # fmt: skip
+    return speed_loop(SpeedGains(K_p, design["speed.K_i_nm_per_rad"], 0.0, SpeedMethod.SYMMETRIC_OPTIMUM), path)
 
 
 def lacking_gains(offers: Collection[str]) -> dict[str, tuple[str, ...]]:

@@ -150,10 +150,20 @@ def _real_roots(series: Array) -> Array:
     return np.sort(np.arccos(kept[np.abs(kept) < 1.0]))
 
 
+_SLOW = np.geomspace(1e-4, 0.3, 800)
+"""Angles per sample at which slow crossings are looked for: 1 % apart."""
+
+
 def _gain_crossings(loop: SampledLoop) -> Array:
-    """Angular frequencies (rad/s) at which |L| = 1."""
+    """Angular frequencies (rad/s) at which |L| = 1; those of a slow loop, near 1, are looked for on a grid besides."""
     guesses = _real_roots(np.asarray(chebyshev.chebsub(_square(loop.num), _square(loop.den))))
-    return _polished(guesses, lambda omega: np.abs(loop.at(omega)) - 1.0, loop)
+    found = _polished(guesses, lambda omega: np.abs(loop.at(omega)) - 1.0, loop)
+    omega = _SLOW / loop.T_s
+    over = np.abs(loop.at(omega)) - 1.0
+    at = np.flatnonzero(np.sign(over[1:]) * np.sign(over[:-1]) < 0.0)
+    missed = at[[not np.any((found >= omega[k]) & (found <= omega[k + 1])) for k in at]] if at.size else at
+    share = over[missed] / (over[missed] - over[missed + 1])
+    return np.sort(np.concatenate([found, omega[missed] + share * (omega[missed + 1] - omega[missed])]))
 
 
 def _phase_crossings(loop: SampledLoop) -> Array:

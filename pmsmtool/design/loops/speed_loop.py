@@ -12,14 +12,16 @@ K_i = K_p / (a^2 T_sum), phase margin atan(a) - atan(1/a).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.design.loops.sampled_loop import SampledLoop
+from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.errors import DesignInfeasible
+from pmsmtool.machine.two_masses import Mechanics, sampled
 
 Array = NDArray[np.float64]
 System = tuple[Array, Array, Array, float]
@@ -85,6 +87,8 @@ class SpeedPath:
         Cut-off of the first-order feedback filter (Hz).
     notch : Notch
         Notch on the torque.
+    shaft : Mechanics or None
+        A load behind an elastic shaft; None: rigid.
     """
 
     J: float
@@ -94,6 +98,7 @@ class SpeedPath:
     pll_rad_s: float
     filter_hz: float
     notch: Notch = Notch()
+    shaft: Mechanics | None = None
 
     @property
     def T_speed(self) -> float:
@@ -161,6 +166,33 @@ def speed_loop(gains: SpeedGains, path: SpeedPath) -> SampledLoop:
     return SampledLoop(tuple(num.tolist()), tuple(den.tolist()), T, path.current.delay_s + 0.5 * T)
 
 
+ELASTIC_PHASE_DEG, ELASTIC_MODULUS = 40.0, 0.4
+"""Least phase margin (degree) of the speed loop with an elastic shaft, and least distance of L from -1 over what that
+shaft may be: |S| stays below 8 dB."""
+_SLOWER, _SLOWER_STEPS = 0.85, 40
+
+
+def slowed(gains: SpeedGains, paths: Sequence[SpeedPath]) -> SpeedGains:
+    """Return gains of the same shape, as slow as all paths, the nominal one first, need to keep their margins.
+
+    Raises
+    ------
+    DesignInfeasible
+        None does.
+    """
+    for k in range(_SLOWER_STEPS):
+        share = _SLOWER**k
+        slower = replace(gains, K_p=share * gains.K_p, K_i=share**2 * gains.K_i, omega_c=share * gains.omega_c)
+        found = [margins(speed_loop(slower, path)) for path in paths]
+        held = all(one.stable and one.modulus_margin >= ELASTIC_MODULUS for one in found)
+        if held and found[0].phase_margin_deg >= ELASTIC_PHASE_DEG:
+            return slower
+    raise DesignInfeasible(
+        "no speed loop keeps its margins with this elastic shaft",
+        where="speed loop", hint="ask for a --speed-bandwidth-hz, or correct resonance_hz and antiresonance_hz",
+    )  # fmt: skip
+
+
 POSITION_PHASE_DEG, POSITION_MODULUS, POSITION_GAIN = 60.0, 0.5, 2.0
 """Least phase margin (degree), distance of L from -1 (|S| <= 6 dB) and gain margin of the position loop."""
 _FREQUENCIES = 4000
@@ -218,6 +250,10 @@ def torque_path(current: SampledLoop) -> System:
 def _mechanics(path: SpeedPath) -> System:
     """Torque to speed, torque linear between samples: w(k+1) = a w(k) + b (t(k) + t(k+1)) / 2, b exact."""
     T = path.current.T_s
+    if path.shaft is not None and path.shaft.elastic:
+        A, torque, c = path.shaft.system()  # its last state is the angle, which the speed does not show
+        A, torque, c, d = sampled((A[:-1, :-1], torque[:-1], c[:1, :-1]), T)
+        return A, torque, c[0], float(d[0])
     y = path.B * T / path.J
     a = math.exp(-y)
     b = T / path.J * (1.0 if y == 0.0 else -math.expm1(-y) / y)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The shaft that a position loop turns: one mass, or a load behind an elastic shaft, as a sampled system.
+"""The shaft that speed and position loops turn: one mass, or a load behind an elastic shaft, as a sampled system.
 
 The two masses are those of ``identify frf``: the load swings alone at the antiresonance f_a (stiffness k = J_L w_a^2),
 both against each other at the resonance f_r, and J_M / J = (f_a / f_r)^2.
@@ -20,6 +20,12 @@ Array = NDArray[np.float64]
 
 DAMPING = 0.01
 """Damping of a resonance whose machine file says none: the lower end of 0.5 to 5 % (steel shaft to jaw coupling)."""
+
+
+RESONANCE_DOUBT, COVERAGE, ZETA_FACTOR = 0.02, 2.0, 2.0
+"""Least relative half width of resonance and antiresonance, else so many of their standard deviations, and factor
+either way of the damping (found within 0.03 % and 14 %, ``tests/measurement/test_frequency_response``; a shaft has more
+than two masses)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +117,27 @@ def mechanics_of(source: MachineFile) -> Mechanics:
             where="machine.antiresonance_hz", hint="`pmsmtool identify frf` measures both",
         )  # fmt: skip
     return Mechanics(machine.J_kgm2, machine.B_nms or 0.0, f_a, f_r, machine.resonance_zeta or DAMPING)
+
+
+def shafts_of(source: MachineFile) -> list[Mechanics]:
+    """Return the elastic shaft of a machine file, and the corners of its intervals; nothing of one mass."""
+    f_r, f_a = source.machine.resonance_hz, source.machine.antiresonance_hz
+    if not source.machine.J_kgm2 or f_r is None or f_a is None or not f_a < f_r:
+        return []
+    nominal = mechanics_of(source)
+    r, a = doubt(source, "resonance_hz", f_r), doubt(source, "antiresonance_hz", f_a)
+    corners = [
+        replace(nominal, resonance_hz=f_r * (1.0 + x * r), antiresonance_hz=f_a * (1.0 + y * a), zeta=z * nominal.zeta)
+        for x in (-1.0, 1.0)
+        for y in (-1.0, 1.0)
+        for z in (1.0 / ZETA_FACTOR, ZETA_FACTOR)
+    ]
+    return [nominal, *(shaft for shaft in corners if shaft.antiresonance_hz < shaft.resonance_hz)]
+
+
+def doubt(source: MachineFile, name: str, value: float) -> float:
+    """Return the relative half width of a resonance or an antiresonance."""
+    return max(RESONANCE_DOUBT, COVERAGE * source.std.get(name, 0.0) / value)
 
 
 def sampled(system: tuple[Array, Array, Array], T_s: float) -> tuple[Array, Array, Array, Array]:
