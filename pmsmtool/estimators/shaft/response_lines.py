@@ -27,7 +27,7 @@ HALF_WIDTH = 3
 """Lines on each side of one that its polynomials use."""
 ORDER = 2
 LINES_LEAST = 40
-"""Coherent lines below which no response is given."""
+"""Lines below which a record is too short."""
 
 
 def transforms(
