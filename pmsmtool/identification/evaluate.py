@@ -39,7 +39,7 @@ from pmsmtool.identification.calibration import calibrated_traces
 from pmsmtool.identification.cogging import Cogging, cogging_of
 from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
-from pmsmtool.identification.mechanics import NOT_RIGID, of_no_rigid_shaft, pushes_of
+from pmsmtool.identification.mechanics import NOT_RIGID, of_no_rigid_shaft, pushes_of, with_play_told
 from pmsmtool.identification.sampling import resistance_as_sampled
 from pmsmtool.identification.wiring import Finding, supply_under_load
 from pmsmtool.machine.parameters import Estimate
@@ -65,9 +65,11 @@ class Evaluation:
 
     ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics``, ``frf``,
     ``cogging`` and ``harmonics``. ``inertia`` is that by mean accelerations, where the mechanics are refused.
+    ``encoder_noise_rad`` is the standard deviation of a position at rest, without what drifts (mechanical).
     """
 
     noise: Noise
+    encoder_noise_rad: float = 0.0
     phases: PhaseCheck | None = None
     mismatch: SensorMismatch | None = None
     pairs: PairCheck | None = None
@@ -213,7 +215,7 @@ def evaluate(
     noise = estimate_noise(traces["zero_current"])
     mismatch = estimate_mismatch(traces["phase_pairs"], noise) if "phase_pairs" in traces else None
     traces = with_equal_sensors(traces, mismatch)
-    result = Evaluation(noise, mismatch=mismatch)
+    result = Evaluation(noise, _encoder_noise(traces["zero_current"]), mismatch=mismatch)
     if "phase_vectors" in traces:
         result = replace(result, phases=check_phases(traces["phase_vectors"], result.noise))
     if "first_turn" in traces:
@@ -274,6 +276,8 @@ def evaluate(
         moving = replace(moving, mechanics=elastic, inertia=inertia)
         if elastic is not None:
             del refused["mechanics"]
+    elif moving.mechanics is not None:
+        moving = replace(moving, mechanics=with_play_told(moving.mechanics, response))
     modulation = None
     if shaft.resistance is not None and shaft.inductance is not None and "speeds" in traces:
         L_h = shaft.inductance.L_d.value, shaft.inductance.L_q.value
@@ -281,6 +285,14 @@ def evaluate(
     harmonics = attempt("harmonics", lambda: harmonics_of(traces, shaft, tolerance, period_s, modulation))
     turned = replace(moving, frequency_response=response, harmonics=harmonics)
     return replace(turned, cogging=attempt("cogging", lambda: cogging_of(traces, turned)), refused=refused)
+
+
+def _encoder_noise(at_rest: Trace) -> float:
+    """Standard deviation of a position (rad), from differences of rows, which hold next to nothing of a drift."""
+    if "theta_M_rad" not in at_rest.signals:
+        return 0.0
+    change = np.diff(at_rest["theta_M_rad"])
+    return float(np.std((change + math.pi) % (2.0 * math.pi) - math.pi)) / math.sqrt(2.0)
 
 
 def with_equal_sensors(traces: Mapping[str, Trace], mismatch: SensorMismatch | None) -> Mapping[str, Trace]:

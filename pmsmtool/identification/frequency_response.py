@@ -10,7 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse, estimate_frequency_response
+from pmsmtool.estimators.shaft.frequency_response import (
+    INFORMATION_GAIN,
+    FrequencyResponse,
+    estimate_frequency_response,
+)
 from pmsmtool.identification.mechanics import in_frame, torque_doubt, torque_of
 from pmsmtool.npz_file import npz_bytes
 from pmsmtool.run_directory import RunDirectory
@@ -22,6 +26,8 @@ if TYPE_CHECKING:
 TRACE = "frf_"
 """Followed by the number of a record."""
 RESPONSE_FILE = "frequency_response.npz"
+SHOWN, RIGID, NOTHING = "shaft_response", "rigid", "nothing"
+"""Condition of a machine file that says what the response shows of the shaft, and two of its values."""
 NOISE_DOUBT = 0.3
 """Relative standard deviation of the torque's scale, of the share of the noise in the power of the current: noise of
 the input makes a response too small."""
@@ -80,6 +86,13 @@ def _doubt(record: Trace, result: Evaluation, dead_time_s: float) -> float:
     emf = round(result.encoder.pole_pairs.value) * turned * result.flux.psi_measured.value
     displaced = 0.5 * dead_time_s * emf / result.inductance.L_q.value
     return math.hypot(doubt, small_signal_doubt(result.noise.sigma_a, displaced, deviation))
+
+
+def shown_of(result: FrequencyResponse | None) -> str:
+    """Return what a response shows of the shaft: ``rigid``, ``elastic`` or ``nothing``."""
+    if result is None or result.inertia is None:
+        return NOTHING
+    return "elastic" if result.information_gain > INFORMATION_GAIN else RIGID
 
 
 def save_response(run: RunDirectory, result: FrequencyResponse | None) -> dict[str, str]:

@@ -37,6 +37,8 @@ TRACE = "inertia_"
 ELASTIC_FALLBACK = "torque pulses on a shaft that is not rigid; J agrees with the frequency response"
 MEAN_FALLBACK = "mean acceleration of torque pulses on a shaft that is not rigid; friction is not known"
 PLAY_FALLBACK = "torque pulses on a shaft with play, of which a small torque turns a part"
+PLAY_LEAST = 0.05
+"""Share of the inertia that a small torque must leave unmoved before it counts as play."""
 SATURATION_DOUBT = 0.25
 """Relative standard deviation of the torque without a flux map, of the curvature of psi_d over i_d: the flux that a q
 current takes from the d axis is not seen. The saturated profile has a curvature of 3 % and its J was 0.77 % off."""
@@ -198,6 +200,18 @@ def of_no_rigid_shaft(
     finer = small if why == ELASTIC_FALLBACK and small is not None and small.std < found.J.std else found.J
     J, B, tau_c = (replace(value, fallback=why) for value in (finer, found.B, found.tau_c))
     return replace(found, J=J, B=B, tau_c=tau_c), None, response
+
+
+def with_play_told(found: MechanicsResult, response: FrequencyResponse | None) -> MechanicsResult:
+    """Return what pushes tell, its inertia saying so where a small torque turns less of the shaft: it has play."""
+    small = None if response is None else response.inertia
+    if small is None:
+        return found
+    check = cross_check("J_kgm2", "J_kgm2", small, found.J)
+    if check.agrees or check.difference > -PLAY_LEAST:
+        return found
+    both = f"{small.value:.3g} kg m2 by a small torque, {found.J.value:.3g} by pulses"
+    return replace(found, J=replace(found.J, fallback=f"{PLAY_FALLBACK}: {both}"))
 
 
 def torque_doubt(flux: FluxResult, displaced: float = 0.0, *, mapped: bool = False) -> float:

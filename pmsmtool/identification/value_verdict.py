@@ -139,6 +139,7 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         "current_scale": request.tolerance.current_scale,
         "voltage_scale": request.tolerance.voltage_scale,
         "noise_apk": evaluation.noise.sigma_a,
+        "encoder_noise_rad": evaluation.encoder_noise_rad,
     }
     if request.tolerance.bridge_difference_v is not None:
         conditions["bridge_difference_v"] = request.tolerance.bridge_difference_v
@@ -148,6 +149,10 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     for axis, fit in () if evaluation.inductance is None else evaluation.inductance.axes.items():
         if "eddy" in fit.effects:
             conditions |= {f"eddy_{axis}_s": fit.eddy_s, f"eddy_{axis}_time_s": fit.eddy_tau_s}
+    if evaluation.shown is not None:
+        conditions["shown_instant_s"] = evaluation.shown.value_s
+    if "frf" in request.measured:
+        conditions[frequency_response.SHOWN] = frequency_response.shown_of(evaluation.frequency_response)
     if evaluation.mechanics is not None:
         if evaluation.mechanics.drag is not None:
             conditions["drag_nms2"] = evaluation.mechanics.drag.value

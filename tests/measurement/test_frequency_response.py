@@ -29,6 +29,7 @@ from pmsmtool.identification.mechanics import (
     PLAY_FALLBACK,
     Pushes,
     of_no_rigid_shaft,
+    with_play_told,
 )
 from pmsmtool.identification.replay import replay
 from pmsmtool.identification.request import IdentifyRequest
@@ -205,6 +206,20 @@ def test_pushes_that_tell_another_inertia_are_believed_only_where_a_small_torque
     assert mean is not None and mean.fallback.startswith(PLAY_FALLBACK) and beside is not None and not beside.inertia
     _, mean, none = of_no_rigid_shaft(Pushed(0.0, 0.0320), None)
     assert mean is not None and mean.fallback == MEAN_FALLBACK and none is None
+
+
+def test_pushes_that_a_rigid_shaft_explains_show_play_where_a_small_torque_turns_less() -> None:
+    """4.2e-3 kg m2 by a small torque, 5.6e-3 by pulses, with 1 degree of play: taken for a rigid shaft before."""
+    nothing = np.zeros(0)
+
+    def response(J_kgm2: float) -> FrequencyResponse:
+        return FrequencyResponse(nothing, nothing.astype(complex), nothing, nothing, 800.0, 1.0, 1.0, 0.0,
+                                 inertia=Estimate(J_kgm2, 2.8e-4, 0.0, "kg m2"))  # fmt: skip
+
+    rigid = Pushed(5.63e-3, 0.0).mechanics()
+    assert with_play_told(rigid, response(4.18e-3)).J.fallback.startswith(PLAY_FALLBACK)
+    for other in (None, response(5.4e-3), response(7.0e-3)):
+        assert with_play_told(rigid, other) is rigid
 
 
 def test_no_notch_without_a_resonance_and_none_beyond_the_speed_controller() -> None:
