@@ -4,11 +4,13 @@
     python -m benchmarks.prove_verdicts --drives 300
     python -m benchmarks.prove_verdicts --drives 40 --first 5000 --kinds gain_low gain_high
     python -m benchmarks.prove_verdicts --drives 300 --declared
+    python -m benchmarks.prove_verdicts --drives 200 --first 205000 --real
 
 Drives follow from their seeds (``random_drives.py``, switched inverter). Each is identified first, over the
 bus as the tool does it; a drive that is refused there is counted apart. With ``--declared`` identification is skipped:
 the tool is given the true parameters off by draws from the intervals that it declares (:data:`DECLARED`). Then it
-designs, flashes over the bus, and proves. Every drive is proven healthy, and once more with one defect that its objects
+designs, flashes over the bus, and proves. With ``--real`` the drives have effects of real machines
+(``real_population.py``). Every drive is proven healthy, and once more with one defect that its objects
 do not show (the kinds in turn): K_p 20 % up or down, one more period of delay, decoupling of the wrong sign, one pole
 pair more or less. A spoiled drive is caught when the proof fails, however it fails.
 
@@ -32,6 +34,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.random_drives import draw_drive
+from benchmarks.real_population import draw_real
+from benchmarks.whole_commission import BLOCKS
 from pmsmtool.bus.connect import connect
 from pmsmtool.commissioning.commission import begin_run
 from pmsmtool.design.design_file import Design
@@ -138,7 +142,8 @@ def identified(truth: MachineFile) -> MachineFile:
     """Return what identification says of a simulated drive; raises what it refuses with."""
     with tempfile.TemporaryDirectory() as folder, _powered(truth, Path(folder)) as drive:
         run = begin_run(drive, Path(folder) / "runs")
-        identify(run, drive, IdentifyRequest(), _silent, _silent, known=(nameplate_of(drive, truth.name), "bench"))
+        known = nameplate_of(drive, truth.name), "bench"
+        identify(run, drive, IdentifyRequest(resonance=True), _silent, _silent, known=known)
         return load_machine_file(run.path / "machine.toml")
 
 
@@ -221,10 +226,9 @@ class Shared:
 
 
 def one_drive(
-    seed: int, kinds: tuple[str, ...], known: Callable[[MachineFile], MachineFile] = identified
+    truth: MachineFile, kinds: tuple[str, ...], known: Callable[[MachineFile], MachineFile] = identified
 ) -> Iterator[tuple[str, bool, str]]:
     """Yield kind (empty: healthy), verdict and the reason for each proof of a drive; ``known`` says what it is."""
-    truth = draw_drive(seed)
     design = tune(known(truth), TuneRequest(field_weakening="lookup"))
     for kind in ("", *kinds):
         try:
@@ -243,6 +247,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--kinds", nargs="*", choices=list(KINDS), help="all of these on every drive; default: in turn")
     parser.add_argument("--declared", action="store_true", help="skip identification: the truth, off by its intervals")
+    parser.add_argument("--real", action="store_true", help="with effects of real machines (real_population.py)")
     parser.add_argument("--verbose", action="store_true", help="a line for every proof")
     asked = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -256,7 +261,8 @@ def main() -> None:
     for k in range(asked.drives):
         seed = asked.first + k
         try:
-            for kind, passed, why in one_drive(seed, tuple(asked.kinds or (names[k % len(names)],)), known):
+            truth = draw_real(seed, BLOCKS[seed % len(BLOCKS)])[0] if asked.real else draw_drive(seed)
+            for kind, passed, why in one_drive(truth, tuple(asked.kinds or (names[k % len(names)],)), known):
                 right = passed if not kind else not passed
                 total[kind or "healthy"] += 1
                 good[kind or "healthy"] += right

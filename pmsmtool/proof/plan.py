@@ -12,7 +12,8 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Shape
 from pmsmtool.errors import ConfigError, NotAvailable
-from pmsmtool.identification.mechanics import PLAY_FALLBACK
+from pmsmtool.identification.frequency_response import NOTHING, RIGID, SHOWN
+from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, MEAN_FALLBACK, PLAY_FALLBACK
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import RAD_S_PER_RPM
 
@@ -20,6 +21,8 @@ RPM = RAD_S_PER_RPM
 
 SIGNALS = ("i_d_a", "i_q_a", "omega_e_rad_s", "u_d_lim_v", "u_q_lim_v")
 """What is recorded of every experiment but a move."""
+LINK, VOLTAGE_LIMITED = "U_dc_v", ("unreachable", "weakening")
+"""Recorded beside them in experiments whose response the link decides."""
 MOVE_SIGNALS = ("following_error_rad", "omega_e_rad_s", "i_q_a")
 """What is recorded of a move by the position loop, and judged."""
 STEPS = (0.5, 0.0, -0.5, 0.0, 1.0, 0.0, -1.0, 0.0)
@@ -168,7 +171,9 @@ class Experiment:
     @property
     def signals(self) -> tuple[str, ...]:
         """What is recorded."""
-        return SIGNALS if self.move is None else MOVE_SIGNALS
+        if self.move is not None:
+            return MOVE_SIGNALS
+        return (*SIGNALS, LINK) if self.name in VOLTAGE_LIMITED else SIGNALS
 
     def scale(self, signal: str) -> float:
         """Return the scale of a signal, in its unit."""
@@ -207,15 +212,17 @@ def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
     sizes = _Sizes.of(design, conditions)
     experiments: list[Experiment] = []
     left_out: list[str] = []
-    turning = sizes.turns
-    if turning:
+    turning, play = sizes.turns, _play(design)
+    if turning and play:
+        left_out.append(f"speed step, field weakening: {play}")
+    elif turning:
         experiments.append(_speed_step(sizes))
     else:
         why = "the shaft is locked" if conditions.shaft == "locked" else "the design has no speed controller"
         left_out.append(f"speed step, field weakening, unreachable reference: {why}; current steps at standstill")
     experiments += [_current_steps(sizes, "q"), _current_steps(sizes, "d")]
     if turning:
-        for make in (_unreachable, _weakening):
+        for make in (_unreachable,) if play else (_unreachable, _weakening):
             found = make(sizes)
             if isinstance(found, Experiment):
                 experiments.append(found)
@@ -298,6 +305,13 @@ def _generation_rpm(design: Design) -> float:
     chopper = stated or design.request.get("overspeed_protection") == "chopper"
     protected = chopper or design["protection.n_short_circuit_rpm"] > 0.0
     return math.inf if protected else float(design.facts.get("generation_rpm", math.inf))
+
+
+def _play(design: Design) -> str:
+    """Return why no response of the speed loop is predicted; empty where identification saw no play."""
+    inertia = design.machine.estimates.get("J_kgm2")
+    known = inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK)
+    return "the shaft has play, which nothing predicts" if known else ""
 
 
 def _speed_step(s: _Sizes) -> Experiment:
@@ -433,9 +447,15 @@ def _moves(s: _Sizes, increments: int) -> tuple[Experiment, ...] | str:
     K_p, slope = s.design["position.K_p_per_s"], s.design["speed.acceleration_rpm_per_s"] * RPM
     if K_p <= 0.0:
         return "position moves: the design has no position controller"
-    inertia = s.design.machine.estimates.get("J_kgm2")
-    if inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK):
-        return "position moves: the shaft has play, which nothing predicts"
+    if play := _play(s.design):
+        return f"position moves: {play}"
+    machine = s.design.machine
+    shown, J = machine.conditions.get(SHOWN, RIGID), machine.estimates.get("J_kgm2")
+    bent = J is not None and J.fallback.startswith((ELASTIC_FALLBACK, MEAN_FALLBACK))
+    if bent or shown not in (RIGID, NOTHING) or machine.machine.resonance_hz is not None:
+        return "position moves: the shaft is not rigid, and its play where the torque reverses is not known"
+    if shown == NOTHING:
+        return "position moves: nothing shows that the shaft is rigid and without play: no frequency response"
     if not increments:
         return "position moves: the drive does not state the increments of a turn (0x608F)"
     acceleration = MOVE_ACCELERATION * slope * min(1.0, s.i_lim / s.design["motor.I_max_apk"])

@@ -15,12 +15,13 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.port import Injection
 from pmsmtool.errors import NotAvailable
+from pmsmtool.identification.frequency_response import RIGID, SHOWN
 from pmsmtool.identification.mechanics import PLAY_FALLBACK
 from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.proof.plan import RPM, SIGNALS, STEPS, Conditions, plan_proof
-from pmsmtool.proof.simulated import BASE_SPEED, LAG_SHARES, SimulatedDrives
+from pmsmtool.proof.simulated import BASE_SPEED, EMF_HARMONICS, LAG_SHARES, SimulatedDrives
 from pmsmtool.proof.stage import ProofRequest, envelope_of
 from pmsmtool.resources import data_folder
 
@@ -40,6 +41,12 @@ def changed(made: Design, **values: float) -> Design:
     return replace(made, values={**made.values, **{n: DesignValue(v, "test") for n, v in names.items()}})
 
 
+def shown(made: Design, response: str) -> Design:
+    """The design of a machine whose frequency response showed that of its shaft."""
+    known = {**made.machine.conditions, SHOWN: response}
+    return replace(made, machine=replace(made.machine, conditions=known))
+
+
 def test_everything_the_issue_asks_for_is_there() -> None:
     plan = plan_proof(design(), conditions(design()))
     names = ["speed_step", "q_steps", "d_steps", "unreachable", "weakening", "move", "move_lag"]
@@ -54,6 +61,8 @@ def test_a_drive_without_what_a_move_needs_is_told() -> None:
     loose = replace(made, machine=replace(made.machine, estimates={**made.machine.estimates, "J_kgm2": J}))
     for without, why in (
         (plan_proof(loose, conditions(made)), "the shaft has play"),
+        (plan_proof(shown(made, "elastic"), conditions(made)), "the shaft is not rigid"),
+        (plan_proof(shown(made, "nothing"), conditions(made)), "nothing shows that the shaft is rigid"),
         (plan_proof(changed(made, position__K_p_per_s=0.0), conditions(made)), "no position controller"),
         (plan_proof(made, conditions(made, encoder_counts=0)), "increments of a turn"),
         (plan_proof(made, conditions(made, encoder_counts=4)), "too coarse"),
@@ -61,6 +70,22 @@ def test_a_drive_without_what_a_move_needs_is_told() -> None:
     ):
         assert not [e for e in without.experiments if e.move is not None]
         assert any(line.startswith("position moves: ") and why in line for line in without.left_out)
+
+
+def test_of_a_shaft_with_play_only_currents_are_predicted() -> None:
+    """A healthy drive with 1 degree of play was at 1.06 of its band in a speed step, another at 2.55 in a move."""
+    made = design()
+    J = Estimate(0.0364, 8e-4, 0.0, "kg m2", fallback=f"{PLAY_FALLBACK}: 0.0193 by a small torque, 0.0364 by pulses")
+    loose = replace(made, machine=replace(made.machine, estimates={**made.machine.estimates, "J_kgm2": J}))
+    plan = plan_proof(loose, conditions(made))
+    assert [e.name for e in plan.experiments] == ["q_steps", "d_steps", "unreachable"]
+    assert "speed step, field weakening: the shaft has play, which nothing predicts" in plan.left_out
+
+
+def test_a_shaft_that_is_shown_to_be_rigid_is_moved() -> None:
+    made = design()
+    plan = plan_proof(shown(made, RIGID), conditions(made))
+    assert [e.name for e in plan.experiments][-2:] == ["move", "move_lag"] and plan.left_out == ()
 
 
 @pytest.mark.chain
@@ -199,6 +224,34 @@ def test_the_prediction_samples_when_the_identified_sensors_do() -> None:
                 and 0.3 * inverter.T_s < lags.max() <= LAG_SHARES[1] * inverter.T_s
                 and not shifts.any()
             )
+
+
+def test_an_angle_may_be_as_old_as_the_voltage_at_speed_shows() -> None:
+    """Square waves at standstill see no angle: of 45 us the instant that fits them and the speeds was 15."""
+    source, std = light(), 0.4e-6
+    inverter = replace(source.inverter, current_lag_s=0.0, sampling_instant_s=15e-6)
+    estimates = {name: Estimate(value, std, 0.0, "s") for name, value in ((LAG, 0.0), (INSTANT, 15e-6))}
+    known = {**source.conditions, "shown_instant_s": 45e-6}
+    made = tune(replace(source, inverter=inverter, estimates=estimates, conditions=known), TuneRequest())
+    limits = conditions(made, U_dc_v=24.0)
+    setups = SimulatedDrives(made, limits, plan_proof(made, limits), 16, 0).setups
+    ages = {round(1e6 * one.sensors.encoder_latency) for one in setups}
+    assert ages - {0} and min(ages - {0}) >= 40, "half of the drives have all of it as an old angle"
+
+
+def test_the_prediction_has_harmonics_and_the_noise_of_the_encoder() -> None:
+    """Of 3.7 % in the back-EMF i_q of a speed step was at 1.29 of its band, by 2.1 steps of noise at 1.21."""
+    source = light()
+    made = tune(replace(source, conditions={**source.conditions, "encoder_noise_rad": 8e-4}), TuneRequest())
+    limits = conditions(made, U_dc_v=24.0)
+    setups = SimulatedDrives(made, limits, plan_proof(made, limits), 24, 0).setups
+    fifth = np.array([5.0 * one.machine.psi_6 / one.machine.psi_f for one in setups])
+    assert np.any(fifth < -0.01) and np.any(fifth > 0.01) and np.max(np.abs(fifth)) <= EMF_HARMONICS["psi_5_wb"][2]
+    assert {one.sensors.encoder_noise for one in setups} == {8e-4}
+    psi_5 = Estimate(1e-5, 1e-7, 0.0, "Wb")
+    seen = replace(made, machine=replace(made.machine, estimates={**made.machine.estimates, "psi_5_wb": psi_5}))
+    for one in SimulatedDrives(seen, limits, plan_proof(seen, limits), 8, 0).setups:
+        assert 0.5e-5 <= abs(one.machine.psi_6) <= 1.5e-5
 
 
 def test_the_prediction_has_the_two_masses_that_the_resonance_tells() -> None:
