@@ -80,6 +80,17 @@ def test_the_truth_is_found_the_drive_is_as_before_and_the_replay_gives_the_same
 
 
 @pytest.mark.chain
+def test_L_alone_is_found_where_the_d_axis_has_the_larger_one(tool: Tool) -> None:
+    """Refused before: first for a frame 89.9 deg off, then for an interval of 93 %, as nothing kept the delay."""
+    code, out, err = tool("identify", "R", "L", "--sim", "jercic-2017", "--yes", "--json")
+    assert code == 0, err
+    machine = load_machine_file(Path(json.loads(out)["run"]) / "machine.toml")
+    for key, true in (("L_d_h", 2.3e-3), ("L_q_h", 2.1e-3)):
+        assert machine.estimates[key].value == pytest.approx(true, rel=TOLERANCE)
+        assert 2.0 * machine.estimates[key].std < 0.03 * true  # measured 1.0 and 0.8 %
+
+
+@pytest.mark.chain
 def test_a_drive_that_compensates_its_dead_time_is_measured_without_and_keeps_it(tool: Tool) -> None:
     """As every drive does that was commissioned before; left on, the phases seemed 190 % apart."""
     bus = ("-i", "pmsmsim", "-c", profile("interior-2k2", inverter_model="switched"), "--yes")

@@ -16,6 +16,8 @@ from pmsmtool.estimators.injection.sampling_instant import ShownInstant
 
 Vector = NDArray[np.float64]
 
+DELAY_CENTRE, DELAY_PRIOR_STD = 1.0, 1.0
+"""Sample to voltage (T_s). A sample within a zero vector does not show it: nothing kept it, and L had 48 %."""
 LAG_CENTRE = 0.1
 """Centre of the prior of the sensor time constant (T_s)."""
 LAG_PRIOR_STD = 1.5
@@ -183,6 +185,7 @@ class Layout:
         """Residuals of the weak priors that keep an undetermined effect from running away."""
         parts = self.split(x)
         rows = [(parts["main"][1] - 1.0) / (EDDY_R_PRIOR_STD if self.effects.eddy else R_PRIOR_STD)]
+        rows.append((parts["main"][2] - DELAY_CENTRE) / DELAY_PRIOR_STD)
         if self.timing is not None:
             rows += self.timing.prior(parts["main"][2], parts["lag"][0] if self.effects.lag else None)
         elif self.effects.lag:
