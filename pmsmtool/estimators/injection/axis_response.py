@@ -228,6 +228,7 @@ def arx_guess(shot: Shot, delay: int) -> tuple[float, float, float]:
 
     Noise on i attenuates it (1.1 to 8 times the bound, -1.8 % bias): never a result.
     """
+    rough = initial_inductance(shot)  # refuses a current that does not follow: rounding would fit it
     i, v = shot.i_a[SKIP_SAMPLES:], shot.u_v[SKIP_SAMPLES - delay : len(shot.u_v) - delay]
     columns = np.stack([i[:-1], v[:-1], np.ones(len(i) - 1)], axis=1)
     x, *_ = np.linalg.lstsq(columns, i[1:], rcond=None)
@@ -235,6 +236,6 @@ def arx_guess(shot: Shot, delay: int) -> tuple[float, float, float]:
     a, b = float(x[0]), float(x[1])
     power = float(residual @ residual)
     if not 0.0 < a < 1.0 or not b > 0.0:
-        return initial_inductance(shot), 0.0, power
+        return rough, 0.0, power
     R = (1.0 - a) / b
     return -R * shot.period_s / math.log(a), R, power
