@@ -160,7 +160,8 @@ class IdentifyRequest:
         unknown = [name for name in self.quantities if name not in NEEDS]
         if unknown or not self.quantities:
             raise ConfigError(
-                f"cannot identify {', '.join(unknown) or 'nothing'}", hint=f"choose from {', '.join(NEEDS)}, or all"
+                f"cannot identify {', '.join(unknown) or 'nothing'}",
+                hint=f"choose from {', '.join(NEEDS)}, hall alone, or all",
             )
         if self.accuracy is not None and not set(self.quantities) & set(KEYS):
             raise ConfigError(
