@@ -45,7 +45,7 @@ MEASURED = Path(__file__).parents[3] / "shared" / "maps" / "baldor_400rpm_map.np
 
 FREE_RMS, FREE_MAX = 0.0025, 0.010
 HELD_RMS, HELD_MAX = 0.0015, 0.015
-"""Of the flux range. Measured: 0.0005 and 0.0078 with the profile and a free rotor; over 28 draws of the noise
+"""Of the flux range. Measured: 0.0005 and 0.0078 with the profile and a free rotor; over 22 draws of the noise
 0.0003 to 0.0008 and 0.0028 to 0.0110 with the measured machine, held (0.0004 and 0.0030 with a free rotor:
 benchmarks/commissioning.py)."""
 INDUCTANCE_MEDIAN = 0.015
