@@ -31,7 +31,8 @@ from can.broadcastmanager import (
 from pmsmtool.bus.clock import NEVER, NS, Ticker, VirtualClock
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.profile import profile_names
-from pmsmtool.sim.channel import BenchSupply, build_line, parse_channel
+from pmsmtool.sim.bench_supply import BenchSupply
+from pmsmtool.sim.channel import build_line, parse_channel
 from pmsmtool.sim.drive_kernel import KernelCore
 from pmsmtool.sim.line import EXTENDED, REMOTE, Frame, Line
 

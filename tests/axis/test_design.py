@@ -12,7 +12,8 @@ import pytest
 
 from pmsmtool.axis.design import PID, AxisGains, AxisRequest, axis_path, from_pid, with_axis
 from pmsmtool.axis.loops import lifted
-from pmsmtool.axis.search import Box, Limits, axis_margins, stiffest
+from pmsmtool.axis.robustness import axis_margins
+from pmsmtool.axis.search import Box, Limits, stiffest
 from pmsmtool.commissioning.axis_design import axis_drive, axis_parameters, design_axis, not_offered
 from pmsmtool.design.design_file import Design, design_text, parse_design
 from pmsmtool.design.loops.speed_loop import Notch

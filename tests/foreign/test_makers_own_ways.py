@@ -7,31 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from pmsmtool.cli.main import run
 from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.foreign.laws import encoder_resolution
 from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import COMMON, HEARTBEAT, TORQUE, Row, epos4, faulhaber, identity, write_eds
-from tests.simulated_bus import settle
 
 KEPT: tuple[Row, ...] = (
     (0x1010, 1, "U32", "rw", ""), (0x1020, 1, "U32", "rw", "0"), (0x1020, 2, "U32", "rw", "0"),
 )  # fmt: skip
 """A command to store; the simulated drive forgets 0x1020, the date of its configuration, in a reset."""
 PROFILE = "interior-2k2"
-
-
-@pytest.fixture
-def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Tool:
-    settle(tmp_path, monkeypatch)
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        code = run(arguments)
-        return code, *capsys.readouterr()
-
-    return call
 
 
 def commissioned(

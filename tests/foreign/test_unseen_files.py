@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from benchmarks.eds_nodes import entries_of, faults_of, mutated, text_of
-from pmsmtool.cli.main import run
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.node.dictionary import Entry
@@ -21,17 +20,6 @@ from tests.foreign.data_sheets import Row, copley, epos4, faulhaber, write_eds
 from tests.simulated_bus import settle
 
 SEEDS = 8
-
-
-@pytest.fixture
-def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Tool:
-    settle(tmp_path, monkeypatch)
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        code = run(arguments)
-        return code, *capsys.readouterr()
-
-    return call
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
 from pmsmtool.experiments.supply_levels import LEVELS
-from pmsmtool.identification.judgement import LOSS_DOUBT, SUPPLY_TOLERANCE, resistance_by_supply
+from pmsmtool.identification.supply_power import LOSS_DOUBT, SUPPLY_TOLERANCE, resistance_by_supply
 from pmsmtool.trace import Trace
 
 R, DROP, IDLE, U = 0.12, 1.5, 6.0, 48.0
