@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import click
 
 from pmsmtool.cli.drive_access import LOOKING_S, map_option, open_node, read_map, rehearsal_bus
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
-from pmsmtool.cli.output import Output
+from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
     from pmsmtool.measurement.capabilities import Capabilities, Row
@@ -51,7 +52,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
         found = examine(node, given)
         own = not found.drive_map.staging  # the reference drive shows the layout of its set
         denied = contradictions(node, found.drive_map.cells) if own else {}
-    out.result("caps", _facts(found, denied), lambda: _lines(found, denied))
+    out.result("caps", _facts(found, denied), lambda: _lines(found, denied, out.verbosity > 0))
     for name, why in found.drive_map.not_written(BY_NAME).items():
         if name not in found.drive_map.left_out:
             out.detail(f"not written: {name}: {why}")
@@ -95,17 +96,7 @@ def _row_facts(row: Row) -> dict[str, Any]:
         "method": row.method.value,
         "available": row.available,
         "needs": list(row.missing),
-        "expected": [
-            {
-                "name": e.name,
-                "half_width": e.half_width,
-                "unit": e.unit,
-                "drives": e.drives,
-                "program": e.program,
-                "given": e.given,
-            }
-            for e in row.expected
-        ],
+        "expected": [dataclasses.asdict(each) for each in row.expected],
         "note": row.note,
     }
 
@@ -121,25 +112,27 @@ def _unwritten(found: Capabilities, denied: Mapping[str, str]) -> dict[str, str]
     return dict.fromkeys(found.drive_map.cells, "no map names this drive")
 
 
-def _parameter_lines(found: Capabilities, denied: Mapping[str, str]) -> list[str]:
+def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bool) -> list[str]:
     """Say value by value what `flash-params` writes; what the map does not even name is a number (-v: by name)."""
     from pmsmtool.params.catalogue import BY_NAME
 
     drive_map = found.drive_map
     others = len(drive_map.not_written(BY_NAME).keys() - drive_map.left_out.keys())
     unwritten = _unwritten(found, denied)
+    written = {name: drive_map.cells[name] for name in _written(found, denied)}
+    rows = [(f"written: {name}", f"0x{row.index:04X}:{row.sub:02X}", row.wire) for name, row in written.items()]
+    lines = [f"written: {drive_map.row_text(name)}" for name in written] if sources else table(("", "", ""), rows)[1:]
     return [
         "",
-        *(f"written: {drive_map.row_text(name)}" for name in _written(found, denied)),
+        *lines,
         *(f"not written: {drive_map.row_text(name)}: {why}" for name, why in unwritten.items()),
         *(f"not written: {name}: {why}" for name, why in drive_map.left_out.items() if name in BY_NAME),
         *([f"not written: {others} other parameters, which the map has no row for"] if others else []),
     ]
 
 
-def _lines(found: Capabilities, denied: Mapping[str, str]) -> list[str]:
-    from pmsmtool.cli.output import table
-
+def _lines(found: Capabilities, denied: Mapping[str, str], sources: bool) -> list[str]:
+    """Return what a person reads: what is had, then what is missing and for what, then what is written."""
     identity = found.identity
     lines = [
         f"node {identity.node}  {identity.name}  vendor {identity.vendor:#010x}  product {identity.product:#x}  "
@@ -149,18 +142,25 @@ def _lines(found: Capabilities, denied: Mapping[str, str]) -> list[str]:
         *found.replaced,
         "",
     ]
-    rows = [(row.quantity, row.method.value, *_said(row)) for row in found.rows()]
-    lines += table(("quantity", "method", "expected total 95 %", ""), rows)
-    return lines if found.drive_map.staging else [*lines, *_parameter_lines(found, denied)]
+    rows = found.rows()
+    had = [row for row in rows if row.method != "manual" and (row.available or row.waits_for_person)]
+    lines += table(
+        ("quantity", "method", "expected total 95 %", ""),
+        [(row.quantity, row.method.value, *_said(row)) for row in had],
+    )
+    by_hand = ", ".join(row.quantity for row in rows if row.method == "manual")
+    lines += [f"as given, in a motor file (`pmsmtool machine new`): {by_hand}", ""]
+    lacking: dict[str, list[str]] = {}
+    for row in rows:
+        if not row.available and not row.waits_for_person:
+            lacking.setdefault(f"by {row.method.value}: needs {', '.join(row.missing)}", []).append(row.quantity)
+    lines += [f"not available: {', '.join(quantities)} {why}" for why, quantities in lacking.items()]
+    return lines if found.drive_map.staging else [*lines, *_parameter_lines(found, denied, sources)]
 
 
 def _said(row: Row) -> tuple[str, str]:
     if row.waits_for_person:
         return ", ".join(map(str, row.expected)), f"needs {', '.join(row.missing)}"
-    if not row.available:
-        return "-", f"not available: needs {', '.join(row.missing)}"
-    if row.method == "manual":
-        return "as given", "`pmsmtool machine new`"
     if row.method == "vendor":
         return "no interval", "; ".join(filter(None, ("`pmsmtool identify --method vendor`", row.note)))
     return ", ".join(map(str, row.expected)) or "not measured", row.note

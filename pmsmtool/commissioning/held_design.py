@@ -89,11 +89,7 @@ def _rated(design: Design, drive_map: DriveMap) -> dict[str, DesignValue]:
 def _quantised(design: Design, drive_map: DriveMap) -> dict[str, DesignValue]:
     """Return the gains as they come back from the drive's counts, with those that follow them."""
     pairs = one_pair(design, drive_map.cells)
-    names = [
-        name
-        for name in (*CURRENT_GAINS, *SPEED_GAINS)
-        if name in drive_map.cells and drive_map.writes(name, {})
-    ]
+    names = [name for name in (*CURRENT_GAINS, *SPEED_GAINS) if name in drive_map.cells and drive_map.writes(name, {})]
     wanted = dict.fromkeys(names)
     for name in names:  # what they are counted relative to
         while name in drive_map.cells and (name := drive_map.cells[name].gain):

@@ -134,9 +134,7 @@ def _cost(middles: list[float], order: str, offset: float) -> tuple[bool, float]
     return max(map(abs, left)) > LARGEST_ERROR_RAD, abs(offset)
 
 
-def _middle(
-    commanded: Array, angle: Array, level: NDArray[np.int64], wire: int
-) -> tuple[float, float, list[float]]:
+def _middle(commanded: Array, angle: Array, level: NDArray[np.int64], wire: int) -> tuple[float, float, list[float]]:
     """Return the middle of a wire's high half, by how much the rotor was late, and how its edges scatter (rad)."""
     moved, changed = np.diff(commanded), np.diff(level)
     between = 0.5 * (angle[:-1] + angle[1:])

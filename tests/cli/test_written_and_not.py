@@ -107,10 +107,28 @@ def test_caps_says_of_every_parameter_whether_it_is_written(
     assert all(not_written.values()) and {**not_written, **drive_map.left_out}.keys() >= not_written.keys()
     assert run(["--sim", f"interior-2k2?nv=:memory:&drive={family}", "caps"]) == 0
     out = capsys.readouterr().out
-    for name in written:
-        assert f"written: {drive_map.row_text(name)}" in out
+    assert [line.split()[1] for line in out.splitlines() if line.startswith("written: ")] == list(written)
     for name, why in drive_map.left_out.items():
         assert name not in BY_NAME or f"not written: {name}: {why}" in out
+    assert run(["--sim", f"interior-2k2?nv=:memory:&drive={family}", "caps", "-v"]) == 0
+    out = capsys.readouterr().out
+    assert all(f"written: {drive_map.row_text(name)}" in out for name in written)
+
+
+def test_caps_says_what_is_missing_once(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What several quantities lack for a method is one line: a person reads twenty lines, not fifty."""
+    assert run(["--sim", "interior-2k2?nv=:memory:&drive=epos4", "caps", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)["quantities"]
+    assert run(["--sim", "interior-2k2?nv=:memory:&drive=epos4", "caps"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    missing = [line.removeprefix("not available: ") for line in lines if line.startswith("not available: ")]
+    said = {(quantity, what.split(" by ")[-1]) for what in (m.split(": needs ")[0] for m in missing)
+            for quantity in what.split(" by ")[0].split(", ")}  # fmt: skip
+    assert said == {(row["quantity"], row["method"]) for row in facts if not row["available"]}
+    needs = [tuple(m.split(" by ")[1].split(": needs ")) for m in missing]
+    assert len(set(needs)) == len(needs)
+    had = {(row["quantity"], row["method"]) for row in facts if row["available"] and row["method"] != "manual"}
+    assert {tuple(line.split()[:2]) for line in lines if tuple(line.split()[:2]) in had} == had
 
 
 def test_caps_says_which_rows_the_drive_contradicts(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -122,7 +140,7 @@ def test_caps_says_which_rows_the_drive_contradicts(home: Path, capsys: pytest.C
     said = [line for line in out.splitlines() if line.startswith("not written: copley ")]
     assert any("motor.R_s_ohm 0x6410:07" in line and "the drive holds 4 bytes there" in line for line in said)
     assert any("torque_slope" in line and "the drive has no such object" in line for line in said)
-    assert any(line.startswith("written: copley motor.L_q_h 0x6410:08") for line in out.splitlines())
+    assert any(line.split()[:3] == ["written:", "motor.L_q_h", "0x6410:08"] for line in out.splitlines())
 
 
 def test_diff_says_what_is_equal_and_what_is_not_compared(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
