@@ -274,3 +274,25 @@ def supply_under_load(at_rest: Trace, loaded: Trace) -> Finding | None:
     if "U_dc_v" not in at_rest.signals or "U_dc_v" not in loaded.signals:
         return None
     return judge_supply(float(np.mean(at_rest["U_dc_v"])), loaded, None)
+
+
+def supply_power(at_rest: Trace, loaded: Trace) -> tuple[float, float]:
+    """Return the power from which on the DC link falls by :data:`SAGS`, and that of the largest current held (W).
+
+    The supply is taken for a voltage behind a resistance: the link falls with the current drawn from it. Infinite where
+    it falls by less than :data:`SAGS` of :data:`SAGS`, which a meter's scatter may be, or was not recorded.
+
+    Parameters
+    ----------
+    at_rest, loaded : Trace
+        ``U_dc_v`` without a current, and under direct currents ``i_d_a`` (A peak) of the voltages ``u_d_v``.
+    """
+    if "U_dc_v" not in at_rest.signals or "U_dc_v" not in loaded.signals:
+        return math.inf, 0.0
+    largest = int(np.argmax(np.abs(loaded["i_d_a"])))
+    U_rest_v, U_v = float(np.mean(at_rest["U_dc_v"])), float(loaded["U_dc_v"][largest])
+    held_w = 1.5 * float(loaded["u_d_v"][largest] * loaded["i_d_a"][largest])
+    fall = 1.0 - U_v / U_rest_v
+    if fall < SAGS * SAGS or not held_w > 0.0:
+        return math.inf, held_w
+    return held_w * (SAGS / fall) * (1.0 - SAGS) / (1.0 - fall), held_w

@@ -54,9 +54,9 @@ def measure_frequency_response(
         raise SafetyRefusal(
             f"the current limit of {limits.i_max_apk:.4g} A leaves none for the sequence", hint="raise --i-max"
         )
-    plan = frequency_response.plan_frequency_response(
-        level, SPEED_SHARE * largest, J, torque_per_ampere(pole_pairs, psi), drive.period_s
-    )
+    per_ampere = torque_per_ampere(pole_pairs, psi)
+    level, speed = limits.within_supply(level, SPEED_SHARE * largest, per_ampere)
+    plan = frequency_response.plan_frequency_response(level, speed, J, per_ampere, drive.period_s)
     say(
         f"frequency response: random current of {plan.i_q_a:.3g} A at {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm, "
         f"{plan.duration_s(drive.period_s):.2g} s"

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.refusals import refuse
@@ -20,6 +20,8 @@ DURATION_S = 600.0
 """Longest time the machine is energised by `identify` (27 times the rotor's inertia took more than 300 s)."""
 HEADROOM = 1.2
 """Largest current of an envelope, of the rated one, where none is asked for."""
+LEAST_CURRENT = 0.2
+"""Least share of a current that turns the shaft, to spare the supply."""
 TRIP_SHARE = 0.85
 """Current that the pulses of a flux map aim at, of the drive's overcurrent trip."""
 
@@ -90,6 +92,8 @@ class Limits:
         Largest voltage (V peak).
     i_d_max_apk : float
         Largest d current in the frame of the rotor (A peak).
+    supply_w : float
+        Largest power that the supply of the DC link is asked for (W).
 
     Raises
     ------
@@ -102,6 +106,7 @@ class Limits:
     omega_max_rad_s: float
     V_max_v: float
     i_d_max_apk: float = math.inf
+    supply_w: float = math.inf
 
     def __post_init__(self) -> None:
         """Refuse before anything moves."""
@@ -121,3 +126,19 @@ class Limits:
     def I_test_apk(self) -> float:
         """Largest steady current of an experiment: the rated one, or what the envelope leaves."""
         return min(self.I_nom_apk, self.i_max_apk / 1.1)
+
+    def on_supply(self, supply_w: float, held_w: float) -> Limits:
+        """Return the limits on a supply whose link gives way at a power (W), where the test current took ``held_w``."""
+        share = min(1.0, math.sqrt(supply_w / held_w)) if held_w > 0.0 else 1.0
+        return replace(self, I_nom_apk=share * self.I_test_apk, supply_w=supply_w) if supply_w < math.inf else self
+
+    def within_supply(self, i_q_a: float, omega_rad_s: float, torque_per_a: float) -> tuple[float, float]:
+        """Return current (A) and mechanical speed (rad/s) that together take no more than the supply gives.
+
+        The current is reduced first, for intervals grow as the speed falls, but not below :data:`LEAST_CURRENT`, which
+        must move the shaft. ``torque_per_a`` is in N m per ampere of q current.
+        """
+        taken_w = i_q_a * omega_rad_s * torque_per_a
+        share = min(1.0, self.supply_w / taken_w) if taken_w > 0.0 else 1.0
+        less = max(share, LEAST_CURRENT)
+        return less * i_q_a, share / less * omega_rad_s

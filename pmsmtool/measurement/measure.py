@@ -39,6 +39,7 @@ from pmsmtool.identification.evaluate import flux_of, resistance_of, tolerance_o
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
 from pmsmtool.identification.request import steps_of
 from pmsmtool.identification.run_files import entry
+from pmsmtool.identification.wiring import supply_power
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import flux_map, frequency_response, mechanics, shaft_forecast
 from pmsmtool.measurement.effort import ALL, Effort, LevelEffort, effort_for, larger_levels
@@ -168,6 +169,7 @@ class Measurement:
             start = standstill.DC_ANGLE_RAD
         resistance = self._attempt("R", lambda: self._levels(noise, start)) if "levels" in steps else None
         if resistance is not None:
+            self._spare_supply()
             self._pairs(noise, resistance)
         self._tell_spent()
         last = standstill.DC_ANGLE_RAD + (standstill.PHASE_ANGLES_RAD[-1] if resistance is not None else 0.0)
@@ -323,7 +325,7 @@ class Measurement:
     def _zero_current(self) -> Noise:
         self.say("noise: currents of the drive at rest")
         trace = standstill.record_zero_current(self.drive)
-        self.keep("zero_current", trace)
+        self._keep_for_later("zero_current", trace)
         return estimate_noise(trace)
 
     def _tell_spent(self) -> None:
@@ -407,7 +409,7 @@ class Measurement:
             self.say(f"R and inverter: {len(plan.levels_a)} levels up to {self.limits.I_test_apk:.3g} A")
             trace = standstill.hold_levels(self.drive, plan)
             start_rad = plan.angle_rad  # the last level is positive
-            self.keep("levels", trace)
+            self._keep_for_later("levels", trace)
             if effort is efforts[-1] or self._enough_levels(trace, noise):
                 break
             self.say("  the accuracy asked for is not reached: more levels")
@@ -432,6 +434,16 @@ class Measurement:
             drift=effort.drift,
             turn_s=self._effort.turn_s,
         )
+
+    def _spare_supply(self) -> None:
+        """Ask no more of a supply that gives way than what keeps the DC link up, from here on."""
+        supply_w, held_w = supply_power(self._kept["zero_current"], self._kept["levels"])
+        if supply_w < math.inf:
+            self.limits = self.limits.on_supply(supply_w, held_w)
+            self.say(
+                f"  the DC link gives way under {held_w:.3g} W: what follows takes at most {supply_w:.3g} W, "
+                f"{self.limits.I_test_apk:.3g} A at standstill"
+            )
 
     def _pairs(self, noise: Noise, resistance: ResistanceResult) -> None:
         """Compare the phases; current sensors that differ spoil every value, so that ends the run."""

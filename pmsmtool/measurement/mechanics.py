@@ -65,7 +65,9 @@ def measure_mechanics(
     psi, J, L_q = (drive.read(f"motor.{name}") for name in ("psi_f_wb", "J_kgm2", "L_q_h"))
     current = I_SHARE * limits.I_test_apk
     largest = min(limits.omega_max_rad_s, EMF_SHARE * limits.V_max_v / (pole_pairs * math.hypot(psi, L_q * current)))
-    plan = mechanics_run.plan_mechanics(current, SPEED_SHARE * largest, J, torque_per_ampere(pole_pairs, psi))
+    per_ampere = torque_per_ampere(pole_pairs, psi)
+    current, speed = limits.within_supply(current, SPEED_SHARE * largest, per_ampere)
+    plan = mechanics_run.plan_mechanics(current, speed, J, per_ampere)
     plan = replace(plan, rows=rows)
     say(
         f"J, B, tau_c: torque pulses of {plan.i_q_a:.3g} A up to about {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm and "

@@ -202,6 +202,7 @@ class SpeedStage:
         largest = min(limits.omega_max_rad_s / 1.1, EMF_SHARE * limits.V_max_v / (flux * pole_pairs))
         # the accelerating current must leave voltage for itself: omega_e L_q i_q stands beside the back-emf
         i_run = min(0.5 * limits.I_test_apk, REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L)))
+        i_run, largest = limits.within_supply(i_run, largest, torque_per_ampere(pole_pairs, psi))
         per_ampere = torque_per_ampere(pole_pairs, psi) / J
         # a current that is slow because the inverter's error is steep would not be steady in its window
         loop = speed_run.steady_loop(

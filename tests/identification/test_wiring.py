@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from pmsmtool.identification.wiring import (
     judge_sensors,
     judge_supply,
     judge_turn,
+    supply_power,
     supply_under_load,
 )
 from pmsmtool.machine.hall import HALL_ORDERS, hall_axis
@@ -139,3 +141,22 @@ def test_a_sensor_of_another_gain_is_seen_and_an_offset_is_not(gain: float, offs
     signals = {"i_a_a": phases[0] + offset, "i_b_a": gain * phases[1], "i_c_a": phases[2], "i_d_a": np.ones(3)}
     trace = Trace(np.arange(3.0), signals, dict.fromkeys(signals, "A"), {})
     assert judge_sensors(trace).verdict == verdict
+
+
+@pytest.mark.parametrize("source_ohm", [2.5, 10.0, 25.0])
+def test_the_power_at_which_a_supply_gives_way_is_that_of_its_resistance(source_ohm: float) -> None:
+    """210 V behind a resistance: the link U at the power P solves U (U_0 - U) = R P."""
+    U_0_v, R_ohm = 210.0, 0.35
+    i_a = np.array([5.0, -10.0, 28.0, -20.0])
+    held_w = 1.5 * R_ohm * i_a**2
+    U_v = 0.5 * (U_0_v + np.sqrt(U_0_v**2 - 4.0 * source_ohm * held_w))
+    at_rest = Trace(np.arange(3.0), {"U_dc_v": np.full(3, U_0_v)}, {"U_dc_v": "V"}, {})
+    signals = {"U_dc_v": U_v, "i_d_a": i_a, "u_d_v": R_ohm * i_a}
+    loaded = Trace(np.arange(4.0), signals, {"U_dc_v": "V", "i_d_a": "A", "u_d_v": "V"}, {})
+    found_w, largest_w = supply_power(at_rest, loaded)
+    assert largest_w == pytest.approx(held_w[2])
+    assert found_w == pytest.approx(0.1 * 0.9 * U_0_v**2 / source_ohm, rel=1e-9)
+    stiff = Trace(np.arange(4.0), {**signals, "U_dc_v": np.full(4, 0.991 * U_0_v)}, loaded.units, {})
+    assert (
+        supply_power(at_rest, stiff)[0] == supply_power(at_rest, replace(loaded, signals={}, units={}))[0] == math.inf
+    )

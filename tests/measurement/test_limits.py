@@ -3,21 +3,27 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from pmsmtool.cli.main import cli
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.experiments.rotation import SLOWEST_STEP_S, STEP_RAD, dwell_within
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import MachineLimits
 from pmsmtool.measurement.by_injection import envelope_of, nameplate_of, plan_lines
-from pmsmtool.measurement.limits import LEAST_SPEED_SHARE, Limits, require_speed, unused_current
+from pmsmtool.measurement.limits import LEAST_CURRENT, LEAST_SPEED_SHARE, Limits, require_speed, unused_current
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.resources import data_folder
 
+WEAK_SUPPLY = 0.01
+"""Of L_d, L_q, psi_f and J behind 25 ohm: 0.6, 0.3, 0.2 and 0.3 % were found."""
 GIVEN = {"I_nom_apk": 5.0, "i_max_apk": 6.0, "omega_max_rad_s": 300.0, "V_max_v": 28.0}
 
 
@@ -31,6 +37,31 @@ def test_a_limit_that_leaves_nothing_is_refused_before_anything_moves(name: str,
 def test_the_test_current_stays_within_the_envelope() -> None:
     assert Limits(**GIVEN).I_test_apk == 5.0
     assert Limits(**{**GIVEN, "i_max_apk": 4.4}).I_test_apk == pytest.approx(4.0)
+
+
+def test_a_weak_supply_is_asked_for_less_current_first_and_for_less_speed_then() -> None:
+    stiff = Limits(**GIVEN)
+    assert stiff.on_supply(math.inf, 20.0) is stiff and stiff.within_supply(4.0, 200.0, 0.5) == (4.0, 200.0)
+    weak = stiff.on_supply(160.0, 90.0)  # what was held does not reach it
+    assert weak.I_test_apk == 5.0 and weak.within_supply(4.0, 200.0, 0.5) == pytest.approx((1.6, 200.0))
+    weaker = stiff.on_supply(40.0, 160.0)
+    assert weaker.I_test_apk == pytest.approx(2.5)  # half of the current takes a quarter of the power
+    i_a, omega = weaker.within_supply(4.0, 200.0, 0.5)
+    assert i_a == pytest.approx(LEAST_CURRENT * 4.0) and i_a * omega * 0.5 == pytest.approx(40.0)
+
+
+@pytest.mark.chain
+def test_a_drive_on_a_supply_in_current_limit_is_identified(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """210 V behind 25 ohm: the test current takes 31 % of the link. Before, the run over speeds ended in 0x3220."""
+    monkeypatch.chdir(tmp_path)
+    outcome = CliRunner().invoke(cli, ["identify", "--sim", "jercic-2017?U_dc_source_ohm=25", "--yes", "--json"])
+    assert outcome.exit_code == 0, outcome.exception
+    assert "the DC link gives way under 378 W: what follows takes at most 159 W" in outcome.stderr
+    facts = json.loads(outcome.stdout)
+    found = {value["name"]: value for value in facts["values"]}
+    true = load_machine_file(data_folder("profiles") / "jercic-2017.toml").machine
+    for name in ("L_d_h", "L_q_h", "psi_f_wb", "J_kgm2"):
+        assert found[name]["value"] == pytest.approx(getattr(true, name), rel=WEAK_SUPPLY), name
 
 
 def test_a_speed_limit_that_no_push_stays_within_is_refused_with_the_least_one() -> None:
