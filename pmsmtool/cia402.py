@@ -60,6 +60,7 @@ class Status(IntFlag):
     SET_POINT_TAKEN = 1 << 12
     HOMING_ATTAINED = 1 << 12
     FOLLOWING_ERROR = 1 << 13
+    HOMING_ERROR = 1 << 13
 
 
 class Control(IntFlag):

@@ -109,7 +109,8 @@ compiler's own run time (`libgcc`, `compiler-rt`) and a `PMSM_SQRT` that rounds 
 - `app.trace` and `app.trace_bytes` give the recorder its memory, after the initialisation.
 - Ask through `app.enabled`, `app.reference` and `app.quick_stop`. `app.trip` holds the code of object 0x603F.
 - With `app.reference.mode` 6 the position is controlled: `app.position.asked` says where to and how, by a jerk-limited
-  profile or on straight lines between targets; `app.position.flags` shows moves, limits and the following error.
+  profile or on straight lines between targets; `app.position.flags` shows moves, limits and the following error. With
+  `app.position.asked.homing` it homes by a limit switch, the index, a stop or where it is; see `app.position.homing`.
 - A trip acts in the period in which it is sampled. What must be faster than that is your hardware's.
 
 ## Faults and flags

@@ -26,6 +26,7 @@ from pmsmtool.sim.node.drive_core import (
     Command,
     ControlMode,
     ExcitationState,
+    HomingPhase,
     PositionCommand,
     PositionFlag,
     PositionState,
@@ -150,15 +151,18 @@ class KernelCore:
         asked.interval, asked.velocity, asked.jerk = command.interval_s, command.velocity, command.jerk
         asked.acceleration, asked.deceleration = command.acceleration, command.deceleration
         asked.stop_deceleration, asked.halt = command.stop_deceleration, command.halt
-        asked.offset = command.offset
         asked.minimum, asked.maximum = command.minimum, command.maximum
         asked.window, asked.window_time = command.window, command.window_time_s
+        homing = command.homing
+        asked.homing.active, asked.homing.start = homing.active, homing.start
+        asked.homing.method, asked.homing.home_offset = homing.method, homing.home_offset
+        asked.homing.slow, asked.homing.torque = homing.slow, homing.torque_nm
 
     def position(self) -> PositionState:
         """Return the state of the position controller."""
         now = self.simulation.position
         flags = PositionFlag(now.flags)
-        return PositionState(now.actual, now.reference, now.error, flags, now.limits, now.asked.offset)
+        return PositionState(now.actual, now.reference, now.error, flags, now.limits, HomingPhase(now.homing))
 
     # ---- time --------------------------------------------------------------------------------------------
 

@@ -229,6 +229,19 @@ class Average(ctypes.Structure):
     )
 
 
+class HomingRequest(ctypes.Structure):
+    """``pmsm_homing_request``."""
+
+    _fields_ = (
+        ("active", _u32),
+        ("start", _u32),
+        ("method", _i32),
+        ("slow", _f32),
+        ("torque", _f32),
+        ("home_offset", _i32),
+    )
+
+
 class PositionRequest(ctypes.Structure):
     """``pmsm_position_request``."""
 
@@ -249,6 +262,7 @@ class PositionRequest(ctypes.Structure):
         ("maximum", _i32),
         ("window", _f32),
         ("window_time", _f32),
+        ("homing", HomingRequest),
     )
 
 
@@ -265,6 +279,7 @@ class Position(ctypes.Structure):
         ("error", _f32),
         ("flags", _u32),
         ("limits", _u32),
+        ("homing", _u32),
     )
 
 

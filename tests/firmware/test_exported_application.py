@@ -56,7 +56,7 @@ class Running:
 
 
 def ask(app: Any, k: int) -> None:
-    """Moves, a chirp with recorder and averages, a quick stop and a trip, one after the other."""
+    """Moves, a homing, a chirp with recorder and averages, a quick stop and a trip, one after the other."""
     position = app.position.asked
     if k == 0:
         app.enabled, app.reference.mode = 1, 6
@@ -68,6 +68,9 @@ def ask(app: Any, k: int) -> None:
         position.target, position.set_point = -2500, 2
     elif k == 1000:
         position.profile, position.interval, position.set_point = 0, 0.01, 3
+    elif k == 1200:
+        homing = position.homing
+        homing.active, homing.start, homing.method, homing.slow, homing.home_offset = 1, 1, 17, 3000.0, 50
     elif k == 1400:
         app.reference.mode = 2
         excitation = app.excitation
@@ -87,16 +90,19 @@ def test_the_compiled_export_equals_the_simulated_drives_application(tmp_path: P
     mine, theirs = Running(load("pmsm_sim")), Running(exported(tmp_path))
     rng = np.random.default_rng(4)
     seen: set[int] = set()
+    phases: set[int] = set()
     for k in range(PERIODS):
         theta = 0.3 * math.sin(k / 200.0) + k / 500.0
         parts = round(theta / (2 * math.pi) * 2**32)
         i = rng.normal(0.0, 3.0, 3)
         sensors = TYPES["pmsm_sensors"](i[0], i[1], i[2], 210.0, 30.0, 30.0, parts >> 32, parts & 0xFFFFFFFF)
-        sensors.limits = int(620 < k < 700)
+        sensors.limits = int(620 < k < 700 or 1230 < k < 1260)
         sensors.U_dc = 210.0 if k < 2900 else 900.0
         for one in (mine, theirs):
             ask(one.app, k)
         assert mine.period(sensors) == theirs.period(sensors), k
         seen.add(mine.app.position.flags)
+        phases.add(mine.app.position.homing)
+    assert phases >= {0, 1, 2, 3}, "a homing from its search to its rest"
     assert mine.app.trip == 0x3210 and mine.app.recorder.state == 3 and mine.app.average.state == 2
     assert all(any(flags & bit for flags in seen) for bit in (1, 2, 8)), "moves, following errors, a switch"

@@ -14,6 +14,7 @@ from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.sim.closed_loop import drive_values
 from pmsmtool.sim.kernel import Part, Simulation
+from pmsmtool.sim.node.drive_core import HomingPhase as Phase
 from pmsmtool.sim.node.drive_core import PositionFlag as Flag
 from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import build_setup
@@ -145,6 +146,20 @@ def test_targets_follow_on_straight_lines_and_end_where_they_are() -> None:
     assert axis.position.reference == 8 * 399 and abs(axis.position.error) <= 2
 
 
+def test_a_profile_takes_over_from_targets_that_were_followed() -> None:
+    """Where the following is, and at its speed: not where the last profile began."""
+    axis = Axis()
+    axis.asked.profile, axis.asked.interval = 0, 0.5
+    axis.go(2 * INCREMENTS)
+    axis.run(0.25)
+    before = axis.position.reference
+    axis.asked.profile = 1
+    rows = axis.run(1.0)
+    assert np.abs(np.diff(rows[:, 0], 2)).max() / axis.T**2 <= 80000 * 1.15  # measured 1.12: the last step
+    assert rows[-1, 0] == 2 * INCREMENTS - before and not axis.flags & Flag.MOVING
+    assert np.abs(rows[:, 2]).max() < 2 * FOLLOWS  # measured 12.1: a straight line begins without an acceleration
+
+
 def test_the_following_error_is_told_after_its_time_and_starts_anew() -> None:
     axis = Axis(speed__tau_max_nm=0.5)  # cannot follow
     axis.asked.window, axis.asked.window_time = 200.0, 0.05
@@ -248,3 +263,128 @@ def test_a_reversed_encoder_counts_and_moves_the_other_way() -> None:
     axis.go(2000 + other.actual)
     axis.run(0.3)
     assert axis.omega == pytest.approx(-forward, rel=0.05) and abs(forward) > 5.0
+
+
+SLOW = 2048.0
+HERE, INDEXES, SWITCHES, STOPS = 37, {33: -1, 34: 1}, {17: -1, 18: 1}, {-1: -1, -2: 1}
+
+
+class Homing(Axis):
+    """An axis that homes: it steps period by period until a phase is left."""
+
+    def home(self, method: int, offset: int = 0, torque: float = 40.0) -> Phase:
+        """Ask for it, and return the phase after a step of the speed controller."""
+        homing = self.asked.homing
+        homing.active, homing.method, homing.slow, homing.torque = 1, method, SLOW, torque
+        homing.home_offset, homing.start = offset, 0
+        self.run(self.T)
+        homing.start = 1
+        self.run(self.T)
+        return self.phase
+
+    @property
+    def phase(self) -> Phase:
+        return Phase(self.position.homing)
+
+    def left(self, phase: Phase, seconds: float = 3.0) -> Phase:
+        """Return what follows a phase; its own when it lasts."""
+        for _ in range(round(seconds / self.T)):
+            if self.phase is not phase:
+                break
+            self.run(self.T)
+        return self.phase
+
+    @property
+    def count(self) -> int:
+        """The encoder's, whatever the zero."""
+        return _wrapped(self.position.actual - self.asked.offset)
+
+
+@pytest.mark.parametrize("turns", [0.3, 2.0**31 / INCREMENTS - 1e-3, -(2.0**31) / INCREMENTS + 1e-3])
+def test_homing_where_it_is_moves_nothing_and_its_zero_is_beyond(turns: float) -> None:
+    axis = Homing(turns)
+    before = axis.count
+    assert axis.home(HERE, offset=700) is Phase.DONE
+    assert abs(axis.position.actual + 700) <= 2 and abs(_wrapped(axis.count - before)) <= 2
+    axis.asked.homing.active = 0
+    axis.go(0)
+    axis.run(0.5)
+    assert axis.phase is Phase.IDLE and axis.position.reference == 0 and abs(axis.position.actual) <= 2
+    assert abs(_wrapped(axis.count - before) - 700) <= 4
+
+
+@pytest.mark.parametrize(("method", "direction"), INDEXES.items())
+@pytest.mark.parametrize("turns", [0.3, 2.0**31 / INCREMENTS - 0.2])
+def test_homing_by_the_index(turns: float, method: int, direction: int) -> None:
+    axis = Homing(turns)
+    turn = axis.count // INCREMENTS + (direction > 0)
+    assert axis.home(method) is Phase.SEARCH
+    axis.run(0.1)
+    assert axis.position.velocity == pytest.approx(direction * SLOW)
+    assert axis.left(Phase.SEARCH) is Phase.REST
+    assert axis.asked.offset == _wrapped(-turn * INCREMENTS)
+    speed = axis.position.velocity
+    assert axis.left(Phase.REST) is Phase.DONE and speed == pytest.approx(direction * SLOW, rel=0.01)
+    way = SLOW**2 / (2 * 80000) + 0.5 * SLOW * 80000 / 4e6  # by the ramp, and the jerk's time
+    assert direction * axis.position.reference == pytest.approx(way, abs=2 * SLOW * axis.T + FOLLOWS)
+    assert abs(axis.position.error) < FOLLOWS
+
+
+@pytest.mark.parametrize(("method", "direction"), SWITCHES.items())
+def test_homing_by_a_limit_switch_and_back_until_it_opens(method: int, direction: int) -> None:
+    axis = Homing()
+    first = axis.count
+    axis.simulation.library.pmsm_sim_set_switches(axis.simulation.sim, -2 * math.pi, 2 * math.pi)
+    assert axis.home(method) is Phase.SEARCH and axis.left(Phase.SEARCH) is Phase.AWAY
+    assert axis.position.velocity == pytest.approx(direction * 8192.0, rel=0.05)
+    assert axis.left(Phase.AWAY) is Phase.REST
+    assert axis.left(Phase.REST) is Phase.DONE
+    assert -axis.asked.offset == pytest.approx(first + direction * INCREMENTS, abs=SLOW * 2 * axis.T + 2)
+    assert not axis.position.limits and not axis.flags & Flag.LIMIT_SWITCH
+
+
+@pytest.mark.parametrize(("method", "direction"), STOPS.items())
+def test_homing_by_a_stop_ends_where_the_torque_stays(method: int, direction: int) -> None:
+    axis = Homing()
+    assert axis.home(method) is Phase.SEARCH
+    axis.run(0.5)
+    assert axis.phase is Phase.SEARCH and direction * axis.position.velocity > 8000, "an acceleration is no stop"
+    axis.simulation.library.pmsm_sim_set_rotor(axis.simulation.sim, 1, 0.0)
+    assert axis.left(Phase.SEARCH) is Phase.DONE
+    assert abs(axis.position.actual) <= 2 and abs(axis.position.reference) <= 2, "no way on into the stop"
+
+
+def test_a_homing_ends_early() -> None:
+    axis = Homing()
+    for method in (0, 1, 19, -3):
+        assert axis.home(method) is Phase.FAILED, method
+    offset = axis.asked.offset
+    assert axis.home(18) is Phase.SEARCH
+    axis.run(0.2)
+    axis.asked.homing.start = 0  # taken back
+    assert axis.left(Phase.SEARCH) is Phase.INTERRUPTED
+    axis.run(0.3)
+    assert axis.position.velocity == 0.0 and not axis.flags & Flag.MOVING and abs(axis.position.error) <= 3
+    for word, value in ((Part.QUICK_STOP, 1), (Part.ENABLED, 0)):
+        assert axis.home(18) is Phase.SEARCH
+        axis.simulation.word(word).value = value
+        assert axis.left(Phase.SEARCH) is Phase.INTERRUPTED
+        axis.simulation.word(word).value = 1 - value
+        axis.run(0.5)
+        assert axis.phase is Phase.INTERRUPTED, "it does not begin by itself"
+    axis.simulation.library.pmsm_sim_set_switches(axis.simulation.sim, -9.0, -8.0)
+    assert axis.home(34) is Phase.FAILED, "a limit switch bars the way to the index"
+    axis.asked.homing.active = 0
+    axis.run(axis.T)
+    assert axis.phase is Phase.IDLE and axis.asked.offset == offset
+
+
+def test_a_search_that_finds_nothing_ends() -> None:
+    """After half of the way that a position tells, here one turn."""
+    axis = Homing()
+    axis.asked.increments, scale = 1 << 30, (1 << 30) / INCREMENTS
+    for name in ("velocity", "acceleration", "deceleration", "stop_deceleration", "jerk"):
+        setattr(axis.asked, name, scale * getattr(axis.asked, name))
+    assert axis.home(18) is Phase.SEARCH and axis.left(Phase.SEARCH) is Phase.FAILED
+    axis.run(0.1)
+    assert axis.position.velocity == 0.0

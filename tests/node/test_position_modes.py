@@ -219,7 +219,9 @@ def test_homing_by_the_index_finds_the_encoders_zero(axis: Axis, method: int, di
     index = (raw // TURN + (direction > 0)) * TURN
     simulation = axis.bus.line.nodes[0].core.simulation
     assert simulation.position.asked.offset == -index
-    assert 0 < direction * axis.number(0x6064) < TURN // 50  # where it came to rest, behind the index
+    ramp, jerk = axis.number(0x609A, 0, "I"), axis.number(0x60A4, 1, "I")
+    way = (TURN // 2) ** 2 / (2 * ramp) + 0.5 * (TURN // 2) * ramp / jerk  # of coming to rest, behind the index
+    assert direction * axis.number(0x6064) == pytest.approx(way, rel=0.05)  # measured 0.98
 
 
 @pytest.mark.parametrize(("method", "direction"), [(17, -1), (18, 1)])
@@ -248,6 +250,15 @@ def test_homing_by_a_stop_ends_when_the_torque_stays(axis: Axis, method: int, di
     assert axis.status & Status.HOMING_ATTAINED and abs(axis.number(0x6064)) < 20
 
 
+def test_a_stop_that_is_a_limit_switch_is_a_homing_error(axis: Axis) -> None:
+    axis.enable(6)
+    simulation = axis.bus.line.nodes[0].core.simulation
+    simulation.library.pmsm_sim_set_switches(simulation.sim, -1.0, 100.0)
+    axis.put(0x2053, 0, 900, "H")
+    status = home(axis, -1, 3.0)
+    assert status & Status.HOMING_ERROR and status & Status.TARGET_REACHED and not status & Status.HOMING_ATTAINED
+
+
 def test_a_homing_is_interrupted_and_unknown_methods_are_refused(axis: Axis) -> None:
     axis.enable(6)
     home(axis, 18, 0.4)
@@ -255,6 +266,8 @@ def test_a_homing_is_interrupted_and_unknown_methods_are_refused(axis: Axis) -> 
     axis.control()
     axis.wait(0.5)
     assert abs(axis.number(0x606C)) < 2_000 and not axis.status & Status.HOMING_ATTAINED
+    axis.control(Control.NEW_SET_POINT, Control.HALT)
+    assert not axis.number(0x606C) > 5_000 and axis.status & Status.TARGET_REACHED
     for method in (0, 1, 19, 36, -3):
         with pytest.raises(Aborted):
             axis.put(0x6098, 0, method, "b")

@@ -51,6 +51,14 @@ static inline uint32_t pmsm_is_barred(uint32_t limits, float way)
 /* position.c: the speed controller's reference and torque of this period, from the position; before the core's step */
 void pmsm_control_position(pmsm_application *app, pmsm_reference *reference);
 
+/* Begin at rest where the shaft is. */
+void pmsm_begin_position(pmsm_position *p);
+
+/* homing.c: at a step of the speed controller, before the profile's. Returns the profile's velocity, increments/s. */
+float pmsm_home(pmsm_application *app, float T);
+/* Nothing homes: a search that was under way is interrupted. */
+void pmsm_leave_homing(pmsm_position *p);
+
 /* rad of an increment of the position */
 static inline float pmsm_increment(const pmsm_application *app)
 {

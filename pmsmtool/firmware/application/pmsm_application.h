@@ -146,9 +146,36 @@ enum pmsm_position_flag {
     PMSM_POSITION_SATURATED = 1u << 4    /* the speed reference is at the machine's largest speed */
 };
 
+enum pmsm_homing_method {        /* object 0x6098, in the encoder's direction; the stops are of this drive's own */
+    PMSM_HOMING_STOP_POSITIVE = -2, PMSM_HOMING_STOP_NEGATIVE = -1,
+    PMSM_HOMING_SWITCH_NEGATIVE = 17, PMSM_HOMING_SWITCH_POSITIVE = 18,
+    PMSM_HOMING_INDEX_NEGATIVE = 33, PMSM_HOMING_INDEX_POSITIVE = 34,
+    PMSM_HOMING_HERE = 37
+};
+
+enum pmsm_homing_phase {
+    PMSM_HOMING_IDLE = 0,
+    PMSM_HOMING_SEARCH,
+    PMSM_HOMING_AWAY,            /* from the limit switch that was found, until it opens */
+    PMSM_HOMING_REST,            /* found: the shaft comes to rest */
+    PMSM_HOMING_DONE,
+    PMSM_HOMING_INTERRUPTED,     /* start was taken back, or the control ended */
+    PMSM_HOMING_FAILED           /* no such method, a limit switch in the way, nothing found */
+};
+
+typedef struct {                 /* homing, by the profile's velocity towards a switch or a stop, and its ramps */
+    uint32_t active;             /* 1: homing takes the place of targets */
+    uint32_t start;              /* 1: home, and stay; 0 interrupts a search */
+    int32_t method;              /* enum pmsm_homing_method */
+    float slow;                  /* increments/s, to an index, and away from a switch */
+    float torque;                /* N m, of either sign, that says: a mechanical stop */
+    int32_t home_offset;         /* increments: the zero lies so far beyond the home position */
+} pmsm_homing_request;
+
 typedef struct {                 /* position control: what is asked; used with reference.mode PMSM_MODE_POSITION */
     uint32_t increments;         /* of the position in a mechanical turn, in the encoder's direction */
-    int32_t offset;              /* increments, added to the encoder's count: position = count + offset, modulo 2^32 */
+    int32_t offset;              /* increments, added to the encoder's count: position = count + offset, modulo 2^32;
+                                    homing writes it */
     uint32_t profile;            /* 1: move to every target by the profile; 0: follow targets, linear between two */
     int32_t target;              /* increments */
     uint32_t set_point;          /* another number: target is a new one. Without one the shaft is held where it is */
@@ -161,6 +188,7 @@ typedef struct {                 /* position control: what is asked; used with r
     uint32_t halt;               /* 1: with a profile, come to rest by the deceleration */
     int32_t minimum, maximum;    /* increments, of every target; none when minimum >= maximum */
     float window, window_time;   /* increments, s: following error that is a fault; window 0: none */
+    pmsm_homing_request homing;
 } pmsm_position_request;
 
 typedef struct {                 /* the reference of a move: trapezoid of the speed, averaged over the jerk's time */
@@ -182,6 +210,7 @@ typedef struct {
     float error;                 /* increments, reference - actual */
     uint32_t flags;              /* enum pmsm_position_flag */
     uint32_t limits;             /* limit switches, as the sensors show them */
+    uint32_t homing;             /* enum pmsm_homing_phase */
     /* private memory */
     pmsm_trajectory trajectory;
     int32_t target;              /* increments, taken and within the limits */
@@ -189,9 +218,13 @@ typedef struct {
     uint32_t left;               /* PWM periods to the end of the interval */
     float step;                  /* increments per PWM period, within the interval */
     uint32_t stopped;            /* 1: a limit switch ended the following */
+    uint32_t followed;           /* 1: targets were followed in the last period, without a profile */
     float outside;               /* s, with the error outside its window */
     uint32_t running;            /* 1: controlled in the last period */
     float omega_ref, torque;     /* rad/s, N m: handed to the speed controller until its next step */
+    uint32_t homing_started;     /* start as it was at the last step */
+    int32_t homing_turns;        /* turns of the encoder at the last step */
+    float pushed;                /* s, with the torque of a stop */
 } pmsm_position;
 
 typedef struct pmsm_application {

@@ -26,7 +26,7 @@ static pmsm_profile profile_of(const pmsm_position_request *asked, float T, floa
     pmsm_profile profile;
     const float jerk = asked->jerk * T * T * T;
     const float most = (jerk > 0.0F) ? jerk * (float)PMSM_JERK_STEPS : STEP_MOST;
-    profile.velocity = asked->velocity * T;
+    profile.velocity = 0.0F; /* the caller's */
     profile.acceleration = pmsm_clamp(asked->acceleration * T * T, STEP_LEAST, most);
     profile.deceleration = pmsm_clamp(deceleration * T * T, STEP_LEAST, most);
     const float larger =
@@ -53,8 +53,7 @@ static uint32_t take_target(pmsm_position *p)
     return 1u;
 }
 
-/* Begin at rest where the shaft is. */
-static void begin(pmsm_position *p)
+void pmsm_begin_position(pmsm_position *p)
 {
     p->running = 1u;
     p->reference = p->actual;
@@ -65,6 +64,7 @@ static void begin(pmsm_position *p)
     p->step = 0.0F;
     p->left = 0u;
     p->stopped = 0u;
+    p->followed = 0u;
     p->outside = 0.0F;
     p->flags = 0u;
     pmsm_trajectory_rest(&p->trajectory, p->actual);
@@ -75,12 +75,12 @@ static void step_profile(pmsm_application *app, float T)
 {
     pmsm_position *p = &app->position;
     const uint32_t limits = app->sensors.limits;
+    const float moving = (p->asked.halt != 0u) ? 0.0F : p->asked.velocity;
+    const float velocity = (p->asked.homing.active != 0u) ? pmsm_home(app, T) : moving;
     const uint32_t barred = pmsm_is_barred(limits, pmsm_way(p->target, p->trajectory.planned)) | p->stopped;
     pmsm_profile profile =
         profile_of(&p->asked, T, (barred != 0u) ? p->asked.stop_deceleration : p->asked.deceleration);
-    if (barred != 0u || p->asked.halt != 0u) {
-        profile.velocity = 0.0F;
-    }
+    profile.velocity = (barred != 0u) ? 0.0F : velocity * T;
     p->flags &= ~((uint32_t)PMSM_POSITION_SWITCH | (uint32_t)PMSM_POSITION_MOVING);
     p->flags |= (barred != 0u) ? (uint32_t)PMSM_POSITION_SWITCH : 0u;
     p->velocity *= T; /* the trajectory counts in steps */
@@ -90,6 +90,16 @@ static void step_profile(pmsm_application *app, float T)
     if (p->trajectory.resting < p->trajectory.length || p->trajectory.planned != p->target) {
         p->flags |= (uint32_t)PMSM_POSITION_MOVING;
     }
+}
+
+/* The profile goes on from where the following of targets is. */
+static void take_over(pmsm_position *p, float T)
+{
+    pmsm_trajectory_rest(&p->trajectory, p->reference);
+    p->trajectory.planned_part = p->reference_part;
+    p->trajectory.planned_velocity = p->velocity * T;
+    p->trajectory.resting = 0u;
+    p->followed = 0u;
 }
 
 /* Every PWM period: on the straight line to the target, which it reaches at the end of the interval. */
@@ -111,10 +121,7 @@ static void follow(pmsm_application *app, float T)
         }
     }
     if (p->left > 0u && pmsm_is_barred(app->sensors.limits, p->step) != 0u) {
-        pmsm_trajectory_rest(&p->trajectory, p->reference);
-        p->trajectory.planned_part = p->reference_part;
-        p->trajectory.planned_velocity = p->velocity * T;
-        p->trajectory.resting = 0u;
+        take_over(p, T);
         p->stopped = 1u;
         p->left = 0u;
     }
@@ -132,6 +139,7 @@ static void follow(pmsm_application *app, float T)
     } else {
         p->flags |= (uint32_t)PMSM_POSITION_SWITCH;
     }
+    p->followed = 1u - p->stopped;
 }
 
 static void check_error(pmsm_position *p, float T)
@@ -172,12 +180,22 @@ void pmsm_control_position(pmsm_application *app, pmsm_reference *reference)
         p->running = 0u;
         p->error = 0.0F;
         p->reference = p->actual;
+        pmsm_leave_homing(p);
         return;
     }
     if (p->running == 0u) {
-        begin(p);
+        pmsm_begin_position(p);
     }
-    if (p->asked.profile == 0u) {
+    if (p->asked.homing.active != 0u) {
+        p->seen = p->asked.set_point; /* no target of a homing */
+    } else {
+        pmsm_leave_homing(p);
+    }
+    const uint32_t profiled = p->asked.profile | p->asked.homing.active;
+    if (profiled != 0u && p->followed != 0u) {
+        take_over(p, T);
+    }
+    if (profiled == 0u) {
         follow(app, T);
     } else if (take_target(p) != 0u) {
         p->stopped = 0u;
@@ -185,7 +203,7 @@ void pmsm_control_position(pmsm_application *app, pmsm_reference *reference)
         /* the same target */
     }
     if (app->control.speed_count == 0u) { /* the speed controller steps in this period */
-        if (p->asked.profile != 0u || p->stopped != 0u) {
+        if (profiled != 0u || p->stopped != 0u) {
             step_profile(app, T);
         }
         check_error(p, T);

@@ -85,6 +85,30 @@ class AverageState(IntEnum):
     COMPLETE = 2
 
 
+class HomingPhase(IntEnum):
+    """``enum pmsm_homing_phase``."""
+
+    IDLE = 0
+    SEARCH = 1
+    AWAY = 2
+    REST = 3
+    DONE = 4
+    INTERRUPTED = 5
+    FAILED = 6
+
+
+@dataclass(frozen=True, slots=True)
+class HomingCommand:
+    """How to home (``pmsm_homing_request``); encoder counts, and counts per second."""
+
+    active: bool = False
+    start: bool = False
+    method: int = 0
+    slow: float = 0.0
+    torque_nm: float = 0.0
+    home_offset: int = 0
+
+
 @dataclass(frozen=True, slots=True)
 class PositionCommand:
     """What the position controller shall do (``pmsm_position_request``); encoder counts, and counts over seconds.
@@ -96,7 +120,6 @@ class PositionCommand:
     target: int = 0
     set_point: int = 0
     profile: bool = False
-    offset: int = 0
     interval_s: float = 0.001
     velocity: float = 0.0
     acceleration: float = 0.0
@@ -108,6 +131,7 @@ class PositionCommand:
     maximum: int = 0
     window: float = 0.0
     window_time_s: float = 0.0
+    homing: HomingCommand = HomingCommand()
 
 
 def wrapped(count: int) -> int:
@@ -117,19 +141,14 @@ def wrapped(count: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class PositionState:
-    """Position now, what it shall be, and their difference (encoder counts); flags, and limit switches."""
+    """Position now, what it shall be, and their difference (encoder counts); flags, limit switches, and homing."""
 
     actual: int
     demand: int
     error: float
     flags: PositionFlag
     limits: int = 0
-    offset: int = 0
-
-    @property
-    def raw(self) -> int:
-        """The encoder's count, without the offset."""
-        return wrapped(self.actual - self.offset)
+    homing: HomingPhase = HomingPhase.IDLE
 
 
 @dataclass(frozen=True, slots=True)

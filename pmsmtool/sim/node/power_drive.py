@@ -94,11 +94,10 @@ class PowerDrive:
         self._position = PositionModes(
             dictionary,
             plant.core,
-            schedule,
             look=plant.look,
             mode=lambda: self.mode,
             apply=self.apply,
-            torque=lambda: self._signal(Signal.TAU) / self._rated_torque_nm() * 1000.0,
+            rated_torque=self._rated_torque_nm,
         )
         self._hook()
 
@@ -394,8 +393,6 @@ class PowerDrive:
             self._step_torque()
         elif control is ControlMode.SPEED:
             self._plant.core.command(Command(control, omega_m_rad_s=self._target_speed()))
-        elif control is ControlMode.POSITION and self._position.released:
-            return
         elif control is ControlMode.POSITION:
             halt = bool(self._controlword & Control.HALT)
             self._plant.core.command(Command(control, position=self._position.command(halt=halt)))
