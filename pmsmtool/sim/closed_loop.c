@@ -372,8 +372,8 @@ static void run_period(pmsm_sim *sim)
 static uint32_t has_news(pmsm_sim *sim)
 {
     const pmsm_application *app = &sim->drive->application;
-    const uint32_t now[6] = {app->trip, app->excitation.state, app->recorder.state, app->average.state,
-                             app->position.flags, app->position.homing};
+    const uint32_t now[PMSM_WATCHED] = {app->trip, app->excitation.state, app->recorder.state, app->average.state,
+                                        app->position.flags, app->position.homing};
     const uint32_t changed = memcmp(now, sim->seen, sizeof now) != 0;
     memcpy(sim->seen, now, sizeof now);
     return changed;

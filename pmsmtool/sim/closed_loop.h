@@ -78,6 +78,8 @@ typedef struct {               /* everything that is fixed during a run */
     uint32_t T_s_ns;           /* PWM period; 0: as the drive's parameter says */
 } pmsm_sim_setup;
 
+#define PMSM_WATCHED 6u           /* states whose change ends a run early */
+
 typedef struct pmsm_sim {
     pmsm_sim_setup setup;
     pmsm_drive *drive;
@@ -105,8 +107,8 @@ typedef struct pmsm_sim {
     uint64_t record_rows, record_row;
     uint32_t record_signals, record_decimation, record_count;
     uint32_t record_signal[PMSM_RECORD_SIGNALS];
-    uint32_t watch;            /* 1: return when trip, excitation, recorder, averages or position changed their state */
-    uint32_t seen[5];
+    uint32_t watch;            /* 1: return when trip, excitation, recorder, averages, position, homing changed */
+    uint32_t seen[PMSM_WATCHED];
     double switch_negative, switch_positive; /* rad, where the limit switches begin, when has_switches */
     uint32_t has_switches;
 } pmsm_sim;
