@@ -99,6 +99,14 @@ def too_large(what: str, largest: int, where: str) -> ConfigError:
     )
 
 
+def make_folder(path: Path, *, hint: str = "choose another folder") -> None:
+    """Make a folder and those above it; raises ``ConfigError`` with the next step where that fails."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", where=str(path), hint=hint) from None
+
+
 def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: str = "choose another folder") -> None:
     """Write a file in one step: a reader finds the old or the new one, never a part.
 

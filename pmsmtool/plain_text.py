@@ -1,11 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Text from outside - drives, files, back ends, servers - made harmless: no control characters, no endless length."""
+"""What is printed: text that is harmless whoever wrote it, as wide as a terminal; values as plain JSON types."""
 
 from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import zip_longest
+from textwrap import wrap
+from typing import Any
 
 LONGEST_REASON = 300
 """Letters of another library's error message that are shown."""
 _KEPT = "\n\t"
+_WORDS = re.compile(r"\s+|(?<=[a-zA-Z]-)(?=[a-zA-Z])")
+"""Between what a cell of a table may be broken."""
 
 
 def plain(text: str) -> str:
@@ -35,6 +47,90 @@ def reason(error: BaseException) -> str:
     """Return another library's error in one line, without the traceback some put into their messages."""
     text = str(error).split("Traceback (most recent call last)")[0].strip()
     return one_line(text.splitlines()[0] if text else type(error).__name__, LONGEST_REASON)
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[object]], width: int | None = None) -> list[str]:
+    """Return aligned lines: text to the left, numbers to the right, two blanks between columns.
+
+    With ``width`` (letters) the widest columns of text are broken between words until the table fits, if it can.
+    """
+    body = [[one_line(str(cell)) for cell in row] for row in rows]
+    columns = list(zip(heads, *body, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    numeric = [bool(body) and all(_is_number(row[k]) for row in body) for k in range(len(heads))]
+    if width is not None:
+        words = [max(len(word) for cell in column for word in _WORDS.split(cell)) for column in columns]
+        while sum(widths) + 2 * (len(widths) - 1) > width and widths != words:
+            widest = max(range(len(widths)), key=lambda k: (widths[k] > words[k], widths[k]))
+            widths[widest] -= 1
+    lines = []
+    for row in ([*heads], *body):
+        cells = [folded(cell, space, hanging=0) for cell, space in zip(row, widths, strict=True)]
+        for parts in zip_longest(*cells, fillvalue=""):
+            aligned = (
+                part.rjust(space) if right else part.ljust(space)
+                for part, space, right in zip(parts, widths, numeric, strict=True)
+            )
+            lines.append("  ".join(aligned).rstrip())
+    return lines
+
+
+def folded(line: str, width: int, *, hanging: int = 2) -> list[str]:
+    """Return a line broken between words into lines of ``width`` letters; a longer word stays whole.
+
+    What follows the first line stands under the last of its columns; without columns ``hanging`` blanks further in.
+    """
+    if len(line) <= width:
+        return [line]
+    gaps = [gap.end() for gap in re.finditer(r"(?<=\S)  +(?=\S)|^ +\w+: +(?=\S)", line)]
+    lead = len(line) - len(line.lstrip())
+    start = max((end for end in gaps if end <= width * 5 // 8), default=lead)
+    return wrap(
+        line[start:], width, initial_indent=line[:start], replace_whitespace=False, break_long_words=False,
+        subsequent_indent=" " * (start if start > lead else lead + hanging), break_on_hyphens=hanging == 0,
+    )  # fmt: skip
+
+
+def jsonable(value: Any) -> Any:
+    """Return a value as plain JSON types.
+
+    Dataclasses become objects, arrays lists, numbers stay SI numbers without formatting; what is not a finite
+    number becomes null, because JSON has no other word for it.
+
+    Raises
+    ------
+    TypeError
+        A type that has no obvious JSON form.
+    """
+    if isinstance(value, enum.Flag):
+        return jsonable(value.value)
+    if isinstance(value, enum.Enum):
+        return value.name.lower().replace("_", "-")
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: jsonable(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(jsonable(key)): jsonable(entry) for key, entry in value.items()}
+    if isinstance(value, (set, frozenset)):
+        return [jsonable(entry) for entry in sorted(value)]
+    if hasattr(value, "tolist"):  # a numpy array or scalar, without importing numpy here
+        return jsonable(value.tolist())
+    if isinstance(value, Iterable) and not isinstance(value, (bytes, bytearray)):
+        return [jsonable(entry) for entry in value]
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return text in ("", "-")
+    return True
 
 
 def _shown(letter: str) -> str:

@@ -17,9 +17,8 @@ from typing import Literal
 import click
 
 from pmsmtool.cli.options import MotionOptions
-from pmsmtool.cli.output import Output
+from pmsmtool.cli.output import Output, show
 from pmsmtool.errors import ConfigError, Declined
-from pmsmtool.plain_text import plain
 
 Subject = Literal["motion", "writing"]
 
@@ -115,7 +114,7 @@ def _ask(
     # shown even when quiet: nobody consents to what he has not seen; a simulated drive may go without
     if not (simulated and options.yes and out.verbosity < 0):
         for line in text:
-            click.echo(plain(line), err=True)
+            show(line, err=True)
     if options.serial is not None and options.serial != serial:
         raise Declined(
             f"the drive's serial number is {serial}, --serial says {options.serial}: nothing was done",

@@ -162,9 +162,9 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, all_la
     call them, what a period costs, and what to do at a fault. The application (speed estimate, trips, quick stop,
     excitation, recorder) is optional. Values that neither reads are for your program; they are listed.
     """
-    from pmsmtool.cli.output import make_folder
     from pmsmtool.commissioning.export import image_of
     from pmsmtool.commissioning.parameter_source import load_parameters
+    from pmsmtool.files import make_folder
     from pmsmtool.firmware.export_c import c_files, not_read
 
     wanted = load_parameters(design)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pmsmtool.cli.output import show
 from pmsmtool.errors import (
     CheckFailed,
     ConfigError,
@@ -24,7 +25,6 @@ from pmsmtool.errors import (
     decisive,
     related,
 )
-from pmsmtool.plain_text import plain
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -171,4 +171,4 @@ def _keep(text: str) -> Path | None:
 
 
 def _echo(text: str, label: str = "") -> None:
-    click.echo(label + plain(text.rstrip("\n")), err=True)
+    show(text.rstrip("\n"), label, err=True)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
@@ -10,8 +11,9 @@ import click
 
 from pmsmtool.cli.command_table import COMMANDS
 from pmsmtool.cli.options import examples
-from pmsmtool.cli.output import table
+from pmsmtool.cli.output import table, terminal_width
 from pmsmtool.errors import ExitCode
+from pmsmtool.plain_text import folded
 
 if TYPE_CHECKING:
     from pmsmtool.machine.key import Key
@@ -33,32 +35,35 @@ EXIT_CODES: dict[ExitCode, str] = {
     ExitCode.READER_GONE: "the reader of the output went away (| head), as with any filter",
 }
 
+_WIDTH = 120
+"""Letters of a line where no terminal is."""
+
 SAFETY = """\
 Nothing moves and nothing is written without your consent; the two are asked one by one:
-  motion   before the first current the envelope is printed: largest current, energy, speed, travel, duration, and
-           what the shaft may do (--shaft, --load, --brake).
+  motion   before the first current the envelope is printed: largest current, energy, speed, travel, duration, and \
+what the shaft may do (--shaft, --load, --brake).
   writing  before the first write the list of differences is printed: name, old, new, unit.
---yes answers them on a simulated drive. On a real bus it needs --serial as well, and --i-max, --speed-max and --shaft
-where the machine moves. The serial number must be that of the drive that answers. A drive that shows no serial number
-is moved and written by a person at a terminal only. --yes cannot be set by an environment variable. Without a terminal
-and without a valid --yes nothing is done: exit 7.
+--yes answers them on a simulated drive. On a real bus it needs --serial as well, and --i-max, --speed-max and --shaft \
+where the machine moves. The serial number must be that of the drive that answers. A drive that shows no serial number \
+is moved and written by a person at a terminal only. --yes cannot be set by an environment variable. Without a \
+terminal and without a valid --yes nothing is done: exit 7.
 
-A command that moved the machine always ends in the same way: voltage off, zero current, parameters restored, and the
-stop confirmed from the statusword. If the drive does not confirm it, the exit code is 8 whatever else went wrong: use
+A command that moved the machine always ends in the same way: voltage off, zero current, parameters restored, and the \
+stop confirmed from the statusword. If the drive does not confirm it, the exit code is 8 whatever else went wrong: use \
 the hardware stop. Ctrl-C, SIGTERM and a closed terminal do the same; a second Ctrl-C removes the voltage at once.
 
 A software stop is no safety function. Keep a hardware stop within reach."""
 
 FILES = """\
-machine file     profiles/*.toml, machine.toml  the machine and its inverter, SI with the unit in the key (R_s_ohm);
-                                                its keys: help machine-file, help simulation
+machine file     profiles/*.toml, machine.toml  the machine and its inverter, SI with the unit in the key (R_s_ohm); \
+its keys: help machine-file, help simulation
 flux map         .npz .mat .csv                 grids of i_d, i_q (A peak) and psi_d, psi_q (Wb)
-iron-loss map    .npz                           axes i_d_a, i_q_a and grids c_h_w_per_hz, c_e_w_per_hz2 over them:
-                                                P_fe = c_h f + c_e f^2, f the electrical frequency (Hz)
+iron-loss map    .npz                           axes i_d_a, i_q_a and grids c_h_w_per_hz, c_e_w_per_hz2 over them: \
+P_fe = c_h f + c_e f^2, f the electrical frequency (Hz)
 design file      design.toml                    gains and limits with their margins; the machine is embedded
 parameter set    params.toml                    catalogue name and SI value; what is written to a drive
-look-up table    .npz .csv                      i_d, i_q over torque and speed; which limit binds, and by how much;
-                                                flash-params and export take the .npz
+look-up table    .npz .csv                      i_d, i_q over torque and speed; which limit binds, and by how much; \
+flash-params and export take the .npz
 scenario         .toml                          what happens in a simulation (help scenario)
 trace            .npz .csv                      named signals over t_s; the second CSV row holds the units
 run directory    runs/<utc>-<serial>/           run.json, traces/, and the files above, as a commissioning leaves them
@@ -91,7 +96,7 @@ def _units() -> str:
             "A current carries its kind too: 12Apk (amplitude) or 8.5Arms. A bare number where a unit is due: refused.",
             "An option or key that ends in a unit (--bandwidth-hz, R_s_ohm) takes the bare number in that unit.",
             "",
-            "dq quantities are amplitudes (peak phase values), torque = 1.5 p (psi_d i_q - psi_q i_d), motoring",
+            "dq quantities are amplitudes (peak phase values), torque = 1.5 p (psi_d i_q - psi_q i_d), motoring "
             "positive, angles electrical, resistance and inductance per phase (star).",
             "",
             *table(("unit", "measures", "also written"), rows),
@@ -142,7 +147,7 @@ def _machine_file() -> str:
     ):  # fmt: skip
         parts += [f"[{name}]", *_keys(keys), ""]
     parts += [
-        "[std], [systematic]: numeric keys of machine, inverter and encoder with one standard deviation, and with the",
+        "[std], [systematic]: numeric keys of machine, inverter and encoder with one standard deviation, and with the "
         "half width of the 95 % systematic part, in the key's own unit.",
         "[conditions], [provenance]: free keys. [simulation]: help simulation. `pmsmtool machine new` writes a file.",
     ]
@@ -207,11 +212,14 @@ def help_command(ctx: click.Context, topic: tuple[str, ...]) -> None:
     """Explain a TOPIC, or a command; without one, list the topics."""
     if not topic:
         lines = [f"{name:<12}  {line}" for name, (line, _) in TOPICS.items()]
-        commands = click.wrap_text(" ".join(row.name for row in COMMANDS), 100, "or a command: ", " " * 14)
+        commands = click.wrap_text(" ".join(row.name for row in COMMANDS), 79, "or a command: ", " " * 14)
         click.echo("\n".join([*lines, "", commands]))
         return
     if len(topic) == 1 and topic[0] in TOPICS:
-        click.echo(TOPICS[topic[0]][1]())
+        width = terminal_width(sys.stdout) or _WIDTH
+        click.echo(
+            "\n".join(part for line in TOPICS[topic[0]][1]().split("\n") for part in folded(line, width, hanging=0))
+        )
         return
     click.echo(_command_help(ctx, topic))
 

@@ -7,72 +7,46 @@ Files a command writes, and the run directory or file it is given.
 from __future__ import annotations
 
 import dataclasses
-import enum
-import math
 import os
 import re
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
+from pmsmtool import plain_text
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import write_file
-from pmsmtool.plain_text import one_line, plain
+from pmsmtool.plain_text import folded, jsonable, one_line, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def jsonable(value: Any) -> Any:
-    """Return a value as plain JSON types.
+def table(heads: Sequence[str], rows: Iterable[Sequence[object]], indent: int = 0) -> list[str]:
+    """Return the lines of :func:`plain_text.table`, on a terminal with cells broken to fit behind an indent."""
+    width = terminal_width(sys.stdout)
+    return plain_text.table(heads, rows, None if width is None else width - indent)
 
-    Dataclasses become objects, arrays lists, numbers stay SI numbers without formatting; what is not a finite
-    number becomes null, because JSON has no other word for it.
 
-    Raises
-    ------
-    TypeError
-        A type that has no obvious JSON form.
+def terminal_width(stream: TextIO) -> int | None:
+    """Return how many letters a line of a terminal has; None where the stream is none."""
+    return shutil.get_terminal_size().columns if stream.isatty() else None
+
+
+def show(text: str, label: str = "", *, err: bool = False) -> None:
+    """Print lines with their verdicts in colour; on a terminal broken between words to its width.
+
+    Elsewhere a line stays one line, for programs that read it.
     """
-    if isinstance(value, enum.Flag):
-        return jsonable(value.value)
-    if isinstance(value, enum.Enum):
-        return value.name.lower().replace("_", "-")
-    if value is None or isinstance(value, (bool, int, str)):
-        return value
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: jsonable(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(jsonable(key)): jsonable(entry) for key, entry in value.items()}
-    if isinstance(value, (set, frozenset)):
-        return [jsonable(entry) for entry in sorted(value)]
-    if hasattr(value, "tolist"):  # a numpy array or scalar, without importing numpy here
-        return jsonable(value.tolist())
-    if isinstance(value, Iterable) and not isinstance(value, (bytes, bytearray)):
-        return [jsonable(entry) for entry in value]
-    raise TypeError(f"{type(value).__name__} has no JSON form")
-
-
-def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
-    """Return aligned lines: text to the left, numbers to the right, two blanks between columns."""
-    body = [[one_line(str(cell)) for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(heads, *body, strict=True)]
-    numeric = [bool(body) and all(_is_number(row[k]) for row in body) for k in range(len(heads))]
-    lines = []
-    for row in ([*heads], *body):
-        cells = (
-            cell.rjust(width) if right else cell.ljust(width)
-            for cell, width, right in zip(row, widths, numeric, strict=True)
-        )
-        lines.append("  ".join(cells).rstrip())
-    return lines
+    width = terminal_width(sys.stderr if err else sys.stdout)
+    text = click.unstyle(label) + plain(text)
+    if width is not None:
+        text = "\n".join(part for line in text.split("\n") for part in folded(line, width))
+    click.echo(coloured(text, label), err=err)
 
 
 _GOOD, _PART, _BAD = "green", "yellow", "red"
@@ -83,19 +57,15 @@ _COLOURS = {
 _VERDICT = re.compile(rf"\b(?:{'|'.join(_COLOURS)})\b")
 
 
-def coloured(text: str) -> str:
-    """Return a text with its verdicts in colour; click takes colours out where no terminal is, NO_COLOR everywhere."""
+def coloured(text: str, label: str = "") -> str:
+    """Return a text with its verdicts in colour; click takes colours out where no terminal is, NO_COLOR everywhere.
+
+    ``label`` is the beginning of the text, in colour already.
+    """
     if os.environ.get("NO_COLOR"):
         return text
-    return _VERDICT.sub(lambda found: click.style(found[0], fg=_COLOURS[found[0]]), text)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return text in ("", "-")
-    return True
+    body = text[len(click.unstyle(label)) :]
+    return label + _VERDICT.sub(lambda found: click.style(found[0], fg=_COLOURS[found[0]]), body)
 
 
 @dataclasses.dataclass(slots=True)
@@ -122,7 +92,7 @@ class Output:
         command : str
             Name in the schema, ``pmsmtool.<command>/1``.
         data : mapping
-            What ``--json`` prints: SI numbers, see :func:`jsonable`.
+            What ``--json`` prints: SI numbers, see :func:`plain_text.jsonable`.
         text : lines, or a function that makes them
             What a person reads.
         """
@@ -131,7 +101,7 @@ class Output:
             self.json_line(command, data)
             return
         for line in text() if callable(text) else text:
-            click.echo(coloured(plain(line)))
+            show(line)
 
     def json_line(self, command: str, data: Mapping[str, Any]) -> None:
         """Print one JSON object on a line of its own (``monitor`` prints many)."""
@@ -157,13 +127,13 @@ class Output:
     def status(self, text: str) -> None:
         """Show progress in one line that is overwritten; nothing where stderr is no terminal."""
         if self.verbosity >= 0 and sys.stderr.isatty():
-            text = one_line(text, 110)
+            text = one_line(text)[: shutil.get_terminal_size().columns - 1]
             click.echo(f"\r{text.ljust(self._status_width)}", nl=False, err=True)
             self._status_width = len(text)
 
     def _say(self, text: str, label: str = "") -> None:
         self._clear_status()
-        click.echo(label + coloured(plain(text)), err=True)
+        show(text, label, err=True)
 
     def _clear_status(self) -> None:
         if self._status_width:
@@ -188,14 +158,6 @@ def set_up_logging(verbosity: int) -> None:
     shown = logging.StreamHandler(sys.stderr)
     shown.setFormatter(Plain("%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=levels.get(verbosity, logging.DEBUG), handlers=[shown])
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder and those above it; raises ``ConfigError`` when that fails."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _unwritable(path, error) from None
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -237,7 +199,3 @@ def figure_format(path: Path) -> str:
 def inside(path: Path, name: str) -> Path:
     """Return a file, or the file of that name in a run directory."""
     return path / name if path.is_dir() else path
-
-
-def _unwritable(path: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"cannot be written: {error.strerror}", where=str(path), hint="choose another folder")

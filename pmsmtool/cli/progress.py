@@ -124,5 +124,5 @@ class StageProgress:
             from pmsmtool.cli.output import table
             from pmsmtool.report.comparison import HEADS, table_cells
 
-            for line in table(HEADS, table_cells(stage.comparison)):
+            for line in table(HEADS, table_cells(stage.comparison), indent=6):
                 self._out.note(f"      {line}")

@@ -141,8 +141,8 @@ def _text(found: Reproduction) -> Iterator[str]:
 
 
 def _write(found: Reproduction, path: Path | None, figure_path: Path | None, out: Output) -> None:
-    from pmsmtool.cli.output import make_folder, save_figure
-    from pmsmtool.files import write_file
+    from pmsmtool.cli.output import save_figure
+    from pmsmtool.files import make_folder, write_file
     from pmsmtool.papers.drawing import csv_text, figure_of
 
     targets: list[Path] = []
@@ -169,7 +169,7 @@ def _content(found: Reproduction, suffix: str, csv_text: Any) -> str:
         return "\n".join((*_text(found), ""))
     import json
 
-    from pmsmtool.cli.output import jsonable
+    from pmsmtool.plain_text import jsonable
 
     content = {"schema": "pmsmtool.reproduce/1", **_data(found), "panels": _series(found)}
     return json.dumps(jsonable(content), allow_nan=False, indent=1) + "\n"
