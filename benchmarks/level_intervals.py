@@ -79,6 +79,7 @@ def truth_of(drive: MachineFile) -> dict[str, float]:
     devices = device_slope_ohm(values)
     rise, magnets = (values.number(f"T_{part}_c") - drive.machine.T_ref_c for part in ("winding", "magnet"))
     psi = values.number("psi_f_wb") * (1.0 + drive.machine.alpha_psi_per_k * magnets)
+    R_s = devices + (values.number("R_s_ohm") - devices) * (1.0 + drive.machine.alpha_R_per_k * rise)
     return {
         "pole_pairs": values.number("pole_pairs"),
         "direction": -1.0 if values.flag("encoder_reversed") else 1.0,
@@ -86,7 +87,8 @@ def truth_of(drive: MachineFile) -> dict[str, float]:
         "frame_offset_rad": 0.0,
         "L_q_app_h": values.number("L_q_h"),
         "psi_f_wb": psi,
-        "R_s_ohm": devices + (values.number("R_s_ohm") - devices) * (1.0 + drive.machine.alpha_R_per_k * rise),
+        "R_s_ohm": R_s,
+        "R_s_ohm_measured": R_s,
         "J_per_psi": values.number("J_kgm2") / psi,
         "tau_c_per_psi": values.number("tau_c_nm") / psi,
     }

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.experiments.shaft_answer import OVER_FRICTION, ShaftAnswer, acceleration_per_ampere
+from pmsmtool.estimators.flux.voltage_flux import STEADY
+from pmsmtool.experiments.shaft_answer import OVER_FRICTION, ShaftAnswer, acceleration_per_ampere, brake_shaft
 from pmsmtool.experiments.signals import readable
 from pmsmtool.trace import Trace
 
@@ -31,10 +32,12 @@ RUN_SHARE = 0.5
 HOLD_SHARE = 0.08
 """Current asked for at the top, of the test current: more than friction, little enough to weaken no field."""
 HOLD_S = 0.4
+HOLDS = 10
+"""Records of the top at most: the third was steady on a motor whose friction takes 75 % of the current that is left."""
 COAST_S = 0.2
 COAST_SHARES = (1.0, -1.0, 0.4, -0.4)
 """Speeds a coast begins at, of the plan's: one speed does not tell the flux from a constant voltage."""
-STOP_SHARE, STOP_SLICES = 0.3, 160
+STOP_SHARE = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,10 @@ class PolledPushPlan:
     shares: tuple[float, ...] = (0.3, 0.5, 0.7)
     omega_failure_rad_s: float = math.inf
     off_s: float = 0.5
+
+    def stop_a(self, answer: ShaftAnswer) -> float:
+        """Return the largest current (A peak) that brakes the shaft."""
+        return min(STOP_SHARE * self.i_test_a, self.most_a(answer, 0.0))
 
     def most_a(self, answer: ShaftAnswer, speed_rad_s: float) -> float:
         """Return the largest current (A peak) at a speed (rad/s) from which the tool may fail."""
@@ -96,7 +103,7 @@ def push_both_ways(
         for sign, ramps in ((1.0, 1.0), (-1.0, 2.0), (1.0, 2.0), (-1.0, 1.0)):
             keep(f"torque_push_{count}", _polled(drive, sign * current, ramps * ramp_s))
             count += 1
-    _stop(drive, plan, answer)
+    brake_shaft(drive, plan.stop_a(answer), answer)
     return answer
 
 
@@ -127,9 +134,9 @@ def run_to_voltage(drive: Drive, plan: PolledPushPlan, answer: ShaftAnswer) -> T
         if last > RUNNING * top and now - last < STALLED_SHARE * answer.per_ampere * net * CHECK_S:
             drive.command_current(0.0, hold)
             drive.wait(HOLD_S)
-            found = _recorded_top(drive, hold)
+            found = _steady_top(drive, hold, top)
             break
-    _stop(drive, plan, answer)
+    brake_shaft(drive, plan.stop_a(answer), answer)
     return found
 
 
@@ -148,32 +155,27 @@ def coast_both_ways(
         drive.command_current(0.0, 0.0)
         drive.wait(CHECK_S)
         keep(f"coast_{number}", readable(drive.record(signals, round(COAST_S / drive.period_s))))
-        _stop(drive, plan, answer)
+        brake_shaft(drive, plan.stop_a(answer), answer)
 
 
-def _recorded_top(drive: Drive, command_a: float) -> Trace:
-    trace = drive.record((*SIGNALS, "U_dc_v"), round(HOLD_S / drive.period_s))
-    return readable(trace, i_command_a=command_a)
+def _steady_top(drive: Drive, command_a: float, top_rad_s: float) -> Trace | None:
+    """Record until the speed is steady, or :data:`HOLDS` times; None where it goes beyond the top speed.
+
+    A small current brings a shaft with friction from where the larger one stalled to the top slowly.
+    """
+    for _ in range(HOLDS):
+        trace = drive.record((*SIGNALS, "U_dc_v"), round(HOLD_S / drive.period_s))
+        found = readable(trace, i_command_a=command_a)
+        t, angle = found.t_s, found["theta_M_rad"]
+        half = len(t) // 2
+        first, second = (abs(angle[k + half - 1] - angle[k]) / (t[k + half - 1] - t[k]) for k in (0, len(t) - half))
+        if second > top_rad_s:
+            return None
+        if abs(second - first) <= 0.5 * STEADY * second:
+            break
+    return found
 
 
 def _polled(drive: Drive, i_q_a: float, seconds: float) -> Trace:
     drive.command_current(0.0, i_q_a)
     return readable(drive.record(SIGNALS, max(2, round(seconds / drive.period_s))), i_command_a=i_q_a)
-
-
-def _stop(drive: Drive, plan: PolledPushPlan, answer: ShaftAnswer) -> None:
-    """Bring the shaft to about rest against its own sense of turning."""
-    current = min(STOP_SHARE * plan.i_test_a, plan.most_a(answer, 0.0))
-    step_s = CHECK_S / 5.0
-    before = drive.live("theta_m_rad")
-    drive.wait(step_s)
-    for _ in range(STOP_SLICES):
-        angle = drive.live("theta_m_rad")
-        speed = (angle - before) / step_s
-        before = angle
-        push = min(current, abs(speed) / (answer.per_ampere * step_s))
-        if push < 0.1 * current:
-            break
-        drive.command_current(0.0, -math.copysign(push, speed))
-        drive.wait(step_s)
-    drive.command_current(0.0, 0.0)

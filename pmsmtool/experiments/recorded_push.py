@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.experiments.shaft_answer import OVER_FRICTION, ShaftAnswer, acceleration_per_ampere
+from pmsmtool.experiments.shaft_answer import OVER_FRICTION, ShaftAnswer, acceleration_per_ampere, brake_shaft
 from pmsmtool.experiments.signals import readable
 from pmsmtool.trace import Trace
 
@@ -22,7 +22,6 @@ SIGNALS = ("i_d_a", "i_q_a", "u_d_v", "u_q_v", "omega_e_rad_s", "theta_m_rad", "
 ANSWER_SHARE = 0.04
 """Speed change, of the wanted one, that counts as an answer of the shaft."""
 LEAST_RAMP_S = 0.05
-STOP_SLICES = 20
 VOLTAGE_SHARE = 0.8
 """Largest voltage of a push, of the largest sine's: the current control keeps the rest for the reversal."""
 USUAL = 0.9
@@ -101,7 +100,7 @@ def swing(
             keep(f"push_{count}", trace)
             last.append(trace)
             count += 1
-        _stop(drive, current, ramp_s)
+        brake_shaft(drive, current, answer)
         larger_a = larger * largest
         speed *= min(1.0, *(_slower(trace, larger / share, larger_a, plan) for trace in last[-4:]))
 
@@ -126,14 +125,3 @@ def _recorded(drive: Drive, plan: PushPlan, i_q_a: float, seconds: float) -> Tra
     decimation = max(1, round(0.97 * seconds / (plan.samples * drive.period_s)))
     trace = drive.record(SIGNALS, plan.samples, decimation=decimation)
     return readable(trace, i_command_a=i_q_a, decimation=decimation)
-
-
-def _stop(drive: Drive, current: float, ramp_s: float) -> None:
-    """Bring the shaft to about rest against its own sense of turning."""
-    for _ in range(STOP_SLICES):
-        omega = drive.live("omega_e_rad_s")
-        drive.command_current(0.0, -math.copysign(current, omega))
-        drive.wait(ramp_s / STOP_SLICES)
-        if omega * drive.live("omega_e_rad_s") <= 0.0:
-            break
-    drive.command_current(0.0, 0.0)

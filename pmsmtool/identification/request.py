@@ -159,8 +159,10 @@ class IdentifyRequest:
         """
         unknown = [name for name in self.quantities if name not in NEEDS]
         if unknown or not self.quantities:
+            files = any(name.endswith(".toml") for name in unknown)
             raise ConfigError(
                 f"cannot identify {', '.join(unknown) or 'nothing'}",
+                likely="identify reads no motor file, it asks the drive; `commission FILE` compares" if files else "",
                 hint=f"choose from {', '.join(NEEDS)}, hall alone, or all",
             )
         if self.accuracy is not None and not set(self.quantities) & set(KEYS):

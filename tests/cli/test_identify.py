@@ -162,6 +162,7 @@ UNMOVED: dict[str, tuple[tuple[str, ...], int, str]] = {
     "nobody to ask": ((), 7, "no terminal to ask for consent to move the machine"),
     "unwritable folder": (("--yes", "--runs", "taken/below"), 2, "cannot write"),
     "unknown quantity": (("--yes", "Q"), 2, "cannot identify Q"),
+    "a motor file": (("--yes", "motor.toml"), 2, "identify reads no motor file"),
     "gravity load": (("--yes", "--load", "gravity"), 5, "a gravity load falls"),
     "nothing to replay": (("--replay", "."), 2, "no run.json here"),
 }

@@ -156,7 +156,7 @@ def test_caps_as_a_table_and_as_json() -> None:
     outcome = run("--sim", CHANNEL + "&drive=epos4", "caps")
     assert outcome.exit_code == 0
     assert "capability level standard" in outcome.stdout and "map epos4 (16 parameters)" in outcome.stdout
-    assert "not available: needs" in outcome.stdout
+    assert "not available: R, L, psi, mechanics by recorder: needs a recorder" in outcome.stdout
     outcome = run("--sim", CHANNEL, "caps", "--json")
     facts = json.loads(outcome.stdout)
     assert facts["schema"] == "pmsmtool.caps/1" and facts["level"] == facts["tier"] == "full"

@@ -31,8 +31,8 @@ LIMIT_DOUBT = 0.035
 """Relative 95 % doubt of the largest voltage where the dead time is known."""
 BLIND_DOUBT = 0.06
 """The same where it is not: it took up to 6 % of it."""
-HELD_SHARE = 0.6
-"""Current, of the one asked for, above which it is not the voltage that holds the speed."""
+HELD_SHARE = 0.85
+"""Current, of the one asked for, above which it is not the voltage that holds the speed: there all of it flows."""
 STEADY = 0.02
 """Largest relative change of the speed over the record of the top."""
 
