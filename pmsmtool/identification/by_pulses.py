@@ -35,6 +35,7 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K, magnet_tolerance_per_k
 from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.report.verdict import ENCODER_SIGN as SIGN
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
@@ -55,7 +56,6 @@ TOO_WIDE = "E_NOT_IDENTIFIABLE"
 """Refusal of ratios whose interval is too wide: the flux linkage beside them stands, and the chain goes on."""
 LIGHT_SHAFT = "a bare shaft with little inertia: the torque that is safe if the tool fails hardly exceeds friction"
 ADD_INERTIA = "couple an inertia to the shaft and say --shaft coupled, or allow more current (--i-max)"
-SIGN = "encoder sign"
 CHECK_WIRING = "switch off and measure the three line-line resistances; `pmsmtool check` looks at the wiring"
 UNDECIDED = "no source says whether this drive's amperes are peak or rms: the interval holds for both"
 Voltage = Literal["machine", "link", ""]

@@ -34,6 +34,9 @@ NEEDED = ("pole_pairs", "R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")
 RATIOS = {"J_kgm2": "J_per_psi"}
 """Needed values that a drive without a voltage gives as a ratio to the flux linkage."""
 
+ENCODER_SIGN = "encoder sign"
+"""Key of a stage's refusals where the position falls under positive torque."""
+
 SIMULATED = "SIMULATED DRIVE"
 SIMULATED_INTERFACE = "pmsmsim"
 SIMULATED_NAMES = ("pmsmsim", "simulated ")
@@ -124,7 +127,7 @@ def verdict_of(record: Mapping[str, Any], complete: Sequence[str] = COMPLETE) ->
     partial = bool(missing or left) or any(stage["status"] == "partial" for stage in latest)
     if not partial:
         return Verdict("pass", "PASS", (head, *_shown(latest, complete), *accepted), simulated)
-    return Verdict("partial", "PARTIAL", ("; ".join((head, *left)), *accepted, *missing), simulated)
+    return Verdict("partial", "PARTIAL", ("; ".join((*_wrong(latest), head, *left)), *accepted, *missing), simulated)
 
 
 _NOT_JUDGED = (ExitCode.DECLINED, ExitCode.INTERRUPTED)
@@ -136,6 +139,12 @@ def _failures(latest: Sequence[Mapping[str, Any]], *, stopped: bool) -> list[str
     ended = ("refused", "interrupted") if stopped else ()
     failed = [stage for stage in latest if stage["status"] not in (*RAN, UNAVAILABLE, *ended)]
     return [f"{_with_status(stage)}: {_failure(stage)}" for stage in failed]
+
+
+def _wrong(latest: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the wiring that was seen to be wrong: to be read before what ran, for no loop may be closed over it."""
+    found = ((stage.get("refused") or {}).get(ENCODER_SIGN) for stage in latest)
+    return [f"{ENCODER_SIGN} WRONG: {str(why).split(' (likely', 1)[0]}" for why in found if why]
 
 
 def _required(record: Mapping[str, Any], latest: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -56,6 +56,15 @@ def test_a_run_that_a_person_ended_broke_no_criterion(status: str, code: int) ->
     assert found.kind == "partial" and f"flash: {status}: flash says why" in found.details
 
 
+def test_wrong_wiring_comes_before_what_ran() -> None:
+    """Before, a commissioning with two swapped leads ended with '6 of 7 stages ran, 20 criteria, all met'."""
+    why = "the position falls under positive torque (likely two motor leads swapped; try: `pmsmtool check`)"
+    identified = {**stage("identify", "partial"), "refused": {"encoder sign": why}}
+    found = verdict_of(record(identified, *(stage(name) for name in COMPLETE[1:])))
+    assert found.headline.startswith("PARTIAL: encoder sign WRONG: the position falls under positive torque; 7 of 7")
+    assert f"encoder sign: refused: {why}" in found.details
+
+
 def test_an_identification_that_gave_a_part_is_partial_and_names_the_rest() -> None:
     identified = stage("identify", "partial")
     identified["values"] = [value for value in identified["values"] if value["name"] != "psi_f_wb"]
