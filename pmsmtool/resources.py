@@ -13,6 +13,8 @@ from pmsmtool.errors import ConfigError, PmsmtoolError
 DataFolder = Literal["profiles", "firmware-params"]
 
 _PACKAGE = Path(__file__).parent
+ELSEWHERE = "check your rights there and the space on the disk; PMSMTOOL_HOME names another folder"
+"""Next step where the user's folder cannot be written."""
 BUNDLE = "_data"
 """Folder inside the installed package that the wheel fills; a checkout has none."""
 

@@ -15,6 +15,9 @@ from pmsmtool.cli.output import Output
 if TYPE_CHECKING:
     from pmsmtool.flash.whole_drive import Listed
 
+SHOWN = 3
+"""Objects that are named of those left out for one reason."""
+
 
 @click.command(
     "backup",
@@ -66,8 +69,11 @@ def backup_command(
             if not snapshot.entries:
                 raise ConfigError("the file names no setting of this drive", where=str(eds), hint="give its own file")
     write_snapshot(path, snapshot)
-    for label, reason in left_out.items():
-        out.note(f"not saved: {label}: {reason}")
+    for reason in dict.fromkeys(left_out.values()):
+        labels = [label for label, why in left_out.items() if why == reason]
+        shown = labels if out.verbosity > 0 else labels[:SHOWN]
+        more = f" and {len(labels) - len(shown)} more (-v names them)" if len(shown) < len(labels) else ""
+        out.note(f"not saved, {reason}: {', '.join(shown)}{more}")
     data = {
         "identity": identity,
         "file": path,

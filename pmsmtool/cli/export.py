@@ -166,6 +166,7 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, all_la
     from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.files import make_folder
     from pmsmtool.firmware.export_c import c_files, not_read
+    from pmsmtool.firmware.export_readme import period_share
 
     wanted = load_parameters(design)
     files = c_files(image_of(wanted), prefix=prefix, design_id=wanted.content_hash(), all_laws=all_laws)
@@ -182,6 +183,11 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, all_la
         few = ", ".join(others[:SHOWN]) + (", ..." if len(others) > SHOWN else "")
         out.warn(f"{folder}: {len(others)} C files there are not of this export: {few}")
     out.note(f"for your program, not read by these files: {', '.join(not_read())}")
+    if (share := period_share(wanted.values)) > 1.0:
+        out.warn(
+            f"the worst counted period takes {100 * share:.0f} % of the control period on a Cortex-M4F at 170 MHz "
+            "(README.md, Cost): lower the control frequency, choose a lighter law (`tune --governor`), or a faster part"
+        )
 
 
 @export_command.command("csv", epilog=examples("pmsmtool export csv design.toml -o parameters.csv"))

@@ -367,6 +367,9 @@ def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison |
         comparison.require_same(run)
     if stage.status == "pass" and comparison is not None:
         comparison.require_whole(run)
+        out.note(
+            f"SAME motor as in {comparison.earlier.run}: {len(comparison.rows)} of {len(comparison.rows)} values agree"
+        )
     if stage.status == "pass":
         return
     refused = [f"{name}: {reason}" for name, reason in stage.refused.items()]

@@ -99,6 +99,8 @@ class FilePath(click.Path):
         """Return the path, or fail as a usage error."""
         from pathlib import Path
 
+        if value == "-":  # else a file of that name is made, which few shells remove
+            self.fail("'-' is not the name of a file; where the system has /dev/stdout, give that", param, ctx)
         return Path(os.fsdecode(super().convert(value, param, ctx)))
 
 

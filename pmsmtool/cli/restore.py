@@ -87,7 +87,10 @@ def restore_command(
                 refuse_another_family(node)
             checked_identity(node, out)
         check_snapshot(node.map, snapshot, identity, other_drive=other_drive)
-        out.note(f"{snapshot.kind} of serial {snapshot.identity.serial}, state {snapshot.state}")
+        state = f", state {snapshot.state}" if snapshot.kind != "backup" else ""
+        out.note(
+            f"{snapshot.kind} of serial {snapshot.identity.serial}{state}; listed: now in the drive -> brought back"
+        )
         plan = plan_restore(node, snapshot)
         if snapshot_file is None and (due := due_of_journal(snapshot, plan, folder)) is not plan:
             out.note("the last download was killed before it wrote anything: the drive holds what it held before it")

@@ -52,7 +52,7 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
     if plan.changes:
         command = f"restore{' --other-drive' if other_drive else ''}" if backup else "flash-params"
         raise VerifyMismatch(
-            f"{len(plan.changes)} of {len(plan.entries)} objects hold something else",
+            f"{len(plan.changes)} of {len(plan.entries)} objects hold something else; listed: drive -> {source.name}",
             where=f"node {identity.node}",
             differences=plan.lines()[: len(plan.changes)],
             hint=f"`pmsmtool {command} {source}` brings them to the drive",

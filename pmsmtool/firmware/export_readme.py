@@ -81,11 +81,14 @@ compiler's own run time (`libgcc`, `compiler-rt`) and a `PMSM_SQRT` that rounds 
 
 | call | when |
 |---|---|
+| `pmsm_image_check(...)` as in `@_main.c` | first; if not `PMSM_IMAGE_OK`: a constant was changed or damaged |
 | `pmsm_init(&state)` | once at start-up, and after another parameter set |
 | `pmsm_step(&state, &@_cfg.params, @UP@_CFG_LUT, &measurement, &reference, &output)` | every {period} |
 | `pmsm_parameters_changed(&state)` | after parameters in RAM were changed while it runs |
 | `pmsm_reset_fault(&state)` | to leave a latched fault |
 
+- The whole sequence stands in `@_main.c`: copy its check, and its `control_period` as what the PWM interrupt calls.
+- `reference.mode` says what is controlled (`PMSM_MODE_OFF`, `_CURRENT`, `_TORQUE`, `_SPEED`, see `pmsm_core.h`).
 - One `pmsm_state` for each motor. Calls with the same state must not interrupt each other. Nothing else is kept.
 - Sample currents, angle, speed and link voltage at the start of the period. The duty ratios act {delay}.
 - `theta_e`, `omega_e` are electrical; currents are phase values (A), `i_d`, `i_q` peak; `U_dc` in V, `T_winding` in
@@ -195,6 +198,12 @@ def counted_law(values: Mapping[str, float]) -> str:
 CLOCK_HZ = 170e6
 """Processor clock of the share that is printed."""
 
+
+def period_share(values: Mapping[str, float]) -> float:
+    """Return the share of a control period that the worst counted period of the nearest law takes at ``CLOCK_HZ``."""
+    return CYCLES[counted_law(values)][2] / (CLOCK_HZ * values["inverter.T_s_ns"] * 1e-9)
+
+
 APPLICATION_SOURCES = tuple(
     sorted("pmsm_" + path.name.removeprefix("pmsm_") for path in APPLICATION_HEADER.parent.glob("*.c"))
 )
@@ -242,7 +251,7 @@ def readme_text(values: Mapping[str, float], prefix: str, *, image_bytes: int, l
     cost = (
         f"A whole period of `{counted}`, of the counted laws the nearest to this set, takes {mean} cycles on average, "
         f"{nominal} at worst in a nominal run, and {worst} at worst on adversarial inputs: "
-        f"{100.0 * worst / (CLOCK_HZ * T_s):.0f} % of {T_s * 1e6:.2f} us at 170 MHz. Cortex-M4F, instructions counted "
+        f"{100.0 * period_share(values):.0f} % of {T_s * 1e6:.2f} us at 170 MHz. Cortex-M4F, instructions counted "
         "under emulation and weighted by a model: no flash wait states, no interrupt entry, not silicon."
     )
     text = _TEXT.format(

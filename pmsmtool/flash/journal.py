@@ -20,15 +20,14 @@ from typing import Any, Literal, get_args
 
 from pmsmtool.drive.port import SERIAL_BITS, Identity
 from pmsmtool.errors import ConfigError, next_step
-from pmsmtool.files import read_bytes, read_text, write_file
+from pmsmtool.files import make_folder, read_bytes, read_text, write_file
 from pmsmtool.machine.key import Key, check_table
-from pmsmtool.resources import user_folder
+from pmsmtool.resources import ELSEWHERE, user_folder
 
 NEXT_STEP = "give a file of `pmsmtool backup`, or a journal as it was written"
 
 _HASH_DIGITS = 12
 """In the names of older journals."""
-_ELSEWHERE = "PMSMTOOL_HOME names another folder for journals"
 
 SCHEMA = "pmsmtool.snapshot/1"
 
@@ -183,11 +182,8 @@ def write_snapshot(path: Path, snapshot: Snapshot) -> None:
     ConfigError
         The folder cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot be made: {error.strerror}", where=str(path.parent), hint=_ELSEWHERE) from error
-    write_file(path, snapshot.dumps(), synced=True, hint=_ELSEWHERE)
+    make_folder(path.parent, hint=ELSEWHERE)
+    write_file(path, snapshot.dumps(), synced=True, hint=ELSEWHERE)
 
 
 _WORD = 0xFFFFFFFF
@@ -281,7 +277,7 @@ class JournalFolder:
                 os.replace(self.path, aside)
             except OSError as error:
                 raise ConfigError(
-                    f"cannot be renamed: {error.strerror}", where=str(self.path), hint=_ELSEWHERE
+                    f"cannot be renamed: {error.strerror}", where=str(self.path), hint=ELSEWHERE
                 ) from error
             return aside
         return None

@@ -20,10 +20,10 @@ from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.drive_map_file import map_hash
 from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
 from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
-from pmsmtool.files import read_text, write_file
+from pmsmtool.files import make_folder, read_text, write_file
 from pmsmtool.flash.journal import JournalFolder
+from pmsmtool.resources import ELSEWHERE
 
-_RIGHTS = "check your rights there and the space on the disk"
 SHOWN = 12
 """Digits of a hash that a message shows."""
 
@@ -154,12 +154,9 @@ def remember_map(drive_map: DriveMap, folder: JournalFolder) -> None:
     if drive_map.staging or not drive_map.scales:
         return
     path = memory_of(folder)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot be made: {error.strerror}", where=str(path.parent), hint=_RIGHTS) from error
+    make_folder(path.parent, hint=ELSEWHERE)
     text = json.dumps({"map": drive_map.name, "sha256": map_hash(drive_map)}) + "\n"
-    write_file(path, text, synced=True, hint=_RIGHTS)
+    write_file(path, text, synced=True, hint=ELSEWHERE)
 
 
 def _kept(folder: JournalFolder) -> str:

@@ -235,7 +235,9 @@ def test_flash_verify_backup_restore(tool: Tool, wanted: str, tmp_path: Path) ->
     assert tool("restore", "--yes")[0] == 0
     assert tool("verify", "before.json")[0] == 0
     code, _, err = tool("verify", wanted)
-    assert code == 1 and "motor.R_s_ohm" in err
+    assert code == 1 and "motor.R_s_ohm" in err and f"listed: drive -> {Path(wanted).name}" in err
+    _, _, err = tool("restore", "--dry-run")
+    assert "listed: now in the drive -> brought back" in err
     code, out, _ = tool("restore")  # a second one is no redo, and needs no consent
     assert code == 0 and "already as before its last download, nothing was done" in out
     assert tool("verify", "before.json")[0] == 0

@@ -227,6 +227,7 @@ def test_on_a_simulated_drive(tool: Tool, tmp_path: Path) -> None:
     (row,) = found["fingerprint"]["quantities"]
     assert row["name"] == "R_s_ohm" and row["verdict"] == "SAME" and abs(row["difference"]) > 0.0
     assert RunDirectory(Path(found["run"])).read().passed("fingerprint")
+    assert err.splitlines()[-1] == f"SAME motor as in {run.path.name}: 1 of 1 values agree"
     code, found, err = on_a_drive(tool, "R", *earlier, seed=2, R_s_ohm=3.8)
     assert code == 1 and "R_s_ohm: not as in" in err and "cable or joint" in err
     assert found["fingerprint"]["likely"] in err

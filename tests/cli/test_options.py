@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from pmsmtool.cli import options
 from pmsmtool.cli.options import BusOptions, MotionOptions
 from pmsmtool.cli.output import Output
+from tests.cli.conftest import Tool
 
 
 def probe(arguments: list[str], **environment: str) -> tuple[BusOptions, Output, MotionOptions]:
@@ -106,3 +107,9 @@ def test_simulated_only_when_the_interface_says_so(monkeypatch: pytest.MonkeyPat
     assert BusOptions("pmsmsim").simulated()
     assert not BusOptions("socketcand").simulated()
     assert not BusOptions().simulated()
+
+
+def test_a_dash_is_no_file(tool: Tool) -> None:
+    """Before, ``-o -`` left a file of that name."""
+    code, _, err = tool("tune", "interior-2k2", "-o", "-")
+    assert code == 2 and "'-' is not the name of a file" in err and not Path("-").exists()

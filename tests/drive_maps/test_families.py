@@ -265,6 +265,14 @@ def test_another_identity_is_refused(folder: JournalFolder) -> None:
         check_map(load_family("epos4"), Identity(1, 0xFB, 0x63220000, 1, 7), folder)
 
 
+def test_a_folder_that_cannot_be_written_names_the_other_one(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    folder = JournalFolder(Identity(1, 0xFB, 0x61500000, 1, 7), tmp_path / "file")
+    with pytest.raises(ConfigError) as refused:
+        remember_map(load_family("epos4"), folder)
+    assert "PMSMTOOL_HOME" in refused.value.hint
+
+
 def test_another_map_for_the_same_drive_is_refused(folder: JournalFolder) -> None:
     epos4 = load_family("epos4")
     identity = Identity(1, 0xFB, 0x68500000, 1, 7)

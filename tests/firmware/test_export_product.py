@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.firmware.export_c import FLAGS, c_files, not_read_by_core
-from pmsmtool.firmware.export_readme import CYCLES, STACK, counted_law, structure_bytes
+from pmsmtool.firmware.export_readme import CYCLES, STACK, counted_law, period_share, structure_bytes
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.firmware.laws import LAWS, laws_in_use
 from pmsmtool.params.catalogue import CATALOGUE
@@ -98,6 +98,31 @@ def test_a_set_for_a_law_that_was_left_out_is_refused(tmp_path: Path) -> None:
     assert COMPILER is not None
     subprocess.run([COMPILER, "-std=c99", "-fno-math-errno", "-o", "check", *sources], cwd=tmp_path, check=True)
     assert subprocess.run([tmp_path / "check"], check=False).returncode == 5, "PMSM_IMAGE_OK, PMSM_IMAGE_RANGE"
+
+
+@needs_linux_compiler
+@pytest.mark.parametrize("changed", [False, True], ids=["as exported", "a constant changed by hand"])
+def test_the_example_that_the_page_names_checks_the_constants(changed: bool, tmp_path: Path) -> None:
+    """Before, the page's calls began with ``pmsm_init``: a program by the page ran on any constants."""
+    files = exported(ALONE["none"])
+    assert "`pmsm_image_check(...)` as in `left_main.c`" in files["README.md"]
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    if changed:
+        held = files["left_cfg.c"]
+        other = re.sub(r"(\.motor_R_s_ohm = )[0-9.]+F", r"\g<1>4.0F", held)
+        assert other != held
+        (tmp_path / "left_cfg.c").write_text(other)
+    assert COMPILER is not None
+    sources = sorted(path.name for path in tmp_path.glob("*.c"))
+    flags = ["-std=c99", "-fno-math-errno", "-DPMSM_EXAMPLE_MAIN", "-o", "example"]
+    subprocess.run([COMPILER, *flags, *sources, "-lm"], cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "example"], check=False).returncode == (2 if changed else 0)
+
+
+def test_the_share_of_a_fast_period_exceeds_it() -> None:
+    slow, fast = (period_share(values({"governor.mode": 3}) | {"inverter.T_s_ns": T}) for T in (83_333.0, 40_000.0))
+    assert slow < 1.0 < fast
 
 
 def test_what_the_kept_laws_do_not_read_is_said() -> None:

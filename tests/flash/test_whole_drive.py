@@ -168,7 +168,10 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         write(node, CHANGED)
         node.store()
     outcome = tool("--sim", first, "backup", "--eds", str(path), "-o", "drive.json", "--json")
-    assert outcome.exit_code == 0 and "0x6040:00" in str(json.loads(outcome.stdout)["left_out"])
+    left_out = json.loads(outcome.stdout)["left_out"]
+    assert outcome.exit_code == 0 and "0x6040:00" in str(left_out)
+    told = [line for line in outcome.stderr.splitlines() if line.startswith("not saved")]
+    assert len(told) == len(set(left_out.values())), "one line for a reason"
     assert "serial" in str(tool("--sim", spare, "--yes", "restore", "drive.json").exception)
     assert tool("--sim", spare, "--yes", "restore", "drive.json", "--other-drive").exit_code == 0
     with connect("pmsmsim", spare) as connection:
