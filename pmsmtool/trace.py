@@ -5,10 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pmsmtool.plain_text import table
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +47,19 @@ class Trace:
                 raise ValueError(f"signal {name} has no unit")
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
+        """Return one signal; raises ``KeyError`` with the nearest name where there is none."""
+        if name not in self.signals:
+            near = get_close_matches(name, self.signals, n=1)
+            raise KeyError(f"no signal {name!r}" + (f"; did you mean {near[0]}?" if near else ""))
         return self.signals[name]
+
+    def __repr__(self) -> str:
+        span = f" from {self.t_s[0]:.6g} to {self.t_s[-1]:.6g} s" if len(self) else ""
+        rows = [
+            (name, self.units[name], *((f"{values.min():.5g}", f"{values.max():.5g}") if len(self) else ("", "")))
+            for name, values in self.signals.items()
+        ]
+        return "\n".join((f"trace: {len(self)} rows{span}", *table(("signal", "unit", "least", "largest"), rows)))
 
     def __len__(self) -> int:
         return len(self.t_s)

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from pmsmtool.machine.key import Key, check_table, did_you_mean
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_from_tables, machine_tables
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
+from pmsmtool.plain_text import table
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
 
@@ -83,6 +85,14 @@ class Design:
             raise KeyError(f"a design has no {name!r}{did_you_mean(name, list(self.values))}")
         return self.values[name].value
 
+    def __repr__(self) -> str:
+        gains = [(name, f"{v.value:.6g}", BY_NAME[name].unit, v.method) for name, v in self.values.items() if v.loop]
+        lines = [
+            *table(("gain", "value", "unit", "method"), gains),
+            *(f"{k}: {achieved(x)}" for k, x in self.loops.items()),
+        ]
+        return "\n".join((f"design of {self.name}: {len(self.values)} values, of which", *lines, *self.notes))
+
     @property
     def name(self) -> str:
         """Name of the machine."""
@@ -107,7 +117,7 @@ def design_text(design: Design) -> str:
         "notes": list(design.notes),
         "request": dict(design.request),
         "facts": dict(design.facts),
-        "loop": {name: _loop_table(loop) for name, loop in design.loops.items()},
+        "loop": {name: asdict(loop) for name, loop in design.loops.items()},
     }
     groups: dict[str, dict[str, Any]] = {}
     for row in EVERY:
@@ -123,10 +133,6 @@ def design_text(design: Design) -> str:
 
 _COMMENT = """Design of one drive, written by `pmsmtool tune`. The machine it is for is embedded; params.toml beside it
 holds the same values in the form that is sent to the drive."""
-
-
-def _loop_table(loop: LoopMargins) -> dict[str, Scalar]:
-    return {item.name: getattr(loop, item.name) for item in fields(LoopMargins)}
 
 
 def _value_table(design: Design, name: str) -> dict[str, Scalar]:
@@ -162,10 +168,8 @@ def load_design(path: str | Path) -> Design:
 def load_machine_or_design(path: Path) -> tuple[MachineFile, Design | None]:
     """Read a machine file or a design, told apart by their schema; a design brings its own machine."""
     text = ""
-    try:
+    with contextlib.suppress(ConfigError):  # the reader below says what is wrong
         text = read_text(path)
-    except ConfigError:
-        pass  # the reader below says what is wrong
     if re.search(rf'^schema\s*=\s*"{re.escape(SCHEMA)}"', text, re.MULTILINE):
         design = load_design(path)
         return design.machine, design
@@ -188,9 +192,7 @@ def parse_design(text: str, *, where: str = "design.toml") -> Design:
         raise ConfigError(f"schema is {schema!r}, expected {SCHEMA!r}", where=where, hint=hint)
     machine_part = tables.get("machine_file")
     if not isinstance(machine_part, dict):
-        raise ConfigError(
-            "the table [machine_file] is missing", where=where, hint="make the design again with `pmsmtool tune`"
-        )
+        raise ConfigError("the table [machine_file] is missing", where=where)
     machine = machine_from_tables(machine_part, where=where, lines=toml_lines(text), path=("machine_file",))
     if tables.get("machine_sha256") != machine.content_hash():
         raise ConfigError(
@@ -242,13 +244,10 @@ def _read_values(table: Any) -> tuple[dict[str, DesignValue], list[str]]:
     return ordered, wrong
 
 
-def _all_numbers(values: Iterable[Any]) -> bool:
-    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
-
-
 def _odd_tables(tables: Mapping[str, Any], where: str) -> list[str]:
     """Return what is wrong with the parts that are only carried along."""
-    wrong = [f"[{name}] is not a table" for name in ("request", "facts", "table") if not _is_table(tables, name)]
+    parts = ("request", "facts", "table")
+    wrong = [f"[{name}] is not a table" for name in parts if not isinstance(tables.get(name, {}), dict)]
     notes = tables.get("notes", [])
     if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
         wrong.append("notes is not a list of texts")
@@ -262,13 +261,9 @@ def _odd_tables(tables: Mapping[str, Any], where: str) -> list[str]:
         wrong += [
             f"table.{name} is not an array of numbers"
             for name, array in arrays.items()
-            if not isinstance(array, list) or not _all_numbers(array)
+            if not (isinstance(array, list) and all(type(value) in (int, float) for value in array))
         ]
     return wrong
-
-
-def _is_table(tables: Mapping[str, Any], name: str) -> bool:
-    return isinstance(tables.get(name, {}), dict)
 
 
 _FACT = Key("facts", "", "float", "", -1e30, 1e30, None, "a result of the design")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from pmsmtool.machine.parameters import (
 )
 from pmsmtool.machine.profile import NAMED, machine_path
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS, resolved_simulation
+from pmsmtool.plain_text import table
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
 
@@ -76,6 +77,19 @@ class MachineFile:
     provenance: Record = field(default_factory=dict)
     simulation: Mapping[str, Value] = field(default_factory=dict)
     flux_map: FluxMap | None = None
+
+    def __repr__(self) -> str:
+        given = {**asdict(self.machine), **asdict(self.inverter)}
+        rows = [
+            (
+                key,
+                value if isinstance(value, str) else f"{value:.6g}",
+                f"{self.std[key]:.2g}" if key in self.std else "",
+            )
+            for key, value in given.items()
+            if isinstance(value, (str, int, float)) and not isinstance(value, bool)
+        ]
+        return "\n".join((f"machine file {self.name}", *table(("key", "value", "std"), rows)))
 
     def simulation_settings(self) -> dict[str, Value]:
         """Return every ``[simulation]`` key with the value that holds, defaults and fall-backs filled in."""

@@ -116,6 +116,8 @@ def _violations(scenario: Scenario) -> list[str]:
     for name, profile in scenario.schedule.items():
         if name not in SCHEDULES:
             found.append(f"[schedule] {name}: unknown{did_you_mean(name, list(SCHEDULES))}")
+        elif isinstance(profile, (int, float)):
+            found.append(f"[schedule] {name} is a number; write [(0.0, {profile!r})]: times in s and values")
         elif not profile:
             found.append(f"[schedule] {name}: has no nodes")
         elif not all(math.isfinite(t) and math.isfinite(v) for t, v in profile):

@@ -11,7 +11,6 @@ torque holds the nearest feasible one (``achieved_torque_nm``), and ``margin_tor
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import struct
 import zlib
@@ -28,6 +27,8 @@ from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.npz_file import npz_bytes
 from pmsmtool.params.parameter_set import LUT_NAMES, ParameterSet
 
+_SECOND = {"speed": ("speed_rpm", "rpm", "V"), "flux": ("flux_wb", "Wb", "Wb")}
+"""By the kind of the second axis: its name, its unit, and that of the voltage margin."""
 NEXT_STEP = "make the table again: `pmsmtool lut DESIGN -o lut.npz`"
 
 SCHEMA = "pmsmtool.lut/1"
@@ -84,7 +85,7 @@ def table_npz(table: LookupTable, facts: Mapping[str, Any], lines: Mapping[str, 
         "margin_torque_nm": table.margin_torque_nm,
     }  # fmt: skip
     bounds = {"least_torque_nm": table.torque_limits.least_nm, "largest_torque_nm": table.torque_limits.largest_nm}
-    arrays: dict[str, NDArray[Any]] = {"torque_nm": table.torque_nm, _second(table): table.y}
+    arrays: dict[str, NDArray[Any]] = {"torque_nm": table.torque_nm, _SECOND[table.axis_kind][0]: table.y}
     if not flat:
         arrays["U_dc_v"] = table.U_dc_v
     arrays |= {name: array[..., 0] if flat else array for name, array in {**cells, **bounds}.items()}
@@ -96,17 +97,12 @@ def table_npz(table: LookupTable, facts: Mapping[str, Any], lines: Mapping[str, 
     return npz_bytes(arrays)
 
 
-def _second(table: LookupTable) -> str:
-    return "speed_rpm" if table.axis_kind == "speed" else "flux_wb"
-
-
 def table_csv(table: LookupTable) -> str:
     """Return the text of the table, one row per cell: names, units, then torque slowest and voltage fastest."""
-    second_unit = "rpm" if table.axis_kind == "speed" else "Wb"
-    margin_unit = "V" if table.axis_kind == "speed" else "Wb"
+    second, second_unit, margin_unit = _SECOND[table.axis_kind]
     columns = {
         "torque_nm": ("N m", table.torque_nm[:, None, None]),
-        _second(table): (second_unit, table.y[None, :, None]),
+        second: (second_unit, table.y[None, :, None]),
         "U_dc_v": ("V", table.U_dc_v[None, None, :]),
         "i_d_a": ("A", table.i_d_a),
         "i_q_a": ("A", table.i_q_a),
@@ -117,13 +113,10 @@ def table_csv(table: LookupTable) -> str:
     }
     if table.U_dc_v.size == 1:
         del columns["U_dc_v"]
-    flat = [np.broadcast_to(array, table.i_d_a.shape).ravel() for _, array in columns.values()]
-    out = io.StringIO()
-    out.write(",".join((*columns, "binding")) + "\n")
-    out.write(",".join((*(unit for unit, _ in columns.values()), "")) + "\n")
-    for *numbers, binding in zip(*flat, table.binding.ravel(), strict=True):
-        out.write(",".join((*(repr(float(x)) for x in numbers), str(binding))) + "\n")
-    return out.getvalue()
+    flat = [np.broadcast_to(array, table.i_d_a.shape).ravel().tolist() for _, array in columns.values()]
+    lines = [(*columns, "binding"), (*(unit for unit, _ in columns.values()), "")]
+    lines += [(*map(repr, numbers), binding) for *numbers, binding in zip(*flat, table.binding.ravel(), strict=True)]
+    return "".join(",".join(map(str, line)) + "\n" for line in lines)
 
 
 def lut_values(table: LookupTable, stored: StoredFormat) -> tuple[dict[str, float], dict[str, tuple[float, ...]]]:
@@ -156,9 +149,8 @@ def table_parameters(arrays: Mapping[str, NDArray[Any]], where: str) -> Paramete
     try:
         facts = json.loads(str(arrays["meta"]))
         kind, stored = str(facts["axis_kind"]), str(facts["stored"])
-        second = "speed_rpm" if kind == "speed" else "flux_wb"
         z = arrays["U_dc_v"] if "U_dc_v" in arrays else facts["U_dc_v"]
-        names = ("torque_nm", second, "i_d_a", "i_q_a")
+        names = ("torque_nm", _SECOND[kind][0], "i_d_a", "i_q_a")
         x, y, i_d, i_q, z = (np.asarray(one, dtype=np.float64) for one in (*(arrays[name] for name in names), z))
     except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
         raise ConfigError(f"is no look-up table: {error}", where=where, hint=hint) from None

@@ -34,6 +34,7 @@ from pmsmtool.design.ratings import ratings_of
 from pmsmtool.design.tolerance import Samples, ToleranceBox
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
+from pmsmtool.plain_text import table
 
 Array = NDArray[np.float64]
 
@@ -169,6 +170,20 @@ class MarginReport:
     corners: int
     samples: int
     notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        rows = [
+            (
+                s.name,
+                s.unit,
+                f"{s.nominal:.4g}",
+                f"{s.worst:.4g}",
+                *(("-", "-") if s.least is None else (s.least, s.ok)),
+            )
+            for s in (*self.loops, *self.headroom)
+        ]
+        lines = table(("margin", "unit", "nominal", "worst corner", "asked", "ok"), rows)
+        return "\n".join((f"margins over {self.corners} corners and {self.samples} samples, ok: {self.ok}", *lines))
 
     @property
     def ok(self) -> bool:
