@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pmsmtool.design.loops.current_loop import imc
 from pmsmtool.drive.port import Drive
@@ -25,6 +26,7 @@ from pmsmtool.measurement.mechanics import numbered
 from pmsmtool.trace import Trace
 from pmsmtool.units import rpm_from_rad_s
 
+Array = NDArray[np.float64]
 EMF_SHARE = 0.8
 """Largest speed of the flux run: back-emf of this share of the largest voltage."""
 RUN_BANDWIDTH_RAD_S = 2.0 * math.pi * 120.0
@@ -155,6 +157,8 @@ class SpeedStage:
             decimation *= 2
         for k, push in enumerate(pushes):
             self.keep(f"push_{k}", push)
+        gained, shown = (float(one[tail].mean()) for one in self._gained(fastest))
+        omega += rate * pole_pairs * (gained - shown)
         i_q = float(fastest["i_q_a"][tail].mean())
         error = resistance.V_dead_v * (1.0 if i_q > 0.0 else -1.0) * 4.0 / math.pi
         psi = (float(fastest["u_q_v"][tail].mean()) - resistance.R_measured.value * i_q - error) / omega
@@ -174,12 +178,11 @@ class SpeedStage:
         for _ in range(9):
             decimation = max(1, round(seconds / (256 * self.drive.period_s)))
             push = self._push(current, 256, decimation, pole_pairs)
-            omega = push["omega_e_rad_s"] / pole_pairs
-            change = float(omega[-16:].mean() - omega[:16].mean())
+            change = _change(push["omega_e_rad_s"]) / pole_pairs
             self._push(-current, 256, decimation, pole_pairs)
             if abs(change) > 0.15 * target:
                 # from the current that flowed: a slow loop, or a dead time, lets it rise late
-                return abs(change) / abs(float(np.sum(push["i_q_a"][8:-8])) * push.period_s)
+                return abs(change / _change(self._gained(push)[1]))
             if current < 0.4 * self.limits.I_test_apk:
                 current *= 2.0
             else:
@@ -190,6 +193,20 @@ class SpeedStage:
             stage="speed run",
             likely="a locked shaft, a brake that is closed, or an encoder that does not count",
         )
+
+    def _gained(self, push: Trace) -> tuple[Array, Array]:
+        """Return the integral of a push's q current (A s), and what the drive's speed estimate shows of it.
+
+        The estimate is a double pole, which lags behind a light shaft by as much as its push takes.
+        """
+        gained = np.cumsum(push["i_q_a"]) * push.period_s
+        follow = -math.expm1(-self.drive.read("encoder.pll_bandwidth_rad_s") * push.period_s)
+        shown, first, second = np.empty_like(gained), 0.0, 0.0
+        for k, value in enumerate(gained):
+            first += follow * (value - first)
+            second += follow * (first - second)
+            shown[k] = second
+        return gained, shown
 
     def _push(self, i_q_a: float, samples: int, decimation: int, pole_pairs: int) -> Trace:
         omega_e = PUSH_END_SHARE * pole_pairs * self.limits.omega_max_rad_s
@@ -256,3 +273,8 @@ class SpeedStage:
     def _off_and_write(self, values: Mapping[str, float]) -> None:
         self.drive.disable()
         self.drive.write(values)
+
+
+def _change(values: Array) -> float:
+    """Return by how much a push changed a value, without the scatter of a sample."""
+    return float(values[-16:].mean() - values[:16].mean())
