@@ -46,9 +46,8 @@ LIMIT = {"R_s_ohm": 0.05, "psi_f_wb": 0.02}
 """Largest relative standard deviation of a tracked value; above it nothing was learned that is worth a number."""
 NIS_GATE = (1.5, 2.6)
 """Mean normalised innovation squared of a consistent filter; two per observation is ideal."""
-INFLATIONS = 4
 INFLATION_MAX = 2.0
-"""Times the noise may be inflated, and the most of it: beyond, the model is wrong and not the noise."""
+"""Most that the noise's variance may be inflated: beyond, the model is wrong and not the noise."""
 MINIMUM = 16
 """Observations for a noise estimate."""
 SETTLED = 8
@@ -250,9 +249,7 @@ class _Run:
 def _consistent(observations: Trace, known: Known, given: Array, noise: tuple[float, float], walk: float) -> _Run:
     found, nis, likelihood = _pass(observations, known, given, noise, walk)
     first, inflation = nis, 1.0
-    for _ in range(INFLATIONS):
-        if nis <= NIS_GATE[1] or inflation > INFLATION_MAX:
-            break
+    while nis > NIS_GATE[1] and inflation <= INFLATION_MAX:  # by more than 1.3 each time: three times at most
         inflation *= 0.5 * nis
         wider = (math.sqrt(inflation) * noise[0], math.sqrt(inflation) * noise[1])
         found, nis, likelihood = _pass(observations, known, given, wider, walk)

@@ -10,7 +10,7 @@ import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.cross_check import cross_check
-from pmsmtool.estimators.estimate import statistical_half_width
+from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
 from pmsmtool.estimators.flux.linkage import (
     DRIVEN_STD,
     MAGNET_CHANGE,
@@ -173,6 +173,41 @@ def test_a_disagreement_is_reported(population: Population) -> None:
 def test_a_check_says_what_it_can(value: float, std: float, word: str) -> None:
     first = Estimate(1.0, 0.001, 0.0, "H")
     assert cross_check("L_q_h_apparent", "L_q_h", Estimate(value, std, 0.0, "H"), first).verdict.startswith(word)
+
+
+@pytest.mark.parametrize(
+    ("std", "common", "half_width"),
+    [
+        (0.02, 0.0, 2.0 * math.sqrt(2.0) * 0.02),
+        (0.02, 0.019, 2.0 * math.sqrt(2.0 * (0.02**2 - 0.019**2))),
+        (0.02, 0.02 * (1.0 + 1e-9), 0.0),  # all that both doubt is common, to rounding
+    ],
+)
+def test_what_two_methods_have_in_common_is_no_excuse(std: float, common: float, half_width: float) -> None:
+    """Both are off by the same scale of the voltage: what sets them apart is something else."""
+    first, second = Estimate(0.5, 0.5 * std, 0.0, "Wb"), Estimate(0.505, 0.505 * std, 0.0, "Wb")
+    found = cross_check("a", "b", second, first, common)
+    assert found.half_width == pytest.approx(half_width, rel=0.03, abs=1e-9)
+    assert found.agrees == (half_width > 0.01)
+
+
+def test_a_doubtful_bridge_does_not_hide_a_disagreement(population: Population) -> None:
+    """Its thresholds scale both flux linkages: 0.5 % of doubt, and 0.3 % that only the q currents show."""
+    d = population.drives
+    trace = population.speeds(0)
+    q = np.abs(trace["i_q_a"]) > 0.5 * Q * d.I_r[0]
+    tolerance = SensorTolerance(bridge_threshold_v=0.5, U_dc_v=100.0)
+    for share, apart in ((0.0, 0.0), (0.003, 0.003)):
+        u_q = trace["u_q_v"] - np.where(q, share * d.psi[0] * trace["omega_e_rad_s"], 0.0)
+        found = estimate_flux_linkage(
+            _changed(trace, u_q_v=u_q),
+            d.R[0],
+            period_s=d.T_s[0],
+            inverter=InverterCurve(*curve_points(d, 0), 0.0),
+            tolerance=tolerance,
+        )
+        assert found.apart_wb == pytest.approx(apart * d.psi[0], rel=0.1)
+        assert found.psi_measured.std / d.psi[0] == pytest.approx(math.hypot(0.005, apart), rel=0.05)
 
 
 def test_without_q_currents_there_is_no_second_method(population: Population) -> None:

@@ -24,8 +24,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.cross_check import driven_flux_linkage
-from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, condition_gate, information_weights
+from pmsmtool.estimators.cross_check import cross_check, driven_flux_linkage
+from pmsmtool.estimators.estimate import SensorTolerance, condition_gate, information_weights
 from pmsmtool.estimators.flux.linkage_rows import STAGE, Corrected, check_speeds, corrected, fastest_pair, pairs_of
 from pmsmtool.estimators.injection.sampling_instant import CoastingPairs, Sampling, ShownInstant, shown_instant
 from pmsmtool.estimators.injection.switching_ripple import Modulation
@@ -212,9 +212,9 @@ def estimate_flux_linkage(
     driven = driven_flux_linkage(rows, L_d, x2, even.curvature, lag_s, tolerance, T)
     apart = 0.0
     if driven is not None:
-        common = tolerance.voltage_scale_std * psi
-        own = math.sqrt(max(0.0, driven.std**2 - common**2 + std**2 - common**2))
-        apart = abs(driven.value - psi) if abs(driven.value - psi) > COVERAGE_FACTOR * own else 0.0
+        alone = Estimate(psi, std, 0.0, "Wb")
+        if not cross_check("psi_f_wb_driven", "psi_f_wb", driven, alone, tolerance.voltage_scale_std).agrees:
+            apart = abs(driven.value - psi)
     std = math.hypot(std, apart)
     # an old angle shows what a late sample does, and wants less of a correction
     if_old = 0.0 if shown is None else per_instant * max(0.0, shown.value_s)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.tracking import LIMIT, NIS_GATE, Track, Tracker, track
+from pmsmtool.estimators.tracking import LIMIT, NIS_GATE, Track, Tracker, observation_noise, track
 from pmsmtool.estimators.tracking_model import (
     ACROSS,
     ALONG,
@@ -87,6 +88,30 @@ def test_an_inverter_error_that_nobody_told_of_is_refused(warming: dict[int, Tra
     with pytest.raises(IdentificationError) as caught:
         track(condense(warming[1], ROWS), known(machine(), curve=False))
     assert caught.value.reason in ("E_MODEL_MISMATCH", "E_NOT_IDENTIFIABLE")
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("factor", [4.0, 10.0])
+def test_more_noise_than_the_typical_window_shows_widens_the_interval_or_refuses(
+    factor: float, warming: dict[int, Trace]
+) -> None:
+    """One window in ten is noisier: the median hides it from the noise, and the innovations show it."""
+    observations = condense(warming[1], ROWS)
+    rng = np.random.default_rng(1)
+    noise = np.where(rng.random(len(observations)) < 0.1, factor, 1.0)
+    voltages = {u: observations[u] + noise * rng.standard_normal(len(observations)) for u in ("u_d_v", "u_q_v")}
+    noisy = replace(observations, signals={**observations.signals, **voltages})
+    if factor > 5.0:
+        with pytest.raises(IdentificationError, match="E_MODEL_MISMATCH"):
+            track(noisy, known(machine()), ("psi_f_wb",))
+        return
+    found = track(noisy, known(machine()), ("psi_f_wb",))
+    assert found.nis > NIS_GATE[1]  # 3.02
+    assert found.inflation == pytest.approx(0.5 * found.nis)
+    assert found.noise_v == pytest.approx(
+        [math.sqrt(found.inflation) * v for v in observation_noise(noisy, known(machine()))]
+    )
+    assert f"innovations {found.nis:.2g} instead of 2: the noise's variance is inflated" in found.notes[0]
 
 
 @pytest.mark.chain
