@@ -39,7 +39,7 @@ def spacing(periods: int, rows: int, turns_per_period: float) -> int:
     turns_per_period : float
         Electrical turns in one control period.
     """
-    least = max(1, math.ceil(periods / rows))
+    least = math.ceil(periods / rows)
     for candidate in range(least, 2 * least):
         cycles = (harmonic * turns_per_period * candidate for harmonic in HARMONICS)
         if all(abs(cycle - round(cycle)) * (periods // candidate) / 2.0 >= BEATS for cycle in cycles):
@@ -60,7 +60,7 @@ class RecordedMeans(Recorder):
     shaft turns the rows span the whole turns.
     """
 
-    _decimation = 1
+    _decimation: int
     _angle_rad = 0.0
     _looks = True
     _trace: Trace | None = None
@@ -100,7 +100,7 @@ class RecordedMeans(Recorder):
             rows = periods // self._decimation
         else:
             self._decimation, rows = 1, min(periods, LOOK if self._looks else AT_REST)
-        self.arm(_fast(signals), max(1, rows), self._decimation, 0, at_excitation=False)
+        self.arm(_fast(signals), rows, self._decimation, 0, at_excitation=False)
 
     def finish_average(self, signals: Sequence[str]) -> Mapping[str, float]:
         """Wait for the record and return its means by signal."""
@@ -118,8 +118,8 @@ class RecordedMeans(Recorder):
         finally:
             self._looks = True
         assert self._trace is not None
-        half = max(1, len(self._trace) // 2)
-        first, second = (self._means(self._trace, rows) for rows in (slice(0, half), slice(-half, None)))
+        half = len(self._trace) // 2
+        first, second = (self._means(self._trace, rows) for rows in (slice(half), slice(-half, None)))
         return Halves(first, second, 2 * half)
 
     def _omega_e_rad_s(self) -> float:

@@ -115,6 +115,7 @@ def test_the_drive_says_a_signal_of_the_map_is_none_of_its(commanded: Rig) -> No
     [
         (epos2_objects.LARGEST, 400, "has not taken"),
         (epos2_objects.FIRST, 300, "cannot begin at 300"),
+        (epos2_objects.FIRST, 256, "cannot begin at 256"),
         (epos2_objects.RECORDED, 9, "9 of at most 256 are there"),
         (epos2_objects.RECORDED, 999, "999 of at most 256 are there"),
     ],
@@ -127,6 +128,62 @@ def test_rings_that_cannot_be_are_refused(
     with pytest.raises(VerifyMismatch) as caught:
         commanded.record(256)
     assert complaint in f"{caught.value} {caught.value.differences}"
+
+
+@RINGS_ONLY
+def test_a_buffer_without_the_last_word_is_refused(commanded: Rig) -> None:
+    entry = commanded.entry(epos2_objects.BUFFER, 0)
+    honest = entry.source
+    assert honest is not None
+    entry.source = lambda: honest()[: 2 * 256 * 2 - 1]
+    with pytest.raises(VerifyMismatch) as caught:
+        commanded.record(256)
+    assert "512 words are in use, 1023 bytes came" in str(caught.value.differences)
+
+
+@RINGS_ONLY
+@pytest.mark.parametrize(("address", "later"), [(epos2_objects.FIRST, 1), (epos2_objects.STATUS, 0x3)])
+def test_one_sign_of_a_ring_that_ran_on_is_enough(commanded: Rig, address: tuple[int, int, str], later: int) -> None:
+    """The oldest sample has moved where the drive says that it stands, or it runs and nothing has moved yet."""
+    buffer, entry = commanded.entry(epos2_objects.BUFFER, 0), commanded.entry(*address[:2])
+    honest = buffer.source
+    assert honest is not None
+
+    def read() -> bytes:
+        entry.source = lambda: entry.encode(later)
+        return honest()
+
+    buffer.source = read
+    with pytest.raises(VerifyMismatch) as caught:
+        commanded.record(256)
+    assert "ran on while it was read" in str(caught.value.differences)
+
+
+@RINGS_ONLY
+def test_a_record_is_taken_as_soon_as_it_is_long_enough(commanded: Rig) -> None:
+    """Ten samples are there and the drive runs on until it is told to stop."""
+    recorded, status = (commanded.entry(*each[:2]) for each in (epos2_objects.RECORDED, epos2_objects.STATUS))
+    control = commanded.entry(*epos2_objects.CONTROL[:2])
+    honest, sink, bits = recorded.source, control.sink, [0x2, 0x3]
+    assert honest is not None and sink is not None
+
+    def told(data: bytes) -> None:
+        bits[1:] = [] if int.from_bytes(data, "little") == epos2_objects.STOP else [0x3]
+        sink(data)
+
+    control.sink, status.source = told, lambda: status.encode(bits[-1])
+    recorded.source = lambda: recorded.encode(min(10, int.from_bytes(honest(), "little")))
+    assert len(commanded.record(10)) == 10
+
+
+@RINGS_ONLY
+def test_what_another_program_left_in_the_set_up_is_taken_back(commanded: Rig) -> None:
+    """Automatic triggers, and samples kept from before the trigger."""
+    entries = [commanded.entry(*each[:2]) for each in (epos2_objects.CONFIGURATION, epos2_objects.PRECEDING)]
+    for entry in entries:
+        entry.put(1)
+    commanded.record(10)
+    assert [entry.integer() for entry in entries] == [0, 0]
 
 
 def test_a_period_that_is_no_multiple_of_the_drives_keeps_time(tmp_path: Path) -> None:

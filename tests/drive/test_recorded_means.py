@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import pytest
@@ -14,8 +14,9 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.recorded_means import AT_REST, LOOK, TURNING, RecordingDrive, spacing
+from pmsmtool.drive.recorded_means import AT_REST, LOOK, TURNING, RecordedMeans, RecordingDrive, spacing
 from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.trace import Trace
 
 SIGNALS = ("u_d_v", "i_d_a", "theta_m_rad", "T_winding_c")
 
@@ -69,10 +70,67 @@ def test_a_drive_with_averages_takes_them_one_after_the_other() -> None:
         made.close()
 
 
-def left_of_the_sixth(periods: int, step: int, turns_per_period: float) -> float:
-    """Share of the inverter's sixth harmonic in the mean of half a window that is thinned out."""
+class Armed(RecordedMeans):
+    """Means of a shaft that turns at a given speed, and how their records were set up."""
+
+    def __init__(self, omega_e_rad_s: float) -> None:
+        self._period_s = 1e-4
+        self.omega_e_rad_s = omega_e_rad_s
+        self.armed: list[tuple[tuple[str, ...], int, int, int]] = []
+
+    def arm(
+        self, signals: Sequence[str], samples: int, decimation: int, pretrigger: int, *, at_excitation: bool,
+        at_move: bool = False,
+    ) -> None:  # fmt: skip
+        assert not at_excitation and not at_move
+        self.armed.append((tuple(signals), samples, decimation, pretrigger))
+
+    def fetch(self, signals: Sequence[str], decimation: int) -> Trace:
+        rows = np.arange(float(self.armed[-1][1]))
+        assert (tuple(signals), decimation) == (self.armed[-1][0], self.armed[-1][2])
+        return Trace(1e-4 * decimation * rows, dict.fromkeys(signals, rows), dict.fromkeys(signals, "1"))
+
+    def _omega_e_rad_s(self) -> float:
+        return self.omega_e_rad_s
+
+    def take(self, periods: int) -> Mapping[str, float]:
+        self.start_average(("i_q_a",), periods)
+        return self.finish_average(("i_q_a",))
+
+
+def test_at_rest_a_look_is_32_rows_and_half_a_window_256() -> None:
+    for omega in (0.0, 20.0):
+        means = Armed(omega)
+        assert means.take(800) == {"i_q_a": 15.5}
+        assert means.halves(means.take, 800).samples == 2 * 256
+        assert means.halves(means.take, 100).samples == 2 * 100
+        assert means.armed == [(("i_q_a",), rows, 1, 0) for rows in (32, 256, 256, 100, 100)]
+
+
+def test_of_a_turning_shaft_both_halves_are_128_rows_out_of_step_with_it() -> None:
+    for omega in (20.1, 700.0, 1400.0, 2800.0):
+        means = Armed(omega)
+        first, second, samples = means.halves(means.take, 1600)
+        ((_, rows, decimation, before),) = means.armed
+        assert decimation == spacing(3200, 128, omega * 1e-4 / (2.0 * math.pi)) >= 25
+        assert (rows, before, samples) == (3200 // decimation, 0, 2 * (rows // 2)) and rows <= 128
+        assert (first["i_q_a"], second["i_q_a"]) == (0.5 * (rows // 2 - 1), rows - 0.5 * (rows // 2 + 1))
+        means.take(1600)
+        assert means.armed[-1][2] == spacing(1600, 32, omega * 1e-4 / (2.0 * math.pi)) >= 50
+    assert Armed(700.0).take(1) == {"i_q_a": 0.0}
+
+
+def test_an_angle_goes_on_where_records_begin_again() -> None:
+    for sense in (1.0, -1.0):
+        means = Armed(0.0)
+        for angle in sense * np.arange(2.9, 40.0, 2.9):
+            assert means.continued(math.remainder(angle, 2.0 * math.pi)) == pytest.approx(angle)
+
+
+def left_of(harmonic: int, periods: int, step: int, turns_per_period: float) -> float:
+    """Share of a harmonic of the inverter's error in the mean of half a window that is thinned out."""
     rows = np.arange(periods // step // 2)
-    return float(abs(np.mean(np.exp(2j * math.pi * 6.0 * turns_per_period * step * rows))))
+    return float(abs(np.mean(np.exp(2j * math.pi * harmonic * turns_per_period * step * rows))))
 
 
 @pytest.mark.parametrize("periods", [600, 1260, 4000])
@@ -81,6 +139,14 @@ def test_rows_are_not_taken_in_step_with_a_harmonic(periods: int) -> None:
     speeds = [float(turns) for turns in np.linspace(1e-3, 2e-2, 400) if 6.0 * turns * periods > 8.0]
     chosen = [spacing(periods, 128, turns) for turns in speeds]
     assert all(least <= step < 2 * least for step in chosen)
-    assert max(left_of_the_sixth(periods, step, turns) for step, turns in zip(chosen, speeds, strict=True)) < 0.2
+    for harmonic in (6, 12, 18, 24):
+        left = [left_of(harmonic, periods, step, turns) for step, turns in zip(chosen, speeds, strict=True)]
+        assert max(left) < 0.2
     if least > 8:  # rows so far apart that the sixth folds onto them at some of these speeds
-        assert max(left_of_the_sixth(periods, least, turns) for turns in speeds) > 0.9
+        assert max(left_of(6, periods, least, turns) for turns in speeds) > 0.9
+
+
+def test_the_narrowest_rows_are_taken_at_which_every_harmonic_beats_twice() -> None:
+    assert spacing(3200, 128, 1.0 / 150.0) == 26  # the sixth: 25 periods apart never, 26 apart 2.5 times, 27 apart 4.7
+    # at 36 rows a turn the twelfth or the eighteenth fold onto 2, 3 and 4 of them; 5 would leave half a record too few
+    assert spacing(256, 128, 1.0 / 36.0) == 2
