@@ -51,17 +51,13 @@ class ChangedObjects:
         self._node.before_write = None
         names = {self._drive.parameters.map.address(n): n for n in (*self._node.map.cells, *self._node.map.tables)}
         parameters = {names[key]: data for key, data in self._before.items() if key in names}
-        others = {key: data for key, data in self._before.items() if key not in names and key not in _MARKS}
+        others = {key: data for key, data in self._before.items() if key not in names}
         changed = {n: data for n, data in parameters.items() if self._drive.parameters.read([n])[n] != data}
         lines = []
         if changed:
             self._drive.replace(changed)
         back = len(changed)
-        # The marks last: every change of another object clears them.
-        for (index, sub), data in [
-            *reversed(others.items()),
-            *((m, self._before[m]) for m in _MARKS if m in self._before),
-        ]:
+        for (index, sub), data in reversed(others.items()):  # the marks, which were noted first, last
             try:
                 if self._read(index, sub) != data:
                     self._node.sdo.download(index, sub, data)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from enum import IntEnum
+from enum import IntEnum, auto
 
 from pmsmtool.bus.nmt import TOOL_NODE
 from pmsmtool.bus.sdo import SdoChannel
@@ -50,10 +50,10 @@ NOTHING_WRITTEN = "nothing was written: the drive holds the set that it held bef
 class Phase(IntEnum):
     """How far a download has come; decides what a roll-back must do."""
 
-    BEFORE = 0
-    STAGING = 1
-    ACTIVE = 2
-    STORING = 3
+    BEFORE = auto()
+    STAGING = auto()
+    ACTIVE = auto()
+    STORING = auto()
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,10 +6,17 @@ from __future__ import annotations
 import math
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from pmsmtool.cia402 import Mode
+from pmsmtool.drive import objects
+from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.speed_loop_drive import POSITION, Oscillation, SpeedLoopDrive
+from pmsmtool.drive.standard_drive import RecorderDrive
+from pmsmtool.errors import DriveTimeout
+from pmsmtool.trace import Trace
 
 TRANSFER_S = 4e-4
 PERIOD_S = 1e-3
@@ -31,6 +38,47 @@ class Bus:
     def transfer(self, item: object, value: float = 0.0) -> float:
         self.t_s += TRANSFER_S
         return 1000.0 if item is POSITION else 3.0
+
+
+def test_a_record_without_a_sample_says_when_its_steps_were() -> None:
+    drive = object.__new__(SpeedLoopDrive)
+    drive.sends, drive._samples, drive._written, drive.may_be_energised = True, [], [(10.5, 20.0)], False
+    trace = drive.finish_record(Recording((), 0))
+    assert len(trace) == 0 and trace.meta["steps"] == [[10.5, 20.0]]
+
+
+@pytest.mark.parametrize("late_s", [2.5e-4, 7.9e-4, 8.1e-4])
+def test_a_step_behind_the_recorder_begins_when_the_drive_gets_it(
+    late_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A row every 0.1 ms, eight more than are asked for: a step may come so much later than the recorder's start."""
+    bus, put, armed = Bus(), [], []
+
+    def write(item: DriveObject, value: float) -> None:
+        bus.t_s += late_s
+        put.append((item, value))
+
+    def fetch(signals: tuple[str, ...], decimation: int) -> Trace:
+        t_s = 1e-4 * np.arange(float(armed[0][1]))
+        return Trace(t_s, {"i_q_a": t_s}, {"i_q_a": "A"}, {"period_s": 1e-4})
+
+    drive = object.__new__(RecorderDrive)
+    drive.node = SimpleNamespace(node=1, connection=bus, put=write)  # type: ignore[assignment]
+    drive.may_be_energised = False
+    drive.recorder = SimpleNamespace(arm=lambda *set_up, at_excitation: armed.append(set_up), fetch=fetch)  # type: ignore[assignment]
+    monkeypatch.setattr(RecorderDrive, "_set_mode", lambda self, mode: put.append(mode))
+    recording = Recording(("i_q_a",), 20, 2, Excitation(Shape.STEP, Injection.SPEED, 10.0 * math.pi), 3)
+
+    drive.begin_record(recording, bus.wait)
+    assert armed == [(("i_q_a",), 28, 2, 3)]
+    assert put == [(objects.TARGET_VELOCITY_MRPM, pytest.approx(300_000.0)), Mode.PROFILE_VELOCITY]
+    if late_s > 8e-4:
+        with pytest.raises(DriveTimeout, match="came 0.81 ms after"):
+            drive.finish_record(recording)
+        return
+    trace = drive.finish_record(recording)
+    assert len(trace) == 20 and trace["i_q_a"] == pytest.approx(trace.t_s + late_s) and trace.t_s[0] == 0.0
+    assert trace.meta["late_s"] == pytest.approx(late_s)
 
 
 def test_a_reference_is_written_in_the_middle_of_its_transfer(monkeypatch: pytest.MonkeyPatch) -> None:

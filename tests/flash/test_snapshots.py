@@ -42,8 +42,12 @@ def changed(change) -> str:
         (lambda body: body["identity"].update(vendor="x"), "vendor is text"),
         (lambda body: body["identity"].update(serial=-1), "serial = -1 is below 0"),
         (lambda body: body["identity"].pop("name"), "name is missing"),
+        (lambda body: body["identity"].update(vendor=1 << 32), "vendor = 4.29497e+09 is above"),
+        (lambda body: body["identity"].update(serial=1 << 65), "serial = 3.68935e+19 is above"),
         (lambda body: body.update(identity=[]), "identity is not a table"),
         (lambda body: body.update(signature=None), "signature is"),
+        (lambda body: body.update(signature=1 << 32), "signature = 4.29497e+09 is above"),
+        (lambda body: body.update(node=128), "node = 128 is above 127"),
         (lambda body: body.update(state="half"), "'half' is not one of open, done, restored"),
         (lambda body: body.update(node=1e400), "node = inf is not finite"),
         (lambda body: body.update(entries={}), "holds no entries"),
@@ -60,7 +64,9 @@ def test_every_part_of_a_snapshot_is_checked(change, said):
 
 
 def test_the_text_of_a_snapshot_comes_back():
-    assert parse_snapshot(SNAPSHOT.dumps(), "journal.json") == SNAPSHOT
+    largest = replace(SNAPSHOT, signature=0xFFFFFFFF, identity=replace(IDENTITY, node=127, serial=0xFFFFFFFFFFFFFFFF))
+    for snapshot in (SNAPSHOT, largest):
+        assert parse_snapshot(snapshot.dumps(), "journal.json") == snapshot
 
 
 def test_a_download_sets_a_damaged_journal_aside_and_says_so(tmp_path):

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from enum import IntEnum
 
 import numpy as np
 
@@ -24,23 +23,8 @@ MEASURE_AGAIN = "measure again; if it comes back, `pmsmtool doctor` examines the
 _BYTES = 4  # every channel is recorded as binary32
 
 
-class TraceState(IntEnum):
-    """Object 0x2060:08."""
-
-    IDLE = 0
-    ARMED = 1
-    TRIGGERED = 2
-    COMPLETE = 3
-
-
-class AverageState(IntEnum):
-    """Object 0x2063:03."""
-
-    IDLE = 0
-    RUNNING = 1
-    COMPLETE = 2
-
-
+_RECORDED, _AVERAGED = 3, 2
+"""Complete, as the objects 0x2060:08 and 0x2063:03 say it."""
 _TRIGGER_NOW, _TRIGGER_EXCITATION, _TRIGGER_MOVE = 0, 4, 6
 
 
@@ -99,7 +83,7 @@ class Recorder:
             The CRC-32 of the data is not the drive's.
         """
         node = self._node
-        self._await(objects.TRACE_STATE, TraceState.COMPLETE, "the recorder")
+        self._await(objects.TRACE_STATE, _RECORDED, "the recorder")
         stored, position = node.whole(objects.TRACE_STORED), node.whole(objects.TRACE_POSITION)
         size = stored * len(signals) * _BYTES
         data = node.sdo.upload(*objects.TRACE_DATA, size=size, mode=Mode.BLOCK).data
@@ -202,7 +186,7 @@ class Recorder:
 
     def finish_average(self, signals: Sequence[str]) -> Mapping[str, float]:
         """Wait for the average and return it by signal."""
-        self._await(objects.AVERAGE_STATE, AverageState.COMPLETE, "the average")
+        self._await(objects.AVERAGE_STATE, _AVERAGED, "the average")
         return {name: self._node.get(objects.AVERAGE_MEANS[k]) for k, name in enumerate(signals)}
 
     def halves(self, take: Callable[[int], Mapping[str, float]], periods: int) -> Halves:
