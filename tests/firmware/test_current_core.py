@@ -81,10 +81,13 @@ def test_current_control_equals_the_twin_bit_for_bit(case: str) -> None:
     assert seen & expected == expected
 
 
-def table(kind: int, n_z: int, holes: bool) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], bytes, float]:
+def table(
+    kind: int, n_z: int, holes: bool, first: float = -30.0
+) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], bytes, float]:
     """Axes, tables as the drive sees them, and the look-up bytes."""
     rng = np.random.default_rng(11)
-    torque = np.cumsum(rng.uniform(3, 9, 9)).astype(f) - f(30)
+    torque = np.cumsum(rng.uniform(3, 9, 9)).astype(f)
+    torque += f(first) - (f(0) if first else torque[0])
     second = np.cumsum(rng.uniform(0.8, 2.0, 7)).astype(f) * f(100 if kind == 0 else 0.05)
     volts = np.array([180, 210, 260], dtype=f)[:n_z]
     shape = (len(torque), len(second), n_z)
@@ -103,9 +106,10 @@ def table(kind: int, n_z: int, holes: bool) -> tuple[tuple[np.ndarray, ...], tup
 
 @pytest.mark.parametrize("kind", [0, 1])
 @pytest.mark.parametrize("n_z", [1, 3])
-@pytest.mark.parametrize("holes", [False, True])
-def test_lookup_equals_the_twin_in_both_formats(kind: int, n_z: int, holes: bool) -> None:
-    axes, tables, lut_int16, lsb = table(kind, n_z, holes)
+@pytest.mark.parametrize(("holes", "first"), [(False, -30.0), (True, -30.0), (False, 0.0)])
+def test_lookup_equals_the_twin_in_both_formats(kind: int, n_z: int, holes: bool, first: float) -> None:
+    """Between the nodes, on them, beyond both ends, at no torque or speed, and under a link that has collapsed."""
+    axes, tables, lut_int16, lsb = table(kind, n_z, holes, first)
     lut_float = b"".join(part.tobytes() for part in (*axes, *tables))
     descriptor = {"lut.n_x": 9, "lut.n_y": 7, "lut.n_z": n_z, "lut.axis_kind": kind, "lut.lsb_a": lsb}
     seen = 0
@@ -119,6 +123,11 @@ def test_lookup_equals_the_twin_in_both_formats(kind: int, n_z: int, holes: bool
             loop.plant.i = np.zeros(2)
             omega = float(f(rng.uniform(-900, 900)))
             U_dc, tau = float(f(rng.uniform(150, 300))), float(f(rng.uniform(-45, 45)))
+            if k % 3 == 1:
+                tau, omega = float(rng.choice([*axes[0], -axes[0][2], 0.0])), float(rng.choice([omega, 0.0]))
+                U_dc = float(rng.choice(axes[2]))
+            elif k % 3 == 2:
+                U_dc = float(f(rng.uniform(0, 30)))
             m = loop.measurement
             m.i_a = m.i_b = m.i_c = 0.0
             m.theta_e, m.omega_e, m.U_dc = 0.1, omega, U_dc
@@ -133,6 +142,30 @@ def test_lookup_equals_the_twin_in_both_formats(kind: int, n_z: int, holes: bool
             seen |= live.flags
     assert seen & FLAG_EDGE
     assert bool(seen & FLAG_NO_POINT) == holes
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_destroyed_axis_leaves_the_current_within_the_table(axis: int) -> None:
+    """Nodes in disorder, as after a flipped bit: no weight outside 0 to 1, so no current beyond the corners'."""
+    axes, tables, _, _ = table(0, 3, False)
+    lut = b"".join(part.tobytes() for part in (*axes, *tables))
+    values = tuned(field_weakening__mode=1) | {
+        "lut.n_x": 9, "lut.n_y": 7, "lut.n_z": 3, "lut.axis_kind": 0, "lut.format": 1, "motor.I_max_apk": 100.0,
+    }  # fmt: skip
+    loop = Loop(core(), values, omega=0, lut=lut)
+    assert loop.lut is not None
+    words, first = np.frombuffer(loop.lut, dtype=f), (0, 9, 16)[axis]
+    words[first + 1 : first + len(axes[axis]) - 1] = axes[axis][1:-1][::-1] + (0.0, 0.0, 70.0)[axis]
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        m = loop.measurement
+        m.i_a = m.i_b = m.i_c = 0.0
+        m.theta_e, m.omega_e, m.U_dc = 0.1, rng.uniform(0, 900), rng.uniform(150, 300)
+        loop.reference.mode, loop.reference.tau_ref = MODE_TORQUE, rng.uniform(-45, 45)
+        loop.binding.library.pmsm_step(loop.state, loop.params, loop.lut, m, loop.reference, loop.output)
+        live = loop.state.live
+        assert tables[0].min() <= live.i_d_req <= tables[0].max()
+        assert abs(live.i_q_req) <= np.abs(tables[1]).max()
 
 
 LIMITED_TORQUE = 0.01
