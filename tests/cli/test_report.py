@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.cli.main import run as program
-from pmsmtool.cli.report import find_browser, print_page
+from pmsmtool.cli.report import LIMIT_S, QUIET, find_browser, print_page
 from pmsmtool.commissioning import report_page
 from pmsmtool.commissioning.design_stages import lut_stage, tune_stage
 from pmsmtool.design.design_file import load_design
@@ -25,6 +26,8 @@ from pmsmtool.design.loops.open_loops import open_loops
 from pmsmtool.design.loops.sampled_loop import margins
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, IdentificationError
+from pmsmtool.identification.value_verdict import value_facts
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.report.junit import junit_xml
 from pmsmtool.report.verdict import Verdict
 from pmsmtool.resources import data_folder
@@ -289,3 +292,30 @@ def test_the_page_as_pdf(made: Path) -> None:
     assert program(["report", str(made), "--pdf", "-q"]) == 0
     assert (made / "report.pdf").read_bytes().startswith(b"%PDF-")
     (made / "report.pdf").unlink()
+
+
+@pytest.mark.chain
+@pytest.mark.skipif(find_browser() is None, reason="no browser on this computer")
+def test_on_a_phone_no_part_is_wider_than_the_screen(made: Path, tmp_path: Path) -> None:
+    """In a frame of 390 px; before, the hidden heads of the tables made the page 478 to 564 px wide."""
+    run = RunDirectory(shutil.copytree(made, tmp_path / "run"))
+    estimate = Estimate(3.6, 0.004, 0.06, "ohm", T_c=25.0, method="multi-level DC, asymptotic slope")
+    values = [{**value_facts("R_s_ohm", estimate), "accepted": True}]
+    run.add(Stage("identify", "pass", 1.0, values=values))
+    (tmp_path / "report.html").write_text(report_page.report_page(run.path), encoding="utf-8")
+    (tmp_path / "phone.html").write_text(
+        '<iframe id="phone" src="report.html" style="width:390px;height:800px;border:0"></iframe><pre id="out"></pre>'
+        '<script>document.getElementById("phone").onload = event => {'
+        "const page = event.target.contentDocument.documentElement;"
+        'document.getElementById("out").textContent = `${page.scrollWidth} ${page.clientWidth}`};</script>',
+        encoding="utf-8",
+    )
+    command = [
+        str(find_browser()), *QUIET, "--no-sandbox", f"--user-data-dir={tmp_path}/profile", "--window-size=800,900",
+        "--allow-file-access-from-files", "--virtual-time-budget=20000", "--dump-dom",
+    ]  # fmt: skip
+    page = (tmp_path / "phone.html").as_uri()
+    seen = subprocess.run([*command, page], capture_output=True, text=True, timeout=LIMIT_S, check=True).stdout
+    found = re.search(r'<pre id="out">(\d+) (\d+)</pre>', seen)
+    assert found is not None, seen[-500:]
+    assert int(found[1]) <= int(found[2]) <= 390
