@@ -315,6 +315,7 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
         except Exception as second:  # whatever it is, what ended the chain outranks it
             out.warn(f"the report could not be written: {type(second).__name__}: {second}")
         raise
+    out.status("writing the report ...")
     write_report(run)
     found = _show(run, out, begun)
     from pmsmtool.errors import ExitCode

@@ -56,9 +56,11 @@ def doctor_command(bus: BusOptions, out: Output, find_bitrate: bool, listen_s: f
     data, lines, failed = result
     out.result("doctor", data, lines)
     if failed:
+        rate = "`pmsmtool doctor --find-bitrate` listens at every usual bit rate"
         raise BusError(
-            failed, where=" ".join(str(v) for v in (bus.interface, bus.channel) if v), hint="see the lines above"
-        )
+            failed, where=" ".join(str(v) for v in (bus.interface, bus.channel) if v),
+            hint=rate if "bit rate" in failed else "see the lines above",
+        )  # fmt: skip
 
 
 def _examined(bus: BusOptions, find_bitrate: bool, listen_s: float) -> tuple[dict[str, Any], list[str], str]:
@@ -73,7 +75,14 @@ def _examined(bus: BusOptions, find_bitrate: bool, listen_s: float) -> tuple[dic
     if find_bitrate:
         rates = examination.find_bitrate(bus.interface, bus.channel, listen_s=listen_s)
         data["bitrates"] = {str(rate): {"frames": n, "error_frames": e} for rate, (n, e) in rates.items()}
-        lines += [_rate_line(rate, n, e) for rate, (n, e) in rates.items()]
+        lines += [f"{rate:>8} bit/s  {n} frames, {e} error frames" for rate, (n, e) in rates.items()]
+        heard = [rate for rate, (n, e) in rates.items() if n and not e]
+        lines += [f"PASS  the bus runs at {rate} bit/s: give -b {rate}" for rate in heard]
+        if not heard:
+            lines.append(
+                "no bit rate was heard without errors: switch a node on, it sends when it starts; "
+                "then look at the termination (60 ohm between CAN_H and CAN_L) and for swapped wires"
+            )
     elif configured.get("interface") is not None:
         with bus.connect() as connection:
             bitrate = bus.bitrate or _number(configured.get("bitrate"))
@@ -122,11 +131,6 @@ def _set_up_lines(interface: str | None) -> list[str]:
 def _finding_lines(result: Examination) -> list[str]:
     lines = [f"{verdict:<4}  {text}" for verdict, text in result.findings]
     return [*lines, f"controller state {result.state}"] if result.state else lines
-
-
-def _rate_line(rate: int, frames: int, errors: int) -> str:
-    verdict = "PASS" if frames and not errors else "FAIL" if errors else "    "
-    return f"{verdict:<4}  {rate:>8} bit/s  {frames} frames, {errors} error frames"
 
 
 def _number(value: Any) -> int | None:

@@ -106,6 +106,7 @@ def prove_command(
         )
     record = run.read()
     run.write(_with_consents(record, [asdict(given) for given in consents]))
+    out.status("writing the report ...")
     write_report(run)
     _show(run, stage, out)
     if stage.status != "pass":

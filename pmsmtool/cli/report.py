@@ -66,7 +66,7 @@ def report_command(run: Path, path: Path | None, anonymous: bool, junit: bool, p
 
         write_file(path, junit_xml(asdict(RunDirectory(run).read()), found))
     else:
-        out.status("calculating the predictions and drawing the figures ...")
+        out.status("writing the report ...")
         write_file(path, report_page(run))
     data = {"file": path, "verdict": found.word, "simulated": found.simulated, "reasons": found.lines, "ended": ended}
     if pdf:

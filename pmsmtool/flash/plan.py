@@ -119,7 +119,8 @@ class Plan:
             for r in rows
         ]
         equal = len(self.entries) - len(rows)
-        lines.append(f"{len(rows)} of {len(self.entries)} objects change, {equal} hold their value already")
+        held = "1 holds its value" if equal == 1 else f"{equal} hold their value"
+        lines.append(f"{len(rows)} of {len(self.entries)} objects change, {held} already")
         return [*lines, *self.left_out()]
 
     def after_lines(self, *, store: bool) -> list[str]:

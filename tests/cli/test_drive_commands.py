@@ -116,6 +116,7 @@ def test_doctor_passes_on_a_good_bus(tool: Tool) -> None:
 def test_doctor_names_the_wrong_bit_rate(tool: Tool) -> None:
     code, out, err = tool("-b", "250000", "doctor", channel="interior-2k2?nv=:memory:&bitrate=500000")
     assert code == 3 and "wrong bit rate" in out and "wrong bit rate" in err
+    assert "try:    `pmsmtool doctor --find-bitrate` listens" in err
 
 
 @pytest.mark.chain
@@ -123,6 +124,8 @@ def test_doctor_finds_the_bit_rate(tool: Tool) -> None:
     found = loaded(tool("doctor", "--find-bitrate", "--json", channel="interior-2k2?nv=:memory:&bitrate=250000"))
     good = [rate for rate, counts in found["bitrates"].items() if counts["frames"] and not counts["error_frames"]]
     assert good == ["250000"]
+    _, out, _ = tool("doctor", "--find-bitrate", channel="interior-2k2?nv=:memory:&bitrate=250000")
+    assert out.splitlines()[-1] == "PASS  the bus runs at 250000 bit/s: give -b 250000" and "FAIL" not in out
 
 
 # ---- parameters -------------------------------------------------------------------------------------------

@@ -32,6 +32,7 @@ from pmsmtool.machine.profile import machine_path
 from pmsmtool.measurement.capabilities import examine
 from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import Stage
 from pmsmtool.sim.channel import parse_channel
 from tests.foreign.data_sheets import GUARDING, Row, copley, epos4, write_eds
@@ -94,6 +95,15 @@ def test_commission_rehearses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         error = run("commission", *option, "--yes").exception
         assert isinstance(error, NotAvailable) and "identify: needs" in str(error) and "torque mode" in str(error)
     assert run("commission", "--eds", "x.eds", "--resume", "runs/1").exit_code == 2
+
+
+def test_the_file_of_the_reference_drive_is_no_makers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, the rehearsal moved the machine and ended with 'parameter image: 0 bytes, the scalars alone take 372'."""
+    monkeypatch.chdir(tmp_path)
+    file = data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds"
+    outcome = run("commission", "interior-2k2", "--eds", str(file), "--yes")
+    assert isinstance(outcome.exception, ConfigError) and "reference drive" in outcome.exception.what
+    assert "--sim MACHINE" in outcome.exception.hint and not Path("runs").exists()
 
 
 def test_a_rehearsal_knows_nothing_of_an_earlier_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.drive_maps.drive_map import REFERENCE_VENDOR
+from pmsmtool.errors import ConfigError
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.families import family_of, laws_of, modes_of, units_of
@@ -194,9 +196,15 @@ def unheld_of(file: str, machine_file: MachineFile) -> tuple[str, ...]:
     Raises
     ------
     ConfigError
-        As ``file_rows.read_makers_objects``.
+        As ``file_rows.read_makers_objects``; or the file is that of the reference drive, which is simulated itself.
     """
-    return ForeignDrive(read_makers_objects(file), set_up_of(machine_file)).unheld
+    objects = read_makers_objects(file)
+    if objects.stored(0x1018, 1) == REFERENCE_VENDOR:
+        raise ConfigError(
+            "the file is that of the reference drive, no other maker's", where=file,
+            hint="give MACHINE as --sim MACHINE: that is the reference drive with this motor",
+        )  # fmt: skip
+    return ForeignDrive(objects, set_up_of(machine_file)).unheld
 
 
 def _within(objects: MakersObjects, set_up: SetUp) -> SetUp:
