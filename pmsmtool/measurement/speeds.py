@@ -41,6 +41,9 @@ PUSH_END_SHARE, SLOW_PUSH_SHARE = 0.9, 0.5
 PUSH_REACHED = 0.4
 """Part of its speed that a push must get to: beside a dead time of 8 R I the current came in the last eighth of it, and
 a flux linkage of half its value, told at 1 % of the speed limit, led the run into the voltage limit."""
+SECOND_PUSH, FAR = (1.5, 0.6), 0.6
+"""Current of the push that tells friction, of the first one that the shaft answered: less where that one went far, of
+what the pushes aim at."""
 PUSH_TRIES = 4
 """Pushes in either direction, each of twice the time of the one before."""
 SPEED_LOOP_RAD_S = 25.0
@@ -173,26 +176,38 @@ class SpeedStage:
         return psi, torque_per_ampere(pole_pairs, psi) / rate
 
     def _acceleration_per_ampere(self, target: float, pole_pairs: int) -> float:
-        """Return the acceleration per ampere (rad/s2/A), from pushes that grow until the shaft answers."""
+        """Return the acceleration per ampere beyond friction (rad/s2/A), from pushes that grow until the shaft answers.
+
+        A second push, of another current, tells what friction took of both.
+        """
         current, seconds = FIRST_SHARE * self.limits.I_test_apk, FIRST_S
         for _ in range(9):
-            decimation = max(1, round(seconds / (256 * self.drive.period_s)))
-            push = self._push(current, 256, decimation, pole_pairs)
-            change = _change(push["omega_e_rad_s"]) / pole_pairs
-            self._push(-current, 256, decimation, pole_pairs)
-            if abs(change) > 0.15 * target:
-                # from the current that flowed: a slow loop, or a dead time, lets it rise late
-                return abs(change / _change(self._gained(push)[1]))
+            change, gained = self._there_and_back(current, seconds, pole_pairs)
+            if change > 0.15 * target:
+                times = SECOND_PUSH[0 if change < FAR * target else 1]
+                other, gained_then = self._there_and_back(times * current, seconds, pole_pairs)
+                # friction takes some of it, or nothing
+                return max((other - change) / (gained_then - gained), change / gained)
             if current < 0.4 * self.limits.I_test_apk:
                 current *= 2.0
             else:
-                seconds *= min(4.0, 0.5 * target / max(abs(change), 1e-3 * target))
+                seconds *= min(4.0, 0.5 * target / max(change, 1e-3 * target))
         raise refuse(
             "E_EXCITATION",
             "the shaft does not move under a torque pulse",
             stage="speed run",
             likely="a locked shaft, a brake that is closed, or an encoder that does not count",
         )
+
+    def _there_and_back(self, i_q_a: float, seconds: float, pole_pairs: int) -> tuple[float, float]:
+        """Push and pull; return the speed (rad/s) that the push added, and the integral of its current (A s).
+
+        The current is the one that flowed: a slow loop, or a dead time, lets it rise late.
+        """
+        decimation = max(1, round(seconds / (256 * self.drive.period_s)))
+        push = self._push(i_q_a, 256, decimation, pole_pairs)
+        self._push(-i_q_a, 256, decimation, pole_pairs)
+        return abs(_change(push["omega_e_rad_s"]) / pole_pairs), abs(_change(self._gained(push)[1]))
 
     def _gained(self, push: Trace) -> tuple[Array, Array]:
         """Return the integral of a push's q current (A s), and what the drive's speed estimate shows of it.
