@@ -68,12 +68,13 @@ class Envelope:
         if self.acceleration_rad_s2 is None:
             gain = "the speed gained until then is not known (no inertia is given)"
         else:
-            gain = f"until then full torque adds up to {rpm_from_rad_s(self.acceleration_rad_s2 * OFF_S):.3g} rpm"
+            gained = float(f"{rpm_from_rad_s(self.acceleration_rad_s2 * OFF_S):.3g}")
+            gain = f"until then full torque adds up to {gained:g} rpm"
         travel = "not limited" if math.isinf(self.travel_rad) else f"{math.degrees(self.travel_rad):.4g} deg (mech)"
         energy = "not limited" if math.isinf(self.energy_j) else f"{self.energy_j:.4g} J"
         return [
             f"current   at most {format_current(self.i_max_apk)}",
-            f"speed     at most {rpm:.4g} rpm",
+            f"speed     at most {float(f'{rpm:.4g}'):g} rpm",
             f"travel    {travel}",
             f"energy    {energy} in the winding",
             f"duration  at most {self.duration_s:.4g} s",

@@ -431,7 +431,7 @@ def test_the_envelope_says_what_a_failure_adds_in_speed() -> None:
     acceleration = largest_acceleration(machine, 4.0)
     assert acceleration == pytest.approx(1125.0)
     line = replace(ENVELOPE, acceleration_rad_s2=acceleration).lines()[5]
-    assert "voltage off after 0.5 s" in line and "adds up to 5.37e+03 rpm" in line
+    assert "voltage off after 0.5 s" in line and "adds up to 5370 rpm" in line
     salient = largest_acceleration(replace(machine, L_q_h=0.05), 4.0)
     assert salient == pytest.approx(1176.7, rel=1e-3), "its reluctance torque at some 20 degrees"
     assert largest_acceleration(replace(machine, J_kgm2=None), 4.0) is None
