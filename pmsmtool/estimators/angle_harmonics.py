@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import legendre
+from numpy.polynomial.legendre import Legendre, legvander
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -96,10 +96,8 @@ def fast_part(t_s: Array, theta: Array) -> int:
 
 
 def _smooth(t_s: Array, theta: Array) -> tuple[Array, Array]:
-    x = 2.0 * (t_s - t_s[0]) / (t_s[-1] - t_s[0]) - 1.0
-    fit = legendre.legfit(x, theta, DEGREE)
-    speed = legendre.legval(x, legendre.legder(fit)) * 2.0 / (t_s[-1] - t_s[0])
-    return np.asarray(legendre.legval(x, fit)), np.asarray(speed)
+    fit = Legendre.fit(t_s, theta, DEGREE)
+    return np.asarray(fit(t_s)), np.asarray(fit.deriv()(t_s))
 
 
 def angle_harmonics(coastings: Sequence[tuple[Array, Array]]) -> AngleHarmonics:
@@ -116,7 +114,7 @@ def angle_harmonics(coastings: Sequence[tuple[Array, Array]]) -> AngleHarmonics:
         return AngleHarmonics()
     turns = min(float(np.ptp(theta)) for _, theta in parts) / (2.0 * math.pi)
     smooth = [_smooth(t, theta) for t, theta in parts]
-    bases = [np.linalg.qr(legendre.legvander(np.linspace(-1.0, 1.0, len(t)), DEGREE))[0] for t, _ in parts]
+    bases = [np.linalg.qr(legvander(np.linspace(-1.0, 1.0, len(t)), DEGREE))[0] for t, _ in parts]
     left = np.concatenate([_without(basis, theta) for basis, (_, theta) in zip(bases, parts, strict=True)])
     lowest = math.ceil(DEGREE / turns)  # slower ones are the polynomial's
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ctypes
 import json
 import math
+import re
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from benchmarks.default_governor import draw
 from pmsmtool.cli.main import cli
 from pmsmtool.design.lookup import design as lookup_design
 from pmsmtool.design.lookup.design import LookupDesign, LookupRequest, design_table
-from pmsmtool.design.lookup.file import lut_values, lut_words, table_csv, table_facts, table_npz
+from pmsmtool.design.lookup.file import lut_values, lut_words, table_csv, table_facts, table_npz, table_parameters
 from pmsmtool.design.lookup.grid import (
     InterpolationError,
     StoredFormat,
@@ -411,6 +412,20 @@ def test_a_flux_table_does_not_pretend_to_know_iron_loss() -> None:
     assert np.array_equal(design.table.i_d_a, design_table(source, rated, request, 0.08).table.i_d_a)
 
 
+def test_a_flux_table_says_by_how_much_it_is_off() -> None:
+    """In volts, of the order of R i, and as a share of the limit."""
+    source = load_machine_file(PROFILES / "mtpv-test.toml")
+    V = 0.92 * source.inverter.V_max_v
+    design = design_table(source, ratings(source, V), LookupRequest("flux", 7, 7), 0.08)
+    (note,) = (note for note in design.notes if "contains no resistance" in note)
+    table = design.table
+    at, over, percent, unused = (float(x) for x in re.findall(r"(?:at|up to|\() ?([0-9.e+-]+) ?(?:V|%|N m)", note))
+    drop = source.machine.R_s_ohm * float(np.nanmax(np.hypot(table.i_d_a, table.i_q_a)))
+    assert at == pytest.approx(V, rel=1e-3) and 0.3 * drop < over < 2.0 * drop
+    assert percent == pytest.approx(100.0 * over / at, rel=0.06)
+    assert 0.0 <= unused < 0.05 * float(table.torque_nm[-1])
+
+
 # -- files and command ---------------------------------------------------------------------------------------
 
 
@@ -426,6 +441,12 @@ def test_files_hold_every_cell_and_the_same_bytes(tmp_path: Path) -> None:
     for name in ("i_d_a", "i_q_a", "achieved_torque_nm", "binding", "margin_v", "margin_i", "margin_torque_nm"):
         assert arrays[name].shape == shape
     assert json.loads(str(arrays["meta"]))["content"].startswith("sha256:")
+    lines_of = {name.split("_")[0]: len(arrays[name]) for name in arrays if name.startswith("mtp")}
+    assert lines_of == {"mtpa": 11, "mtpv": 11}
+    assert "mtpv_speed_rpm" in arrays and "mtpa_speed_rpm" not in arrays, "a largest torque per ampere has no speed"
+    back = table_parameters(arrays, "lut.npz")
+    values, tables = lut_values(design.table, design.stored)
+    assert (back.values, back.tables) == (values, tables)
     lines = table_csv(design.table).splitlines()
     assert lines[0].startswith("torque_nm,speed_rpm,i_d_a") and lines[0].endswith("binding")
     assert lines[1].startswith("N m,rpm,A,A,N m,V,A")

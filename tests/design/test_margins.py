@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -158,6 +159,28 @@ def test_assumptions_and_bad_ranges_are_told() -> None:
     assert sum("assumed" in note for note in tolerance_box(source).notes) == 7
     with pytest.raises(ConfigError, match="box"):
         tolerance_box(source, U_dc_v=(300.0, 200.0))
+
+
+def test_what_a_data_sheet_leaves_open() -> None:
+    """Without deviations, limits or a range of the link; a reference temperature below a cold start's."""
+    source = load_machine_file(PROFILES / "jercic-2017.toml")
+    source = replace(source, std={}, systematic={}, limits=replace(source.limits, T_winding_max_c=None))
+    box, U_dc = tolerance_box(source), source.inverter.U_dc_v
+    assert {name: box.factors[name].std for name in box.factors} == pytest.approx(
+        {"R_s_ohm": 0.03, "L_d_h": 0.05, "L_q_h": 0.05, "psi_f_wb": 0.02, "J_kgm2": 0.05}
+    )
+    assert box.encoder_rad.half_width == pytest.approx(1.959964 * math.radians(1.0))
+    assert box.U_dc_v == pytest.approx((0.95 * U_dc, 1.05 * U_dc))
+    assert box.T_winding_c == (-20.0, 155.0)
+    cold = replace(source, machine=replace(source.machine, T_ref_c=-40.0))
+    assert tolerance_box(cold).T_winding_c[0] == tolerance_box(cold).T_magnet_c[0] == -40.0
+
+
+def test_a_factor_that_nobody_measured_stays_between_a_fifth_and_five() -> None:
+    box = tolerance_box(load_machine_file(PROFILES / "jercic-2017.toml"))
+    wild = replace(box, factors={"R_s_ohm": replace(box.factors["R_s_ohm"], std=50.0)})
+    column = wild.draw(100, seed=1, block=0).column("R_s_ohm")
+    assert column.min() == 0.2 and column.max() == 5.0
 
 
 # -- headroom ------------------------------------------------------------------------------------------------

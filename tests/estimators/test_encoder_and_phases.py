@@ -14,7 +14,7 @@ from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.phase_check import check_pairs, check_phases, over_phases
 from pmsmtool.estimators.refusals import REFUSALS, refuse
 from pmsmtool.estimators.resistance import ResistanceResult
-from pmsmtool.estimators.sensor_mismatch import without_mismatch
+from pmsmtool.estimators.sensor_mismatch import SensorMismatch, widened, without_mismatch
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
@@ -235,6 +235,38 @@ def test_sensors_that_differ_a_little_are_measured_and_corrected() -> None:
         true = without_mismatch(shown, found, angle)
         assert abs(d - 3.0) > 5e-3
         assert (true["i_d_a"][0], true["i_q_a"][0]) == pytest.approx((3.0, 0.2), abs=1e-3)
+
+
+def test_resistances_of_pairs_are_those_of_the_true_currents() -> None:
+    """Along a vector with phase a idle the sensors of b and c show the current: half of a's gain less, beyond it."""
+    gains = (1.014, 0.99, 0.996)
+    shown = pairs((2.0, 2.0, 2.0), gains=gains)
+    along = shown["i_d_a"] * (1.0 - 0.5 * np.repeat(np.array(gains) - 1.0, 2))
+    found = check_pairs(trace(**{**shown.signals, "i_d_a": along}), NOISE, STEP)
+    assert found.resistance_ohm == pytest.approx((2.0, 2.0, 2.0), rel=3e-4)  # 1.4 % apart as shown
+    assert max(found.resistance_ohm) - min(found.resistance_ohm) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("gains", "std", "corrected"),
+    [
+        ((0.0019, -0.0019, 0.0), 1e-5, False),
+        ((0.0021, -0.0012, -0.0009), 1e-5, True),
+        ((0.0012, -0.0021, 0.0009), 5e-4, True),
+        ((0.0012, -0.0021, 0.0009), 5.5e-4, False),  # not by four standard deviations
+    ],
+)
+def test_a_mismatch_is_corrected_where_it_is_large_and_sure(
+    gains: tuple[float, float, float], std: float, corrected: bool
+) -> None:
+    mismatch = SensorMismatch(gains, std)
+    assert mismatch.corrected == corrected
+    assert mismatch.spread == pytest.approx(max(gains) - min(gains))
+    doubt = math.hypot(0.05 * mismatch.spread, std) if corrected else 0.0
+    assert mismatch.doubt == pytest.approx(doubt)
+    R = Estimate(-2.0, 1e-3, 0.01, "ohm")
+    assert widened(R, None) is R
+    assert widened(R, mismatch).std == pytest.approx(math.hypot(1e-3, 2.0 * doubt))
 
 
 LEGS = tuple(2.0 * math.pi / 3.0 * k for k in range(3))

@@ -133,6 +133,34 @@ def test_fluxes_and_inductances_of_a_saturated_machine(swing: float) -> None:
 
 
 @pytest.mark.chain
+@pytest.mark.parametrize("I_apk", [9.0, 40.0])
+def test_inductances_for_the_machine_file_are_those_of_the_largest_torque(I_apk: float) -> None:
+    """Of the rated current, or of the largest one that the map knows."""
+    found = plain()
+    current = min(I_apk, found.radius_a)
+    angle = np.linspace(0.5 * math.pi, math.pi, 2001)
+    psi_d, psi_q = MACHINE.flux(current * np.cos(angle), current * np.sin(angle))
+    best = angle[np.argmax(psi_d * current * np.sin(angle) - psi_q * current * np.cos(angle))]
+    i_d, i_q, h = current * math.cos(best), current * math.sin(best), 1e-3
+    psi_d, psi_q = MACHINE.flux(i_d, i_q)
+    truth = {
+        "L_d_h": (MACHINE.flux(i_d + h, i_q)[0] - MACHINE.flux(i_d - h, i_q)[0]) / (2 * h),
+        "L_q_h": (MACHINE.flux(i_d, i_q + h)[1] - MACHINE.flux(i_d, i_q - h)[1]) / (2 * h),
+        "L_q_app_h": psi_q / i_q,
+        "L_d_app_h": (psi_d - PSI_F) / i_d,
+    }
+    rows = found.at_rated_current(4, I_apk)
+    assert set(rows) == set(truth)
+    for name, estimate_of in rows.items():
+        assert estimate_of.value == pytest.approx(float(truth[name]), rel=0.02), name  # 0.7 %
+        assert math.hypot(estimate_of.i_d_apk, estimate_of.i_q_apk) == pytest.approx(current)
+        assert estimate_of.i_d_apk == pytest.approx(i_d, rel=0.02)
+        assert 0.0 < estimate_of.std < 0.02 * estimate_of.value
+        systematic = math.hypot(found.systematic_flux, found.systematic_current)
+        assert estimate_of.systematic == pytest.approx(systematic * estimate_of.value)
+
+
+@pytest.mark.chain
 def test_the_motion_shows_the_flux_of_the_magnets_when_nothing_else_does() -> None:
     """A wrong anchor is contradicted by a rotor that swings over 46 degrees: chi-square says so."""
     facts = pulses(0.8)[0].meta

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from benchmarks.mechanics_accuracy import realisation
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.shaft.mechanics import (
     NOTED,
     RIPPLE_MOST,
     MechanicsResult,
     estimate_mechanics,
+    mean_inertia,
     require_useful,
 )
 from pmsmtool.estimators.shaft.model import Run
@@ -125,6 +127,19 @@ def test_errors_lie_in_their_intervals_and_within_the_limits() -> None:
             inside.append(abs(value.value - true) <= 1.96 * value.std)
         assert found.chi2 < 1.25
     assert sum(inside) >= 10
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("direction", [1, -1])
+def test_an_inertia_by_means_alone_is_near_and_says_how_near(direction: int) -> None:
+    traces = run_of(np.random.default_rng(3), (J, B, TAU_C))
+    if direction < 0:
+        traces = [replace(t, signals={**t.signals, "theta_M_rad": -t["theta_M_rad"]}) for t in traces]
+    found = mean_inertia(traces, lambda i_d, i_q: PER_A * i_q, 0.03, direction)
+    assert found is not None and found.value == pytest.approx(J, rel=0.02)  # 0.3 %
+    assert found.std == pytest.approx(0.05 * found.value) and found.n == len(traces)
+    assert found.systematic == pytest.approx(SensorTolerance().inertia * found.value)
+    assert mean_inertia(traces, lambda i_d, i_q: -PER_A * i_q, 0.03, direction) is None, "it turns against its torque"
 
 
 @pytest.mark.chain

@@ -14,12 +14,16 @@ from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, Verdi
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import (
+    R_MEASURED,
     Copper,
     ResistanceResult,
+    at_the_test,
     estimate_resistance,
+    settled_levels,
     tail_models,
     unsettled,
 )
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, draw, inverter_shape, level_sequence
 
@@ -334,6 +338,35 @@ def test_a_few_levels_that_move_are_told_apart() -> None:
     second[3] += 0.05 * float(np.max(trace["u_d_v"]))
     moving = replace(trace, signals={**trace.signals, "u_d_second_v": second})
     assert list(np.flatnonzero(unsettled(moving, noise_of(d, 0)))) == [3]
+
+
+def with_signals(trace: Trace, **signals: np.ndarray) -> Trace:
+    units = {**trace.units, **dict.fromkeys(signals, "1")}
+    return replace(trace, signals={**trace.signals, **signals}, units=units)
+
+
+def test_up_to_a_quarter_of_the_levels_may_be_left_out() -> None:
+    rng = np.random.default_rng(13)
+    d = replace_inverter(draw(1, rng))
+    trace = levels_of(d, 0, rng)
+    n, noise = len(trace), noise_of(d, 0)
+    assert settled_levels(trace, noise) == (trace, 0)
+    for count, left_out in ((1, 1), (n // 4, n // 4), (n // 4 + 1, 0)):
+        moved = (np.arange(n) < count).astype(float)
+        found, out = settled_levels(with_signals(trace, moved=moved), noise)
+        assert (out, len(found)) == (left_out, n - left_out)
+        assert found["i_d_a"] == pytest.approx(trace["i_d_a"][left_out:])
+    flagged = {"moved": np.eye(n)[0] + np.eye(n)[1], "flagged": np.eye(n)[1]}
+    found, out = settled_levels(with_signals(trace, **flagged), noise)
+    assert out == 1 and found["flagged"][0] == 1.0, "a limit is no motion: the estimator names it"
+
+
+def test_loops_have_R_as_it_was_measured_where_nobody_knows_its_temperature() -> None:
+    measured = Estimate(2.0, 1e-3, 0.0, "ohm")
+    unknown, known = replace(measured, value=1.8), replace(measured, value=1.8, T_c=40.0)
+    assert at_the_test({"R_s_ohm": unknown, R_MEASURED: measured})["R_s_ohm"] is measured
+    assert at_the_test({"R_s_ohm": known, R_MEASURED: measured})["R_s_ohm"] is known
+    assert at_the_test({"R_s_ohm": unknown}) == {"R_s_ohm": unknown}
 
 
 def test_the_low_levels_may_settle_more_slowly_than_those_that_make_R() -> None:

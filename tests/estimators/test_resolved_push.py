@@ -70,6 +70,16 @@ def _mirrored(trace: Trace) -> Trace:
     return replace(trace, signals={k: v if k in even else -np.asarray(v) for k, v in trace.signals.items()})
 
 
+def test_a_push_shows_its_acceleration_its_lag_and_its_current() -> None:
+    """A lag of 5 ms behind a shaft that gains 900 rad/s a second is 4.5 rad/s; backwards the other way."""
+    forward = push(5.0)
+    for trace, sign in ((forward, 1.0), (_mirrored(forward), -1.0)):
+        blocks = push_blocks(trace, T_S, PAIRS)
+        assert blocks.rate == pytest.approx(60.0 * 5.0 * PAIRS, rel=1e-3)
+        assert blocks.lag == pytest.approx(-sign * OBSERVER_S * 900.0, rel=1e-3)
+        assert blocks.i_q == pytest.approx(float(np.mean(trace["i_q_a"])), rel=1e-9)
+
+
 @pytest.mark.parametrize("incremental", [1.0, 0.6])
 def test_the_whole_push_gives_resistance_flux_and_apparent_inductance(incremental: float) -> None:
     found = solved(swing(incremental=incremental))

@@ -182,6 +182,16 @@ def test_an_old_angle_looks_like_a_late_sample() -> None:
     assert old.value_s - fresh.value_s == pytest.approx(2e-6, rel=1e-6)
 
 
+def test_the_prediction_keeps_rising_past_the_end_of_the_zero_vectors() -> None:
+    """With the least slope of 0.7 where the ripple turns back, and as the ripple says before."""
+    shown = shown_instant(_run(0.0, 0.0), 0.4, 0.1, MODULATION, 1.0)
+    assert shown is not None
+    slope = np.diff(shown.predicted_s, axis=0) / (np.diff(INSTANTS) * T_S)[:, None]
+    late = np.array(INSTANTS[1:]) > 0.12
+    assert np.all(slope[late] >= 0.7 - 1e-9) and np.any(np.isclose(slope[late], 0.7)) and np.max(slope) < 1.5
+    assert np.any(slope[~late] < 0.7)
+
+
 def test_too_few_pairs_show_nothing() -> None:
     rows = _run(0.0, 0.0)
     few = CoastingPairs(rows.w, rows.u_d, rows.i_d, rows.i_q, rows.v_d, rows.v_q, list(rows.pairs)[:4])

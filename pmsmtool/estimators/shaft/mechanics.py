@@ -264,7 +264,7 @@ def mean_inertia(
     runs: Sequence[Trace],
     torque: Torque,
     scale_std: float,
-    direction: int = 1,
+    direction: int,
     tolerance: SensorTolerance | None = None,
 ) -> Estimate | None:
     """Return the inertia alone, from a regression of the mean torques on the mean motions of half traces.
