@@ -116,7 +116,7 @@ def identify(level: str, drive: MachineFile, path: Path, speed: float, *, given:
         pole_pairs = round(found.estimates["pole_pairs"].value)
         pushing = TorqueDrive(connection, 1, drive_map=family)
         pushed = told_by(push_by_torque, pushing, envelope, drive.inverter if given else None, pole_pairs=pole_pairs)
-        return PulseResult({**found.estimates, **pushed.estimates}, pushed.missing, {})
+        return PulseResult({**found.estimates, **pushed.estimates}, pushed.missing)
 
 
 def told_by(
@@ -153,7 +153,7 @@ def _by_injection(drive: RecordingDrive) -> PulseResult:
     T_s, T_ref, U_dc = nameplate.inverter.T_s, nameplate.machine.T_ref_c, nameplate.inverter.U_dc_v
     found = evaluate(traces, T_s, T_ref_c=T_ref, U_dc_v=U_dc).whole()
     estimates: dict[str, Estimate] = found.estimates()
-    return PulseResult({name: estimates[name] for name in OF_THE_MACHINE}, {}, {})
+    return PulseResult({name: estimates[name] for name in OF_THE_MACHINE}, {})
 
 
 def judged(level: str, seed: int, speed: float, *, given: bool = True) -> dict[str, Any]:

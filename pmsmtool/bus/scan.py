@@ -38,7 +38,7 @@ class FoundNode:
         return self.device_type is not None and self.device_type & 0xFFFF == 402
 
 
-def find_nodes(connection: Connection, seconds: float = LISTEN_S) -> list[FoundNode]:
+def find_nodes(connection: Connection) -> list[FoundNode]:
     """Ask every node id for its device type and return who answered or was heard, by node id."""
     types: dict[int, int | None] = {}
     states: dict[int, NmtState] = {}
@@ -57,7 +57,7 @@ def find_nodes(connection: Connection, seconds: float = LISTEN_S) -> list[FoundN
     try:
         for node in NODES:
             connection.send(0x600 + node, _DEVICE_TYPE_REQUEST)
-        connection.wait(seconds)
+        connection.wait(LISTEN_S)
     finally:
         for cob_id, callback in subscriptions:
             connection.unsubscribe(cob_id, callback)

@@ -481,10 +481,7 @@ class SdoChannel:
 
     def _result(self, attempt: Attempt, data: bytes, tries: int) -> Transfer:
         self.retries += tries - 1
-        return Transfer(
-            attempt.index, attempt.sub, data, attempt.mode, tries,
-            attempt.retransmitted, attempt.discarded, tuple(attempt.notes),
-        )  # fmt: skip
+        return Transfer(data, attempt.mode, tries, attempt.retransmitted, attempt.discarded, tuple(attempt.notes))
 
     def _where(self, attempt: Attempt) -> str:
         return f"node {self.node}, 0x{attempt.index:04X}:{attempt.sub:02X}"

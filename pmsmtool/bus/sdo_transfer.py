@@ -48,8 +48,6 @@ class Transfer:
 
     Attributes
     ----------
-    index, sub : int
-        The object.
     data : bytes
         Bytes read or written.
     mode : Mode
@@ -64,8 +62,6 @@ class Transfer:
         One line per retry and fall-back.
     """
 
-    index: int
-    sub: int
     data: bytes
     mode: Mode
     tries: int = 1

@@ -57,14 +57,11 @@ class Emergency:
         Error register 0x1001.
     detail : bytes
         Manufacturer's five bytes, fewer when the message was short.
-    time_s : float
-        On the bus clock.
     """
 
     code: int
     register: int
     detail: bytes
-    time_s: float
 
     def __str__(self) -> str:
         text = f"emergency {self.code:#06x} ({error_text(self.code)}), register {self.register:#04x}"
@@ -260,7 +257,7 @@ class Supervision:
         if len(data) >= 2:
             code = int.from_bytes(data[:2], "little")
             register = data[2] if len(data) > 2 else 0
-            self.emergencies.append(Emergency(code, register, data[3:8], self._connection.clock.now()))
+            self.emergencies.append(Emergency(code, register, data[3:8]))
             if len(self.emergencies) > EMERGENCIES_MAX:
                 # One that ends the work is not pushed out by others before it was looked at.
                 harmless = (k for k, one in enumerate(self.emergencies) if one.code >> 12 not in STOPPING_CLASSES)

@@ -151,13 +151,10 @@ class Horizon:
         None: not finitely determined below ``HORIZON_CAP``.
     eps : float or None
         Tightening of the steady-state row; None without that row.
-    omega_e : float
-        Electrical speed (rad/s).
     """
 
     k_max: int | None
     eps: float | None
-    omega_e: float
 
     @property
     def by_tolerance(self) -> bool:
@@ -218,12 +215,12 @@ def horizon(
     # Horizons are short where they exist: search upwards in growing steps, then bisect.
     while test.excess(high) > REDUNDANT:
         if high == cap:
-            return Horizon(None, eps, omega_e)
+            return Horizon(None, eps)
         low, high = high, min(2 * high + 1, cap)
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if test.excess(middle) <= REDUNDANT else (middle, high)
-    return Horizon(high, eps, omega_e)
+    return Horizon(high, eps)
 
 
 class _Redundancy:

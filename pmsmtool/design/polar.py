@@ -258,9 +258,7 @@ class CdmGains:
     K_I12: float
 
 
-def cdm_gains(
-    machine: SurfaceMachine, V_a: float, delta: float, V_max: float, T_s: float, tau_s: float, gamma: float = CDM_GAMMA
-) -> CdmGains:
+def cdm_gains(machine: SurfaceMachine, V_a: float, delta: float, V_max: float, T_s: float, tau_s: float) -> CdmGains:
     """Return the gains of the coefficient diagram method at one operating point, (24)-(37).
 
     a1 = gamma / tau, a0 = gamma / tau^2. Near zero voltage the d axis is slowed down by (37):
@@ -273,7 +271,7 @@ def cdm_gains(
     tau_12 = 0.1 / level * T_s if level < 0.01 else tau_s
 
     def pair(tau: float, gain: float) -> tuple[float, float]:
-        return (gamma / tau * machine.L_s_h - machine.R_s_ohm) / gain, gamma / tau**2 * machine.L_s_h / gain
+        return (CDM_GAMMA / tau * machine.L_s_h - machine.R_s_ohm) / gain, CDM_GAMMA / tau**2 * machine.L_s_h / gain
 
     K_P21, K_I21 = pair(tau_s, cosine)
     K_P12, K_I12 = pair(tau_12, -V_a * cosine)

@@ -46,41 +46,25 @@ def controllable(machine: SurfaceMachine, point: Equilibrium) -> bool:
     return bool(values[1] > RANK_TOLERANCE * values[0])
 
 
-@dataclass(frozen=True, slots=True)
-class ConditionMap:
-    """Conditioning over speed (rows, rpm) and torque (columns, N m).
-
-    Attributes
-    ----------
-    speed_rpm, torque_nm : ndarray, shape (n,), (m,)
-        Axes.
-    condition : ndarray, shape (n, m)
-        V_max / V_a, infinite at zero voltage, NaN out of reach.
-    """
-
-    speed_rpm: Array
-    torque_nm: Array
-    condition: Array
-
-    def share_above(self, limit: float) -> float:
-        """Return the share of the reachable points whose condition number exceeds a limit."""
-        reachable = self.condition[~np.isnan(self.condition)]
-        return float(np.mean(reachable > limit))
-
-
 def condition_map(
     machine: SurfaceMachine, V_max: float, speed_rpm: Sequence[float] | Array, torque_nm: Sequence[float] | Array
-) -> ConditionMap:
-    """Return the conditioning over a grid; every point is the steady state of least loss."""
-    speeds, torques = np.asarray(speed_rpm, dtype=np.float64), np.asarray(torque_nm, dtype=np.float64)
-    shape = (len(speeds), len(torques))
-    condition = np.full(shape, np.nan)
-    for k, rpm in enumerate(speeds):
-        for n, torque in enumerate(torques):
+) -> Array:
+    """Return V_max / V_a in the steady states of least loss, shape (n, m).
+
+    Infinite without voltage, NaN out of reach.
+    """
+    condition = np.full((len(speed_rpm), len(torque_nm)), np.nan)
+    for k, rpm in enumerate(speed_rpm):
+        for n, torque in enumerate(torque_nm):
             found = conditioning(machine, float(rpm) * RPM * machine.pole_pairs, float(torque), V_max)
             if found.reachable:
                 condition[k, n] = found.condition
-    return ConditionMap(speeds, torques, condition)
+    return condition
+
+
+def share_above(condition: Array, limit: float) -> float:
+    """Return the share of the reachable points whose condition number exceeds a limit."""
+    return float(np.mean(condition[~np.isnan(condition)] > limit))
 
 
 def stability_map(

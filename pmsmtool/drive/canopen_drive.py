@@ -212,20 +212,6 @@ class CanopenDrive:
         """
         return self.take(Recording(signals, samples, decimation, excitation, pretrigger), self.wait)
 
-    def record_move(self, signals: Sequence[str], samples: int, decimation: int, move: ProfileMove) -> Trace:
-        """Move by the drive's own position loop; record from the period in which the reference begins to move.
-
-        Raises
-        ------
-        NotAvailable
-            No profile position mode, or more than the recorder holds.
-        DriveFault
-            The drive tripped, as when the following error left its window.
-        DriveTimeout
-            It does not take the set-point, or does not begin to move.
-        """
-        return self.take(Recording(signals, samples, decimation, move=move), self.wait)
-
     def take(self, recording: Recording, wait: Callable[[float], None]) -> Trace:
         """Prepare, begin and finish a record; ``wait`` lets time pass. An excitation ends however this ends.
 

@@ -28,14 +28,11 @@ class Noise:
         Standard deviation of one sample of i_d or i_q (A).
     offset_d_a, offset_q_a : float
         Mean of the zero-current trace (A).
-    n : int
-        Samples per axis.
     """
 
     sigma_a: float
     offset_d_a: float
     offset_q_a: float
-    n: int
 
 
 def estimate_noise(trace: Trace) -> Noise:
@@ -72,4 +69,4 @@ def estimate_noise(trace: Trace) -> Noise:
             likely="a converter coarser than its noise, or a current measurement that is switched off",
             hint="check that the current measurement works, and the range of its converter",
         )
-    return Noise(sigma, means[0], means[1], n)
+    return Noise(sigma, means[0], means[1])

@@ -149,8 +149,6 @@ class ResistanceResult:
         Plateau of that error, without the device slope that R contains (V).
     drift : float
         Relative change of R over the sweep that the temperature reading does not explain.
-    hardness : float
-        V_dead/(R I): above 3 the class that is hard to separate.
     verdict : Verdict
         ``warn`` when the fit is above its chi-square limit.
     copper : Copper
@@ -162,7 +160,6 @@ class ResistanceResult:
     curve: InverterCurve
     V_dead_v: float
     drift: float
-    hardness: float
     verdict: Verdict
     copper: Copper = Copper()
 
@@ -278,7 +275,6 @@ def estimate_resistance(
         curve=curve_from_levels(i, v_w - R_w * i - v_0 - V_link * np.sign(i) * fall, math.sqrt(3.0) / 2.0),
         V_dead_v=V_dead,
         drift=drift,
-        hardness=hardness,
         verdict=verdict,
         copper=copper,
     )

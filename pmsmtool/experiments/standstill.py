@@ -116,14 +116,17 @@ def record_zero_current(drive: Drive) -> Trace:
     return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "U_dc_v", "flags"), NOISE_SAMPLES))
 
 
-def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace:
+PERIODS = 512
+"""Of the means of one vector, in two halves."""
+
+
+def hold_phase_vectors(drive: Drive, i_a: float) -> Trace:
     """Hold a small vector at 0, 120 and 240 degrees and return one row of means for each.
 
     The drive is enabled on entry and holds zero current on return. It is off between two vectors: what its controller
     has wound up against an open phase must not meet the other two.
     """
     names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
-    half = max(1, periods // 2)
     rows: list[dict[str, float]] = []
     times = []
     elapsed = 0.0
@@ -134,7 +137,7 @@ def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace
         drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
         for _ in range(TRIES):
             elapsed += settle(drive, i_a, arrival_s=ARRIVAL_LIMIT_S)
-            first, second, _ = drive.halves(names, half)
+            first, second, _ = drive.halves(names, PERIODS // 2)
             moved = abs(second["theta_m_rad"] - first["theta_m_rad"]) >= REST_RAD
             if not moved:
                 break
@@ -147,7 +150,6 @@ def hold_phase_vectors(drive: Drive, i_a: float, *, periods: int = 512) -> Trace
 
 PAIR_SHARES = (0.15, 0.30)
 """Currents of the three pairs of phases, of the largest: more is no stable position for a reluctance machine."""
-PAIR_PERIODS = 512
 PAIR_ARRIVED = 0.005
 """Distance of either half of a window from the set-point, relative, that asks for another window: beside a large dead
 time the controller of the parameter set is slow, and 2 % below its set-point it made 12 % of a slope."""
@@ -167,7 +169,7 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s
         time of a turn (s).
     """
     names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
-    half = PAIR_PERIODS // 2
+    half = PERIODS // 2
     rows: list[dict[str, float]] = []
     times: list[float] = []
     elapsed = 0.0
@@ -189,7 +191,7 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s
             times[len(rows) :] = [elapsed]
             row = {name: 0.5 * (first[name] + second[name]) for name in names if name != "theta_m_rad"}
             rows.append({**row, "moved": float(moved)})
-            elapsed += PAIR_PERIODS * drive.period_s
+            elapsed += PERIODS * drive.period_s
     drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
     return table(rows, times, i_command_a=i_a, idle=["a", "a", "b", "b", "c", "c"])
 
@@ -210,14 +212,7 @@ def turn_and_look(drive: Drive, i_a: float, start_rad: float, end_rad: float) ->
     return table(rows, [0.0, seconds], i_command_a=i_a)
 
 
-def settle(
-    drive: Drive,
-    i_d_a: float,
-    *,
-    limit_s: float = REST_LIMIT_S,
-    arrival_s: float = REST_LIMIT_S,
-    near_a: float = 0.0,
-) -> float:
+def settle(drive: Drive, i_d_a: float, *, arrival_s: float = REST_LIMIT_S, near_a: float = 0.0) -> float:
     """Wait until the current has arrived and the shaft stands still, or a limit is over; return the time (s).
 
     A current that has not arrived is waited for as long as the shaft moves, and ``arrival_s`` at least. A flag ends it:
@@ -226,7 +221,7 @@ def settle(
     periods = max(1, round(0.25 * LOOK_S / drive.period_s))
     waited = 0.0
     last = math.inf
-    while waited < limit_s:
+    while waited < REST_LIMIT_S:
         drive.wait(LOOK_S)
         waited += LOOK_S
         now = drive.average(("theta_m_rad", "i_d_a", "i_q_a", "flags"), periods)

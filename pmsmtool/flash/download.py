@@ -68,8 +68,8 @@ class Outcome:
         Whether the drive keeps the set over a reset, as seen after one.
     crc : int or None
         CRC-32 of the drive's whole set; None where it has none.
-    retries, discarded : int
-        Transfers repeated, frames thrown away.
+    retries : int
+        Transfers repeated.
     starts : int
         2 when the node was reset in between and everything started over.
     refused : mapping of str to str
@@ -81,7 +81,6 @@ class Outcome:
     stored: bool
     crc: int | None
     retries: int
-    discarded: int
     starts: int
     refused: Mapping[str, str] = field(default_factory=dict)
 
@@ -437,12 +436,11 @@ class Download:
 
     def _outcome(self, written: int, *, starts: int, stored: bool) -> Outcome:
         crc = self._parameters.crc_active if self.node.map.staging else None
-        sdo = self.node.sdo
         whole = self._parameters
         refused = dict(whole.refused) if isinstance(whole, WholeDrive) else {}
         equal = len(self.plan.entries) - written
         written -= len(refused)
-        return Outcome(written, equal, stored, crc, sdo.retries, sdo.discarded, starts, refused)
+        return Outcome(written, equal, stored, crc, self.node.sdo.retries, starts, refused)
 
 
 @contextlib.contextmanager

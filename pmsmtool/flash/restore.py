@@ -228,7 +228,7 @@ def nothing_written(node: DriveNode, plan: Plan) -> Outcome:
     """Return the outcome of a plan without a change that is left alone; the drive is only read."""
     parameters = DriveParameters(node)
     crc = parameters.crc_active if node.map.staging else None
-    return Outcome(0, len(plan.entries), parameters.is_stored(), crc, node.sdo.retries, node.sdo.discarded, 0)
+    return Outcome(0, len(plan.entries), parameters.is_stored(), crc, node.sdo.retries, 0)
 
 
 def names_of(snapshot: Snapshot) -> tuple[str, ...]:

@@ -71,13 +71,10 @@ class PulseResult:
         By the keys of a machine file.
     missing : mapping of str to str
         What was asked and cannot be told, with the reason.
-    traces : mapping of str to Trace
-        What was recorded.
     """
 
     estimates: Mapping[str, Estimate]
     missing: Mapping[str, str]
-    traces: Mapping[str, Trace]
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,10 +158,9 @@ def pulse_result(
     tolerance = tolerance or SensorTolerance()
     if tolerance.bridge_difference_v is not None:
         tolerance = tolerance_on(tolerance, facts.U_dc_v or math.inf)
-    recorded, traces = traces, calibrated_traces(traces, tolerance)
+    traces = calibrated_traces(traces, tolerance)
     if facts.kind == Method.RECORDER:
-        result = _by_recorder(traces, facts, tolerance, copper or Copper(), alpha_psi_per_k)
-        return replace(result, traces=recorded)
+        return _by_recorder(traces, facts, tolerance, copper or Copper(), alpha_psi_per_k)
     estimates: dict[str, Estimate] = {}
     if SUPPLY_LEVELS in traces:
         R = resistance_by_supply(traces[SUPPLY_LEVELS], tolerance=tolerance)
@@ -179,7 +175,7 @@ def pulse_result(
         pushed, missing = _by_torque(traces, replace(facts, pole_pairs=pole_pairs), tolerance, inverter, psi_f_wb)
         estimates |= pushed
         missing = {name: why for name, why in missing.items() if name not in estimates}
-    return PulseResult(estimates, missing, recorded)
+    return PulseResult(estimates, missing)
 
 
 def _by_recorder(
@@ -201,7 +197,7 @@ def _by_recorder(
     except IdentificationError as error:
         missing["J_per_psi"] = error.what
     reasons = not_told(estimates, pushes)
-    return PulseResult(without(estimates, reasons), missing | reasons, traces)
+    return PulseResult(without(estimates, reasons), missing | reasons)
 
 
 def _by_torque(

@@ -80,7 +80,7 @@ def vendor_machine(known: tuple[MachineFile, str] | None, found: Mapping[str, Es
         What completes them.
     """
     if known is None:
-        return CompletedMachine(None, (), (), ("no machine file is written: it needs ratings and the inverter, too",))
+        return CompletedMachine(None, (), ("no machine file is written: it needs ratings and the inverter, too",))
     given_file, source = known
     table = {key: e for key, e in found.items() if key != PHASE_INDUCTANCE}
     notes = []
@@ -109,7 +109,7 @@ def vendor_machine(known: tuple[MachineFile, str] | None, found: Mapping[str, Es
         provenance={"source": f"{SOURCE}: {', '.join(table) or 'nothing'}; {source}: {', '.join(given)}"},
         simulation={},
     )
-    return CompletedMachine(machine, tuple(table), given, tuple(notes))
+    return CompletedMachine(machine, given, tuple(notes))
 
 
 def coarse_notes(tuning: VendorTuning, answers: Mapping[str, VendorAnswer]) -> list[str]:

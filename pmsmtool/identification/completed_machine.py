@@ -36,14 +36,13 @@ class CompletedMachine:
     ----------
     machine : MachineFile or None
         None when values are lacking.
-    measured, given : tuple of str
-        Keys by where their values come from.
+    given : tuple of str
+        Keys whose values were not measured.
     notes : tuple of str
         What was done to the values.
     """
 
     machine: MachineFile | None
-    measured: tuple[str, ...]
     given: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
@@ -71,8 +70,7 @@ def completed_machine(known: MachineFile | None, found: Mapping[str, Estimate], 
         Where ``known`` comes from.
     """
     if known is None:
-        told = {"psi_f_wb", "pole_pairs", "R_s_ohm"} & set(found)
-        return CompletedMachine(None, tuple(sorted(told)), ())
+        return CompletedMachine(None, ())
     values, notes = _at_reference(known, found)
     psi = _flux_of_the_run(known, values.get("psi_f_wb"))
     for ratio, key in PER_PSI.items():
@@ -97,7 +95,7 @@ def completed_machine(known: MachineFile | None, found: Mapping[str, Estimate], 
         provenance={"source": f"measured: {', '.join(measured) or 'nothing'}; {source}: {', '.join(given)}"},
         simulation={},
     )
-    return CompletedMachine(machine, measured, given, (*notes, *more))
+    return CompletedMachine(machine, given, (*notes, *more))
 
 
 def _at_reference(known: MachineFile, found: Mapping[str, Estimate]) -> tuple[dict[str, Estimate], tuple[str, ...]]:

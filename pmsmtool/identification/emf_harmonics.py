@@ -84,11 +84,10 @@ class EmfHarmonic:
 
 @dataclass(frozen=True, slots=True)
 class EmfHarmonics:
-    """Harmonics at the temperature of the run, the flux linkage there (Wb), and the largest speed (rad/s)."""
+    """Harmonics at the temperature of the run, the flux linkage there (Wb)."""
 
     harmonics: tuple[EmfHarmonic, ...]
     psi_wb: float
-    omega_rad_s: float
     T_c: float
 
     def estimates(self) -> dict[str, Estimate]:
@@ -184,8 +183,7 @@ def harmonics_of(
             value, std, dof = fitted[k]
             by_L = math.hypot(*(abs(doubt[k][0] - value) for doubt in doubts))
             harmonics.append(EmfHarmonic(order + sense, value, math.hypot(std, by_L), tolerance.flux * abs(value), dof))
-    fastest = max(abs(row.w) for row in rows)
-    return EmfHarmonics(tuple(harmonics), circuit.psi_wb, fastest, flux.psi_measured.T_c)
+    return EmfHarmonics(tuple(harmonics), circuit.psi_wb, flux.psi_measured.T_c)
 
 
 def _corners(L_d: Estimate, L_q: Estimate) -> tuple[tuple[float, float], tuple[float, float]]:

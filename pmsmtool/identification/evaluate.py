@@ -22,7 +22,7 @@ from pmsmtool.estimators.injection.inductance import FrameAhead, InductanceResul
 from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstant
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.noise import Noise, estimate_noise
-from pmsmtool.estimators.phase_check import PairCheck, PhaseCheck, check_pairs, check_phases, over_phases
+from pmsmtool.estimators.phase_check import PairCheck, check_pairs, check_phases, over_phases
 from pmsmtool.estimators.resistance import (
     R_MEASURED,
     Copper,
@@ -70,7 +70,6 @@ class Evaluation:
 
     noise: Noise
     encoder_noise_rad: float = 0.0
-    phases: PhaseCheck | None = None
     mismatch: SensorMismatch | None = None
     pairs: PairCheck | None = None
     resistance: ResistanceResult | None = None
@@ -217,7 +216,7 @@ def evaluate(
     traces = with_equal_sensors(traces, mismatch)
     result = Evaluation(noise, _encoder_noise(traces["zero_current"]), mismatch=mismatch)
     if "phase_vectors" in traces:
-        result = replace(result, phases=check_phases(traces["phase_vectors"], result.noise))
+        check_phases(traces["phase_vectors"], result.noise)
     if "first_turn" in traces:
         check_encoder_counts(traces["first_turn"])
     refused = dict(ended or {})

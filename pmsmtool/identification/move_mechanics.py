@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.axis.move import RESTING
-from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.shaft.inertia_ratio import estimate_ratios
 from pmsmtool.identification.by_pulses import either_reading
 from pmsmtool.machine.parameters import Estimate
@@ -29,9 +28,7 @@ LEAST_SAMPLES = 60
 """Samples of half a move: the estimator makes 24 blocks of them."""
 
 
-def move_mechanics(
-    trace: Trace, *, pole_pairs: int, undecided: bool, tolerance: SensorTolerance | None = None
-) -> dict[str, Estimate]:
+def move_mechanics(trace: Trace, *, pole_pairs: int, undecided: bool) -> dict[str, Estimate]:
     """Return ``J_per_psi`` (kg m2/Wb) and ``tau_c_per_psi`` (N m/Wb) of recorded moves.
 
     Parameters
@@ -42,15 +39,13 @@ def move_mechanics(
         Of the machine.
     undecided : bool
         Whether no source says if the drive's amperes are peak or rms; they were read as rms.
-    tolerance : SensorTolerance, optional
-        Declared sensor tolerances.
 
     Raises
     ------
     IdentificationError
         Too few moves, or they do not tell inertia from friction.
     """
-    found = estimate_ratios(halves_of_moves(trace), pole_pairs=pole_pairs, tolerance=tolerance)
+    found = estimate_ratios(halves_of_moves(trace), pole_pairs=pole_pairs)
     if undecided:
         found = {name: either_reading(estimate) for name, estimate in found.items()}
     return {name: replace(estimate, method=METHOD) for name, estimate in found.items()}

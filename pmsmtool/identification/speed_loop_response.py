@@ -84,8 +84,6 @@ class SpeedLoop:
         Shown current per acceleration: J over the torque per shown ampere.
     reference_scale : float
         Speed that came, over the one that was asked for.
-    misfit : float
-        Residual over the noise at a held speed, root mean square of position's and current's.
     """
 
     K_p_per_J: float
@@ -94,7 +92,6 @@ class SpeedLoop:
     late_s: float
     amps_per_rad_s2: float
     reference_scale: float
-    misfit: float
 
 
 def phase_margin_rad(K_p_per_J: float, K_i_per_J: float, lag_s: float) -> float:
@@ -227,7 +224,7 @@ def fit_speed_loop(record: StepRecord, first: SpeedLoop | None = None) -> SpeedL
     parts = model.fitted(plain)[:2]
     weights = tuple(max(1.0, float(np.sqrt(np.mean(part**2)))) for part in parts)
     plain = _solve(model, plain, weights)
-    rest_position, rest_current, amps, scale = model.fitted(plain)
+    *_, amps, scale = model.fitted(plain)
     if not scale > 0.0 or amps == 0.0:
         raise IdentificationError(
             "E_EXCITATION",
@@ -235,10 +232,7 @@ def fit_speed_loop(record: StepRecord, first: SpeedLoop | None = None) -> SpeedL
             likely="a locked shaft or a closed brake, or a speed loop that is not set up",
             hint="free the shaft; run the maker's own set-up first",
         )
-    misfit = math.hypot(*(float(np.sqrt(np.mean(part**2))) for part in (rest_position, rest_current))) / math.sqrt(2.0)
-    return SpeedLoop(
-        math.exp(plain[0]), math.exp(plain[1]), math.exp(plain[2]), float(plain[3]), amps, scale, misfit
-    )  # fmt: skip
+    return SpeedLoop(math.exp(plain[0]), math.exp(plain[1]), math.exp(plain[2]), float(plain[3]), amps, scale)
 
 
 def _weighted(model: _Model, p: Array, weights: Sequence[float]) -> Array:

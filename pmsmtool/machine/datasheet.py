@@ -24,7 +24,6 @@ from pmsmtool.units import RAD_S_PER_RPM, RPM_PER_RAD_S, format_quantity, parse_
 
 Between = Literal["line-line", "phase"]
 Connection = Literal["star", "delta"]
-Kind = Literal["rms", "peak"]
 CommutatedKind = Literal["rms", "peak", "block"]
 """``block``: of block commutation, a direct current through two terminals, a direct voltage between them."""
 Source = Literal["datasheet", "meter", "guess"]
@@ -181,24 +180,18 @@ _TORQUE_UNIT = {"Nm": 1.0, "mNm": 1e-3, "ozin": 0.0070615518, "lbin": 0.11298482
 """N m; ounce- and pound-force inch by 0.45359237 kg * 9.80665 m/s2 * 0.0254 m (exact definitions)."""
 
 
-def _kind(written: str | None, said: Kind | None, text: str) -> Kind:
-    """Rms or peak, from the unit or from the caller, who may not contradict each other."""
-    found: Kind | None = None
-    if written is not None:
-        found = "rms" if written in ("rms", "eff") else "peak"
-    if found is not None and said is not None and found != said:
-        raise ConfigError(f"{text!r} says {found}, but {said} was given beside it", hint="leave one of the two out")
-    kind = found or said
-    if kind is None:
+def _kind(written: str | None, text: str) -> CommutatedKind:
+    """Rms or peak, as the unit says."""
+    if written is None:
         raise ConfigError(
             f"{text!r} does not say whether it is rms or peak",
             likely="the two differ by a factor of 1.414",
             hint=f"write Vrms or Vpk (Arms or Apk for a torque constant) in the unit{_OR_BLOCK}",
         )
-    return kind
+    return "rms" if written in ("rms", "eff") else "peak"
 
 
-def parse_emf_constant(text: str, between: Between | None, kind: Kind | None = None) -> EmfConstant:
+def parse_emf_constant(text: str, between: Between | None) -> EmfConstant:
     """Read a back-EMF constant.
 
     Parameters
@@ -208,8 +201,6 @@ def parse_emf_constant(text: str, between: Between | None, kind: Kind | None = N
         linkage ``0.41Wb``.
     between : {"line-line", "phase"} or None
         Where the voltage is measured; needed for all but a flux linkage and block commutation (the terminals).
-    kind : {"rms", "peak"} or None
-        When the unit does not say it.
 
     Raises
     ------
@@ -229,13 +220,13 @@ def parse_emf_constant(text: str, between: Between | None, kind: Kind | None = N
     if not value > 0.0:
         raise ConfigError(f"{text!r} is no back-EMF constant", hint="write it like 58Vrms/krpm, 0.39Vpks/rad or 0.41Wb")
     if written in ("block", "dc"):
-        if kind is not None or between == "phase":
+        if between == "phase":
             raise ConfigError(f"{text!r} is a direct voltage between two terminals", hint="leave the other word out")
         return EmfConstant(value, "block", "line-line", False, text)
     if between is None:
         where_said = f"add line-line or phase{_OR_BLOCK}"
         raise ConfigError(f"{text!r} does not say where the voltage is measured", hint=where_said)
-    return EmfConstant(value, _kind(written, kind, text), between, False, text)
+    return EmfConstant(value, _kind(written, text), between, False, text)
 
 
 def line_current(text: str) -> float:
@@ -250,28 +241,24 @@ def line_current(text: str) -> float:
     return parse_current(text) if block is None else PEAK_PER_AMPERE["block"] * _scaled(block[1], block[2])
 
 
-def parse_torque_constant(text: str, kind: CommutatedKind | None = None) -> TorqueConstant:
+def parse_torque_constant(text: str) -> TorqueConstant:
     """Read a torque constant: ``1.74Nm/Arms``, ``85mNm/Apk``, ``12 oz-in/Arms``, ``38.5mNm/A block``.
 
     Raises
     ------
     ConfigError
-        Not readable, or neither the unit nor ``kind`` says what the ampere is.
+        Not readable, or the unit does not say what the ampere is.
     """
     value, written = _torque_number(text)
     if written in ("block", "dc"):
-        if kind not in (None, "block"):
-            raise ConfigError(f"{text!r} says block, but {kind} was given beside it", hint="leave one of the two out")
         return TorqueConstant(value, "block", text)
-    if written is None and kind == "block":
-        return TorqueConstant(value, "block", text)
-    if written is None and kind is None:
+    if written is None:
         raise ConfigError(
             f"{text!r} does not say whether the ampere is peak, rms or of block commutation",
             likely="1 Apk makes 1.5 p psi, 1 A block 1.654 p psi, 1 Arms 2.121 p psi",
             hint="write Apk, Arms or 'A block'; with --ke beside it the kind is recognised where the two fit",
         )
-    return TorqueConstant(value, _kind(written, None if kind == "block" else kind, text), text)
+    return TorqueConstant(value, _kind(written, text), text)
 
 
 def torque_constant_by_emf(

@@ -189,17 +189,16 @@ class FluxTables:
 
     Attributes
     ----------
-    forward, inverse : Table
-        psi(i) and i(psi).
+    inverse : Table
+        i(psi).
     struct : FluxMapStruct
-        The same for C.
+        psi(i) and i(psi) for C.
     inverse_error_a : float
         Largest |i(psi(i)) - i| (A) over the nodes and the cell centres of the map.
     inverse_error_rms_a : float
         Its root mean square (A).
     """
 
-    forward: Table
     inverse: Table
     struct: FluxMapStruct
     inverse_error_a: float
@@ -322,7 +321,7 @@ def _build(flux_map: FluxMap) -> FluxTables:
     struct.inverse_cells = pointer(inverse.cells)
     struct.arrays = (*struct.arrays, inverse.cells)
     error = _round_trip(flux_map, struct)
-    return FluxTables(flux_map.forward, inverse, struct, float(error.max()), float(np.sqrt(np.mean(error**2))))
+    return FluxTables(inverse, struct, float(error.max()), float(np.sqrt(np.mean(error**2))))
 
 
 def _round_trip(flux_map: FluxMap, struct: FluxMapStruct) -> Array:

@@ -60,12 +60,12 @@ class FluxMapReport:
     ----------
     det_min_h2 : float
         Smallest determinant of the incremental inductance (H^2); must be positive.
-    L_dd_h, L_qq_h : tuple of float
-        Smallest and largest self inductance of the map (H).
+    L_qq_h : tuple of float
+        Smallest and largest q self inductance of the map (H).
     not_monotonic : int
         Sample points (3 x 3 per cell) where the map does not rise with the current.
-    reciprocity_rms, reciprocity_max : float
-        Distance to the nearest reciprocal map, of the flux range.
+    reciprocity_rms : float
+        Root mean square distance to the nearest reciprocal map, of the flux range.
     curl_max_h : float
         Largest cell mean of d psi_d/d i_q - d psi_q/d i_d (H).
     no_load_angle_rad : float
@@ -79,11 +79,9 @@ class FluxMapReport:
     """
 
     det_min_h2: float
-    L_dd_h: tuple[float, float]
     L_qq_h: tuple[float, float]
     not_monotonic: int
     reciprocity_rms: float
-    reciprocity_max: float
     curl_max_h: float
     no_load_angle_rad: float
     psi_f_wb: float
@@ -147,11 +145,9 @@ def check_flux_map(flux_map: FluxMap) -> FluxMapReport:
     )
     return FluxMapReport(
         det_min_h2=float(det.min()),
-        L_dd_h=(float(jac[0, 0].min()), float(jac[0, 0].max())),
         L_qq_h=(float(jac[1, 1].min()), float(jac[1, 1].max())),
         not_monotonic=int(bad.sum()),
         reciprocity_rms=rms,
-        reciprocity_max=largest,
         curl_max_h=float(np.abs(curl).max()),
         no_load_angle_rad=angle,
         psi_f_wb=psi_f,

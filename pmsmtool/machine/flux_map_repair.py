@@ -42,11 +42,11 @@ class FluxGrid:
         """Nodes without a flux, shape (n_d, n_q)."""
         return ~(np.isfinite(self.psi_d_wb) & np.isfinite(self.psi_q_wb))
 
-    def holes_text(self, most: int = 5) -> str:
-        """Return how many nodes are holes, and the currents of the first ones."""
+    def holes_text(self) -> str:
+        """Return how many nodes are holes, and the currents of the first five."""
         at = np.argwhere(self.holes)
-        places = ", ".join(f"({self.i_d_a[m]:g}, {self.i_q_a[n]:g}) A" for m, n in at[:most])
-        more = f" and {len(at) - most} more" if len(at) > most else ""
+        places = ", ".join(f"({self.i_d_a[m]:g}, {self.i_q_a[n]:g}) A" for m, n in at[:5])
+        more = f" and {len(at) - 5} more" if len(at) > 5 else ""
         return f"{len(at)} of {self.holes.size} nodes are holes: {places}{more}"
 
 

@@ -252,10 +252,9 @@ def _in_order(values: Mapping[str, float]) -> dict[str, float]:
     return {name: float(values[name]) for name in MEASURABLE if name in values}
 
 
-def dump_machine_file(machine_file: MachineFile, *, embed_flux_map: bool = False, comment: str = "") -> str:
+def dump_machine_file(machine_file: MachineFile, *, embed_flux_map: bool = False) -> str:
     """Return the machine file's text: same machine, same bytes, and ``parse_machine`` gives it back.
 
     A map that has no file of its own is always embedded.
     """
-    tables = {"schema": SCHEMA, **machine_tables(machine_file, embed_flux_map=embed_flux_map)}
-    return toml_text(tables, comment=comment)
+    return toml_text({"schema": SCHEMA, **machine_tables(machine_file, embed_flux_map=embed_flux_map)})

@@ -46,13 +46,13 @@ RPM, SETTLED_S = 800.0, 0.2
 HIGH_NM, FAR_NM, BACK_NM = 4.5, 12.0, 1.0
 
 
-def delivered(ratio: float | Array, points: int = 7200) -> Array:
+def delivered(ratio: float | Array) -> Array:
     """Return the fundamental the inverter gives for a demand, both over the linear limit.
 
     The legs of the demand plus the min-max zero sequence are cut at half the link; the fundamental is that of the line
     voltages. An independent statement of what the core's modulation does.
     """
-    theta = 2.0 * math.pi * (np.arange(points) + 0.5) / points
+    theta = 2.0 * math.pi * (np.arange(7200) + 0.5) / 7200
     demand = np.atleast_1d(np.asarray(ratio, dtype=np.float64)) / math.sqrt(3.0)
     legs = np.cos(theta[None, :] - 2.0 * math.pi / 3.0 * np.arange(3)[:, None])
     middle = 0.5 * (legs.max(axis=0) + legs.min(axis=0))
@@ -194,11 +194,10 @@ UNREACHABLE = (
 )
 
 
-def unreachable(law: Controller, seed: int = 0, *, sign: float = 1.0) -> tuple[Held, Response]:
+def unreachable(law: Controller, seed: int = 0) -> tuple[Held, Response]:
     """Return what a law holds when 12 N m are asked for at 800 rpm, and the response, which ends with 1 N m again."""
     torque = steps([(0.0, BACK_NM), (0.06, FAR_NM), (0.16, BACK_NM)])
-    nodes = [(t, sign * value) for t, value in torque]
-    r = run(law, SIMULATION, nodes, [(0.0, sign * RPM)], 0.3, seed=seed)
+    r = run(law, SIMULATION, torque, [(0.0, RPM)], 0.3, seed=seed)
     return held(r, 0.13, 0.16), r
 
 

@@ -28,6 +28,7 @@ from pmsmtool.design.polar_map import (
     controllable,
     design_or_none,
     gain_schedule,
+    share_above,
     stability_map,
 )
 from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, at_most, near
@@ -220,14 +221,14 @@ def controllability(seed: int) -> Reproduction:
         near(
             "share of the reachable area with condition > 10",
             6.6,
-            100 * grid.share_above(10.0),
+            100 * share_above(grid, 10.0),
             "%",
             absolute=0.5,
             where=EXPECTED,
         )
     )
     checks.append(
-        near("share with condition > 100", 0.3, 100 * grid.share_above(100.0), "%", absolute=0.1, where=EXPECTED)
+        near("share with condition > 100", 0.3, 100 * share_above(grid, 100.0), "%", absolute=0.1, where=EXPECTED)
     )
     stability, more = _stability()
     notes = (

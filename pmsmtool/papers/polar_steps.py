@@ -91,10 +91,9 @@ def response(controller: Controller, bench: Bench = SIMULATION, seed: int = 0, *
     return run(controller, bench, torque, [(0.0, sign * RPM)], LEAD_S + END_S, seed=seed)
 
 
-def measured(r: Response, *, mirrored: bool = False) -> TorqueStep:
+def measured(r: Response) -> TorqueStep:
     """Return the measures of such a response."""
-    sign = -1.0 if mirrored else 1.0
-    return torque_step(r, LEAD_S + UP_S, LEAD_S + DOWN_S, sign * LOW_NM, sign * HIGH_NM)
+    return torque_step(r, LEAD_S + UP_S, LEAD_S + DOWN_S, LOW_NM, HIGH_NM)
 
 
 def _row(controller: Controller, m: TorqueStep) -> tuple[str | float, ...]:

@@ -196,8 +196,6 @@ class Outcome:
         Largest voltage after the limiter over V_max.
     final_a : ndarray
         Distance from the target at the end (A).
-    overshoot_a : ndarray
-        Largest distance past the target along the step (A).
     """
 
     settling_s: Array
@@ -205,7 +203,6 @@ class Outcome:
     demand: Array
     applied: Array
     final_a: Array
-    overshoot_a: Array
 
 
 def run_cases(
@@ -215,8 +212,6 @@ def run_cases(
     rows = []
     for case, target, band in zip(cases, targets, bands_a, strict=True):
         response = drive.step(case.rpm, case.start, case.target, duration_s)
-        way = np.asarray(target) - np.asarray(case.start)
-        length = max(float(np.hypot(*way)), 1e-9)
         error = response.i - np.asarray(target)
         rows.append(
             (
@@ -225,7 +220,6 @@ def run_cases(
                 float(np.hypot(*response.demanded.T).max()) / V_max(),
                 float(np.hypot(*response.applied.T).max()) / V_max(),
                 float(np.hypot(*error[-1])),
-                max(0.0, float((error @ way).max()) / length),
             )
         )
     return Outcome(*np.array(rows).T)

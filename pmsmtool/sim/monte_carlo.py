@@ -22,7 +22,7 @@ from pmsmtool.machine.flux_map import FluxScale, ScalableMap
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import open_simulation
-from pmsmtool.sim.kernel import Application, Setup, library
+from pmsmtool.sim.kernel import Setup, library
 from pmsmtool.sim.scenarios import Scenario
 
 Array = NDArray[np.float64]
@@ -73,11 +73,8 @@ class DriveRuns:
         Largest mechanical speed (rad/s).
     u_peak : ndarray
         Largest voltage demanded, behind the limiter, over the DC link.
-    T_winding_peak_c : ndarray
-        Hottest winding (degC).
-    limited, governed, infeasible : ndarray
-        Shares of the periods with the voltage at its limit, with a reference changed by the governor, and with no
-        admissible current at all.
+    infeasible : ndarray
+        Share of the periods with no admissible current at all.
     trip : ndarray of int
         Latched trip as CiA 402 error code, 0 without.
     trip_s : ndarray
@@ -93,9 +90,6 @@ class DriveRuns:
     torque_nm: Array
     omega_peak_rad_s: Array
     u_peak: Array
-    T_winding_peak_c: Array
-    limited: Array
-    governed: Array
     infeasible: Array
     trip: NDArray[np.int64]
     trip_s: Array
@@ -159,7 +153,6 @@ def simulate_many(
     *,
     threads: int | None = None,
     signals: Sequence[int] = (),
-    application: Application = Application.DRIVE,
 ) -> DriveRuns:
     """Run a scenario on many drives, in one call of the kernel.
 
@@ -173,8 +166,6 @@ def simulate_many(
         Threads; one per core when not given. The result does not depend on it.
     signals : sequence of int
         Signals (``signals.Signal``, ``signals.Truth``) recorded of every drive, every ``scenario.decimation`` periods.
-    application : Application
-        The whole drive, or the control core alone.
 
     Raises
     ------
@@ -182,7 +173,7 @@ def simulate_many(
         What cannot be simulated together.
     """
     lib = _library()
-    machine_file, model, periods = open_simulation(machine_file, params, scenario, None, application)
+    machine_file, model, periods = open_simulation(machine_file, params, scenario, None)
     n = len(variations)
     setups = (Setup * n)()
     flux_map = machine_file.flux_map
@@ -211,9 +202,6 @@ def _runs(result: NDArray[Any], periods: int, T_s: float, record: Array) -> Driv
         torque_nm=result["torque"].copy(),
         omega_peak_rad_s=result["omega_peak"].copy(),
         u_peak=result["u_peak"].copy(),
-        T_winding_peak_c=result["T_winding_peak"].copy(),
-        limited=result["limited"] / periods,
-        governed=result["governed"] / periods,
         infeasible=result["infeasible"] / periods,
         trip=result["trip"].astype(np.int64),
         trip_s=np.where(tripped, T_s * result["trip_period"].astype(np.float64), math.nan),

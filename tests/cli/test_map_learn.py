@@ -156,7 +156,7 @@ def test_killed_with_a_changed_gain_the_next_connection_restores(
         monkeypatch.setattr(connection.bus, "_pulled", True)
         raise KeyboardInterrupt
 
-    loop = SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02, 1.0, 1.0)
+    loop = SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02, 1.0)
     monkeypatch.setattr(learn_gains, "fit_speed_loop", lambda *arguments: loop)
     monkeypatch.setattr(learn_gains, "PATTERN", learn_gains.PATTERN[:18])
     monkeypatch.setattr(GuardedDrive, "change", cut)

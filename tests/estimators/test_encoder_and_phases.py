@@ -121,7 +121,7 @@ def vectors(i: float = 0.5, R: float = 1.0, phases: tuple[float, float, float] =
     )
 
 
-NOISE = Noise(0.005, 0.0, 0.0, 2048)
+NOISE = Noise(0.005, 0.0, 0.0)
 
 
 def test_a_healthy_motor_passes() -> None:
@@ -159,9 +159,9 @@ def test_a_motor_without_current_and_a_drive_without_signal_are_told_apart() -> 
     with pytest.raises(IdentificationError, match="E_NOT_CONNECTED"):
         check_phases(small, NOISE)
     with pytest.raises(IdentificationError, match="E_SNR"):
-        check_phases(small, Noise(1.0, 0.0, 0.0, 2048))
+        check_phases(small, Noise(1.0, 0.0, 0.0))
     with pytest.raises(IdentificationError, match="E_CURRENT_SENSOR"):
-        check_phases(vectors_of(0.5), Noise(0.005, 0.2, 0.0, 2048))
+        check_phases(vectors_of(0.5), Noise(0.005, 0.2, 0.0))
 
 
 def vectors_of(command: float) -> Trace:
@@ -199,7 +199,7 @@ def test_unequal_phases_give_the_mean_of_them() -> None:
     """Levels are held with phase a idle: they show the mean of b and c."""
     found = check_pairs(pairs((2.06, 1.98, 1.96)), NOISE, STEP)
     R = Estimate(1.97, 1e-3, 0.01, "ohm", T_c=20.0)
-    levels = ResistanceResult(R, R, STEP, 5.0, 0.0, 1.0, Verdict.PASS)
+    levels = ResistanceResult(R, R, STEP, 5.0, 0.0, Verdict.PASS)
     mean = over_phases(levels, found, SensorTolerance())
     assert mean.R_measured.value == pytest.approx(2.0) and mean.R_s.value == pytest.approx(2.0)
     assert mean.R_s.systematic >= 0.03  # what a pair of phases is off the mean

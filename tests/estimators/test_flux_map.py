@@ -66,7 +66,7 @@ PLANTS: dict[str, Currents] = {"saturated": MACHINE.current, "strange": strange}
 def estimate(traces: Sequence[Trace], *, align: bool = False) -> FluxMapResult:
     facts = traces[0].meta
     frame = Frame(facts["signed_pole_pairs"], facts["offset_rad"], facts["offset_rad"])
-    noise = Noise(SIGMA, 0.0, 0.0, 2048)
+    noise = Noise(SIGMA, 0.0, 0.0)
     return estimate_flux_map(traces, noise, resistance(), frame, MagnetFlux(PSI_F, 0.0), align=align)
 
 

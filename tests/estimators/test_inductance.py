@@ -75,7 +75,7 @@ class Shots:
         return estimate_inductances(
             [self.trace(k, "d", half) for half in HALF_PERIODS],
             [self.trace(k, "q", half) for half in HALF_PERIODS],
-            Noise(d.sigma_dq[k], 0.0, 0.0, 2048),
+            Noise(d.sigma_dq[k], 0.0, 0.0),
             d.R[k],
             frame=_ahead(d, k) if offset else None,
             inverter=InverterCurve(*curve_points(d, k), 0.0) if compensate else None,
@@ -158,7 +158,7 @@ def test_a_rotor_that_does_not_follow_is_no_reason_to_refuse(plain: Shots) -> No
     for k in range(d.n):
         shots = {axis: [plain.trace(k, axis, half) for half in HALF_PERIODS] for axis in "dq"}
         scale = 0.01 * d.L_q[k] / (HALF_PERIODS[0] * d.T_s[k]) ** 2
-        noise, known = Noise(d.sigma_dq[k], 0, 0, 2048), Motion(0.0, 0.02 * scale)
+        noise, known = Noise(d.sigma_dq[k], 0, 0), Motion(0.0, 0.02 * scale)
         result = estimate_inductances(
             shots["d"],
             shots["q"],
@@ -189,7 +189,7 @@ def test_each_axis_is_unmixed_with_the_angle_of_its_own_shots(plain: Shots) -> N
     d, k = plain.drives, 0
     shots = {axis: [plain.trace(k, axis, half) for half in HALF_PERIODS] for axis in "dq"}
     frame = FrameAhead(0.1, -0.2, 1e-4)
-    result = estimate_inductances(shots["d"], shots["q"], Noise(d.sigma_dq[k], 0, 0, 2048), d.R[k], frame=frame)
+    result = estimate_inductances(shots["d"], shots["q"], Noise(d.sigma_dq[k], 0, 0), d.R[k], frame=frame)
     g_d, g_q = 1.0 / result.L_d.value, 1.0 / result.L_q.value
     for axis, angle, (near, far) in (("d", 0.1, (g_d, g_q)), ("q", -0.2, (g_q, g_d))):
         mixed = math.cos(angle) ** 2 * near + math.sin(angle) ** 2 * far
@@ -220,7 +220,7 @@ def test_the_d_axis_may_be_that_of_the_larger_inductance(plain: Shots) -> None:
         return replace(trace, signals={name: trace[swapped.get(name, name)] for name in trace.signals})
 
     result = estimate_inductances(
-        [turned(t) for t in as_d], [turned(t) for t in as_q], Noise(d.sigma_dq[k], 0, 0, 2048), d.R[k]
+        [turned(t) for t in as_d], [turned(t) for t in as_q], Noise(d.sigma_dq[k], 0, 0), d.R[k]
     )
     assert result.L_d.value > 1.2 * result.L_q.value
     assert abs(result.axis_angle_rad) == pytest.approx(abs(d.offset[k]), abs=0.01)
@@ -235,9 +235,7 @@ def test_one_shot_of_an_unknown_delay_is_not_biased_by_it(plain: Shots) -> None:
         for trace in [plain.trace(k, axis, half) for half in HALF_PERIODS]
     ]
     d = plain.drives
-    result = estimate_inductances(
-        shifted[:2], shifted[2:], Noise(d.sigma_dq[k], 0, 0, 2048), d.R[k], frame=_ahead(d, k)
-    )
+    result = estimate_inductances(shifted[:2], shifted[2:], Noise(d.sigma_dq[k], 0, 0), d.R[k], frame=_ahead(d, k))
     assert result.delay == pytest.approx(0.0, abs=0.03)
     assert result.L_d.value == pytest.approx(d.L_d[k], rel=3e-3)
 
@@ -260,7 +258,7 @@ def test_two_frequencies_that_disagree_are_both_reported(plain: Shots) -> None:
     result = estimate_inductances(
         [plain.trace(k, "d", 6), weaker],
         [plain.trace(k, "q", half) for half in HALF_PERIODS],
-        Noise(d.sigma_dq[k], 0, 0, 2048),
+        Noise(d.sigma_dq[k], 0, 0),
         d.R[k],
         frame=_ahead(d, k),
     )
@@ -314,7 +312,7 @@ def test_refusals(plain: Shots, change: Change, reason: str) -> None:
     d = plain.drives
     with pytest.raises(IdentificationError) as caught:
         estimate_inductances(
-            traces, [plain.trace(k, "q", 6)], Noise(d.sigma_dq[k], 0, 0, 2048), d.R[k], frame=FrameAhead(0.0, 0.0, 1e-4)
+            traces, [plain.trace(k, "q", 6)], Noise(d.sigma_dq[k], 0, 0), d.R[k], frame=FrameAhead(0.0, 0.0, 1e-4)
         )
     assert caught.value.reason == reason
 
@@ -332,7 +330,7 @@ def test_what_the_encoder_scatters_is_no_motion_of_the_rotor(plain: Shots) -> No
                 replace(trace, signals={**trace.signals, "theta_M_rad": theta})
                 for trace, theta in zip(traces, noisy, strict=True)
             ]
-        noise = Noise(d.sigma_dq[k], 0, 0, 2048)
+        noise = Noise(d.sigma_dq[k], 0, 0)
         found.append(estimate_inductances(shots["d"], shots["q"], noise, d.R[k], frame=_ahead(d, k)).L_d.value)
     assert found[0] == found[1]
 
@@ -341,7 +339,7 @@ def test_a_short_trace_is_no_excitation(plain: Shots) -> None:
     short = plain.trace(0, "d", 13)
     short = replace(short, t_s=short.t_s[:200], signals={name: values[:200] for name, values in short.signals.items()})
     with pytest.raises(IdentificationError, match="E_EXCITATION"):
-        estimate_inductances([short], [short], Noise(0.01, 0, 0, 2048), 1.0)
+        estimate_inductances([short], [short], Noise(0.01, 0, 0), 1.0)
 
 
 def test_a_bridge_of_unequal_thresholds_is_a_voltage_scale_of_unknown_size(plain: Shots) -> None:
@@ -349,7 +347,7 @@ def test_a_bridge_of_unequal_thresholds_is_a_voltage_scale_of_unknown_size(plain
     d = plain.drives
     k = 0
     shots = {axis: [plain.trace(k, axis, half) for half in HALF_PERIODS] for axis in "dq"}
-    noise = Noise(d.sigma_dq[k], 0, 0, 2048)
+    noise = Noise(d.sigma_dq[k], 0, 0)
     mosfet, igbt = (
         estimate_inductances(shots["d"], shots["q"], noise, d.R[k], frame=_ahead(d, k), tolerance=tolerance).L_d
         for tolerance in (SensorTolerance(), SensorTolerance(U_dc_v=100.0))
@@ -364,7 +362,7 @@ def test_what_depends_on_the_current_acts_at_one_edge_of_each_leg(plain: Shots) 
     d = plain.drives
     k = 0
     shots = {axis: [plain.trace(k, axis, half) for half in HALF_PERIODS] for axis in "dq"}
-    noise = Noise(d.sigma_dq[k], 0, 0, 2048)
+    noise = Noise(d.sigma_dq[k], 0, 0)
     slope = 0.2 * d.R[k]
     i = np.array([0.01, 1.0]) * d.I_r[k]
     held = Motion(0.0, 1.0)  # else the average takes in models whose motion, fitted to noise, shares the slope
@@ -389,7 +387,7 @@ def test_square_waves_that_contradict_the_turning_machine_widen_the_interval(pla
 
     def estimate(instant: ShownInstant) -> InductanceResult:
         shots = {axis: [plain.trace(k, axis, half) for half in HALF_PERIODS] for axis in "dq"}
-        noise = Noise(d.sigma_dq[k], 0, 0, 2048)
+        noise = Noise(d.sigma_dq[k], 0, 0)
         return estimate_inductances(shots["d"], shots["q"], noise, d.R[k], frame=_ahead(d, k), instant=instant)
 
     agrees = estimate(shown(1.0 - fits.delay))
@@ -410,7 +408,7 @@ def _shaken(plain: Shots, wave: Callable[[np.ndarray], np.ndarray]) -> tuple[Ind
         replace(t, signals={**t.signals, "i_d_a": t["i_d_a"] + size * wave(np.arange(len(t), dtype=float))})
         for t in traces
     ]
-    noise, q = Noise(d.sigma_dq[k], 0.0, 0.0, 2048), [plain.trace(k, "q", half) for half in HALF_PERIODS]
+    noise, q = Noise(d.sigma_dq[k], 0.0, 0.0), [plain.trace(k, "q", half) for half in HALF_PERIODS]
     quiet = plain.estimate(k, compensate=False)
     loud = estimate_inductances(shaken, q, noise, d.R[k], frame=_ahead(d, k))
     assert abs(loud.L_d.value - d.L_d[k]) < 3.0 * loud.L_d.std
@@ -473,7 +471,7 @@ def test_iron_loss_and_an_eddy_branch_are_no_inductance(plain: Shots, flux: floa
 
     result = estimate_inductances(
         *([with_eddies(axis, half) for half in HALF_PERIODS] for axis in "dq"),
-        Noise(d.sigma_dq[k], 0.0, 0.0, 2048),
+        Noise(d.sigma_dq[k], 0.0, 0.0),
         d.R[k],
         frame=_ahead(d, k),
         inverter=InverterCurve(*curve_points(d, k), 0.0),

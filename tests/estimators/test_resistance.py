@@ -75,7 +75,7 @@ def levels_of(
 
 
 def noise_of(d: Drives, k: int) -> Noise:
-    return Noise(d.sigma_dq[k], 0.0, 0.0, 2048)
+    return Noise(d.sigma_dq[k], 0.0, 0.0)
 
 
 def summary(

@@ -276,7 +276,9 @@ REACH_ROOM_NM = 0.02
 @pytest.mark.parametrize(("law", "torque"), REACHED, ids=[law.name for law, _ in REACHED])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_torque_out_of_reach_is_cut_and_comes_back(law: Controller, torque: float, sign: float) -> None:
-    held, r = polar_limit.unreachable(law, sign=sign)
+    torque_nm = [(t, sign * nm) for t, nm in steps([(0.0, 1.0), (0.06, 12.0), (0.16, 1.0)])]
+    r = run(law, SIMULATION, torque_nm, [(0.0, sign * 800.0)], 0.3)
+    held = polar_limit.held(r, 0.13, 0.16)
     assert sign * held.torque == pytest.approx(torque, abs=REACH_ROOM_NM)
     assert held.ripple <= 0.01  # N m; 1e-5
     assert sign * r.torque[-1] == pytest.approx(1.0, abs=0.01)

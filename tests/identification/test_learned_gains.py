@@ -19,7 +19,7 @@ P, I = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"  # noqa: E741
 
 
 def loop(a: float, b: float, amps: float = 0.02) -> SpeedLoop:
-    return SpeedLoop(a, b, 2e-3, 1e-3, amps, 1.0, 1.2)
+    return SpeedLoop(a, b, 2e-3, 1e-3, amps, 1.0)
 
 
 def b_of(form: str, gain: int, integral: int) -> float:

@@ -16,7 +16,7 @@ EXACT = SensorTolerance(bridge_threshold_v=0.0)
 
 
 def of(sigma_a: float, *, dead_time_v: float = 2.0, tolerance: SensorTolerance = EXACT) -> Prediction:
-    return predict(Noise(sigma_a, 0.0, 0.0, 2048), LEVELS, 1600, 0.25, 4096, dead_time_v, 80.0, tolerance)
+    return predict(Noise(sigma_a, 0.0, 0.0), LEVELS, 1600, 0.25, 4096, dead_time_v, 80.0, tolerance)
 
 
 def test_a_usual_drive_is_predicted_below_a_third_of_a_percent() -> None:

@@ -179,19 +179,18 @@ def test_deviations_follow_the_source(source):
 
 
 @pytest.mark.parametrize(
-    ("text", "between", "kind", "says"),
+    ("text", "between", "says"),
     [
-        ("60V/krpm", "line-line", None, "does not say whether it is rms or peak"),
-        ("60Vrms/krpm", None, None, "where the voltage is measured"),
-        ("60Vrms/krpm", "phase", "peak", "says rms, but peak"),
-        ("60Vrms/furlong", "phase", None, "no back-EMF constant"),
-        ("0Vrms/krpm", "phase", None, "no back-EMF constant"),
-        ("fast", "phase", None, "no back-EMF constant"),
+        ("60V/krpm", "line-line", "does not say whether it is rms or peak"),
+        ("60Vrms/krpm", None, "where the voltage is measured"),
+        ("60Vrms/furlong", "phase", "no back-EMF constant"),
+        ("0Vrms/krpm", "phase", "no back-EMF constant"),
+        ("fast", "phase", "no back-EMF constant"),
     ],
 )
-def test_a_bad_back_emf_constant_says_why(text, between, kind, says):
+def test_a_bad_back_emf_constant_says_why(text, between, says):
     with pytest.raises(ConfigError) as caught:
-        parse_emf_constant(text, between, kind)
+        parse_emf_constant(text, between)
     assert says in str(caught.value)
 
 

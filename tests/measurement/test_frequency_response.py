@@ -180,7 +180,7 @@ class Pushed(Pushes):
             raise refuse("E_NOT_CONVERGED", "no minimum", stage="mechanics")
         values = [Estimate(value, 0.01 * value, 0.0, unit) for value, unit in
                   ((J, "kg m2"), (1e-3, "N m s"), (0.1, "N m"))]  # fmt: skip
-        return MechanicsResult(*values, (0.0, 0.0, 0.0), 1.0, 1.0, 1.0, True)
+        return MechanicsResult(*values, (0.0, 0.0, 0.0), 1.0, 1.0, True)
 
     def inertia(self) -> Estimate | None:
         J = self.scale_std

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from benchmarks.level_intervals import told_by
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
 from pmsmtool.drive.drive_node import DriveNode, is_safe
@@ -29,6 +28,7 @@ from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import Interrupted, NotAvailable, Partial
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.recorded_push import DELAY_DOUBT, estimate_pushes
+from pmsmtool.identification.by_pulses import PulseResult, pulse_result
 from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
@@ -39,6 +39,8 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
 
 pytestmark = pytest.mark.chain
+
+Pushed = tuple[MappedRecorderDrive, PulseResult, list[Trace]]
 
 ADDED = {
     "u_d_v": (19, "0.1 V"),
@@ -108,17 +110,21 @@ def test_a_drive_that_does_not_have_what_its_map_says_is_no_recorder(tmp_path: P
 
 
 @pytest.fixture(scope="module")
-def pushed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[MappedRecorderDrive, object]]:
+def pushed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pushed]:
     with opened(tmp_path_factory.mktemp("mapped"), completed()) as (connection, found):
         drive = open_for_level(connection, 1, found)
         assert isinstance(drive, MappedRecorderDrive)
         envelope = Envelope(i_max_apk=7.0, speed_max_rad_s=280.0, duration_s=600.0)
-        yield drive, told_by(swing_and_record, drive, envelope)
+        traces: dict[str, Trace] = {}
+        facts = swing_and_record(drive, envelope, traces.__setitem__, lambda text: None)
+        yield drive, pulse_result(traces, facts), list(traces.values())
         assert is_safe(drive.node.state())
         drive.close()
 
 
-def test_resistance_flux_and_inductance_come_from_scaled_integers(pushed: tuple[MappedRecorderDrive, object]) -> None:
+def test_resistance_flux_and_inductance_come_from_scaled_integers(
+    pushed: Pushed,
+) -> None:
     """0.01 A and 0.1 V, a row every few periods: the truth is within every interval."""
     result = pushed[1]
     machine = load_machine_file(machine_path("interior-2k2"))
@@ -128,23 +134,23 @@ def test_resistance_flux_and_inductance_come_from_scaled_integers(pushed: tuple[
         "frame_offset_rad": 0.0,
     }  # fmt: skip
     for name, value in truth.items():
-        estimate = result.estimates[name]  # type: ignore[attr-defined]
+        estimate = result.estimates[name]
         assert abs(estimate.value - value) <= total_half_width(estimate), name
-    assert not result.missing  # type: ignore[attr-defined]
+    assert not result.missing
 
 
-def test_a_memory_of_fewer_rows_takes_them_further_apart(pushed: tuple[MappedRecorderDrive, object]) -> None:
-    traces = pushed[1].traces  # type: ignore[attr-defined]
-    for trace in traces.values():
+def test_a_memory_of_fewer_rows_takes_them_further_apart(
+    pushed: Pushed,
+) -> None:
+    for trace in pushed[2]:
         assert len(trace) == 256  # of 341 that fit, a quarter of the 1024 asked for
         assert trace.t_s[1] - trace.t_s[0] == pytest.approx(trace.meta["period_s"])
 
 
 def test_that_nobody_says_which_period_a_voltage_belongs_to_widens_the_resistance(
-    pushed: tuple[MappedRecorderDrive, object],
+    pushed: Pushed,
 ) -> None:
-    drive, result = pushed
-    pushes = list(result.traces.values())  # type: ignore[attr-defined]
+    drive, _, pushes = pushed
     assert {trace.meta[DELAY_DOUBT] for trace in pushes} == {DELAY_DOUBT_PERIODS}
     wide = estimate_pushes(pushes, period_s=drive.period_s, pole_pairs=3).R
     for trace in pushes:
@@ -154,9 +160,7 @@ def test_that_nobody_says_which_period_a_voltage_belongs_to_widens_the_resistanc
     assert wide.value == narrow.value and wide.systematic > narrow.systematic
 
 
-def test_samples_at_the_largest_voltage_are_marked(
-    pushed: tuple[MappedRecorderDrive, object], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_samples_at_the_largest_voltage_are_marked(pushed: Pushed, monkeypatch: pytest.MonkeyPatch) -> None:
     """The link of 540 V gives 312 V at most: 95 % of them are 296 V."""
     drive = pushed[0]
     u_q_v = np.array([0.0, 290.0, -295.0, -297.5, 310.0])
@@ -173,7 +177,7 @@ def _shows_nothing(name: str) -> float:
     raise NotAvailable(f"the drive does not show {name}")
 
 
-def test_what_it_does_not_show_or_take_is_said(pushed: tuple[MappedRecorderDrive, object]) -> None:
+def test_what_it_does_not_show_or_take_is_said(pushed: Pushed) -> None:
     drive = pushed[0]
     assert drive.read("motor.pole_pairs") == 3.0
     assert math.isnan(drive.live("T_winding_c"))

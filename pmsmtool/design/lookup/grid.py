@@ -138,9 +138,9 @@ def _fine_limits(table: LookupTable, points: int) -> Array:
     return np.ascontiguousarray(np.stack((bounds.least_nm, bounds.largest_nm), axis=-1))
 
 
-def interpolation_error(table: LookupTable, points: int = POINTS_PER_INTERVAL) -> InterpolationError:
+def interpolation_error(table: LookupTable) -> InterpolationError:
     """Return the bounds of a stored table (see :func:`as_stored`)."""
-    return _bounds(table, cell_errors(table, points))
+    return _bounds(table, cell_errors(table))
 
 
 def _bounds(table: LookupTable, errors: Array) -> InterpolationError:

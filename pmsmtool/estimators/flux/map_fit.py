@@ -103,8 +103,8 @@ class CoenergyFit:
         Coefficients.
     covariance : ndarray, shape (k, k)
         Of the coefficients, widened by the residual.
-    R_ohm, inverter, delay_s : float
-        Resistance, factor on the inverter curve and delay of the current sample that fit.
+    delay_s : float
+        Delay of the current sample that fits (s).
     sigma_a : float
         Noise of one sample (A).
     chi2 : float
@@ -128,8 +128,6 @@ class CoenergyFit:
     spline: CoenergySpline
     c: Array
     covariance: Array
-    R_ohm: float
-    inverter: float
     delay_s: float
     sigma_a: float
     chi2: float
@@ -286,7 +284,7 @@ def _fine_fit(
             break
         rising = np.concatenate([rising[0], more[0]]), np.concatenate([rising[1], more[1]])
     return CoenergyFit(
-        spline, x[:k], covariance[:k, :k], float(x[k]), float(x[k + 1]), float(x[own - 1]), sigma_a,
+        spline, x[:k], covariance[:k, :k], float(x[own - 1]), sigma_a,
         sums.squares(x) / (sigma_a**2 * (sums.n - len(x))), sums.n, symmetric, asymmetry, axis,
         FittedSkew(free[:k], skew, free[own:]), frame, magnet.std_wb,
     )  # fmt: skip

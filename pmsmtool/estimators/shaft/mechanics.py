@@ -111,8 +111,6 @@ class MechanicsResult:
         Torque per square of the speed (N m s2), where the data ask for it: it is in neither B nor tau_c.
     chi2 : float
         Reduced chi-square of the whitened position.
-    condition : float
-        Condition number of the scaled, whitened Jacobian.
     """
 
     J: Estimate
@@ -121,7 +119,6 @@ class MechanicsResult:
     fit_std: tuple[float, float, float]
     ripple: float
     chi2: float
-    condition: float
     unexplained: bool
     harmonics: AngleHarmonics = NO_HARMONICS
     drag: Estimate | None = None
@@ -257,7 +254,7 @@ def estimate_mechanics(
     ]
     ripple = max(noise.values())
     J_found, B_found, tau_found = estimates
-    return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, condition, unexplained, harmonics, drag)
+    return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, unexplained, harmonics, drag)
 
 
 def mean_inertia(
