@@ -38,9 +38,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from pmsmtool.design.governor import EPS_LEAST
-from pmsmtool.firmware.core_binding import CORE_HEADERS, HEADER_FOLDER, core, parse_structs
+from pmsmtool.firmware.core_binding import CORE_HEADERS, HEADER_FOLDER, core
 from pmsmtool.firmware.export_q import q_files
 from pmsmtool.firmware.image import pack_image
+from pmsmtool.native import parse_structs
 from tests.firmware import cortex_m
 from tests.firmware.closed_loop import (
     BEST,

@@ -11,6 +11,7 @@ import ctypes
 import math
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,25 +22,21 @@ from pmsmtool.machine.flux_map_cells import FluxMapStruct, library
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 from pmsmtool.machine.torque import air_gap_torque
+from pmsmtool.native import parse_structs
 
 Array = NDArray[np.float64]
+
+_STRUCTS = parse_structs(
+    Path(__file__).with_name("lookup").joinpath("current_plane.h").read_text(encoding="ascii"),
+    {"pmsm_flux_map*": ctypes.POINTER(FluxMapStruct)},
+    names=("pmsm_plane",),
+)
 
 
 class PlaneStruct(ctypes.Structure):
     """``pmsm_plane``; ``maps`` keeps the flux-map structs alive."""
 
-    _fields_ = (
-        ("map", ctypes.POINTER(FluxMapStruct)),
-        ("loss", ctypes.POINTER(FluxMapStruct)),
-        ("R", ctypes.c_double),
-        ("pole_pairs", ctypes.c_double),
-        ("L_d", ctypes.c_double),
-        ("L_q", ctypes.c_double),
-        ("psi_f", ctypes.c_double),
-        ("psi_shift", ctypes.c_double),
-        ("I_max", ctypes.c_double),
-        ("i_d_min", ctypes.c_double),
-    )
+    _fields_ = _STRUCTS["pmsm_plane"]._fields_
     maps: tuple[FluxMapStruct, ...] = ()
 
 

@@ -8,8 +8,9 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from functools import cache
 
-from pmsmtool.firmware.core_binding import APPLICATION_HEADER, CORE_HEADERS, HEADER_FOLDER, parse_structs
+from pmsmtool.firmware.core_binding import APPLICATION_HEADER, CORE_HEADERS, HEADER_FOLDER
 from pmsmtool.firmware.laws import LAWS, Law
+from pmsmtool.native import parse_structs
 
 CYCLES = {
     "PI": (1588, 1609, 1675),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -32,30 +33,15 @@ EQUIDISTANT_TOLERANCE = 1e-9
 cell's change; ``numpy.linspace`` stays below 1e-13)."""
 
 Array = NDArray[np.float64]
-_doubles = ctypes.POINTER(ctypes.c_double)
+_STRUCTS = native.parse_structs(
+    Path(__file__).with_name("flux_map.h").read_text(encoding="ascii"), {"double*": ctypes.POINTER(ctypes.c_double)}
+)
 
 
 class FluxMapStruct(ctypes.Structure):
     """``pmsm_flux_map``; the arrays it points to are kept alive in the attribute ``arrays``."""
 
-    _fields_ = (
-        ("i_d", _doubles),
-        ("i_q", _doubles),
-        ("cells", _doubles),
-        ("inverse_cells", _doubles),
-        ("i_d_per_step", ctypes.c_double),
-        ("i_q_per_step", ctypes.c_double),
-        ("psi_d_min", ctypes.c_double),
-        ("psi_d_step", ctypes.c_double),
-        ("psi_d_per_step", ctypes.c_double),
-        ("psi_q_min", ctypes.c_double),
-        ("psi_q_step", ctypes.c_double),
-        ("psi_q_per_step", ctypes.c_double),
-        ("n_i_d", ctypes.c_int32),
-        ("n_i_q", ctypes.c_int32),
-        ("n_psi_d", ctypes.c_int32),
-        ("n_psi_q", ctypes.c_int32),
-    )
+    _fields_ = _STRUCTS["pmsm_flux_map"]._fields_
     arrays: tuple[Array, ...] = ()
 
 
@@ -188,4 +174,4 @@ def _contiguous(values: ArrayLike) -> Array:
 
 def pointer(array: Array) -> Any:
     """Return a C pointer to the doubles of a contiguous array."""
-    return array.ctypes.data_as(_doubles)
+    return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))

@@ -17,7 +17,7 @@ from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.errors import NotAvailable
 from pmsmtool.proof.simulated_margins import variations
 from pmsmtool.sim.closed_loop import drive_values, image_of, open_simulation
-from pmsmtool.sim.kernel import Machine, Params, Part, Setup
+from pmsmtool.sim.kernel import STRUCTS, Params, Part, Setup
 from pmsmtool.sim.monte_carlo import vary
 from pmsmtool.sim.scenarios import MODES, SCHEDULES, Scenario, built_in
 from pmsmtool.sim.signals import Signal, Truth
@@ -41,7 +41,7 @@ class Moved:
 
 
 def _machine(*names: str) -> tuple[int, ...]:
-    return tuple(int(Setup.machine.offset + getattr(Machine, name).offset) for name in names)
+    return tuple(int(Setup.machine.offset + getattr(STRUCTS["pmsm_machine"], name).offset) for name in names)
 
 
 MOVED: Mapping[str, Moved] = {

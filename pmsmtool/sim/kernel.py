@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The simulation kernel ``pmsm_sim`` through ctypes: mirrored structs, declared functions, owned memory.
+"""The simulation kernel ``pmsm_sim`` through ctypes: its structs, declared functions, owned memory.
 
-Field names and their meaning are those of ``closed_loop.h``, ``plant.h``, ``inverter.h``, ``sensors.h`` and
-``pmsm_application.h``; every mirrored struct is checked against the library's size when it is loaded.
+The structs are read from ``closed_loop.h``, ``plant.h``, ``inverter.h``, ``sensors.h``, ``monte_carlo.h`` and
+``pmsm_application.h``, where their members are explained; their sizes are checked when the library is loaded.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import ctypes
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,269 +19,49 @@ from numpy.typing import NDArray
 
 from pmsmtool import native
 from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.core_binding import APPLICATION_HEADER, CORE_HEADERS, HEADER_FOLDER
 from pmsmtool.machine.flux_map_cells import FluxMapStruct
-from pmsmtool.params.catalogue import CATALOGUE
 
 Array = NDArray[np.float64]
 
-_f32, _f64, _i32, _u32, _u64 = ctypes.c_float, ctypes.c_double, ctypes.c_int32, ctypes.c_uint32, ctypes.c_uint64
-TRACE_CHANNELS = 8
+_f32, _f64, _u32, _u64 = ctypes.c_float, ctypes.c_double, ctypes.c_uint32, ctypes.c_uint64
 
 
-class Machine(ctypes.Structure):
-    """``pmsm_machine``."""
-
-    _fields_ = (
-        ("pole_pairs", _f64),
-        ("R_copper", _f64),
-        ("R_fixed", _f64),
-        ("L_d", _f64),
-        ("L_q", _f64),
-        ("psi_f", _f64),
-        ("T_ref", _f64),
-        ("alpha_R", _f64),
-        ("alpha_psi", _f64),
-        ("map", ctypes.POINTER(FluxMapStruct)),
-        ("R_iron", _f64),
-        ("eddy_d", _f64),
-        ("eddy_q", _f64),
-        ("eddy_rate", _f64),
-        ("psi_6", _f64),
-        ("psi_12", _f64),
-        ("psi_7", _f64),
-        ("J", _f64),
-        ("B", _f64),
-        ("tau_c", _f64),
-        ("load_viscous", _f64),
-        ("drag", _f64),
-        ("cogging", _f64),
-        ("cogging_periods", _f64),
-        ("thermal_resistance", _f64),
-        ("thermal_capacity", _f64),
-        ("T_ambient", _f64),
-        ("rotor", _u32),
-        ("J_load", _f64),
-        ("coupling_stiffness", _f64),
-        ("coupling_damping", _f64),
-        ("backlash", _f64),
-        ("stribeck", _f64),
-        ("stribeck_speed", _f64),
-        ("friction_once", _f64),
-        ("cogging_slot", _f64),
-        ("cogging_slot_periods", _f64),
-        ("cogging_pole", _f64),
-        ("cogging_pole_periods", _f64),
-        ("L_6", _f64),
-        ("L_imbalance", _f64),
-    )
+_SIM = Path(__file__).parent
 
 
-class Inverter(ctypes.Structure):
-    """``pmsm_inverter_setup``."""
-
-    _fields_ = (
-        ("model", _u32),
-        ("shape", _u32),
-        ("dead_time", _f64 * 3),
-        ("i_knee", _f64),
-        ("V_switch", _f64),
-        ("r_switch", _f64),
-        ("V_diode", _f64),
-        ("r_diode", _f64),
-        ("r_leg", _f64 * 3),
-        ("capacitance", _f64),
-        ("minimum_pulse", _f64),
-        ("open", _u32 * 3),
-    )
+def _text(*headers: Path) -> str:
+    return "\n".join(path.read_text(encoding="ascii") for path in headers)
 
 
-class Sensors(ctypes.Structure):
-    """``pmsm_sensor_setup``."""
-
-    _fields_ = (
-        ("gain", _f64 * 3),
-        ("offset", _f64 * 3),
-        ("noise", _f64),
-        ("full_scale", _f64),
-        ("adc_bits", _u32),
-        ("encoder_bits", _u32),
-        ("U_dc_gain", _f64),
-        ("encoder_offset_e", _f64),
-        ("encoder_reversed", _u32),
-        ("fault", _u32),
-        ("encoder_latency", _f64),
-        ("encoder_once", _f64),
-        ("encoder_twice", _f64),
-        ("encoder_noise", _f64),
-        ("T_lag", _f64),
-        ("blind", _f64),
-        ("cubic", _f64),
-        ("drift", _f64),
-        ("hall_axis", _f64 * 3),
-        ("hall", _u32),
-    )
+STRUCTS = native.parse_structs(
+    _text(*(_SIM / f"{name}.h" for name in ("plant", "inverter", "sensors", "closed_loop", "monte_carlo"))),
+    {
+        **native.parse_structs(_text(*(HEADER_FOLDER / name for name in CORE_HEADERS), APPLICATION_HEADER)),
+        "pmsm_flux_map*": ctypes.POINTER(FluxMapStruct),
+    },
+    names=("pmsm_machine", "pmsm_inverter_setup", "pmsm_sensor_setup", "pmsm_sim_setup", "pmsm_drive_run",
+           "pmsm_monte_carlo"),
+)  # fmt: skip
+"""Structs that Python and the kernel share, by their C names."""
 
 
 class Setup(ctypes.Structure):
     """``pmsm_sim_setup``: everything that is fixed during a run."""
 
-    _fields_ = (
-        ("machine", Machine),
-        ("inverter", Inverter),
-        ("sensors", Sensors),
-        ("U_dc", _f64),
-        ("U_dc_ripple", _f64),
-        ("U_dc_ripple_hz", _f64),
-        ("U_dc_source", _f64),
-        ("U_dc_source_time", _f64),
-        ("U_dc_capacitance", _f64),
-        ("U_dc_chopper", _f64),
-        ("U_dc_chopper_ohm", _f64),
-        ("T_winding", _f64),
-        ("T_magnet", _f64),
-        ("theta_M", _f64),
-        ("omega_M", _f64),
-        ("load", _f64),
-        ("sensor_lag", _f64),
-        ("sampling_shift", _f64),
-        ("seed", _u64),
-        ("delay", _u32),
-        ("application", _u32),
-        ("T_s_ns", _u32),
-    )
+    _fields_ = STRUCTS["pmsm_sim_setup"]._fields_
 
 
 class Params(ctypes.Structure):
     """``pmsm_params``: one member per catalogue row."""
 
-    _fields_ = tuple((row.c_name, _u32 if row.is_integer else _f32) for row in CATALOGUE)
+    _fields_ = STRUCTS["pmsm_params"]._fields_
 
 
 class Reference(ctypes.Structure):
     """``pmsm_reference`` in binary32."""
 
-    _fields_ = (
-        ("mode", _u32),
-        ("i_d_ref", _f32),
-        ("i_q_ref", _f32),
-        ("tau_ref", _f32),
-        ("omega_M_ref", _f32),
-        ("u_d_inject", _f32),
-        ("u_q_inject", _f32),
-        ("bias_bandwidth", _f32),
-    )
-
-
-class ExcitationState(ctypes.Structure):
-    """``pmsm_excitation``."""
-
-    _fields_ = (
-        ("shape", _u32),
-        ("point", _u32),
-        ("hold_periods", _u32),
-        ("amplitude", _f32),
-        ("amplitude_q", _f32),
-        ("bias_d", _f32),
-        ("bias_q", _f32),
-        ("bias_bandwidth", _f32),
-        ("f0", _f32),
-        ("f1", _f32),
-        ("duration", _f32),
-        ("fixed_angle", _f32),
-        ("i_limit_d", _f32),
-        ("i_limit_q", _f32),
-        ("i_centre_d", _f32),
-        ("abort_current", _f32),
-        ("abort_speed", _f32),
-        ("command", _u32),
-        ("state", _u32),
-        ("buffer_samples", _u32),
-    )
-
-
-class Recorder(ctypes.Structure):
-    """``pmsm_recorder``."""
-
-    _fields_ = (
-        ("decimation", _u32),
-        ("depth", _u32),
-        ("pretrigger", _u32),
-        ("trigger", _u32),
-        ("trigger_signal", _u32),
-        ("trigger_level", _f32),
-        ("command", _u32),
-        ("state", _u32),
-        ("stored", _u32),
-        ("trigger_position", _u32),
-        ("channel", _u32 * TRACE_CHANNELS),
-    )
-
-
-class Average(ctypes.Structure):
-    """``pmsm_average``."""
-
-    _fields_ = (
-        ("periods", _u32),
-        ("command", _u32),
-        ("state", _u32),
-        ("signal", _u32 * TRACE_CHANNELS),
-        ("mean", _f32 * TRACE_CHANNELS),
-        ("std", _f32 * TRACE_CHANNELS),
-    )
-
-
-class HomingRequest(ctypes.Structure):
-    """``pmsm_homing_request``."""
-
-    _fields_ = (
-        ("active", _u32),
-        ("start", _u32),
-        ("method", _i32),
-        ("slow", _f32),
-        ("torque", _f32),
-        ("home_offset", _i32),
-    )
-
-
-class PositionRequest(ctypes.Structure):
-    """``pmsm_position_request``."""
-
-    _fields_ = (
-        ("increments", _u32),
-        ("offset", _i32),
-        ("profile", _u32),
-        ("target", _i32),
-        ("set_point", _u32),
-        ("interval", _f32),
-        ("velocity", _f32),
-        ("acceleration", _f32),
-        ("deceleration", _f32),
-        ("stop_deceleration", _f32),
-        ("jerk", _f32),
-        ("halt", _u32),
-        ("minimum", _i32),
-        ("maximum", _i32),
-        ("window", _f32),
-        ("window_time", _f32),
-        ("homing", HomingRequest),
-    )
-
-
-class Position(ctypes.Structure):
-    """``pmsm_position``, up to its private memory."""
-
-    _fields_ = (
-        ("asked", PositionRequest),
-        ("actual", _i32),
-        ("reference", _i32),
-        ("reference_part", _f32),
-        ("velocity", _f32),
-        ("acceleration", _f32),
-        ("error", _f32),
-        ("flags", _u32),
-        ("limits", _u32),
-        ("homing", _u32),
-    )
+    _fields_ = STRUCTS["pmsm_reference"]._fields_
 
 
 class Application(IntEnum):
@@ -335,19 +116,16 @@ class Part(IntEnum):
 
 
 _LAYOUT_SIM, _LAYOUT_DRIVE = 0, 1
-_MIRRORED: tuple[tuple[int, type[ctypes.Structure]], ...] = (
+_SHARED: tuple[tuple[int, type[ctypes.Structure]], ...] = (
     (2, Setup),
-    (3, Machine),
-    (4, Inverter),
-    (5, Sensors),
     (6, Params),
     (7, Reference),
-    (8, ExcitationState),
-    (9, Recorder),
-    (10, Average),
+    (8, STRUCTS["pmsm_excitation"]),
+    (9, STRUCTS["pmsm_recorder"]),
+    (10, STRUCTS["pmsm_average"]),
     (11, FluxMapStruct),
-    (12, Position),
 )
+"""Numbers of ``enum pmsm_layout``."""
 
 
 @cache
@@ -357,13 +135,13 @@ def library() -> Any:
     Raises
     ------
     RuntimeError
-        A mirrored struct has another size in the library: it was built from other sources.
+        A struct has another size in the library: it was built from other sources.
     """
     lib = native.load("pmsm_sim")
     lib.pmsm_sim_layout.argtypes, lib.pmsm_sim_layout.restype = (_u32,), _u32
-    for number, mirror in _MIRRORED:
-        if lib.pmsm_sim_layout(number) != ctypes.sizeof(mirror):
-            raise RuntimeError(f"struct {mirror.__name__} of the library pmsm_sim has another size; rebuild it")
+    for number, struct in _SHARED:
+        if lib.pmsm_sim_layout(number) != ctypes.sizeof(struct):
+            raise RuntimeError(f"struct {struct.__name__} of the library pmsm_sim has another size; rebuild it")
     data = ctypes.c_void_p
     declarations: tuple[tuple[str, tuple[Any, ...], Any], ...] = (
         ("pmsm_sim_part", (data, _u32), data),
@@ -455,24 +233,24 @@ class Simulation:
         return Reference.from_address(self.part(Part.REFERENCE))
 
     @property
-    def excitation(self) -> ExcitationState:
+    def excitation(self) -> Any:
         """The drive's excitation."""
-        return ExcitationState.from_address(self.part(Part.EXCITATION))
+        return STRUCTS["pmsm_excitation"].from_address(self.part(Part.EXCITATION))
 
     @property
-    def recorder(self) -> Recorder:
+    def recorder(self) -> Any:
         """The drive's trace recorder."""
-        return Recorder.from_address(self.part(Part.RECORDER))
+        return STRUCTS["pmsm_recorder"].from_address(self.part(Part.RECORDER))
 
     @property
-    def average(self) -> Average:
+    def average(self) -> Any:
         """The drive's window averages."""
-        return Average.from_address(self.part(Part.AVERAGE))
+        return STRUCTS["pmsm_average"].from_address(self.part(Part.AVERAGE))
 
     @property
-    def position(self) -> Position:
+    def position(self) -> Any:
         """The drive's position controller."""
-        return Position.from_address(self.part(Part.POSITION))
+        return STRUCTS["pmsm_position"].from_address(self.part(Part.POSITION))
 
     def word(self, part: Part) -> Any:
         """Return ENABLED, QUICK_STOP, TRIP or RECORDER_WRITE as an unsigned word with a ``value``."""

@@ -22,7 +22,7 @@ from pmsmtool.machine.flux_map import FluxScale, ScalableMap
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import open_simulation
-from pmsmtool.sim.kernel import Setup, library
+from pmsmtool.sim.kernel import STRUCTS, Setup, library
 from pmsmtool.sim.scenarios import Scenario
 
 Array = NDArray[np.float64]
@@ -97,34 +97,7 @@ class DriveRuns:
     record: Array
 
 
-class _Task(ctypes.Structure):
-    """``pmsm_monte_carlo``."""
-
-    _fields_ = (
-        ("model", ctypes.c_void_p),
-        ("setup", ctypes.POINTER(Setup)),
-        ("n", ctypes.c_uint32),
-        ("threads", ctypes.c_uint32),
-        ("periods", ctypes.c_uint64),
-        ("memory", ctypes.c_void_p),
-        ("record", ctypes.c_void_p),
-        ("record_rows", ctypes.c_uint64),
-        ("record_signals", ctypes.c_uint32),
-        ("record_decimation", ctypes.c_uint32),
-        ("record_signal", ctypes.c_void_p),
-        ("result", ctypes.c_void_p),
-    )
-
-
-_RESULT = np.dtype(
-    [
-        *((name, "f8") for name in ("i_peak", "i_square", "torque", "omega_peak", "u_peak", "T_winding_peak")),
-        *((name, "u8") for name in ("limited", "governed", "infeasible", "trip_period", "outside")),
-        ("trip", "u4"),
-        ("reserved", "u4"),
-    ]
-)
-"""``pmsm_drive_run``."""
+_Task, _RESULT = STRUCTS["pmsm_monte_carlo"], np.dtype(STRUCTS["pmsm_drive_run"])
 
 
 @cache
@@ -186,8 +159,9 @@ def simulate_many(
     record = np.zeros((n, rows, names.size))
     result = np.zeros(n, dtype=_RESULT)
     task = _Task(
-        model.sim, setups, n, workers, periods, memory.ctypes.data, record.ctypes.data if names.size else None,
-        rows, names.size, scenario.decimation, names.ctypes.data, result.ctypes.data,
+        model.sim, ctypes.addressof(setups), n, workers, periods, memory.ctypes.data,
+        record.ctypes.data if names.size else None, rows, names.size, scenario.decimation, names.ctypes.data,
+        result.ctypes.data,
     )  # fmt: skip
     lib.pmsm_monte_carlo_run(ctypes.byref(task))
     del keep  # the flux maps of the machines had to live until here

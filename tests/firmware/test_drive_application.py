@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pmsmtool.firmware.core_binding import core, parse_structs
+from pmsmtool.firmware.core_binding import core
 from pmsmtool.firmware.image import pack_image
-from pmsmtool.native import load
+from pmsmtool.native import load, parse_structs
 from pmsmtool.params.catalogue import CATALOGUE
 from tests.firmware.linear_plant import LinearPlant
 

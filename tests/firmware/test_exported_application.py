@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pmsmtool.firmware.core_binding import APPLICATION_HEADER, core, parse_structs
+from pmsmtool.firmware.core_binding import APPLICATION_HEADER, core
 from pmsmtool.firmware.export_c import FLAGS, c_files
 from pmsmtool.firmware.image import pack_image
-from pmsmtool.native import load
+from pmsmtool.native import load, parse_structs
 from pmsmtool.params.catalogue import CATALOGUE
 
 pytestmark = pytest.mark.chain
