@@ -26,7 +26,7 @@ from pathlib import Path
 from benchmarks.commissioning import prepared
 from benchmarks.random_drives import data_sheet, draw_drive
 from pmsmtool.bus.connect import Connection
-from pmsmtool.commissioning.commission import Commissioning, Silent, begin_run
+from pmsmtool.commissioning.commission import Commissioning, Silent
 from pmsmtool.commissioning.report_page import verdict
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
@@ -35,6 +35,7 @@ from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.capabilities import examine
 from pmsmtool.measurement.identify import open_for_level
+from pmsmtool.measurement.run_account import begin_run
 from pmsmtool.proof.stage import ProofRequest
 from pmsmtool.report.comparison import unchecked
 from pmsmtool.run_directory import RunDirectory, Stage

@@ -37,7 +37,6 @@ from benchmarks.random_drives import draw_drive
 from benchmarks.real_population import draw_real
 from benchmarks.whole_commission import BLOCKS
 from pmsmtool.bus.connect import connect
-from pmsmtool.commissioning.commission import begin_run
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.prediction import Prediction
 from pmsmtool.design.tune import tune
@@ -51,6 +50,7 @@ from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.identify import identify
+from pmsmtool.measurement.run_account import begin_run
 from pmsmtool.proof import stage as proving
 from pmsmtool.proof.simulated import predict_proof
 from pmsmtool.run_directory import RunDirectory, Stage, new_record

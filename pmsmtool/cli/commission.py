@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, read_map, rehearsal_bus
+from pmsmtool.cli.drive_access import FOLDER, map_option, new_run, read_map, rehearsal_bus, runs_option
 from pmsmtool.cli.options import (
     FILE,
     HZ,
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from pmsmtool.report.verdict import Verdict
     from pmsmtool.run_directory import RunDirectory
 
-FOLDER = click.Path(file_okay=False, path_type=Path)
 STAGES = ("identify", "tune", "lut", "margins", "flash", "verify", "prove")
 LIMITS = ("current", "speed")
 """As in ``commissioning.commission`` and ``commissioning.rated_limits``, which take too long to import for
@@ -56,7 +54,7 @@ LIMITS = ("current", "speed")
 @click.option("--resume", type=FOLDER, metavar="RUN_DIR", help="Go on with a run where it ended.")
 @click.option("--rehearse", metavar="FAMILY", help="Rehearse: MACHINE, simulated, behind the map of a drive family.")
 @click.option("--eds", metavar="FILE", help="Rehearse: MACHINE, simulated, behind the EDS or DCF of its drive.")
-@click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
+@runs_option
 @click.option("--flux-map", is_flag=True, help="Measure the flux map, and design with it, whether the machine "
               "saturates or not.")  # fmt: skip
 @click.option("--bandwidth-hz", type=HZ, metavar="HZ", help="Bandwidth of the current loops.  [default: modulus "
@@ -121,7 +119,7 @@ def commission_command(
     speed, else PARTIAL (exit 10), with the reason for every stage that did not run.
     """
     from pmsmtool.cli.consent import refuse_unattended
-    from pmsmtool.commissioning.commission import Commissioning, begin_run
+    from pmsmtool.commissioning.commission import Commissioning
     from pmsmtool.commissioning.compared_stage import check_accepted
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.journal import JournalFolder
@@ -158,9 +156,7 @@ def commission_command(
             )
         if begun is None and _starts_blank(bus):
             forget_map(JournalFolder(found.identity))
-        run = begun or begin_run(
-            drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=_recorded(bus), level=found.level
-        )
+        run = begun or new_run(bus, drive, runs, found.level)
         progress = StageProgress(out)
         person = _Person(run, drive, bus, motion, out, progress)
         chain = Commissioning(run, drive, person, progress, **asked, capabilities=found)
@@ -225,15 +221,11 @@ def _asked(
     }
 
 
-def _recorded(bus: BusOptions) -> dict[str, Any]:
-    return {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate}
-
-
 def _as_begun(bus: BusOptions, run: RunDirectory) -> BusOptions:
     """Fill in the bus of a run where the command line names none."""
     recorded = run.read().bus
     if bus.interface is None and bus.channel is None:
-        bus = replace(bus, **{key: recorded.get(key) for key in _recorded(bus)})
+        bus = replace(bus, **{key: recorded.get(key) for key in bus.recorded})
     return replace(bus, node=recorded.get("node")) if bus.node is None else bus
 
 
@@ -286,13 +278,12 @@ class _Person:
         self._ask(ask_writing, lines)
 
     def _ask(self, ask: Any, lines: Sequence[str]) -> None:
-        from dataclasses import asdict
+        from pmsmtool.cli.consent import keep
 
         self._progress.pause()
         given = ask(lines, **self._asked)
         self._progress.resume()
-        record = self._run.read()
-        self._run.write(replace(record, consents=(*record.consents, asdict(given))))
+        keep(self._run, given)
 
 
 @contextmanager

@@ -11,14 +11,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 import click
 
 from pmsmtool.cli.options import MotionOptions
 from pmsmtool.cli.output import Output, show
 from pmsmtool.errors import ConfigError, Declined
+
+if TYPE_CHECKING:
+    from pmsmtool.run_directory import RunDirectory
 
 Subject = Literal["motion", "writing"]
 
@@ -40,6 +43,12 @@ class Consent:
     subject: Subject
     answer: Literal["prompt", "--yes"]
     text: tuple[str, ...]
+
+
+def keep(run: RunDirectory, given: Consent) -> None:
+    """Put a consent into the record before anything moves: somebody signs it, however the run ends."""
+    record = run.read()
+    run.write(replace(record, consents=(*record.consents, asdict(given))))
 
 
 def person_present() -> bool:

@@ -99,13 +99,12 @@ def _configuration(bus: BusOptions) -> dict[str, Any]:
     """Return what python-can will use, from options, files and environment."""
     import can
 
-    given = {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate}
-    typed = {key: value for key, value in given.items() if value is not None}
+    typed = {key: value for key, value in bus.recorded.items() if value is not None}
     try:
         loaded = can.util.load_config(config=dict(typed))
     except (can.CanError, ValueError):
         return typed
-    return {key: loaded.get(key) for key in ("interface", "channel", "bitrate") if loaded.get(key) is not None}
+    return {key: loaded.get(key) for key in bus.recorded if loaded.get(key) is not None}
 
 
 def _adapter_lines(found: list[Adapter], configured: dict[str, Any]) -> list[str]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,8 +24,9 @@ if TYPE_CHECKING:
     from pmsmtool.drive.canopen_drive import CanopenDrive
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.drive_maps.drive_map import DriveMap
+    from pmsmtool.run_directory import RunDirectory
 
-
+FOLDER = click.Path(file_okay=False, path_type=Path)
 LOOKING_S = 30.0
 """Time for the transfers of a command that reads a few objects; a drive that answers needs a second."""
 WHOLE_SET_S = 120.0
@@ -39,6 +41,19 @@ def map_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add ``--map`` to a command, which receives ``map_file: Path | None``."""
     text = "Map of the drive's objects: TOML file, or family (`firmware-params`)."
     return click.option("--map", "map_file", type=FILE, metavar="FILE", help=text)(function)
+
+
+def runs_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add ``--runs`` to a command, which receives ``runs: Path``."""
+    text = "Where run directories are made."
+    return click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help=text)(function)
+
+
+def new_run(bus: BusOptions, drive: CanopenDrive, runs: Path, level: str = "") -> RunDirectory:
+    """Make the directory of a run that begins now; its record has the command line and the bus."""
+    from pmsmtool.measurement.run_account import begin_run
+
+    return begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=bus.recorded, level=level)
 
 
 def read_map(path: Path | None) -> DriveMap:

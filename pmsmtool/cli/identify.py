@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,21 +12,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import map_option
+from pmsmtool.cli.drive_access import FOLDER, map_option, runs_option
 from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
     from pmsmtool.bus.connection import Connection
-    from pmsmtool.cli.consent import Consent
     from pmsmtool.cli.fingerprint import Comparison
     from pmsmtool.experiments.supply_levels import ReadSupply
     from pmsmtool.identification.fingerprint import Earlier
     from pmsmtool.identification.request import IdentifyRequest, Method
     from pmsmtool.measurement.capabilities import Capabilities
     from pmsmtool.run_directory import RunDirectory, Stage
-
-FOLDER = click.Path(file_okay=False, path_type=Path)
 
 
 @click.command(
@@ -51,7 +47,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 @click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="Recompute from the traces of a run; moves nothing.")
 @click.option("--fingerprint", type=FOLDER, metavar="RUN", help="Measure R, L, psi, encoder and pole pairs again, in "
               "short, and compare them with those of a run: exit code 1 where one differs.")  # fmt: skip
-@click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
+@runs_option
 @click.option(
     "--sensor-tol",
     type=click.FloatRange(0.0, 0.2),
@@ -257,15 +253,11 @@ def _measure(
     *,
     supply: bool,
 ) -> tuple[RunDirectory, Stage]:
-    from dataclasses import asdict
-
-    from pmsmtool import __version__
-    from pmsmtool.cli.consent import ask_motion
-    from pmsmtool.cli.drive_access import choose_node
+    from pmsmtool.cli.consent import ask_motion, keep
+    from pmsmtool.cli.drive_access import choose_node, new_run
     from pmsmtool.identification.request import Method
     from pmsmtool.measurement.by_injection import nameplate_of, with_limits_of
     from pmsmtool.measurement.identify import identify, open_for_level
-    from pmsmtool.run_directory import RunDirectory, new_record
 
     with bus.connect() as connection:
         drive = open_for_level(connection, choose_node(connection, bus.node), found)
@@ -273,17 +265,10 @@ def _measure(
         reader = supply_reader(connection, identity.node, simulated=bus.simulated()) if supply else None
         if earlier is not None and how is Method.INJECT:
             request = with_limits_of(earlier.request, request, nameplate_of(drive))
-        record = new_record(
-            ["pmsmtool", *sys.argv[1:]],
-            drive=asdict(identity),
-            bus={"interface": bus.interface, "channel": bus.channel, "node": identity.node},
-            versions={"pmsmtool": __version__},
-        )
-        run = RunDirectory.create(runs, identity.serial, record)
+        run = new_run(bus, drive, runs)
 
         def allow(lines: Any) -> None:
-            given = ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
-            _keep(run, given)
+            keep(run, ask_motion(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out))
 
         with _accounted(run, out) as say:
             stage = identify(run, drive, request, allow, say, method=how, found=found, read_supply=reader)
@@ -307,14 +292,6 @@ def _accounted(run: RunDirectory, out: Output) -> Iterator[Callable[[str], None]
     except BaseException:
         out.note(f"how it ended, and what is complete: pmsmtool report {run.path}")
         raise
-
-
-def _keep(run: RunDirectory, given: Consent) -> None:
-    """Put the consent into the record before anything moves: somebody signs it, however the run ends."""
-    from dataclasses import asdict
-
-    record = run.read()
-    run.write(replace(record, consents=(*record.consents, asdict(given))))
 
 
 def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison | None = None) -> None:

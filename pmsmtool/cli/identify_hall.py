@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pmsmtool.cli.drive_access import open_drive
+from pmsmtool.cli.drive_access import new_run, open_drive
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
@@ -37,7 +36,6 @@ def identify_hall(bus: BusOptions, motion: MotionOptions, out: Output, runs: Pat
         E_HALL.
     """
     from pmsmtool.cli.consent import ask_motion
-    from pmsmtool.commissioning.commission import begin_run
     from pmsmtool.drive import objects
     from pmsmtool.drive.envelope import Envelope
     from pmsmtool.drive.guard import guarded
@@ -64,8 +62,7 @@ def identify_hall(bus: BusOptions, motion: MotionOptions, out: Output, runs: Pat
         way = f"a current vector turns the shaft by {math.degrees(WAY_RAD):.0f} electrical degrees and back"
         lines = [*envelope.lines(), way, "nothing is stored in the drive; every changed object is restored"]
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
-        recorded = {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate}
-        run = begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=recorded)
+        run = new_run(bus, drive, runs)
         began = drive.node.connection.clock.now()
         with guarded(drive, envelope, say=out.note) as guard:
             guard.enable()

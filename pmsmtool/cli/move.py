@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import LOOKING_S, claimed_node, map_option, open_node, read_map
+from pmsmtool.cli.drive_access import LOOKING_S, claimed_node, map_option, new_run, open_node, read_map, runs_option
 from pmsmtool.cli.options import (
     DURATION,
     FILE,
@@ -40,7 +39,6 @@ TRAVEL_MARGIN, SPEED_MARGIN = 1.25, 1.5
 ERROR_SHARE = 0.5
 """Following error at which the voltage is removed, of the way."""
 DURATION_S = 45.0
-FOLDER = click.Path(file_okay=False, path_type=Path)
 TRACE = "traces/move.npz"
 SHOWN = {"rad": (math.degrees, "deg"), "s": (lambda value: 1e3 * value, "ms")}
 
@@ -65,13 +63,7 @@ SHOWN = {"rad": (math.degrees, "deg"), "s": (lambda value: 1e3 * value, "ms")}
               "found.  [default: machine.toml of the run]")  # fmt: skip
 @click.option("--times", type=click.IntRange(1, 20), help="Moves there and back.  [default: 1, with --identify 4]")
 @click.option("--settle", "settle_s", type=DURATION, default="0.5s", help="How long to look on after the demand ended.")
-@click.option(
-    "--runs",
-    type=FOLDER,
-    default=Path("runs"),
-    metavar="DIR",
-    help="Where run directories are made.",
-)
+@runs_option
 @map_option
 @bus_options
 @motion_options
@@ -136,7 +128,7 @@ def move_command(
             "nothing is stored in the drive; every changed object is restored",
         ]  # fmt: skip
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
-        run = _run(runs, drive, bus)
+        run = new_run(bus, drive, runs)
         with guarded(drive, envelope, say=out.note) as guard:
             guard.write(lent)
             began = connection.clock.now()
@@ -249,18 +241,6 @@ def _lent(drive: PositionDrive, profile: dict[str, float]) -> dict[str, float]:
 
 def _held(drive: PositionDrive, name: str) -> float | None:
     return drive.read(name) if name in drive.node.map.cells else None
-
-
-def _run(runs: Path, drive: PositionDrive, bus: BusOptions) -> RunDirectory:
-    from pmsmtool import __version__
-    from pmsmtool.run_directory import RunDirectory, new_record
-
-    record = new_record(
-        ["pmsmtool", *sys.argv[1:]], drive=asdict(drive.identity),
-        bus={"interface": bus.interface, "channel": bus.channel, "node": drive.identity.node},
-        versions={"pmsmtool": __version__},
-    )  # fmt: skip
-    return RunDirectory.create(runs, drive.identity.serial, record)
 
 
 def shown(value: float, unit: str) -> str:

@@ -268,6 +268,11 @@ class BusOptions:
         except can.CanInterfaceNotImplementedError:
             return False
 
+    @property
+    def recorded(self) -> dict[str, Any]:
+        """What the record of a run keeps of it."""
+        return {"interface": self.interface, "channel": self.channel, "bitrate": self.bitrate}
+
     def connect(self) -> Connection:
         """Open the bus; raises ``BusError`` or ``ConfigError``."""
         from pmsmtool.bus.connect import connect

@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, open_drive, read_map
+from pmsmtool.cli.drive_access import map_option, new_run, open_drive, read_map, runs_option
 from pmsmtool.cli.options import (
     BusOptions,
     MotionOptions,
@@ -25,8 +24,6 @@ from pmsmtool.cli.output import Output
 if TYPE_CHECKING:
     from pmsmtool.run_directory import RunDirectory, Stage
 
-FOLDER = click.Path(file_okay=False, path_type=Path)
-
 
 @click.command(
     "prove",
@@ -36,7 +33,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
     ),
 )
 @click.argument("design", type=click.Path(exists=True, path_type=Path))
-@click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
+@runs_option
 @click.option("--machines", type=click.IntRange(32, 2000), default=96, help="Machines drawn for the prediction.")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the draw.")
 @overspeed_option
@@ -65,10 +62,10 @@ def prove_command(
     weakening, a move of the position loop with the speed fed forward and one without. Above the speed of uncontrolled
     generation they go only where a fault shorts the windings, or a brake chopper is stated.
     """
-    from dataclasses import asdict, replace
+    from dataclasses import replace
 
-    from pmsmtool.cli.consent import Consent, ask_motion
-    from pmsmtool.commissioning.commission import begin_run, write_report
+    from pmsmtool.cli.consent import ask_motion, keep
+    from pmsmtool.commissioning.commission import write_report
     from pmsmtool.design.design_file import design_text, load_design
     from pmsmtool.errors import ConfigError
     from pmsmtool.proof.stage import ProofRequest, not_proven, prove_stage
@@ -87,25 +84,21 @@ def prove_command(
     asked = ProofRequest(
         motion.i_max_apk, motion.speed_max_rad_s, motion.shaft or "free", motion.load, motion.brake, machines, seed
     )
-    consents: list[Consent] = []
     with open_drive(bus, read_map(map_file)) as drive:
 
         def allow(lines: Any) -> None:
             serial = drive.identity.serial
-            consents.append(ask_motion(lines, motion, simulated=bus.simulated(), serial=serial, out=out))
+            keep(run, ask_motion(lines, motion, simulated=bus.simulated(), serial=serial, out=out))
 
-        recorded = {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate}
         if design.is_dir():
             run = RunDirectory(design)
             _same_drive(run, drive.identity.serial)
         else:
-            run = begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=recorded)
+            run = new_run(bus, drive, runs)
             run.save("design.toml", design_text(made))
         stage = _proven(
             run, out, lambda say: prove_stage(run, drive, made, asked, allow, say), fresh=not design.is_dir()
         )
-    record = run.read()
-    run.write(_with_consents(record, [asdict(given) for given in consents]))
     out.status("writing the report ...")
     write_report(run)
     _show(run, stage, out)
@@ -141,12 +134,6 @@ def _proven(run: RunDirectory, out: Output, prove: Callable[[Callable[[str], Non
             shutil.rmtree(run.path, ignore_errors=True)
         raise
     return stage
-
-
-def _with_consents(record: Any, consents: list[dict[str, Any]]) -> Any:
-    from dataclasses import replace
-
-    return replace(record, consents=(*record.consents, *consents))
 
 
 def _show(run: RunDirectory, stage: Stage, out: Output) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import map_option, open_drive, read_map
+from pmsmtool.cli.drive_access import FOLDER, map_option, new_run, open_drive, read_map, runs_option
 from pmsmtool.cli.options import FREQUENCY, TIME, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from pmsmtool.run_directory import RunDirectory
     from pmsmtool.trace import Trace
 
-FOLDER = click.Path(file_okay=False, path_type=Path)
 QUANTITIES = {"R": "R_s_ohm", "psi": "psi_f_wb"}
 
 
@@ -46,7 +44,7 @@ QUANTITIES = {"R": "R_s_ohm", "psi": "psi_f_wb"}
 @click.option("--by", type=click.Choice(["pdo", "trace"]), default="pdo", help="Process data, or recordings.")
 @click.option("--rate", "rate_hz", type=FREQUENCY, default="100Hz", help="Process data per second.")
 @click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="From what an earlier track kept; asks no drive.")
-@click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help="Where run directories are made.")
+@runs_option
 @map_option
 @bus_options
 @output_options
@@ -111,7 +109,6 @@ def _live(
     drive_map: DriveMap,
 ) -> tuple[RunDirectory, Tracked]:
     """Observe the drive and follow what it showed; the run keeps what was seen, whatever ends it."""
-    from pmsmtool.commissioning.commission import begin_run
     from pmsmtool.errors import PmsmtoolError
     from pmsmtool.identification.track import follow, known_of, track_stage
     from pmsmtool.machine.machine_file import dump_machine_file
@@ -122,8 +119,7 @@ def _live(
         drive = bus_open.enter_context(open_drive(bus, drive_map))
         described = _described(machine) if machine else nameplate_of(drive, drive.identity.name or "drive")
         known = known_of(described, compensated=drive.read("inverter.deadtime_compensation") != 0.0)
-        recorded = {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate}
-        run = begin_run(drive, runs, command=["pmsmtool", *sys.argv[1:]], bus=recorded)
+        run = new_run(bus, drive, runs)
         run.save("machine.toml", dump_machine_file(described))
         with accounted(run, "track", out.note) as say:
             try:

@@ -11,11 +11,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from pmsmtool import __version__
 from pmsmtool.commissioning.compared_stage import check_accepted, compared, refusal
 from pmsmtool.commissioning.contradiction import DATA_SHEET
 from pmsmtool.commissioning.level_stages import LevelStages
@@ -25,7 +23,6 @@ from pmsmtool.design.lookup.design import LookupRequest
 from pmsmtool.design.loops.margins import MarginRequest
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.port import Identity
 from pmsmtool.drive.stop import quick_stop
 from pmsmtool.errors import (
     CheckFailed,
@@ -40,10 +37,10 @@ from pmsmtool.errors import (
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.capabilities import Capabilities, reference_capabilities
-from pmsmtool.measurement.run_account import RunAccount, status_of, text_of
+from pmsmtool.measurement.run_account import RunAccount, begin_run, status_of, text_of
 from pmsmtool.proof.stage import ProofRequest, not_proven
 from pmsmtool.report.verdict import RAN
-from pmsmtool.run_directory import RunDirectory, RunRecord, Stage, new_record
+from pmsmtool.run_directory import RunDirectory, RunRecord, Stage
 
 FROM_TABLE = TuneRequest(field_weakening="lookup")
 """The chain's default design: the drive takes its current references from the table the chain makes and checks."""
@@ -238,7 +235,7 @@ class Commissioning:
             raise _required(lines, self.run)
 
     def _check_drive(self, record: RunRecord) -> None:
-        found = drive_facts(self.drive.identity)
+        found = asdict(self.drive.identity)
         wrong = [
             f"{key} {found[key]} instead of {record.drive[key]}" for key in IDENTITY if found[key] != record.drive[key]
         ]
@@ -362,29 +359,6 @@ NOT_ACCEPTED = (
 )
 IDENTITY = ("vendor", "product", "serial")
 """What must agree before a run is resumed."""
-
-
-def drive_facts(identity: Identity) -> dict[str, Any]:
-    """Return a drive's identity as the record keeps it."""
-    return asdict(identity)
-
-
-def begin_run(
-    drive: CanopenDrive,
-    runs: Path,
-    *,
-    command: Sequence[str] = ("commission",),
-    bus: Mapping[str, Any] | None = None,
-    level: str = "",
-) -> RunDirectory:
-    """Make the run directory of a drive below ``runs``; raises ``ConfigError`` when it cannot be written."""
-    record = new_record(
-        command,
-        drive={**drive_facts(drive.identity), **({"level": level, "map": drive.node.map.name} if level else {})},
-        bus={**(bus or {}), "node": drive.identity.node},
-        versions={"pmsmtool": __version__, **{name: version(name) for name in ("numpy", "scipy", "python-can")}},
-    )
-    return RunDirectory.create(runs, drive.identity.serial, record)
 
 
 def write_report(run: RunDirectory) -> None:

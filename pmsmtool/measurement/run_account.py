@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How a run ended, in its own record: a run that did not come to its end says so to whoever opens it years later.
+"""How a run began and ended, in its own record: one that did not come to its end says so to whoever opens it later.
 
 An account is begun before anything moves and closed on every way out, so a run whose account is still open was killed,
 lost its power, or still runs.
@@ -10,12 +10,15 @@ from __future__ import annotations
 import contextlib
 import datetime
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pmsmtool import __version__
+from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import RESTORED
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.errors import (
@@ -31,13 +34,31 @@ from pmsmtool.errors import (
 )
 from pmsmtool.files import PART
 from pmsmtool.measurement.observe import GIVEN_BACK
-from pmsmtool.run_directory import RECORD, RunDirectory, Stage, Status
+from pmsmtool.run_directory import RECORD, RunDirectory, Stage, Status, new_record
 
 WRITTEN_AFTER = (RECORD, "report.html")
 """Files of a run that say what the others hold: not counted among them."""
 NOTHING_SAID = "no stop and no restore was reported: nothing had been begun, or it was not confirmed"
 """What an account says where no guard lent the drive, or none came to its end."""
 Say = Callable[[str], None]
+
+
+def begin_run(
+    drive: CanopenDrive,
+    runs: Path,
+    *,
+    command: Sequence[str] = ("commission",),
+    bus: Mapping[str, Any] | None = None,
+    level: str = "",
+) -> RunDirectory:
+    """Make the run directory of a drive below ``runs``; raises ``ConfigError`` when it cannot be written."""
+    record = new_record(
+        command,
+        drive={**asdict(drive.identity), **({"level": level, "map": drive.node.map.name} if level else {})},
+        bus={**(bus or {}), "node": drive.identity.node},
+        versions={"pmsmtool": __version__, **{name: version(name) for name in ("numpy", "scipy", "python-can")}},
+    )
+    return RunDirectory.create(runs, drive.identity.serial, record)
 
 
 @dataclass(frozen=True, slots=True)
